@@ -1,0 +1,63 @@
+"""The one description of a person that flows through the project."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from refu_core.errors import FrameError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+N_JOINTS = 24
+N_BETAS = 10
+
+
+def _array(name: str, value: Any, shape: tuple[int, ...], dtype: type[np.floating[Any]]) -> NDArray[Any]:
+    """`value` as a read-only, finite array; accepts any layout with the right number of elements."""
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        msg = f"{name} must be {shape} numbers, got {type(value).__name__}: {error}"
+        raise FrameError(msg) from error
+    if array.size != np.prod(shape) or array.shape not in (shape, (array.size,)):
+        msg = f"{name} must have the shape {shape} or {(int(np.prod(shape)),)}, got {array.shape}"
+        raise FrameError(msg)
+    bad = int(np.count_nonzero(~np.isfinite(array)))
+    if bad:
+        msg = f"{name} has {bad} value{'s' if bad > 1 else ''} that {'are' if bad > 1 else 'is'} NaN or infinite"
+        raise FrameError(msg)
+    with np.errstate(over="ignore"):
+        array = array.reshape(shape).astype(dtype)  # always a copy: the frame owns its data
+    if not np.isfinite(array).all():
+        msg = f"{name} has values beyond the range of {np.dtype(dtype)}"
+        raise FrameError(msg)
+    array.setflags(write=False)
+    return array
+
+
+@dataclass(frozen=True, eq=False)
+class SmplFrame:
+    """Parameters of one SMPL body at one time; validated, immutable, in SMPL axes (y up, z forward, left = +x).
+
+    Raises `FrameError` when an array has a wrong number of elements or isn't finite.
+    """
+
+    pose: NDArray[np.float32]
+    """Rotation vector of each joint relative to its parent, root first [rad], shape (24, 3) (or flat, (72,))."""
+    betas: NDArray[np.float32] = field(default_factory=lambda: np.zeros(N_BETAS, np.float32))
+    """Shape coefficients in standard deviations, shape (10,)."""
+    transl: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    """Translation added to the posed vertices [m], shape (3,). float64: a body far from the origin loses no precision."""
+    stamp_ns: int = 0
+    """Time of the measurement [ns since the epoch of the sender's clock]."""
+
+    def __post_init__(self) -> None:
+        # A frozen dataclass is normalised through object.__setattr__, once, here.
+        object.__setattr__(self, "pose", _array("pose", self.pose, (N_JOINTS, 3), np.float32))
+        object.__setattr__(self, "betas", _array("betas", self.betas, (N_BETAS,), np.float32))
+        object.__setattr__(self, "transl", _array("transl", self.transl, (3,), np.float64))
+        object.__setattr__(self, "stamp_ns", int(self.stamp_ns))
