@@ -51,7 +51,7 @@ class SmplFrame:
     betas: NDArray[np.float32] = field(default_factory=lambda: np.zeros(N_BETAS, np.float32))
     """Shape coefficients in standard deviations, shape (10,)."""
     transl: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
-    """Translation added to the posed vertices [m], shape (3,). float64: a body far from the origin loses no precision."""
+    """Added to the posed vertices [m], shape (3,); float64, so that a body far from the origin loses no precision."""
     stamp_ns: int = 0
     """Time of the measurement [ns since the epoch of the sender's clock]."""
 

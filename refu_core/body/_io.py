@@ -1,0 +1,50 @@
+"""Loads body models: built-in names, `.npz` files, and official SMPL `.pkl` files."""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+
+from refu_core._npz import read_npz
+from refu_core.body._model import BodyArrays, SmplBody
+from refu_core.body._pickle import read_smpl_pickle
+from refu_core.errors import BodyError
+
+if TYPE_CHECKING:
+    import os
+
+BUILTIN_BODIES: tuple[str, ...] = ("male", "female", "neutral")
+_KEYS = ("v_template", "f", "weights", "J_regressor", "kintree_table", "shapedirs", "posedirs")
+
+
+def load_body(
+    source: str | os.PathLike[str], *, device: str | torch.device = "cpu", dtype: torch.dtype = torch.float32
+) -> SmplBody:
+    """Loads a body model.
+
+    Args:
+        source: `male`, `female` or `neutral` (built in), or the path of an SMPL-layout `.npz` or an official `.pkl`. A
+            pickle is read as data only: nothing in it is ever executed.
+        device: where its tensors live.
+        dtype: torch.float32 or torch.float64.
+
+    Raises:
+        BodyError: no such body or file, a file that can't be read, or one that isn't an SMPL-layout model.
+    """
+    if str(source) in BUILTIN_BODIES:
+        name = str(source)
+        with resources.as_file(resources.files("refu_core") / "assets" / f"body_{name}.npz") as path:
+            data = read_npz(path, keys=_KEYS, error=BodyError)
+        return SmplBody(BodyArrays.from_mapping(data, source=f"body {name}"), name=name, device=device, dtype=dtype)
+    path = Path(source)
+    if not path.is_file():
+        msg = f"no body {str(source)!r}: wanted one of {', '.join(BUILTIN_BODIES)}, or the path of an .npz or .pkl file"
+        raise BodyError(msg)
+    if path.suffix not in (".npz", ".pkl"):
+        msg = f"{path}: a body model must be an .npz or an official .pkl file, got {path.suffix or 'no suffix'!r}"
+        raise BodyError(msg)
+    data = read_npz(path, keys=_KEYS, error=BodyError) if path.suffix == ".npz" else read_smpl_pickle(path, keys=_KEYS)
+    return SmplBody(BodyArrays.from_mapping(data, source=str(path)), name=path.stem, device=device, dtype=dtype)

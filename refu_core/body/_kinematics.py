@@ -1,0 +1,94 @@
+"""Rotations and the kinematic tree of the 24 SMPL joints."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+JOINT_NAMES: tuple[str, ...] = (
+    "pelvis",
+    "left_hip",
+    "right_hip",
+    "spine1",
+    "left_knee",
+    "right_knee",
+    "spine2",
+    "left_ankle",
+    "right_ankle",
+    "spine3",
+    "left_foot",
+    "right_foot",
+    "neck",
+    "left_collar",
+    "right_collar",
+    "head",
+    "left_shoulder",
+    "right_shoulder",
+    "left_elbow",
+    "right_elbow",
+    "left_wrist",
+    "right_wrist",
+    "left_hand",
+    "right_hand",
+)
+"""Names of the SMPL joints in their order."""
+
+PARENTS: tuple[int, ...] = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
+"""Parent of each SMPL joint; the root's is -1, and a parent stands before its children."""
+
+
+def rotvec_to_rotmat(rotvec: Tensor) -> Tensor:
+    """Rotation matrices of rotation vectors [rad]: shape (..., 3) -> (..., 3, 3) (Rodrigues' formula).
+
+    Smooth with finite derivatives at the zero rotation, where sin θ / θ and (1 - cos θ) / θ² are taken from
+    their series.
+    """
+    angle2 = (rotvec * rotvec).sum(-1)
+    small = angle2 < 1e-4 if rotvec.dtype == torch.float32 else angle2 < 1e-8
+    safe2 = torch.where(small, torch.ones_like(angle2), angle2)  # keeps the unused branch's gradient finite
+    angle = safe2.sqrt()
+    a = torch.where(small, 1 - angle2 / 6 + angle2 * angle2 / 120, angle.sin() / angle)
+    # 2 sin²(θ/2) instead of 1 - cos θ: no cancellation just above the switch to the series.
+    b = torch.where(small, 0.5 - angle2 / 24 + angle2 * angle2 / 720, 2 * (0.5 * angle).sin().square() / safe2)
+    x, y, z = rotvec.unbind(-1)
+    zero = torch.zeros_like(x)
+    skew = torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), -1).reshape(*rotvec.shape, 3)
+    # K² = r rᵀ - |r|² I, one outer product instead of a matrix product.
+    outer = rotvec.unsqueeze(-1) * rotvec.unsqueeze(-2)
+    eye = torch.eye(3, dtype=rotvec.dtype, device=rotvec.device)
+    k2: Tensor = outer - angle2[..., None, None] * eye
+    return eye + a[..., None, None] * skew + b[..., None, None] * k2
+
+
+class RigidTransforms(NamedTuple):
+    """Maps from the rest pose to the posed body, one a joint."""
+
+    rotation: Tensor
+    """Shape (B, 24, 3, 3)."""
+    translation: Tensor
+    """[m], shape (B, 24, 3)."""
+
+
+def forward_kinematics(rotations: Tensor, joints: Tensor) -> tuple[Tensor, RigidTransforms]:
+    """Poses the joint tree.
+
+    Args:
+        rotations: rotation of each joint relative to its parent, shape (B, 24, 3, 3).
+        joints: rest positions of the joints [m], shape (B, 24, 3).
+
+    Returns:
+        Posed joints [m], shape (B, 24, 3), and the transforms that take a rest-pose point of each joint's bone to its
+        posed place.
+    """
+    world_rotation = [rotations[:, 0]]
+    world_joint = [joints[:, 0]]
+    for j, parent in enumerate(PARENTS[1:], start=1):
+        offset = joints[:, j] - joints[:, parent]
+        world_rotation.append(world_rotation[parent] @ rotations[:, j])
+        world_joint.append(world_joint[parent] + (world_rotation[parent] @ offset.unsqueeze(-1)).squeeze(-1))
+    rotation = torch.stack(world_rotation, 1)
+    posed = torch.stack(world_joint, 1)
+    translation = posed - (rotation @ joints.unsqueeze(-1)).squeeze(-1)
+    return posed, RigidTransforms(rotation, translation)

@@ -1,0 +1,219 @@
+"""The SMPL body model (Loper et al. 2015): shape, pose and joints to a posed mesh."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from refu_core.body._kinematics import PARENTS, RigidTransforms, forward_kinematics, rotvec_to_rotmat
+from refu_core.body._skinning import apply_transforms, blend_transforms
+from refu_core.errors import BodyError, FrameError
+from refu_core.frames import N_BETAS, N_JOINTS
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import ArrayLike, NDArray
+
+N_POSE_FEATURES = 9 * (N_JOINTS - 1)
+
+
+class BodyOutput(NamedTuple):
+    """A batch of posed bodies in SMPL axes."""
+
+    vertices: Tensor
+    """[m], shape (B, V, 3)."""
+    joints: Tensor
+    """[m], shape (B, 24, 3)."""
+    transforms: RigidTransforms
+    """Rest pose to posed, per joint and without `transl`; what garments are posed with."""
+
+
+@dataclass(frozen=True, eq=False)
+class BodyArrays:
+    """The arrays of an SMPL-layout model file, checked; V vertices, F faces."""
+
+    v_template: NDArray[np.float64]
+    """Mean shape in the T-pose [m], shape (V, 3)."""
+    faces: NDArray[np.int64]
+    """Counter-clockwise from outside, shape (F, 3)."""
+    weights: NDArray[np.float64]
+    """Skinning weights, rows sum to one, shape (V, 24)."""
+    joint_regressor: NDArray[np.float64]
+    """Joints of a shape, rows sum to one, shape (24, V)."""
+    shapedirs: NDArray[np.float64]
+    """Displacement a unit of each beta [m], shape (V, 3, 10)."""
+    posedirs: NDArray[np.float64] | None
+    """Displacement a unit of each pose feature (entries of R_j - I, j = 1…23) [m], shape (V, 3, 207); None for none."""
+
+    @classmethod
+    def from_mapping(cls, data: Mapping[str, Any], *, source: str) -> BodyArrays:
+        """Reads the keys of SMPL files (`f`, `J_regressor`, `kintree_table`, …); raises `BodyError`."""
+        missing = sorted({"v_template", "f", "weights", "J_regressor", "kintree_table", "shapedirs"} - set(data))
+        if missing:
+            msg = f"{source}: not an SMPL-layout model, it lacks {', '.join(missing)}"
+            raise BodyError(msg)
+
+        def numbers(key: str) -> NDArray[np.float64]:
+            try:
+                array = np.asarray(data[key], dtype=np.float64)
+            except (TypeError, ValueError) as error:
+                msg = f"{source}: {key} is not an array of numbers: {error}"
+                raise BodyError(msg) from error
+            if not np.isfinite(array).all():
+                msg = f"{source}: {key} has values that are NaN or infinite"
+                raise BodyError(msg)
+            return array
+
+        v_template = numbers("v_template")
+        n = len(v_template) if v_template.ndim == 2 else 0
+        parents = numbers("kintree_table")
+        # The root's parent is stored as 2**32 - 1 or -1.
+        if parents.shape != (2, N_JOINTS) or tuple(parents[0, 1:].astype(int)) != PARENTS[1:]:
+            msg = f"{source}: kintree_table must be the tree of SMPL's {N_JOINTS} joints, got the shape {parents.shape}"
+            raise BodyError(msg)
+        posedirs = numbers("posedirs") if "posedirs" in data else None
+        shapedirs = numbers("shapedirs")
+        if shapedirs.ndim != 3 or shapedirs.shape[2] < N_BETAS:
+            msg = f"{source}: shapedirs must be (V, 3, {N_BETAS} or more), got {shapedirs.shape}"
+            raise BodyError(msg)
+        arrays = cls(
+            v_template=v_template,
+            faces=numbers("f").astype(np.int64),
+            weights=numbers("weights"),
+            joint_regressor=numbers("J_regressor"),
+            shapedirs=shapedirs[:, :, :N_BETAS],
+            posedirs=posedirs if posedirs is not None and posedirs.any() else None,
+        )
+        wanted = {
+            "v_template": (n, 3),
+            "faces": (len(arrays.faces), 3),
+            "weights": (n, N_JOINTS),
+            "joint_regressor": (N_JOINTS, n),
+            "shapedirs": (n, 3, N_BETAS),
+        }
+        if arrays.posedirs is not None:
+            wanted["posedirs"] = (n, 3, N_POSE_FEATURES)
+        for name, shape in wanted.items():
+            if getattr(arrays, name).shape != shape or not n:
+                msg = f"{source}: {name} must have the shape {shape}, got {getattr(arrays, name).shape}"
+                raise BodyError(msg)
+        if arrays.faces.min(initial=0) < 0 or arrays.faces.max(initial=0) >= n:
+            msg = f"{source}: faces must index {n} vertices, got {arrays.faces.min()} to {arrays.faces.max()}"
+            raise BodyError(msg)
+        if np.abs(arrays.weights.sum(1) - 1).max() > 1e-3:
+            msg = f"{source}: the skinning weights of a vertex must sum to one"
+            raise BodyError(msg)
+        return arrays
+
+
+class SmplBody:
+    """An SMPL-layout body: batched, differentiable, float32 or float64, on any device.
+
+    V = mean + shape blend shapes(β) + pose blend shapes(θ), skinned by the transforms of the regressed joints.
+    """
+
+    def __init__(
+        self, arrays: BodyArrays, *, name: str, device: str | torch.device = "cpu", dtype: torch.dtype = torch.float32
+    ) -> None:
+        self.name = name
+        """What the body was loaded as: a built-in name or a file's stem."""
+        self._arrays = arrays
+        self.device = torch.device(device)
+        self.dtype = dtype
+
+        def tensor(array: NDArray[Any]) -> Tensor:
+            return torch.as_tensor(np.ascontiguousarray(array)).to(device=self.device, dtype=dtype)
+
+        self.faces = torch.as_tensor(arrays.faces, device=self.device)
+        """Shape (F, 3), int64."""
+        self.v_template = tensor(arrays.v_template)
+        self.weights = tensor(arrays.weights)
+        n = len(arrays.v_template)
+        self._shapedirs = tensor(arrays.shapedirs.reshape(n * 3, N_BETAS))
+        self._posedirs = tensor(arrays.posedirs.reshape(n * 3, -1)) if arrays.posedirs is not None else None
+        # Joints are linear in β, so the regressor is applied once to the basis and not to each body.
+        self._joint_template = tensor(arrays.joint_regressor @ arrays.v_template)
+        self._joint_shapedirs = tensor(np.einsum("jv,vcb->jcb", arrays.joint_regressor, arrays.shapedirs))
+
+    def __repr__(self) -> str:
+        return f"SmplBody({self.name!r}, {self.n_vertices} vertices, {self.dtype}, {self.device})"
+
+    @property
+    def n_vertices(self) -> int:
+        """Number of vertices V."""
+        return len(self.v_template)
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Hash of the model's arrays (16 hexadecimal digits): weights name the body that they were trained on by it."""
+        digest = hashlib.sha256()
+        for entry in fields(self._arrays):
+            array = getattr(self._arrays, entry.name)
+            if array is not None:
+                digest.update(np.ascontiguousarray(array, dtype="<i4" if entry.name == "faces" else "<f4").tobytes())
+        return digest.hexdigest()[:16]
+
+    def to(self, *, device: str | torch.device | None = None, dtype: torch.dtype | None = None) -> SmplBody:
+        """The same body on another device or in another precision."""
+        return SmplBody(self._arrays, name=self.name, device=device or self.device, dtype=dtype or self.dtype)
+
+    def _batch(self, name: str, value: ArrayLike | Tensor, width: tuple[int, ...]) -> Tensor:
+        tensor = torch.as_tensor(value, device=self.device).to(self.dtype)
+        size = int(np.prod(width))
+        if tensor.shape[1:] not in (width, (size,)) or tensor.ndim < 2:
+            msg = f"{name} must have the shape (B, {', '.join(map(str, width))}), got {tuple(tensor.shape)}"
+            raise FrameError(msg)
+        return tensor.reshape(-1, *width)
+
+    def rest_joints(self, betas: Tensor) -> Tensor:
+        """Joints of the unposed shapes [m], shape (B, 24, 3), for betas (B, 10)."""
+        return self._joint_template + torch.einsum("jck,bk->bjc", self._joint_shapedirs, betas)
+
+    def rest_vertices(self, betas: Tensor) -> Tensor:
+        """Unposed bodies without pose blend shapes [m], shape (B, V, 3), for betas (B, 10)."""
+        return self.v_template + (betas @ self._shapedirs.T).view(-1, self.n_vertices, 3)
+
+    def __call__(
+        self,
+        pose: ArrayLike | Tensor,
+        betas: ArrayLike | Tensor | None = None,
+        transl: ArrayLike | Tensor | None = None,
+    ) -> BodyOutput:
+        """Poses a batch of bodies.
+
+        Args:
+            pose: rotation vectors relative to the parent joint [rad], shape (B, 24, 3) or (B, 72).
+            betas: shape coefficients, (B, 10) or (1, 10); zeros if not given.
+            transl: added to vertices and joints, in its own precision [m], (B, 3) or (1, 3).
+
+        Raises:
+            FrameError: a shape is wrong.
+        """
+        theta = self._batch("pose", pose, (N_JOINTS, 3))
+        batch = len(theta)
+        beta = self._batch("betas", betas, (N_BETAS,)) if betas is not None else theta.new_zeros(1, N_BETAS)
+        if len(beta) not in (1, batch):
+            msg = f"betas must have the shape ({batch}, {N_BETAS}) or (1, {N_BETAS}), got {tuple(beta.shape)}"
+            raise FrameError(msg)
+        rotations = rotvec_to_rotmat(theta)
+        joints, transforms = forward_kinematics(rotations, self.rest_joints(beta).expand(batch, -1, -1))
+        shaped = self.rest_vertices(beta).expand(batch, -1, -1)
+        if self._posedirs is not None:
+            eye = torch.eye(3, dtype=self.dtype, device=self.device)
+            feature = (rotations[:, 1:] - eye).flatten(1)
+            shaped = shaped + (feature @ self._posedirs.T).view(batch, -1, 3)
+        vertices = apply_transforms(shaped, blend_transforms(self.weights, transforms))
+        if transl is not None:
+            shift = torch.as_tensor(transl, device=self.device)
+            if shift.ndim != 2 or shift.shape[1] != 3 or len(shift) not in (1, batch):
+                msg = f"transl must have the shape ({batch}, 3), got {tuple(shift.shape)}"
+                raise FrameError(msg)
+            vertices, joints = vertices + shift[:, None], joints + shift[:, None]
+        return BodyOutput(vertices, joints, transforms)

@@ -1,0 +1,47 @@
+"""Linear blend skinning of points, and its inverse."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from refu_core.body._kinematics import RigidTransforms
+
+_MIN_DETERMINANT = 1e-4
+"""Blends of rotations almost half a turn apart collapse; below this determinant unposing is bounded, not exact."""
+
+
+def blend_transforms(weights: Tensor, transforms: RigidTransforms) -> RigidTransforms:
+    """Blends the joints' transforms by skinning weights.
+
+    Args:
+        weights: skinning weights, rows sum to one, shape (V, 24).
+        transforms: of the joints, leading shape (B, 24).
+
+    Returns:
+        Transforms of the vertices, leading shape (B, V); the "rotation" of a blend isn't orthonormal.
+    """
+    batch = transforms.rotation.shape[0]
+    stacked = torch.cat((transforms.rotation.flatten(2), transforms.translation), -1)  # (B, 24, 12): one product
+    blended = weights @ stacked
+    return RigidTransforms(blended[..., :9].view(batch, -1, 3, 3), blended[..., 9:])
+
+
+def apply_transforms(points: Tensor, transforms: RigidTransforms) -> Tensor:
+    """Posed points [m], shape (B, V, 3), of rest-pose points of the same shape, by transforms of the shape (B, V)."""
+    return (transforms.rotation @ points.unsqueeze(-1)).squeeze(-1) + transforms.translation
+
+
+def unapply_transforms(points: Tensor, transforms: RigidTransforms) -> Tensor:
+    """Rest-pose points [m] of posed points [m], both (B, V, 3): the inverse of `apply_transforms`.
+
+    Exact to rounding; where a blend has collapsed (joint rotations of almost half a turn against each other) the
+    determinant is bounded away from zero, so that the result stays finite.
+    """
+    moved = points - transforms.translation
+    a, b, c = transforms.rotation.unbind(-1)  # columns
+    bc, ca, ab = torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)
+    det = (a * bc).sum(-1)
+    det = torch.where(det.abs() < _MIN_DETERMINANT, torch.where(det < 0, -_MIN_DETERMINANT, _MIN_DETERMINANT), det)
+    solved = torch.stack(((bc * moved).sum(-1), (ca * moved).sum(-1), (ab * moved).sum(-1)), -1)  # Cramer's rule
+    return solved / det.unsqueeze(-1)

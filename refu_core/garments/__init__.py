@@ -1,0 +1,5 @@
+"""Garment templates: the four built-in garments, how they follow shape and style, how they are posed and unposed."""
+
+from refu_core.garments._template import BUILTIN_GARMENTS, N_STYLES, GarmentTemplate, load_garment
+
+__all__ = ["BUILTIN_GARMENTS", "N_STYLES", "GarmentTemplate", "load_garment"]
