@@ -1,0 +1,53 @@
+"""Warp, imported once and quietly, and the bridges between its arrays and torch's."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+
+
+@contextlib.contextmanager
+def _no_stderr() -> Iterator[None]:
+    """Warp's native code writes to the file descriptor itself, below `sys.stderr`."""
+    saved, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, 2)
+    try:
+        yield
+    finally:
+        os.dup2(saved, 2)
+        os.close(saved)
+        os.close(null)
+
+
+def _start_quietly() -> None:
+    # Warp's banner, and its word that a machine has no GPU, would land in a node's log and in a command's output.
+    if hasattr(wp.config, "log_level"):
+        wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
+    else:  # releases before the logger
+        wp.config.quiet = True
+    with contextlib.nullcontext() if torch.cuda.is_available() else _no_stderr():
+        wp.init()
+
+
+_start_quietly()
+
+
+def as_warp(tensor: Tensor, dtype: Any) -> Any:
+    """A Warp array over the memory of a contiguous `tensor`: nothing is copied, no gradient is carried."""
+    return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
+
+
+@contextlib.contextmanager
+def torch_stream(device: torch.device) -> Iterator[None]:
+    """Queues Warp's work on torch's current CUDA stream, so that the two keep their order; nothing to do on a CPU."""
+    if device.type == "cuda":
+        with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device))):
+            yield
+    else:
+        yield

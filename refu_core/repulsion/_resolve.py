@@ -1,0 +1,164 @@
+"""ReFU with an accurate distance, repeated for the few vertices that one push hasn't brought to safety."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from refu_core.repulsion._unit import DEFAULT_MARGIN, MAX_DISPLACEMENT, repulse
+from refu_core.sdf import BodySdf, SdfSample
+
+
+@dataclass(frozen=True, eq=False)
+class Resolution:
+    """A garment off the body, and what that took."""
+
+    vertices: Tensor
+    """Garment vertices [m], shape (N, 3)."""
+    distance: Tensor
+    """Their signed distance [m], shape (N,)."""
+    n_inside: int
+    """Vertices inside the body before."""
+    n_pushed: int
+    """Vertices that were moved."""
+    rounds: int
+    """How often moved vertices were asked for their distance again."""
+    max_depth: float
+    """Depth of the deepest vertex before [m], 0 where none was inside."""
+    n_unresolved: int
+    """Vertices still inside: held between touching limbs, or deeper than the bound on displacements."""
+
+
+@torch.no_grad()
+def resolve(
+    points: Tensor,
+    sdf: BodySdf,
+    *,
+    margin: float = DEFAULT_MARGIN,
+    scale: float | Tensor = 1.0,
+    max_pushes: int = 4,
+    tolerance: float = 2e-4,
+    max_displacement: float = MAX_DISPLACEMENT,
+    edges: Tensor | None = None,
+) -> Resolution:
+    """Pushes garment vertices to f ≥ `margin`, and looks again at those it pushed. Not differentiable.
+
+    One push along the gradient (the paper's Eq. refu) can end inside another part of the body: in an armpit, between the
+    thighs. So the pushed vertices, and no others, are asked again and pushed again while they are closer than
+    `margin - tolerance`. Where limbs leave less room than twice the margin a vertex would be thrown to and fro: a push
+    against the last one goes half as far, and the best position found is kept.
+
+    Args:
+        points: Garment vertices [m], shape (N, 3), in the frame of the body last given to `sdf`.
+        sdf: The body's signed distance; an approximate one is only as safe as it is right.
+        margin: ε ≥ 0 [m].
+        scale: α of the first push, one number or shape (N,).
+        max_pushes: Upper bound on pushes of one vertex.
+        tolerance: Shortfall of the margin that is let pass [m].
+        max_displacement: Bound on each vertex's movement [m], all pushes together.
+        edges: Pairs of vertices, shape (E, 2), of `unique_edges`: where given, the middles of edges near the skin are
+            checked, too, and both ends of those too close are raised.
+    """
+    start = sdf.query(points)
+    state = _State(points.clone(), start.distance.clone(), points, sdf, margin, tolerance, max_displacement)
+    rows = torch.nonzero(start.distance < margin)[:, 0]
+    first = SdfSample(start.distance[rows], start.gradient[rows])
+    alpha = scale[rows] if isinstance(scale, Tensor) and scale.ndim else scale
+    rounds = _push(state, rows, first, alpha, max_pushes)
+    if edges is not None:
+        rounds += _raise_edges(state, edges, max_pushes)
+    vertices, distance = state.vertices, state.distance
+    return Resolution(
+        vertices,
+        distance,
+        n_inside=int((start.distance < 0).sum()),
+        n_pushed=int((vertices != points).any(dim=-1).sum()),
+        rounds=rounds,
+        max_depth=max(0.0, -float(start.distance.min())) if len(points) else 0.0,
+        n_unresolved=int((distance < 0).sum()),
+    )
+
+
+@dataclass(eq=False)
+class _State:
+    """Best positions and distances so far, and the bounds on what may be done to them."""
+
+    vertices: Tensor
+    distance: Tensor
+    origin: Tensor
+    sdf: BodySdf
+    margin: float
+    tolerance: float
+    max_displacement: float
+
+    def bounded(self, moved: Tensor, rows: Tensor) -> Tensor:
+        """`moved`, drawn back to within the largest displacement from where rows began."""
+        way = moved - self.origin[rows]
+        length = torch.linalg.vector_norm(way, dim=-1, keepdim=True)
+        return self.origin[rows] + way * (self.max_displacement / length.clamp_min(1e-12)).clamp_max(1.0)
+
+    def keep_better(self, rows: Tensor, moved: Tensor, distance: Tensor) -> None:
+        better = distance > self.distance[rows]
+        self.vertices[rows[better]] = moved[better]
+        self.distance[rows[better]] = distance[better]
+
+
+def _push(state: _State, rows: Tensor, sample: SdfSample, scale: float | Tensor, max_pushes: int) -> int:
+    """Pushes `rows`, whose distance and gradient are `sample`, until they are clear; returns the rounds it took."""
+    here, push, last = state.vertices[rows], scale, torch.zeros_like(sample.gradient)
+    for round_ in range(max_pushes):
+        if not len(rows):
+            return round_
+        moved = repulse(here, sample, scale=push, margin=state.margin, max_displacement=state.max_displacement)
+        here = state.bounded(moved, rows)
+        last = sample.gradient
+        sample = state.sdf.query(here)
+        state.keep_better(rows, here, sample.distance)
+        unclear = torch.nonzero(sample.distance < state.margin - state.tolerance)[:, 0]
+        rows, here, last = rows[unclear], here[unclear], last[unclear]
+        sample = SdfSample(sample.distance[unclear], sample.gradient[unclear])
+        push = torch.where((last * sample.gradient).sum(-1) < 0, 0.5, 1.0)
+    return max_pushes
+
+
+def _raise_edges(state: _State, edges: Tensor, max_rounds: int) -> int:
+    """Raises both ends of the edges whose middle is closer to the body than half the margin; returns the rounds."""
+    wanted = 0.5 * state.margin
+    for round_ in range(max_rounds):
+        ends = state.vertices[edges]
+        half = 0.5 * torch.linalg.vector_norm(ends[:, 0] - ends[:, 1], dim=-1)
+        # f changes by no more than the way walked: only these middles can be too close.
+        near = torch.nonzero(state.distance[edges].amax(dim=1) < half + wanted)[:, 0]
+        middle = state.sdf.query(ends[near].mean(dim=1))
+        low = torch.nonzero(middle.distance < wanted)[:, 0]
+        if not len(low):
+            return round_
+        deficit = (wanted - middle.distance[low]).repeat_interleave(2)
+        rise = deficit[:, None] * middle.gradient[low].repeat_interleave(2, dim=0)
+        raised = edges[near[low]].reshape(-1)
+        # A vertex of several low edges follows the lowest of them.
+        largest = state.distance.new_zeros(len(state.distance)).scatter_reduce(0, raised, deficit, "amax")
+        wins = deficit == largest[raised]
+        moves = torch.zeros_like(state.vertices).index_copy(0, raised[wins], rise[wins])
+        rows = torch.nonzero(largest)[:, 0]
+        moved = state.bounded(state.vertices[rows] + moves[rows], rows)
+        distance = state.sdf.query(moved).distance
+        clear = distance >= torch.minimum(
+            state.distance[rows], state.distance.new_tensor(state.margin - state.tolerance)
+        )
+        state.vertices[rows[clear]] = moved[clear]
+        state.distance[rows[clear]] = distance[clear]
+    return max_rounds
+
+
+def unique_edges(faces: Tensor | NDArray[Any]) -> Tensor:
+    """The edges of triangles, shape (F, 3), each once with the lower vertex first; int64, shape (E, 2), sorted."""
+    array = np.asarray(faces.cpu() if isinstance(faces, Tensor) else faces, dtype=np.int64)
+    sides = np.sort(array[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    edges = torch.from_numpy(np.unique(sides, axis=0))
+    return edges.to(faces.device) if isinstance(faces, Tensor) else edges

@@ -1,0 +1,82 @@
+"""The ReFU layer in its first form: one push along the gradient, by a given scale of the distance to a margin."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from refu_core.errors import MeshError
+from refu_core.sdf import SdfSample
+
+DEFAULT_MARGIN = 0.004
+"""ε: how far off the skin the vertices are pushed [m]. A garment's edges cut the corners between its vertices: with
+vertices exactly on the skin (ε = 0, the paper's fixed scale) they run through it; a few mm clear nearly all of them."""
+
+MAX_DISPLACEMENT = 0.1
+"""No vertex moves further than this [m], however wrong its distance is."""
+
+_UP = (0.0, 1.0, 0.0)
+
+
+def repulse(
+    points: Tensor,
+    sample: SdfSample,
+    *,
+    scale: float | Tensor = 1.0,
+    margin: float = 0.0,
+    max_displacement: float = MAX_DISPLACEMENT,
+    fallback: Tensor | None = None,
+) -> Tensor:
+    """ReFU: the points [m], shape (N, 3), with those closer to the body than `margin` moved along the gradient.
+
+    Treats f - ε as the field whose zero level is to be reached (the paper's Eq. refu, gradient and offset; ε = 0 is the
+    paper's): x' = x - α (f(x) - ε) ∇f/|∇f| where f(x) < ε, x elsewhere. Differentiable with respect to the points, the
+    sample and the scale. Only the rows with f < ε are touched.
+
+    Args:
+        points: Garment vertices [m], shape (N, 3).
+        sample: Signed distance and gradient at the points; the gradient needs no unit length.
+        scale: α, one number or shape (N,); 1 is the paper's "fixed scale".
+        margin: ε ≥ 0 [m].
+        max_displacement: Bound on each point's movement [m].
+        fallback: Direction where the gradient is zero or not finite, shape (3,) or (N, 3); up by default.
+
+    Raises:
+        MeshError: Arrays whose shapes don't belong together, or a negative margin or bound.
+    """
+    _check(points, sample, scale, margin, max_displacement)
+    rows = torch.nonzero(sample.distance.detach() < margin)[:, 0]
+    if not len(rows):
+        return points
+    deficit = margin - sample.distance[rows]
+    alpha = scale[rows] if isinstance(scale, Tensor) and scale.ndim else scale
+    offset = (alpha * deficit).clamp(-max_displacement, max_displacement)
+    if fallback is None:
+        fallback = points.new_tensor(_UP)
+    direction = unit_direction(sample.gradient[rows], fallback[rows] if fallback.ndim == 2 else fallback)
+    return points.index_add(0, rows, offset[:, None] * direction)
+
+
+def unit_direction(gradient: Tensor, fallback: Tensor) -> Tensor:
+    """∇f/|∇f| (Eq. gradient), shape (N, 3); `fallback` where that isn't defined. Finite, and so are its derivatives."""
+    length = torch.linalg.vector_norm(gradient.detach(), dim=-1, keepdim=True)
+    defined = torch.isfinite(length) & (length > torch.finfo(gradient.dtype).tiny ** 0.5)
+    # Normalising the stand-in, too, keeps NaN out of the branch that isn't taken and so out of its derivative.
+    usable = torch.where(defined, gradient, fallback)
+    return usable / torch.linalg.vector_norm(usable, dim=-1, keepdim=True)
+
+
+def _check(points: Tensor, sample: SdfSample, scale: float | Tensor, margin: float, max_displacement: float) -> None:
+    n = len(points)
+    if points.shape != (n, 3) or sample.distance.shape != (n,) or sample.gradient.shape != (n, 3):
+        msg = (
+            f"points and gradient must have the shape (N, 3), distance (N,); got {tuple(points.shape)}, "
+            f"{tuple(sample.gradient.shape)} and {tuple(sample.distance.shape)}"
+        )
+        raise MeshError(msg)
+    if isinstance(scale, Tensor) and scale.shape not in ((), (n,)):
+        msg = f"scale must be one number or have the shape ({n},), got {tuple(scale.shape)}"
+        raise MeshError(msg)
+    if not (margin >= 0 and max_displacement >= 0):
+        msg = f"margin and max_displacement must not be negative, got {margin} and {max_displacement}"
+        raise MeshError(msg)

@@ -1,0 +1,172 @@
+# mypy: ignore-errors
+# (Warp reads a kernel's annotations as array types of its own; a type checker can't.)
+"""Closest point on a triangle mesh, with the sign of the angle-weighted pseudo-normal: one code for CPU and CUDA.
+
+Barycentrics here weigh a face's vertices 0, 1, 2 in that order. The part of a face that holds the closest point is its
+*feature*: 0 the interior, 1 to 3 the vertices 0 to 2, 4 to 6 the edges (0, 1), (1, 2), (2, 0).
+"""
+
+import warp as wp
+
+from refu_core import _warp  # noqa: F401  (quiets Warp before it starts)
+
+FACE = wp.constant(0)
+VERTEX = wp.constant(1)  # 1, 2, 3
+EDGE = wp.constant(4)  # 4, 5, 6
+
+# Below this distance [m] the direction to a closest edge or vertex is rounding noise; the pseudo-normal stands in.
+ON_SURFACE = wp.constant(1e-5)
+
+
+@wp.func
+def closest_on_triangle(p: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3):
+    """Barycentrics of the point of triangle abc closest to p, and its feature, by p's Voronoi region."""
+    ab = b - a
+    ac = c - a
+    ap = p - a
+    ab_ap = wp.dot(ab, ap)
+    ac_ap = wp.dot(ac, ap)
+    if ab_ap <= 0.0 and ac_ap <= 0.0:
+        return wp.vec3(1.0, 0.0, 0.0), VERTEX
+
+    bp = p - b
+    ab_bp = wp.dot(ab, bp)
+    ac_bp = wp.dot(ac, bp)
+    if ab_bp >= 0.0 and ac_bp <= ab_bp:
+        return wp.vec3(0.0, 1.0, 0.0), VERTEX + 1
+
+    weight_c = ab_ap * ac_bp - ab_bp * ac_ap
+    if weight_c <= 0.0 and ab_ap >= 0.0 and ab_bp <= 0.0:
+        t = ab_ap / (ab_ap - ab_bp)
+        return wp.vec3(1.0 - t, t, 0.0), EDGE
+
+    cp = p - c
+    ab_cp = wp.dot(ab, cp)
+    ac_cp = wp.dot(ac, cp)
+    if ac_cp >= 0.0 and ab_cp <= ac_cp:
+        return wp.vec3(0.0, 0.0, 1.0), VERTEX + 2
+
+    weight_b = ab_cp * ac_ap - ab_ap * ac_cp
+    if weight_b <= 0.0 and ac_ap >= 0.0 and ac_cp <= 0.0:
+        t = ac_ap / (ac_ap - ac_cp)
+        return wp.vec3(1.0 - t, 0.0, t), EDGE + 2
+
+    weight_a = ab_bp * ac_cp - ab_cp * ac_bp
+    if weight_a <= 0.0 and ac_bp - ab_bp >= 0.0 and ab_cp - ac_cp >= 0.0:
+        t = (ac_bp - ab_bp) / ((ac_bp - ab_bp) + (ab_cp - ac_cp))
+        return wp.vec3(0.0, 1.0 - t, t), EDGE + 1
+
+    scale = 1.0 / (weight_a + weight_b + weight_c)
+    t_b = weight_b * scale
+    t_c = weight_c * scale
+    return wp.vec3(1.0 - t_b - t_c, t_b, t_c), FACE
+
+
+@wp.func
+def corner(mesh: wp.uint64, face: int, k: int):
+    """Vertex number of corner k of a face."""
+    return wp.mesh_get_index(mesh, 3 * face + k)
+
+
+@wp.func
+def face_normal(mesh: wp.uint64, face: int):
+    a = wp.mesh_get_point(mesh, 3 * face)
+    b = wp.mesh_get_point(mesh, 3 * face + 1)
+    c = wp.mesh_get_point(mesh, 3 * face + 2)
+    return wp.normalize(wp.cross(b - a, c - a))
+
+
+@wp.func
+def vertex_normal(mesh: wp.uint64, vertex: int, fan_start: wp.array(dtype=int), fan_face: wp.array(dtype=int)):
+    """Sum of the normals of the faces around a vertex, weighted by their angles there (Baerentzen and Aanaes, 2005)."""
+    total = wp.vec3(0.0, 0.0, 0.0)
+    for i in range(fan_start[vertex], fan_start[vertex + 1]):
+        face = fan_face[i]
+        k = wp.where(corner(mesh, face, 1) == vertex, 1, wp.where(corner(mesh, face, 2) == vertex, 2, 0))
+        here = wp.mesh_get_point(mesh, 3 * face + k)
+        to_next = wp.mesh_get_point(mesh, 3 * face + (k + 1) % 3) - here
+        to_last = wp.mesh_get_point(mesh, 3 * face + (k + 2) % 3) - here
+        normal = wp.cross(to_next, to_last)
+        total += wp.atan2(wp.length(normal), wp.dot(to_next, to_last)) * wp.normalize(normal)
+    return total
+
+
+@wp.func
+def pseudo_normal(
+    mesh: wp.uint64,
+    face: int,
+    feature: int,
+    across: wp.array2d(dtype=int),
+    fan_start: wp.array(dtype=int),
+    fan_face: wp.array(dtype=int),
+):
+    """Unit vector whose side of the closest feature is the outside, for every point that feature is closest to."""
+    normal = face_normal(mesh, face)
+    if feature >= EDGE:
+        normal += face_normal(mesh, across[face, feature - EDGE])
+    elif feature >= VERTEX:
+        normal = vertex_normal(mesh, corner(mesh, face, feature - VERTEX), fan_start, fan_face)
+    return wp.normalize(normal)
+
+
+@wp.kernel(enable_backward=False)
+def closest_kernel(
+    mesh: wp.uint64,
+    across: wp.array2d(dtype=int),
+    fan_start: wp.array(dtype=int),
+    fan_face: wp.array(dtype=int),
+    points: wp.array(dtype=wp.vec3),
+    max_distance: float,
+    by_winding: bool,
+    # outputs
+    out_face: wp.array(dtype=int),
+    out_feature: wp.array(dtype=int),
+    out_barycentrics: wp.array(dtype=wp.vec3),
+    out_normal: wp.array(dtype=wp.vec3),
+    out_distance: wp.array(dtype=float),
+    out_gradient: wp.array(dtype=wp.vec3),
+):
+    """Closest point, pseudo-normal there, signed distance and its gradient; face -1 where nothing is close enough."""
+    i = wp.tid()
+    p = points[i]
+    if by_winding:
+        hit = wp.mesh_query_point_sign_winding_number(mesh, p, max_distance)
+    else:
+        hit = wp.mesh_query_point_no_sign(mesh, p, max_distance)
+    if not hit.result:
+        out_face[i] = -1
+        out_feature[i] = FACE
+        out_barycentrics[i] = wp.vec3(1.0, 0.0, 0.0)
+        out_normal[i] = wp.vec3(0.0, 1.0, 0.0)
+        out_distance[i] = wp.inf
+        out_gradient[i] = wp.vec3(0.0, 1.0, 0.0)
+        return
+
+    face = hit.face
+    a = wp.mesh_get_point(mesh, 3 * face)
+    b = wp.mesh_get_point(mesh, 3 * face + 1)
+    c = wp.mesh_get_point(mesh, 3 * face + 2)
+    w, feature = closest_on_triangle(p, a, b, c)
+    normal = pseudo_normal(mesh, face, feature, across, fan_start, fan_face)
+    # Relative to a vertex: a difference of nearby positions keeps the digits that absolute ones lose.
+    offset = (p - a) - (w[1] * (b - a) + w[2] * (c - a))
+    height = wp.dot(offset, normal)
+    outside = wp.where(height < 0.0, -1.0, 1.0)
+    if by_winding:
+        outside = hit.sign
+
+    distance = wp.length(offset)
+    gradient = wp.vec3()
+    if feature == FACE:
+        distance = wp.abs(height)
+    if feature == FACE or distance < ON_SURFACE:
+        gradient = wp.where(height * outside < 0.0, -normal, normal)
+    else:
+        gradient = offset * (outside / distance)
+
+    out_face[i] = face
+    out_feature[i] = feature
+    out_barycentrics[i] = w
+    out_normal[i] = normal
+    out_distance[i] = outside * distance
+    out_gradient[i] = gradient
