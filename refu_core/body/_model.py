@@ -129,9 +129,9 @@ class SmplBody:
         self.dtype = dtype
 
         def tensor(array: NDArray[Any]) -> Tensor:
-            return torch.as_tensor(np.ascontiguousarray(array)).to(device=self.device, dtype=dtype)
+            return torch.tensor(array, device=self.device, dtype=dtype)
 
-        self.faces = torch.as_tensor(arrays.faces, device=self.device)
+        self.faces = torch.tensor(arrays.faces, device=self.device)
         """Shape (F, 3), int64."""
         self.v_template = tensor(arrays.v_template)
         self.weights = tensor(arrays.weights)
@@ -165,7 +165,7 @@ class SmplBody:
         return SmplBody(self._arrays, name=self.name, device=device or self.device, dtype=dtype or self.dtype)
 
     def _batch(self, name: str, value: ArrayLike | Tensor, width: tuple[int, ...]) -> Tensor:
-        tensor = torch.as_tensor(value, device=self.device).to(self.dtype)
+        tensor = _tensor(value, self.device).to(self.dtype)
         size = int(np.prod(width))
         if tensor.shape[1:] not in (width, (size,)) or tensor.ndim < 2:
             msg = f"{name} must have the shape (B, {', '.join(map(str, width))}), got {tuple(tensor.shape)}"
@@ -211,9 +211,14 @@ class SmplBody:
             shaped = shaped + (feature @ self._posedirs.T).view(batch, -1, 3)
         vertices = apply_transforms(shaped, blend_transforms(self.weights, transforms))
         if transl is not None:
-            shift = torch.as_tensor(transl, device=self.device)
+            shift = _tensor(transl, self.device)
             if shift.ndim != 2 or shift.shape[1] != 3 or len(shift) not in (1, batch):
                 msg = f"transl must have the shape ({batch}, 3), got {tuple(shift.shape)}"
                 raise FrameError(msg)
             vertices, joints = vertices + shift[:, None], joints + shift[:, None]
         return BodyOutput(vertices, joints, transforms)
+
+
+def _tensor(value: ArrayLike | Tensor, device: torch.device) -> Tensor:
+    """A tensor on `device`; arrays are copied, since a frame's are read-only."""
+    return value.to(device) if isinstance(value, Tensor) else torch.tensor(np.asarray(value), device=device)

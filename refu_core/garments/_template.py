@@ -110,13 +110,13 @@ def load_garment(
         data = read_npz(path, keys=("v_template", "f", "weights", "shapedirs", "styledirs", "body"), error=GarmentError)
 
     def tensor(array: NDArray[Any]) -> Tensor:
-        return torch.as_tensor(np.ascontiguousarray(array)).to(device=device, dtype=dtype)
+        return torch.tensor(array, device=device, dtype=dtype)
 
     n = len(data["v_template"])
     return GarmentTemplate(
         name=name,
         body=str(data["body"]),
-        faces=torch.as_tensor(data["f"].astype(np.int64), device=device),
+        faces=torch.tensor(data["f"].astype(np.int64), device=device),
         weights=tensor(data["weights"]),
         v_template=tensor(data["v_template"]),
         shapedirs=tensor(data["shapedirs"].reshape(n * 3, -1)),

@@ -1,0 +1,195 @@
+"""The command `refu`. Every subcommand has `--help` and `--json FILE`; bad input is one clear line and exit code 2."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from refu_core import RefuError, __version__
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from types import FrameType
+
+EXIT_BAD_INPUT = 2
+EXIT_INTERRUPTED = 130
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        """One line, as for every other kind of bad input."""
+        self.exit(EXIT_BAD_INPUT, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
+
+
+def _names(text: str) -> tuple[str, ...]:
+    names = tuple(name.strip() for name in text.split(",") if name.strip())
+    if not names:
+        msg = "wanted one name or several with commas between them"
+        raise argparse.ArgumentTypeError(msg)
+    return names
+
+
+def _numbers(count: int) -> Callable[[str], tuple[float, ...]]:
+    def parse(text: str) -> tuple[float, ...]:
+        try:
+            numbers = tuple(float(number) for number in text.split(","))
+        except ValueError:
+            numbers = ()
+        if not 1 <= len(numbers) <= count or any(number != number or abs(number) == float("inf") for number in numbers):
+            msg = f"wanted up to {count} finite numbers with commas between them, got {text!r}"
+            raise argparse.ArgumentTypeError(msg)
+        return numbers + (0.0,) * (count - len(numbers))
+
+    return parse
+
+
+def _positive(text: str) -> int:
+    try:
+        number = int(text)
+    except ValueError:
+        number = 0
+    if number < 1:
+        msg = f"wanted a whole number above zero, got {text!r}"
+        raise argparse.ArgumentTypeError(msg)
+    return number
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(prog="refu", description="Garments on SMPL bodies, free of body-garment collisions.")
+    parser.add_argument("--version", action="version", version=f"refu {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Parser)
+    _add_replay(commands)
+    _add_info(commands)
+    return parser
+
+
+def _add_common(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the results as JSON")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def _add_replay(commands: Any) -> None:
+    parser = commands.add_parser(
+        "replay",
+        help="run recorded motion through the pipeline and measure it",
+        description="Run every frame of a bag or motion file through the pipeline, write the garments as a bag, and "
+        "evaluate them with exact collision checks.",
+    )
+    parser.add_argument(
+        "input", type=Path, metavar="INPUT", help="an .mcap, a rosbag2 directory, or an AMASS-style .npz"
+    )
+    parser.add_argument("--output", type=Path, metavar="OUT", help="bag to write: OUT.mcap, or a directory for rosbag2")
+    parser.add_argument("--report", type=Path, metavar="DIR", help="write DIR/index.html with plots and pictures")
+    parser.add_argument(
+        "--garments",
+        type=_names,
+        default=("tshirt-male", "short-pant-male"),
+        metavar="A,B",
+        help="garments of one body (default: tshirt-male,short-pant-male)",
+    )
+    parser.add_argument("--backbone", default="skinned", metavar="NAME", help="skinned (default)")
+    parser.add_argument("--sdf", default="accurate", metavar="MODE", help="accurate (default) or none")
+    parser.add_argument("--margin", type=float, default=0.004, metavar="M", help="clearance from the skin [m] (0.004)")
+    parser.add_argument("--betas", type=_numbers(10), metavar="B0,…", help="shape to use instead of the recorded one")
+    parser.add_argument("--style", type=_numbers(4), metavar="G0,…", help="garment style γ")
+    parser.add_argument(
+        "--speed", choices=("max", "real"), default="max", help="as fast as possible (default), or paced"
+    )
+    parser.add_argument("--topic", metavar="NAME", help="input topic, where a bag has several of SMPL parameters")
+    parser.add_argument("--input-type", metavar="TYPE", help="multiarray, joint_state, pose_array or smpl_msgs")
+    parser.add_argument(
+        "--input-axes",
+        choices=("smpl", "frame"),
+        default="smpl",
+        help="axes of the recorded root: SMPL's world, y up (default), or those of the frame itself",
+    )
+    parser.add_argument("--frame-id", default="map", metavar="ID", help="frame_id of the markers (map)")
+    parser.add_argument("--device", default="cpu", metavar="DEVICE", help="cpu (default) or cuda")
+    parser.add_argument("--max-frames", type=_positive, metavar="N", help="stop after N frames")
+    parser.add_argument("--overwrite", action="store_true", help="replace an output that is there already")
+    _add_common(parser)
+    parser.set_defaults(run=_replay)
+
+
+def _add_info(commands: Any) -> None:
+    parser = commands.add_parser(
+        "info", help="what is installed, built in and usable", description="What is installed."
+    )
+    _add_common(parser)
+    parser.set_defaults(run=_info)
+
+
+def _replay(args: argparse.Namespace) -> int:
+    from refu_ros.replay import ReplayOptions, replay
+    from refu_ros.tables import replay_table
+
+    for path in (args.json, args.report):
+        _check_writable(path)
+    given = {key: value for key, value in vars(args).items() if key in ReplayOptions.__dataclass_fields__}
+    result = replay(ReplayOptions(**given), progress=not args.quiet)
+    print(replay_table(result))
+    _write_json(args.json, result.as_dict())
+    if args.report is not None and result.frames:
+        from refu_ros.report import write_report
+
+        print(f"report: {write_report(result, args.report, progress=not args.quiet)}")
+    return EXIT_INTERRUPTED if result.interrupted else 0
+
+
+def _info(args: argparse.Namespace) -> int:
+    from refu_ros.info import collect
+
+    facts = collect()
+    for name, value in facts.items():
+        print(f"{name:>12}  {value}")
+    _write_json(args.json, facts)
+    return 0
+
+
+def _check_writable(path: Path | None) -> None:
+    """Says so before the work is done, not after it."""
+    if path is None:
+        return
+    existing = path.absolute()
+    while not existing.exists():
+        existing = existing.parent
+    if not os.access(existing, os.W_OK) or (existing != path.absolute() and not existing.is_dir()):
+        msg = f"{path}: can't be written, {existing} is not a writable folder"
+        raise RefuError(msg)
+
+
+def _write_json(path: Path | None, content: dict[str, Any]) -> None:
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _interrupt(_signal: int, _frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs the command line; returns the exit code."""
+    signal.signal(signal.SIGTERM, _interrupt)  # a terminated replay closes its bag like an interrupted one
+    try:
+        args = _parser().parse_args(arguments)
+        code: int = args.run(args)
+    except RefuError as error:
+        print(f"refu: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return EXIT_BAD_INPUT
+    except OSError as error:
+        print(f"refu: error: {error}", file=sys.stderr)
+        return EXIT_BAD_INPUT
+    except KeyboardInterrupt:
+        print("refu: interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

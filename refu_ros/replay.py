@@ -1,0 +1,371 @@
+"""Replays recorded motion through the garment pipeline without ROS: bytes in, garments out, measured frame by frame."""
+
+from __future__ import annotations
+
+import itertools
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager, ExitStack
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from tqdm import tqdm
+
+import msg_adapters as adapters
+from refu_core import GarmentPipeline, SmplFrame
+from refu_core.evaluation import CollisionChecker, GarmentMetrics, MetricsSummary, SelfContact, SelfContactDetector
+from refu_core.repulsion import DEFAULT_MARGIN
+
+if TYPE_CHECKING:
+    from types import TracebackType
+
+    from numpy.typing import NDArray
+
+    from msg_adapters import FrameRecord
+    from refu_core.realtime import PipelineOutput
+
+GARMENTS_TOPIC = "/garments"
+INPUT_TOPIC = "/smpl_params"
+PALETTE: Mapping[str, tuple[float, float, float, float]] = {
+    "shirt-male": (0.36, 0.55, 0.75, 1.0),
+    "tshirt-male": (0.85, 0.45, 0.33, 1.0),
+    "short-pant-male": (0.33, 0.42, 0.50, 1.0),
+    "skirt-female": (0.55, 0.40, 0.62, 1.0),
+}
+"""Marker colours, RGBA."""
+_MAX_REASONS = 20
+"""Reasons of skips that are counted apart."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayOptions:
+    """What to replay and how; the fields are the options of `refu replay`."""
+
+    input: Path
+    garments: tuple[str, ...] = ("tshirt-male", "short-pant-male")
+    output: Path | None = None
+    backbone: str = "skinned"
+    sdf: str = "accurate"
+    margin: float = DEFAULT_MARGIN
+    betas: tuple[float, ...] | None = None
+    style: tuple[float, ...] | None = None
+    speed: Literal["max", "real"] = "max"
+    topic: str | None = None
+    input_type: str | None = None
+    input_axes: Literal["smpl", "frame"] = "smpl"
+    frame_id: str = "map"
+    device: str = "cpu"
+    max_frames: int | None = None
+    overwrite: bool = False
+
+
+@dataclass(frozen=True)
+class GarmentRecord:
+    """One garment in one frame, before (`raw`) and after collision handling."""
+
+    latency_ms: float
+    n_inside_before: int
+    n_inside: int
+    n_pairs_before: int
+    n_pairs: int
+    max_depth_before: float
+    """[m]."""
+    max_depth: float
+    """[m]."""
+    near_self_contact: bool
+
+
+@dataclass(frozen=True)
+class FrameResult:
+    """One replayed frame; enough to find it again and to plot it."""
+
+    frame: SmplFrame
+    latency_ms: float
+    """From input bytes to output bytes."""
+    stage_ms: Mapping[str, float]
+    garments: Mapping[str, GarmentRecord]
+
+    @property
+    def badness(self) -> tuple[int, float, int, float]:
+        """Orders frames from best to worst: what is left first, what there was to do second."""
+        g = self.garments.values()
+        return (
+            sum(r.n_pairs + r.n_inside for r in g),
+            max((r.max_depth for r in g), default=0.0),
+            sum(r.n_pairs_before for r in g),
+            max((r.max_depth_before for r in g), default=0.0),
+        )
+
+
+@dataclass(eq=False)
+class ReplayResult:
+    """Everything a table, a JSON file or a report needs."""
+
+    options: ReplayOptions
+    source: str
+    """What was read: a topic and its type, or a motion file."""
+    frames: list[FrameResult] = field(default_factory=list)
+    skips: Counter[str] = field(default_factory=Counter)
+    """Messages that were not replayed, by reason."""
+    warnings: list[str] = field(default_factory=list)
+    before: dict[str, MetricsSummary] = field(default_factory=dict)
+    after: dict[str, MetricsSummary] = field(default_factory=dict)
+    interrupted: bool = False
+
+    def latency_ms(self, garment: str | None = None) -> dict[str, float]:
+        """Percentiles of the latency of a garment (the frame without the others' own stages), or of the frame [ms]."""
+        values = [f.latency_ms if garment is None else f.garments[garment].latency_ms for f in self.frames]
+        p50, p95, p99 = np.percentile(values, (50, 95, 99)) if values else (0.0, 0.0, 0.0)
+        return {"p50": float(p50), "p95": float(p95), "p99": float(p99)}
+
+    def as_dict(self) -> dict[str, Any]:
+        """The machine-readable result (`--json`)."""
+        garments: dict[str, Any] = {}
+        for name, after in self.after.items():
+            figures = after.all.as_dict()
+            garments[name] = {
+                "latency_ms": self.latency_ms(name),
+                **figures,
+                "self_contact_frames": after.n_contact_frames,
+                "before": self.before[name].all.as_dict(),
+                "without_self_contact_frames": after.contact_free_frames.as_dict(),
+                "without_self_contact_vertices": after.contact_free_vertices.as_dict(),
+            }
+        return {
+            "input": str(self.options.input),
+            "source": self.source,
+            "output": None if self.options.output is None else str(self.options.output),
+            "backbone": self.options.backbone,
+            "sdf": self.options.sdf,
+            "margin_m": self.options.margin,
+            "device": self.options.device,
+            "frames": len(self.frames),
+            "skipped": dict(self.skips),
+            "warnings": self.warnings,
+            "interrupted": self.interrupted,
+            "self_contact_frames": sum(any(g.near_self_contact for g in f.garments.values()) for f in self.frames),
+            "latency_ms": self.latency_ms(),
+            "garments": garments,
+        }
+
+
+class Source(AbstractContextManager["Source"]):
+    """Frames of a bag or of a motion file, as records of one kind."""
+
+    def __init__(self, options: ReplayOptions) -> None:
+        self._stack = ExitStack()
+        if options.input.suffix == ".npz":
+            motion = adapters.read_motion(options.input)
+            self.topic, self.message_type = INPUT_TOPIC, adapters.INPUT_TYPES["multiarray"]
+            self.description = f"{options.input.name}, {len(motion)} frames at {motion.fps:g} Hz"
+            self.count: int | None = len(motion)
+            self.decoder = adapters.decoder_for("multiarray")
+            self._records = _motion_records(motion, self.topic)
+            self._bag = None
+        else:
+            self._bag = self._stack.enter_context(
+                adapters.open_smpl_bag(options.input, topic=options.topic, input_type=options.input_type)
+            )
+            self.topic, self.message_type = self._bag.topic.name, self._bag.topic.message_type
+            self.description = f"{self.topic} ({self.message_type})"
+            self.count = self._bag.message_count
+            self.decoder = self._bag.decoder
+            self._records = iter(self._bag)
+
+    def __iter__(self) -> Iterator[FrameRecord]:
+        return self._records
+
+    @property
+    def definition(self) -> tuple[str | None, str | None]:
+        """The input type's definition and hash as the bag has them."""
+        return (self._bag.topic.definition, self._bag.topic.type_hash) if self._bag else (None, None)
+
+    @property
+    def warnings(self) -> list[str]:
+        """What was wrong with the file as a whole; complete after the last record."""
+        return list(self._bag.reader.warnings) if self._bag else []
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.close()
+
+
+def _motion_records(motion: adapters.Motion, topic: str) -> Iterator[FrameRecord]:
+    encode = adapters.encoder_for("multiarray")
+    for frame in motion.frames():
+        yield adapters.FrameRecord(
+            frame=frame,
+            error=None,
+            stamp_ns=frame.stamp_ns,
+            log_time_ns=frame.stamp_ns,
+            topic=topic,
+            raw=encode(frame),
+        )
+
+
+class Evaluator:
+    """Exact metrics of every frame, before and after collision handling."""
+
+    def __init__(self, pipeline: GarmentPipeline) -> None:
+        self._pipeline = pipeline
+        self._body_faces = pipeline.body.faces.cpu().numpy()
+        self._checker = CollisionChecker(self._body_faces)
+        self._detector: tuple[bytes, SelfContactDetector] | None = None
+        faces = {name: garment.faces.cpu().numpy() for name, garment in pipeline.garments.items()}
+        self._faces = faces
+        self.before = {name: GarmentMetrics(f) for name, f in faces.items()}
+        self.after = {name: GarmentMetrics(f) for name, f in faces.items()}
+
+    def _self_contact(self, frame: SmplFrame, body: NDArray[np.float32]) -> SelfContact:
+        # Faces that overlap in the rest pose already (toes) depend on the shape: one detector a shape.
+        key = frame.betas.tobytes()
+        if self._detector is None or self._detector[0] != key:
+            betas = self._pipeline.body.v_template.new_tensor(frame.betas)[None]
+            rest = self._pipeline.body.rest_vertices(betas)[0].cpu().numpy()
+            self._detector = (key, SelfContactDetector(self._body_faces, rest))
+        return self._detector[1].detect(body)
+
+    def add(self, frame: SmplFrame, output: PipelineOutput, latency_ms: float) -> dict[str, GarmentRecord]:
+        """Measures one frame."""
+        contact = self._self_contact(frame, output.body)
+        self._checker.update(output.body)
+        own_ms = {name: output.stats.garments[name].ms for name in output}
+        records = {}
+        for name, mesh in output.items():
+            near = contact.near(mesh.local)
+            raw = self._checker.check(mesh.raw, self._faces[name])
+            done = self._checker.check(mesh.local, self._faces[name])
+            self.before[name].add(mesh.raw, raw, near_contact=near)
+            self.after[name].add(mesh.local, done, near_contact=near)
+            records[name] = GarmentRecord(
+                latency_ms=latency_ms - sum(own_ms.values()) + own_ms[name],
+                n_inside_before=raw.n_inside,
+                n_inside=done.n_inside,
+                n_pairs_before=raw.n_pairs,
+                n_pairs=done.n_pairs,
+                max_depth_before=raw.max_depth,
+                max_depth=done.max_depth,
+                near_self_contact=bool(near.any()),
+            )
+        return records
+
+
+class _Replayer:
+    """The loop's parts, so that one frame is one call."""
+
+    def __init__(self, options: ReplayOptions, pipeline: GarmentPipeline, source: Source, result: ReplayResult) -> None:
+        self._options = options
+        self._pipeline = pipeline
+        self._source = source
+        self._result = result
+        self._evaluator = Evaluator(pipeline)
+        self._betas = None if options.betas is None else np.asarray(options.betas, np.float32)
+        meshes = [
+            adapters.MarkerMesh(
+                ns=adapters.garment_namespace(name),
+                faces=garment.faces.cpu().numpy(),
+                n_vertices=garment.n_vertices,
+                color=PALETTE[name],
+            )
+            for name, garment in pipeline.garments.items()
+        ]
+        self._encoder = adapters.MarkerArrayEncoder(meshes, frame_id=options.frame_id, axes=options.input_axes)
+
+    def open_writer(self) -> adapters.BagWriter | None:
+        """The output bag with its topics, None where no output was asked for."""
+        if self._options.output is None:
+            return None
+        writer = adapters.BagWriter(self._options.output, overwrite=self._options.overwrite)
+        definition, type_hash = self._source.definition
+        writer.add_topic(self._source.topic, self._source.message_type, definition=definition, type_hash=type_hash)
+        writer.add_topic(GARMENTS_TOPIC, adapters.MARKER_ARRAY)
+        return writer
+
+    def run(self, record: FrameRecord, writer: adapters.BagWriter | None) -> None:
+        """Bytes to bytes (timed), then the bag and the metrics (not timed)."""
+        if writer is not None:
+            writer.write(self._source.topic, record.raw, log_time_ns=record.log_time_ns)
+        start = time.perf_counter()
+        try:
+            frame = replace(self._source.decoder.from_bytes(record.raw), stamp_ns=record.stamp_ns)
+            if self._betas is not None:
+                frame = replace(frame, betas=self._betas)
+            output = self._pipeline(frame)
+            data = self._encoder.encode(
+                [mesh.local for mesh in output.values()], stamp_ns=frame.stamp_ns, transl=frame.transl
+            )
+        except (adapters.DecodeError, adapters.EncodeError) as error:
+            self._skip(str(error))
+            return
+        latency_ms = 1e3 * (time.perf_counter() - start)
+        if writer is not None:
+            writer.write(GARMENTS_TOPIC, data, log_time_ns=record.log_time_ns)
+        garments = self._evaluator.add(frame, output, latency_ms)
+        self._result.frames.append(FrameResult(frame, latency_ms, output.stats.stage_ms, garments))
+
+    def _skip(self, reason: str) -> None:
+        skips = self._result.skips
+        skips[reason if reason in skips or len(skips) < _MAX_REASONS else "other reasons"] += 1
+
+    def summarise(self) -> None:
+        """Completes the result."""
+        self._result.before = {name: metrics.summary() for name, metrics in self._evaluator.before.items()}
+        self._result.after = {name: metrics.summary() for name, metrics in self._evaluator.after.items()}
+
+
+def replay(options: ReplayOptions, *, progress: bool = False) -> ReplayResult:
+    """Runs every frame of the input through the pipeline, writes the output bag, measures.
+
+    An interrupt (Ctrl-C) ends the replay early: the bag is closed and the result so far is returned.
+
+    Raises:
+        RefuError: a bad input file, an unknown garment, an output that can't be written, or no frame that could be
+            replayed.
+    """
+    pipeline = GarmentPipeline.load(
+        options.garments,
+        sdf=options.sdf,
+        backbone=options.backbone,
+        style=options.style,
+        margin=options.margin,
+        device=options.device,
+    )
+    pipeline(
+        SmplFrame(pose=np.zeros((24, 3), np.float32))
+    )  # compiles kernels, so that the first frame's latency is a frame's
+    with ExitStack() as stack:
+        source = stack.enter_context(Source(options))
+        result = ReplayResult(options, source.description)
+        replayer = _Replayer(options, pipeline, source, result)
+        writer = replayer.open_writer()
+        if writer is not None:
+            stack.enter_context(writer)
+        records = itertools.islice(source, options.max_frames)
+        total = source.count if options.max_frames is None else min(source.count or sys.maxsize, options.max_frames)
+        try:
+            for record in tqdm(_paced(records, options.speed), total=total, unit="frame", disable=not progress):
+                replayer.run(record, writer)
+        except KeyboardInterrupt:
+            result.interrupted = True
+        result.warnings += source.warnings
+    replayer.summarise()
+    if not result.frames and not result.interrupted:
+        reasons = "; ".join(f"{count} x {reason}" for reason, count in result.skips.most_common(3))
+        msg = f"{options.input}: no frame could be replayed: {reasons or 'the input is empty'}"
+        raise adapters.BagError(msg)
+    return result
+
+
+def _paced(records: Iterable[FrameRecord], speed: Literal["max", "real"]) -> Iterator[FrameRecord]:
+    """The records, as fast as they are taken or at the pace of their log times."""
+    origin: tuple[float, int] | None = None
+    for record in records:
+        if speed == "real":
+            origin = origin or (time.monotonic(), record.log_time_ns)
+            time.sleep(max(0.0, origin[0] + 1e-9 * (record.log_time_ns - origin[1]) - time.monotonic()))
+        yield record

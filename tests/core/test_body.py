@@ -1,0 +1,325 @@
+"""SmplBody against a slow reference, its derivatives, and what loading refuses."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import pickle
+import subprocess
+import sys
+import types
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.sparse
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from refu_core import BodyError, FrameError, load_body
+from refu_core.body import BUILTIN_BODIES, PARENTS, SmplBody, rotvec_to_rotmat
+from refu_core.body._model import BodyArrays
+
+ASSETS = Path(__file__).parents[2] / "refu_core" / "assets"
+
+
+def asset(name: str = "male") -> dict[str, NDArray[np.float64]]:
+    with np.load(ASSETS / f"body_{name}.npz") as file:
+        return {key: file[key] for key in file.files}
+
+
+def reference(
+    data: dict[str, NDArray[np.float64]], pose: NDArray[np.float64], betas: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """SMPL as its paper writes it: 4x4 matrices, one joint and one vertex at a time, float64."""
+    shaped = data["v_template"].astype(float) + data["shapedirs"].astype(float) @ betas
+    joints = data["J_regressor"].astype(float) @ shaped
+    rotations = Rotation.from_rotvec(pose).as_matrix()
+    shaped = shaped + data["posedirs"].astype(float) @ (rotations[1:] - np.eye(3)).ravel()
+    world: list[NDArray[np.float64]] = []
+    for j, parent in enumerate(PARENTS):
+        local = np.eye(4)
+        local[:3, :3] = rotations[j]
+        local[:3, 3] = joints[j] - (joints[parent] if parent >= 0 else 0)
+        world.append(world[parent] @ local if parent >= 0 else local)
+    posed = np.array([m[:3, 3] for m in world])
+    rest = np.tile(np.eye(4), (24, 1, 1))
+    rest[:, :3, 3] = -joints
+    transforms = np.array(world) @ rest
+    vertices = np.empty_like(shaped)
+    for i, w in enumerate(data["weights"].astype(float)):
+        vertices[i] = (np.tensordot(w, transforms, 1) @ np.append(shaped[i], 1))[:3]
+    return vertices, posed
+
+
+def random_model(rng: np.random.Generator, n: int = 60) -> dict[str, NDArray[np.float64]]:
+    """A model with pose blend shapes, which the built-in bodies have none of."""
+    weights, regressor = rng.random((n, 24)) ** 4, rng.random((24, n)) ** 4
+    return {
+        "v_template": rng.normal(size=(n, 3)),
+        "f": rng.integers(0, n, (2 * n, 3)),
+        "weights": weights / weights.sum(1, keepdims=True),
+        "J_regressor": regressor / regressor.sum(1, keepdims=True),
+        "kintree_table": np.array([[2**32 - 1, *PARENTS[1:]], range(24)]),
+        "shapedirs": 0.1 * rng.normal(size=(n, 3, 10)),
+        "posedirs": 0.1 * rng.normal(size=(n, 3, 207)),
+    }
+
+
+def model(data: dict[str, NDArray[np.float64]], dtype: torch.dtype = torch.float64) -> SmplBody:
+    return SmplBody(BodyArrays.from_mapping(data, source="test"), name="test", dtype=dtype)
+
+
+@pytest.mark.parametrize("name", BUILTIN_BODIES)
+def test_built_in_bodies_match_the_reference(name: str) -> None:
+    rng = np.random.default_rng(1)
+    pose, betas = rng.normal(0, 0.5, (24, 3)), rng.normal(size=10)
+    vertices, joints = reference(asset(name), pose, betas)
+    for dtype, tolerance in ((torch.float64, 1e-9), (torch.float32, 2e-6)):
+        out = load_body(name, dtype=dtype)(pose[None], betas[None])
+        np.testing.assert_allclose(out.vertices[0].numpy(), vertices, atol=tolerance)
+        np.testing.assert_allclose(out.joints[0].numpy(), joints, atol=tolerance)
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_full_model_matches_the_reference(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    data = random_model(rng)
+    pose, betas = rng.normal(0, 1.5, (24, 3)), rng.normal(0, 2, 10)
+    vertices, joints = reference(data, pose, betas)
+    out = model(data)(pose.reshape(1, 72), betas[None])
+    np.testing.assert_allclose(out.vertices[0].numpy(), vertices, atol=1e-9)
+    np.testing.assert_allclose(out.joints[0].numpy(), joints, atol=1e-9)
+
+
+def test_matches_smplx_where_it_is_installed(tmp_path: Path) -> None:
+    smplx = pytest.importorskip("smplx", reason="smplx isn't installed: its licence forbids to depend on it")
+    rng = np.random.default_rng(2)
+    data = random_model(rng, 6890)
+    np.savez(tmp_path / "SMPL_NEUTRAL.npz", **data)
+    other = smplx.SMPL(str(tmp_path / "SMPL_NEUTRAL.npz"), dtype=torch.float64)
+    pose, betas = torch.as_tensor(rng.normal(size=(4, 24, 3))), torch.as_tensor(rng.normal(size=(4, 10)))
+    theirs = other(global_orient=pose[:, 0], body_pose=pose[:, 1:].flatten(1), betas=betas)
+    torch.testing.assert_close(model(data)(pose, betas).vertices, theirs.vertices, atol=1e-9, rtol=0)
+
+
+def test_batch_equals_single_frames() -> None:
+    body = load_body("female")
+    rng = np.random.default_rng(3)
+    pose, betas, transl = rng.normal(0, 0.4, (3, 24, 3)), rng.normal(size=(3, 10)), rng.normal(size=(3, 3))
+    batch = body(pose, betas, transl)
+    assert batch.vertices.dtype == torch.float64, "the translation's precision is kept"
+    for i in range(3):
+        single = body(pose[i : i + 1], betas[i : i + 1], transl[i : i + 1])
+        torch.testing.assert_close(batch.vertices[i], single.vertices[0], atol=1e-6, rtol=0)
+        torch.testing.assert_close(batch.joints[i], single.joints[0], atol=1e-6, rtol=0)
+
+
+def test_translation_far_away_loses_no_precision() -> None:
+    body = load_body("male")
+    pose = np.random.default_rng(4).normal(0, 0.4, (1, 24, 3))
+    far = np.array([[1e5, -2e5, 3e5]])
+    here, there = body(pose, transl=np.zeros((1, 3))), body(pose, transl=far)
+    torch.testing.assert_close(there.vertices - torch.as_tensor(far), here.vertices, atol=1e-9, rtol=0)
+
+
+def test_derivatives() -> None:
+    rng = np.random.default_rng(5)
+    body = model(random_model(rng, 12))
+    pose = torch.as_tensor(rng.normal(0, 0.7, (1, 24, 3)))
+    pose[0, 3] = 0  # the zero rotation, where a careless formula has NaN derivatives
+    pose[0, 4] *= 1e-9
+    betas = torch.as_tensor(rng.normal(size=(1, 10)))
+    inputs = (pose.requires_grad_(), betas.requires_grad_())
+    assert torch.autograd.gradcheck(lambda p, b: body(p, b).vertices, inputs)
+
+
+LENGTHS = st.one_of(
+    st.sampled_from([0.0, 1e-30, 1e-12, 1e-6, 1e-4, 1e-3, 0.01, np.pi, 2 * np.pi, 1e3]), st.floats(0, 10)
+)
+
+
+@given(length=LENGTHS, seed=st.integers(0, 1000))
+def test_rotation_matrices(length: float, seed: int) -> None:
+    axis = np.random.default_rng(seed).normal(size=3)
+    rotvec = length * axis / np.linalg.norm(axis)
+    wanted = Rotation.from_rotvec(rotvec).as_matrix()
+    double = rotvec_to_rotmat(torch.as_tensor(rotvec)).numpy()
+    np.testing.assert_allclose(double, wanted, atol=1e-12 * max(1, length))
+    single = rotvec_to_rotmat(torch.as_tensor(rotvec, dtype=torch.float32)).numpy()
+    np.testing.assert_allclose(single, wanted, atol=4e-7 * max(1, length))
+    np.testing.assert_allclose(single @ single.T, np.eye(3), atol=2e-6)
+
+
+@pytest.mark.parametrize(
+    ("pose", "betas", "transl", "wanted"),
+    [
+        (np.zeros((1, 23, 3)), None, None, r"pose must have the shape \(B, 24, 3\)"),
+        (np.zeros((24, 3)), None, None, r"pose must have the shape \(B, 24, 3\)"),
+        (np.zeros((1, 72)), np.zeros((1, 11)), None, r"betas must have the shape \(B, 10\)"),
+        (np.zeros((3, 72)), np.zeros((2, 10)), None, r"betas must have the shape \(3, 10\)"),
+        (np.zeros((3, 72)), None, np.zeros((3, 2)), r"transl must have the shape \(3, 3\)"),
+    ],
+)
+def test_wrong_shapes(
+    pose: NDArray[np.float64], betas: NDArray[np.float64] | None, transl: NDArray[np.float64] | None, wanted: str
+) -> None:
+    with pytest.raises(FrameError, match=wanted):
+        load_body("male")(pose, betas, transl)
+
+
+def test_fingerprint_tells_bodies_apart() -> None:
+    prints = {load_body(name).fingerprint for name in BUILTIN_BODIES}
+    assert len(prints) == len(BUILTIN_BODIES)
+    assert load_body("male", dtype=torch.float64).fingerprint == load_body("male").fingerprint
+
+
+# ---- files ----------------------------------------------------------------------------------------------------------
+
+
+def test_loads_an_npz_of_the_user(tmp_path: Path) -> None:
+    np.savez(tmp_path / "mine.npz", **asset("female"))
+    assert load_body(tmp_path / "mine.npz").fingerprint == load_body("female").fingerprint
+
+
+def official_pickle(data: dict[str, NDArray[np.float64]]) -> bytes:
+    """A pickle built as the official files are: protocol 2, chumpy variables, a sparse joint regressor."""
+
+    class Ch:
+        def __init__(self, x: NDArray[np.float64]) -> None:
+            self.x = x
+
+    chumpy, module = types.ModuleType("chumpy"), types.ModuleType("chumpy.ch")
+    Ch.__module__, Ch.__qualname__ = "chumpy.ch", "Ch"
+    module.Ch = Ch  # type: ignore[attr-defined]
+    sys.modules.update({"chumpy": chumpy, "chumpy.ch": module})
+    try:
+        content = dict(data)
+        content["v_template"] = Ch(data["v_template"])  # type: ignore[assignment]
+        content["shapedirs"] = Ch(np.asfortranarray(data["shapedirs"]))  # type: ignore[assignment]
+        content["J_regressor"] = scipy.sparse.csc_matrix(data["J_regressor"])
+        content["bs_style"] = "lbs"  # type: ignore[assignment]
+        return pickle.dumps(content, protocol=2)
+    finally:
+        del sys.modules["chumpy"], sys.modules["chumpy.ch"]
+
+
+def test_loads_an_official_pickle_without_chumpy(tmp_path: Path) -> None:
+    data = random_model(np.random.default_rng(6))
+    (tmp_path / "model.pkl").write_bytes(official_pickle(data))
+    assert "chumpy" not in sys.modules
+    body = load_body(tmp_path / "model.pkl", dtype=torch.float64)
+    pose = np.random.default_rng(7).normal(size=(1, 24, 3))
+    torch.testing.assert_close(body(pose).vertices, model(data)(pose).vertices)
+
+
+class Evil:
+    def __init__(self, function: object, *arguments: object) -> None:
+        self._call = (function, arguments)
+
+    def __reduce__(self) -> tuple[object, tuple[object, ...]]:
+        return self._call
+
+
+@pytest.mark.parametrize(
+    ("function", "arguments", "named"),
+    [
+        (os.system, ("touch {marker}",), r"(posix|nt)\.system"),
+        (subprocess.check_call, (["touch", "{marker}"],), r"(subprocess|commands)\.check_call"),
+        (eval, ("open({marker!r}, 'w')",), "builtins.eval|__builtin__.eval"),
+        (np.load, ("{marker}",), "numpy.*load"),
+        (io.open, ("{marker}", "w"), "open"),
+        (getattr, (np, "load"), "getattr"),
+    ],
+)
+@pytest.mark.parametrize("protocol", [0, 2, 5])
+def test_a_pickle_that_executes_code_is_refused(
+    tmp_path: Path, function: object, arguments: tuple[object, ...], named: str, protocol: int
+) -> None:
+    marker = tmp_path / "marker"
+
+    def fill(value: object) -> object:
+        if isinstance(value, list):
+            return [fill(item) for item in value]
+        return value.format(marker=str(marker)) if isinstance(value, str) and "{marker" in value else value
+
+    if function is getattr:
+        arguments = ("text", "upper")
+    content = {"v_template": Evil(function, *(fill(a) for a in arguments))}
+    (tmp_path / "evil.pkl").write_bytes(pickle.dumps(content, protocol=protocol))
+    with pytest.raises(BodyError, match=f"(?:{named}).*nothing was executed"):
+        load_body(tmp_path / "evil.pkl")
+    assert not marker.exists()
+
+
+@given(data=st.data())
+def test_damaged_pickles_raise_body_errors_only(data: st.DataObject, tmp_path_factory: pytest.TempPathFactory) -> None:
+    good = bytearray(official_pickle(random_model(np.random.default_rng(8), 30)))
+    for _ in range(data.draw(st.integers(1, 4))):
+        good[data.draw(st.integers(0, len(good) - 1))] = data.draw(st.integers(0, 255))
+    cut = data.draw(st.integers(0, len(good)))
+    path = tmp_path_factory.mktemp("damaged") / "model.pkl"
+    path.write_bytes(bytes(good[:cut]) if data.draw(st.booleans()) else bytes(good))
+    with contextlib.suppress(BodyError):  # some damage leaves a model; anything but a BodyError fails the test
+        load_body(path)
+
+
+def save(path: Path, **changes: object) -> Path:
+    data: dict[str, object] = dict(random_model(np.random.default_rng(9)))
+    data.update(changes)
+    np.savez(path, **{key: value for key, value in data.items() if value is not None})  # type: ignore[arg-type]
+    return path
+
+
+@pytest.mark.parametrize(
+    ("changes", "wanted"),
+    [
+        ({"weights": None, "f": None}, "lacks f, weights"),
+        ({"v_template": np.zeros((60, 2))}, r"v_template must have the shape"),
+        ({"v_template": np.zeros(60)}, r"v_template must have the shape"),
+        ({"v_template": np.full((60, 3), np.nan)}, "NaN or infinite"),
+        ({"v_template": np.array(["a"] * 60)}, "not an array of numbers"),
+        ({"v_template": np.array([{}])}, "can't be read as .npz"),
+        ({"f": np.full((9, 3), 60)}, "faces must index 60 vertices"),
+        ({"weights": np.ones((60, 24))}, "must sum to one"),
+        ({"weights": np.ones((60, 55))}, r"weights must have the shape \(60, 24\)"),
+        ({"shapedirs": np.zeros((60, 3, 9))}, "shapedirs must be"),
+        ({"posedirs": np.ones((60, 3, 486))}, r"posedirs must have the shape \(60, 3, 207\)"),
+        ({"kintree_table": np.zeros((2, 55))}, "kintree_table must be the tree of SMPL's 24 joints"),
+    ],
+)
+def test_bad_models_are_named(tmp_path: Path, changes: dict[str, object], wanted: str) -> None:
+    with pytest.raises(BodyError, match=wanted) as caught:
+        load_body(save(tmp_path / "bad.npz", **changes))
+    assert "bad.npz" in str(caught.value)
+
+
+def test_files_that_are_no_models(tmp_path: Path) -> None:
+    with pytest.raises(BodyError, match="wanted one of male, female, neutral"):
+        load_body("mail")
+    (tmp_path / "model.obj").write_text("v 0 0 0\n")
+    with pytest.raises(BodyError, match=r"must be an .npz or an official .pkl file, got '.obj'"):
+        load_body(tmp_path / "model.obj")
+    for suffix in ("npz", "pkl"):
+        for content in (b"", b"garbage", b"PK\x03\x04garbage", pickle.dumps([1, 2])):
+            path = tmp_path / f"bad.{suffix}"
+            path.write_bytes(content)
+            with pytest.raises(BodyError, match=f"bad.{suffix}"):
+                load_body(path)
+
+
+def test_a_decompression_bomb_is_refused_before_it_is_unpacked(tmp_path: Path) -> None:
+    import zipfile
+
+    with (
+        zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open("v_template.npy", "w", force_zip64=True) as entry,
+    ):
+        for _ in range(1100):
+            entry.write(bytes(1 << 20))
+    with pytest.raises(BodyError, match="unpacks to 1100 MiB"):
+        load_body(tmp_path / "bomb.npz")
