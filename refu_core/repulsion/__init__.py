@@ -2,7 +2,6 @@
 
 from refu_core.repulsion._resolve import Resolution as Resolution
 from refu_core.repulsion._resolve import resolve as resolve
-from refu_core.repulsion._resolve import unique_edges as unique_edges
 from refu_core.repulsion._unit import DEFAULT_MARGIN as DEFAULT_MARGIN
 from refu_core.repulsion._unit import MAX_DISPLACEMENT as MAX_DISPLACEMENT
 from refu_core.repulsion._unit import repulse as repulse

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from refu_core.repulsion._unit import DEFAULT_MARGIN, MAX_DISPLACEMENT, repulse
@@ -48,8 +45,8 @@ def resolve(
 ) -> Resolution:
     """Pushes garment vertices to f ≥ `margin`, and looks again at those it pushed. Not differentiable.
 
-    One push along the gradient (the paper's Eq. refu) can end inside another part of the body: in an armpit, between the
-    thighs. So the pushed vertices, and no others, are asked again and pushed again while they are closer than
+    One push along the gradient (the paper's Eq. refu) can end inside another part of the body: in an armpit, between
+    the thighs. So the pushed vertices, and no others, are asked again and pushed again while they are closer than
     `margin - tolerance`. Where limbs leave less room than twice the margin a vertex would be thrown to and fro: a push
     against the last one goes half as far, and the best position found is kept.
 
@@ -61,8 +58,8 @@ def resolve(
         max_pushes: Upper bound on pushes of one vertex.
         tolerance: Shortfall of the margin that is let pass [m].
         max_displacement: Bound on each vertex's movement [m], all pushes together.
-        edges: Pairs of vertices, shape (E, 2), of `unique_edges`: where given, the middles of edges near the skin are
-            checked, too, and both ends of those too close are raised.
+        edges: Pairs of vertices, shape (E, 2), such as a garment template's `edges`: where given, the middles of edges
+            near the skin are checked, too, and both ends of those too close are raised.
     """
     start = sdf.query(points)
     state = _State(points.clone(), start.distance.clone(), points, sdf, margin, tolerance, max_displacement)
@@ -100,7 +97,8 @@ class _State:
         """`moved`, drawn back to within the largest displacement from where rows began."""
         way = moved - self.origin[rows]
         length = torch.linalg.vector_norm(way, dim=-1, keepdim=True)
-        return self.origin[rows] + way * (self.max_displacement / length.clamp_min(1e-12)).clamp_max(1.0)
+        bounded: Tensor = self.origin[rows] + way * (self.max_displacement / length.clamp_min(1e-12)).clamp_max(1.0)
+        return bounded
 
     def keep_better(self, rows: Tensor, moved: Tensor, distance: Tensor) -> None:
         better = distance > self.distance[rows]
@@ -154,11 +152,3 @@ def _raise_edges(state: _State, edges: Tensor, max_rounds: int) -> int:
         state.vertices[rows[clear]] = moved[clear]
         state.distance[rows[clear]] = distance[clear]
     return max_rounds
-
-
-def unique_edges(faces: Tensor | NDArray[Any]) -> Tensor:
-    """The edges of triangles, shape (F, 3), each once with the lower vertex first; int64, shape (E, 2), sorted."""
-    array = np.asarray(faces.cpu() if isinstance(faces, Tensor) else faces, dtype=np.int64)
-    sides = np.sort(array[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    edges = torch.from_numpy(np.unique(sides, axis=0))
-    return edges.to(faces.device) if isinstance(faces, Tensor) else edges

@@ -54,7 +54,8 @@ def repulse(
     if fallback is None:
         fallback = points.new_tensor(_UP)
     direction = unit_direction(sample.gradient[rows], fallback[rows] if fallback.ndim == 2 else fallback)
-    return points.index_add(0, rows, offset[:, None] * direction)
+    pushed: Tensor = points.index_add(0, rows, offset[:, None] * direction)
+    return pushed
 
 
 def unit_direction(gradient: Tensor, fallback: Tensor) -> Tensor:
@@ -63,7 +64,8 @@ def unit_direction(gradient: Tensor, fallback: Tensor) -> Tensor:
     defined = torch.isfinite(length) & (length > torch.finfo(gradient.dtype).tiny ** 0.5)
     # Normalising the stand-in, too, keeps NaN out of the branch that isn't taken and so out of its derivative.
     usable = torch.where(defined, gradient, fallback)
-    return usable / torch.linalg.vector_norm(usable, dim=-1, keepdim=True)
+    direction: Tensor = usable / torch.linalg.vector_norm(usable, dim=-1, keepdim=True)
+    return direction
 
 
 def _check(points: Tensor, sample: SdfSample, scale: float | Tensor, margin: float, max_displacement: float) -> None:

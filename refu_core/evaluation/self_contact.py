@@ -1,0 +1,120 @@
+"""Where the body intersects itself: no garment can be free of it there, so such places are reported apart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+from numpy.typing import NDArray
+
+from refu_core._warp import as_warp
+from refu_core.errors import MeshError
+from refu_core.evaluation._intersect import as_vertices, crossings, inside_by_components, pierced_edges
+from refu_core.evaluation._near import near_kernel
+from refu_core.sdf import ExactSdf
+
+DEFAULT_NEAR = 0.02
+"""A garment vertex this close to a place of self-contact [m] may have nowhere to go."""
+
+_OFF_SURFACE = 1e-4  # [m]; how far off its own surface a body vertex is asked whether another limb has it
+
+
+@dataclass(frozen=True, eq=False)
+class SelfContact:
+    """Where a posed body intersects itself and its rest pose doesn't."""
+
+    pairs: NDArray[np.int32]
+    """Intersecting body faces, shape (K, 2), in lexicographic order; none of a pair share an edge."""
+    faces: NDArray[np.int32]
+    """Faces of those pairs, and those buried in another limb, shape (M,), in order."""
+    triangles: NDArray[np.float32]
+    """Corners of `faces` [m], shape (M, 3, 3)."""
+
+    @property
+    def is_free(self) -> bool:
+        """The body touches itself nowhere that it doesn't in its rest pose."""
+        return not len(self.faces)
+
+    def near(self, points: Any, *, distance: float = DEFAULT_NEAR) -> NDArray[np.bool_]:
+        """Which of `points` [m], shape (N, 3), lie within `distance` [m] of a face in contact; bool, shape (N,)."""
+        queries = as_vertices("points", points)
+        near = np.zeros(len(queries), np.bool_)
+        if self.is_free or not len(queries):
+            return near
+        corners = torch.from_numpy(self.triangles.reshape(-1, 3))
+        mesh = wp.Mesh(as_warp(corners, wp.vec3), as_warp(torch.arange(len(corners), dtype=torch.int32), wp.int32))
+        wp.launch(
+            near_kernel,
+            dim=len(queries),
+            inputs=[mesh.id, as_warp(torch.from_numpy(queries), wp.vec3), distance],
+            outputs=[as_warp(torch.from_numpy(near), wp.bool)],
+            device="cpu",
+        )
+        return near
+
+
+class SelfContactDetector:
+    """Finds where a posed body intersects itself, its rest pose's own intersections (toes, ears) left out.
+
+    Faces of a bending joint's crease (groin, armpit, the crook of a knee) that fold into each other count: skin that
+    overlaps skin leaves a garment no room, whichever limbs it belongs to.
+    """
+
+    def __init__(self, body_faces: Any, rest_vertices: Any) -> None:
+        """Prepares for a body with these faces, shape (F, 3), and this rest pose [m], shape (V, 3).
+
+        Raises `MeshError` when the faces aren't a closed, consistently oriented surface, or don't fit the vertices.
+        """
+        self._body = ExactSdf(body_faces, sign="winding")
+        self._faces = self._body.faces.numpy()
+        pairs, buried = self._contacts(as_vertices("rest_vertices", rest_vertices))
+        self._rest_pairs = self._keys(pairs)
+        self._rest_buried = buried
+
+    def detect(self, body_vertices: Any) -> SelfContact:
+        """The self-contact of a posed body, `body_vertices` [m], shape (V, 3). Raises `MeshError` for other shapes."""
+        vertices = as_vertices("body_vertices", body_vertices)
+        if len(vertices) != len(self._rest_buried):
+            msg = f"body_vertices must have the rest pose's shape ({len(self._rest_buried)}, 3), got {vertices.shape}"
+            raise MeshError(msg)
+        pairs, buried = self._contacts(vertices)
+        pairs = pairs[~np.isin(self._keys(pairs), self._rest_pairs)]
+        covered = np.flatnonzero((buried & ~self._rest_buried)[self._faces].any(axis=1))
+        faces = np.union1d(pairs, covered).astype(np.int32)
+        return SelfContact(pairs, faces, vertices[self._faces[faces]])
+
+    def _contacts(self, vertices: NDArray[np.float32]) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
+        """All intersecting pairs of faces, (K, 2), and the vertices inside another part of the body, (V,)."""
+        self._body.update(torch.from_numpy(vertices))
+        found = crossings(self._body, vertices, self._faces, is_body=True)
+        if not len(found.pairs):
+            return found.pairs, np.zeros(len(vertices), np.bool_)
+        pierced = np.concatenate(
+            [
+                pierced_edges(self._faces, found.pairs[:, 0], found.edge_of_face),
+                pierced_edges(self._faces, found.pairs[:, 1], found.edge_of_body),
+            ]
+        )
+        above = vertices + _OFF_SURFACE * _vertex_normals(vertices, self._faces)
+        buried = inside_by_components(
+            len(vertices),
+            self._faces,
+            pierced,
+            lambda rows: (self._body.closest(torch.from_numpy(above[rows])).sign < 0).numpy(),
+        )
+        return found.pairs, buried
+
+    def _keys(self, pairs: NDArray[np.int32]) -> NDArray[np.int64]:
+        keys: NDArray[np.int64] = pairs[:, 0].astype(np.int64) * len(self._faces) + pairs[:, 1]
+        return keys
+
+
+def _vertex_normals(vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> NDArray[np.float32]:
+    a, b, c = vertices[faces].transpose(1, 0, 2)
+    normals = np.zeros_like(vertices)
+    np.add.at(normals, faces, np.cross(b - a, c - a)[:, None])
+    unit: NDArray[np.float32] = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
+    return unit
