@@ -1,0 +1,217 @@
+"""Writing bags as rosbag2 of ROS 2 Jazzy does: MCAP of profile ros2 in compressed chunks, metadata.yaml beside it."""
+
+from __future__ import annotations
+
+import os
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO, Literal
+
+from mcap.writer import CompressionType, Writer
+
+from msg_adapters.bags._metadata import MAX_TIME_NS, METADATA_FILE, QosProfile, TopicSummary, dump_metadata
+from msg_adapters.definitions import full_type_name, message_definition
+from msg_adapters.errors import BagError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from types import TracebackType
+
+    from typing_extensions import Self
+
+_COMPRESSION = {"zstd": CompressionType.ZSTD, "none": CompressionType.NONE}
+_DEFAULT_QOS = QosProfile()
+
+
+@dataclass
+class _Topic:
+    channel_id: int
+    message_type: str
+    type_hash: str
+    qos: str
+    message_count: int = 0
+
+
+class BagWriter:
+    """Writes one bag: a single file where `path` ends in `.mcap`, otherwise a rosbag2 directory.
+
+    Each chunk that is full is on disk: a process that is killed leaves a file that can be read up to there. Leaving
+    the `with` block finishes the bag, also after an exception.
+
+    Raises `BagError` when the path can't be written, or holds something and `overwrite` isn't set.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        compression: Literal["zstd", "none"] = "zstd",
+        chunk_bytes: int = 1 << 20,
+        overwrite: bool = False,
+    ) -> None:
+        self.path = Path(path)
+        self._directory = None if self.path.suffix == ".mcap" else self.path
+        self.file_path = self.path if self._directory is None else self.path / f"{self.path.name}_0.mcap"
+        """The MCAP file itself."""
+        self._topics: dict[str, _Topic] = {}
+        self._start_ns, self._end_ns = MAX_TIME_NS, 0
+        self._finished = False
+        with self._writing():
+            self._stream = self._open(overwrite=overwrite)
+            self._writer = Writer(self._stream, chunk_size=chunk_bytes, compression=_COMPRESSION[compression])
+            self._writer.start(profile="ros2", library="refu-ros")
+            self._stream.flush()
+            self._whole = self._stream.tell()
+            """Where the last complete record ends."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if error is None:
+            self.finish()
+            return
+        with suppress(BagError):  # the error under way says more
+            self.finish()
+
+    @property
+    def message_count(self) -> int:
+        """Messages written so far."""
+        return sum(topic.message_count for topic in self._topics.values())
+
+    def add_topic(
+        self,
+        topic: str,
+        message_type: str,
+        *,
+        definition: str | None = None,
+        type_hash: str | None = None,
+        qos: QosProfile | str = _DEFAULT_QOS,
+    ) -> None:
+        """Declare a topic before its first message; a second time with the same type does nothing.
+
+        `definition` (`ros2msg` text) and `type_hash` are built in for the types of this project. `qos` may also be the
+        YAML text of a bag that is copied from.
+
+        Raises `BagError` for a type that isn't built in without a definition, and for a second type on one topic.
+        """
+        message_type = full_type_name(message_type)
+        known = self._topics.get(topic)
+        if known is not None:
+            if known.message_type != message_type:
+                msg = f"{self.path}: {topic} already carries {known.message_type}, it can't carry {message_type} too"
+                raise BagError(msg)
+            return
+        if definition is None:
+            builtin = message_definition(message_type)
+            definition, type_hash = builtin.text, type_hash or builtin.type_hash
+        profiles = qos if isinstance(qos, str) else qos.to_yaml()
+        with self._writing():
+            schema_id = self._writer.register_schema(message_type, "ros2msg", definition.encode())
+            metadata = {"offered_qos_profiles": profiles, "topic_type_hash": type_hash or ""}
+            channel_id = self._writer.register_channel(topic, "cdr", schema_id, metadata)
+        self._topics[topic] = _Topic(channel_id, message_type, type_hash or "", profiles)
+
+    def write(self, topic: str, data: bytes, *, log_time_ns: int, publish_time_ns: int | None = None) -> None:
+        """Append a message in CDR, received at `log_time_ns` and sent at `publish_time_ns` (None: the same).
+
+        Raises `BagError` for an undeclared topic, a time that rosbag2 can't hold, and when writing fails.
+        """
+        channel = self._topics.get(topic)
+        if channel is None:
+            msg = f"{self.path}: {topic} isn't declared; call add_topic first"
+            raise BagError(msg)
+        publish_time_ns = log_time_ns if publish_time_ns is None else publish_time_ns
+        if not (0 <= log_time_ns <= MAX_TIME_NS and 0 <= publish_time_ns <= MAX_TIME_NS):
+            msg = f"{self.path}: a bag's times are nanoseconds in [0, 2^63), got {log_time_ns} and {publish_time_ns}"
+            raise BagError(msg)
+        with self._writing():
+            self._writer.add_message(
+                channel.channel_id, log_time_ns, data, publish_time_ns, sequence=channel.message_count & 0xFFFFFFFF
+            )
+            end = self._stream.tell()
+            if end != self._whole:  # a chunk was completed
+                self._stream.flush()
+                self._whole = end
+        channel.message_count += 1
+        self._start_ns = min(self._start_ns, log_time_ns)
+        self._end_ns = max(self._end_ns, log_time_ns)
+
+    def finish(self) -> None:
+        """Write what is buffered, the summary and the metadata; a second call does nothing.
+
+        Raises `BagError` when writing fails; the file stays readable up to its last whole chunk.
+        """
+        if self._finished:
+            return
+        text = self._metadata()
+        with self._writing():
+            self._writer.add_metadata("rosbag2", {"serialized_metadata": text})
+            self._writer.finish()
+            self._finished = True
+            self._stream.close()
+            if self._directory is not None:
+                # Under another name first: a reader never meets half of it.
+                partial = self._directory / f"{METADATA_FILE}.partial"
+                partial.write_text(text, encoding="utf-8")
+                partial.replace(self._directory / METADATA_FILE)
+
+    def _metadata(self) -> str:
+        topics = [
+            TopicSummary(name, topic.message_type, topic.type_hash, topic.qos, topic.message_count)
+            for name, topic in self._topics.items()
+        ]
+        start_ns = min(self._start_ns, self._end_ns)
+        return dump_metadata(file_name=self.file_path.name, topics=topics, start_ns=start_ns, end_ns=self._end_ns)
+
+    def _open(self, *, overwrite: bool) -> BinaryIO:
+        if self._directory is not None:
+            self._clear(self._directory, overwrite=overwrite)
+        self.file_path.parent.mkdir(parents=True, exist_ok=True)
+        return self.file_path.open("wb" if overwrite else "xb")
+
+    def _clear(self, directory: Path, *, overwrite: bool) -> None:
+        """Make way for a new bag: of an old one, its own files are removed and nothing else."""
+        old = list(directory.iterdir()) if directory.exists() else []
+        ours = [file for file in old if file.name == METADATA_FILE or file.suffix == ".mcap"]
+        if old and not (overwrite and len(ours) == len(old)):
+            hint = "it holds other files than a bag's" if overwrite else "choose another path, or overwrite it"
+            msg = f"{directory}: the directory isn't empty; {hint}"
+            raise BagError(msg)
+        for file in ours:
+            file.unlink()
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        """Turn errors of the file system into one line, and leave a file that can be read whatever interrupts."""
+        if self._finished:
+            msg = f"{self.path}: the bag is finished; nothing can be added"
+            raise BagError(msg)
+        try:
+            yield
+        except FileExistsError as error:
+            msg = f"{self.path}: exists already; choose another path, or overwrite it"
+            raise BagError(msg) from error
+        except OSError as error:
+            self._abandon()
+            msg = f"{self.path}: can't be written: {error.strerror or error}"
+            raise BagError(msg) from error
+        except BagError:
+            raise
+        except BaseException:
+            self._abandon()
+            raise
+
+    def _abandon(self) -> None:
+        """Cut the file back to its last whole chunk: the writer's state isn't known any more."""
+        self._finished = True
+        stream = getattr(self, "_stream", None)
+        if stream is None:
+            return
+        with suppress(OSError):  # it tries to write what it has buffered
+            stream.close()
+        with suppress(OSError):  # readers cope with a torn end as well
+            os.truncate(self.file_path, getattr(self, "_whole", 0))

@@ -1,0 +1,109 @@
+"""std_msgs/Float32MultiArray: blocks of numbers one after another, each declared by a dimension's label.
+
+`layout.dim` holds one dimension a block, in the order of the data: `pose` (72 rotation vector components [rad]),
+`betas` (10) and `transl` (3, [m]); the last two are optional. A block starts `stride` numbers after the one before it
+(0 stands for its size), the first one at `layout.data_offset`.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from msg_adapters.cdr import CdrReader, CdrWriter
+from msg_adapters.errors import DecodeError
+from msg_adapters.inputs._frame import decoding, reading_fields, smpl_frame
+from refu_core.frames import N_BETAS, N_JOINTS, SmplFrame
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from msg_adapters.cdr import Buffer
+
+MESSAGE_TYPE = "std_msgs/msg/Float32MultiArray"
+_SIZES = {"pose": N_JOINTS * 3, "betas": N_BETAS, "transl": 3}
+_LABELLING = "label layout.dim pose (72), betas (10, optional) and transl (3, optional) in the order of the data"
+_MAX_DIMENSIONS = 16
+_MIN_DIMENSION_BYTES = 12
+
+
+class _Dimension(NamedTuple):
+    label: str
+    size: int
+    stride: int
+
+
+def _blocks(dimensions: Sequence[_Dimension], offset: int, data: NDArray[Any]) -> dict[str, NDArray[Any]]:
+    """The declared blocks by label."""
+    if not dimensions:
+        msg = f"the layout of {data.size} numbers isn't declared; {_LABELLING}"
+        raise DecodeError(msg)
+    blocks: dict[str, NDArray[Any]] = {}
+    start = end = offset
+    for label, size, stride in dimensions:
+        if label not in _SIZES or label in blocks:
+            what = "label" if label not in _SIZES else "second"
+            msg = f"unexpected {what} {label!r} in layout.dim; {_LABELLING}"
+            raise DecodeError(msg)
+        if size != _SIZES[label]:
+            msg = f"{label} must have {_SIZES[label]} numbers, its dimension says {size}"
+            raise DecodeError(msg)
+        if stride and stride < size:
+            msg = f"the stride of {label} must be 0 or at least its size {size}, got {stride}"
+            raise DecodeError(msg)
+        end = start + size
+        blocks[label] = data[start:end]
+        start += stride or size
+    if data.size not in (end, start):
+        msg = f"the layout declares {end} numbers, the data has {data.size}; check sizes, strides and data_offset"
+        raise DecodeError(msg)
+    if "pose" not in blocks:
+        msg = f"the layout declares {', '.join(blocks)} but no pose; {_LABELLING}"
+        raise DecodeError(msg)
+    return blocks
+
+
+def _frame(dimensions: Sequence[_Dimension], offset: int, data: NDArray[Any]) -> SmplFrame:
+    blocks = _blocks(dimensions, offset, data)
+    return smpl_frame(blocks["pose"], blocks.get("betas"), blocks.get("transl"))
+
+
+def from_bytes(data: Buffer) -> SmplFrame:
+    """The frame of a message in CDR; its stamp is 0, this type has no header."""
+    with decoding(MESSAGE_TYPE):
+        reader = CdrReader(data)
+        count = reader.length(item_bytes=_MIN_DIMENSION_BYTES)
+        if count > _MAX_DIMENSIONS:
+            msg = f"{count} dimensions in layout.dim; {_LABELLING}"
+            raise DecodeError(msg)
+        dimensions = [_Dimension(reader.string(), *reader.numbers("II")) for _ in range(count)]
+        (offset,) = reader.numbers("I")
+        values = reader.array("f4", reader.length(item_bytes=4))
+        reader.finish()
+        return _frame(dimensions, offset, values)
+
+
+def from_message(message: Any) -> SmplFrame:
+    """The frame of a message object."""
+    with decoding(MESSAGE_TYPE):
+        with reading_fields(message):
+            layout = message.layout
+            dimensions = [_Dimension(str(d.label), int(d.size), int(d.stride)) for d in layout.dim]
+            offset = int(layout.data_offset)
+            values = np.asarray(message.data, dtype=np.float32)
+        return _frame(dimensions, offset, values)
+
+
+def to_bytes(frame: SmplFrame, *, frame_id: str = "map") -> bytes:  # noqa: ARG001 - the type has no header
+    """The message in CDR: pose, betas, transl."""
+    writer = CdrWriter()
+    writer.numbers("I", len(_SIZES))
+    for label, size in _SIZES.items():
+        writer.string(label)
+        writer.numbers("II", size, size)
+    writer.numbers("I", 0)
+    writer.sequence("f4", np.concatenate([frame.pose.ravel(), frame.betas, frame.transl]))
+    return writer.to_bytes()

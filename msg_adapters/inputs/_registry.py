@@ -1,0 +1,88 @@
+"""Which decoder and encoder belong to which input type."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, Protocol
+
+from msg_adapters.definitions import full_type_name
+from msg_adapters.errors import DecodeError
+from msg_adapters.inputs import _joint_state, _multiarray, _pose_array, _smpl
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from msg_adapters.cdr import Buffer
+    from refu_core.frames import SmplFrame
+
+InputType = Literal["multiarray", "joint_state", "pose_array", "smpl_msgs"]
+
+INPUT_TYPES: dict[InputType, str] = {
+    "multiarray": _multiarray.MESSAGE_TYPE,
+    "joint_state": _joint_state.MESSAGE_TYPE,
+    "pose_array": _pose_array.MESSAGE_TYPE,
+    "smpl_msgs": _smpl.MESSAGE_TYPE,
+}
+"""Message type of each input type."""
+
+
+class Encoder(Protocol):
+    """Turns a frame into a message's CDR bytes."""
+
+    def __call__(self, frame: SmplFrame, *, frame_id: str = "map") -> bytes:
+        """The message in CDR; raises `EncodeError` for a stamp outside the message's range."""
+
+
+@dataclass(frozen=True)
+class Decoder:
+    """Turns messages of one type into frames."""
+
+    input_type: InputType
+    message_type: str
+    from_bytes: Callable[[Buffer], SmplFrame]
+    """The frame of a message in CDR; raises `DecodeError`. Its stamp is 0 where the message has none."""
+    from_message: Callable[[Any], SmplFrame]
+    """The frame of a message object of rclpy, rosbags or mcap-ros2; raises `DecodeError`."""
+
+    def __call__(self, message: Any) -> SmplFrame:
+        """The frame of a message in either form."""
+        if isinstance(message, (bytes, bytearray, memoryview)):
+            return self.from_bytes(message)
+        return self.from_message(message)
+
+
+_ENCODERS: dict[InputType, Encoder] = {
+    "multiarray": _multiarray.to_bytes,
+    "joint_state": _joint_state.to_bytes,
+    "pose_array": _pose_array.to_bytes,
+    "smpl_msgs": _smpl.to_bytes,
+}
+
+
+def _input_type(name: str) -> InputType:
+    full_name = full_type_name(name)
+    for input_type, message_type in INPUT_TYPES.items():
+        if name == input_type or full_name == message_type:
+            return input_type
+    known = ", ".join(f"{input_type} ({message_type})" for input_type, message_type in INPUT_TYPES.items())
+    msg = f"wanted an input type, got {name!r}; there are {known}"
+    raise DecodeError(msg)
+
+
+def decoder_for(name: str, *, definition: str | None = None) -> Decoder:
+    """The decoder of an input type or of a message type's name.
+
+    `definition` is the `.msg` text that came with the messages; smpl_msgs, which has no release, is read by it.
+    Raises `DecodeError` for a name that isn't an input type, and for a definition without the fields wanted.
+    """
+    input_type = _input_type(name)
+    message_type = INPUT_TYPES[input_type]
+    if input_type == "smpl_msgs":
+        return Decoder(input_type, message_type, _smpl.bytes_decoder(definition), _smpl.from_message)
+    module = {"multiarray": _multiarray, "joint_state": _joint_state, "pose_array": _pose_array}[input_type]
+    return Decoder(input_type, message_type, module.from_bytes, module.from_message)
+
+
+def encoder_for(name: str) -> Encoder:
+    """The encoder of an input type or of a message type's name; raises `DecodeError` for any other name."""
+    return _ENCODERS[_input_type(name)]

@@ -1,0 +1,108 @@
+"""smpl_msgs/Smpl, the message of idra-lab's smpl_ros: a header and fixed arrays.
+
+The package has no release, so a bag's own definition of the message, where it has one, says the order and the
+precision of the arrays; only the names and sizes are relied on.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from msg_adapters.cdr import CdrReader, CdrWriter
+from msg_adapters.definitions import message_definition
+from msg_adapters.errors import DecodeError
+from msg_adapters.inputs._frame import decoding, reading_fields, smpl_frame, stamp_ns_of
+from refu_core.frames import N_BETAS, N_JOINTS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from numpy.typing import NDArray
+
+    from msg_adapters.cdr import Buffer
+    from refu_core.frames import SmplFrame
+
+MESSAGE_TYPE = "smpl_msgs/msg/Smpl"
+_SIZES = {"global_orient": 3, "body_pose": (N_JOINTS - 1) * 3, "betas": N_BETAS, "transl": 3}
+_KINDS = {"float32": "f4", "float64": "f8"}
+_HEADER = re.compile(r"std_msgs/(msg/)?Header\s+header")
+_ARRAY = re.compile(r"(?P<type>float32|float64)\[(?P<size>\d{1,4})\]\s+(?P<name>[a-z]\w*)")
+
+Layout = tuple[tuple[str, str, int], ...]
+"""Name, numpy kind and size of each array that follows the header."""
+
+
+def parse_layout(definition: str) -> Layout:
+    """The arrays of a `.msg` text.
+
+    Raises `DecodeError` for a definition that is more than a header and fixed float arrays, or lacks one of ours.
+    """
+    own = definition.split("\n====", maxsplit=1)[0]
+    lines = [line.split("#", maxsplit=1)[0].strip() for line in own.splitlines()]
+    lines = [line for line in lines if line]
+    with decoding(MESSAGE_TYPE):
+        if not lines or not _HEADER.fullmatch(lines[0]):
+            msg = f"wanted a definition that starts with 'std_msgs/Header header', got {lines[:1]}"
+            raise DecodeError(msg)
+        layout = []
+        for line in lines[1:]:
+            field = _ARRAY.fullmatch(line)
+            if field is None:
+                msg = f"wanted fixed float arrays in the definition, got {line!r}; convert to another input type"
+                raise DecodeError(msg)
+            layout.append((field["name"], _KINDS[field["type"]], int(field["size"])))
+        sizes = {name: size for name, _, size in layout}
+        for name, size in _SIZES.items():
+            if sizes.get(name) != size:
+                msg = f"wanted {name}[{size}] in the definition, got {sizes.get(name, 'no such field')}"
+                raise DecodeError(msg)
+    return tuple(layout)
+
+
+def _frame(values: Mapping[str, NDArray[Any]], stamp_ns: int) -> SmplFrame:
+    pose = np.concatenate([values["global_orient"], values["body_pose"]])
+    return smpl_frame(pose, values["betas"], values["transl"], stamp_ns=stamp_ns)
+
+
+def bytes_decoder(definition: str | None = None) -> Callable[[Buffer], SmplFrame]:
+    """A decoder of CDR bytes laid out as `definition` says (None: the published message)."""
+    layout = parse_layout(definition or message_definition(MESSAGE_TYPE).text)
+
+    def from_bytes(data: Buffer) -> SmplFrame:
+        """The frame of a message in CDR."""
+        with decoding(MESSAGE_TYPE):
+            reader = CdrReader(data)
+            stamp_ns = reader.stamp_ns()
+            reader.string()
+            values = {name: reader.array(kind, size) for name, kind, size in layout}
+            reader.finish()
+            return _frame(values, stamp_ns)
+
+    return from_bytes
+
+
+def from_message(message: Any) -> SmplFrame:
+    """The frame of a message object."""
+    with decoding(MESSAGE_TYPE):
+        with reading_fields(message):
+            stamp_ns = stamp_ns_of(message.header)
+            values = {name: np.asarray(getattr(message, name), dtype=np.float64).reshape(-1) for name in _SIZES}
+        for name, size in _SIZES.items():
+            if values[name].size != size:
+                msg = f"{name} must have {size} numbers, got {values[name].size}"
+                raise DecodeError(msg)
+        return _frame(values, stamp_ns)
+
+
+def to_bytes(frame: SmplFrame, *, frame_id: str = "map") -> bytes:
+    """The message in CDR; its keypoints are zero."""
+    pose = frame.pose.ravel()
+    values = {"global_orient": pose[:3], "body_pose": pose[3:], "betas": frame.betas, "transl": frame.transl}
+    writer = CdrWriter()
+    writer.header(frame.stamp_ns, frame_id)
+    for name, kind, size in parse_layout(message_definition(MESSAGE_TYPE).text):
+        writer.array(kind, values.get(name, np.zeros(size)))
+    return writer.to_bytes()

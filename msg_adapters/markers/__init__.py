@@ -1,0 +1,17 @@
+"""visualization_msgs/MarkerArray with one TRIANGLE_LIST a garment, straight between arrays and CDR bytes."""
+
+from msg_adapters.markers._decoder import Marker, decode_marker_array, vertices_from_points
+from msg_adapters.markers._encoder import MARKER_ARRAY, MarkerArrayEncoder, encode_delete, encode_delete_all
+from msg_adapters.markers._mesh import MarkerMesh, garment_namespace
+
+__all__ = [
+    "MARKER_ARRAY",
+    "Marker",
+    "MarkerArrayEncoder",
+    "MarkerMesh",
+    "decode_marker_array",
+    "encode_delete",
+    "encode_delete_all",
+    "garment_namespace",
+    "vertices_from_points",
+]

@@ -1,0 +1,112 @@
+"""MarkerArray decoding without copies, and the way back from triangle corners to vertices."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from msg_adapters.cdr import CdrReader
+from msg_adapters.errors import DecodeError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from msg_adapters.cdr import Buffer
+
+_MIN_MARKER_BYTES = 180
+
+
+@dataclass(frozen=True, eq=False)
+class Marker:
+    """The parts of visualization_msgs/Marker that a triangle list uses."""
+
+    stamp_ns: int
+    frame_id: str
+    ns: str
+    id: int
+    type: int
+    action: int
+    pose: tuple[float, ...]
+    """Position xyz [m] and orientation xyzw."""
+    scale: tuple[float, ...]
+    color: tuple[float, ...]
+    """Red, green, blue, alpha."""
+    lifetime_ns: int
+    frame_locked: bool
+    points: NDArray[np.float64]
+    """Triangle corners [m], shape (3F, 3), in the axes of `frame_id`: a read-only view of the message."""
+    colors: NDArray[np.float32]
+    """Colour of each corner, shape (3F, 4), or (0, 4): a read-only view of the message."""
+
+
+def _marker(reader: CdrReader) -> Marker:
+    stamp_ns, frame_id, ns = reader.stamp_ns(), reader.string(), reader.string()
+    marker_id, kind, action = reader.numbers("iii")
+    pose, scale, color = reader.numbers("ddddddd"), reader.numbers("ddd"), reader.numbers("ffff")
+    lifetime_ns = reader.stamp_ns()
+    (frame_locked,) = reader.numbers("B")
+    points = reader.array("f8", 3 * reader.length(item_bytes=24)).reshape(-1, 3)
+    colors = reader.array("f4", 4 * reader.length(item_bytes=16)).reshape(-1, 4)
+    reader.string()  # texture_resource
+    reader.stamp_ns()  # texture.header
+    reader.string()
+    reader.string()  # texture.format
+    reader.skip(reader.length(item_bytes=1))  # texture.data
+    reader.array("f4", 2 * reader.length(item_bytes=8))  # uv_coordinates
+    for _ in ("text", "mesh_resource", "mesh_file.filename"):
+        reader.string()
+    reader.skip(reader.length(item_bytes=1))  # mesh_file.data
+    reader.numbers("B")  # mesh_use_embedded_materials
+    return Marker(
+        stamp_ns=stamp_ns,
+        frame_id=frame_id,
+        ns=ns,
+        id=marker_id,
+        type=kind,
+        action=action,
+        pose=pose,
+        scale=scale,
+        color=color,
+        lifetime_ns=lifetime_ns,
+        frame_locked=bool(frame_locked),
+        points=points,
+        colors=colors,
+    )
+
+
+def decode_marker_array(data: Buffer) -> list[Marker]:
+    """The markers of a `visualization_msgs/MarkerArray` in CDR; points and colours are views of `data`.
+
+    Raises `DecodeError` for anything that isn't one.
+    """
+    reader = CdrReader(data)
+    markers = [_marker(reader) for _ in range(reader.length(item_bytes=_MIN_MARKER_BYTES))]
+    reader.finish()
+    return markers
+
+
+def vertices_from_points(
+    points: NDArray[np.floating[Any]], faces: NDArray[np.integer[Any]], *, n_vertices: int | None = None
+) -> NDArray[np.float64]:
+    """Vertices, shape (V, 3), of a mesh whose triangle corners are `points`, shape (3F, 3), with known `faces`, (F, 3).
+
+    Raises `DecodeError` when the corners can't come from these faces, or a vertex is in none.
+    """
+    corners = np.asarray(faces).reshape(-1)
+    if points.shape != (corners.size, 3) or not corners.size:
+        msg = f"wanted the ({corners.size}, 3) corners of {corners.size // 3} triangles, got points {points.shape}"
+        raise DecodeError(msg)
+    count = int(corners.max()) + 1 if n_vertices is None else n_vertices
+    used = np.zeros(count, dtype=bool)
+    used[corners] = True
+    if not used.all():
+        msg = f"vertex {int(np.argmin(used))} of {count} is in no triangle; its position can't be known"
+        raise DecodeError(msg)
+    vertices = np.empty((count, 3))
+    vertices[corners] = points
+    if not np.array_equal(vertices[corners], points):
+        msg = "the points' shared corners differ: they were made with other faces"
+        raise DecodeError(msg)
+    return vertices

@@ -1,0 +1,55 @@
+"""What of a marker stays the same from frame to frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from msg_adapters.errors import EncodeError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+Rgba = tuple[float, float, float, float]
+_CLOTH: Rgba = (0.55, 0.63, 0.75, 1.0)
+
+
+def garment_namespace(garment: str, person: str = "") -> str:
+    """Namespace of a garment's marker: `<person>/<garment>`, or the garment's name where there is one person."""
+    return f"{person}/{garment}" if person else garment
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerMesh:
+    """Topology, name and colour of one marker.
+
+    Raises `EncodeError` when faces or colour can't be drawn: viewers drop such a marker without a word.
+    """
+
+    ns: str
+    """Namespace; with `id` it names the marker."""
+    faces: NDArray[np.integer[Any]]
+    """Vertex indices of the triangles, shape (F, 3), F > 0."""
+    n_vertices: int
+    """Number of vertices each frame will bring."""
+    color: Rgba = _CLOTH
+    """Red, green, blue, alpha in [0, 1]."""
+    id: int = 0
+    vertex_colors: bool = False
+    """Whether frames bring a colour for each vertex (RViz draws those without shading)."""
+
+    def __post_init__(self) -> None:
+        faces = np.asarray(self.faces)
+        if faces.ndim != 2 or faces.shape[1] != 3 or not len(faces) or not np.issubdtype(faces.dtype, np.integer):
+            msg = f"{self.ns}: wanted faces of shape (F, 3) of integers, F > 0, got {faces.shape} of {faces.dtype}"
+            raise EncodeError(msg)
+        if faces.min() < 0 or faces.max() >= self.n_vertices:
+            msg = f"{self.ns}: wanted face indices in [0, {self.n_vertices}), got {faces.min()} ... {faces.max()}"
+            raise EncodeError(msg)
+        color = np.asarray(self.color, dtype=np.float64)
+        if color.shape != (4,) or not ((color >= 0) & (color <= 1)).all():
+            msg = f"{self.ns}: wanted a colour of 4 numbers in [0, 1] (red, green, blue, alpha), got {self.color}"
+            raise EncodeError(msg)
+        object.__setattr__(self, "faces", faces)

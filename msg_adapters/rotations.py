@@ -1,0 +1,53 @@
+"""Rotation vectors and unit quaternions (x, y, z, w); any leading batch dimensions, computed in float64."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+Float64Array = np.ndarray[Any, np.dtype[np.float64]]
+
+_SMALL = 1e-8  # below it, sin(x)/x equals its limit to the last digit of float64
+
+
+def quaternion_from_rotvec(rotvec: ArrayLike) -> NDArray[np.float64]:
+    """Unit quaternions xyzw, shape (..., 4), of rotation vectors [rad], shape (..., 3)."""
+    rotvec = np.asarray(rotvec, dtype=np.float64)
+    angle = np.linalg.norm(rotvec, axis=-1, keepdims=True)
+    half_sinc = np.where(angle < _SMALL, 0.5, np.sin(0.5 * angle) / np.maximum(angle, _SMALL))
+    return np.concatenate([half_sinc * rotvec, np.cos(0.5 * angle)], axis=-1)
+
+
+def rotvec_from_quaternion(quaternion: ArrayLike) -> NDArray[np.float64]:
+    """Rotation vectors [rad] no longer than pi, shape (..., 3), of quaternions xyzw of any length > 0, (..., 4)."""
+    q = np.asarray(quaternion, dtype=np.float64)
+    # Scaling by the largest component first keeps the norm from over- and underflowing.
+    q = q / np.max(np.abs(q), axis=-1, keepdims=True)
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    q = np.where(q[..., 3:] < 0, -q, q)  # q and -q are one rotation; this one has the shorter vector
+    vector, w = q[..., :3], q[..., 3:]
+    sine = np.linalg.norm(vector, axis=-1, keepdims=True)
+    scale = np.where(sine < _SMALL, 2.0, 2.0 * np.arctan2(sine, w) / np.maximum(sine, _SMALL))
+    result: Float64Array = scale * vector
+    return result
+
+
+def slerp(start: NDArray[np.float64], end: NDArray[np.float64], fraction: ArrayLike) -> NDArray[np.float64]:
+    """Unit quaternions on the shorter arc from `start` to `end`, shapes (..., 4); `fraction` in [0, 1], shape (...)."""
+    t = np.asarray(fraction, dtype=np.float64)[..., None]
+    cosine = np.sum(start * end, axis=-1, keepdims=True)
+    end = np.where(cosine < 0, -end, end)
+    # The angle from the chord: accurate for close rotations, where arccos isn't.
+    angle = 2.0 * np.arcsin(np.clip(0.5 * np.linalg.norm(end - start, axis=-1, keepdims=True), 0.0, 1.0))
+    sine = np.sin(angle)
+    close = sine < _SMALL
+    safe = np.where(close, 1.0, sine)
+    a = np.where(close, 1.0 - t, np.sin((1.0 - t) * angle) / safe)
+    b = np.where(close, t, np.sin(t * angle) / safe)
+    q = a * start + b * end
+    result: Float64Array = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return result
