@@ -18,6 +18,7 @@ from tqdm import tqdm
 import msg_adapters as adapters
 from refu_core import GarmentPipeline, SmplFrame
 from refu_core.evaluation import CollisionChecker, GarmentMetrics, MetricsSummary, SelfContact, SelfContactDetector
+from refu_core.evaluation.render import GARMENT_COLOURS
 from refu_core.repulsion import DEFAULT_MARGIN
 
 if TYPE_CHECKING:
@@ -30,13 +31,6 @@ if TYPE_CHECKING:
 
 GARMENTS_TOPIC = "/garments"
 INPUT_TOPIC = "/smpl_params"
-PALETTE: Mapping[str, tuple[float, float, float, float]] = {
-    "shirt-male": (0.36, 0.55, 0.75, 1.0),
-    "tshirt-male": (0.85, 0.45, 0.33, 1.0),
-    "short-pant-male": (0.33, 0.42, 0.50, 1.0),
-    "skirt-female": (0.55, 0.40, 0.62, 1.0),
-}
-"""Marker colours, RGBA."""
 _MAX_REASONS = 20
 """Reasons of skips that are counted apart."""
 
@@ -271,7 +265,7 @@ class _Replayer:
                 ns=adapters.garment_namespace(name),
                 faces=garment.faces.cpu().numpy(),
                 n_vertices=garment.n_vertices,
-                color=PALETTE[name],
+                color=(*GARMENT_COLOURS[name], 1.0),
             )
             for name, garment in pipeline.garments.items()
         ]

@@ -13,8 +13,8 @@ from tqdm import tqdm
 
 from refu_core import GarmentPipeline, RefuError
 from refu_core.evaluation import CollisionChecker
-from refu_core.evaluation.render import Camera, RenderMesh, render, save_png
-from refu_ros.replay import PALETTE, FrameResult, ReplayResult
+from refu_core.evaluation.render import GARMENT_COLOURS, Camera, RenderMesh, render, save_png
+from refu_ros.replay import FrameResult, ReplayResult
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -92,7 +92,7 @@ def _plot(result: ReplayResult, folder: Path) -> None:
     drawn, (inside, pairs, depth) = figure(3)
     for name in result.after:
         records = [f.garments[name] for f in result.frames]
-        colour = PALETTE[name][:3]
+        colour = GARMENT_COLOURS[name]
         for ax, before, after in (
             (inside, [r.n_inside_before for r in records], [r.n_inside for r in records]),
             (pairs, [r.n_pairs_before for r in records], [r.n_pairs for r in records]),
@@ -154,7 +154,7 @@ def _draw_frames(result: ReplayResult, folder: Path, *, progress: bool) -> list[
                 for name, mesh in output.items():
                     vertices = mesh.raw if when == "before" else mesh.local
                     found = checker.check(vertices, mesh.faces)
-                    colours = np.tile(np.array(PALETTE[name][:3]), (len(vertices), 1))
+                    colours = np.tile(np.array(GARMENT_COLOURS[name]), (len(vertices), 1))
                     colours[mesh.faces[np.unique(found.pairs[:, 0])].reshape(-1)] = _MARK
                     colours[found.inside] = _MARK
                     meshes.append(RenderMesh(vertices, mesh.faces, colours))
@@ -204,8 +204,8 @@ def _page(result: ReplayResult, pictures: Sequence[_Pictured]) -> str:
 A whole frame, bytes to bytes: p50 {frame["p50"]:.1f}, p95 {frame["p95"]:.1f}, p99 {frame["p99"]:.1f} ms.</p>{warning}
 <h2>Figures</h2>{_table(data)}
 <p class="note">VFCP: vertices inside the body. CFMP: frames without any collision, vertices and triangles.
-Both by exact checks. Where the body intersects itself (an arm in the flank, thighs in a squat) no garment can be free of
-it: the second row of a garment leaves those frames out.</p>
+Both by exact checks. Where the body intersects itself (an arm in the flank, thighs in a squat) no garment can be free
+of it: the second row of a garment leaves those frames out.</p>
 <h2>Penetration over time</h2><img class="plot" src="penetration.svg" alt="penetration over time">
 <p class="note">Grey: the body touches itself near a garment.</p>
 <h2>Latency</h2><img class="plot" src="latency.svg" alt="latency over time">

@@ -1,0 +1,149 @@
+"""The garment pipeline from frame to vertices."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from refu_core import FrameError, GarmentError, GarmentPipeline, RefuError, SmplFrame, WeightsError, load_body
+from refu_core.realtime import PipelineOutput
+from refu_core.sdf import ExactSdf
+
+
+def frame(seed: int = 0, *, spread: float = 0.25, transl: tuple[float, float, float] = (0, 0, 0)) -> SmplFrame:
+    rng = np.random.default_rng(seed)
+    return SmplFrame(
+        pose=rng.normal(0, spread, (24, 3)).astype(np.float32),
+        betas=rng.normal(0, 0.7, 10).astype(np.float32),
+        transl=np.array(transl, np.float64),
+    )
+
+
+@pytest.fixture(scope="module")
+def pipeline() -> GarmentPipeline:
+    return GarmentPipeline.load(["tshirt-male", "short-pant-male"])
+
+
+def test_what_comes_out(pipeline: GarmentPipeline) -> None:
+    out = pipeline(frame(transl=(1, 2, 3)))
+    assert list(out) == ["tshirt-male", "short-pant-male"]
+    for name, mesh in out.items():
+        assert mesh.vertices.shape == (pipeline.garments[name].n_vertices, 3)
+        assert mesh.vertices.dtype == np.float64
+        assert np.isfinite(mesh.vertices).all()
+        np.testing.assert_allclose(mesh.vertices - [1, 2, 3], mesh.local, atol=1e-12)
+        assert out.stats.garments[name].ms > 0
+    assert set(out.stats.stage_ms) == {"body", "backbone", "sdf", "refu"}
+
+
+def test_garments_are_pushed_to_the_margin_and_no_farther(pipeline: GarmentPipeline) -> None:
+    out = pipeline(frame(1, spread=0.12))
+    sdf = ExactSdf(pipeline.body.faces)
+    sdf.update(torch.as_tensor(out.body))
+    for name, mesh in out.items():
+        before = sdf.query(torch.as_tensor(mesh.raw)).distance.numpy()
+        after = sdf.query(torch.as_tensor(mesh.local)).distance.numpy()
+        moved = np.linalg.norm(mesh.local - mesh.raw, axis=1)
+        assert after.min() > 0, name
+        assert out.stats.garments[name].n_inside == (before < 0).sum()
+        clear = (before > 0.02) & (moved == 0)
+        assert clear.any(), "what is far from the skin isn't touched"
+        assert moved.max() < 0.004 + 2 * max(0.0, -before.min()) + 0.01, "no vertex is thrown far out"
+
+
+def test_without_signed_distance_the_raw_backbone_comes_out() -> None:
+    out = GarmentPipeline.load(["tshirt-male"], sdf="none")(frame(2))
+    np.testing.assert_array_equal(out["tshirt-male"].local, out["tshirt-male"].raw)
+
+
+def test_a_batch_is_what_single_persons_are(pipeline: GarmentPipeline) -> None:
+    frames = [frame(3), frame(4, transl=(5, 0, 0)), frame(5)]
+    batch = pipeline(frames)
+    assert len(batch) == 3
+    for together, one in zip(batch, frames, strict=True):
+        alone = pipeline(one)
+        for name, mesh in alone.items():
+            np.testing.assert_allclose(together[name].vertices, mesh.vertices, atol=1e-5)
+    assert pipeline([]) == []
+
+
+def close(a: PipelineOutput, b: PipelineOutput, turn: Rotation, root: np.ndarray) -> None:
+    for name, mesh in a.items():
+        np.testing.assert_allclose(turn.apply(mesh.local - root) + root, b[name].local, atol=1e-4)
+
+
+def test_turning_the_person_turns_the_garments() -> None:
+    pipeline = GarmentPipeline.load(["skirt-female"])
+    here = frame(6, spread=0.1)
+    turn = Rotation.from_rotvec([0.4, -1.9, 0.7])
+    pose = np.array(here.pose)
+    pose[0] = (turn * Rotation.from_rotvec(pose[0])).as_rotvec()
+    there = SmplFrame(pose=pose, betas=here.betas)
+    root = pipeline.body.rest_joints(torch.tensor(here.betas)[None])[0, 0].numpy()
+    close(pipeline(here), pipeline(there), turn, root)
+
+
+def test_far_from_the_origin_nothing_changes(pipeline: GarmentPipeline) -> None:
+    near, far = pipeline(frame(7)), pipeline(frame(7, transl=(1e5, -2e5, 3e5)))
+    for name, mesh in near.items():
+        np.testing.assert_allclose(far[name].vertices - [1e5, -2e5, 3e5], mesh.vertices, atol=1e-9)
+
+
+def test_the_same_frame_gives_the_same_bits(pipeline: GarmentPipeline) -> None:
+    one, two = pipeline(frame(8)), pipeline(frame(8))
+    pipeline(frame(9))  # what came between leaves no trace
+    three = pipeline(frame(8))
+    for name, mesh in one.items():
+        np.testing.assert_array_equal(mesh.local, two[name].local)
+        np.testing.assert_array_equal(mesh.local, three[name].local)
+
+
+@pytest.mark.parametrize(
+    ("garments", "options", "error", "wanted"),
+    [
+        ([], {}, GarmentError, "name at least one"),
+        (["kilt"], {}, GarmentError, "no garment 'kilt'"),
+        (["tshirt-male", "skirt-female"], {}, GarmentError, r"tshirt-male \(male\), skirt-female \(female\)"),
+        (["tshirt-male"], {"sdf": "exact"}, RefuError, "no sdf mode 'exact': wanted accurate"),
+        (["tshirt-male"], {"backbone": "resnet"}, WeightsError, "no backbone 'resnet'"),
+        (["tshirt-male"], {"margin": -1}, RefuError, "margin must be between"),
+        (["tshirt-male"], {"margin": float("nan")}, RefuError, "margin must be between"),
+        (["tshirt-male"], {"device": "quantum"}, RefuError, "no device 'quantum'"),
+        (["tshirt-male"], {"style": [1, 2]}, GarmentError, "style must be 4 finite numbers"),
+    ],
+)
+def test_bad_options_are_named(garments: list[str], options: dict[str, object], error: type, wanted: str) -> None:
+    with pytest.raises(error, match=wanted):
+        GarmentPipeline.load(garments, **options)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("values", "wanted"),
+    [
+        ({"pose": np.zeros((23, 3))}, r"pose must have the shape \(24, 3\)"),
+        ({"pose": np.full(72, np.nan)}, "pose has 72 values that are NaN or infinite"),
+        ({"pose": "standing"}, "pose must be"),
+        ({"pose": np.zeros(72), "betas": np.zeros(9)}, r"betas must have the shape \(10,\)"),
+        ({"pose": np.zeros(72), "transl": [0, np.inf, 0]}, "transl has 1 value that is NaN or infinite"),
+        ({"pose": np.full(72, 1e300)}, "beyond the range of float32"),
+    ],
+)
+def test_bad_frames_are_named(values: dict[str, object], wanted: str) -> None:
+    with pytest.raises(FrameError, match=wanted):
+        SmplFrame(**values)  # type: ignore[arg-type]
+
+
+def test_frames_own_their_data() -> None:
+    pose = np.zeros((24, 3), np.float32)
+    made = SmplFrame(pose=pose)
+    pose[:] = 1
+    assert not made.pose.any()
+    with pytest.raises(ValueError, match="read-only"):
+        made.pose[0] = 1
+
+
+def test_the_readme_example_runs() -> None:
+    body = load_body("male")(np.zeros((1, 72)), np.zeros((1, 10)), np.zeros((1, 3)))
+    assert body.vertices.shape == (1, load_body("male").n_vertices, 3)
