@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -30,8 +30,9 @@ class SelfContact:
     """Intersecting body faces, shape (K, 2), in lexicographic order; none of a pair share an edge."""
     faces: NDArray[np.int32]
     """Faces of those pairs, and those buried in another limb, shape (M,), in order."""
-    triangles: NDArray[np.float32]
-    """Corners of `faces` [m], shape (M, 3, 3)."""
+    vertices: NDArray[np.float32]
+    """The posed body [m], shape (V, 3)."""
+    _body: ExactSdf = field(repr=False)
 
     @property
     def is_free(self) -> bool:
@@ -39,17 +40,33 @@ class SelfContact:
         return not len(self.faces)
 
     def near(self, points: Any, *, distance: float = DEFAULT_NEAR) -> NDArray[np.bool_]:
-        """Which of `points` [m], shape (N, 3), lie within `distance` [m] of a face in contact; bool, shape (N,)."""
+        """Which of `points` [m], shape (N, 3), this contact leaves no way out; bool, shape (N,).
+
+        Those within `distance` [m] of a face in contact; and, at any distance, those inside the body whose closest face
+        is in contact: to leave by a buried face is to enter another limb.
+        """
         queries = as_vertices("points", points)
         near = np.zeros(len(queries), np.bool_)
         if self.is_free or not len(queries):
             return near
-        corners = torch.from_numpy(self.triangles.reshape(-1, 3))
-        mesh = wp.Mesh(as_warp(corners, wp.vec3), as_warp(torch.arange(len(corners), dtype=torch.int32), wp.int32))
+        # The detector may have seen other poses since.
+        self._body.update(torch.from_numpy(self.vertices))
+        in_contact = torch.zeros(len(self._body.faces), dtype=torch.bool)
+        in_contact[torch.from_numpy(self.faces).long()] = True
+        contact = wp.Mesh(
+            as_warp(torch.from_numpy(self.vertices), wp.vec3),
+            as_warp(self._body.faces[in_contact].view(-1), wp.int32),
+        )
         wp.launch(
             near_kernel,
             dim=len(queries),
-            inputs=[mesh.id, as_warp(torch.from_numpy(queries), wp.vec3), distance],
+            inputs=[
+                contact.id,
+                self._body.mesh_id,
+                as_warp(in_contact, wp.bool),
+                as_warp(torch.from_numpy(queries), wp.vec3),
+                distance,
+            ],
             outputs=[as_warp(torch.from_numpy(near), wp.bool)],
             device="cpu",
         )
@@ -84,7 +101,7 @@ class SelfContactDetector:
         pairs = pairs[~np.isin(self._keys(pairs), self._rest_pairs)]
         covered = np.flatnonzero((buried & ~self._rest_buried)[self._faces].any(axis=1))
         faces = np.union1d(pairs, covered).astype(np.int32)
-        return SelfContact(pairs, faces, vertices[self._faces[faces]])
+        return SelfContact(pairs, faces, vertices, self._body)
 
     def _contacts(self, vertices: NDArray[np.float32]) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
         """All intersecting pairs of faces, (K, 2), and the vertices inside another part of the body, (V,)."""
@@ -96,6 +113,7 @@ class SelfContactDetector:
             [
                 pierced_edges(self._faces, found.pairs[:, 0], found.edge_of_face),
                 pierced_edges(self._faces, found.pairs[:, 1], found.edge_of_body),
+                self._edges_at(_pinched(self._faces, found.pairs)),
             ]
         )
         above = vertices + _OFF_SURFACE * _vertex_normals(vertices, self._faces)
@@ -107,9 +125,22 @@ class SelfContactDetector:
         )
         return found.pairs, buried
 
+    def _edges_at(self, vertices: NDArray[np.int32]) -> NDArray[np.int64]:
+        """All edges that end at one of `vertices`, as vertex pairs (E, 2)."""
+        edges = self._faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).astype(np.int64)
+        ending: NDArray[np.int64] = edges[np.isin(edges, vertices).any(axis=1)]
+        return ending
+
     def _keys(self, pairs: NDArray[np.int32]) -> NDArray[np.int64]:
         keys: NDArray[np.int64] = pairs[:, 0].astype(np.int64) * len(self._faces) + pairs[:, 1]
         return keys
+
+
+def _pinched(faces: NDArray[np.int32], pairs: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Vertices in both faces of a pair, (K, 2): their fans cut through themselves, so a crease ends there, and from
+    them the skin goes on into both layers without piercing anything."""
+    first, second = faces[pairs[:, 0]], faces[pairs[:, 1]]
+    return np.unique(first[(first[:, :, None] == second[:, None, :]).any(axis=2)])
 
 
 def _vertex_normals(vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> NDArray[np.float32]:

@@ -125,30 +125,33 @@ def _push(state: _State, rows: Tensor, sample: SdfSample, scale: float | Tensor,
 
 
 def _raise_edges(state: _State, edges: Tensor, max_rounds: int) -> int:
-    """Raises both ends of the edges whose middle is closer to the body than half the margin; returns the rounds."""
+    """Raises both ends of the edges whose middle is closer to the body than half the margin; returns the rounds.
+
+    Only edges with an end at the margin are looked at: skin would have to bulge by more than the margin between two
+    vertices further off, as only a finger does.
+    """
     wanted = 0.5 * state.margin
+    low = edges[state.distance[edges].amin(dim=1) < state.margin + state.tolerance]
     for round_ in range(max_rounds):
-        ends = state.vertices[edges]
-        half = 0.5 * torch.linalg.vector_norm(ends[:, 0] - ends[:, 1], dim=-1)
-        # f changes by no more than the way walked: only these middles can be too close.
-        near = torch.nonzero(state.distance[edges].amax(dim=1) < half + wanted)[:, 0]
-        middle = state.sdf.query(ends[near].mean(dim=1))
-        low = torch.nonzero(middle.distance < wanted)[:, 0]
-        if not len(low):
+        middle = state.sdf.query(state.vertices[low].mean(dim=1))
+        is_low = middle.distance < wanted
+        if not bool(is_low.any()):
             return round_
-        deficit = (wanted - middle.distance[low]).repeat_interleave(2)
-        rise = deficit[:, None] * middle.gradient[low].repeat_interleave(2, dim=0)
-        raised = edges[near[low]].reshape(-1)
+        low = low[is_low]
+        deficit = (wanted - middle.distance[is_low]).repeat_interleave(2)
+        rise = deficit[:, None] * middle.gradient[is_low].repeat_interleave(2, dim=0)
+        ends = low.reshape(-1)
         # A vertex of several low edges follows the lowest of them.
-        largest = state.distance.new_zeros(len(state.distance)).scatter_reduce(0, raised, deficit, "amax")
-        wins = deficit == largest[raised]
-        moves = torch.zeros_like(state.vertices).index_copy(0, raised[wins], rise[wins])
+        largest = torch.zeros_like(state.distance).scatter_reduce(0, ends, deficit, "amax")
+        wins = deficit == largest[ends]
+        moves = torch.zeros_like(state.vertices).index_copy(0, ends[wins], rise[wins])
         rows = torch.nonzero(largest)[:, 0]
         moved = state.bounded(state.vertices[rows] + moves[rows], rows)
         distance = state.sdf.query(moved).distance
-        clear = distance >= torch.minimum(
-            state.distance[rows], state.distance.new_tensor(state.margin - state.tolerance)
-        )
-        state.vertices[rows[clear]] = moved[clear]
-        state.distance[rows[clear]] = distance[clear]
+        clear = distance >= state.distance[rows].clamp_max(state.margin - state.tolerance)
+        raised = rows[clear]
+        state.vertices[raised] = moved[clear]
+        state.distance[raised] = distance[clear]
+        # Edges of which neither end could move are between two limbs, and stay there.
+        low = low[torch.isin(low, raised).any(dim=1)]
     return max_rounds

@@ -104,6 +104,12 @@ class ExactSdf:
                 support_winding_number=self._by_winding,
             )
 
+    @property
+    def mesh_id(self) -> int:
+        """The body as kernels of one's own take it (`wp.uint64`). Raises `MeshError` before the first `update`."""
+        self._require_update()
+        return int(self._mesh.id)
+
     def query(self, points: Tensor) -> SdfSample:
         """Signed distance and gradient at `points` [m], shape (N, 3), differentiable as the class says.
 
