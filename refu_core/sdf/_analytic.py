@@ -43,8 +43,9 @@ def _to_faces(points: Tensor, corners: Tensor, feature: Feature) -> tuple[Tensor
     a, b, c = corners[rows].unbind(1)
     normal = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
     height = ((points[rows] - a) * normal).sum(-1)
-    # Within intersecting limbs the side by winding number may not be the normal's.
-    flip = torch.where(feature.sign[rows] * height.detach() < 0, -1.0, 1.0).to(points)
+    # Within intersecting limbs the side by winding number may not be the normal's; nearer, the two differ by rounding.
+    off_surface = height.detach().abs() > float(ON_SURFACE)
+    flip = torch.where(off_surface & (feature.sign[rows] * height.detach() < 0), -1.0, 1.0).to(points)
     return rows, SdfSample(flip * height, flip[:, None] * normal)
 
 

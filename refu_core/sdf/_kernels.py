@@ -160,7 +160,8 @@ def closest_kernel(
     if feature == FACE:
         distance = wp.abs(height)
     if feature == FACE or distance < ON_SURFACE:
-        gradient = wp.where(height * outside < 0.0, -normal, normal)
+        # On the surface the two signs may differ by rounding alone, and the way out is the normal.
+        gradient = wp.where(distance > ON_SURFACE and height * outside < 0.0, -normal, normal)
     else:
         gradient = offset * (outside / distance)
 
