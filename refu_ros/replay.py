@@ -16,7 +16,7 @@ import numpy as np
 from tqdm import tqdm
 
 import msg_adapters as adapters
-from refu_core import GarmentPipeline, SmplFrame
+from refu_core import FrameError, GarmentPipeline, SmplFrame
 from refu_core.evaluation import CollisionChecker, GarmentMetrics, MetricsSummary, SelfContact, SelfContactDetector
 from refu_core.evaluation.render import GARMENT_COLOURS
 from refu_core.repulsion import DEFAULT_MARGIN
@@ -175,6 +175,11 @@ class Source(AbstractContextManager["Source"]):
         return self._records
 
     @property
+    def is_bag(self) -> bool:
+        """Whether the records are messages, which go into the output whatever they hold."""
+        return self._bag is not None
+
+    @property
     def definition(self) -> tuple[str | None, str | None]:
         """The input type's definition and hash as the bag has them."""
         return (self._bag.topic.definition, self._bag.topic.type_hash) if self._bag else (None, None)
@@ -192,14 +197,16 @@ class Source(AbstractContextManager["Source"]):
 
 def _motion_records(motion: adapters.Motion, topic: str) -> Iterator[FrameRecord]:
     encode = adapters.encoder_for("multiarray")
-    for frame in motion.frames():
+    for i in range(len(motion)):
+        stamp_ns = round(1e9 * i / motion.fps)
+        frame, error, raw = None, None, b""
+        try:
+            frame = motion.frame(i)
+            raw = encode(frame)
+        except FrameError as cause:  # one bad frame of a clip is skipped like one bad message of a bag
+            error = adapters.DecodeError(str(cause))
         yield adapters.FrameRecord(
-            frame=frame,
-            error=None,
-            stamp_ns=frame.stamp_ns,
-            log_time_ns=frame.stamp_ns,
-            topic=topic,
-            raw=encode(frame),
+            frame=frame, error=error, stamp_ns=stamp_ns, log_time_ns=stamp_ns, topic=topic, raw=raw
         )
 
 
@@ -283,8 +290,11 @@ class _Replayer:
 
     def run(self, record: FrameRecord, writer: adapters.BagWriter | None) -> None:
         """Bytes to bytes (timed), then the bag and the metrics (not timed)."""
-        if writer is not None:
+        if writer is not None and (record.raw or self._source.is_bag):
             writer.write(self._source.topic, record.raw, log_time_ns=record.log_time_ns)
+        if record.error is not None:
+            self._skip(str(record.error))
+            return
         start = time.perf_counter()
         try:
             frame = replace(self._source.decoder.from_bytes(record.raw), stamp_ns=record.stamp_ns)
@@ -294,7 +304,7 @@ class _Replayer:
             data = self._encoder.encode(
                 [mesh.local for mesh in output.values()], stamp_ns=frame.stamp_ns, transl=frame.transl
             )
-        except (adapters.DecodeError, adapters.EncodeError) as error:
+        except adapters.EncodeError as error:
             self._skip(str(error))
             return
         latency_ms = 1e3 * (time.perf_counter() - start)
