@@ -1,0 +1,138 @@
+"""The metrics against slow references written from the paper's words."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from refu_core.errors import MeshError
+from refu_core.evaluation import Collisions, GarmentMetrics
+
+MESH = trimesh.creation.icosphere(subdivisions=1)
+N, G = len(MESH.vertices), len(MESH.faces)
+
+
+def random_frame(rng: np.random.Generator, *, free: bool = False) -> tuple[NDArray[np.float32], Collisions]:
+    vertices = (MESH.vertices + rng.normal(scale=0.02, size=(N, 3))).astype(np.float32)
+    if free:
+        none = np.zeros(N, np.bool_)
+        return vertices, Collisions(np.zeros((0, 2), np.int32), none[:0], none, none.astype(np.float32))
+    pairs = np.unique(rng.integers(0, G, size=(12, 2)), axis=0).astype(np.int32)
+    inside = rng.random(N) < 0.2
+    depth = np.where(inside, rng.uniform(0.001, 0.02, N), 0).astype(np.float32)
+    return vertices, Collisions(pairs, rng.random(len(pairs)) < 0.5, inside, depth)
+
+
+def laplacian(vertices: NDArray[np.float64], i: int) -> NDArray[np.float64]:
+    neighbours = {int(v) for face in MESH.faces if i in face for v in face} - {i}
+    return vertices[i] - np.mean([vertices[v] for v in neighbours], axis=0)
+
+
+@settings(max_examples=15)
+@given(seed=st.integers(0, 2**31), n_frames=st.integers(1, 5))
+def test_equals_the_slow_reference(seed: int, n_frames: int) -> None:
+    rng = np.random.default_rng(seed)
+    metrics = GarmentMetrics(MESH.faces)
+    rows: dict[str, list[dict[str, float]]] = {"all": [], "frames": [], "vertices": []}
+    for k in range(n_frames):
+        vertices, collisions = random_frame(rng, free=k == 1)
+        truth = (vertices + rng.normal(scale=0.01, size=(N, 3))).astype(np.float32)
+        near = np.zeros(N, np.bool_) if k == 2 else rng.random(N) < 0.3
+        region = rng.random(N) < 0.5
+        metrics.add(vertices, collisions, truth=truth, near_contact=near, resolved=region)
+        for kind in rows:
+            if kind == "frames" and near.any():
+                continue
+            kept = [i for i in range(N) if kind != "vertices" or not near[i]]
+            pairs = [
+                (int(face), bool(is_vf))
+                for (face, _), is_vf in zip(collisions.pairs, collisions.pair_is_vf, strict=True)
+                if all(v in kept for v in MESH.faces[face])
+            ]
+            a, b = vertices.astype(float), truth.astype(float)
+            rows[kind].append(
+                {
+                    "mpve_mm": 1e3 * float(np.mean([np.linalg.norm(a[i] - b[i]) for i in kept])),
+                    "vfcp_percent": 100 * sum(bool(collisions.inside[i]) for i in kept) / len(kept),
+                    "cfmp_percent": 100.0 * (not pairs and not any(collisions.inside[i] for i in kept)),
+                    "avg_vf": len({face for face, is_vf in pairs if is_vf}),
+                    "avg_ee": len({face for face, is_vf in pairs if not is_vf}),
+                    "mean_energy": sum(float(collisions.depth[i]) ** 2 for i in kept),
+                    "max_depth_mm": 1e3 * max(float(collisions.depth[i]) for i in kept),
+                    "laplacian_mm": 1e3
+                    * float(np.mean([np.linalg.norm(laplacian(a, i) - laplacian(b, i)) for i in kept if region[i]])),
+                }
+            )
+    summary = metrics.summary()
+    assert summary.n_frames == n_frames
+    assert summary.n_contact_frames == n_frames - len(rows["frames"])
+    for kind, figures in (
+        ("all", summary.all),
+        ("frames", summary.contact_free_frames),
+        ("vertices", summary.contact_free_vertices),
+    ):
+        found = figures.as_dict()
+        assert found.pop("n_frames") == len(rows[kind])
+        for name, value in found.items():
+            values = [row[name] for row in rows[kind]]
+            if not values:
+                assert value is None
+            else:
+                wanted = max(values) if name == "max_depth_mm" else np.mean(values)
+                assert value == pytest.approx(wanted, rel=1e-5, abs=1e-9), name
+
+
+def test_figures_of_one_frame() -> None:
+    rng = np.random.default_rng(0)
+    vertices, collisions = random_frame(rng)
+    frame = GarmentMetrics(MESH.faces).add(vertices, collisions)
+    assert (frame.n_vertices, frame.n_inside) == (N, collisions.n_inside)
+    assert (frame.n_vf, frame.n_ee, frame.is_free) == (collisions.n_vf, collisions.n_ee, collisions.is_free)
+    assert frame.mpve_mm is None
+    assert frame.laplacian_mm is None
+
+
+def test_laplacian_error_ignores_translation_and_mpve_does_not() -> None:
+    vertices, collisions = random_frame(np.random.default_rng(1))
+    frame = GarmentMetrics(MESH.faces).add(vertices + np.float32(0.125), collisions, truth=vertices)
+    assert frame.mpve_mm == pytest.approx(125 * 3**0.5, rel=1e-4)
+    assert frame.laplacian_mm == pytest.approx(0, abs=1e-3)
+
+
+def test_nothing_added_and_everything_near() -> None:
+    metrics = GarmentMetrics(MESH.faces)
+    assert metrics.summary().all.as_dict() == {
+        "n_frames": 0,
+        "mpve_mm": None,
+        "vfcp_percent": None,
+        "cfmp_percent": None,
+        "avg_vf": None,
+        "avg_ee": None,
+        "max_depth_mm": None,
+        "mean_energy": None,
+        "laplacian_mm": None,
+    }
+    vertices, collisions = random_frame(np.random.default_rng(2))
+    metrics.add(vertices, collisions, near_contact=np.ones(N, np.bool_))
+    summary = metrics.summary()
+    assert summary.contact_free_vertices.n_frames == 0
+    assert summary.contact_free_frames.vfcp_percent is None
+    assert summary.n_contact_frames == 1
+    json.dumps(summary.all.as_dict())
+
+
+def test_refuses_arrays_of_another_garment() -> None:
+    vertices, collisions = random_frame(np.random.default_rng(3))
+    metrics = GarmentMetrics(MESH.faces)
+    with pytest.raises(MeshError, match=r"belong to the garment's 42 vertices"):
+        metrics.add(vertices, collisions, truth=vertices[:10])
+    with pytest.raises(MeshError, match=r"\(10,\)"):
+        metrics.add(vertices, collisions, near_contact=np.zeros(10, np.bool_))
+    with pytest.raises(MeshError, match=r"belong to the garment's 41 vertices"):
+        metrics.add(vertices[:41], collisions)
