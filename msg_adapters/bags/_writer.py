@@ -171,7 +171,11 @@ class BagWriter:
         if self._directory is not None:
             self._clear(self._directory, overwrite=overwrite)
         self.file_path.parent.mkdir(parents=True, exist_ok=True)
-        return self.file_path.open("wb" if overwrite else "xb")
+        try:
+            return self.file_path.open("wb" if overwrite else "xb")
+        except FileExistsError as error:
+            msg = f"{self.path}: exists already; choose another path, or overwrite it"
+            raise BagError(msg) from error
 
     def _clear(self, directory: Path, *, overwrite: bool) -> None:
         """Make way for a new bag: of an old one, its own files are removed and nothing else."""
@@ -192,9 +196,6 @@ class BagWriter:
             raise BagError(msg)
         try:
             yield
-        except FileExistsError as error:
-            msg = f"{self.path}: exists already; choose another path, or overwrite it"
-            raise BagError(msg) from error
         except OSError as error:
             self._abandon()
             msg = f"{self.path}: can't be written: {error.strerror or error}"

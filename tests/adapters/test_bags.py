@@ -1,0 +1,567 @@
+"""Bags: opened by two independent readers, read back whole, cut short, damaged and hostile."""
+
+from __future__ import annotations
+
+import shutil
+import struct
+import sys
+import tracemalloc
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+import yaml
+import zstandard
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+from mcap_ros2.decoder import DecoderFactory
+from reference import deserialise
+from rosbags.rosbag2 import Reader as RosbagsReader
+
+from msg_adapters import (
+    INPUT_TYPES,
+    MARKER_ARRAY,
+    BagError,
+    BagReader,
+    BagWriter,
+    MarkerArrayEncoder,
+    MarkerMesh,
+    QosProfile,
+    decoder_for,
+    encode_diagnostics,
+    encoder_for,
+    iter_smpl_frames,
+    message_definition,
+    open_smpl_bag,
+)
+from refu_core import SmplFrame
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+BAGS = Path(__file__).parents[2] / "bags"
+START_NS = 1_700_000_000_000_000_000
+STEP_NS = 33_333_333
+TOPIC = "/smpl_params"
+
+
+def frame(i: int) -> SmplFrame:
+    return SmplFrame(np.full(72, 0.01 * i), transl=[0, 1, 0.1 * i], stamp_ns=START_NS + i * STEP_NS)
+
+
+def write_bag(path: Path, *, input_type: str = "joint_state", count: int = 40, **options: Any) -> Path:
+    encode = encoder_for(input_type)
+    with BagWriter(path, **options) as bag:
+        bag.add_topic(TOPIC, INPUT_TYPES[input_type])  # type: ignore[index]
+        for i in range(count):
+            bag.write(TOPIC, encode(frame(i)), log_time_ns=frame(i).stamp_ns + 5)
+    return bag.file_path
+
+
+@pytest.fixture
+def every_type(tmp_path: Path) -> Path:
+    """A bag with a topic of every type that the project writes."""
+    mesh = MarkerMesh("skirt-female", np.array([[0, 1, 2]]), 3)
+    messages = {f"/in/{name}": (INPUT_TYPES[name], encoder_for(name)(frame(1))) for name in INPUT_TYPES}
+    messages["/garments"] = (MARKER_ARRAY, MarkerArrayEncoder([mesh]).encode([np.eye(3)], stamp_ns=7))
+    messages["/diagnostics"] = ("diagnostic_msgs/msg/DiagnosticArray", encode_diagnostics([], stamp_ns=7))
+    with BagWriter(tmp_path / "bag") as bag:
+        for topic, (message_type, data) in messages.items():
+            bag.add_topic(topic, message_type, qos=QosProfile(reliability="best_effort", depth=1))
+            bag.write(topic, data, log_time_ns=START_NS, publish_time_ns=START_NS - 3)
+    return tmp_path / "bag"
+
+
+# ------------------------------------------------------------------------------------------------ what others read
+
+
+def test_mcap_ros2_decodes_every_message(every_type: Path) -> None:
+    with (every_type / "bag_0.mcap").open("rb") as file:
+        decoded = make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
+        messages = {channel.topic: message for _, channel, _, message in decoded}
+    assert len(messages) == len(INPUT_TYPES) + 2
+    for name in INPUT_TYPES:
+        read = decoder_for(name).from_message(messages[f"/in/{name}"])
+        np.testing.assert_allclose(read.pose, frame(1).pose, atol=1e-6)
+    marker = messages["/garments"].markers[0]
+    assert marker.ns == "skirt-female"
+    assert [(p.x, p.y, p.z) for p in marker.points] == [(0, 1, 0), (0, 0, 1), (1, 0, 0)]
+
+
+def test_rosbags_opens_the_directory_and_the_file(every_type: Path) -> None:
+    for path in (every_type, every_type / "bag_0.mcap"):
+        with RosbagsReader(path) as reader:
+            read = {connection.topic: (connection, time, data) for connection, time, data in reader.messages()}
+            assert reader.message_count == len(read) == len(INPUT_TYPES) + 2
+        for connection, time, data in read.values():
+            assert time == START_NS
+            if connection.msgtype != INPUT_TYPES["smpl_msgs"]:
+                assert deserialise(data, connection.msgtype) is not None
+            assert connection.msgdef.data == message_definition(connection.msgtype).text
+            if path.is_dir():
+                assert connection.digest == message_definition(connection.msgtype).type_hash
+            (qos,) = connection.ext.offered_qos_profiles
+            assert (qos.reliability.name, qos.durability.name, qos.history.name, qos.depth) == (
+                "BEST_EFFORT",
+                "VOLATILE",
+                "KEEP_LAST",
+                1,
+            )
+
+
+def test_the_file_is_laid_out_as_rosbag2_lays_it_out(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "bag", chunk_bytes=4096)
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        assert reader.get_header().profile == "ros2"
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        statistics = summary.statistics
+        assert (statistics.message_count, statistics.message_start_time) == (40, START_NS + 5)
+        assert {index.compression for index in summary.chunk_indexes} == {"zstd"}
+        assert len(summary.chunk_indexes) > 10
+        (schema,) = summary.schemas.values()
+        assert (schema.name, schema.encoding) == (INPUT_TYPES["joint_state"], "ros2msg")
+        (metadata,) = reader.iter_metadata()
+        assert metadata.name == "rosbag2"
+        assert [m.log_time for _, _, m in reader.iter_messages()] == [frame(i).stamp_ns + 5 for i in range(40)]
+    text = (tmp_path / "bag" / "metadata.yaml").read_text()
+    assert metadata.metadata["serialized_metadata"] == text
+    information = yaml.safe_load(text)["rosbag2_bagfile_information"]
+    assert (information["version"], information["storage_identifier"]) == (9, "mcap")
+    assert information["relative_file_paths"] == ["bag_0.mcap"]
+    assert information["duration"]["nanoseconds"] == 39 * STEP_NS
+
+
+# ------------------------------------------------------------------------------------------------ there and back
+
+
+@pytest.mark.parametrize("input_type", INPUT_TYPES)
+@pytest.mark.parametrize("compression", ["zstd", "none"])
+@pytest.mark.parametrize("name", ["bag", "bag.mcap"])
+def test_round_trip(tmp_path: Path, input_type: str, compression: Any, name: str) -> None:
+    path = write_bag(tmp_path / name, input_type=input_type, compression=compression)
+    assert path.parent == (tmp_path / "bag" if name == "bag" else tmp_path)
+    bag = open_smpl_bag(tmp_path / name)
+    records = list(bag)
+    assert bag.message_count == len(records) == 40
+    assert bag.topic.message_type == INPUT_TYPES[input_type]  # type: ignore[index]
+    assert not bag.reader.truncated
+    assert bag.reader.warnings == []
+    for i, record in enumerate(records):
+        assert record.frame is not None
+        # Float32MultiArray has no stamp: when it was received has to do.
+        assert record.stamp_ns == record.frame.stamp_ns == frame(i).stamp_ns + (5 if input_type == "multiarray" else 0)
+        assert (record.log_time_ns, record.topic) == (frame(i).stamp_ns + 5, TOPIC)
+        np.testing.assert_allclose(record.frame.pose, frame(i).pose, atol=1e-6)
+        assert record.raw == encoder_for(input_type)(frame(i))
+
+
+def test_several_files_are_read_in_order(tmp_path: Path) -> None:
+    bag = tmp_path / "split"
+    bag.mkdir()
+    for part in range(3):
+        file = write_bag(tmp_path / f"{part}.mcap", count=part + 2)
+        shutil.move(file, bag / f"z{2 - part}.mcap")
+    names = ["split/z2.mcap", "split/z1.mcap", "z0.mcap"]  # bags of old versions list the directory too
+    metadata = {"storage_identifier": "mcap", "relative_file_paths": names, "compression_mode": "NONE"}
+    (bag / "metadata.yaml").write_text(yaml.safe_dump({"rosbag2_bagfile_information": metadata}))
+    reader = BagReader(bag)
+    assert [topic.message_count for topic in reader.topics] == [9]
+    times = [message.log_time_ns for message in reader.messages()]
+    assert times == [frame(i).stamp_ns + 5 for part in range(3) for i in range(part + 2)]
+
+
+def test_two_channels_of_one_topic_are_one(tmp_path: Path) -> None:
+    data = encoder_for("joint_state")(frame(0))
+    with (tmp_path / "two.mcap").open("wb") as file:
+        writer = Writer(file, compression=CompressionType.LZ4)
+        writer.start(profile="ros2")
+        schema = writer.register_schema("sensor_msgs/JointState", "ros2msg", b"")  # the short name occurs as well
+        for _ in range(2):
+            channel = writer.register_channel(TOPIC, "cdr", schema)
+            writer.add_message(channel, START_NS, data, START_NS)
+        writer.finish()
+    pytest.importorskip("lz4")
+    bag = open_smpl_bag(tmp_path / "two.mcap")
+    assert [record.raw for record in bag] == [data, data]
+    assert bag.message_count == 2
+
+
+def test_only_the_topics_asked_for(every_type: Path) -> None:
+    reader = BagReader(every_type)
+    assert {m.topic for m in reader.messages({"/garments", "/nothing"})} == {"/garments"}
+    assert all(m.publish_time_ns == m.log_time_ns - 3 for m in reader.messages())
+
+
+def test_bad_messages_are_records_and_the_rest_goes_on(tmp_path: Path) -> None:
+    nan = bytearray(encoder_for("joint_state")(frame(1)))
+    nan[-40:-32] = struct.pack("<d", np.nan)
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.add_topic(TOPIC, INPUT_TYPES["joint_state"])
+        for i, data in enumerate(
+            [encoder_for("joint_state")(frame(0)), b"", bytes(nan), encoder_for("joint_state")(frame(3))]
+        ):
+            bag.write(TOPIC, data, log_time_ns=100 + i)
+    records = list(iter_smpl_frames(tmp_path / "bag"))
+    assert [record.frame is None for record in records] == [False, True, True, False]
+    assert [record.stamp_ns for record in records] == [frame(0).stamp_ns, 101, 102, frame(3).stamp_ns]
+    assert "header of 4 bytes, got 0 bytes" in str(records[1].error)
+    assert "NaN" in str(records[2].error)
+
+
+def test_a_message_received_at_an_impossible_time(tmp_path: Path) -> None:
+    data = encoder_for("multiarray")(frame(0))
+    path = tmp_path / "late.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channel = writer.register_channel(
+            TOPIC, "cdr", writer.register_schema(INPUT_TYPES["multiarray"], "ros2msg", b"")
+        )
+        for time in (2**62, 2**63, 5):
+            writer.add_message(channel, time, data, 0)
+        writer.finish()
+    bag = open_smpl_bag(path)
+    first, last = bag
+    assert "impossible time" in str(first.error)
+    assert last.frame is not None
+    assert "a time that ROS can't hold" in bag.reader.warnings[0]
+
+
+# ------------------------------------------------------------------------------------------------ choosing the topic
+
+
+def test_the_usual_name_decides(tmp_path: Path) -> None:
+    def write(path: Path, topics: list[str]) -> Path:
+        with BagWriter(path) as bag:
+            for topic in topics:
+                bag.add_topic(topic, INPUT_TYPES["joint_state"])
+                bag.write(topic, encoder_for("joint_state")(frame(0)), log_time_ns=1)
+        return path
+
+    assert open_smpl_bag(write(tmp_path / "a", ["/body"])).topic.name == "/body"
+    assert (
+        open_smpl_bag(write(tmp_path / "b", ["/joint_states", "/anna/smpl_params"])).topic.name == "/anna/smpl_params"
+    )
+    two = write(tmp_path / "c", ["/anna/smpl_params", "/ben/smpl_params"])
+    with pytest.raises(BagError, match=r"2 topics could carry the body: /anna.* \(sensor_.*\), /ben.*--topic"):
+        open_smpl_bag(two)
+    assert open_smpl_bag(two, topic="ben/smpl_params").topic.name == "/ben/smpl_params"
+    with pytest.raises(BagError, match=r"no topic /carl; the bag has /anna"):
+        open_smpl_bag(two, topic="/carl")
+    with pytest.raises(BagError, match="doesn't carry std_msgs/msg/Float32MultiArray"):
+        open_smpl_bag(two, topic="/ben/smpl_params", input_type="multiarray")
+    with pytest.raises(BagError, match="no SMPL topic"):
+        open_smpl_bag(two, input_type="multiarray")
+
+
+def test_bags_without_a_body(tmp_path: Path, every_type: Path) -> None:
+    with pytest.raises(BagError, match=r"4 topics could carry the body"):
+        open_smpl_bag(every_type)
+    with pytest.raises(BagError, match=r"/garments \(visualization_msgs/msg/MarkerArray\) doesn't carry a body"):
+        open_smpl_bag(every_type, topic="/garments")
+    with BagWriter(tmp_path / "none") as bag:
+        bag.add_topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
+        bag.write("/diagnostics", encode_diagnostics([], stamp_ns=0), log_time_ns=0)
+    with pytest.raises(BagError, match=r"no SMPL topic; the bag has /diagnostics \(diag.*wanted a topic of std_msgs"):
+        open_smpl_bag(tmp_path / "none")
+    BagWriter(tmp_path / "empty").finish()
+    with pytest.raises(BagError, match="no message in this bag"):
+        open_smpl_bag(tmp_path / "empty")
+
+
+def test_other_encodings_are_named(tmp_path: Path) -> None:
+    with (tmp_path / "json.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema(INPUT_TYPES["multiarray"], "jsonschema", b"{}")
+        writer.add_message(writer.register_channel(TOPIC, "json", schema), 1, b"{}", 1)
+        writer.finish()
+    with pytest.raises(BagError, match="encoded as json; wanted cdr"):
+        open_smpl_bag(tmp_path / "json.mcap")
+
+
+def make_sqlite(path: Path) -> None:
+    path.write_bytes(b"SQLite format 3\0" + bytes(100))
+
+
+def make_sqlite_bag(path: Path) -> None:
+    path.mkdir()
+    metadata = {"storage_identifier": "sqlite3", "relative_file_paths": ["a.db3"], "compression_mode": ""}
+    (path / "metadata.yaml").write_text(yaml.safe_dump({"rosbag2_bagfile_information": metadata}))
+
+
+def make_missing_file_bag(path: Path) -> None:
+    path.mkdir()
+    metadata = {"storage_identifier": "mcap", "relative_file_paths": ["gone.mcap"]}
+    (path / "metadata.yaml").write_text(yaml.safe_dump({"rosbag2_bagfile_information": metadata}))
+
+
+def make_odd_metadata(path: Path) -> None:
+    path.mkdir()
+    (path / "metadata.yaml").write_text("- just a list")
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda _: None, "no such file or directory"),
+        (Path.touch, "an empty file"),
+        (Path.mkdir, "no .mcap file in this directory"),
+        (lambda path: path.write_text("hello, world"), "not an MCAP file; wanted a .mcap file, a rosbag2 directory"),
+        (make_sqlite, "not an MCAP file; convert it with `ros2 bag convert`"),
+        (make_sqlite_bag, "stored as sqlite3 .* only plain mcap is read; convert it"),
+        (make_missing_file_bag, "gone.mcap: can't be opened: No such file"),
+        (make_odd_metadata, "not rosbag2 metadata"),
+    ],
+)
+def test_what_is_no_bag(tmp_path: Path, make: Callable[[Path], Any], message: str) -> None:
+    make(tmp_path / "bag")
+    with pytest.raises(BagError, match=message) as caught:
+        open_smpl_bag(tmp_path / "bag")
+    assert "\n" not in str(caught.value)
+    assert str(tmp_path / "bag") in str(caught.value)
+
+
+# ------------------------------------------------------------------------------------------------ cut and damaged
+
+
+def test_a_bag_cut_anywhere_gives_what_is_before_the_cut(tmp_path: Path) -> None:
+    whole = write_bag(tmp_path / "whole.mcap", chunk_bytes=4096).read_bytes()
+    stamps = [frame(i).stamp_ns for i in range(40)]
+    counts = []
+    for cut in sorted({*range(0, len(whole), 61), *range(len(whole) - 40, len(whole))}):
+        path = tmp_path / "cut.mcap"
+        path.write_bytes(whole[:cut])
+        try:
+            bag = open_smpl_bag(path)
+        except BagError:
+            counts.append(0)
+            continue
+        read = [record.stamp_ns for record in bag]
+        assert read == stamps[: len(read)]
+        # What is cut off the summary isn't missed; what is cut off the data is.
+        assert len(read) == 40 or bag.reader.truncated
+        assert len(read) == bag.message_count
+        counts.append(len(read))
+    assert counts == sorted(counts)
+    assert {0, 40} < set(counts)
+    assert len(set(counts)) > 10
+
+
+def test_a_directory_whose_recording_was_interrupted(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "bag", chunk_bytes=4096)
+    (tmp_path / "bag" / "metadata.yaml").unlink()
+    path.write_bytes(path.read_bytes()[:3000])
+    bag = open_smpl_bag(tmp_path / "bag")
+    assert 0 < len(list(bag)) < 40
+    assert "was the recording interrupted?" in bag.reader.warnings[0]
+
+
+def test_a_damaged_chunk_is_left_out(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "bag.mcap", chunk_bytes=4096)
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    chunk = summary.chunk_indexes[3]
+    data = bytearray(path.read_bytes())
+    data[chunk.chunk_start_offset + chunk.chunk_length - 5] ^= 0xFF
+    path.write_bytes(data)
+    reader = BagReader(path)
+    times = {m.log_time_ns for m in reader.messages()}
+    missing = {frame(i).stamp_ns + 5 for i in range(40)} - times
+    assert missing == {t for t in missing if chunk.message_start_time <= t <= chunk.message_end_time} != set()
+    assert reader.truncated
+    assert f"in the record at byte {chunk.chunk_start_offset}" in reader.warnings[0]
+
+
+@settings(max_examples=400)
+@given(st.data())
+def test_damaged_bags_raise_nothing_else(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
+    folder = tmp_path_factory.getbasetemp()
+    whole = folder / "fuzz.mcap"
+    if not whole.exists():
+        write_bag(whole, count=6, chunk_bytes=2048)
+    content = bytearray(whole.read_bytes())
+    for _ in range(data.draw(st.integers(1, 3))):
+        at = data.draw(st.integers(0, len(content) - 1))
+        new = data.draw(st.one_of(st.binary(min_size=1, max_size=8), st.just(b"\xff" * 8), st.just(bytes(8))))
+        content[at : at + len(new)] = new
+    path = folder / "damaged.mcap"
+    path.write_bytes(content)
+    try:
+        records = list(iter_smpl_frames(path))
+    except BagError as error:
+        records = []
+        message = str(error)
+        assert "\n" not in message
+    assert len(records) <= 6
+
+
+def chunk_record(*, size: int, packed: bytes, compression: bytes = b"zstd") -> bytes:
+    content = struct.pack("<QQQI", 0, 0, size, 0)
+    content += struct.pack("<I", len(compression)) + compression + struct.pack("<Q", len(packed)) + packed
+    return struct.pack("<BQ", 0x06, len(content)) + content
+
+
+@pytest.mark.parametrize(
+    ("record", "message"),
+    [
+        (chunk_record(size=2**60, packed=zstandard.compress(bytes(1000))), "at most 256 are read"),
+        (chunk_record(size=1000, packed=zstandard.compress(bytes(1 << 28))), "unpacks to 1001 bytes where 1000"),
+        (chunk_record(size=1000, packed=b"no zstd"), "zstd can't unpack"),
+        (chunk_record(size=7, packed=b"1234567", compression=b"rot13"), "unknown compression 'rot13'"),
+        (chunk_record(size=7, packed=b"1234567", compression=b""), "7 bytes where a record should start"),
+        (struct.pack("<BQ", 0x06, 2**63), "wants 9223372036854775808 bytes"),
+        (struct.pack("<BQ", 0x05, 3) + b"abc", "a message record of 3 bytes"),
+        (struct.pack("<BQHIQQ", 0x05, 22, 9, 0, 0, 0), "undeclared channel 9"),
+        (struct.pack("<BQHI", 0x03, 6, 1, 2**32 - 1), "a field of 4294967295 bytes where 0 are left"),
+    ],
+)
+def test_hostile_records(tmp_path: Path, record: bytes, message: str) -> None:
+    path = tmp_path / "hostile.mcap"
+    path.write_bytes(b"\x89MCAP0\r\n" + record)
+    tracemalloc.start()
+    with pytest.raises(BagError, match=r"no message in this bag") as caught:
+        open_smpl_bag(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 8 << 20
+    assert message in str(caught.value) or message in "".join(warnings_of(path))
+
+
+def warnings_of(path: Path) -> list[str]:
+    reader = BagReader(path)
+    assert list(reader.messages()) == []
+    return reader.warnings
+
+
+def test_reading_and_writing_stream(tmp_path: Path) -> None:
+    """A bag far larger than a chunk passes through in the memory of a few chunks."""
+    blob = np.random.default_rng(0).bytes(1 << 20)
+    tracemalloc.start()
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.add_topic("/garments", MARKER_ARRAY)
+        for i in range(48):
+            bag.write("/garments", blob, log_time_ns=i)
+    assert sum(len(m.data) for m in BagReader(tmp_path / "bag").messages()) == 48 << 20
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 24 << 20
+
+
+# ------------------------------------------------------------------------------------------------ the writer's errors
+
+
+def test_the_writer_says_what_is_wrong(tmp_path: Path) -> None:
+    bag = BagWriter(tmp_path / "bag")
+    with pytest.raises(BagError, match="no definition of my_msgs/msg/Thing is built in"):
+        bag.add_topic("/thing", "my_msgs/Thing")
+    bag.add_topic("/thing", "my_msgs/Thing", definition="int32 x", type_hash="RIHS01_0")
+    bag.add_topic("/thing", "my_msgs/msg/Thing")
+    with pytest.raises(BagError, match="/thing already carries my_msgs/msg/Thing"):
+        bag.add_topic("/thing", MARKER_ARRAY)
+    with pytest.raises(BagError, match="/other isn't declared"):
+        bag.write("/other", b"", log_time_ns=0)
+    for time in (-1, 2**63):
+        with pytest.raises(BagError, match="a bag's times are nanoseconds"):
+            bag.write("/thing", b"", log_time_ns=time)
+    bag.write("/thing", b"\0\1\0\0", log_time_ns=0)
+    bag.finish()
+    bag.finish()
+    with pytest.raises(BagError, match="the bag is finished"):
+        bag.write("/thing", b"", log_time_ns=0)
+    with pytest.raises(BagError, match="the directory isn't empty"):
+        BagWriter(tmp_path / "bag")
+    assert [t.definition for t in BagReader(tmp_path / "bag").topics] == ["int32 x"]
+
+
+def test_overwriting_touches_nothing_but_a_bag(tmp_path: Path) -> None:
+    file, directory = tmp_path / "a.mcap", tmp_path / "b"
+    for path in (file, directory):
+        write_bag(path, count=3)
+        with pytest.raises(BagError, match=r"choose another path, or overwrite it"):
+            write_bag(path)
+        write_bag(path, count=2, overwrite=True)
+        assert len(list(iter_smpl_frames(path))) == 2
+    (directory / "thesis.tex").touch()
+    with pytest.raises(BagError, match="holds other files than a bag's"):
+        write_bag(directory, overwrite=True)
+    assert len(list(directory.iterdir())) == 3
+
+
+def test_paths_that_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for path in (tmp_path / "file" / "bag", tmp_path / "file" / "bag.mcap"):
+        with pytest.raises(BagError, match=r"can't be written: (Not a directory|File exists)"):
+            BagWriter(path)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/dev/full is Linux's")
+def test_a_full_disk_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "full.mcap").symlink_to("/dev/full")
+    with pytest.raises(BagError, match=r"can't be written: No space left on device"):
+        write_bag(tmp_path / "full.mcap", overwrite=True)
+
+
+def test_an_interrupted_run_leaves_a_whole_bag(tmp_path: Path) -> None:
+    def interrupted() -> None:
+        with BagWriter(tmp_path / "bag") as bag:
+            bag.add_topic(TOPIC, INPUT_TYPES["joint_state"])
+            for i in range(5):
+                bag.write(TOPIC, encoder_for("joint_state")(frame(i)), log_time_ns=i)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    bag = open_smpl_bag(tmp_path / "bag")
+    assert len(list(bag)) == 5
+    assert bag.reader.warnings == []
+
+
+def test_an_interrupt_within_a_write_leaves_what_is_before_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def torn() -> None:
+        with BagWriter(tmp_path / "bag.mcap", chunk_bytes=4096) as bag:
+            bag.add_topic(TOPIC, INPUT_TYPES["joint_state"])
+            for i in range(30):
+                if i == 20:
+                    monkeypatch.setattr(zstandard, "compress", interrupt)
+                bag.write(TOPIC, encoder_for("joint_state")(frame(i)), log_time_ns=i)
+
+    def interrupt(_: bytes) -> bytes:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        torn()
+    monkeypatch.undo()
+    bag = open_smpl_bag(tmp_path / "bag.mcap")
+    assert 15 < len(list(bag)) <= 21
+    assert bag.reader.truncated
+
+
+# ------------------------------------------------------------------------------------------------ the bags we ship
+
+
+@pytest.mark.parametrize(("name", "input_type"), [("walk", "multiarray"), ("reach_squat", "joint_state")])
+def test_shipped_bags(name: str, input_type: str) -> None:
+    bag = open_smpl_bag(BAGS / name)
+    records = list(bag)
+    assert bag.decoder.input_type == input_type
+    assert len(records) == 300
+    frames = [record.frame for record in records if record.frame is not None]
+    assert len(frames) == 300
+    assert np.allclose(np.diff([f.stamp_ns for f in frames]), 1e9 / 30, atol=1)
+    assert any(f.betas.any() for f in frames) == (name == "reach_squat")
+    turns = np.diff([quaternion_angle(f.pose) for f in frames], axis=0)
+    assert np.abs(turns).max() * 30 < 8  # [rad/s]
+    with RosbagsReader(BAGS / name) as reader:
+        assert reader.message_count == 300
+
+
+def quaternion_angle(pose: Any) -> Any:
+    return np.linalg.norm(pose, axis=-1)

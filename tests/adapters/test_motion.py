@@ -1,0 +1,156 @@
+"""AMASS-style files: their three layouts, what they leave out, resampling, and what is refused."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation, Slerp
+
+from msg_adapters import Motion, MotionFileError, quaternion_from_rotvec, read_motion, slerp
+from refu_core import FrameError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+RNG = np.random.default_rng(0)
+T = 12
+
+
+def save(path: Path, **changes: Any) -> Path:
+    arrays: dict[str, Any] = {
+        "poses": RNG.normal(size=(T, 72)),
+        "trans": RNG.normal(size=(T, 3)),
+        "betas": RNG.normal(size=16),
+        "mocap_framerate": 120.0,
+        "gender": "female",
+    }
+    arrays |= changes
+    np.savez(path, **{name: value for name, value in arrays.items() if value is not None})
+    return path
+
+
+@pytest.mark.parametrize("columns", [72, 156, 165])
+def test_layouts(tmp_path: Path, columns: int) -> None:
+    poses, trans = RNG.normal(size=(T, columns)), RNG.normal(size=(T, 3))
+    motion = read_motion(save(tmp_path / "a.npz", poses=poses, trans=trans, gender=b"male"))
+    shared = 24 if columns == 72 else 22
+    assert len(motion) == T
+    np.testing.assert_array_equal(motion.poses[:, :shared].reshape(T, -1), poses[:, : shared * 3].astype(np.float32))
+    assert not motion.poses[:, shared:].any()
+    np.testing.assert_array_equal(motion.transl, trans)
+    assert (motion.fps, motion.gender) == (120.0, "male")
+    frames = list(motion.frames(start_ns=1000))
+    assert [f.stamp_ns for f in frames[:4]] == [1000, 8334333, 16667667, 25001000]
+    np.testing.assert_array_equal(frames[3].pose, motion.poses[3])
+    np.testing.assert_array_equal(frames[3].transl, trans[3])
+
+
+def test_what_may_be_left_out(tmp_path: Path) -> None:
+    changes = {
+        "trans": None,
+        "betas": np.ones(4),
+        "gender": None,
+        "mocap_framerate": None,
+        "mocap_frame_rate": np.array([60]),
+    }
+    motion = read_motion(save(tmp_path / "a.npz", **changes))
+    np.testing.assert_array_equal(motion.betas, [1] * 4 + [0] * 6)
+    assert not motion.transl.any()
+    assert (motion.fps, motion.gender) == (60.0, "neutral")
+    assert not read_motion(save(tmp_path / "b.npz", betas=None)).betas.any()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"poses": None}, "no array 'poses'"),
+        ({"poses": np.zeros((T, 69))}, r"poses must be \(T, 72 \| 156 \| 165\) with T > 0, got \(12, 69\)"),
+        ({"poses": np.zeros((0, 72))}, r"got \(0, 72\)"),
+        ({"poses": np.zeros((T, 24, 3))}, r"got \(12, 24, 3\)"),
+        ({"poses": np.full((T, 72), "x")}, "poses must be numbers"),
+        ({"poses": np.full((T, 72), None)}, "can't be read as .npz: Object arrays cannot be loaded"),
+        ({"trans": np.zeros((T - 1, 3))}, r"trans must be \(12, 3\) like poses, got \(11, 3\)"),
+        ({"betas": np.full(10, np.nan)}, "betas has values that are NaN"),
+        ({"betas": np.zeros((T, 10))}, "betas must be one row"),
+        ({"mocap_framerate": None}, "no frame rate"),
+        ({"mocap_framerate": 0.0}, r"frame rate in \(0, 10000\], got 0"),
+        ({"mocap_framerate": np.nan}, "frame rate"),
+        ({"mocap_framerate": "fast"}, "mocap_framerate must be numbers"),
+    ],
+)
+def test_files_that_are_refused(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+    path = save(tmp_path / "a.npz", **changes)
+    with pytest.raises(MotionFileError, match=message) as caught:
+        read_motion(path)
+    assert str(path) in str(caught.value)
+
+
+def test_other_files(tmp_path: Path) -> None:
+    text = tmp_path / "a.npz"
+    text.write_text("not a zip archive")
+    for path in (tmp_path / "none.npz", tmp_path, text):
+        with pytest.raises(MotionFileError, match="can't be read"):
+            read_motion(path)
+    with pytest.raises(MotionFileError, match="12 frames, at most 5"):
+        read_motion(save(tmp_path / "b.npz"), max_frames=5)
+
+
+def test_every_truncation(tmp_path: Path) -> None:
+    data = save(tmp_path / "a.npz").read_bytes()
+    for cut in range(0, len(data), 97):
+        (tmp_path / "cut.npz").write_bytes(data[:cut])
+        with pytest.raises(MotionFileError):
+            read_motion(tmp_path / "cut.npz")
+
+
+def test_frames_that_are_not_finite_are_known_by_their_error(tmp_path: Path) -> None:
+    poses = np.zeros((T, 72))
+    poses[3, 5] = np.nan
+    poses[4, 5] = 1e300
+    motion = read_motion(save(tmp_path / "a.npz", poses=poses))
+    for index in (3, 4):
+        with pytest.raises(FrameError, match="NaN or infinite"):
+            motion.frame(index)
+    with pytest.raises(MotionFileError, match=r"2 of 12 frames aren't finite \(the first: 3\)"):
+        motion.resampled(30)
+
+
+def test_slerp_is_scipys() -> None:
+    start, end = Rotation.random(50, random_state=1), Rotation.random(50, random_state=2)
+    end = Rotation.concatenate([start[:5], end[5:]])
+    for fraction in (0.0, 0.3, 1.0):
+        ours = slerp(start.as_quat(), -end.as_quat(), np.full(50, fraction))
+        for i, q in enumerate(ours):
+            expected = Slerp([0, 1], Rotation.concatenate([start[i], end[i]]))(fraction)
+            assert (Rotation.from_quat(q) * expected.inv()).magnitude() < 1e-7
+
+
+def test_resampling_ignores_jumps_of_full_turns() -> None:
+    angle = np.linspace(0, 1.5, 31)
+    axis = np.array([0.6, 0, 0.8])
+    poses = np.zeros((31, 24, 3), np.float32)
+    poses[:, 4] = (angle + 2 * np.pi * (np.arange(31) % 2))[:, None] * axis
+    transl = np.stack([angle, angle**2, np.ones(31)], -1)
+    motion = Motion(poses, transl, np.zeros(10, np.float32), fps=60.0)
+    half, double = motion.resampled(30), motion.resampled(120)
+    assert (len(half), len(double), half.fps) == (16, 61, 30)
+    for other, at in ((half, angle[::2]), (double, np.linspace(0, 1.5, 61))):
+        np.testing.assert_allclose(other.poses[:, 4], at[:, None] * axis, atol=1e-5)
+        np.testing.assert_allclose(other.transl[:, 0], at, atol=1e-9)
+    same = motion.resampled(60)
+    q, r = quaternion_from_rotvec(same.poses), quaternion_from_rotvec(motion.poses)
+    np.testing.assert_allclose(np.abs(np.sum(q * r, -1)), 1, atol=1e-6)
+    np.testing.assert_array_equal(same.transl, transl)
+    assert len(Motion(poses[:1], transl[:1], motion.betas, 60.0).resampled(30)) == 1
+    with pytest.raises(MotionFileError, match="frame rate"):
+        motion.resampled(0)
+
+
+def test_recorded_motion(motions: list[Path]) -> None:
+    for path in motions:
+        motion = read_motion(path)
+        resampled = motion.resampled(30)
+        assert abs(len(resampled) / 30 - len(motion) / motion.fps) < 0.1
+        assert sum(1 for _ in resampled.frames()) == len(resampled)
