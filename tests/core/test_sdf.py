@@ -192,13 +192,24 @@ def test_moves_with_the_body(seed: int, shift: float, angle: float) -> None:
 
 
 def test_rebuild_and_refit_answer_alike(body: SmplBody) -> None:
-    points = around(posed(body, 8), 1000, 8)
-    refitted, rebuilt = ExactSdf(body.faces), ExactSdf(body.faces)
-    refitted.update(body.v_template)
-    for sdf in (refitted, rebuilt):
-        sdf.update(posed(body, 8))
-    rebuilt.rebuild()
-    torch.testing.assert_close(refitted.query(points).distance, rebuilt.query(points).distance, atol=1e-7, rtol=0)
+    squat = torch.zeros(1, 24, 3)
+    squat[0, [1, 2, 4, 5], 0] = torch.tensor([-1.9, -1.9, 2.2, 2.2])
+    vertices = body(pose=squat, betas=torch.zeros(1, 10)).vertices[0]
+    points = around(vertices, 2000, 8)
+    once, by_itself, by_hand = (
+        ExactSdf(body.faces, rebuild_distance=torch.inf),
+        ExactSdf(body.faces),
+        ExactSdf(body.faces),
+    )
+    for sdf in (once, by_itself, by_hand):
+        sdf.update(body.v_template)
+        built = sdf.mesh_id
+        sdf.update(body.v_template + 0.01)
+        assert sdf.mesh_id == built
+        sdf.update(vertices)
+    by_hand.rebuild()
+    for sdf in (by_itself, by_hand):
+        torch.testing.assert_close(once.query(points).distance, sdf.query(points).distance, atol=1e-7, rtol=0)
 
 
 def test_no_points_and_satisfies_the_protocol() -> None:
