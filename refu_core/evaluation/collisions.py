@@ -62,8 +62,8 @@ class CollisionChecker:
     """Exact check of garments against one body: set the body once a frame, then check each garment.
 
     Intersections are those of all pairs of triangles, decided in double precision on float32 vertices. Touching counts
-    as intersecting. Triangles that overlap within one plane count only where an edge of another face meets them, which
-    on a closed body there always is.
+    as intersecting; lying in a face's plane doesn't, so a triangle flat on a body face is found only where it reaches
+    the face's border, by the faces beyond.
     """
 
     def __init__(self, body_faces: Any, *, device: str | torch.device = "cpu") -> None:

@@ -59,7 +59,8 @@ def resolve(
         tolerance: Shortfall of the margin that is let pass [m].
         max_displacement: Bound on each vertex's movement [m], all pushes together.
         edges: Pairs of vertices, shape (E, 2), such as a garment template's `edges`: where given, the middles of edges
-            near the skin are checked, too, and both ends of those too close are raised.
+            near the skin are checked, too, and both ends of those too close are raised. That clears the edges which cut
+            a corner; not a limb thinner than it is deep in the garment, around which vertices part to both sides.
     """
     start = sdf.query(points)
     state = _State(points.clone(), start.distance.clone(), points, sdf, margin, tolerance, max_displacement)

@@ -73,7 +73,7 @@ def ball(radius: float = 1.0, *, subdivisions: int = 1, at: tuple[float, float, 
     return mesh
 
 
-@settings(max_examples=25)
+@settings(max_examples=12)
 @given(
     seed=st.integers(0, 2**31),
     shift=st.tuples(*[st.floats(-1.2, 1.2)] * 3),

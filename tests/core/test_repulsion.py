@@ -195,7 +195,7 @@ def test_no_vertex_stays_inside_on_recorded_motion(wearer: Wearer, motions: list
         with np.load(clip) as data:
             poses = torch.tensor(data["poses"], dtype=torch.float32).view(-1, 1, 24, 3)
         poses[:, :, 0] = 0
-        shares += [wearer.assert_resolved(poses[len(poses) * k // 3], torch.zeros(1, 10)) for k in range(3)]
+        shares += [wearer.assert_resolved(poses[len(poses) * k // 4], torch.zeros(1, 10)) for k in (1, 3)]
     assert np.mean(shares) > 0.8  # or the claim is about too little of the garment
 
 
