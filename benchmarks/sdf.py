@@ -2,8 +2,8 @@
 
     python benchmarks/sdf.py [--garment tshirt-male] [--rounds 15] [--poses 6] [--json FILE]
 
-Every method gets the same poses, in turn, so that a busy machine slows all alike. Each answers for every vertex of a new
-pose, its preparation for the pose included. The ratio is to Warp's refit and point query, built once in the rest pose.
+Every method gets the same poses, in turn, so that a busy machine slows all alike. Each answers for every vertex of a
+new pose, its preparation for the pose included. The ratio is to Warp's refit and query, built once in the rest pose.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Exact collisions, self-contact of the body, and the paper's metrics. Pictures are in `refu_core.evaluation.render`."""
+"""Exact collisions, the body's self-contact, and the paper's metrics; pictures are in `refu_core.evaluation.render`."""
 
 from refu_core.evaluation.collisions import CollisionChecker as CollisionChecker
 from refu_core.evaluation.collisions import Collisions as Collisions
