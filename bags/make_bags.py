@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
@@ -23,9 +24,7 @@ from msg_adapters import INPUT_TYPES, SMPL_JOINTS, BagWriter, encoder_for
 from refu_core import SmplFrame, load_body
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from numpy.typing import NDArray
+    from collections.abc import Callable, Mapping, Sequence
 
 FPS = 30
 SECONDS = 10
@@ -34,7 +33,7 @@ TOPIC = "/smpl_params"
 CHUNK_BYTES = 16 << 10  # small chunks: of a bag that was cut short, what is before the cut can still be read
 CONTACT_M = 0.004  # how near the floor a sole counts as standing on it
 LEG_M = 0.85
-Curve = NDArray[np.float64] if TYPE_CHECKING else object
+Curve = NDArray[np.float64]
 
 # Angles of a leg over one gait cycle from heel strike to heel strike [fraction, degrees]: ordinary level walking.
 HIP_FLEXION = [(0, 26), (0.12, 23), (0.30, 6), (0.50, -10), (0.62, -2), (0.75, 20), (0.87, 30), (1, 26)]
@@ -159,11 +158,10 @@ def reach_squat_angles(t: Curve, abduction: Curve) -> Angles:
     return angles
 
 
-def gait(knots: list[tuple[float, float]], cycle: Curve) -> Curve:
+def gait(knots: Sequence[tuple[float, float]], cycle: Curve) -> Curve:
     """A periodic curve [degrees] through `knots`, at fractions of the cycle."""
     at, value = np.array(knots, dtype=np.float64).T
-    curve: Curve = CubicSpline(at, value, bc_type="periodic")(cycle)
-    return curve
+    return np.asarray(CubicSpline(at, value, bc_type="periodic")(cycle))
 
 
 def ease(name: str, t: Curve) -> Curve:
@@ -207,7 +205,7 @@ def write_bag(path: Path, *, input_type: str, pose: NDArray[np.float64], betas: 
         bag.add_topic(TOPIC, INPUT_TYPES[input_type])  # type: ignore[index]
         for i in range(len(pose)):
             stamp_ns = START_NS + round(i * 1e9 / FPS)
-            frame = SmplFrame(pose[i].round(6), betas=betas, transl=transl[i], stamp_ns=stamp_ns)
+            frame = SmplFrame(pose[i].round(6), betas=betas.astype(np.float32), transl=transl[i], stamp_ns=stamp_ns)
             bag.write(TOPIC, encode(frame), log_time_ns=stamp_ns)
 
 

@@ -24,7 +24,8 @@ HEADER_BYTES = 4
 LITTLE_ENDIAN_HEADER = b"\x00\x01\x00\x00"
 NS_PER_S = 1_000_000_000
 _BYTE_ORDERS = {0: ">", 1: "<"}
-_MAX_TRAILING = 3  # RTPS pads payloads to a multiple of 4
+# RTPS pads payloads to a multiple of 4; rclpy's serialize_message leaves up to 12 unused bytes after empty sequences.
+_MAX_TRAILING = 15
 
 
 class CdrReader:
@@ -105,7 +106,7 @@ class CdrReader:
         return int(seconds) * NS_PER_S + int(nanoseconds)
 
     def finish(self) -> None:
-        """The message must end here, but for up to 3 bytes of padding."""
+        """The message must end here, but for a few bytes of padding."""
         if self.remaining > _MAX_TRAILING:
             msg = f"{self.remaining} bytes follow the message's last field; is it of another type?"
             raise DecodeError(msg)

@@ -104,7 +104,7 @@ def _smpl_poses(poses: NDArray[Any], path: Path) -> NDArray[np.float32]:
         raise MotionFileError(msg)
     n = N_JOINTS if poses.shape[1] == N_JOINTS * 3 else _BODY_JOINTS
     result = np.zeros((len(poses), N_JOINTS, 3), np.float32)
-    with np.errstate(over="ignore"):  # becomes inf, which the frame refuses
+    with np.errstate(over="ignore", invalid="ignore"):  # becomes inf or NaN, which the frame refuses
         result[:, :n] = poses[:, : n * 3].reshape(len(poses), n, 3)
     return result
 

@@ -160,7 +160,7 @@ class BagReader:
         Raises `BagError` when a file can't be read any more, or a chunk's compression isn't installed.
         """
         for path in self._files:
-            catalogue = _Catalogue()
+            catalogue, _ = self._summary(path)
             for message in self._file_messages(path, catalogue):
                 channel = catalogue.channels.get(message.channel_id)
                 if channel is None:
@@ -176,7 +176,8 @@ class BagReader:
                         data=bytes(message.data),
                     )
 
-    def _file_topics(self, path: Path) -> dict[str, TopicInfo]:
+    def _summary(self, path: Path) -> tuple[_Catalogue, dict[int, int] | None]:
+        """What the file's end says of its channels, and how many messages each has (None: it doesn't)."""
         catalogue = _Catalogue()
         counts: dict[int, int] | None = None
         with _mcap.open_mcap(path) as file:
@@ -188,6 +189,10 @@ class BagReader:
                     counts = _mcap.parse_message_counts(content)
         except _mcap.DamageError as damage:
             self._damage(path, damage)
+        return catalogue, counts
+
+    def _file_topics(self, path: Path) -> dict[str, TopicInfo]:
+        catalogue, counts = self._summary(path)
         if counts is None or not catalogue.channels.keys() >= counts.keys():
             counts = {}
             for message in self._file_messages(path, catalogue):

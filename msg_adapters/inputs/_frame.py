@@ -5,6 +5,8 @@ from __future__ import annotations
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from msg_adapters.cdr import NS_PER_S
 from msg_adapters.errors import DecodeError
 from refu_core.errors import FrameError
@@ -20,7 +22,8 @@ if TYPE_CHECKING:
 def decoding(message_type: str) -> Iterator[None]:
     """Every error of a message's content becomes a `DecodeError` that names the message's type."""
     try:
-        yield
+        with np.errstate(invalid="ignore"):  # signalling NaNs warn when they are cast; the frame refuses all NaNs
+            yield
     except (DecodeError, FrameError) as error:
         msg = f"{message_type}: {error}"
         raise DecodeError(msg) from None

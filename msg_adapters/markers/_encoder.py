@@ -186,10 +186,12 @@ class MarkerArrayEncoder:
             msg = f"{mesh.ns}: wanted vertices ({mesh.n_vertices}, 3) of float32 or float64, "
             msg += f"got {vertices.shape} of {vertices.dtype}"
             raise EncodeError(msg)
-        for out, column in enumerate(self._columns):
-            np.add(vertices[:, column], offset[column], out=slot.placed[:, out], dtype=np.float64)
-        # A sum is finite only if every term is: one pass, nothing allocated.
-        if not np.isfinite(slot.placed.sum()):
+        with np.errstate(invalid="ignore", over="ignore"):
+            for out, column in enumerate(self._columns):
+                np.add(vertices[:, column], offset[column], out=slot.placed[:, out], dtype=np.float64)
+            # A sum is finite only if every term is: one pass, nothing allocated.
+            total = slot.placed.sum()
+        if not np.isfinite(total):
             bad = int(np.count_nonzero(~np.isfinite(slot.placed).all(axis=1)))
             msg = f"{mesh.ns}: {bad} of {mesh.n_vertices} vertices are NaN or infinite; viewers would drop the marker"
             raise EncodeError(msg)
@@ -206,7 +208,7 @@ class MarkerArrayEncoder:
         if slot.colors is None:
             return
         rgba = np.asarray(colors, dtype=np.float32)
-        if rgba.shape != (mesh.n_vertices, 4) or not np.isfinite(rgba.sum()):
+        if rgba.shape != (mesh.n_vertices, 4) or not np.isfinite(rgba).all():
             msg = f"{mesh.ns}: wanted finite vertex colours ({mesh.n_vertices}, 4), got {rgba.shape}"
             raise EncodeError(msg)
         np.take(rgba, slot.corners, axis=0, out=slot.colors, mode="clip")

@@ -201,6 +201,8 @@ def test_vertices_that_are_not_finite_are_refused(value: float, dtype: type) -> 
         encoder.encode([vertices], stamp_ns=0)
     with pytest.raises(EncodeError, match="3 of 3 vertices"):
         encoder.encode([np.zeros((3, 3))], stamp_ns=0, transl=[0, value, 0])
+    with pytest.raises(EncodeError, match="2 of 3 vertices"):
+        encoder.encode([np.diag([value, -value, 0])], stamp_ns=0)
 
 
 @pytest.mark.parametrize(
