@@ -161,12 +161,13 @@ def reach_squat_angles(t: Curve, abduction: Curve) -> Angles:
 def gait(knots: Sequence[tuple[float, float]], cycle: Curve) -> Curve:
     """A periodic curve [degrees] through `knots`, at fractions of the cycle."""
     at, value = np.array(knots, dtype=np.float64).T
-    return np.asarray(CubicSpline(at, value, bc_type="periodic")(cycle))
+    curve: Curve = CubicSpline(at, value, bc_type="periodic")(cycle)
+    return curve
 
 
 def ease(name: str, t: Curve) -> Curve:
     """One angle of the key poses [degrees], from key to key with the smoothness of human reaching (minimum jerk)."""
-    at = np.array([time for time, _ in KEY_POSES])
+    at = np.array([time for time, _ in KEY_POSES], dtype=np.float64)
     value = np.array([pose.get(name, 0.0) for _, pose in KEY_POSES])
     i = np.clip(np.searchsorted(at, t, side="right") - 1, 0, len(at) - 2)
     s = np.clip((t - at[i]) / (at[i + 1] - at[i]), 0, 1)
@@ -194,7 +195,8 @@ def grounded_translation(pose: NDArray[np.float64], betas: NDArray[np.float64]) 
     transl = np.zeros((len(pose), 3))
     transl[1:] = -np.cumsum(gaussian_filter1d(slip, 0.8, axis=0, mode="nearest"), axis=0)
     transl[:, 1] = gaussian_filter1d(-soles[:, :, 1].min(axis=1), 0.8, mode="nearest")
-    return transl.round(6)
+    rounded: NDArray[np.float64] = transl.round(6)
+    return rounded
 
 
 def write_bag(path: Path, *, input_type: str, pose: NDArray[np.float64], betas: NDArray[np.float64]) -> None:
