@@ -1,0 +1,1 @@
+"""What the asset builders share; needed only to rebuild the files of `refu_core/assets`."""

