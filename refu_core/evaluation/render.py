@@ -38,10 +38,11 @@ GARMENT_COLOURS: dict[str, tuple[float, float, float]] = {
 }
 """sRGB colours of the built-in garments."""
 
-_SUN_RAYS, _SKY_RAYS = 12, 96
+_SUN_RAYS, _SKY_RAYS = 40, 96
 _SUN_SPREAD = 0.012  # 1 - cos of the disc's half angle: 9 degrees, an overcast sun
 _SKY_REACH = 0.8  # [m] what is farther off doesn't dim the sky
-_GROUND_CELLS = 128
+_COVERED = 0.3  # share of the sky under which a vertex counts as covered
+_GROUND_CELLS = 112
 _CREASE = math.cos(math.radians(55.0))
 
 
@@ -206,24 +207,27 @@ def render(
     mesh = wp.Mesh(array(vertices, wp.vec3), faces_wp)
 
     def light(points: NDArray[np.float32], normals: NDArray[np.float32]) -> tuple[Any, Any]:
-        sun, sky = (wp.zeros(len(points), dtype=float, device=device) for _ in range(2))
+        sun, sky = (wp.zeros(len(points), dtype=wp.float32, device=device) for _ in range(2))
         rays = [vec3(to_sun), _SUN_SPREAD, _SUN_RAYS, _SKY_RAYS, _SKY_REACH]
         inputs = [mesh.id, array(points, wp.vec3), array(normals, wp.vec3), *rays]
         wp.launch(shading.light_kernel, dim=len(points), inputs=inputs, outputs=[sun, sky], device=device)
         return sun, sky
 
+    sun, sky = (x.numpy() for x in light(vertices, vertex_normals))
+    on_vertices = [array(_uncovered(x, sky < _COVERED, faces), wp.float32) for x in (sun, sky)]
     low, high = vertices.min(0), vertices.max(0)
     ground_y = float(low[1]) if stage.ground_height is None else stage.ground_height
     # The grid reaches as far as the shadow does; beyond it the ground lies in full light.
     shadow = np.abs(to_sun[[0, 2]] / max(to_sun[1], 0.2)) * max(float(high[1]) - ground_y, 0.0)
     grid_low = low[[0, 2]] - shadow - _SKY_REACH / 2
-    step = float((high[[0, 2]] + shadow + _SKY_REACH / 2 - grid_low).max()) / (_GROUND_CELLS - 1)
+    cells = _GROUND_CELLS if stage.show_ground else 2
+    step = float((high[[0, 2]] + shadow + _SKY_REACH / 2 - grid_low).max()) / (cells - 1)
     centre = (low[[0, 2]] + high[[0, 2]]) / 2
     radius = 3.0 * float(np.linalg.norm(high - low)) if stage.show_ground else 0.0
-    cells = np.stack(np.meshgrid(*[np.arange(_GROUND_CELLS)] * 2, indexing="ij"), -1).reshape(-1, 2) * step + grid_low
-    ground = np.stack([cells[:, 0], np.full(len(cells), ground_y), cells[:, 1]], 1).astype(np.float32)
+    grid = np.stack(np.meshgrid(*[np.arange(cells)] * 2, indexing="ij"), -1).reshape(-1, 2) * step + grid_low
+    ground = np.stack([grid[:, 0], np.full(len(grid), ground_y), grid[:, 1]], 1).astype(np.float32)
     upward = np.broadcast_to(np.array([0, 1, 0], np.float32), ground.shape)
-    ground_light = [x.reshape((_GROUND_CELLS, _GROUND_CELLS)) for x in light(ground, upward)]
+    ground_light = [x.reshape((cells, cells)) for x in light(ground, upward)]
 
     image = wp.zeros((height, width), dtype=wp.vec3, device=device)
     wp.launch(
@@ -234,7 +238,7 @@ def render(
             faces_wp,
             array(scene.colours, wp.vec3),
             array(corner_normals.reshape(-1, 3), wp.vec3),
-            *light(vertices, vertex_normals),
+            *on_vertices,
             *ground_light,
             wp.vec2(float(grid_low[0]), float(grid_low[1])),
             step,
@@ -316,6 +320,23 @@ def _normals(
     sharp = np.einsum("fck,fk->fc", corners, flat) < _CREASE
     corners[sharp] = np.broadcast_to(flat[:, None], corners.shape)[sharp]
     return corners.astype(np.float32), smooth.astype(np.float32)
+
+
+def _uncovered(light: NDArray[np.float32], covered: NDArray[np.bool_], faces: NDArray[np.int64]) -> NDArray[np.float32]:
+    """Light of the vertices, shape (V,), where those that cloth covers take that of their uncovered neighbours.
+
+    Or the darkness under a hem would spread beyond it, into every face that the hem crosses.
+    """
+    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    result = light.astype(np.float64)
+    for _ in range(2):
+        known = ~covered[edges[:, 1]]
+        count = np.bincount(edges[known, 0], minlength=len(light))
+        total = np.bincount(edges[known, 0], result[edges[known, 1]], len(light))
+        filled = covered & (count > 0)
+        result[filled] = total[filled] / count[filled]
+        covered = covered & ~filled
+    return result.astype(np.float32)
 
 
 def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
