@@ -16,7 +16,7 @@ from refu_core.body import RigidTransforms, SmplBody, load_body
 from refu_core.errors import GarmentError, RefuError
 from refu_core.frames import SmplFrame
 from refu_core.garments import N_STYLES, GarmentTemplate, load_garment
-from refu_core.repulsion import DEFAULT_MARGIN, resolve
+from refu_core.repulsion import DEFAULT_MARGIN, Limbs, resolve
 from refu_core.sdf import ExactSdf
 
 if TYPE_CHECKING:
@@ -95,6 +95,7 @@ class _Wearable:
 
     template: GarmentTemplate
     backbone: Backbone
+    limbs: Limbs
     faces: NDArray[np.int64]
 
 
@@ -164,7 +165,12 @@ class GarmentPipeline:
             raise GarmentError(msg)
         body = load_body(worn_by.pop(), device=torch_device)
         wearables = {
-            name: _Wearable(t, load_backbone(backbone, name, device=torch_device), t.faces.cpu().numpy())
+            name: _Wearable(
+                t,
+                load_backbone(backbone, name, device=torch_device),
+                Limbs.of(body.weights, body.faces, t.weights, t.faces),
+                t.faces.cpu().numpy(),
+            )
             for name, t in templates.items()
         }
         gamma = None if style is None else _style(style, torch_device)
@@ -228,7 +234,9 @@ class GarmentPipeline:
         for name, wearable in self._wearables.items():
             vertices, counts = raw[name], GarmentStats()
             if self._sdf is not None:
-                done = resolve(vertices, self._sdf, margin=self.margin, edges=wearable.template.edges)
+                done = resolve(
+                    vertices, self._sdf, margin=self.margin, edges=wearable.template.edges, limbs=wearable.limbs
+                )
                 vertices = done.vertices
                 counts = GarmentStats(done.n_inside, done.n_pushed, done.n_unresolved, done.max_depth)
             meshes[name] = GarmentMesh(vertices.cpu().numpy(), raw[name].cpu().numpy(), wearable.faces, frame.transl)

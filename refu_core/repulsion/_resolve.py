@@ -7,8 +7,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from refu_core.repulsion._limbs import Limbs
 from refu_core.repulsion._unit import DEFAULT_MARGIN, MAX_DISPLACEMENT, repulse
 from refu_core.sdf import BodySdf, SdfSample
+
+_BUMP = 0.012
+"""Depth up to which a vertex may leave a foreign limb on its far side [m]: cloth follows a bump of that height."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +32,7 @@ class Resolution:
     max_depth: float
     """Depth of the deepest vertex before [m], 0 where none was inside."""
     n_unresolved: int
-    """Vertices still inside: held between touching limbs, or deeper than the bound on displacements."""
+    """Vertices still inside, left where they were: between limbs that intersect, or deeper than they may move."""
 
 
 @torch.no_grad()
@@ -42,13 +46,15 @@ def resolve(
     tolerance: float = 2e-4,
     max_displacement: float = MAX_DISPLACEMENT,
     edges: Tensor | None = None,
+    limbs: Limbs | None = None,
 ) -> Resolution:
     """Pushes garment vertices to f ≥ `margin`, and looks again at those it pushed. Not differentiable.
 
     One push along the gradient (the paper's Eq. refu) can end inside another part of the body: in an armpit, between
     the thighs. So the pushed vertices, and no others, are asked again and pushed again while they are closer than
     `margin - tolerance`. Where limbs leave less room than twice the margin a vertex would be thrown to and fro: a push
-    against the last one goes half as far, and the best position found is kept.
+    against the last one goes half as far, and the best position found is kept. A vertex for which none is outside stays
+    where it was: cloth between limbs that intersect is as smooth as the backbone left it.
 
     Args:
         points: Garment vertices [m], shape (N, 3), in the frame of the body last given to `sdf`.
@@ -60,14 +66,25 @@ def resolve(
         max_displacement: Bound on each vertex's movement [m], all pushes together.
         edges: Pairs of vertices, shape (E, 2), such as a garment template's `edges`: where given, the middles of edges
             near the skin are checked, too, and both ends of those too close are raised. That clears the edges which cut
-            a corner; not a limb thinner than it is deep in the garment, around which vertices part to both sides.
+            a corner.
+        limbs: Where given, a vertex that the gradient would take out on the far side of a limb it doesn't lie on is
+            moved towards its own skin instead, so that an arm in the flank dents a shirt and doesn't tear it.
     """
     start = sdf.query(points)
     state = _State(points.clone(), start.distance.clone(), points, sdf, margin, tolerance, max_displacement)
     rows = torch.nonzero(start.distance < margin)[:, 0]
-    first = SdfSample(start.distance[rows], start.gradient[rows])
+    first = start.rows(rows)
+    rounds = 0
+    if limbs is not None and first.face is not None and len(rows):
+        outward = limbs.outward(points)
+        crossing = limbs.crosses(rows, first.face, first.gradient, outward)
+        rounds += _retreat(state, rows[crossing], outward, limbs, max_pushes)
+        kept = torch.nonzero(~crossing)[:, 0]
+        rows, first = rows[kept], first.rows(kept)
     alpha = scale[rows] if isinstance(scale, Tensor) and scale.ndim else scale
-    rounds = _push(state, rows, first, alpha, max_pushes)
+    rounds += _push(state, rows, first, alpha, max_pushes)
+    stuck = state.distance < 0
+    state.vertices[stuck] = points[stuck]
     if edges is not None:
         rounds += _raise_edges(state, edges, max_pushes)
     vertices, distance = state.vertices, state.distance
@@ -120,9 +137,35 @@ def _push(state: _State, rows: Tensor, sample: SdfSample, scale: float | Tensor,
         state.keep_better(rows, here, sample.distance)
         unclear = torch.nonzero(sample.distance < state.margin - state.tolerance)[:, 0]
         rows, here, last = rows[unclear], here[unclear], last[unclear]
-        sample = SdfSample(sample.distance[unclear], sample.gradient[unclear])
+        sample = sample.rows(unclear)
         push = torch.where((last * sample.gradient).sum(-1) < 0, 0.5, 1.0)
     return max_pushes
+
+
+def _retreat(state: _State, rows: Tensor, outward: Tensor, limbs: Limbs, max_steps: int) -> int:
+    """Moves `rows` against `outward` (N, 3) out of a limb; returns the rounds it took."""
+    start_distance = state.distance.clone()
+    here, distance = state.vertices[rows], start_distance[rows]
+    for round_ in range(max_steps):
+        if not len(rows):
+            return round_
+        # No surface is nearer than |f|, so a step of |f| (and the margin) can't jump over the room that is sought.
+        here = state.bounded(here - (state.margin - distance)[:, None] * outward[rows], rows)
+        sample = state.sdf.query(here)
+        distance = sample.distance
+        state.keep_better(rows, here, distance)
+        unclear = torch.nonzero(distance < state.margin - state.tolerance)[:, 0]
+        rows, here, distance = rows[unclear], here[unclear], distance[unclear]
+    # The room may lie a little aside of the way that was gone: the last steps follow the gradient.
+    sample = state.sdf.query(state.vertices[rows])
+    assert sample.face is not None  # limbs are used with distances to faces only
+    near_side = torch.nonzero(~limbs.crosses(rows, sample.face, sample.gradient, outward))[:, 0]
+    rounds = max_steps + 1 + _push(state, rows[near_side], sample.rows(near_side), 1.0, max_steps)
+    # No room between limb and skin: out on the far side after all, where that is a bump and not a tear.
+    stuck = rows[state.distance[rows] < 0]
+    shallow = stuck[start_distance[stuck] > -_BUMP]
+    state.vertices[shallow], state.distance[shallow] = state.origin[shallow], start_distance[shallow]
+    return rounds + _push(state, shallow, state.sdf.query(state.vertices[shallow]), 1.0, max_steps)
 
 
 def _raise_edges(state: _State, edges: Tensor, max_rounds: int) -> int:
@@ -132,7 +175,8 @@ def _raise_edges(state: _State, edges: Tensor, max_rounds: int) -> int:
     vertices further off, as only a finger does.
     """
     wanted = 0.5 * state.margin
-    low = edges[state.distance[edges].amin(dim=1) < state.margin + state.tolerance]
+    closer = state.distance[edges].amin(dim=1)
+    low = edges[(closer < state.margin + state.tolerance) & (closer >= 0)]
     for round_ in range(max_rounds):
         middle = state.sdf.query(state.vertices[low].mean(dim=1))
         is_low = middle.distance < wanted

@@ -145,10 +145,10 @@ class ExactSdf:
         assert self._vertices is not None  # _search has seen to it
         tracked = torch.is_grad_enabled() and (points.requires_grad or self._vertices.requires_grad)
         if not tracked and points.dtype == torch.float32:
-            return SdfSample(distance, gradient)
+            return SdfSample(distance, gradient, face)
         corners = self._vertices.to(points)[self.faces.long()[face.long()]]
         found = Feature(feature, normal.to(points), distance.sign().to(points), barycentrics.to(points))
-        return signed_distance(points, corners, found)
+        return signed_distance(points, corners, found)._replace(face=face)
 
     def closest(self, points: Tensor, *, max_distance: float = math.inf) -> ClosestPoints:
         """The closest point of the body to each of `points` [m], shape (N, 3), where one is within `max_distance` [m].

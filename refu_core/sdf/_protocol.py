@@ -14,6 +14,13 @@ class SdfSample(NamedTuple):
     """Distance to the body's surface, negative inside [m], shape (N,)."""
     gradient: Tensor
     """Unit direction in which the distance grows, shape (N, 3)."""
+    face: Tensor | None = None
+    """Closest face of the body, shape (N,), where the distance is to faces."""
+
+    def rows(self, index: Tensor) -> SdfSample:
+        """The sample at some of the points."""
+        face = None if self.face is None else self.face[index]
+        return SdfSample(self.distance[index], self.gradient[index], face)
 
 
 @runtime_checkable

@@ -1,0 +1,56 @@
+"""Which limb a garment vertex lies on, so that another limb can't pull the garment through itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+_LIMBS: tuple[tuple[int, ...], ...] = (
+    (0, 3, 6, 9, 12, 13, 14, 15),  # trunk and head
+    (16, 18, 20, 22),  # left arm
+    (17, 19, 21, 23),  # right arm
+    (1, 2, 4, 5, 7, 8, 10, 11),  # both legs: a skirt lies on either
+)
+"""SMPL joints of each limb."""
+_OWN = 0.02
+"""A vertex lies on every limb that has more than this of its skinning weight: around the armpit, on trunk and arm."""
+
+
+@dataclass(frozen=True, eq=False)
+class Limbs:
+    """The limbs of a body's faces and of a garment's vertices."""
+
+    of_face: Tensor
+    """Limb of each body face, int64, shape (F,)."""
+    own: Tensor
+    """Which limbs each garment vertex lies on, bool, shape (N, L)."""
+    faces: Tensor
+    """The garment's faces, counter-clockwise from outside, shape (G, 3)."""
+
+    @classmethod
+    def of(cls, body_weights: Tensor, body_faces: Tensor, garment_weights: Tensor, garment_faces: Tensor) -> Limbs:
+        """From the skinning weights of body (V, 24) and garment (N, 24) and their faces (F, 3) and (G, 3)."""
+        groups = body_weights.new_zeros(24, len(_LIMBS))
+        for limb, joints in enumerate(_LIMBS):
+            groups[list(joints), limb] = 1
+        of_face = (body_weights @ groups)[body_faces].sum(1).argmax(1)
+        return cls(of_face, garment_weights @ groups > _OWN, garment_faces)
+
+    def outward(self, points: Tensor) -> Tensor:
+        """Unit normals of the garment [m], away from the skin it lies on, shape (N, 3), for its vertices (N, 3)."""
+        a, b, c = points[self.faces].unbind(1)
+        normal = torch.linalg.cross(b - a, c - a)
+        summed = torch.zeros_like(points).index_add_(0, self.faces.T.reshape(-1), normal.repeat(3, 1))
+        return torch.nn.functional.normalize(summed, dim=-1)
+
+    def crosses(self, rows: Tensor, body_face: Tensor, gradient: Tensor, outward: Tensor) -> Tensor:
+        """Whether a push along `gradient` (R, 3) would take vertices `rows` (R,) out through a limb they don't lie on.
+
+        `body_face` (R,) is each one's closest face. Between the skin it lies on and another limb, a garment leaves the
+        other limb on the near side, towards its own skin. The gradient points out on the far side where a limb is thin
+        (a hand, a forearm): half the vertices would follow it, and the cloth between them be torn around the limb.
+        """
+        foreign = ~self.own[rows, self.of_face[body_face.long()]]
+        return foreign & ((gradient * outward[rows]).sum(-1) > 0)
