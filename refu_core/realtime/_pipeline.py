@@ -166,10 +166,7 @@ class GarmentPipeline:
         body = load_body(worn_by.pop(), device=torch_device)
         wearables = {
             name: _Wearable(
-                t,
-                load_backbone(backbone, name, device=torch_device),
-                Limbs.of(body.weights, body.faces, t.weights, t.faces),
-                t.faces.cpu().numpy(),
+                t, load_backbone(backbone, name, device=torch_device), _limbs(body, t), t.faces.cpu().numpy()
             )
             for name, t in templates.items()
         }
@@ -256,6 +253,13 @@ def _dress(
     if displacement is not None:
         unposed = unposed + displacement
     return template.pose(unposed, transforms)
+
+
+def _limbs(body: SmplBody, garment: GarmentTemplate) -> Limbs:
+    rest = ExactSdf(body.faces, device=body.device)
+    rest.update(body.v_template)
+    clearance = rest.query(garment.v_template).distance
+    return Limbs.of(body.weights, body.faces, garment.weights, garment.faces, clearance=clearance)
 
 
 def _device(name: str) -> torch.device:

@@ -16,6 +16,8 @@ _LIMBS: tuple[tuple[int, ...], ...] = (
 """SMPL joints of each limb."""
 _OWN = 0.02
 """A vertex lies on every limb that has more than this of its skinning weight: around the armpit, on trunk and arm."""
+_SIDEWAYS = -0.3
+"""Cosine between push and outward normal above which a push leads around a limb, and no longer back from it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,15 +30,26 @@ class Limbs:
     """Which limbs each garment vertex lies on, bool, shape (N, L)."""
     faces: Tensor
     """The garment's faces, counter-clockwise from outside, shape (G, 3)."""
+    clearance: Tensor
+    """How far off the skin the garment is cut [m], shape (N,): room that it can give way into."""
 
     @classmethod
-    def of(cls, body_weights: Tensor, body_faces: Tensor, garment_weights: Tensor, garment_faces: Tensor) -> Limbs:
-        """From the skinning weights of body (V, 24) and garment (N, 24) and their faces (F, 3) and (G, 3)."""
+    def of(
+        cls,
+        body_weights: Tensor,
+        body_faces: Tensor,
+        garment_weights: Tensor,
+        garment_faces: Tensor,
+        *,
+        clearance: Tensor,
+    ) -> Limbs:
+        """From the skinning weights of body (V, 24) and garment (N, 24), their faces (F, 3) and (G, 3), and the
+        garment's distance from the body in the rest pose [m], shape (N,)."""
         groups = body_weights.new_zeros(24, len(_LIMBS))
         for limb, joints in enumerate(_LIMBS):
             groups[list(joints), limb] = 1
         of_face = (body_weights @ groups)[body_faces].sum(1).argmax(1)
-        return cls(of_face, garment_weights @ groups > _OWN, garment_faces)
+        return cls(of_face, garment_weights @ groups > _OWN, garment_faces, clearance.clamp_min(0.0))
 
     def outward(self, points: Tensor) -> Tensor:
         """Unit normals of the garment [m], away from the skin it lies on, shape (N, 3), for its vertices (N, 3)."""
@@ -53,4 +66,4 @@ class Limbs:
         (a hand, a forearm): half the vertices would follow it, and the cloth between them be torn around the limb.
         """
         foreign = ~self.own[rows, self.of_face[body_face.long()]]
-        return foreign & ((gradient * outward[rows]).sum(-1) > 0)
+        return foreign & ((gradient * outward[rows]).sum(-1) > _SIDEWAYS)

@@ -11,8 +11,8 @@ from refu_core.repulsion._limbs import Limbs
 from refu_core.repulsion._unit import DEFAULT_MARGIN, MAX_DISPLACEMENT, repulse
 from refu_core.sdf import BodySdf, SdfSample
 
-_BUMP = 0.012
-"""Depth up to which a vertex may leave a foreign limb on its far side [m]: cloth follows a bump of that height."""
+_BUMP = 0.004
+"""Depth up to which a vertex may leave another limb on its far side [m]: a bump, where more would be a tear."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,8 +79,11 @@ def resolve(
         outward = limbs.outward(points)
         crossing = limbs.crosses(rows, first.face, first.gradient, outward)
         rounds += _retreat(state, rows[crossing], outward, limbs, max_pushes)
-        kept = torch.nonzero(~crossing)[:, 0]
-        rows, first = rows[kept], first.rows(kept)
+        # Those without room, but not deep: out on the far side after all.
+        crossing &= (state.distance[rows] >= 0) | (first.distance <= -_BUMP)
+        others = torch.nonzero(~crossing)[:, 0]
+        rows, first = rows[others], first.rows(others)
+        state.vertices[rows], state.distance[rows] = points[rows], first.distance
     alpha = scale[rows] if isinstance(scale, Tensor) and scale.ndim else scale
     rounds += _push(state, rows, first, alpha, max_pushes)
     stuck = state.distance < 0
@@ -143,29 +146,22 @@ def _push(state: _State, rows: Tensor, sample: SdfSample, scale: float | Tensor,
 
 
 def _retreat(state: _State, rows: Tensor, outward: Tensor, limbs: Limbs, max_steps: int) -> int:
-    """Moves `rows` against `outward` (N, 3) out of a limb; returns the rounds it took."""
-    start_distance = state.distance.clone()
-    here, distance = state.vertices[rows], start_distance[rows]
+    """Moves `rows` against `outward` (N, 3) out of a limb, as far as their clearance; returns the rounds it took."""
+    here, distance = state.vertices[rows], state.distance[rows]
+    way = torch.zeros_like(distance)
     for round_ in range(max_steps):
         if not len(rows):
             return round_
         # No surface is nearer than |f|, so a step of |f| (and the margin) can't jump over the room that is sought.
-        here = state.bounded(here - (state.margin - distance)[:, None] * outward[rows], rows)
-        sample = state.sdf.query(here)
-        distance = sample.distance
+        # Farther in than the garment is cut off the skin there is only flesh.
+        step = torch.minimum(state.margin - distance, limbs.clearance[rows] - way)
+        here = here - step[:, None] * outward[rows]
+        way = way + step
+        distance = state.sdf.query(here).distance
         state.keep_better(rows, here, distance)
-        unclear = torch.nonzero(distance < state.margin - state.tolerance)[:, 0]
-        rows, here, distance = rows[unclear], here[unclear], distance[unclear]
-    # The room may lie a little aside of the way that was gone: the last steps follow the gradient.
-    sample = state.sdf.query(state.vertices[rows])
-    assert sample.face is not None  # limbs are used with distances to faces only
-    near_side = torch.nonzero(~limbs.crosses(rows, sample.face, sample.gradient, outward))[:, 0]
-    rounds = max_steps + 1 + _push(state, rows[near_side], sample.rows(near_side), 1.0, max_steps)
-    # No room between limb and skin: out on the far side after all, where that is a bump and not a tear.
-    stuck = rows[state.distance[rows] < 0]
-    shallow = stuck[start_distance[stuck] > -_BUMP]
-    state.vertices[shallow], state.distance[shallow] = state.origin[shallow], start_distance[shallow]
-    return rounds + _push(state, shallow, state.sdf.query(state.vertices[shallow]), 1.0, max_steps)
+        going = torch.nonzero((distance < state.margin - state.tolerance) & (way < limbs.clearance[rows]))[:, 0]
+        rows, here, distance, way = rows[going], here[going], distance[going], way[going]
+    return max_steps
 
 
 def _raise_edges(state: _State, edges: Tensor, max_rounds: int) -> int:

@@ -1,0 +1,82 @@
+"""Cloth between two limbs: it leaves the other limb on the near side, and is never torn around it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from refu_core import GarmentTemplate, SmplBody, load_body, load_garment
+from refu_core.repulsion import Limbs, resolve
+from refu_core.sdf import ExactSdf
+
+
+def dressed(lower: float, *, garment: str = "tshirt-male") -> tuple[torch.Tensor, ExactSdf, Limbs, torch.Tensor]:
+    """A garment that follows the skin, on a body whose arms are lowered by `lower` [rad]."""
+    template = load_garment(garment)
+    body = load_body(template.body)
+    pose = torch.zeros(1, 24, 3)
+    pose[0, 16, 2], pose[0, 17, 2] = -lower, lower
+    out = body(pose)
+    sdf = ExactSdf(body.faces)
+    sdf.update(out.vertices[0])
+    points = template.pose(template.rest(torch.zeros(1, 10)), out.transforms)[0]
+    return points, sdf, limbs_of(body, template), template.edges
+
+
+def limbs_of(body: SmplBody, template: GarmentTemplate) -> Limbs:
+    rest = ExactSdf(body.faces)
+    rest.update(body.v_template)
+    clearance = rest.query(template.v_template).distance
+    return Limbs.of(body.weights, body.faces, template.weights, template.faces, clearance=clearance)
+
+
+def overstretched(points: torch.Tensor, before: torch.Tensor, edges: torch.Tensor) -> int:
+    """Edges that are more than twice as long as they were."""
+    now, then = ((x[edges[:, 0]] - x[edges[:, 1]]).norm(dim=-1) for x in (points, before))
+    return int((now > 2 * then).sum())
+
+
+@pytest.mark.parametrize(("garment", "lower"), [("shirt-male", 1.65), ("shirt-male", 1.7), ("tshirt-male", 1.7)])
+def test_an_arm_in_the_flank_tears_the_cloth_less(garment: str, lower: float) -> None:
+    points, sdf, limbs, edges = dressed(lower, garment=garment)
+    torn = resolve(points, sdf, edges=edges).vertices
+    held = resolve(points, sdf, edges=edges, limbs=limbs).vertices
+    assert overstretched(held, points, edges) < 0.9 * overstretched(torn, points, edges)
+    assert (held - points).norm(dim=-1).max() < (torn - points).norm(dim=-1).max()
+
+
+def test_unresolved_vertices_stay_where_they_were() -> None:
+    points, sdf, limbs, edges = dressed(1.7)
+    done = resolve(points, sdf, edges=edges, limbs=limbs)
+    stuck = done.distance < 0
+    assert 0 < int(stuck.sum()) == done.n_unresolved
+    torch.testing.assert_close(done.vertices[stuck], points[stuck], atol=0, rtol=0)
+
+
+def test_where_nothing_touches_limbs_change_nothing() -> None:
+    points, sdf, limbs, edges = dressed(0.4)
+    free = resolve(points, sdf, edges=edges)
+    held = resolve(points, sdf, edges=edges, limbs=limbs)
+    torch.testing.assert_close(held.vertices, free.vertices, atol=0, rtol=0)
+
+
+def test_limbs_of_body_and_garment() -> None:
+    template = load_garment("shirt-male")
+    body = load_body("male")
+    limbs = limbs_of(body, template)
+    centre = body.v_template[body.faces].mean(1)
+    assert set(limbs.of_face[centre[:, 0] > 0.5].tolist()) == {1}, "the left arm is at +x in the T-pose"
+    assert set(limbs.of_face[centre[:, 0] < -0.5].tolist()) == {2}
+    assert set(limbs.of_face[centre[:, 1] < -0.6].tolist()) == {3}
+    sleeve = template.v_template[:, 0] > 0.5
+    assert limbs.own[sleeve].sum(0).tolist() == [0, int(sleeve.sum()), 0, 0]
+    assert limbs.own.any(1).all()
+
+
+def test_outward_normals_point_away_from_the_skin() -> None:
+    points, sdf, limbs, _ = dressed(0.0)
+    outward = limbs.outward(points)
+    np.testing.assert_allclose(outward.norm(dim=-1).numpy(), 1, atol=1e-5)
+    aligned = (outward * sdf.query(points).gradient).sum(-1)
+    assert float((aligned > 0).float().mean()) > 0.99
