@@ -58,6 +58,19 @@ class Limbs:
         summed = torch.zeros_like(points).index_add_(0, self.faces.T.reshape(-1), normal.repeat(3, 1))
         return torch.nn.functional.normalize(summed, dim=-1)
 
+    def mean_of_neighbours(self, points: Tensor, rows: Tensor) -> Tensor:
+        """Mean place of the neighbours of `rows` (R,) that aren't among them [m], shape (R, 3); their own if none."""
+        missing = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+        missing[rows] = True
+        ends = self.faces[missing[self.faces].any(1)][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+        here, there = torch.cat((ends, ends.flip(1))).unbind(1)
+        use = missing[here] & ~missing[there]
+        here, there = here[use], there[use]
+        total = torch.zeros_like(points).index_add_(0, here, points[there])[rows]
+        count = torch.zeros_like(points[:, 0]).index_add_(0, here, torch.ones_like(points[here, 0]))[rows]
+        mean: Tensor = torch.where(count[:, None] > 0, total / count.clamp_min(1)[:, None], points[rows])
+        return mean
+
     def crosses(self, rows: Tensor, body_face: Tensor, gradient: Tensor, outward: Tensor) -> Tensor:
         """Whether a push along `gradient` (R, 3) would take vertices `rows` (R,) out through a limb they don't lie on.
 

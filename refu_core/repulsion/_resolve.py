@@ -11,8 +11,9 @@ from refu_core.repulsion._limbs import Limbs
 from refu_core.repulsion._unit import DEFAULT_MARGIN, MAX_DISPLACEMENT, repulse
 from refu_core.sdf import BodySdf, SdfSample
 
-_BUMP = 0.004
-"""Depth up to which a vertex may leave another limb on its far side [m]: a bump, where more would be a tear."""
+_RETREAT_STEPS = 8
+_STEP_ON = 1e-3
+"""What is added to each step of a retreat [m], so that it ends."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,9 +80,8 @@ def resolve(
         outward = limbs.outward(points)
         crossing = limbs.crosses(rows, first.face, first.gradient, outward)
         rounds += _retreat(state, rows[crossing], outward, limbs, max_pushes)
-        # Those without room, but not deep: out on the far side after all.
-        crossing &= (state.distance[rows] >= 0) | (first.distance <= -_BUMP)
-        others = torch.nonzero(~crossing)[:, 0]
+        # Those without any room: out on the far side after all.
+        others = torch.nonzero(~crossing | (state.distance[rows] < 0))[:, 0]
         rows, first = rows[others], first.rows(others)
         state.vertices[rows], state.distance[rows] = points[rows], first.distance
     alpha = scale[rows] if isinstance(scale, Tensor) and scale.ndim else scale
@@ -145,23 +145,29 @@ def _push(state: _State, rows: Tensor, sample: SdfSample, scale: float | Tensor,
     return max_pushes
 
 
-def _retreat(state: _State, rows: Tensor, outward: Tensor, limbs: Limbs, max_steps: int) -> int:
-    """Moves `rows` against `outward` (N, 3) out of a limb, as far as their clearance; returns the rounds it took."""
-    here, distance = state.vertices[rows], state.distance[rows]
-    way = torch.zeros_like(distance)
-    for round_ in range(max_steps):
-        if not len(rows):
+def _retreat(state: _State, rows: Tensor, outward: Tensor, limbs: Limbs, max_pushes: int) -> int:
+    """Moves `rows` against `outward` (N, 3) out of a limb, as far as there is room; returns the rounds it took."""
+    walker, here = rows, state.vertices[rows]
+    distance, way = state.distance[rows], torch.zeros_like(state.distance[rows])
+    for round_ in range(_RETREAT_STEPS):
+        if not len(walker):
             return round_
-        # No surface is nearer than |f|, so a step of |f| (and the margin) can't jump over the room that is sought.
+        # No surface is nearer than |f|: a step of |f| can't jump over the room that is sought, however narrow it is.
         # Farther in than the garment is cut off the skin there is only flesh.
-        step = torch.minimum(state.margin - distance, limbs.clearance[rows] - way)
-        here = here - step[:, None] * outward[rows]
+        step = torch.minimum(-distance + _STEP_ON, limbs.clearance[walker] + _STEP_ON - way)
+        here = here - step[:, None] * outward[walker]
         way = way + step
         distance = state.sdf.query(here).distance
-        state.keep_better(rows, here, distance)
-        going = torch.nonzero((distance < state.margin - state.tolerance) & (way < limbs.clearance[rows]))[:, 0]
-        rows, here, distance, way = rows[going], here[going], distance[going], way[going]
-    return max_steps
+        state.keep_better(walker, here, distance)
+        going = torch.nonzero((distance <= 0) & (way < limbs.clearance[walker]))[:, 0]
+        walker, here, distance, way = walker[going], here[going], distance[going], way[going]
+    # The few that missed it go where their neighbours went.
+    missed = rows[state.distance[rows] < 0]
+    filled = limbs.mean_of_neighbours(state.vertices, missed)
+    state.keep_better(missed, filled, state.sdf.query(filled).distance)
+    # In the room between limb and skin the gradient keeps to the middle, or at the margin where that is wide enough.
+    found = rows[state.distance[rows] > 0]
+    return _RETREAT_STEPS + _push(state, found, state.sdf.query(state.vertices[found]), 1.0, max_pushes)
 
 
 def _raise_edges(state: _State, edges: Tensor, max_rounds: int) -> int:
