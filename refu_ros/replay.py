@@ -127,6 +127,7 @@ class ReplayResult:
                 "self_contact_frames": after.n_contact_frames,
                 "before": self.before[name].all.as_dict(),
                 "before_without_self_contact_frames": self.before[name].contact_free_frames.as_dict(),
+                "before_without_self_contact_vertices": self.before[name].contact_free_vertices.as_dict(),
                 "without_self_contact_frames": after.contact_free_frames.as_dict(),
                 "without_self_contact_vertices": after.contact_free_vertices.as_dict(),
             }

@@ -204,8 +204,9 @@ def _page(result: ReplayResult, pictures: Sequence[_Pictured]) -> str:
 A whole frame, bytes to bytes: p50 {frame["p50"]:.1f}, p95 {frame["p95"]:.1f}, p99 {frame["p99"]:.1f} ms.</p>{warning}
 <h2>Figures</h2>{_table(data)}
 <p class="note">VFCP: vertices inside the body. CFMP: frames without any collision, vertices and triangles.
-Both by exact checks. Where the body intersects itself (an arm in the flank, thighs in a squat) no garment can be free
-of it: the second row of a garment leaves those frames out.</p>
+Both by exact checks. Where the body intersects itself (an arm in the flank, the crease of an armpit, thighs in a squat)
+no garment can be free of it: the rows below a garment leave out the vertices near such places, or all frames that
+have one.</p>
 <h2>Penetration over time</h2><img class="plot" src="penetration.svg" alt="penetration over time">
 <p class="note">Grey: the body touches itself near a garment.</p>
 <h2>Latency</h2><img class="plot" src="latency.svg" alt="latency over time">
@@ -223,16 +224,19 @@ def _table(data: dict[str, Any]) -> str:
         keys = (("vfcp_percent", 3), ("cfmp_percent", 1), ("max_depth_mm", 1), ("mpve_mm", 2))
         return "".join(f"<td>{cell(before[key], after[key], digits)}</td>" for key, digits in keys)
 
+    def sub(label: str, before: dict[str, Any], after: dict[str, Any]) -> str:
+        count = f"<td>{label}</td><td>{after['n_frames']}</td><td></td><td></td><td></td>"
+        return f'<tr class="sub">{count}{cells(before, after)}</tr>'
+
     rows = ""
     for name, g in data["garments"].items():
         latency = "".join(f"<td>{g['latency_ms'][p]:.2f}</td>" for p in ("p50", "p95", "p99"))
         rows += f"<tr><td>{name}</td><td>{g['n_frames']}</td>{latency}{cells(g['before'], g)}</tr>"
-        free = g["without_self_contact_frames"]
-        if g["self_contact_frames"] and free["n_frames"]:
-            rows += (
-                f'<tr class="sub"><td>without self-contact</td><td>{free["n_frames"]}</td><td></td><td></td><td></td>'
-                f"{cells(g['before_without_self_contact_frames'], free)}</tr>"
-            )
+        if g["self_contact_frames"]:
+            away, free = g["without_self_contact_vertices"], g["without_self_contact_frames"]
+            rows += sub("away from self-contact", g["before_without_self_contact_vertices"], away)
+            if free["n_frames"]:
+                rows += sub("frames without any", g["before_without_self_contact_frames"], free)
     head = "".join(
         f"<th>{name}</th>"
         for name in ("garment", "frames", "p50 ms", "p95 ms", "p99 ms", "VFCP %", "CFMP %", "deepest mm", "MPVE mm")

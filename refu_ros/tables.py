@@ -36,7 +36,11 @@ def replay_table(result: ReplayResult) -> str:
         latency = result.latency_ms(name)
         rows.append((name, *_row(before.all, after.all, latency)))
         if after.n_contact_frames:
-            rows.append(("  no self-contact", *_row(before.contact_free_frames, after.contact_free_frames, None)))
+            rows.append(
+                ("  away from self-contact", *_row(before.contact_free_vertices, after.contact_free_vertices, None))
+            )
+        if 0 < after.contact_free_frames.n_frames < after.n_frames:
+            rows.append(("  frames without any", *_row(before.contact_free_frames, after.contact_free_frames, None)))
     lines = [f"{result.options.input}: {result.source}", "", format_table(header, rows), ""]
     whole = result.latency_ms()
     lines.append(

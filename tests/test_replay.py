@@ -174,13 +174,13 @@ def test_report_is_complete_in_its_folder(small_bag: Path, tmp_path: Path) -> No
 
 
 def test_betas_can_be_given(small_bag: Path, tmp_path: Path) -> None:
-    widths = []
+    depths = []
     for betas in ("0", "0,2"):
         out = tmp_path / f"{betas}.mcap"
         assert run(small_bag, "--betas", betas, "--output", out, "--garments", "short-pant-male") == 0
         (marker,) = adapters.decode_marker_array(raw_messages(out)[1][2])
-        widths.append(np.ptp(marker.points[:, 1]))
-    assert widths[1] > widths[0] + 0.02, "the second component is girth"
+        depths.append(np.ptp(marker.points[:, 0]))
+    assert depths[1] > depths[0] + 0.02, "the second component is girth"
 
 
 def test_real_speed_keeps_the_pace(small_bag: Path) -> None:
