@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -144,6 +146,10 @@ def test_frames_own_their_data() -> None:
         made.pose[0] = 1
 
 
-def test_the_readme_example_runs() -> None:
-    body = load_body("male")(np.zeros((1, 72)), np.zeros((1, 10)), np.zeros((1, 3)))
-    assert body.vertices.shape == (1, load_body("male").n_vertices, 3)
+def test_the_readme_example_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    readme = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
+    code = readme.split("```python\n")[1].split("```")[0]
+    exec(compile(code, "README.md", "exec"), {})
+    garment, body = capsys.readouterr().out.splitlines()
+    assert garment.startswith("(7662, 3)")
+    assert body == f"torch.Size([1, {load_body('male').n_vertices}, 3])"
