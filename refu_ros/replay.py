@@ -354,7 +354,9 @@ def replay(options: ReplayOptions, *, progress: bool = False) -> ReplayResult:
         records = itertools.islice(source, options.max_frames)
         total = source.count if options.max_frames is None else min(source.count or sys.maxsize, options.max_frames)
         try:
-            for record in tqdm(_paced(records, options.speed), total=total, unit="frame", disable=not progress):
+            for record in tqdm(
+                _paced(records, options.speed), total=total, unit="frame", disable=None if progress else True
+            ):
                 replayer.run(record, writer)
         except KeyboardInterrupt:
             result.interrupted = True

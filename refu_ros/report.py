@@ -143,7 +143,7 @@ def _draw_frames(result: ReplayResult, folder: Path, *, progress: bool) -> list[
     body_faces = pipeline.body.faces.cpu().numpy()
     checker = CollisionChecker(body_faces)
     pictures = []
-    with tqdm(total=2 * len(chosen), desc="pictures", unit="picture", disable=not progress) as bar:
+    with tqdm(total=2 * len(chosen), desc="pictures", unit="picture", disable=None if progress else True) as bar:
         for title, index in chosen.items():
             frame = result.frames[index]
             output = pipeline(frame.frame)
