@@ -1,0 +1,35 @@
+"""Ground truth: simulated garments for any body, pose, shape and style, checked to be free of collisions."""
+
+from refu_core.simulation._cloth import ClothSettings
+from refu_core.simulation._drape import Drape, Draper, DrapeSettings, canonical_pose
+from refu_core.simulation._errors import SimulationError
+from refu_core.simulation._plan import Plan
+from refu_core.simulation._poses import Clip, RoomSettings, load_clips, split_clips
+from refu_core.simulation._run import Progress, simulate_dataset, summarise
+from refu_core.simulation._selection import CAUSES, SelectionSettings
+from refu_core.simulation._styles import StyleBasis, Tailoring, build_styles, tailoring_of
+from refu_core.simulation._worker import SimulationSettings
+
+__all__ = [
+    "CAUSES",
+    "Clip",
+    "ClothSettings",
+    "Drape",
+    "DrapeSettings",
+    "Draper",
+    "Plan",
+    "Progress",
+    "RoomSettings",
+    "SelectionSettings",
+    "SimulationError",
+    "SimulationSettings",
+    "StyleBasis",
+    "Tailoring",
+    "build_styles",
+    "canonical_pose",
+    "load_clips",
+    "simulate_dataset",
+    "split_clips",
+    "summarise",
+    "tailoring_of",
+]

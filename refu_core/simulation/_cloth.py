@@ -1,0 +1,249 @@
+"""One garment on one moving body: the state of the cloth, its contacts, and a frame of simulated time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from refu_core.sdf import ExactSdf
+from refu_core.simulation._solver import find_pairs, refresh_points, stale_points, substep
+
+if TYPE_CHECKING:
+    from refu_core.simulation._mesh import ClothTopology
+
+F32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class ClothSettings:
+    """Material, contact and solver of the cloth; the values are those that were tuned together."""
+
+    density: float = 0.15
+    """Mass of the cloth [kg/m²]."""
+    stretch_compliance: float = 1e-7
+    """Of the distance along an edge [m/N]."""
+    bend_compliance: float = 2e-3
+    """Of the distance across an edge [m/N]."""
+    friction: float = 0.3
+    """Coulomb's coefficient between cloth and skin."""
+    margin: float = 0.004
+    """Distance that vertices keep from the skin [m]."""
+    edge_margin: float = 0.003
+    """Distance that edge midpoints keep from the skin [m]."""
+    thickness: float = 0.003
+    """Distance that vertices keep from other parts of the cloth [m]."""
+    substep: float = 1 / 2400
+    """Time step [s]."""
+    substeps: int = 40
+    """Time steps a frame."""
+    refresh: int = 20
+    """Time steps between two looks for contacts."""
+    iterations: int = 1
+    """Sweeps over all constraints a time step: more steps of one sweep stretch less than fewer of several."""
+    most_ease: float = 0.15
+    """Share by which an edge may give way freely, for the sake of moving joints."""
+    anchor_stiffness: float = 0.2
+    """Share of a waistband's distance from its place on the skin that is closed in one sweep."""
+
+
+_REACH = 0.04  # [m]: how far from the skin a vertex knows its distance
+_NEAR = 0.012  # [m]: closer vertices carry a contact
+_SLIDE = 0.003  # [m]: a contact's tangent plane holds for this far
+_PAIR_REACH = 0.007  # [m]: a vertex this close to another piece of the cloth is watched
+_MAX_SPEED = 6.0  # [m/s]
+
+
+class Cloth:
+    """The simulated garment. Positions are relative to the body's root, in SMPL axes [m]; one thread, deterministic."""
+
+    def __init__(self, topology: ClothTopology, sdf: ExactSdf, *, settings: ClothSettings | None = None) -> None:
+        """A garment of this topology against the body behind `sdf`.
+
+        `sdf` must have its BVH built on the same vertices in every process (a body at rest): the tree decides which of
+        two equally close faces is found, and with it the last bit of the result.
+        """
+        self.settings = settings or ClothSettings()
+        self.topology = topology
+        self._sdf = sdf
+        self._body_faces = sdf.faces.cpu().numpy().astype(np.int32)
+        n = topology.n_vertices
+        # Bends first: in each sweep the stiffer edges have the last word.
+        self._ends = np.concatenate((topology.bends[topology.bend_order], topology.edges[topology.stretch_order]))
+        h2 = self.settings.substep**2
+        self._softness = np.concatenate(
+            (
+                np.full(len(topology.bends), self.settings.bend_compliance / h2, np.float32),
+                np.full(len(topology.edges), self.settings.stretch_compliance / h2, np.float32),
+            )
+        )
+        self.positions: F32 = np.zeros((n, 3), np.float32)
+        self.velocities: F32 = np.zeros((n, 3), np.float32)
+        self._previous: F32 = np.zeros((n, 3), np.float32)
+        self._anchors: tuple[NDArray[np.int32], NDArray[np.int32], F32, F32] | None = None
+        self._dress(np.zeros((n, 3), np.float32))
+
+    def _dress(self, rest: F32) -> None:
+        n = self.topology.n_vertices
+        self._rest = rest
+        self._face = np.full(n, -1, np.int32)
+        self._weights: F32 = np.zeros((n, 3), np.float32)
+        self._normal: F32 = np.zeros((n, 3), np.float32)
+        self._asked_at: F32 = np.full((n, 3), 1e6, np.float32)  # far away: everything is stale
+        self._asked_distance: F32 = np.zeros(n, np.float32)
+
+    def start(
+        self,
+        rest: F32,
+        positions: F32,
+        *,
+        eased: Sequence[F32] = (),
+        waist: NDArray[np.intp] | None = None,
+        body_rest: F32 | None = None,
+    ) -> None:
+        """Puts the cloth at `positions` (N, 3), at rest, with the rest lengths and masses of `rest` (N, 3).
+
+        Where an edge is longer in one of the shapes `eased`, (N, 3) each, it gives way up to there, within limits.
+
+        `waist` vertices are held at the place of the skin that they have in the rest pose: the body at rest is
+        `body_rest` (V, 3).
+        """
+        self._dress(np.ascontiguousarray(rest, dtype=np.float32))
+        self.positions[:] = positions
+        self.velocities[:] = 0
+        ends = self._rest[self._ends]
+        self._shortest: F32 = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).astype(np.float32)
+        self._longest = self._shortest
+        for shape in eased:
+            ends = shape[self._ends]
+            self._longest = np.maximum(
+                self._longest, np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).astype(np.float32)
+            )
+        self._longest = np.minimum(self._longest, self._shortest * np.float32(1 + self.settings.most_ease))
+        self._edge_length = float(np.median(self._shortest[-len(self.topology.edges) :]))
+        area = self.topology.vertex_areas(self._rest)
+        # Slivers would get next to no mass and soak up every correction of their neighbours.
+        area = np.maximum(area, 0.25 * np.median(area))
+        self._inverse_mass: F32 = (1 / (self.settings.density * area)).astype(np.float32)
+        self._anchors = None
+        if waist is not None and len(waist):
+            assert body_rest is not None
+            self._anchors = self._anchor(waist, body_rest)
+
+    def _anchor(self, waist: NDArray[np.intp], body_rest: F32) -> tuple[NDArray[np.int32], NDArray[np.int32], F32, F32]:
+        self._sdf.update(torch.from_numpy(body_rest))
+        points = self._rest[waist]
+        found = self._sdf.closest(torch.from_numpy(points))
+        offset = np.maximum(found.distance.numpy() * found.sign.numpy(), self.settings.margin + 0.002)
+        return (
+            waist.astype(np.int32),
+            found.face.numpy(),
+            found.barycentrics.numpy(),
+            offset[:, None].astype(np.float32),
+        )
+
+    def _anchor_points(self, body: F32) -> F32:
+        assert self._anchors is not None
+        _, face, weights, offset = self._anchors
+        a, b, c = body[self._body_faces[face]].transpose(1, 0, 2)
+        normal = np.cross(b - a, c - a)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True) + 1e-12
+        points: F32 = weights[:, :1] * a + weights[:, 1:2] * b + weights[:, 2:] * c + offset * normal
+        return points
+
+    def frame(self, body_from: F32, body_to: F32, *, gravity: F32, drag: float, careful: bool = False) -> float:
+        """Simulates `settings.substeps` time steps while the body moves straight from one mesh (V, 3) to the other.
+
+        Args:
+            body_from: body vertices at the start [m], shape (V, 3).
+            body_to: at the end; the same object where the body rests.
+            gravity: acceleration [m/s²], shape (3,).
+            drag: rate at which the velocity fades [1/s].
+            careful: contacts of edge midpoints, too, and a look for contacts twice as often.
+
+        Returns:
+            Root mean square speed of the vertices at the end [m/s].
+        """
+        s = self.settings
+        moving = body_from is not body_to
+        refresh = s.refresh if moving or careful else s.substeps
+        h = np.float32(s.substep)
+        motion = (body_to - body_from) / np.float32(s.substeps) if moving else None
+        empty3 = np.zeros((0, 3), np.float32)
+        anchor_vertex, anchor, anchor_motion = np.zeros(0, np.int32), empty3, empty3
+        if self._anchors is not None:
+            anchor_vertex = self._anchors[0]
+            anchor = np.ascontiguousarray(self._anchor_points(body_from))
+            target = self._anchor_points(body_to) if moving else anchor
+            anchor_motion = np.ascontiguousarray((target - anchor) / np.float32(s.substeps))
+        for first in range(0, s.substeps, refresh):
+            body = body_from if motion is None else body_from + np.float32(first) * motion
+            contacts = self._contacts(body, motion, everything=moving and first == 0)
+            edges = (
+                self._edge_contacts(body, motion) if careful else (np.zeros((0, 2), np.int32), empty3, empty3, empty3)
+            )
+            if first == 0 or careful:
+                pairs = find_pairs(
+                    self.positions,
+                    self.topology.faces,
+                    self._rest,
+                    np.float32(2.2 * self._edge_length),
+                    np.float32(_PAIR_REACH),
+                    np.float32(_PAIR_REACH + 0.85 * self._edge_length),
+                )
+            for _ in range(min(refresh, s.substeps - first)):
+                substep(
+                    self.positions, self.velocities, self._previous, self._inverse_mass,
+                    self._ends, self._shortest, self._longest, self._softness,
+                    h, gravity, np.float32(np.exp(-drag * s.substep)),
+                    *contacts, np.float32(s.margin), np.float32(s.friction),
+                    anchor_vertex, anchor, anchor_motion, np.float32(s.anchor_stiffness),
+                    *pairs, np.float32(s.thickness),
+                    *edges, np.float32(s.edge_margin),
+                    s.iterations, np.float32(_MAX_SPEED * s.substep),
+                )  # fmt: skip
+        return float(np.sqrt((self.velocities**2).sum(1).mean()))
+
+    def _contacts(self, body: F32, motion: F32 | None, *, everything: bool) -> tuple[Any, ...]:
+        stale = stale_points(
+            self.positions, self._asked_at, self._asked_distance, np.float32(_NEAR), np.float32(_SLIDE), everything
+        )
+        if len(stale):
+            asked = self.positions[stale]
+            self._sdf.update(torch.from_numpy(body))
+            found = self._sdf.closest(torch.from_numpy(asked), max_distance=_REACH)
+            self._face[stale] = found.face.numpy()
+            self._weights[stale] = found.barycentrics.numpy()
+            self._asked_at[stale] = asked
+            self._asked_distance[stale] = np.minimum(found.distance.numpy(), _REACH) * found.sign.numpy()
+        contacts: tuple[Any, ...] = refresh_points(
+            self.positions, self._face, self._weights, self._asked_distance, self._normal, stale,
+            self._body_faces, body, body if motion is None else motion, motion is not None, np.float32(_NEAR),
+        )  # fmt: skip
+        return contacts
+
+    def _edge_contacts(self, body: F32, motion: F32 | None) -> tuple[Any, ...]:
+        near = self._asked_distance < _NEAR
+        ends = self.topology.edges[near[self.topology.edges].all(1)]
+        middle = self.positions[ends].mean(1)
+        self._sdf.update(torch.from_numpy(body))
+        found = self._sdf.closest(torch.from_numpy(middle), max_distance=_REACH)
+        distance = np.minimum(found.distance.numpy(), _REACH) * found.sign.numpy()
+        which, *rest = refresh_points(
+            middle, found.face.numpy(), found.barycentrics.numpy(), distance, np.zeros_like(middle),
+            np.arange(len(middle), dtype=np.int32),
+            self._body_faces, body, body if motion is None else motion, motion is not None, np.float32(_NEAR),
+        )  # fmt: skip
+        return (ends[which], *rest)
+
+    def stretch(self) -> F32:
+        """Length of each edge over its rest length, shape (E,)."""
+        ends = self.positions[self.topology.edges]
+        order = self.topology.stretch_order
+        ratio = np.empty(len(order), np.float32)
+        ratio[order] = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)[order] / self._longest[-len(order) :]
+        return ratio

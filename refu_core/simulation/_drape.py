@@ -1,0 +1,227 @@
+"""From (β, θ, γ) to a draped garment: the settled canonical drape, the way to the pose, the settling.
+
+Simulated cloth depends on how it got where it is: reached by two ways, one pose leaves a T-shirt 10 to 16 mm apart and
+a skirt 13 to 51 mm. So every sample starts from the settled drape of its own shape and style in one canonical pose and
+takes the same way to its own pose: the result is a function of (β, θ, γ) alone, and samples don't depend on each other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from refu_core.frames import N_BETAS, N_JOINTS
+from refu_core.garments import N_STYLES
+from refu_core.sdf import ExactSdf
+from refu_core.simulation._cloth import Cloth, ClothSettings
+from refu_core.simulation._mesh import ClothTopology
+
+if TYPE_CHECKING:
+    from refu_core.body import SmplBody
+    from refu_core.garments import GarmentTemplate
+    from refu_core.simulation._cloth import F32
+
+GRAVITY = 9.81
+"""[m/s²], along -y of the world."""
+HELD_AT_WAIST = ("short-pant", "skirt")
+"""Garments (by the start of their name) that a waistband holds; the others hang from the shoulders."""
+
+
+@dataclass(frozen=True)
+class DrapeSettings:
+    """How long a sample is simulated."""
+
+    cloth: ClothSettings = field(default_factory=ClothSettings)
+    dress_frames: int = 6
+    """Frames in the T-pose, with strong damping, in which the template turns into cloth."""
+    lower_frames: int = 16
+    """Frames in which the arms go down from the T-pose to the canonical one."""
+    canonical_frames: int = 60
+    """Most frames in which the canonical drape settles."""
+    speed: float = 0.05
+    """Way of the fastest part of the body in a frame of the move, on average [m]."""
+    move_frames: tuple[int, int] = (8, 24)
+    """Fewest and most frames of the move."""
+    settle_frames: tuple[int, int] = (14, 45)
+    """Fewest and most frames of settling; it ends early when the cloth rests."""
+    careful_frames: int = 5
+    """Last frames, in which contacts of edge midpoints are solved, too."""
+    rest_speed: float = 0.012
+    """Root mean square speed of a cloth at rest [m/s]."""
+    drag: tuple[float, float, float] = (130.0, 6.0, 30.0)
+    """Rates at which velocity fades [1/s]: as the template turns into cloth, as the body moves, as the cloth settles."""
+    waistband: float = 0.012
+    """Width of the band that holds to the skin [m]."""
+
+
+def canonical_pose() -> NDArray[np.float32]:
+    """The pose of the canonical drape: arms lowered by 50°, legs slightly apart [rad], shape (24, 3)."""
+    pose = np.zeros((N_JOINTS, 3), np.float32)
+    pose[16, 2], pose[17, 2] = -0.87, 0.87
+    pose[1, 2], pose[2, 2] = 0.08, -0.08
+    return pose
+
+
+def pose_path(start: NDArray[np.floating], end: NDArray[np.floating], n: int) -> NDArray[np.float32]:
+    """`n` poses after `start`, the last one `end`: each joint turns about one axis, slowly at both ends.
+
+    Poses are rotation vectors [rad], shape (24, 3); the result has the shape (n, 24, 3).
+    """
+    first = Rotation.from_rotvec(np.asarray(start, np.float64))
+    turn = (first.inv() * Rotation.from_rotvec(np.asarray(end, np.float64))).as_rotvec()
+    t = np.arange(1, n + 1) / n
+    t = t * t * (3 - 2 * t)
+    path = np.stack([(first * Rotation.from_rotvec(turn * u)).as_rotvec() for u in t]).astype(np.float32)
+    path[-1] = end
+    return path
+
+
+def comfort_poses() -> NDArray[np.float32]:
+    """Poses that a garment is cut to be comfortable in [rad], shape (P, 24, 3); the T-pose isn't among them.
+
+    Cloth cut to the T-pose alone is too short over the shoulders when arms hang, at the elbows when they bend, at the
+    seat and the crotch when legs are raised or spread; a tailor leaves room there.
+    """
+    hang, bend, raised, spread = np.zeros((4, N_JOINTS, 3), np.float32)
+    hang[16, 2], hang[17, 2] = -0.87, 0.87
+    bend[16, 1], bend[17, 1] = -0.7, 0.7
+    bend[18, 1], bend[19, 1] = -1.2, 1.2
+    raised[1, 0] = raised[2, 0] = -0.8
+    spread[1, 2], spread[2, 2] = 0.4, -0.4
+    return np.stack((hang, bend, raised, spread))
+
+
+@dataclass(frozen=True, eq=False)
+class Drape:
+    """A settled garment."""
+
+    vertices: F32
+    """In the body's frame with the root's rotation, without translation [m], shape (N, 3)."""
+    speed: float
+    """Root mean square speed that is left [m/s]."""
+    stretch: float
+    """99.9th percentile of the edges' length over their rest length."""
+    n_frames: int
+    """Simulated frames."""
+
+
+class Draper:
+    """Drapes one garment on one body; keeps the canonical drape of the last shape and style."""
+
+    def __init__(self, garment: GarmentTemplate, body: SmplBody, *, settings: DrapeSettings | None = None) -> None:
+        """Prepares for `garment` on `body`, both on the CPU.
+
+        Raises `MeshError` when the body isn't watertight or the garment's mesh isn't one of edges of one or two faces.
+        """
+        self.garment = garment
+        self.body = body
+        self.settings = settings or DrapeSettings()
+        self.topology = ClothTopology.of(garment.faces.numpy())
+        sdf = ExactSdf(body.faces)
+        # The BVH is built here, once, on the same mesh in every process, and only refitted afterwards (see `Cloth`).
+        sdf.update(body.rest_vertices(torch.zeros(1, N_BETAS))[0])
+        self.cloth = Cloth(self.topology, sdf, settings=self.settings.cloth)
+        self.waist: NDArray[np.intp] | None = None
+        if garment.name.startswith(HELD_AT_WAIST):
+            vertices = garment.v_template.numpy()
+            loop = max(self.topology.boundary_loops(), key=lambda rim: float(vertices[rim, 1].mean()))
+            self.waist = np.flatnonzero(self.topology.distance_from(vertices, loop) < self.settings.waistband)
+        self._comfort = comfort_poses()
+        self._canonical: tuple[bytes, F32, F32, float] | None = None
+
+    def rest(self, betas: NDArray[np.floating], style: NDArray[np.floating]) -> F32:
+        """The garment cut for this shape and style [m], shape (N, 3): its edges are the cloth's rest lengths."""
+        gamma = (
+            None if self.garment.styledirs is None else torch.as_tensor(style, dtype=torch.float32).view(1, N_STYLES)
+        )
+        rest: F32 = self.garment.rest(torch.as_tensor(betas, dtype=torch.float32).view(1, N_BETAS), gamma)[0].numpy()
+        return rest
+
+    def _bodies(self, poses: NDArray[np.float32], betas: NDArray[np.floating]) -> F32:
+        shape = torch.as_tensor(betas, dtype=torch.float32).view(1, N_BETAS)
+        vertices: F32 = self.body(poses, shape).vertices.numpy()
+        return vertices
+
+    def canonical(self, betas: NDArray[np.floating], style: NDArray[np.floating]) -> tuple[F32, F32]:
+        """The settled canonical drape of a shape and style and its body, (N, 3) and (V, 3) [m]."""
+        key = np.concatenate((betas, style)).astype(np.float32).tobytes()
+        if self._canonical is None or self._canonical[0] != key:
+            self._canonical = (key, *self._settle_canonical(betas, style))
+        _, positions, body, _ = self._canonical
+        return positions, body
+
+    def _settle_canonical(self, betas: NDArray[np.floating], style: NDArray[np.floating]) -> tuple[F32, F32, float]:
+        # Dressed in the T-pose that it was cut in: lowered by skinning, an armpit would start out folded into itself.
+        s = self.settings
+        shape = torch.as_tensor(betas, dtype=torch.float32).view(1, N_BETAS)
+        rest = self.rest(betas, style)
+        body: F32 = self.body.rest_vertices(shape)[0].numpy()
+        self._start(rest, betas, style)
+        gravity = np.array([0, -GRAVITY, 0], np.float32)
+        for _ in range(s.dress_frames):
+            self.cloth.frame(body, body, gravity=gravity, drag=s.drag[0])
+        for after in self._bodies(pose_path(np.zeros((N_JOINTS, 3)), canonical_pose(), s.lower_frames), betas):
+            self.cloth.frame(body, after, gravity=gravity, drag=s.drag[1])
+            body = after
+        speed = np.inf
+        for k in range(s.canonical_frames):
+            speed = self.cloth.frame(body, body, gravity=gravity, drag=s.drag[2])
+            if k > 8 and speed < s.rest_speed / 2:
+                break
+        return self.cloth.positions.copy(), body, speed
+
+    def _start(self, positions: F32, betas: NDArray[np.floating], style: NDArray[np.floating]) -> None:
+        rest = self.rest(betas, style)
+        shape = torch.as_tensor(betas, dtype=torch.float32).view(1, N_BETAS)
+        transforms = self.body(self._comfort, shape).transforms
+        eased = self.garment.pose(torch.from_numpy(rest).expand(len(self._comfort), -1, -1), transforms).numpy()
+        body_rest = self.body.rest_vertices(shape)[0].numpy()
+        self.cloth.start(rest, positions, eased=list(eased), waist=self.waist, body_rest=body_rest)
+
+    def drape(self, pose: NDArray[np.floating], betas: NDArray[np.floating], style: NDArray[np.floating]) -> Drape:
+        """The garment of `style` (4,) at rest on the body of `betas` (10,) in `pose` (24, 3) [rad].
+
+        The root's rotation tilts gravity and not the body: a person who bends forward doesn't swing the cloth about.
+        """
+        s = self.settings
+        start, body = self.canonical(betas, style)
+        self._start(start, betas, style)
+        target = np.array(pose, np.float32)
+        root = Rotation.from_rotvec(target[0].astype(np.float64))
+        target[0] = 0
+        way = np.linalg.norm(self._bodies(target[None], betas)[0] - body, axis=1).max()
+        n = int(np.clip(np.ceil(way / s.speed), *s.move_frames))
+        poses = pose_path(canonical_pose(), target, n)
+        tilts = pose_path(np.zeros((1, 3)), root.as_rotvec()[None], n)
+        bodies = self._bodies(poses, betas)
+        down = np.array([0, -GRAVITY, 0])
+        gravity = np.zeros(3, np.float32)
+        for after, tilt in zip(bodies, tilts, strict=True):
+            gravity = Rotation.from_rotvec(tilt[0]).inv().apply(down).astype(np.float32)
+            self.cloth.frame(body, after, gravity=gravity, drag=s.drag[1])
+            body = after
+        speed = np.inf
+        settled = 0
+        while settled < s.settle_frames[1] - s.careful_frames:
+            speed = self.cloth.frame(body, body, gravity=gravity, drag=s.drag[2])
+            settled += 1
+            if speed < s.rest_speed and settled >= s.settle_frames[0] - s.careful_frames:
+                break
+        for _ in range(s.careful_frames):
+            speed = self.cloth.frame(body, body, gravity=gravity, drag=s.drag[2], careful=True)
+        return Drape(
+            self._with_root(self.cloth.positions, root, betas),
+            speed,
+            float(np.percentile(self.cloth.stretch(), 99.9)),
+            n + settled + s.careful_frames,
+        )
+
+    def _with_root(self, points: F32, root: Rotation, betas: NDArray[np.floating]) -> F32:
+        pelvis = self.body.rest_joints(torch.as_tensor(betas, dtype=torch.float32).view(1, N_BETAS))[0, 0].numpy()
+        turned: F32 = np.ascontiguousarray(root.apply(points.astype(np.float64) - pelvis) + pelvis, dtype=np.float32)
+        return turned

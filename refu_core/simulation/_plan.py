@@ -1,0 +1,124 @@
+"""What is simulated: which shape, style and pose each slot of a data set has.
+
+Every draw comes from a generator seeded by the plan's seed and the number of what is drawn, so a slot means the same on
+every machine, in every order, and after every interruption.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr, ndtri
+
+from refu_core.frames import N_BETAS
+from refu_core.garments import N_STYLES
+from refu_core.simulation._errors import SimulationError
+from refu_core.simulation._poses import clip_pose, random_pose
+
+if TYPE_CHECKING:
+    from refu_core.simulation._poses import Clip
+
+TRAIN, TEST = 0, 1
+MAX_PIVOTS_SHARE = 0.5
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The slots of one data set.
+
+    Half of the training samples belong to `pivots` style-shape pairs with many poses each (TailorNet's high-frequency
+    networks are one a pivot), the other half to pairs with `poses_per_pair` poses (its low-frequency and style-shape
+    networks learn from them). Test samples have pairs of their own and poses of clips kept for the test.
+    """
+
+    garment: str
+    count: int
+    """Samples in the set, training and test together."""
+    seed: int = 0
+    test_share: float = 1 / 6
+    pivots: int = 20
+    poses_per_pair: int = 6
+    recorded_share: float = 0.6
+    """Share of poses that are frames of motions; the others are drawn within the limits of human joints."""
+    spread: float = 1.2
+    """Standard deviation of β and γ before they are cut off at ±2."""
+    block: int = 12
+    """Slots that are simulated together, one after the other, from one canonical drape."""
+
+    def __post_init__(self) -> None:
+        """Raises `SimulationError` for numbers that make no plan."""
+        if self.count < 1 or self.pivots < 1 or self.poses_per_pair < 1 or self.block < 1:
+            msg = f"count, pivots, poses_per_pair and block must be at least 1, got {asdict(self)}"
+            raise SimulationError(msg)
+        if not (0 <= self.test_share < 1 and 0 <= self.recorded_share <= 1 and self.spread > 0):
+            msg = f"shares must lie in [0, 1) and the spread above 0, got {asdict(self)}"
+            raise SimulationError(msg)
+
+    @property
+    def n_test(self) -> int:
+        """Test samples."""
+        return round(self.count * self.test_share)
+
+    @property
+    def n_pivot(self) -> int:
+        """Training samples of the pivots: the first ones of the set."""
+        return int((self.count - self.n_test) * MAX_PIVOTS_SHARE)
+
+    def pair_of(self, slot: int) -> int:
+        """Number of the style-shape pair of a slot; the pivots are 0 to `pivots` - 1."""
+        if slot < self.n_pivot:
+            return slot * self.pivots // self.n_pivot
+        n_train = self.count - self.n_test
+        if slot < n_train:
+            return self.pivots + (slot - self.n_pivot) // self.poses_per_pair
+        first = self.pivots + -(-(n_train - self.n_pivot) // self.poses_per_pair)
+        return first + (slot - n_train) // self.poses_per_pair
+
+    def split_of(self, slot: int) -> int:
+        """`TRAIN` or `TEST`."""
+        return TEST if slot >= self.count - self.n_test else TRAIN
+
+    def blocks(self) -> list[range]:
+        """The slots in runs of one style-shape pair and at most `block` slots, in an order that mixes all kinds.
+
+        So a set is representative from its first hour on, and each shard of it is, too.
+        """
+        runs: list[range] = []
+        start = 0
+        for slot in range(1, self.count + 1):
+            if slot == self.count or slot - start == self.block or self.pair_of(slot) != self.pair_of(start):
+                runs.append(range(start, slot))
+                start = slot
+        order = np.random.default_rng(self._key(0)).permutation(len(runs))
+        return [runs[k] for k in order]
+
+    def _key(self, *numbers: int) -> list[int]:
+        return [self.seed, zlib.crc32(self.garment.encode()), *numbers]
+
+    def style_shape(self, pair: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """β (10,) and γ (4,) of a pair, normal, cut off at ±2; the pivots are spread evenly over each coordinate."""
+        edge = ndtr(2 / self.spread)
+        if pair < self.pivots:
+            rng = np.random.default_rng(self._key(1))
+            cells = np.stack([rng.permutation(self.pivots) for _ in range(N_BETAS + N_STYLES)], 1)
+            u = (cells[pair] + rng.random((self.pivots, N_BETAS + N_STYLES))[pair]) / self.pivots
+        else:
+            u = np.random.default_rng(self._key(2, pair)).random(N_BETAS + N_STYLES)
+        value = np.clip(self.spread * ndtri((1 - edge) + u * (2 * edge - 1)), -2, 2).astype(np.float32)
+        return value[:N_BETAS], value[N_BETAS:]
+
+    def pose(self, slot: int, attempt: int, clips: Sequence[Clip]) -> tuple[NDArray[np.float32], int, int]:
+        """The pose that a slot tries at its `attempt`: (24, 3) [rad], the clip's number and frame, or -1 and -1."""
+        rng = np.random.default_rng(self._key(3, slot, attempt))
+        if rng.random() < self.recorded_share and clips:
+            return clip_pose(clips, rng)
+        return random_pose(rng), -1, -1
+
+    def as_dict(self) -> dict[str, Any]:
+        """The plan as it stands in a data set's card."""
+        return asdict(self)

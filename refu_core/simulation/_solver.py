@@ -1,0 +1,360 @@
+# mypy: ignore-errors
+# (Numba infers the types of these functions from their arguments; a type checker can't follow.)
+"""The inner loops of the cloth: extended position-based dynamics (Macklin et al. 2016), Gauss-Seidel, in Numba.
+
+Everything runs on one thread and in a fixed order: a result is the same bit for bit on the same machine. Positions,
+velocities and lengths are float32 in metres and seconds; arrays that aren't described are shaped as in `Cloth`.
+"""
+
+import numba
+import numpy as np
+
+_TINY = np.float32(1e-12)
+
+
+@numba.njit(cache=True, fastmath=True)
+def substep(
+    x,  # positions (N, 3), updated
+    v,  # velocities (N, 3), updated
+    previous,  # scratch (N, 3)
+    inverse_mass,  # (N,)
+    ends,  # vertices of the distance constraints (E, 2)
+    shortest,  # between these two lengths they give way freely (E,)
+    longest,
+    softness,  # their compliance over h² (E,)
+    h,
+    gravity,  # (3,)
+    damping,
+    contact_vertex,  # (C,)
+    contact_point,  # (C, 3), advanced by contact_motion once
+    contact_normal,  # (C, 3)
+    contact_motion,  # of the skin in this substep (C, 3)
+    margin,
+    friction,
+    anchor_vertex,  # (A,)
+    anchor_point,  # (A, 3), advanced by anchor_motion once
+    anchor_motion,  # (A, 3)
+    anchor_stiffness,  # share of the way to the anchor closed by an iteration
+    pair_vertex,  # self-contacts (S,)
+    pair_face,  # (S, 3) vertices
+    pair_side,  # (S,) side of the face that the vertex was on when the pair was found
+    thickness,
+    edge_ends,  # contacts of edge midpoints (M, 2)
+    edge_point,  # (M, 3), advanced by edge_motion once
+    edge_normal,  # (M, 3)
+    edge_motion,  # (M, 3)
+    edge_margin,
+    iterations,
+    max_step,  # no vertex moves further in one substep; keeps a bad contact from throwing the cloth away
+):
+    one = np.float32(1.0)
+    half = np.float32(0.5)
+    n = x.shape[0]
+    for i in range(n):
+        for k in range(3):
+            previous[i, k] = x[i, k]
+            v[i, k] = v[i, k] * damping + h * gravity[k]
+            x[i, k] += h * v[i, k]
+    for c in range(contact_vertex.shape[0]):
+        for k in range(3):
+            contact_point[c, k] += contact_motion[c, k]
+    for c in range(anchor_vertex.shape[0]):
+        for k in range(3):
+            anchor_point[c, k] += anchor_motion[c, k]
+    for c in range(edge_ends.shape[0]):
+        for k in range(3):
+            edge_point[c, k] += edge_motion[c, k]
+
+    for _ in range(iterations):
+        for c in range(anchor_vertex.shape[0]):
+            i = anchor_vertex[c]
+            for k in range(3):
+                x[i, k] += anchor_stiffness * (anchor_point[c, k] - x[i, k])
+        for e in range(ends.shape[0]):
+            i = ends[e, 0]
+            j = ends[e, 1]
+            dx = x[i, 0] - x[j, 0]
+            dy = x[i, 1] - x[j, 1]
+            dz = x[i, 2] - x[j, 2]
+            length = np.sqrt(dx * dx + dy * dy + dz * dz) + _TINY
+            wi = inverse_mass[i]
+            wj = inverse_mass[j]
+            s = (min(max(length, shortest[e]), longest[e]) - length) / ((wi + wj + softness[e]) * length)
+            a = s * wi
+            b = s * wj
+            x[i, 0] += a * dx
+            x[i, 1] += a * dy
+            x[i, 2] += a * dz
+            x[j, 0] -= b * dx
+            x[j, 1] -= b * dy
+            x[j, 2] -= b * dz
+        _separate_pairs(x, inverse_mass, pair_vertex, pair_face, pair_side, thickness)
+        for c in range(contact_vertex.shape[0]):
+            i = contact_vertex[c]
+            nx = contact_normal[c, 0]
+            ny = contact_normal[c, 1]
+            nz = contact_normal[c, 2]
+            depth = (
+                margin
+                - (x[i, 0] - contact_point[c, 0]) * nx
+                - (x[i, 1] - contact_point[c, 1]) * ny
+                - (x[i, 2] - contact_point[c, 2]) * nz
+            )
+            if depth > 0:
+                x[i, 0] += depth * nx
+                x[i, 1] += depth * ny
+                x[i, 2] += depth * nz
+                # Coulomb friction on the sliding over the moving skin since the start of the substep.
+                sx = x[i, 0] - previous[i, 0] - contact_motion[c, 0]
+                sy = x[i, 1] - previous[i, 1] - contact_motion[c, 1]
+                sz = x[i, 2] - previous[i, 2] - contact_motion[c, 2]
+                along = sx * nx + sy * ny + sz * nz
+                sx -= along * nx
+                sy -= along * ny
+                sz -= along * nz
+                slide = np.sqrt(sx * sx + sy * sy + sz * sz) + _TINY
+                s = min(one, friction * depth / slide)
+                x[i, 0] -= s * sx
+                x[i, 1] -= s * sy
+                x[i, 2] -= s * sz
+        for c in range(edge_ends.shape[0]):
+            i = edge_ends[c, 0]
+            j = edge_ends[c, 1]
+            depth = edge_margin
+            for k in range(3):
+                depth -= (half * (x[i, k] + x[j, k]) - edge_point[c, k]) * edge_normal[c, k]
+            if depth > 0:
+                wi = inverse_mass[i]
+                wj = inverse_mass[j]
+                s = half * depth * (one + one) / (wi + wj)
+                for k in range(3):
+                    x[i, k] += s * wi * edge_normal[c, k]
+                    x[j, k] += s * wj * edge_normal[c, k]
+
+    for i in range(n):
+        step2 = np.float32(0.0)
+        for k in range(3):
+            d = x[i, k] - previous[i, k]
+            step2 += d * d
+        s = one
+        if step2 > max_step * max_step:
+            s = max_step / np.sqrt(step2)
+        for k in range(3):
+            d = (x[i, k] - previous[i, k]) * s
+            x[i, k] = previous[i, k] + d
+            v[i, k] = d / h
+
+
+@numba.njit(cache=True, fastmath=True)
+def _separate_pairs(x, inverse_mass, pair_vertex, pair_face, pair_side, thickness):
+    """Pushes a vertex and a face of the cloth apart to `thickness`, on the side where the vertex was found."""
+    one = np.float32(1.0)
+    slack = np.float32(0.02)  # a vertex over the rim of a face belongs to its neighbour, too
+    for c in range(pair_vertex.shape[0]):
+        i = pair_vertex[c]
+        a = pair_face[c, 0]
+        b = pair_face[c, 1]
+        d = pair_face[c, 2]
+        ux = x[b, 0] - x[a, 0]
+        uy = x[b, 1] - x[a, 1]
+        uz = x[b, 2] - x[a, 2]
+        vx = x[d, 0] - x[a, 0]
+        vy = x[d, 1] - x[a, 1]
+        vz = x[d, 2] - x[a, 2]
+        nx = uy * vz - uz * vy
+        ny = uz * vx - ux * vz
+        nz = ux * vy - uy * vx
+        area2 = nx * nx + ny * ny + nz * nz + _TINY * _TINY
+        area = np.sqrt(area2)
+        rx = x[i, 0] - x[a, 0]
+        ry = x[i, 1] - x[a, 1]
+        rz = x[i, 2] - x[a, 2]
+        side = pair_side[c]
+        distance = (rx * nx + ry * ny + rz * nz) / area * side
+        if distance >= thickness or distance < -thickness - thickness:
+            continue
+        wb = ((ry * vz - rz * vy) * nx + (rz * vx - rx * vz) * ny + (rx * vy - ry * vx) * nz) / area2
+        wd = ((uy * rz - uz * ry) * nx + (uz * rx - ux * rz) * ny + (ux * ry - uy * rx) * nz) / area2
+        wa = one - wb - wd
+        if wa < -slack or wb < -slack or wd < -slack:
+            continue
+        mass = (
+            inverse_mass[i] + inverse_mass[a] * wa * wa + inverse_mass[b] * wb * wb + inverse_mass[d] * wd * wd
+        ) * area
+        s = np.float32(0.5) * (thickness - distance) / mass * side
+        si = s * inverse_mass[i]
+        sa = s * inverse_mass[a] * wa
+        sb = s * inverse_mass[b] * wb
+        sd = s * inverse_mass[d] * wd
+        x[i, 0] += si * nx
+        x[i, 1] += si * ny
+        x[i, 2] += si * nz
+        x[a, 0] -= sa * nx
+        x[a, 1] -= sa * ny
+        x[a, 2] -= sa * nz
+        x[b, 0] -= sb * nx
+        x[b, 1] -= sb * ny
+        x[b, 2] -= sb * nz
+        x[d, 0] -= sd * nx
+        x[d, 1] -= sd * ny
+        x[d, 2] -= sd * nz
+
+
+@numba.njit(cache=True, fastmath=True)
+def find_pairs(x, faces, rest, rest_apart, reach, cell):
+    """Vertices within `reach` of a face of the same cloth that isn't near it in the rest shape.
+
+    Faces are binned by their centres in a grid of the given cell size (at least `reach` plus the longest distance of a
+    corner from its centre). Returns the vertex (S,), the face's vertices (S, 3) and the side of it (S,), by vertex.
+    """
+    n = x.shape[0]
+    m = faces.shape[0]
+    third = np.float32(1.0 / 3.0)
+    low = np.empty(3, np.float32)
+    size = np.empty(3, np.int64)
+    for k in range(3):
+        a, b = x[0, k], x[0, k]
+        for i in range(n):
+            a, b = min(a, x[i, k]), max(b, x[i, k])
+        low[k] = a - cell * np.float32(1.5)  # a rim of empty cells: no neighbour lies outside the grid
+        size[k] = int((b - low[k]) / cell) + 2
+    key = np.empty(m, np.int32)
+    start = np.zeros(size[0] * size[1] * size[2] + 1, np.int32)
+    for f in range(m):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        bucket = int(((x[a, 0] + x[b, 0] + x[c, 0]) * third - low[0]) / cell)
+        bucket = bucket * size[1] + int(((x[a, 1] + x[b, 1] + x[c, 1]) * third - low[1]) / cell)
+        bucket = bucket * size[2] + int(((x[a, 2] + x[b, 2] + x[c, 2]) * third - low[2]) / cell)
+        key[f] = bucket
+        start[bucket + 1] += 1
+    for c in range(len(start) - 1):
+        start[c + 1] += start[c]
+    fill = start[:-1].copy()
+    member = np.empty(m, np.int32)
+    centre = np.empty(
+        (m, 6), np.float32
+    )  # of the present and of the rest shape, side by side in the order of the cells
+    for f in range(m):
+        s = fill[key[f]]
+        fill[key[f]] += 1
+        member[s] = f
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        for k in range(3):
+            centre[s, k] = (x[a, k] + x[b, k] + x[c, k]) * third
+            centre[s, k + 3] = (rest[a, k] + rest[b, k] + rest[c, k]) * third
+
+    found_vertex = np.empty(1024, np.int32)
+    found_face = np.empty(1024, np.int32)
+    found_side = np.empty(1024, np.float32)
+    count = 0
+    cell2 = cell * cell
+    apart2 = rest_apart * rest_apart
+    for i in range(n):
+        ci = int((x[i, 0] - low[0]) / cell)
+        cj = int((x[i, 1] - low[1]) / cell)
+        ck = int((x[i, 2] - low[2]) / cell)
+        for di in range(ci - 1, ci + 2):
+            for dj in range(cj - 1, cj + 2):
+                row = (di * size[1] + dj) * size[2] + ck
+                for s in range(start[row - 1], start[row + 2]):  # three cells that follow each other
+                    px = x[i, 0] - centre[s, 0]
+                    py = x[i, 1] - centre[s, 1]
+                    pz = x[i, 2] - centre[s, 2]
+                    rx = rest[i, 0] - centre[s, 3]
+                    ry = rest[i, 1] - centre[s, 4]
+                    rz = rest[i, 2] - centre[s, 5]
+                    if px * px + py * py + pz * pz > cell2 or rx * rx + ry * ry + rz * rz < apart2:
+                        continue
+                    f = member[s]
+                    a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+                    ux, uy, uz = x[b, 0] - x[a, 0], x[b, 1] - x[a, 1], x[b, 2] - x[a, 2]
+                    vx, vy, vz = x[c, 0] - x[a, 0], x[c, 1] - x[a, 1], x[c, 2] - x[a, 2]
+                    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+                    height = (x[i, 0] - x[a, 0]) * nx + (x[i, 1] - x[a, 1]) * ny + (x[i, 2] - x[a, 2]) * nz
+                    if abs(height) < reach * np.sqrt(nx * nx + ny * ny + nz * nz):
+                        if count == len(found_vertex):
+                            found_vertex = np.concatenate((found_vertex, np.empty(count, np.int32)))
+                            found_face = np.concatenate((found_face, np.empty(count, np.int32)))
+                            found_side = np.concatenate((found_side, np.empty(count, np.float32)))
+                        found_vertex[count] = i
+                        found_face[count] = f
+                        found_side[count] = 1.0 if height >= 0 else -1.0
+                        count += 1
+    return found_vertex[:count], faces[found_face[:count]], found_side[:count]
+
+
+@numba.njit(cache=True)
+def stale_points(x, asked_at, asked_distance, near, slide, everything):
+    """Points whose distance to the skin must be asked again: those that moved too far since the last time."""
+    n = x.shape[0]
+    out = np.empty(n, np.int32)
+    count = 0
+    for i in range(n):
+        moved2 = np.float32(0.0)
+        for k in range(3):
+            d = x[i, k] - asked_at[i, k]
+            moved2 += d * d
+        allowed = slide
+        if asked_distance[i] > near + slide:
+            allowed = asked_distance[i] - near
+        if everything or moved2 > allowed * allowed:
+            out[count] = i
+            count += 1
+    return out[:count]
+
+
+@numba.njit(cache=True)
+def refresh_points(x, face, weights, asked_distance, normal, stale, body_faces, body, motion, moving, near):
+    """Contacts of the points near the skin: their number, the point on the skin, its normal, its motion in a substep.
+
+    `normal` (N, 3) keeps the direction from the skin to each point as it was when it was asked for; the `stale` ones
+    get theirs here.
+    """
+    n = x.shape[0]
+    for s in range(stale.shape[0]):
+        i = stale[s]
+        f = face[i]
+        if f < 0:
+            continue
+        a, b, c = body_faces[f, 0], body_faces[f, 1], body_faces[f, 2]
+        length2 = np.float32(0.0)
+        for k in range(3):
+            skin = weights[i, 0] * body[a, k] + weights[i, 1] * body[b, k] + weights[i, 2] * body[c, k]
+            normal[i, k] = x[i, k] - skin
+            length2 += normal[i, k] * normal[i, k]
+        length = np.sqrt(length2)
+        if length > 1e-4:
+            sign = np.float32(1.0) if asked_distance[i] >= 0 else np.float32(-1.0)
+            for k in range(3):
+                normal[i, k] *= sign / length
+        else:  # on the skin a difference has no direction
+            ux, uy, uz = body[b, 0] - body[a, 0], body[b, 1] - body[a, 1], body[b, 2] - body[a, 2]
+            vx, vy, vz = body[c, 0] - body[a, 0], body[c, 1] - body[a, 1], body[c, 2] - body[a, 2]
+            nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+            area = np.sqrt(nx * nx + ny * ny + nz * nz) + _TINY
+            normal[i, 0], normal[i, 1], normal[i, 2] = nx / area, ny / area, nz / area
+    count = 0
+    for i in range(n):
+        if face[i] >= 0 and asked_distance[i] < near + near:
+            count += 1
+    which = np.empty(count, np.int32)
+    point = np.empty((count, 3), np.float32)
+    out_normal = np.empty((count, 3), np.float32)
+    out_motion = np.zeros((count, 3), np.float32)
+    count = 0
+    for i in range(n):
+        if face[i] >= 0 and asked_distance[i] < near + near:
+            f = face[i]
+            which[count] = i
+            for k in range(3):
+                skin = np.float32(0.0)
+                moved = np.float32(0.0)
+                for corner in range(3):
+                    skin += weights[i, corner] * body[body_faces[f, corner], k]
+                    if moving:
+                        moved += weights[i, corner] * motion[body_faces[f, corner], k]
+                point[count, k] = skin
+                out_normal[count, k] = normal[i, k]
+                out_motion[count, k] = moved
+            count += 1
+    return which, point, out_normal, out_motion

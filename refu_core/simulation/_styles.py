@@ -1,0 +1,309 @@
+"""Styles: tailoring parameters as smooth displacements of the template, and the principal components γ of their drapes.
+
+A tailoring parameter moves the vertices of the *cut* (the rest shape in the T-pose) along a fixed smooth field, so a
+cut is linear in the parameters. Drapes of cuts with different parameters on the mean body are analysed for their
+principal axes, as TailorNet does; γ are the scores on those axes, scaled to unit variance. As γ is a rotation of the
+parameters, the cut follows γ exactly: rest lengths and template come from one linear map, and the folds of a drape stay
+where they belong, in the displacement that a backbone predicts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from refu_core.frames import N_BETAS
+from refu_core.garments import N_STYLES
+from refu_core.sdf import ExactSdf
+from refu_core.simulation._drape import HELD_AT_WAIST, Draper
+from refu_core.simulation._mesh import ClothTopology
+
+if TYPE_CHECKING:
+    from refu_core.body import SmplBody
+    from refu_core.garments import GarmentTemplate
+    from refu_core.simulation._cloth import F32
+
+F64 = NDArray[np.float64]
+_CLEARANCE = 0.005
+"""Distance that a cut made longer or wider keeps from the mean body [m]."""
+
+
+@dataclass(frozen=True)
+class Tailoring:
+    """One tailoring parameter: how far the cut moves at the place where it moves most [m]."""
+
+    name: str
+    mean: float
+    """Added to the template as it was cut: the middle of the range."""
+    std: float
+    """Of the parameter; γ of ±2 reaches two of them."""
+
+
+_PARAMETERS: dict[str, tuple[Tailoring, ...]] = {
+    "shirt": (
+        Tailoring("length", 0.0, 0.03),
+        Tailoring("sleeve_length", -0.01, 0.02),
+        Tailoring("ease", 0.012, 0.004),
+        Tailoring("neckline", 0.008, 0.007),
+    ),
+    "tshirt": (
+        Tailoring("length", 0.0, 0.03),
+        Tailoring("sleeve_length", 0.0, 0.025),
+        Tailoring("ease", 0.012, 0.004),
+        Tailoring("neckline", 0.010, 0.008),
+    ),
+    "short-pant": (
+        Tailoring("length", 0.0, 0.03),
+        Tailoring("flare", 0.008, 0.008),
+        Tailoring("ease", 0.007, 0.003),
+        Tailoring("rise", 0.0, 0.010),
+    ),
+    "skirt": (
+        Tailoring("length", 0.0, 0.04),
+        Tailoring("flare", 0.02, 0.022),
+        Tailoring("ease", 0.005, 0.004),
+        Tailoring("rise", 0.0, 0.010),
+    ),
+}
+
+
+def tailoring_of(garment: str) -> tuple[Tailoring, ...]:
+    """The four tailoring parameters of a built-in garment (`tshirt-male`, …)."""
+    return _PARAMETERS[garment.rpartition("-")[0]]
+
+
+@dataclass(frozen=True, eq=False)
+class StyleBasis:
+    """What a garment with styles is made of."""
+
+    v_template: F32
+    """The mean cut in the T-pose [m], shape (N, 3): the template, moved to the middle of each parameter's range."""
+    styledirs: F32
+    """Displacement of the cut a unit of each γ [m], shape (N, 3, 4)."""
+    tailoring_from_style: F32
+    """Parameters in standard deviations of a γ, shape (4, 4): p = A γ; orthogonal, so γ = Aᵀ p."""
+    parameters: tuple[Tailoring, ...]
+    variance: F64
+    """Share of the drapes' variance on each axis of γ, shape (4,)."""
+    linear: float
+    """Share of the drapes' variance that is linear in the parameters; the rest is folds."""
+
+
+def _smoothstep(value: F64, low: float, high: float) -> F64:
+    t = np.clip((value - low) / (high - low), 0, 1)
+    smooth: F64 = t * t * (3 - 2 * t)
+    return smooth
+
+
+class _Cut:
+    """The template's geometry that tailoring fields are made of."""
+
+    def __init__(self, garment: GarmentTemplate, body: SmplBody) -> None:
+        self.topology = ClothTopology.of(garment.faces.numpy())
+        self.x: F64 = garment.v_template.numpy().astype(np.float64)
+        self.joints: F64 = body.rest_joints(torch.zeros(1, N_BETAS))[0].double().numpy()
+        loops = self.topology.boundary_loops()
+        height = [self.x[loop, 1].mean() for loop in loops]
+        self.top = loops[int(np.argmax(height))]
+        self.bottom = loops[int(np.argmin(height))]
+        self.from_top = self.topology.distance_from(self.x, self.top)
+        self.held = garment.name.startswith(HELD_AT_WAIST)
+        self._sdf = ExactSdf(body.faces)
+        self._sdf.update(body.rest_vertices(torch.zeros(1, N_BETAS))[0])
+
+    def normals(self, smoothing: int = 30) -> F64:
+        """Outward unit normals, smoothed so that a wider cut doesn't deepen the folds of the body under it."""
+        a, b, c = (self.x[self.topology.faces[:, k]] for k in range(3))
+        face = np.cross(b - a, c - a)
+        normal = np.zeros_like(self.x)
+        for k in range(3):
+            np.add.at(normal, self.topology.faces[:, k], face)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        normal = self.smooth(normal, smoothing)
+        unit: F64 = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+        return unit
+
+    def smooth(self, field: F64, rounds: int = 10) -> F64:
+        """A field (N, 3) after `rounds` of moving each vertex halfway to the mean of its neighbours."""
+        i, j = self.topology.edges.T
+        degree = np.bincount(self.topology.edges.ravel(), minlength=len(field))[:, None]
+        for _ in range(rounds):
+            total = np.zeros_like(field)
+            np.add.at(total, i, field[j])
+            np.add.at(total, j, field[i])
+            field = 0.5 * field + 0.5 * total / degree
+        return field
+
+    def outside(self, vertices: F64) -> F64:
+        """`vertices` (N, 3) moved out of the mean body where they are closer to it than a garment should be."""
+        for _ in range(4):
+            found = self._sdf.query(torch.from_numpy(vertices.astype(np.float32)))
+            depth = np.clip(_CLEARANCE - found.distance.numpy(), 0, None)[:, None]
+            if not depth.any():
+                break
+            vertices = (
+                vertices
+                + self.smooth(depth * found.gradient.numpy().astype(np.float64), 3)
+                + (0.3 * depth * found.gradient.numpy())
+            )
+        return vertices
+
+
+def _length(cut: _Cut) -> F64:
+    start = cut.joints[1:3, 1].mean() + 0.02 if cut.held else cut.joints[16:18, 1].mean() - 0.12
+    low = cut.x[cut.bottom, 1].mean()
+    share = np.clip((start - cut.x[:, 1]) / (start - low), 0, None) ** 1.2
+    return np.stack((0 * share, -share, 0 * share), 1)
+
+
+def _sleeve_length(cut: _Cut) -> F64:
+    start = 0.7 * abs(cut.joints[16, 0])
+    far = np.abs(cut.x[:, 0]).max()
+    share = np.clip((np.abs(cut.x[:, 0]) - start) / (far - start), 0, None) ** 1.1
+    return np.stack((np.sign(cut.x[:, 0]) * share, 0 * share, 0 * share), 1)
+
+
+def _ease(cut: _Cut) -> F64:
+    if cut.held:
+        return cut.normals() * _smoothstep(cut.from_top, 0.01, 0.08)[:, None]
+    # Sleeves are narrower than the trunk: the same share of their girth is less.
+    weight = _smoothstep(cut.from_top, 0.06, 0.22)
+    return cut.normals() * (weight * (1 - 0.4 * _smoothstep(np.abs(cut.x[:, 0]), 0.17, 0.26)))[:, None]
+
+
+def _neckline(cut: _Cut) -> F64:
+    # Along the cloth, away from the neck: the gradient of the distance from its rim.
+    a, b, c = (cut.topology.faces[:, k] for k in range(3))
+    x, d = cut.x, cut.from_top
+    normal = np.cross(x[b] - x[a], x[c] - x[a])
+    area2 = (normal**2).sum(1, keepdims=True) + 1e-18
+    gradient = (
+        np.cross(normal, x[c] - x[b]) * d[a, None]
+        + np.cross(normal, x[a] - x[c]) * d[b, None]
+        + np.cross(normal, x[b] - x[a]) * d[c, None]
+    ) / area2
+    away = np.zeros_like(x)
+    for corner in (a, b, c):
+        np.add.at(away, corner, gradient * np.sqrt(area2))
+    away = cut.smooth(away / (np.linalg.norm(away, axis=1, keepdims=True) + 1e-12), 20)
+    # A neckline is cut deeper in front than at the back and on the shoulders.
+    middle = x[cut.top, 2].mean()
+    front = 0.35 + 0.65 * _smoothstep(x[:, 2], middle - 0.01, middle + 0.07)
+    field: F64 = away * (np.exp(-((d / 0.1) ** 2)) * front)[:, None]
+    return field
+
+
+def _flare(cut: _Cut) -> F64:
+    if len(cut.topology.boundary_loops()) > 2:  # trouser legs: away from the axis of each leg
+        side = np.where(cut.x[:, 0] >= 0, 1, 2)
+        hip, knee = cut.joints[side], cut.joints[np.where(side == 1, 4, 5)]
+        along = ((cut.x[:, 1] - hip[:, 1]) / (knee[:, 1] - hip[:, 1]))[:, None]
+        away = cut.x - (hip + along * (knee - hip))
+        start = cut.x[cut.bottom, 1].mean() + 0.75 * (cut.joints[1, 1] - cut.x[cut.bottom, 1].mean())
+    else:
+        away = cut.x - cut.x[cut.bottom].mean(0)
+        start = cut.x[cut.top, 1].mean()
+    away[:, 1] = 0
+    away /= np.linalg.norm(away, axis=1, keepdims=True) + 1e-9
+    low = cut.x[cut.bottom, 1].mean()
+    share = np.clip((start - cut.x[:, 1]) / (start - low), 0, None) ** 1.2
+    return cut.smooth(away * share[:, None])
+
+
+def _rise(cut: _Cut) -> F64:
+    share = np.exp(-((cut.from_top / 0.08) ** 2))
+    return np.stack((0 * share, share, 0 * share), 1)
+
+
+_FIELDS: dict[str, Callable[[_Cut], F64]] = {
+    "length": _length,
+    "sleeve_length": _sleeve_length,
+    "ease": _ease,
+    "neckline": _neckline,
+    "flare": _flare,
+    "rise": _rise,
+}
+_ALONG_THE_BODY = ("length", "sleeve_length", "neckline", "rise")
+"""Fields that carry cloth to where the body may be wider; what they move is kept outside of it."""
+
+
+def tailored(garment: GarmentTemplate, body: SmplBody) -> tuple[F64, F64]:
+    """The mean cut [m], shape (N, 3), and its displacement a standard deviation of each parameter, shape (N, 3, 4)."""
+    cut = _Cut(garment, body)
+    parameters = tailoring_of(garment.name)
+    mean = cut.x.copy()
+    fields = []
+    for parameter in parameters:
+        field = _FIELDS[parameter.name](cut)
+        mean = mean + parameter.mean * field
+        fields.append(parameter.std * field)
+    mean = cut.outside(mean)
+    out = []
+    for parameter, field in zip(parameters, fields, strict=True):
+        if parameter.name in _ALONG_THE_BODY:
+            field = (cut.outside(mean + 2 * field) - cut.outside(mean - 2 * field)) / 4
+        out.append(cut.smooth(field, 2))
+    return mean, np.stack(out, -1)
+
+
+def build_styles(
+    garment: GarmentTemplate,
+    body: SmplBody,
+    *,
+    n_drapes: int = 24,
+    seed: int = 0,
+    progress: Callable[[int], Any] | None = None,
+) -> StyleBasis:
+    """Cuts the garment's styles and finds the principal axes of their drapes on the mean body.
+
+    Args:
+        garment: as it was cut, without styles.
+        body: the body it was cut for.
+        n_drapes: how many drapes, besides the mean cut's and two of each parameter.
+        seed: of their parameters.
+        progress: called with the number of drapes done.
+    """
+    mean, fields = tailored(garment, body)
+    n = len(mean)
+    corners = np.concatenate((1.5 * np.eye(N_STYLES), -1.5 * np.eye(N_STYLES)))
+    drawn = np.clip(np.random.default_rng(seed).normal(size=(n_drapes, N_STYLES)), -2, 2)
+    scores = np.concatenate((np.zeros((1, N_STYLES)), corners, drawn))
+    directions = np.ascontiguousarray(fields, dtype=np.float32)
+    cut = with_styles(garment, mean.astype(np.float32), directions)
+    draper = Draper(cut, body)
+    drapes = np.empty((len(scores), n, 3))
+    for k, score in enumerate(scores):
+        drapes[k], _ = draper.canonical(np.zeros(N_BETAS), score)
+        if progress is not None:
+            progress(k + 1)
+    weight = np.sqrt(draper.topology.vertex_areas(mean))[None, :, None]
+    centred = ((drapes - drapes.mean(0)) * weight).reshape(len(scores), -1)
+    slope, *_ = np.linalg.lstsq(scores - scores.mean(0), centred, rcond=None)  # (4, 3N): drape a unit of each parameter
+    _, singular, axes = np.linalg.svd(slope.T, full_matrices=False)
+    rotation = axes.T  # p = A γ
+    rotation *= np.sign(rotation[np.abs(rotation).argmax(0), np.arange(N_STYLES)])  # larger is longer, wider, deeper
+    explained = ((scores - scores.mean(0)) @ slope).var(0).sum() / centred.var(0).sum()
+    return StyleBasis(
+        mean.astype(np.float32),
+        (fields @ rotation).astype(np.float32),
+        rotation.astype(np.float32),
+        tailoring_of(garment.name),
+        singular**2 / (singular**2).sum(),
+        float(explained),
+    )
+
+
+def with_styles(garment: GarmentTemplate, v_template: F32, styledirs: F32) -> GarmentTemplate:
+    """The garment with another mean cut (N, 3) and these style directions (N, 3, 4), everything else as it was."""
+    from dataclasses import replace
+
+    return replace(
+        garment,
+        v_template=torch.from_numpy(np.ascontiguousarray(v_template)),
+        styledirs=torch.from_numpy(np.ascontiguousarray(styledirs).reshape(-1, N_STYLES)),
+    )

@@ -1,0 +1,53 @@
+#!/usr/bin/env python3
+"""Adds styles to the built-in garments: run after `build_garments.py`, which writes them without.
+
+    python scripts/build_styles.py [--assets refu_core/assets] [--output DIR] [GARMENT ...]
+
+Replaces a garment's `v_template` by the mean cut and adds `styledirs`, `tailoring`, `tailoring_from_style`; about a
+minute a garment. See docs/dataset.md, "Styles".
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from refu_core.body import load_body
+from refu_core.garments import BUILTIN_GARMENTS, load_garment
+from refu_core.simulation import build_styles
+
+
+def main() -> int:
+    """Returns the exit code."""
+    assets = Path(__file__).parents[1] / "refu_core" / "assets"
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("garments", nargs="*", default=BUILTIN_GARMENTS, help="all of them if none is named")
+    parser.add_argument("--output", type=Path, default=assets, help="folder for the files (default: where they are)")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    for name in args.garments:
+        garment = load_garment(name)
+        if garment.styledirs is not None:
+            print(f"{name}: has styles already; run build_garments.py first", file=sys.stderr)
+            return 2
+        basis = build_styles(garment, load_body(garment.body))
+        with np.load(assets / f"garment_{name}.npz", allow_pickle=False) as data:
+            arrays = {key: data[key] for key in data.files}
+        arrays["v_template"] = basis.v_template
+        arrays["styledirs"] = basis.styledirs
+        arrays["tailoring"] = np.array([f"{p.name} {p.std:g} m" for p in basis.parameters])
+        arrays["tailoring_from_style"] = basis.tailoring_from_style
+        args.output.mkdir(parents=True, exist_ok=True)
+        np.savez_compressed(args.output / f"garment_{name}.npz", **arrays)
+        shares = ", ".join(f"{100 * share:.0f} %" for share in basis.variance)
+        print(f"{name}: axes of the drapes {shares}; {100 * basis.linear:.0f} % of their variance linear in the cut")
+        print(np.round(basis.tailoring_from_style.T, 2), [p.name for p in basis.parameters])
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
