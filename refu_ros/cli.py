@@ -59,11 +59,20 @@ def _positive(text: str) -> int:
     return number
 
 
+def _shard(text: str) -> tuple[int, int]:
+    index, _, count = text.partition("/")
+    if not (index.isdigit() and count.isdigit() and int(index) < int(count)):
+        msg = f"wanted I/N with 0 <= I < N, such as 0/4, got {text!r}"
+        raise argparse.ArgumentTypeError(msg)
+    return int(index), int(count)
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="refu", description="Garments on SMPL bodies, free of body-garment collisions.")
     parser.add_argument("--version", action="version", version=f"refu {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Parser)
     _add_replay(commands)
+    _add_simulate(commands)
     _add_info(commands)
     return parser
 
@@ -116,10 +125,36 @@ def _add_replay(commands: Any) -> None:
     parser.set_defaults(run=_replay)
 
 
+def _add_simulate(commands: Any) -> None:
+    parser = commands.add_parser(
+        "simulate",
+        help="make a data set of simulated garments",
+        description="Simulate collision-free garments on bodies of many poses, shapes and styles. An interrupted run "
+        "goes on when the same command is given again.",
+    )
+    parser.add_argument("garment", metavar="GARMENT", help="tshirt-male or another built-in garment")
+    parser.add_argument(
+        "--count", type=_positive, required=True, metavar="N", help="samples, training and test together"
+    )
+    parser.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder of the data set")
+    parser.add_argument(
+        "--motions", type=Path, required=True, metavar="DIR", help="folder of AMASS-style .npz files, two at least"
+    )
+    parser.add_argument(
+        "--body", metavar="BODY", help="a body's name or file (default: the one the garment is cut for)"
+    )
+    parser.add_argument("--seed", type=int, default=0, metavar="S", help="of everything that is drawn (0)")
+    parser.add_argument("--processes", type=_positive, default=1, metavar="P", help="processes, a thread each (1)")
+    parser.add_argument("--shard", type=_shard, default=(0, 1), metavar="I/N", help="make the I-th of N parts, from 0")
+    _add_common(parser)
+    parser.set_defaults(run=_simulate)
+
+
 def _add_info(commands: Any) -> None:
     parser = commands.add_parser(
         "info", help="what is installed, built in and usable", description="What is installed."
     )
+    parser.add_argument("--body", metavar="FILE", help="say what a body model (.npz or official .pkl) holds instead")
     _add_common(parser)
     parser.set_defaults(run=_info)
 
@@ -141,10 +176,30 @@ def _replay(args: argparse.Namespace) -> int:
     return EXIT_INTERRUPTED if result.interrupted else 0
 
 
-def _info(args: argparse.Namespace) -> int:
-    from refu_ros.info import collect
+def _simulate(args: argparse.Namespace) -> int:
+    from refu_ros.simulate import simulate, simulation_table
 
-    facts = collect()
+    _check_writable(args.json)
+    card = simulate(
+        args.garment,
+        args.count,
+        args.output,
+        motions=args.motions,
+        body=args.body,
+        seed=args.seed,
+        processes=args.processes,
+        shard=args.shard,
+        progress=not args.quiet,
+    )
+    print(simulation_table(card, args.output))
+    _write_json(args.json, card)
+    return 0
+
+
+def _info(args: argparse.Namespace) -> int:
+    from refu_ros.info import collect, describe_body
+
+    facts = collect() if args.body is None else describe_body(args.body)
     for name, value in facts.items():
         print(f"{name:>12}  {value}")
     _write_json(args.json, facts)

@@ -7,11 +7,12 @@ from importlib import metadata
 from importlib.util import find_spec
 from typing import Any
 
-from refu_core import __version__
+from refu_core import MeshError, __version__
 from refu_core.backbones import BACKBONES
 from refu_core.body import BUILTIN_BODIES, load_body
 from refu_core.garments import BUILTIN_GARMENTS, load_garment
 from refu_core.realtime import SDF_MODES
+from refu_core.sdf import check_faces
 
 
 def _version(distribution: str) -> str:
@@ -19,6 +20,25 @@ def _version(distribution: str) -> str:
         return metadata.version(distribution)
     except metadata.PackageNotFoundError:
         return "not installed"
+
+
+def describe_body(source: str) -> dict[str, Any]:
+    """What a body model file holds, and whether it can be used. Raises `BodyError`."""
+    body = load_body(source)
+    try:
+        check_faces(body.faces)
+        closed = "yes"
+    except MeshError as error:
+        closed = f"no, its signed distance can't be used: {error}"
+    low, high = body.v_template[:, 1].min(), body.v_template[:, 1].max()
+    return {
+        "body": source,
+        "fingerprint": body.fingerprint,
+        "vertices": body.n_vertices,
+        "faces": len(body.faces),
+        "height": f"{float(high - low):.2f} m",
+        "watertight": closed,
+    }
 
 
 def collect() -> dict[str, Any]:

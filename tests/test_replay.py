@@ -360,3 +360,36 @@ def test_info_names_what_is_there(tmp_path: Path, capsys: pytest.CaptureFixture[
     facts = json.loads((tmp_path / "info.json").read_text())
     assert set(facts["garments"]) == set(BUILTIN_GARMENTS)
     assert "tshirt-male" in capsys.readouterr().out
+
+
+def test_info_describes_a_body(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info", "--body", "female", "--json", str(tmp_path / "body.json")]) == 0
+    facts = json.loads((tmp_path / "body.json").read_text())
+    assert facts["watertight"] == "yes"
+    assert facts["fingerprint"] == load_body("female").fingerprint
+    assert "6909" in capsys.readouterr().out
+
+
+class Evil:
+    def __reduce__(self) -> tuple[Callable[[str], int], tuple[str]]:
+        return os.system, ("echo owned",)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "wanted"),
+    [
+        ("evil.pkl", pickle.dumps({"v_template": Evil()}), "nothing was executed"),
+        ("noise.pkl", os.urandom(200), "can't be read"),
+        ("noise.npz", os.urandom(200), "can't be read"),
+        ("model.fbx", b"", "must be an .npz or an official .pkl"),
+    ],
+    ids=["evil.pkl", "noise.pkl", "noise.npz", "model.fbx"],
+)
+def test_an_unreadable_body_is_one_clear_line(
+    name: str, content: bytes, wanted: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / name).write_bytes(content)
+    code = main(["info", "--body", str(tmp_path / name)])
+    printed = capfd.readouterr()
+    assert_one_line(code, printed.err, name, wanted)
+    assert "owned" not in printed.out

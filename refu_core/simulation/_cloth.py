@@ -64,8 +64,8 @@ class Cloth:
     def __init__(self, topology: ClothTopology, sdf: ExactSdf, *, settings: ClothSettings | None = None) -> None:
         """A garment of this topology against the body behind `sdf`.
 
-        `sdf` must have its BVH built on the same vertices in every process (a body at rest): the tree decides which of
-        two equally close faces is found, and with it the last bit of the result.
+        `sdf` must have its BVH built on the same vertices whenever the same drape is simulated, and must not rebuild it
+        by itself: the tree decides which of two equally close faces is found, and with it the last bit of the result.
         """
         self.settings = settings or ClothSettings()
         self.topology = topology

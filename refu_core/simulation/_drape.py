@@ -7,6 +7,7 @@ takes the same way to its own pose: the result is a function of (β, θ, γ) alo
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -54,7 +55,7 @@ class DrapeSettings:
     rest_speed: float = 0.012
     """Root mean square speed of a cloth at rest [m/s]."""
     drag: tuple[float, float, float] = (130.0, 6.0, 30.0)
-    """Rates at which velocity fades [1/s]: as the template turns into cloth, as the body moves, as the cloth settles."""
+    """Rates at which velocity fades [1/s]: as the template becomes cloth, as the body moves, as the cloth settles."""
     waistband: float = 0.012
     """Width of the band that holds to the skin [m]."""
 
@@ -122,9 +123,10 @@ class Draper:
         self.body = body
         self.settings = settings or DrapeSettings()
         self.topology = ClothTopology.of(garment.faces.numpy())
-        sdf = ExactSdf(body.faces)
-        # The BVH is built here, once, on the same mesh in every process, and only refitted afterwards (see `Cloth`).
-        sdf.update(body.rest_vertices(torch.zeros(1, N_BETAS))[0])
+        # Which of two equally close faces is found depends on the BVH, and with it the last bit of a result: it is built
+        # anew for each drape, on a mesh that only depends on the drape, and never in between.
+        sdf = ExactSdf(body.faces, rebuild_distance=math.inf)
+        self._sdf = sdf
         self.cloth = Cloth(self.topology, sdf, settings=self.settings.cloth)
         self.waist: NDArray[np.intp] | None = None
         if garment.name.startswith(HELD_AT_WAIST):
@@ -161,7 +163,7 @@ class Draper:
         shape = torch.as_tensor(betas, dtype=torch.float32).view(1, N_BETAS)
         rest = self.rest(betas, style)
         body: F32 = self.body.rest_vertices(shape)[0].numpy()
-        self._start(rest, betas, style)
+        self._start(rest, betas, style, body)
         gravity = np.array([0, -GRAVITY, 0], np.float32)
         for _ in range(s.dress_frames):
             self.cloth.frame(body, body, gravity=gravity, drag=s.drag[0])
@@ -175,13 +177,17 @@ class Draper:
                 break
         return self.cloth.positions.copy(), body, speed
 
-    def _start(self, positions: F32, betas: NDArray[np.floating], style: NDArray[np.floating]) -> None:
+    def _start(self, positions: F32, betas: NDArray[np.floating], style: NDArray[np.floating], body: F32) -> None:
         rest = self.rest(betas, style)
         shape = torch.as_tensor(betas, dtype=torch.float32).view(1, N_BETAS)
         transforms = self.body(self._comfort, shape).transforms
         eased = self.garment.pose(torch.from_numpy(rest).expand(len(self._comfort), -1, -1), transforms).numpy()
         body_rest = self.body.rest_vertices(shape)[0].numpy()
+        self._sdf.update(torch.from_numpy(body_rest))
+        self._sdf.rebuild()
         self.cloth.start(rest, positions, eased=list(eased), waist=self.waist, body_rest=body_rest)
+        self._sdf.update(torch.from_numpy(np.ascontiguousarray(body)))
+        self._sdf.rebuild()
 
     def drape(self, pose: NDArray[np.floating], betas: NDArray[np.floating], style: NDArray[np.floating]) -> Drape:
         """The garment of `style` (4,) at rest on the body of `betas` (10,) in `pose` (24, 3) [rad].
@@ -190,7 +196,6 @@ class Draper:
         """
         s = self.settings
         start, body = self.canonical(betas, style)
-        self._start(start, betas, style)
         target = np.array(pose, np.float32)
         root = Rotation.from_rotvec(target[0].astype(np.float64))
         target[0] = 0
@@ -199,6 +204,7 @@ class Draper:
         poses = pose_path(canonical_pose(), target, n)
         tilts = pose_path(np.zeros((1, 3)), root.as_rotvec()[None], n)
         bodies = self._bodies(poses, betas)
+        self._start(start, betas, style, bodies[-1])
         down = np.array([0, -GRAVITY, 0])
         gravity = np.zeros(3, np.float32)
         for after, tilt in zip(bodies, tilts, strict=True):

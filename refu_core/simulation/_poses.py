@@ -26,8 +26,8 @@ _BODY_JOINTS = 22  # SMPL-H and SMPL-X share them with SMPL; the hands have no c
 _MIRRORED = np.array([0, 2, 1, 3, 5, 4, 6, 8, 7, 9, 11, 10, 12, 14, 13, 15, 17, 16, 19, 18, 21, 20, 23, 22])
 
 # Range of each joint's rotation vector [degrees] about x, y, z, for the left side where there are two; the right side
-# is its mirror image. x points to the subject's left, y up, z forward, so a thigh is raised by a negative turn about x, an
-# arm lowered by a negative turn about z, an elbow bent by a negative turn about y.
+# is its mirror image. x points to the subject's left, y up, z forward, so a thigh is raised by a negative turn about x,
+# an arm lowered by a negative turn about z, an elbow bent by a negative turn about y.
 _LIMITS: dict[int, tuple[tuple[float, float], tuple[float, float], tuple[float, float]]] = {
     0: ((-15, 25), (0, 0), (-10, 10)),
     1: ((-85, 20), (-20, 20), (-5, 30)),

@@ -39,7 +39,7 @@ class SelfIntersection:
         return int(self._mesh.id)
 
     def pairs(self, vertices: F32) -> NDArray[np.int32]:
-        """The pairs of faces that intersect, shape (K, 2); neighbours meet at their common edge or vertex without it."""
+        """The pairs of faces that intersect, shape (K, 2); neighbours may meet at an edge or vertex."""
         points = torch.from_numpy(np.ascontiguousarray(vertices, dtype=np.float32))
         self._mesh = wp.Mesh(as_warp(points, wp.vec3), as_warp(self._flat, wp.int32))
         found = crossings(self, points.numpy(), self._faces, is_body=True)  # type: ignore[arg-type]
