@@ -104,7 +104,8 @@ def test_matches_smplx_where_it_is_installed(tmp_path: Path) -> None:
     other = smplx.SMPL(str(tmp_path / "SMPL_NEUTRAL.pkl"), dtype=torch.float64)
     pose, betas = torch.as_tensor(rng.normal(size=(4, 24, 3))), torch.as_tensor(rng.normal(size=(4, 10)))
     theirs = other(global_orient=pose[:, 0], body_pose=pose[:, 1:].flatten(1), betas=betas)
-    torch.testing.assert_close(model(data)(pose, betas).vertices, theirs.vertices, atol=1e-9, rtol=0)
+    # smplx keeps some of its arrays in float32
+    torch.testing.assert_close(model(data)(pose, betas).vertices, theirs.vertices, atol=2e-6, rtol=0)
 
 
 def test_batch_equals_single_frames() -> None:

@@ -1,0 +1,58 @@
+"""What `refu simulate` does: a data set of simulated garments, with progress, and a summary of its card."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Any
+
+from tqdm import tqdm
+
+from refu_core.simulation import Progress, simulate_dataset
+from refu_ros.tables import format_table
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def simulate(
+    garment: str,
+    count: int,
+    output: Path,
+    *,
+    motions: Path,
+    body: str | None,
+    seed: int,
+    processes: int,
+    shard: tuple[int, int],
+    progress: bool,
+) -> dict[str, Any]:
+    """Simulates with a progress bar that shows what was dropped; returns the set's card. Raises `RefuError`."""
+    with ExitStack() as stack:
+        bar = stack.enter_context(tqdm(total=None, unit="sample", disable=None if progress else True))
+
+        def show(state: Progress) -> None:
+            bar.total = state.total
+            bar.set_postfix(state.dropped, refresh=False)
+            bar.update(state.done - bar.n)
+
+        return simulate_dataset(
+            garment,
+            count,
+            output,
+            motions=motions,
+            body=body,
+            seed=seed,
+            processes=processes,
+            shard=shard,
+            progress=show,
+        )
+
+
+def simulation_table(card: dict[str, Any], output: Path) -> str:
+    """What `refu simulate` prints."""
+    counts, share, figures = card["counts"], card["yield"], card.get("figures", {})
+    rows = [(name.replace("_", " "), str(number)) for name, number in counts.items()]
+    rows += [("yield", f"{100 * share['kept_share']:.1f} %")]
+    rows += [(f"  dropped: {cause.replace('_', ' ')}", str(n)) for cause, n in share["dropped"].items() if n]
+    rows += [(name.replace("_", " "), f"{value:.3f}") for name, value in figures.items()]
+    return format_table((f"{card['garment']} on {card['body']}", str(output)), rows)
