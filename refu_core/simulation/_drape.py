@@ -123,7 +123,7 @@ class Draper:
         self.body = body
         self.settings = settings or DrapeSettings()
         self.topology = ClothTopology.of(garment.faces.numpy())
-        # Which of two equally close faces is found depends on the BVH, and with it the last bit of a result: it is built
+        # Which of two equally close faces is found depends on the BVH, and with it a result's last bit: it is built
         # anew for each drape, on a mesh that only depends on the drape, and never in between.
         sdf = ExactSdf(body.faces, rebuild_distance=math.inf)
         self._sdf = sdf
