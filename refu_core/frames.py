@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 N_JOINTS = 24
 N_BETAS = 10
+N_STYLES = 4
 
 
 def _array(name: str, value: Any, shape: tuple[int, ...], dtype: type[np.floating[Any]]) -> NDArray[Any]:
@@ -52,6 +53,8 @@ class SmplFrame:
     """Shape coefficients in standard deviations, shape (10,)."""
     transl: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     """Added to the posed vertices [m], shape (3,); float64, so that a body far from the origin loses no precision."""
+    style: NDArray[np.float32] | None = None
+    """Garment style γ in standard deviations, shape (4,); None for the wearer's usual one."""
     stamp_ns: int = 0
     """Time of the measurement [ns since the epoch of the sender's clock]."""
 
@@ -60,4 +63,6 @@ class SmplFrame:
         object.__setattr__(self, "pose", _array("pose", self.pose, (N_JOINTS, 3), np.float32))
         object.__setattr__(self, "betas", _array("betas", self.betas, (N_BETAS,), np.float32))
         object.__setattr__(self, "transl", _array("transl", self.transl, (3,), np.float64))
+        if self.style is not None:
+            object.__setattr__(self, "style", _array("style", self.style, (N_STYLES,), np.float32))
         object.__setattr__(self, "stamp_ns", int(self.stamp_ns))

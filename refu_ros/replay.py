@@ -20,6 +20,7 @@ from refu_core import FrameError, GarmentPipeline, SmplFrame
 from refu_core.evaluation import CollisionChecker, GarmentMetrics, MetricsSummary, SelfContact, SelfContactDetector
 from refu_core.evaluation.render import GARMENT_COLOURS
 from refu_core.repulsion import DEFAULT_MARGIN
+from refu_ros.truth import GroundTruth
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -214,13 +215,14 @@ def _motion_records(motion: adapters.Motion, topic: str) -> Iterator[FrameRecord
 class Evaluator:
     """Exact metrics of every frame, before and after collision handling."""
 
-    def __init__(self, pipeline: GarmentPipeline) -> None:
+    def __init__(self, pipeline: GarmentPipeline, truth: GroundTruth | None = None) -> None:
         self._pipeline = pipeline
         self._body_faces = pipeline.body.faces.cpu().numpy()
         self._checker = CollisionChecker(self._body_faces)
         self._detector: tuple[bytes, SelfContactDetector] | None = None
         faces = {name: garment.faces.cpu().numpy() for name, garment in pipeline.garments.items()}
         self._faces = faces
+        self.truth = truth or GroundTruth()
         self.before = {name: GarmentMetrics(f) for name, f in faces.items()}
         self.after = {name: GarmentMetrics(f) for name, f in faces.items()}
 
@@ -243,8 +245,9 @@ class Evaluator:
             near = contact.near(mesh.local)
             raw = self._checker.check(mesh.raw, self._faces[name])
             done = self._checker.check(mesh.local, self._faces[name])
-            self.before[name].add(mesh.raw, raw, near_contact=near)
-            self.after[name].add(mesh.local, done, near_contact=near)
+            truth = self.truth.of(name, frame)
+            self.before[name].add(mesh.raw, raw, truth=truth, near_contact=near)
+            self.after[name].add(mesh.local, done, truth=truth, near_contact=near)
             records[name] = GarmentRecord(
                 latency_ms=latency_ms - sum(own_ms.values()) + own_ms[name],
                 n_inside_before=raw.n_inside,
@@ -266,7 +269,9 @@ class _Replayer:
         self._pipeline = pipeline
         self._source = source
         self._result = result
-        self._evaluator = Evaluator(pipeline)
+        faces = {name: garment.faces.cpu().numpy() for name, garment in pipeline.garments.items()}
+        truth = GroundTruth.of_bag(options.input, faces, axes=options.input_axes) if source.is_bag else None
+        self._evaluator = Evaluator(pipeline, truth)
         self._betas = None if options.betas is None else np.asarray(options.betas, np.float32)
         meshes = [
             adapters.MarkerMesh(

@@ -393,3 +393,26 @@ def test_an_unreadable_body_is_one_clear_line(
     printed = capfd.readouterr()
     assert_one_line(code, printed.err, name, wanted)
     assert "owned" not in printed.out
+
+
+def test_ground_truth_in_the_bag_gives_mpve(tmp_path: Path) -> None:
+    """A bag whose truth is what comes out, 3 mm to the side: MPVE after is 3 mm."""
+    pipeline = GarmentPipeline.load(["short-pant-male"])
+    mesh = adapters.MarkerMesh(
+        ns="short-pant-male",
+        faces=pipeline.garments["short-pant-male"].faces.numpy(),
+        n_vertices=pipeline.garments["short-pant-male"].n_vertices,
+    )
+    encoder, encode = adapters.MarkerArrayEncoder([mesh]), adapters.encoder_for("multiarray")
+    bag = tmp_path / "truth.mcap"
+    with adapters.BagWriter(bag) as writer:
+        writer.add_topic("/smpl_params", adapters.INPUT_TYPES["multiarray"])
+        writer.add_topic("/ground_truth", adapters.MARKER_ARRAY)
+        for frame in motion():
+            true = pipeline(frame)["short-pant-male"].local + np.array([0.003, 0, 0], np.float32)
+            data = encoder.encode([true], stamp_ns=frame.stamp_ns, transl=frame.transl)
+            writer.write("/smpl_params", encode(frame), log_time_ns=frame.stamp_ns)
+            writer.write("/ground_truth", data, log_time_ns=frame.stamp_ns)
+    assert run(bag, "--garments", "short-pant-male", "--json", tmp_path / "r.json") == 0
+    figures = json.loads((tmp_path / "r.json").read_text())["garments"]["short-pant-male"]
+    assert figures["mpve_mm"] == pytest.approx(3.0, abs=1e-3)

@@ -48,10 +48,15 @@ def stamp_ns_of(header: Any) -> int:
 
 
 def smpl_frame(
-    pose: NDArray[Any], betas: NDArray[Any] | None, transl: NDArray[Any] | None, *, stamp_ns: int = 0
+    pose: NDArray[Any],
+    betas: NDArray[Any] | None,
+    transl: NDArray[Any] | None,
+    *,
+    style: NDArray[Any] | None = None,
+    stamp_ns: int = 0,
 ) -> SmplFrame:
     """The validated frame; what a message leaves out is zero."""
-    given = {"betas": betas, "transl": transl}
+    given = {"betas": betas, "transl": transl, "style": style}
     return SmplFrame(
         pose=pose, stamp_ns=stamp_ns, **{name: value for name, value in given.items() if value is not None}
     )

@@ -1,8 +1,8 @@
 """std_msgs/Float32MultiArray: blocks of numbers one after another, each declared by a dimension's label.
 
 `layout.dim` holds one dimension a block, in the order of the data: `pose` (72 rotation vector components [rad]),
-`betas` (10) and `transl` (3, [m]); the last two are optional. A block starts `stride` numbers after the one before it
-(0 stands for its size), the first one at `layout.data_offset`.
+`betas` (10), `transl` (3, [m]) and `style` (4, a garment's γ); all but the pose are optional. A block starts `stride`
+numbers after the one before it (0 stands for its size), the first one at `layout.data_offset`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from msg_adapters.cdr import CdrReader, CdrWriter
 from msg_adapters.errors import DecodeError
 from msg_adapters.inputs._frame import decoding, reading_fields, smpl_frame
-from refu_core.frames import N_BETAS, N_JOINTS, SmplFrame
+from refu_core.frames import N_BETAS, N_JOINTS, N_STYLES, SmplFrame
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from msg_adapters.cdr import Buffer
 
 MESSAGE_TYPE = "std_msgs/msg/Float32MultiArray"
-_SIZES = {"pose": N_JOINTS * 3, "betas": N_BETAS, "transl": 3}
-_LABELLING = "label layout.dim pose (72), betas (10, optional) and transl (3, optional) in the order of the data"
+_SIZES = {"pose": N_JOINTS * 3, "betas": N_BETAS, "transl": 3, "style": N_STYLES}
+_LABELLING = "label layout.dim pose (72) and, if there, betas (10), transl (3) and style (4), in the order of the data"
 _MAX_DIMENSIONS = 16
 _MIN_DIMENSION_BYTES = 12
 
@@ -68,7 +68,7 @@ def _blocks(dimensions: Sequence[_Dimension], offset: int, data: NDArray[Any]) -
 
 def _frame(dimensions: Sequence[_Dimension], offset: int, data: NDArray[Any]) -> SmplFrame:
     blocks = _blocks(dimensions, offset, data)
-    return smpl_frame(blocks["pose"], blocks.get("betas"), blocks.get("transl"))
+    return smpl_frame(blocks["pose"], blocks.get("betas"), blocks.get("transl"), style=blocks.get("style"))
 
 
 def from_bytes(data: Buffer) -> SmplFrame:
@@ -98,12 +98,15 @@ def from_message(message: Any) -> SmplFrame:
 
 
 def to_bytes(frame: SmplFrame, *, frame_id: str = "map") -> bytes:  # noqa: ARG001 - the type has no header
-    """The message in CDR: pose, betas, transl."""
+    """The message in CDR: pose, betas, transl, and style where the frame has one."""
+    blocks: dict[str, NDArray[Any]] = {"pose": frame.pose.ravel(), "betas": frame.betas, "transl": frame.transl}
+    if frame.style is not None:
+        blocks["style"] = frame.style
     writer = CdrWriter()
-    writer.numbers("I", len(_SIZES))
-    for label, size in _SIZES.items():
+    writer.numbers("I", len(blocks))
+    for label, block in blocks.items():
         writer.string(label)
-        writer.numbers("II", size, size)
+        writer.numbers("II", block.size, block.size)
     writer.numbers("I", 0)
-    writer.sequence("f4", np.concatenate([frame.pose.ravel(), frame.betas, frame.transl]))
+    writer.sequence("f4", np.concatenate(list(blocks.values())))
     return writer.to_bytes()

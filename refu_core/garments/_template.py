@@ -14,12 +14,12 @@ from torch import Tensor
 from refu_core._npz import read_npz
 from refu_core.body import RigidTransforms, apply_transforms, blend_transforms, unapply_transforms
 from refu_core.errors import GarmentError
+from refu_core.frames import N_STYLES as N_STYLES
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 BUILTIN_GARMENTS: tuple[str, ...] = ("shirt-male", "tshirt-male", "short-pant-male", "skirt-female")
-N_STYLES = 4
 
 
 @dataclass(frozen=True, eq=False)

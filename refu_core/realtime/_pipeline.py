@@ -201,7 +201,7 @@ class GarmentPipeline:
         betas = torch.as_tensor(np.stack([f.betas for f in frames]), device=device)
         posed = self.body(pose, betas)
         stages = {"body": clock.lap() / len(frames)}
-        style = None if self._style is None else self._style.expand(len(frames), -1)
+        style = self._styles(frames)
         raw: dict[str, Tensor] = {}
         dress_ms: dict[str, float] = {}
         for name, wearable in self._wearables.items():
@@ -212,6 +212,14 @@ class GarmentPipeline:
             self._handle_collisions(frame, posed.vertices[i], {name: x[i] for name, x in raw.items()}, stages, dress_ms)
             for i, frame in enumerate(frames)
         ]
+
+    def _styles(self, frames: Sequence[SmplFrame]) -> Tensor | None:
+        """γ of each frame, shape (B, 4): its own, else the pipeline's; None where nobody gave any."""
+        if self._style is None and all(frame.style is None for frame in frames):
+            return None
+        usual = np.zeros(N_STYLES, np.float32) if self._style is None else self._style[0].cpu().numpy()
+        own = [usual if frame.style is None else frame.style for frame in frames]
+        return torch.as_tensor(np.stack(own), device=self.body.device)
 
     def _handle_collisions(
         self,

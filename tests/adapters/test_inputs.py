@@ -353,3 +353,11 @@ def test_strings_must_be_utf8_and_end() -> None:
 def test_stamps_that_no_message_can_hold(stamp_ns: int) -> None:
     with pytest.raises(EncodeError, match="32 bits of seconds"):
         encoder_for("joint_state")(replace(REST, stamp_ns=stamp_ns))
+
+
+def test_a_style_travels_in_a_multiarray() -> None:
+    styled = SmplFrame(pose=np.zeros(72), style=[0.5, -1, 2, 0])
+    decoded = decoder_for("multiarray").from_bytes(encoder_for("multiarray")(styled))
+    np.testing.assert_array_equal(decoded.style, styled.style)
+    plain = decoder_for("multiarray").from_bytes(encoder_for("multiarray")(SmplFrame(pose=np.zeros(72))))
+    assert plain.style is None

@@ -1,0 +1,56 @@
+"""Ground truth that a bag carries beside its body parameters: garments as markers on a topic of their own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+import msg_adapters as adapters
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from refu_core import SmplFrame
+
+TOPIC = "/ground_truth"
+"""A MarkerArray a frame, stamped as its body parameters are; a marker's `ns` is the garment's name."""
+
+
+@dataclass(frozen=True, eq=False)
+class GroundTruth:
+    """True garments by name and stamp."""
+
+    garments: Mapping[str, Mapping[int, NDArray[np.float64]]] = field(default_factory=dict)
+    """Vertices in SMPL axes with the translation [m], shape (V, 3), by stamp [ns]."""
+
+    @classmethod
+    def of_bag(
+        cls, path: Path, faces: Mapping[str, NDArray[np.int64]], *, axes: adapters.InputAxes = "smpl"
+    ) -> GroundTruth:
+        """What the bag at `path` holds of the garments whose faces (F, 3) are given.
+
+        Raises:
+            AdapterError: the bag can't be read, or a garment in it has another topology.
+        """
+        garments: dict[str, dict[int, NDArray[np.float64]]] = {name: {} for name in faces}
+        with adapters.BagReader(path) as reader:
+            if TOPIC not in {topic.name for topic in reader.topics}:
+                return cls()
+            for message in reader.messages([TOPIC]):
+                for marker in adapters.decode_marker_array(message.data):
+                    if marker.ns in faces:
+                        vertices = adapters.vertices_from_points(marker.points, faces[marker.ns])
+                        if axes == "smpl":
+                            vertices = adapters.vertices_smpl_from_ros(vertices)
+                        garments[marker.ns][marker.stamp_ns] = np.ascontiguousarray(vertices)
+        return cls(garments)
+
+    def of(self, garment: str, frame: SmplFrame) -> NDArray[np.float64] | None:
+        """The true garment without the translation [m], shape (V, 3); None where the bag has none at that stamp."""
+        vertices = self.garments.get(garment, {}).get(frame.stamp_ns)
+        return None if vertices is None else vertices - frame.transl
