@@ -57,6 +57,17 @@ class ReplayOptions:
     max_frames: int | None = None
     overwrite: bool = False
 
+    def load_pipeline(self) -> GarmentPipeline:
+        """The pipeline that these options ask for. Raises `RefuError` for options that make none."""
+        return GarmentPipeline.load(
+            self.garments,
+            sdf=self.sdf,
+            backbone=self.backbone,
+            style=self.style,
+            margin=self.margin,
+            device=self.device,
+        )
+
 
 @dataclass(frozen=True)
 class GarmentRecord:
@@ -338,14 +349,7 @@ def replay(options: ReplayOptions, *, progress: bool = False) -> ReplayResult:
         RefuError: a bad input file, an unknown garment, an output that can't be written, or no frame that could be
             replayed.
     """
-    pipeline = GarmentPipeline.load(
-        options.garments,
-        sdf=options.sdf,
-        backbone=options.backbone,
-        style=options.style,
-        margin=options.margin,
-        device=options.device,
-    )
+    pipeline = options.load_pipeline()
     pipeline(
         SmplFrame(pose=np.zeros((24, 3), np.float32))
     )  # compiles kernels, so that the first frame's latency is a frame's

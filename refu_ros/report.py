@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from refu_core import GarmentPipeline, RefuError
+from refu_core import RefuError
 from refu_core.evaluation import CollisionChecker
 from refu_core.evaluation.render import GARMENT_COLOURS, Camera, RenderMesh, render, save_png
 from refu_ros.replay import FrameResult, ReplayResult
@@ -131,15 +131,7 @@ def _draw_frames(result: ReplayResult, folder: Path, *, progress: bool) -> list[
     """Renders the worst, a median and the best frame, before and after, from their parameters."""
     order = sorted(range(len(result.frames)), key=lambda i: result.frames[i].badness)
     chosen = {"worst": order[-1], "median": order[len(order) // 2], "best": order[0]}
-    options = result.options
-    pipeline = GarmentPipeline.load(
-        options.garments,
-        sdf=options.sdf,
-        backbone=options.backbone,
-        style=options.style,
-        margin=options.margin,
-        device=options.device,
-    )
+    pipeline = result.options.load_pipeline()
     body_faces = pipeline.body.faces.cpu().numpy()
     checker = CollisionChecker(body_faces)
     pictures = []

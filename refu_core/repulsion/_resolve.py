@@ -87,7 +87,7 @@ def resolve(
     alpha = scale[rows] if isinstance(scale, Tensor) and scale.ndim else scale
     rounds += _push(state, rows, first, alpha, max_pushes)
     stuck = state.distance < 0
-    state.vertices[stuck] = points[stuck]
+    state.vertices[stuck], state.distance[stuck] = points[stuck], start.distance[stuck]
     if edges is not None:
         rounds += _raise_edges(state, edges, max_pushes)
     vertices, distance = state.vertices, state.distance
@@ -149,9 +149,9 @@ def _retreat(state: _State, rows: Tensor, outward: Tensor, limbs: Limbs, max_pus
     """Moves `rows` against `outward` (N, 3) out of a limb, as far as there is room; returns the rounds it took."""
     walker, here = rows, state.vertices[rows]
     distance, way = state.distance[rows], torch.zeros_like(state.distance[rows])
-    for round_ in range(_RETREAT_STEPS):
-        if not len(walker):
-            return round_
+    rounds = 0
+    while len(walker) and rounds < _RETREAT_STEPS:
+        rounds += 1
         # No surface is nearer than |f|: a step of |f| can't jump over the room that is sought, however narrow it is.
         # Farther in than the garment is cut off the skin there is only flesh.
         step = torch.minimum(-distance + _STEP_ON, limbs.clearance[walker] + _STEP_ON - way)
@@ -167,7 +167,7 @@ def _retreat(state: _State, rows: Tensor, outward: Tensor, limbs: Limbs, max_pus
     state.keep_better(missed, filled, state.sdf.query(filled).distance)
     # In the room between limb and skin the gradient keeps to the middle, or at the margin where that is wide enough.
     found = rows[state.distance[rows] > 0]
-    return _RETREAT_STEPS + _push(state, found, state.sdf.query(state.vertices[found]), 1.0, max_pushes)
+    return rounds + _push(state, found, state.sdf.query(state.vertices[found]), 1.0, max_pushes)
 
 
 def _raise_edges(state: _State, edges: Tensor, max_rounds: int) -> int:
