@@ -181,11 +181,11 @@ class RoomSettings:
 
     near: float = 0.008
     """A vertex this close to skin that touches other skin has no room [m]."""
-    padding: float = 0.0015
+    padding: float = 0.002
     """Room that cloth takes on the skin of the trunk and the upper arms [m]."""
     limb_padding: float = 0.004
     """Room that it takes on the legs, which have two layers between them, and on forearms and hands [m]."""
-    tolerated: int = 8
+    tolerated: int = 4
     """Vertices without room that don't count yet: creases of elbow and groin press skin on skin, too."""
     step: float = 0.15
     """Share of its way that a limb is moved back at once."""
