@@ -30,7 +30,7 @@ _MIRRORED = np.array([0, 2, 1, 3, 5, 4, 6, 8, 7, 9, 11, 10, 12, 14, 13, 15, 17, 
 # an arm lowered by a negative turn about z, an elbow bent by a negative turn about y.
 _LIMITS: dict[int, tuple[tuple[float, float], tuple[float, float], tuple[float, float]]] = {
     0: ((-15, 25), (0, 0), (-10, 10)),
-    1: ((-85, 20), (-20, 20), (-5, 30)),
+    1: ((-85, 20), (-20, 20), (-5, 25)),
     3: ((-8, 18), (-12, 12), (-10, 10)),
     4: ((0, 100), (-5, 5), (0, 0)),
     6: ((-5, 15), (-12, 12), (-10, 10)),
