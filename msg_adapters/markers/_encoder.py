@@ -144,7 +144,7 @@ class MarkerArrayEncoder:
         self,
         vertices: Sequence[ArrayLike],
         *,
-        stamp_ns: int,
+        stamp_ns: int | Sequence[int],
         transl: ArrayLike | None = None,
         colors: Sequence[ArrayLike | None] | None = None,
     ) -> bytes:
@@ -153,22 +153,26 @@ class MarkerArrayEncoder:
         Args:
             vertices: for each mesh its vertices [m], shape (V, 3), float32 or float64, in SMPL axes (or, with
                 `axes="frame"`, in the axes of the frame).
-            stamp_ns: time of the measurement [ns].
+            stamp_ns: time of the measurement [ns], of all meshes or of each.
             transl: added in float64 [m], in the same axes: shape (3,) for all meshes or (M, 3) for each.
             colors: for each mesh with `vertex_colors` its red, green, blue, alpha, shape (V, 4); None for the others.
 
         Raises:
             EncodeError: a shape is wrong, a vertex isn't finite, or the stamp doesn't fit a ROS time.
         """
-        stamp = split_stamp(stamp_ns)
         n = len(self._slots)
         if len(vertices) != n or (colors is not None and len(colors) != n):
             got = len(vertices) if colors is None else (len(vertices), len(colors))
             msg = f"wanted vertices (and colours, if any) of {n} meshes, got {got}"
             raise EncodeError(msg)
+        each = [stamp_ns] * n if isinstance(stamp_ns, (int, np.integer)) else stamp_ns
+        stamps = [split_stamp(stamp) for stamp in each]
+        if len(stamps) != n:
+            msg = f"wanted a stamp for all meshes or {n} stamps, got {len(stamps)}"
+            raise EncodeError(msg)
         offsets = self._offsets(transl)
         for i, slot in enumerate(self._slots):
-            struct.pack_into("<iI", self._payload, slot.stamp_at, *stamp)
+            struct.pack_into("<iI", self._payload, slot.stamp_at, *stamps[i])
             self._write_points(slot, np.asarray(vertices[i]), offsets[i])
             self._write_colors(slot, None if colors is None else colors[i])
         return self._message.tobytes()

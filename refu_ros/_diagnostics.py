@@ -1,0 +1,121 @@
+"""What the node says about itself once a second; each WARN or ERROR is something to act on."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from msg_adapters import DiagnosticStatus
+from msg_adapters.diagnostics import ERROR, OK, WARN
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from refu_ros._recorder import RecorderState
+    from refu_ros._settings import NodeSettings
+    from refu_ros._statistics import Report
+
+_OVER_BUDGET = 0.1
+"""Share of the frames that may be superseded before they are worked on."""
+_LOW_DISK_BYTES = 1 << 30
+
+
+def statuses(
+    report: Report,
+    settings: NodeSettings,
+    *,
+    node: str,
+    state: str,
+    persons: Sequence[str],
+    recording: RecorderState | None,
+) -> list[DiagnosticStatus]:
+    """Input, output and recording; `state` is the lifecycle's, `persons` are those in the scene."""
+    active = state == "active"
+    return [
+        _input(report, settings, f"{node}: input", persons=persons, active=active),
+        _output(report, settings, f"{node}: garments", state=state),
+        _recording(recording, f"{node}: recording"),
+    ]
+
+
+def _input(
+    report: Report, settings: NodeSettings, name: str, *, persons: Sequence[str], active: bool
+) -> DiagnosticStatus:
+    invalid, received = report.recent["drop.invalid"], report.recent["received"]
+    missing = [] if settings.follow_humans else [person for person in settings.persons if person not in persons]
+    level, message = OK, f"{report.rate('received'):.1f} Hz"
+    if not active:
+        message = "not active"
+    elif invalid and invalid == received:
+        level, message = ERROR, f"every message is invalid: {report.reasons.get('invalid', '')}"
+    elif invalid:
+        level, message = WARN, f"{invalid} of {received} messages are invalid: {report.reasons.get('invalid', '')}"
+    elif report.silent_for is None:
+        level, message = WARN, "no input yet"
+    elif missing:
+        who = ", ".join(filter(None, missing))
+        level = WARN
+        message = f"no input from {who}" if who else f"no input for {report.silent_for:.1f} s"
+    values = {
+        "rate [Hz]": f"{report.rate('received'):.1f}",
+        "received": str(report.total["received"]),
+        "persons": ", ".join(filter(None, persons)) or str(len(persons)),
+        "input type": settings.input_type,
+    }
+    values |= {f"dropped: {cause}": str(n) for cause, n in sorted(report.group("drop").items())}
+    return DiagnosticStatus(level, name, message, values=values)
+
+
+def _output(report: Report, settings: NodeSettings, name: str, *, state: str) -> DiagnosticStatus:
+    stale, received = report.recent["drop.stale"], report.recent["received"]
+    failed = report.recent["drop.failed"] + report.recent["drop.not_finite"]
+    p50, p95, p99 = report.latency_ms
+    level, message = OK, f"{report.rate('ticks'):.1f} Hz, latency p95 {p95:.1f} ms"
+    if report.last_error:
+        level, message = ERROR, report.last_error
+    elif state != "active":
+        message = f"not active but {state}"
+    elif failed:
+        reason = report.reasons.get("failed") or report.reasons.get("not_finite", "")
+        level, message = ERROR, f"{failed} frames failed: {reason}"
+    elif stale > _OVER_BUDGET * received:
+        level = WARN
+        message = f"over budget: {stale} of {received} frames were superseded; latency p95 {p95:.1f} ms"
+    found, unresolved = report.total["penetration.found"], report.total["penetration.unresolved"]
+    values = {
+        "rate [Hz]": f"{report.rate('ticks'):.1f}",
+        "messages": str(report.total["ticks"]),
+        "frames": str(report.total["frames"]),
+        "latency p50 [ms]": f"{p50:.1f}",
+        "latency p95 [ms]": f"{p95:.1f}",
+        "latency p99 [ms]": f"{p99:.1f}",
+        "penetrating vertices found": str(found),
+        "penetrating vertices resolved": str(found - unresolved),
+        "penetrating vertices unresolved": str(unresolved),
+        "garments": ", ".join(settings.garments),
+        "backbone": settings.backbone,
+        "sdf": settings.sdf,
+        "device": settings.device,
+    }
+    values |= {f"skipped: {kind}": str(n) for kind, n in sorted(report.group("skip").items())}
+    return DiagnosticStatus(level, name, message, values=values)
+
+
+def _recording(state: RecorderState | None, name: str) -> DiagnosticStatus:
+    if state is None:
+        return DiagnosticStatus(OK, name, "not recording")
+    level, message = OK, f"{state.written} messages in {state.path}"
+    if state.error:
+        level, message = ERROR, f"recording stopped: {state.error}"
+    elif state.free_bytes is not None and state.free_bytes < _LOW_DISK_BYTES:
+        level, message = WARN, f"disk nearly full: {state.free_bytes / 1e6:.0f} MB left"
+    elif state.dropped:
+        level, message = WARN, f"{state.dropped} messages not recorded: the disk is too slow"
+    values = {
+        "path": str(state.path),
+        "messages": str(state.written),
+        "queued": str(state.queued),
+        "dropped": str(state.dropped),
+        "size [MB]": f"{state.size_bytes / 1e6:.1f}",
+        "disk free [MB]": "unknown" if state.free_bytes is None else f"{state.free_bytes / 1e6:.0f}",
+    }
+    return DiagnosticStatus(level, name, message, values=values)

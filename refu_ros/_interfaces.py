@@ -1,0 +1,18 @@
+"""ROS message and service classes by name."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+from refu_core import RefuError
+
+
+def interface(name: str) -> Any:
+    """The class of a type such as `std_msgs/msg/Header`. Raises `RefuError` where its package isn't there."""
+    package, kind, type_name = name.split("/")
+    try:
+        return getattr(import_module(f"{package}.{kind}"), type_name)
+    except ImportError as error:
+        msg = f"{name} isn't importable: install or source {package} ({error})"
+        raise RefuError(msg) from error

@@ -1,0 +1,118 @@
+"""Who is in the scene and what each person sent last; the meeting point of the executor and the inference thread."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from refu_core import FrameError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from refu_core import SmplFrame
+    from refu_ros._statistics import Statistics
+
+_MAX_ANGLE = 1e3
+_MAX_BETA = 20.0
+_MAX_TRANSL = 1e9
+_MAX_STAMP_NS = 2**31 * 10**9
+
+
+@dataclass(frozen=True, eq=False)
+class Arrival:
+    """A frame and when it came."""
+
+    frame: SmplFrame
+    received: float
+    """On the scene's clock [s]."""
+
+
+def check_plausible(frame: SmplFrame) -> None:
+    """Finite is not enough: numbers no body has would overflow further on, where they are hard to tell apart.
+
+    Raises `FrameError`.
+    """
+    for name, value, limit in (
+        ("pose", frame.pose, _MAX_ANGLE),
+        ("betas", frame.betas, _MAX_BETA),
+        ("transl", frame.transl, _MAX_TRANSL),
+    ):
+        largest = float(np.abs(value).max())
+        if largest > limit:
+            msg = f"{name}: wanted magnitudes up to {limit:g}, got {largest:g}"
+            raise FrameError(msg)
+    if not 0 <= frame.stamp_ns < _MAX_STAMP_NS:
+        msg = f"wanted a stamp that fits a ROS time, got {frame.stamp_ns} ns"
+        raise FrameError(msg)
+
+
+class Scene:
+    """The newest frame of each person: a slot each, never a queue, so that nothing stale is ever worked on.
+
+    Thread-safe. A frame that is replaced before it was taken is counted: as `max_rate` while the rate limit held it
+    back, otherwise as `stale`.
+    """
+
+    def __init__(self, statistics: Statistics, *, clock: Callable[[], float] = time.monotonic) -> None:
+        self._statistics = statistics
+        self._clock = clock
+        self._changed = threading.Condition()
+        self._pending: dict[str, Arrival] = {}
+        self._seen: dict[str, float] = {}
+        self._held = False
+        self._closed = False
+
+    def put(self, person: str, frame: SmplFrame) -> None:
+        """A person's new frame."""
+        now = self._clock()
+        with self._changed:
+            if person in self._pending:
+                if self._held:
+                    self._statistics.skip("max_rate")
+                else:
+                    self._statistics.drop("stale")
+            self._pending[person] = Arrival(frame, now)
+            self._seen[person] = now
+            self._changed.notify()
+
+    def take(self, *, not_before: float = 0.0, timeout: float = 0.1) -> dict[str, Arrival]:
+        """All persons' new frames, as soon as there is one, but not before a time; nothing after `timeout` [s]."""
+        deadline = self._clock() + timeout
+        with self._changed:
+            while not self._closed:
+                now = self._clock()
+                self._held = now < not_before
+                if self._pending and not self._held:
+                    taken, self._pending = self._pending, {}
+                    return taken
+                wake = min(deadline, not_before) if self._pending else deadline
+                if now >= deadline:
+                    break
+                self._changed.wait(wake - now)
+        return {}
+
+    def leave(self, timeout: float) -> list[str]:
+        """Those who haven't sent for `timeout` [s]; each is named once."""
+        with self._changed:
+            horizon = self._clock() - timeout
+            gone = [person for person, seen in self._seen.items() if seen < horizon and person not in self._pending]
+            for person in gone:
+                del self._seen[person]
+            return gone
+
+    @property
+    def persons(self) -> tuple[str, ...]:
+        """Those who are here."""
+        with self._changed:
+            return tuple(self._seen)
+
+    def wake(self) -> None:
+        """Ends a `take` under way, and all later ones at once."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()

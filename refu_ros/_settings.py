@@ -1,0 +1,227 @@
+"""The node's parameters: what each means, what it may be, and whether it may change while the node runs."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, field, fields, replace
+from functools import cache
+from typing import TYPE_CHECKING, Any, cast
+
+from msg_adapters import INPUT_TYPES, InputAxes, InputType
+from refu_core import GarmentPipeline, RefuError, load_garment
+from refu_core.backbones import BACKBONES
+from refu_core.realtime import SDF_MODES
+from refu_core.repulsion import DEFAULT_MARGIN
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from refu_core import GarmentTemplate
+
+_PERSON = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+
+
+class SettingsError(RefuError, ValueError):
+    """A parameter of the node that has no meaning."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ParameterSpec:
+    """What ROS is told about a parameter."""
+
+    description: str
+    low: float | None = None
+    high: float | None = None
+    choices: tuple[str, ...] = ()
+    live: bool = True
+    """Whether it may change while the node runs."""
+
+
+def _parameter(default: Any, description: str, **limits: Any) -> Any:
+    return field(default=default, metadata={"spec": ParameterSpec(description=description, **limits)})
+
+
+@dataclass(frozen=True, kw_only=True)
+class PipelineKey:
+    """The settings that need another pipeline when they change."""
+
+    garments: tuple[str, ...]
+    sdf: str
+    backbone: str
+    margin: float
+    device: str
+
+    def load(self) -> GarmentPipeline:
+        """Loads it, which takes some tenths of a second. Raises `RefuError`."""
+        return GarmentPipeline.load(
+            self.garments, sdf=self.sdf, backbone=self.backbone, margin=self.margin, device=self.device
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class NodeSettings:
+    """All parameters; each field is one, of the same name.
+
+    Raises `SettingsError` for a value out of range and for values that can't go together.
+    """
+
+    garments: tuple[str, ...] = _parameter(
+        ("tshirt-male", "short-pant-male"), "Garments that every person wears; all of one body."
+    )
+    backbone: str = _parameter(
+        "skinned", "What predicts the garment before collisions are handled.", choices=tuple(BACKBONES)
+    )
+    sdf: str = _parameter("accurate", "How collisions are found.", choices=SDF_MODES)
+    margin: float = _parameter(DEFAULT_MARGIN, "Clearance that is kept from the skin [m].", low=0.0, high=0.05)
+    device: str = _parameter("cpu", "Torch device: cpu or cuda.")
+    style: tuple[float, ...] = _parameter(
+        (0.0,) * 4, "Garment style γ in standard deviations; zeros are the mean style.", low=-10.0, high=10.0
+    )
+    betas: tuple[float, ...] = _parameter(
+        (0.0,) * 10, "Body shape in standard deviations, where betas_source is fixed.", low=-20.0, high=20.0
+    )
+    betas_source: str = _parameter(
+        "message", "Whether the body shape is the message's, or the parameter betas.", choices=("message", "fixed")
+    )
+    input_type: str = _parameter(
+        "multiarray", "Message type and layout of smpl_params.", choices=tuple(INPUT_TYPES), live=False
+    )
+    input_axes: str = _parameter(
+        "smpl",
+        "Axes of root orientation and translation: smpl (y up; turned into ROS axes) or frame (those of frame_id).",
+        choices=("smpl", "frame"),
+    )
+    frame_id: str = _parameter("map", "Frame of the markers.")
+    persons: tuple[str, ...] = _parameter(
+        ("",), "Persons, each with a topic <person>/smpl_params; one without a name listens to smpl_params.", live=False
+    )
+    follow_humans: bool = _parameter(
+        False, "Dress everybody with a topic /humans/bodies/<id>/joint_states (REP-155); needs joint_state.", live=False
+    )
+    person_timeout: float = _parameter(
+        1.0, "A person who hasn't sent for so long leaves the scene [s].", low=0.05, high=3600.0
+    )
+    max_rate: float = _parameter(0.0, "At most so many frames a second; 0 for no limit [Hz].", low=0.0, high=1000.0)
+    max_distance: float = _parameter(
+        0.0, "A person farther from the origin of frame_id isn't dressed; 0 for no limit [m].", low=0.0, high=1e6
+    )
+    record: str = _parameter("", "Directory that inputs and outputs are recorded to as a bag; empty for none.")
+    autostart: bool = _parameter(True, "Whether the node configures and activates itself.", live=False)
+
+    def __post_init__(self) -> None:
+        for name, spec in specs().items():
+            _check(name, getattr(self, name), spec)
+        if not all(_PERSON.fullmatch(name) for name in self.persons if name) or len(set(self.persons)) < len(
+            self.persons
+        ):
+            msg = f"persons: wanted distinct names of letters, digits and underscores, got {list(self.persons)}"
+            raise SettingsError(msg)
+        if not self.persons or ("" in self.persons and len(self.persons) > 1):
+            msg = f"persons: wanted one person without a name, or names for all, got {list(self.persons)}"
+            raise SettingsError(msg)
+        if self.follow_humans and self.input_type != "joint_state":
+            msg = f"follow_humans: REP-155 has bodies as joint_state, but input_type is {self.input_type}"
+            raise SettingsError(msg)
+        if not self.frame_id or "\0" in self.frame_id + self.record:
+            msg = f"frame_id, record: wanted names without NUL, the frame's not empty, got {self.frame_id!r}"
+            raise SettingsError(msg)
+        self._check_garments()
+
+    def _check_garments(self) -> None:
+        if not self.garments or len(set(self.garments)) < len(self.garments):
+            msg = f"garments: wanted distinct names, at least one, got {list(self.garments)}"
+            raise SettingsError(msg)
+        try:
+            templates = {name: _template(name) for name in self.garments}
+        except RefuError as error:
+            msg = f"garments: {error}"
+            raise SettingsError(msg) from error
+        if len({template.body for template in templates.values()}) > 1:
+            cut_for = ", ".join(f"{name} ({template.body})" for name, template in templates.items())
+            msg = f"garments: one person wears garments of one body, got {cut_for}"
+            raise SettingsError(msg)
+        plain = [name for name, template in templates.items() if template.styledirs is None]
+        if any(self.style) and plain:
+            msg = f"style: {', '.join(plain)} has no styles; set it to zeros"
+            raise SettingsError(msg)
+
+    def changed(self, values: Mapping[str, Any]) -> NodeSettings:
+        """These settings with some values as ROS has them (lists, numbers of any kind). Raises `SettingsError`."""
+        known = specs()
+        return replace(self, **{name: _coerce(name, value) for name, value in values.items() if name in known})
+
+    @property
+    def pipeline(self) -> PipelineKey:
+        """What the pipeline depends on."""
+        return PipelineKey(
+            garments=self.garments, sdf=self.sdf, backbone=self.backbone, margin=self.margin, device=self.device
+        )
+
+    @property
+    def axes(self) -> InputAxes:
+        """`input_axes`, checked."""
+        return cast("InputAxes", self.input_axes)
+
+    @property
+    def layout(self) -> InputType:
+        """`input_type`, checked."""
+        return cast("InputType", self.input_type)
+
+
+@cache
+def specs() -> dict[str, ParameterSpec]:
+    """Each parameter's specification by name."""
+    return {item.name: item.metadata["spec"] for item in fields(NodeSettings)}
+
+
+@cache
+def defaults() -> dict[str, Any]:
+    """Each parameter's default by name."""
+    return {item.name: item.default for item in fields(NodeSettings)}
+
+
+@cache
+def _template(name: str) -> GarmentTemplate:
+    return load_garment(name)
+
+
+def _coerce(name: str, value: Any) -> Any:
+    """A value of ROS as the settings have it: tuples for lists, floats for whole numbers."""
+    default = defaults()[name]
+    if isinstance(default, bool):
+        right, wanted = isinstance(value, bool), "true or false"
+    elif isinstance(default, float):
+        right, wanted = _is_number(value), "a number"
+    elif isinstance(default, str):
+        right, wanted = isinstance(value, str), "a string"
+    else:
+        items = list(value) if hasattr(value, "__iter__") and not isinstance(value, (str, bytes)) else None
+        if isinstance(default[0], str):
+            right, wanted = items is not None and all(isinstance(item, str) for item in items), "a list of strings"
+        else:
+            right = items is not None and len(items) == len(default) and all(map(_is_number, items))
+            wanted = f"a list of {len(default)} numbers"
+        value = items
+    if not right:
+        msg = f"{name}: wanted {wanted}, got {value!r}"
+        raise SettingsError(msg)
+    if isinstance(default, tuple):
+        return tuple(map(type(default[0]), value))
+    return type(default)(value)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _check(name: str, value: Any, spec: ParameterSpec) -> None:
+    if spec.choices and value not in spec.choices:
+        msg = f"{name}: wanted {' or '.join(spec.choices)}, got {value!r}"
+        raise SettingsError(msg)
+    numbers = value if isinstance(value, tuple) else (value,)
+    if spec.low is not None and spec.high is not None:
+        bad = [n for n in numbers if not (math.isfinite(n) and spec.low <= n <= spec.high)]
+        if bad:
+            msg = f"{name}: wanted {spec.low:g} to {spec.high:g}, got {bad[0]:g}"
+            raise SettingsError(msg)

@@ -1,0 +1,193 @@
+"""A node under test in a process of its own, and a peer in this one that talks to it over loopback."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import JointState
+from visualization_msgs.msg import MarkerArray
+
+from msg_adapters import Marker, decode_marker_array, encoder_for
+from refu_core import SmplFrame
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+ROOT = Path(__file__).parents[2]
+GARMENTS = ("tshirt-male", "short-pant-male")
+
+
+class NodeProcess:
+    """`garment_node` with parameters; killed at the end of the block if it still runs."""
+
+    def __init__(self, log: Path, prepare: Callable[[], None] | None = None, **parameters: Any) -> None:
+        self._log = log
+        arguments = [item for name, value in parameters.items() for item in ("-p", f"{name}:={_yaml(value)}")]
+        command = [sys.executable, "-m", "refu_ros.garment_node", "--ros-args", *arguments]
+        with log.open("wb") as file:
+            self.process = subprocess.Popen(command, cwd=ROOT, stdout=file, stderr=file, preexec_fn=prepare)
+
+    def __enter__(self) -> NodeProcess:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.wait()
+
+    @property
+    def log(self) -> str:
+        """What it has printed."""
+        return self._log.read_text(errors="replace")
+
+    def stop(self, *signals: signal.Signals) -> int:
+        """Sends signals, one after the other, and waits for the exit status."""
+        for number in signals:
+            self.process.send_signal(number)
+            time.sleep(0.05)
+        return self.process.wait(timeout=20)
+
+
+def _yaml(value: Any) -> str:
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(map(_yaml, value)) + "]"
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+class Peer:
+    """Sender, raw subscriber and operator."""
+
+    def __init__(self, *persons: str) -> None:
+        self.node = rclpy.create_node("peer")
+        prefixes = {person: f"{person}/" if person else "" for person in persons or ("",)}
+        self._publishers = {
+            person: self.node.create_publisher(JointState, f"{prefix}smpl_params", QoSProfile(depth=1))
+            for person, prefix in prefixes.items()
+        }
+        self.garments: list[list[Marker]] = []
+        self.diagnostics: list[DiagnosticArray] = []
+        self._subscription: Any = None
+        self._encode = encoder_for("joint_state")
+        self.node.create_subscription(DiagnosticArray, "/diagnostics", self.diagnostics.append, 10)
+        self.watch()
+
+    def watch(self) -> None:
+        """Listens to the garments."""
+        self._subscription = self.node.create_subscription(
+            MarkerArray, "garments", lambda data: self.garments.append(decode_marker_array(data)), 10, raw=True
+        )
+
+    def unwatch(self) -> None:
+        """Listens no longer."""
+        self.node.destroy_subscription(self._subscription)
+
+    def spin_until(self, condition: Callable[[], Any], what: str, *, timeout: float = 20.0) -> None:
+        """Fails with `what` when it doesn't come true."""
+        end = time.monotonic() + timeout
+        while not condition():
+            assert time.monotonic() < end, f"waited {timeout} s in vain: {what}"
+            rclpy.spin_once(self.node, timeout_sec=0.02)
+
+    def spin(self, seconds: float) -> None:
+        """For so long."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            rclpy.spin_once(self.node, timeout_sec=0.02)
+
+    def wait_for_node(self) -> None:
+        """Until it listens, and what it sends arrives."""
+        self.spin_until(
+            lambda: (
+                all(publisher.get_subscription_count() for publisher in self._publishers.values())
+                and self.node.count_publishers("garments")
+            ),
+            "the node listens",
+            timeout=40.0,
+        )
+
+    def send(self, frame: SmplFrame, person: str = "") -> None:
+        """A good frame."""
+        self.send_raw(self._encode(frame), person)
+
+    def send_raw(self, data: bytes, person: str = "") -> None:
+        """Any bytes."""
+        self._publishers[person].publish(data)
+
+    def seen(self, stamp_ns: int, ns: str = GARMENTS[0]) -> Marker | None:
+        """The marker with that stamp, if it has come."""
+        for markers in reversed(self.garments):
+            for marker in markers:
+                if marker.stamp_ns == stamp_ns and marker.ns == ns:
+                    return marker
+        return None
+
+    def dress(self, frame: SmplFrame, person: str = "") -> Marker:
+        """Sends a frame (again and again: input is best effort) until its T-shirt comes back."""
+        ns = f"{person}/{GARMENTS[0]}" if person else GARMENTS[0]
+        end = time.monotonic() + 20
+        while (marker := self.seen(frame.stamp_ns, ns)) is None:
+            assert time.monotonic() < end, f"no garment for {person or 'the frame'}"
+            self.send(frame, person)
+            self.spin(0.1)
+        return marker
+
+    def status(self, part: str) -> tuple[int, str, dict[str, str]]:
+        """Level, message and values of the newest status of a part of the node."""
+        for array in reversed(self.diagnostics):
+            for status in array.status:
+                if status.name == f"garment_node: {part}":
+                    return status.level[0], status.message, {item.key: item.value for item in status.values}
+        return -1, "", {}
+
+    def count(self, part: str, key: str) -> int:
+        """A counter of the diagnostics."""
+        return int(self.status(part)[2].get(key, "0"))
+
+    def call(self, service_type: Any, name: str, request: Any) -> Any:
+        """A service's answer."""
+        client = self.node.create_client(service_type, name)
+        try:
+            assert client.wait_for_service(timeout_sec=20.0), name
+            future = client.call_async(request)
+            self.spin_until(future.done, f"{name} answers")
+            return future.result()
+        finally:
+            self.node.destroy_client(client)
+
+    def set(self, **parameters: Any) -> list[Any]:
+        """Sets parameters of the node; returns a result for each."""
+        values = [Parameter(name, value=value).to_parameter_msg() for name, value in parameters.items()]
+        request = SetParameters.Request(parameters=values)
+        return list(self.call(SetParameters, "garment_node/set_parameters", request).results)
+
+    def close(self) -> None:
+        """Leaves the graph."""
+        self.node.destroy_node()
+
+
+def frame(i: int, *, stamp_ns: int | None = None, transl: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> SmplFrame:
+    """A waving, walking person; a stamp of its own for each `i`."""
+    pose = np.zeros((24, 3))
+    pose[16, 2], pose[17, 2] = -0.9 + 0.3 * np.sin(0.3 * i), 0.9 - 0.3 * np.sin(0.3 * i)
+    pose[1, 0], pose[2, 0] = 0.3 * np.sin(0.2 * i), -0.3 * np.sin(0.2 * i)
+    stamp = 10**9 + i * 33_333_333 if stamp_ns is None else stamp_ns
+    return SmplFrame(pose=pose, transl=np.array(transl), stamp_ns=stamp)
+
+
+def isolate() -> None:
+    """Keeps tests on this machine and apart from other tests and robots."""
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
+    os.environ.setdefault("OMP_NUM_THREADS", "1")

@@ -1,0 +1,176 @@
+"""`garment_node` as a process, with real rclpy on both sides."""
+
+from __future__ import annotations
+
+import struct
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="rclpy isn't installed (extra ros): the node isn't tested")
+
+from harness import GARMENTS, NodeProcess, Peer, frame
+
+from msg_adapters import encoder_for, vertices_from_points, vertices_ros_from_smpl
+from refu_core import GarmentPipeline
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")
+
+
+@pytest.fixture(scope="module")
+def scene(ros: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Peer]:  # noqa: ARG001
+    """A node for two persons, and its peer."""
+    log = tmp_path_factory.mktemp("node") / "log.txt"
+    parameters = {
+        "persons": ["ann", "bob"],
+        "input_type": "joint_state",
+        "person_timeout": 2.0,
+        "max_distance": 50,
+    }  # whole numbers will do for floats
+    with NodeProcess(log, **parameters) as node:
+        peer = Peer("ann", "bob")
+        peer.wait_for_node()
+        yield peer
+        peer.close()
+        assert node.process.poll() is None, node.log
+        assert "Traceback" not in node.log
+
+
+def test_garments_are_those_of_the_pipeline(scene: Peer) -> None:
+    wanted = GarmentPipeline.load(GARMENTS)
+    for i in range(5):
+        sent = frame(i, transl=(1.0, 2.0, 3.0))
+        marker = scene.dress(sent, "ann")
+        assert (marker.stamp_ns, marker.frame_id, marker.type) == (sent.stamp_ns, "map", 11)
+        mesh = wanted(sent)[GARMENTS[0]]
+        got = vertices_from_points(marker.points, mesh.faces)
+        np.testing.assert_allclose(got, vertices_ros_from_smpl(mesh.vertices), atol=1e-5)
+
+
+def test_everybody_in_the_scene_is_dressed(scene: Peer) -> None:
+    for person in ("ann", "bob"):
+        scene.dress(frame(20), person)
+        assert scene.seen(frame(20).stamp_ns, f"{person}/{GARMENTS[1]}") is not None
+
+
+def hostile() -> list[bytes]:
+    good = encoder_for("joint_state")(frame(0))
+    rng = np.random.default_rng(0)
+    not_finite, labels = bytearray(good), good.replace(b"left_hip_x", b"left_hop_x")
+    not_finite[-8 * 20 : -8 * 10] = struct.pack("<10d", *[np.nan] * 10)
+    long = bytearray(good)
+    long[12:16] = b"\xff\xff\xff\x7f"  # the length of a string
+    return [
+        *[rng.bytes(int(n)) for n in (5, 64, 5000)],
+        b"\0\1\0\0" + rng.bytes(200),
+        good[: len(good) // 2],
+        bytes(not_finite),
+        labels,
+        bytes(long),
+    ]
+
+
+def test_bad_input_is_counted_and_harms_nobody(scene: Peer) -> None:
+    before = scene.count("input", "dropped: invalid")
+    sent = hostile()
+    for i, data in enumerate(sent):
+        scene.send_raw(data, "ann")
+        scene.dress(frame(100 + i), "bob")
+    scene.dress(frame(99), "ann")
+    scene.spin_until(lambda: scene.count("input", "dropped: invalid") > before + len(sent) // 2, "bad input is counted")
+    assert all(np.isfinite(marker.points).all() for markers in scene.garments for marker in markers)
+
+
+def test_a_burst_leaves_no_backlog(scene: Peer) -> None:
+    for i in range(2000):
+        scene.send(frame(i, stamp_ns=50 * 10**9 + i), "ann")
+    scene.garments.clear()
+    marker = scene.dress(frame(3), "ann")
+    assert marker.stamp_ns == frame(3).stamp_ns
+    assert len(scene.garments) < 100
+
+
+def test_parameters_change_while_frames_flow(scene: Peer) -> None:
+    scene.dress(frame(30), "bob")
+    (result,) = scene.set(garments=[GARMENTS[0]])
+    assert result.successful, result.reason
+    scene.garments.clear()
+
+    def deleted() -> bool:
+        scene.send(frame(31), "bob")
+        last = f"bob/{GARMENTS[1]}"
+        return any(marker.ns == last and marker.action == 2 for markers in scene.garments for marker in markers)
+
+    scene.spin_until(deleted, "the garment that isn't worn any more is taken out of the scene")
+    (result,) = scene.set(frame_id="odom")
+    assert result.successful
+    assert scene.dress(frame(32), "bob").frame_id == "odom"
+    results = scene.set(garments=list(GARMENTS), frame_id="map", max_rate=200, style=[1.0, 0.0, 0.0, 0.0])
+    assert all(result.successful for result in results), results
+    scene.set(style=[0.0] * 4)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "reason"),
+    [
+        ("garments", ["cape"], "no garment 'cape'"),
+        ("garments", ["tshirt-male", "skirt-female"], "garments of one body"),
+        ("sdf", "magic", "wanted"),
+        ("margin", 1.0, "range"),
+        ("max_rate", "fast", "wanted a number"),
+        ("betas", [1.0], "wanted a list of 10 numbers"),
+        ("persons", ["eve"], "read-only"),
+        ("record", "/proc/nowhere", "/proc/nowhere"),
+    ],
+)
+def test_values_without_a_meaning_are_rejected_with_a_reason(
+    scene: Peer, name: str, value: object, reason: str
+) -> None:
+    (result,) = scene.set(**{name: value})
+    assert not result.successful
+    assert reason in result.reason
+
+
+def test_work_nobody_needs_is_skipped_and_counted(scene: Peer) -> None:
+    def skipped(kind: str) -> int:
+        return scene.count("garments", f"skipped: {kind}")
+
+    unchanged, distance, unwatched = skipped("unchanged"), skipped("distance"), skipped("unwatched")
+    for i in range(5):
+        scene.dress(frame(7, stamp_ns=90 * 10**9 + i), "ann")  # the same pose at another time
+    scene.spin_until(lambda: skipped("unchanged") >= unchanged + 3, "unchanged frames are skipped")
+    scene.send(frame(8, transl=(0.0, 0.0, 60.0)), "ann")
+    scene.spin_until(lambda: skipped("distance") > distance, "who is too far away is skipped")
+    scene.unwatch()
+    scene.spin(0.3)
+    for i in range(20):
+        scene.send(frame(i), "ann")
+        scene.spin(0.05)
+    scene.spin_until(lambda: skipped("unwatched") > unwatched, "what nobody watches is skipped")
+    scene.watch()
+    scene.dress(frame(9), "ann")
+
+
+def test_who_leaves_is_taken_out_of_the_scene(scene: Peer) -> None:
+    scene.dress(frame(40), "ann")
+    scene.garments.clear()
+    scene.spin_until(
+        lambda: (
+            {m.ns for markers in scene.garments for m in markers if m.action == 2} >= {f"ann/{g}" for g in GARMENTS}
+        ),
+        "the garments of who has left are deleted",
+    )
+    scene.spin_until(lambda: "ann" in scene.status("input")[1], "silence is reported")
+    assert scene.status("input")[0] == 1
+
+
+def test_a_bad_start_is_one_line(ros: None, tmp_path: Path) -> None:  # noqa: ARG001
+    with NodeProcess(tmp_path / "log.txt", garments=["cape"]) as node:
+        assert node.process.wait(timeout=40) == 2
+        assert "no garment 'cape'" in node.log
+        assert "Traceback" not in node.log

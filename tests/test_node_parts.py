@@ -1,0 +1,445 @@
+"""The parts of the node that know nothing of ROS: settings, scene, recorder, inference thread, diagnostics."""
+
+from __future__ import annotations
+
+import resource
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from msg_adapters import BagError, BagReader, BagWriter, Marker, QosProfile, decode_marker_array
+from refu_core import FrameError, GarmentPipeline, SmplFrame
+from refu_ros._diagnostics import statuses
+from refu_ros._loader import PipelineLoader
+from refu_ros._recorder import Recorder, RecorderState, free_path
+from refu_ros._scene import Scene, check_plausible
+from refu_ros._settings import NodeSettings, SettingsError, defaults, specs
+from refu_ros._statistics import Statistics
+from refu_ros._worker import Worker
+
+TOPIC, TYPE = "/garments", "visualization_msgs/msg/MarkerArray"
+GARMENT = "short-pant-male"
+
+
+def frame(angle: float = 0.0, *, stamp_ns: int = 1, transl: tuple[float, ...] = (0.0, 0.0, 0.0)) -> SmplFrame:
+    pose = np.zeros((24, 3))
+    pose[1, 0] = angle
+    return SmplFrame(pose=pose, transl=np.array(transl), stamp_ns=stamp_ns)
+
+
+# Settings -----------------------------------------------------------------------------------------
+
+
+def test_every_parameter_is_described() -> None:
+    assert all(spec.description.endswith(".") for spec in specs().values())
+    assert NodeSettings().changed(dict(defaults())) == NodeSettings()
+
+
+@pytest.mark.parametrize(
+    ("values", "reason"),
+    [
+        ({"garments": []}, "at least one"),
+        ({"garments": ["cape"]}, "no garment 'cape'"),
+        ({"garments": ["tshirt-male", "skirt-female"]}, "one body"),
+        ({"garments": "tshirt-male"}, "a list of strings"),
+        ({"style": [0.0, float("nan"), 0.0, 0.0]}, "style: wanted"),
+        ({"betas": [1.0]}, "a list of 10 numbers"),
+        ({"max_rate": -1}, "max_rate: wanted 0 to"),
+        ({"max_rate": True}, "a number"),
+        ({"persons": ["a", "a"]}, "distinct"),
+        ({"persons": ["a", ""]}, "without a name"),
+        ({"persons": ["a/b"]}, "letters"),
+        ({"follow_humans": True}, "joint_state"),
+        ({"frame_id": ""}, "frame_id"),
+        ({"input_axes": "ros"}, "smpl or frame"),
+    ],
+)
+def test_settings_without_a_meaning(values: dict[str, Any], reason: str) -> None:
+    with pytest.raises(SettingsError, match=reason):
+        NodeSettings().changed(values)
+
+
+def test_whole_numbers_do_for_floats() -> None:
+    settings = NodeSettings().changed({"max_rate": 30, "style": [1, 0, 0, 0], "use_sim_time": True})
+    assert (settings.max_rate, settings.style) == (30.0, (1.0, 0.0, 0.0, 0.0))
+
+
+# Scene --------------------------------------------------------------------------------------------
+
+
+class Clock:
+    """Time that the test moves."""
+
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@given(st.lists(st.sampled_from(["put a", "put b", "take"])))
+def test_the_newest_frame_wins_and_the_others_are_counted(events: list[str]) -> None:
+    statistics = Statistics()
+    scene = Scene(statistics, clock=Clock())
+    newest: dict[str, int] = {}
+    stale = 0
+    for i, event in enumerate(events):
+        if event == "take":
+            taken = scene.take(timeout=0.0)
+            assert {person: arrival.frame.stamp_ns for person, arrival in taken.items()} == newest
+            newest = {}
+        else:
+            person = event[-1]
+            stale += person in newest
+            newest[person] = i
+            scene.put(person, frame(stamp_ns=i))
+    assert statistics.report().total["drop.stale"] == stale
+
+
+def test_the_rate_limit_holds_frames_back_and_counts_them_apart() -> None:
+    clock, statistics = Clock(), Statistics()
+    scene = Scene(statistics, clock=clock)
+    scene.put("", frame(stamp_ns=1))
+    assert scene.take(not_before=5.0, timeout=0.0) == {}
+    scene.put("", frame(stamp_ns=2))
+    clock.now = 5.0
+    assert scene.take(not_before=5.0, timeout=0.0)[""].frame.stamp_ns == 2
+    assert statistics.report().group("skip") == {"max_rate": 1}
+
+
+def test_who_is_silent_leaves_once() -> None:
+    clock = Clock()
+    scene = Scene(Statistics(), clock=clock)
+    scene.put("a", frame())
+    scene.take(timeout=0.0)
+    clock.now = 1.0
+    scene.put("b", frame())
+    clock.now = 1.5
+    assert scene.leave(1.0) == ["a"]
+    assert scene.leave(1.0) == []
+    assert scene.persons == ("b",)
+
+
+def test_a_frame_wakes_the_thread_that_waits() -> None:
+    scene = Scene(Statistics())
+    taken: list[Any] = []
+    thread = threading.Thread(target=lambda: taken.append(scene.take(timeout=30.0)))
+    thread.start()
+    scene.put("", frame(stamp_ns=7))
+    thread.join(timeout=10.0)
+    assert not thread.is_alive()
+    assert taken[0][""].frame.stamp_ns == 7
+
+
+@pytest.mark.parametrize(
+    ("bad", "reason"),
+    [
+        (SmplFrame(pose=np.full((24, 3), 1e9)), "pose"),
+        (SmplFrame(pose=np.zeros((24, 3)), betas=np.full(10, 1e30)), "betas"),
+        (SmplFrame(pose=np.zeros((24, 3)), transl=np.full(3, 1e300)), "transl"),
+        (SmplFrame(pose=np.zeros((24, 3)), stamp_ns=-1), "stamp"),
+        (SmplFrame(pose=np.zeros((24, 3)), stamp_ns=2**63), "stamp"),
+    ],
+)
+def test_numbers_no_body_has(bad: SmplFrame, reason: str) -> None:
+    check_plausible(frame(3.0))
+    with pytest.raises(FrameError, match=reason):
+        check_plausible(bad)
+
+
+# Recorder -----------------------------------------------------------------------------------------
+
+
+def put(recorder: Recorder, i: int, data: bytes = b"\0\1\0\0data") -> None:
+    recorder.put(TOPIC, TYPE, data, time_ns=i, qos=QosProfile())
+
+
+def test_everything_queued_is_in_the_file(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "bag")
+    for i in range(500):
+        put(recorder, i)
+    recorder.close()
+    put(recorder, 500)  # too late, and no error
+    with BagReader(tmp_path / "bag") as bag:
+        assert [message.log_time_ns for message in bag.messages()] == list(range(500))
+        assert not bag.truncated
+    assert recorder.state().written == 500
+    assert (tmp_path / "bag" / "metadata.yaml").is_file()
+
+
+def test_a_recording_never_replaces_another(tmp_path: Path) -> None:
+    paths = []
+    for _ in range(3):
+        recorder = Recorder(tmp_path / "bag")
+        recorder.close()
+        paths.append(recorder.path.name)
+    assert paths == ["bag", "bag-1", "bag-2"]
+    (tmp_path / "empty").mkdir()
+    assert free_path(tmp_path / "empty") == tmp_path / "empty"
+
+
+def test_a_slow_disk_drops_and_never_blocks(tmp_path: Path) -> None:
+    gate = threading.Event()
+
+    class SlowBag(BagWriter):
+        def write(self, *args: Any, **kwargs: Any) -> None:
+            gate.wait()
+            super().write(*args, **kwargs)
+
+    recorder = Recorder(tmp_path / "bag", max_queued_bytes=1000, open_bag=SlowBag)
+    for i in range(100):
+        put(recorder, i, bytes(100))
+    state = recorder.state()
+    gate.set()
+    recorder.close()
+    assert 89 <= state.dropped <= 90  # ten fit, and one more if the writer had already taken one
+    assert recorder.state().written == 100 - state.dropped
+
+
+def test_a_full_disk_ends_the_recording_and_nothing_else(tmp_path: Path) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    recorder = Recorder(tmp_path / "bag")
+    noise = np.random.default_rng(0).bytes(300_000)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (3_000_000, hard))
+        for i in range(100):
+            put(recorder, i, noise)
+            while recorder.state().queued > 3:
+                time.sleep(0.001)
+        recorder.close()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert not recorder.running
+    state = recorder.state()
+    assert "can't be written" in state.error
+    with BagReader(recorder.path / "bag_0.mcap") as bag:
+        count = sum(1 for _ in bag.messages())
+    assert 4 <= count <= state.written < 100
+
+
+def test_a_path_that_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(BagError, match="file"):
+        Recorder(tmp_path / "file" / "bag")
+
+
+# Inference thread ---------------------------------------------------------------------------------
+
+
+class Viewer:
+    """An outlet that keeps what it gets."""
+
+    def __init__(self) -> None:
+        self.watching = True
+        self.body_watching = False
+        self.messages: list[list[Marker]] = []
+        self.bodies: list[list[Marker]] = []
+
+    def watched(self) -> bool:
+        return self.watching
+
+    def body_watched(self) -> bool:
+        return self.body_watching
+
+    def now_ns(self) -> int:
+        return 99
+
+    def send_garments(self, data: bytes) -> None:
+        self.messages.append(decode_marker_array(data))
+
+    def send_body(self, data: bytes) -> None:
+        self.bodies.append(decode_marker_array(data))
+
+
+class Setup:
+    """A worker that the test ticks by hand."""
+
+    def __init__(self, pipeline: Any, **settings: Any) -> None:
+        self.clock = Clock()
+        self.statistics = Statistics()
+        self.scene = Scene(self.statistics, clock=self.clock)
+        self.viewer = Viewer()
+        settings = {"garments": [GARMENT], **settings}
+        self.worker = Worker(
+            self.scene, self.statistics, self.viewer, settings=NodeSettings().changed(settings), pipeline=pipeline
+        )
+
+    def tick(self, **frames: SmplFrame) -> None:
+        for person, sent in frames.items():
+            self.scene.put(person, sent)
+        self.worker.tick(self.scene.take(timeout=0.0))
+
+    def total(self, key: str) -> int:
+        return self.statistics.report().total[key]
+
+
+@pytest.fixture(scope="module")
+def pipeline() -> GarmentPipeline:
+    return GarmentPipeline.load([GARMENT])
+
+
+def test_a_tick_is_one_message_with_each_persons_stamp(pipeline: GarmentPipeline) -> None:
+    setup = Setup(pipeline)
+    setup.tick(ann=frame(stamp_ns=5), bob=frame(0.3, stamp_ns=6, transl=(0.0, 0.0, 2.0)))
+    (markers,) = setup.viewer.messages
+    assert [(marker.ns, marker.stamp_ns) for marker in markers] == [(f"ann/{GARMENT}", 5), (f"bob/{GARMENT}", 6)]
+    assert markers[1].points[:, 0].mean() == pytest.approx(2.0, abs=0.3)  # SMPL's z is ROS's x
+
+
+def test_unchanged_frames_cost_no_inference_but_move(pipeline: GarmentPipeline) -> None:
+    setup = Setup(pipeline)
+    setup.tick(ann=frame(stamp_ns=1))
+    setup.tick(ann=frame(stamp_ns=2, transl=(1.0, 0.0, 0.0)))
+    (first,), (second,) = setup.viewer.messages
+    assert (second.stamp_ns, setup.total("skip.unchanged")) == (2, 1)
+    np.testing.assert_allclose(second.points, first.points + np.array([0.0, 1.0, 0.0]), atol=1e-12)
+
+
+def test_nothing_is_done_for_nobody(pipeline: GarmentPipeline) -> None:
+    setup = Setup(pipeline)
+    setup.viewer.watching = False
+    setup.tick(ann=frame())
+    assert not setup.viewer.messages
+    assert setup.total("skip.unwatched") == 1
+    setup.viewer.body_watching = True
+    setup.tick(ann=frame())
+    assert [marker.ns for marker in setup.viewer.bodies[0]] == ["ann/body"]
+
+
+def test_who_goes_away_is_deleted(pipeline: GarmentPipeline) -> None:
+    setup = Setup(pipeline, max_distance=10.0, person_timeout=1.0)
+    setup.tick(ann=frame(), bob=frame())
+    setup.tick(ann=frame(transl=(0.0, 0.0, 11.0)))
+    assert [(m.ns, m.action) for m in setup.viewer.messages[-1]] == [(f"ann/{GARMENT}", 2)]
+    setup.clock.now = 2.0
+    setup.tick()
+    assert [(m.ns, m.action, m.stamp_ns) for m in setup.viewer.messages[-1]] == [(f"bob/{GARMENT}", 2, 99)]
+    count = len(setup.viewer.messages)
+    setup.worker.stop()
+    assert len(setup.viewer.messages) == count  # nobody is left to delete
+
+
+def test_a_pipeline_is_swapped_between_ticks(pipeline: GarmentPipeline) -> None:
+    setup = Setup(pipeline)
+    setup.tick(ann=frame(stamp_ns=1))
+    setup.worker.use(GarmentPipeline.load(["tshirt-male"]))
+    setup.tick(ann=frame(stamp_ns=2))
+    added, deleted = setup.viewer.messages[1:]
+    assert [(m.ns, m.action) for m in added] == [("ann/tshirt-male", 0)]
+    assert [(m.ns, m.action) for m in deleted] == [(f"ann/{GARMENT}", 2)]
+
+
+def test_parameters_replace_shape_and_style(pipeline: GarmentPipeline) -> None:
+    setup = Setup(pipeline, betas_source="fixed", betas=[2.0] + [0.0] * 9, style=[1.0, 0.0, 0.0, 0.0])
+    setup.tick(ann=frame())
+    wanted = SmplFrame(np.zeros((24, 3)), betas=np.eye(10)[0] * 2, style=np.eye(4)[0])
+    mesh = pipeline(wanted)[GARMENT]
+    np.testing.assert_allclose(setup.viewer.messages[0][0].points, mesh.vertices[mesh.faces.ravel()][:, [2, 0, 1]])
+
+
+class Choosy:
+    """A pipeline that fails for some poses."""
+
+    def __init__(self, pipeline: GarmentPipeline) -> None:
+        self._pipeline = pipeline
+        self.body, self.garments = pipeline.body, pipeline.garments
+
+    def __call__(self, frames: list[SmplFrame]) -> list[Any]:
+        if any(frame.pose[1, 0] > 1 for frame in frames):
+            msg = "not this pose"
+            raise ValueError(msg)
+        return self._pipeline(frames)
+
+
+def test_one_persons_failure_is_nobody_elses(pipeline: GarmentPipeline) -> None:
+    setup = Setup(Choosy(pipeline))
+    setup.tick(ann=frame(2.0), bob=frame(0.5), eve=frame(0.2))
+    assert [marker.ns for marker in setup.viewer.messages[0]] == [f"bob/{GARMENT}", f"eve/{GARMENT}"]
+    assert setup.total("drop.failed") == 1
+    setup.tick(ann=frame(0.1))
+    assert [marker.ns for marker in setup.viewer.messages[1]] == [f"ann/{GARMENT}"]
+
+
+def test_the_rate_limit(pipeline: GarmentPipeline) -> None:
+    statistics, viewer = Statistics(), Viewer()
+    scene = Scene(statistics)
+    settings = NodeSettings().changed({"garments": [GARMENT], "max_rate": 20})
+    worker = Worker(scene, statistics, viewer, settings=settings, pipeline=pipeline)
+    worker.start()
+    start = time.monotonic()
+    for i in range(100):
+        scene.put("", frame(0.001 * i, stamp_ns=i))
+        time.sleep(0.005)
+    seconds = time.monotonic() - start
+    worker.stop()
+    adds = [markers for markers in viewer.messages if markers[0].action == 0]
+    assert 2 <= len(adds) <= 20 * seconds + 2
+    assert statistics.report().total["skip.max_rate"] > 0
+
+
+# Loader -------------------------------------------------------------------------------------------
+
+
+def test_what_cannot_be_loaded_is_reported() -> None:
+    came: list[Any] = []
+    loader = PipelineLoader(lambda _, key: came.append(key), lambda error, _: came.append(error))
+    missing = NodeSettings(garments=(GARMENT,), device="nonsense").pipeline
+    good = NodeSettings(garments=(GARMENT,)).pipeline
+    for i, key in enumerate((missing, good)):
+        loader.request(key)
+        end = time.monotonic() + 30
+        while len(came) <= i and time.monotonic() < end:
+            time.sleep(0.01)
+    loader.close()
+    assert "nonsense" in str(came[0])
+    assert came[1] == good
+
+
+# Diagnostics --------------------------------------------------------------------------------------
+
+
+def report_of(statistics: Statistics, recording: RecorderState | None = None, **settings: Any) -> dict[str, Any]:
+    found = statuses(
+        statistics.report(),
+        NodeSettings().changed(settings),
+        node="n",
+        state="active",
+        persons=("",),
+        recording=recording,
+    )
+    return {status.name.removeprefix("n: "): status for status in found}
+
+
+def test_levels_mean_something(tmp_path: Path) -> None:
+    statistics = Statistics()
+    assert (report_of(statistics)["input"].level, report_of(statistics)["input"].message) == (1, "no input yet")
+    statistics.receive()
+    statistics.publish([10.0], found=5, unresolved=2)
+    fine = report_of(statistics)
+    assert [fine[part].level for part in ("input", "garments", "recording")] == [0, 0, 0]
+    assert fine["garments"].values["penetrating vertices resolved"] == "3"
+    statistics.receive()
+    statistics.drop("invalid", "no pose in it")
+    only_bad = report_of(statistics)["input"]
+    assert only_bad.level == 2
+    assert "no pose in it" in only_bad.message
+    for i in range(10):
+        statistics.receive()
+        statistics.drop("invalid" if i % 2 else "stale", "no pose in it")
+    mixed = report_of(statistics)
+    assert (mixed["input"].level, mixed["garments"].level) == (1, 1)
+    assert "over budget" in mixed["garments"].message
+    statistics.set_error("no weights")
+    assert (report_of(statistics)["garments"].level, report_of(statistics)["garments"].message) == (2, "no weights")
+    for level, state in (
+        (0, RecorderState(tmp_path, 1, 0, 0, 10, 10**12, "")),
+        (1, RecorderState(tmp_path, 1, 0, 3, 10, 10**12, "")),
+        (1, RecorderState(tmp_path, 1, 0, 0, 10, 10**6, "")),
+        (2, RecorderState(tmp_path, 1, 0, 0, 10, 10**12, "no space left")),
+    ):
+        assert report_of(statistics, recording=state)["recording"].level == level
