@@ -16,6 +16,8 @@ _LIMBS: tuple[tuple[int, ...], ...] = (
 """SMPL joints of each limb."""
 _OWN = 0.02
 """A vertex lies on every limb that has more than this of its skinning weight: around the armpit, on trunk and arm."""
+_INWARD = 0.15
+"""Share of vertices that a limb has to push inwards not to count as under the cloth."""
 _SIDEWAYS = -0.3
 """Cosine between push and outward normal above which a push leads around a limb, and no longer back from it."""
 
@@ -78,5 +80,13 @@ class Limbs:
         other limb on the near side, towards its own skin. The gradient points out on the far side where a limb is thin
         (a hand, a forearm): half the vertices would follow it, and the cloth between them be torn around the limb.
         """
-        foreign = ~self.own[rows, self.of_face[body_face.long()]]
-        return foreign & ((gradient * outward[rows]).sum(-1) > _SIDEWAYS)
+        limb = self.of_face[body_face.long()]
+        along = (gradient * outward[rows]).sum(-1)
+        foreign = ~self.own[rows, limb]
+        # A limb that nearly all of the cloth would leave outwards is under the cloth, as a hand in a fold of a skirt:
+        # there the gradient is right.
+        inward = torch.zeros(len(_LIMBS), device=rows.device)
+        touched = inward.index_add(0, limb[foreign], torch.ones_like(along[foreign]))
+        inward.index_add_(0, limb[foreign], (along[foreign] < 0).float())
+        under_cloth = inward < _INWARD * touched
+        return foreign & (along > _SIDEWAYS) & ~under_cloth[limb]
