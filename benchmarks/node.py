@@ -1,0 +1,207 @@
+"""The node under load: sender, `garment_node` and raw subscriber as processes of their own, over loopback.
+
+    python benchmarks/node.py                              # one person, T-shirt and short pant at 30 Hz, 60 s
+    python benchmarks/node.py --persons 4 --rate 10        # four persons, two garments each
+
+Prints how many frames came out, latencies from the sender's stamp to the subscriber, whether they grow, and how long
+the node takes to answer parameter changes meanwhile. Needs rclpy (extra `ros`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+from typing import Any
+
+import numpy as np
+
+GARMENTS = ("tshirt-male", "short-pant-male")
+
+
+def names(persons: int) -> list[str]:
+    return [f"p{i}" for i in range(persons)] if persons > 1 else [""]
+
+
+def start_ros(name: str) -> Any:
+    import rclpy
+
+    rclpy.init()
+    return rclpy.create_node(name)
+
+
+def send(options: argparse.Namespace) -> dict[str, Any]:
+    """The sender: procedural motion, stamped when it is sent."""
+    from rclpy.qos import QoSProfile
+    from sensor_msgs.msg import JointState
+
+    from msg_adapters import encoder_for
+    from refu_core import SmplFrame
+
+    node = start_ros("sender")
+    persons = names(options.persons)
+    topics = [f"{person}/smpl_params" if person else "smpl_params" for person in persons]
+    publishers = [node.create_publisher(JointState, topic, QoSProfile(depth=1)) for topic in topics]
+    while not all(publisher.get_subscription_count() for publisher in publishers):
+        time.sleep(0.05)
+    time.sleep(3.0)  # the subscriber may still be looking for the node
+    encode = encoder_for("joint_state")
+    sent: dict[str, list[int]] = {person: [] for person in persons}
+    start = time.monotonic()
+    for i in range(round(options.seconds * options.rate)):
+        time.sleep(max(0.0, start + i / options.rate - time.monotonic()))
+        for k, (person, publisher) in enumerate(zip(persons, publishers, strict=True)):
+            stamp = time.time_ns()
+            publisher.publish(encode(SmplFrame(pose=pose(i / options.rate + k), stamp_ns=stamp)))
+            sent[person].append(stamp)
+    return {"sent": sent}
+
+
+def pose(t: float) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Somebody who walks and waves."""
+    joints = np.zeros((24, 3))
+    swing = np.sin(4.0 * t)
+    joints[1, 0], joints[2, 0] = 0.4 * swing, -0.4 * swing
+    joints[4, 0], joints[5, 0] = 0.4 + 0.3 * swing, 0.4 - 0.3 * swing
+    joints[16, 2], joints[17, 2] = -0.9 + 0.4 * np.sin(1.7 * t), 0.9 - 0.4 * np.sin(1.3 * t)
+    return joints
+
+
+def receive(options: argparse.Namespace) -> dict[str, Any]:
+    """The subscriber: raw bytes, looked at as arrays."""
+    import rclpy
+    from rclpy.qos import QoSProfile
+    from visualization_msgs.msg import MarkerArray
+
+    from msg_adapters import decode_marker_array
+
+    node = start_ros("receiver")
+    got: dict[str, dict[int, float]] = {person: {} for person in names(options.persons)}
+    bad = 0
+
+    def take(data: bytes) -> None:
+        nonlocal bad
+        now = time.time_ns()
+        for marker in decode_marker_array(data):
+            if marker.action == 0:
+                person = marker.ns.rpartition("/")[0]
+                got[person][marker.stamp_ns] = 1e-6 * (now - marker.stamp_ns)
+                bad += not np.isfinite(marker.points.sum())
+
+    node.create_subscription(MarkerArray, "garments", take, QoSProfile(depth=10), raw=True)
+    end = time.monotonic() + options.seconds + 30.0
+    last = 0.0
+    while time.monotonic() < end:
+        before = sum(map(len, got.values()))
+        rclpy.spin_once(node, timeout_sec=0.1)
+        if sum(map(len, got.values())) > before:
+            last = time.monotonic()
+        if last and time.monotonic() - last > 4.0:
+            break
+    return {"got": got, "not_finite": bad}
+
+
+def operate(options: argparse.Namespace, sender: subprocess.Popen[bytes]) -> dict[str, Any]:
+    """Changes parameters while frames flow, and keeps the node's last word about itself."""
+    import rclpy
+    from diagnostic_msgs.msg import DiagnosticArray
+    from rcl_interfaces.srv import SetParameters
+    from rclpy.parameter import Parameter
+
+    node = start_ros("operator")
+    statuses: dict[str, Any] = {}
+
+    def note(array: DiagnosticArray) -> None:
+        for status in array.status:
+            if "Hz" in status.message and not status.message.startswith("0.0"):
+                statuses[status.name] = {"message": status.message, **{item.key: item.value for item in status.values}}
+
+    node.create_subscription(DiagnosticArray, "/diagnostics", note, 10)
+    client = node.create_client(SetParameters, "garment_node/set_parameters")
+    client.wait_for_service(timeout_sec=60.0)
+    answers, i = [], 0
+    while sender.poll() is None:
+        end = time.monotonic() + 1.0
+        while time.monotonic() < end:
+            rclpy.spin_once(node, timeout_sec=0.1)
+        i += 1
+        change = {"max_distance": float(i)} if not options.reload else {"margin": 0.004 + 1e-4 * (i % 5)}
+        request = SetParameters.Request(
+            parameters=[Parameter(k, value=v).to_parameter_msg() for k, v in change.items()]
+        )
+        start = time.perf_counter()
+        rclpy.spin_until_future_complete(node, client.call_async(request), timeout_sec=5.0)
+        answers.append(1e3 * (time.perf_counter() - start))
+    return {"parameter_ms": percentiles(answers), "parameter_max_ms": max(answers), "diagnostics": statuses}
+
+
+def percentiles(values: list[float]) -> dict[str, float]:
+    return {f"p{q}": round(float(np.percentile(values, q)), 1) for q in (50, 95, 99)} if values else {}
+
+
+def summary(sent: dict[str, list[int]], got: dict[str, dict[str, float]]) -> dict[str, Any]:
+    """Shares and latencies of all persons together."""
+    n_sent = sum(map(len, sent.values()))
+    ms = [(int(stamp), value) for person in got.values() for stamp, value in person.items()]
+    n_got = sum(len(set(map(int, got[person])) & set(stamps)) for person, stamps in sent.items())
+    ms.sort()
+    third = max(len(ms) // 3, 1)
+    return {
+        "sent": n_sent,
+        "received": n_got,
+        "received_percent": round(100 * n_got / n_sent, 2),
+        "unknown_stamps": len(ms) - n_got,
+        "latency_ms": percentiles([value for _, value in ms]),
+        "latency_p50_first_third_ms": percentiles([value for _, value in ms[:third]]).get("p50"),
+        "latency_p50_last_third_ms": percentiles([value for _, value in ms[-third:]]).get("p50"),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--persons", type=int, default=1)
+    parser.add_argument("--rate", type=float, default=30.0, help="frames a second of each person")
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--garments", default=",".join(GARMENTS))
+    parser.add_argument(
+        "--reload", action="store_true", help="change a parameter that loads another pipeline each time"
+    )
+    parser.add_argument("--role", choices=("send", "receive"), help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.role:
+        role = send if options.role == "send" else receive
+        print(json.dumps(role(options)))
+        return
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    os.environ["ROS_DOMAIN_ID"] = str(101 + os.getpid() % 50)
+    os.environ["OMP_NUM_THREADS"] = "1"
+    parameters = {"input_type": "joint_state", "garments": f"[{options.garments}]"}
+    if options.persons > 1:
+        parameters["persons"] = f"[{', '.join(names(options.persons))}]"
+    arguments = [item for name, value in parameters.items() for item in ("-p", f"{name}:={value}")]
+    node = subprocess.Popen([sys.executable, "-m", "refu_ros.garment_node", "--ros-args", *arguments])
+    same = [
+        sys.executable,
+        __file__,
+        f"--persons={options.persons}",
+        f"--rate={options.rate}",
+        f"--seconds={options.seconds}",
+    ]
+    try:
+        receiver = subprocess.Popen([*same, "--role=receive"], stdout=subprocess.PIPE)
+        sender = subprocess.Popen([*same, "--role=send"], stdout=subprocess.PIPE)
+        operated = operate(options, sender)
+        sent = json.loads(sender.communicate()[0])["sent"]
+        received = json.loads(receiver.communicate()[0])
+    finally:
+        node.terminate()
+        node.wait()
+    result = {**summary(sent, received["got"]), "not_finite": received["not_finite"], **operated}
+    print(json.dumps(result, indent=2))
+
+
+if __name__ == "__main__":
+    main()
