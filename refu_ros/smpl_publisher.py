@@ -1,0 +1,233 @@
+"""A node that plays motion live as SMPL parameters: an AMASS-style file, a bag, or a march on the spot."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+import threading
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import rclpy
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.exceptions import ParameterException
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
+from scipy.spatial.transform import Rotation
+
+from msg_adapters import INPUT_TYPES, SMPL_JOINTS, BagError, Motion, encoder_for, iter_smpl_frames, read_motion
+from refu_core import FrameError, RefuError, SmplFrame
+from refu_ros._interfaces import interface
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from msg_adapters import Encoder, InputType
+
+TOPIC = "smpl_params"
+EXIT_BAD_INPUT = 2
+_MARCH_FPS = 30.0
+_MARCH_STEPS_S = 1.2
+_ROOT_HEIGHT_M = 1.156  # of the built-in male body's root above its soles
+
+
+@dataclass(frozen=True, kw_only=True)
+class PublisherOptions:
+    """The node's parameters: what is played, and how."""
+
+    motion: str = ""
+    input_type: InputType = "multiarray"
+    input_axes: Literal["smpl", "frame"] = "smpl"
+    frame_id: str = "map"
+    rate: float = 30.0
+    loop: bool = True
+    in_place: bool = False
+    persons: tuple[str, ...] = ()
+    spacing: float = 1.0
+
+
+DESCRIPTIONS = {
+    "motion": "AMASS-style .npz, .mcap, or rosbag2 directory to play; empty for a march on the spot",
+    "input_type": f"message to send: {', '.join(INPUT_TYPES)}",
+    "input_axes": "axes of the root: smpl (y up), or frame (z up, as AMASS has it: set it at the garment node, too)",
+    "frame_id": "frame_id of messages that have a header",
+    "rate": "messages a second, the motion resampled to it [Hz]; 0 for the rate it was recorded at",
+    "loop": "start again after the last frame, instead of stopping the node",
+    "in_place": "hold the horizontal position of the first frame",
+    "persons": "names of several persons: each plays the motion from another time, on <name>/smpl_params",
+    "spacing": "distance between persons, to the left [m]",
+}
+"""What each parameter is for."""
+
+
+def march() -> Motion:
+    """Steps on the spot with swinging arms, in SMPL axes; the end joins the beginning."""
+    t = np.arange(round(2 * _MARCH_STEPS_S * _MARCH_FPS)) / (2 * _MARCH_STEPS_S * _MARCH_FPS) * 2 * np.pi
+    pose = np.zeros((len(t), len(SMPL_JOINTS), 3))
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        lift = np.maximum(sign * np.sin(t), 0) ** 2  # one leg always stands, straight
+        pose[:, SMPL_JOINTS.index(f"{side}_hip"), 0] = -0.9 * lift
+        pose[:, SMPL_JOINTS.index(f"{side}_knee"), 0] = 1.3 * lift
+        pose[:, SMPL_JOINTS.index(f"{side}_ankle"), 0] = -0.4 * lift  # the sole stays level
+        down_then_swing = np.stack([np.full_like(t, -sign * 1.15), 0.5 * sign * np.sin(t)], axis=1)
+        pose[:, SMPL_JOINTS.index(f"{side}_shoulder")] = Rotation.from_euler("zx", down_then_swing).as_rotvec()
+        pose[:, SMPL_JOINTS.index(f"{side}_elbow"), 1] = -sign * 0.4
+    pose[:, SMPL_JOINTS.index("spine2"), 1] = 0.12 * np.sin(t)
+    transl = np.tile([0.0, _ROOT_HEIGHT_M, 0.0], (len(t), 1))
+    return Motion(pose.astype(np.float32), transl, np.zeros(10, np.float32), _MARCH_FPS)
+
+
+def load_motion(path: str) -> Motion:
+    """The motion of a file, of a bag (evenly spaced, with the betas of its first frame), or `march` for an empty path.
+
+    Raises `MotionFileError` and `BagError`.
+    """
+    if not path:
+        return march()
+    if Path(path).suffix == ".npz":
+        return read_motion(path)
+    frames = [record.frame for record in iter_smpl_frames(path) if record.frame is not None]
+    if not frames:
+        msg = f"{path}: no frame of its SMPL topic can be decoded; `refu replay {path}` says why"
+        raise BagError(msg)
+    seconds = (frames[-1].stamp_ns - frames[0].stamp_ns) * 1e-9
+    fps = (len(frames) - 1) / seconds if seconds > 0 else _MARCH_FPS
+    poses, transl = (np.stack(arrays) for arrays in zip(*((f.pose, f.transl) for f in frames), strict=True))
+    return Motion(poses, transl, frames[0].betas, fps)
+
+
+def in_place(motion: Motion, *, up: int) -> Motion:
+    """The motion with its translations held where the first frame is, but along the axis `up`."""
+    held = np.repeat(motion.transl[:1], len(motion), axis=0)
+    held[:, up] = motion.transl[:, up]
+    return replace(motion, transl=held)
+
+
+class SmplPublisher(Node):  # type: ignore[misc]  # rclpy has no types
+    """Publishes frame after frame at a steady rate, stamped with the time they are sent."""
+
+    def __init__(self) -> None:
+        """Declare the parameters and load the motion. Raises `RefuError`, and `ParameterException` for a wrong type."""
+        super().__init__("smpl_publisher")
+        self.options = self._declare()
+        self.encode: Encoder = encoder_for(self.options.input_type)
+        self.motion = self._prepare(load_motion(self.options.motion))
+        self.finished = False
+        self._index = 0
+        message_class = interface(INPUT_TYPES[self.options.input_type])
+        names = self.options.persons
+        self._outputs = [
+            self.create_publisher(
+                message_class,
+                f"{name}/{TOPIC}" if name else TOPIC,
+                QoSProfile(depth=1),
+                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            )
+            for name in names or ("",)
+        ]
+        self.create_timer(1 / self.motion.fps, self._tick)
+        self.get_logger().info(
+            f"{self.options.motion or 'march on the spot'}: {len(self.motion)} frames at {self.motion.fps:g} Hz as "
+            f"{INPUT_TYPES[self.options.input_type]} on {', '.join(output.topic_name for output in self._outputs)}"
+        )
+
+    def _declare(self) -> PublisherOptions:
+        values: dict[str, Any] = {}
+        for field in fields(PublisherOptions):
+            # An empty list has no type of its own in rclpy: one empty name stands for no name.
+            default = [""] if field.name == "persons" else field.default
+            number = isinstance(default, float)
+            descriptor = ParameterDescriptor(
+                description=DESCRIPTIONS[field.name],
+                read_only=True,
+                dynamic_typing=number,  # whole numbers are fine for floats (`rate:=30`); ROS alone would refuse them
+            )
+            value = self.declare_parameter(field.name, default, descriptor).value
+            values[field.name] = float(value) if number and type(value) is int else value
+        values["persons"] = tuple(name for name in values["persons"] if name)
+        options = PublisherOptions(**values)
+        if not (isinstance(options.rate, float) and options.rate >= 0 and isinstance(options.spacing, float)):
+            msg = f"wanted numbers, rate >= 0, got rate {options.rate!r}, spacing {options.spacing!r}"
+            raise RefuError(msg)
+        if options.input_axes not in ("smpl", "frame"):
+            msg = f"wanted input_axes smpl or frame, got {options.input_axes!r}"
+            raise RefuError(msg)
+        return options
+
+    def _prepare(self, motion: Motion) -> Motion:
+        if self.options.in_place:
+            motion = in_place(motion, up=1 if self.options.input_axes == "smpl" else 2)
+        if self.options.rate not in (0, motion.fps):
+            motion = motion.resampled(self.options.rate)
+        return motion
+
+    def _tick(self) -> None:
+        if self._index >= len(self.motion) and not self.options.loop:
+            self.finished = True
+            return
+        stamp_ns = self.get_clock().now().nanoseconds
+        for i, output in enumerate(self._outputs):
+            start = i * len(self.motion) // len(self._outputs)
+            try:
+                frame = self.motion.frame((self._index + start) % len(self.motion))
+            except FrameError as error:  # recordings have such frames; what is sent is always a person
+                self.get_logger().warning(f"frame left out: {error}", throttle_duration_sec=5.0)
+                continue
+            left = np.eye(3)[0 if self.options.input_axes == "smpl" else 1]
+            frame = SmplFrame(
+                frame.pose,
+                betas=frame.betas,
+                transl=frame.transl + i * self.options.spacing * left,
+                stamp_ns=stamp_ns,
+            )
+            output.publish(self.encode(frame, frame_id=self.options.frame_id))
+        self._index += 1
+
+
+def _parse(arguments: Sequence[str]) -> None:
+    """Answers --help; everything else is a ROS parameter."""
+    defaults = {field.name: field.default for field in fields(PublisherOptions)}
+    listing = "\n".join(f"  {name:<11} {text} (default: {defaults[name]!r})" for name, text in DESCRIPTIONS.items())
+    argparse.ArgumentParser(
+        prog="smpl_publisher",
+        usage="smpl_publisher [--help] [--ros-args -p NAME:=VALUE ...]",
+        description=__doc__,
+        epilog=f"parameters:\n{listing}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    ).parse_args(arguments)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs the node until SIGINT, SIGTERM or the end of the motion; returns the exit code."""
+    arguments = sys.argv if arguments is None else ["smpl_publisher", *arguments]
+    _parse(remove_ros_args(arguments)[1:])
+    # rclpy's own handlers tear the context down under a running callback; a flag lets the loop end by itself.
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        node = SmplPublisher()
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        while not (stop.is_set() or node.finished) and rclpy.ok():
+            executor.spin_once(timeout_sec=0.1)
+        executor.shutdown()
+        node.destroy_node()
+    except (RefuError, ParameterException) as error:
+        print(f"smpl_publisher: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return EXIT_BAD_INPUT
+    finally:
+        rclpy.try_shutdown()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,203 @@
+"""`smpl_publisher`: what it plays, and the process itself with a raw subscriber on the other side."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import msg_adapters as adapters
+from refu_core import load_body
+
+rclpy = pytest.importorskip("rclpy", reason="rclpy isn't installed (extra ros)")
+
+from rclpy.context import Context  # noqa: E402
+from rclpy.executors import SingleThreadedExecutor  # noqa: E402
+from rclpy.node import Node  # noqa: E402
+from rclpy.qos import QoSProfile  # noqa: E402
+
+from refu_ros._interfaces import interface  # noqa: E402
+from refu_ros.smpl_publisher import in_place, load_motion, main, march  # noqa: E402
+
+# rclpy's parser of message definitions uses a module that Python 3.11 deprecates.
+pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")
+
+BAGS = Path(__file__).parents[2] / "bags"
+ENVIRONMENT = os.environ | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_DOMAIN_ID": "61"}
+
+
+class Listener:
+    """A node that keeps the raw messages of some topics."""
+
+    def __init__(self, context: Context, input_type: adapters.InputType, topics: tuple[str, ...]) -> None:
+        self.node = Node("listener", context=context)
+        self.executor = SingleThreadedExecutor(context=context)
+        self.executor.add_node(self.node)
+        self.received: dict[str, list[bytes]] = {topic: [] for topic in topics}
+        for topic, messages in self.received.items():
+            self.node.create_subscription(
+                interface(adapters.INPUT_TYPES[input_type]), topic, messages.append, QoSProfile(depth=100), raw=True
+            )
+
+    def collect(self, count: int, *, seconds: float = 30.0) -> None:
+        """Until each topic has so many messages."""
+        until = time.monotonic() + seconds
+        while min(map(len, self.received.values())) < count:
+            assert time.monotonic() < until, {topic: len(messages) for topic, messages in self.received.items()}
+            self.executor.spin_once(timeout_sec=0.1)
+
+    def close(self) -> None:
+        self.executor.shutdown()
+        self.node.destroy_node()
+
+
+@pytest.fixture(scope="module")
+def context() -> Iterator[Context]:
+    patch = pytest.MonkeyPatch()
+    for name in ("ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_DOMAIN_ID"):
+        patch.setenv(name, ENVIRONMENT[name])
+    context = Context()
+    rclpy.init(context=context)
+    yield context
+    rclpy.try_shutdown(context=context)
+    patch.undo()
+
+
+def ros_arguments(parameters: dict[str, Any]) -> list[str]:
+    return ["--ros-args", *(word for name, value in parameters.items() for word in ("-p", f"{name}:={value}"))]
+
+
+def start(**parameters: Any) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "refu_ros.smpl_publisher", *ros_arguments(parameters)]
+    return subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+@pytest.mark.parametrize(
+    ("input_type", "bag", "stop"),
+    [
+        ("joint_state", "walk", signal.SIGINT),
+        ("multiarray", "reach_squat", signal.SIGTERM),
+        ("pose_array", "walk", signal.SIGINT),
+    ],
+)
+def test_plays_a_bag(context: Context, input_type: adapters.InputType, bag: str, stop: signal.Signals) -> None:
+    """The bag's frames in order and from the beginning again, in another type, stamped anew; then a clean end."""
+    listener = Listener(context, input_type, ("smpl_params",))
+    process = start(motion=BAGS / bag, input_type=input_type, frame_id="camera")
+    try:
+        listener.collect(20)
+    finally:
+        process.send_signal(stop)
+        _, errors = process.communicate(timeout=10)
+        listener.close()
+    assert process.returncode == 0, errors
+    assert "Traceback" not in errors
+    recorded = load_motion(str(BAGS / bag))
+    frames = [adapters.decoder_for(input_type)(data) for data in listener.received["smpl_params"]]
+    first = int(np.abs(recorded.poses - frames[0].pose).max(axis=(1, 2)).argmin())
+    for i, frame in enumerate(frames):
+        index = (first + i) % len(recorded)
+        np.testing.assert_allclose(frame.pose, recorded.poses[index], atol=1e-5)
+        np.testing.assert_allclose(frame.transl, recorded.transl[index], atol=1e-6)
+        if input_type != "pose_array":  # carries no betas
+            np.testing.assert_allclose(frame.betas, recorded.betas, atol=1e-6)
+    if input_type != "multiarray":  # has no header
+        stamps = [frame.stamp_ns for frame in frames]
+        assert stamps == sorted(set(stamps))
+        assert abs(stamps[-1] * 1e-9 - time.time()) < 60
+
+
+def test_persons_stand_apart_and_move_apart(context: Context) -> None:
+    listener = Listener(context, "joint_state", ("ann/smpl_params", "bob/smpl_params"))
+    process = start(input_type="joint_state", persons="[ann, bob]", spacing=1.5, rate=60)
+    try:
+        listener.collect(5)
+    finally:
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=10)
+        listener.close()
+    assert process.returncode == 0, errors
+    decode = adapters.decoder_for("joint_state")
+    ann, bob = ({f.stamp_ns: f for f in map(decode, messages)} for messages in listener.received.values())
+    common = sorted(ann.keys() & bob.keys())
+    assert common
+    for stamp in common:
+        np.testing.assert_allclose(bob[stamp].transl - ann[stamp].transl, [1.5, 0, 0], atol=1e-6)
+        assert np.abs(bob[stamp].pose - ann[stamp].pose).max() > 0.01
+
+
+@pytest.mark.usefixtures("context")
+def test_ends_with_the_motion(capfd: pytest.CaptureFixture[str]) -> None:
+    assert run(loop=False, rate=0.0) == 0
+    assert "72 frames at 30 Hz" in "".join(capfd.readouterr())
+
+
+@pytest.mark.usefixtures("context")
+@pytest.mark.parametrize(
+    ("parameters", "words"),
+    [
+        ({"motion": "nowhere"}, "nowhere: no such file"),
+        ({"input_type": "pointcloud"}, "wanted an input type, got 'pointcloud'"),
+        ({"rate": -1}, "rate >= 0, got rate -1.0"),
+        ({"rate": "fast"}, "wanted numbers"),
+        ({"loop": 1}, "loop"),
+        ({"input_axes": "left"}, "input_axes smpl or frame, got 'left'"),
+    ],
+    ids=lambda value: str(value),
+)
+def test_bad_parameters_are_one_line(capfd: pytest.CaptureFixture[str], parameters: dict[str, Any], words: str) -> None:
+    assert run(**parameters) == 2
+    (line,) = capfd.readouterr().err.strip().splitlines()
+    assert line.startswith("smpl_publisher: error: ")
+    assert words in line
+
+
+def run(**parameters: Any) -> int:
+    """The program's exit code, run in this process, whose signal handlers are put back."""
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        return main(ros_arguments(parameters))
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+
+
+def test_in_place_holds_the_ground_and_not_the_height() -> None:
+    walk = load_motion(str(BAGS / "walk"))
+    held = in_place(walk, up=1)
+    np.testing.assert_array_equal(held.transl[:, 1], walk.transl[:, 1])
+    np.testing.assert_array_equal(held.transl[:, [0, 2]], np.tile(walk.transl[0, [0, 2]], (len(walk), 1)))
+    np.testing.assert_array_equal(held.poses, walk.poses)
+
+
+def test_march_loops_and_stands_on_the_floor() -> None:
+    motion = march()
+    steps = np.abs(np.diff(motion.poses, axis=0, append=motion.poses[:1])).max(axis=(1, 2))
+    assert steps[-1] <= steps.max() * 1.01  # the seam is a step like any other
+    assert steps.max() < 0.2
+    soles = load_body("male")(motion.poses, transl=motion.transl).vertices[..., 1].min(dim=1).values.numpy()
+    assert np.abs(soles).max() < 0.01
+
+
+def test_npz_is_read_and_bags_keep_their_rate(tmp_path: Path) -> None:
+    np.savez(tmp_path / "clip.npz", poses=np.zeros((5, 72)), trans=np.ones((5, 3)), mocap_framerate=25.0)
+    assert (len(load_motion(str(tmp_path / "clip.npz"))), load_motion(str(tmp_path / "clip.npz")).fps) == (5, 25.0)
+    walk = load_motion(str(BAGS / "walk"))
+    assert len(walk) == 300
+    assert walk.fps == pytest.approx(30, abs=1e-6)
+
+
+def test_a_bag_without_a_body_is_refused(tmp_path: Path) -> None:
+    with adapters.BagWriter(tmp_path / "bad.mcap") as bag:
+        bag.add_topic("/smpl_params", adapters.INPUT_TYPES["multiarray"])
+        bag.write("/smpl_params", b"\x00\x01\x00\x00nonsense", log_time_ns=1)
+    with pytest.raises(adapters.BagError, match="no frame of its SMPL topic can be decoded"):
+        load_motion(str(tmp_path / "bad.mcap"))
