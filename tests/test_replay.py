@@ -290,7 +290,7 @@ def all_bad_bag(path: Path) -> Path:
         ("good.mcap", lambda path: write_bag(path, motion(1)), ("--output", "/proc/nope/out.mcap"), ("/proc/nope",)),
         ("good.mcap", lambda path: write_bag(path, motion(1)), ("--json", "/proc/nope/r.json"), ("/proc/nope",)),
         ("good.mcap", lambda path: write_bag(path, motion(1)), ("--betas", "1,nan"), ("--betas",)),
-        ("good.mcap", lambda path: write_bag(path, motion(1)), ("--style", "1"), ("style",)),
+        ("good.mcap", lambda path: write_bag(path, motion(1)), ("--style", "1,2,3,4,5"), ("--style",)),
         ("good.mcap", lambda path: write_bag(path, motion(1)), ("--margin", "7"), ("margin",)),
         ("good.mcap", lambda path: write_bag(path, motion(1)), ("--backbone", "resnet"), ("resnet", "skinned")),
         ("good.mcap", lambda path: write_bag(path, motion(1)), ("--nonsense",), ("--nonsense",)),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -11,6 +13,7 @@ from hypothesis import strategies as st
 from refu_core import GarmentError, load_body, load_garment
 from refu_core.body import apply_transforms, blend_transforms
 from refu_core.garments import BUILTIN_GARMENTS
+from refu_core.sdf import ExactSdf
 
 PAPER_VERTICES = {"shirt-male": 9723, "tshirt-male": 7702, "short-pant-male": 2710, "skirt-female": 7130}
 
@@ -89,7 +92,25 @@ def test_edges_are_each_there_once() -> None:
 def test_unknown_garments_and_styles_are_named() -> None:
     with pytest.raises(GarmentError, match="no garment 'kilt': wanted one of shirt-male"):
         load_garment("kilt")
-    garment = load_garment("tshirt-male")
-    if garment.styledirs is None:
-        with pytest.raises(GarmentError, match="tshirt-male has one style only"):
-            garment.rest(torch.zeros(1, 10), torch.zeros(1, 4))
+    plain = replace(load_garment("tshirt-male"), styledirs=None)
+    with pytest.raises(GarmentError, match="tshirt-male has one style only"):
+        plain.rest(torch.zeros(1, 10), torch.zeros(1, 4))
+
+
+@pytest.mark.parametrize("name", BUILTIN_GARMENTS)
+def test_styles_change_the_cut_and_stay_outside(name: str) -> None:
+    garment = load_garment(name)
+    assert garment.styledirs is not None
+    body = load_body(garment.body)
+    sdf = ExactSdf(body.faces)
+    sdf.update(body.v_template)
+    betas = torch.zeros(1, 10)
+    mean = garment.rest(betas)
+    torch.testing.assert_close(garment.rest(betas, torch.zeros(1, 4)), mean)
+    for k in range(4):
+        for sign in (-1.5, 1.5):
+            style = torch.zeros(1, 4)
+            style[0, k] = sign
+            cut = garment.rest(betas, style)
+            assert (cut - mean).norm(dim=-1).max() > 0.003
+            assert float(sdf.query(cut[0]).distance.min()) > 0
