@@ -113,9 +113,9 @@ def in_place(motion: Motion, *, up: int) -> Motion:
 class SmplPublisher(Node):  # type: ignore[misc]  # rclpy has no types
     """Publishes frame after frame at a steady rate, stamped with the time they are sent."""
 
-    def __init__(self) -> None:
+    def __init__(self, **options: Any) -> None:
         """Declare the parameters and load the motion. Raises `RefuError`, and `ParameterException` for a wrong type."""
-        super().__init__("smpl_publisher")
+        super().__init__("smpl_publisher", **options)
         self.options = self._declare()
         self.encode: Encoder = encoder_for(self.options.input_type)
         self.motion = self._prepare(load_motion(self.options.motion))

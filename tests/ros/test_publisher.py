@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -15,17 +16,18 @@ import numpy as np
 import pytest
 
 import msg_adapters as adapters
-from refu_core import load_body
+from refu_core import RefuError, load_body
 
 rclpy = pytest.importorskip("rclpy", reason="rclpy isn't installed (extra ros)")
 
 from rclpy.context import Context  # noqa: E402
+from rclpy.exceptions import ParameterException  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.node import Node  # noqa: E402
 from rclpy.qos import QoSProfile  # noqa: E402
 
 from refu_ros._interfaces import interface  # noqa: E402
-from refu_ros.smpl_publisher import in_place, load_motion, main, march  # noqa: E402
+from refu_ros.smpl_publisher import SmplPublisher, in_place, load_motion, march  # noqa: E402
 
 # rclpy's parser of message definitions uses a module that Python 3.11 deprecates.
 pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")
@@ -134,13 +136,20 @@ def test_persons_stand_apart_and_move_apart(context: Context) -> None:
         assert np.abs(bob[stamp].pose - ann[stamp].pose).max() > 0.01
 
 
-@pytest.mark.usefixtures("context")
-def test_ends_with_the_motion(capfd: pytest.CaptureFixture[str]) -> None:
-    assert run(loop=False, rate=0.0) == 0
-    assert "72 frames at 30 Hz" in "".join(capfd.readouterr())
+def test_ends_with_the_motion(context: Context) -> None:
+    listener = Listener(context, "joint_state", ("smpl_params",))
+    node = publisher(context, loop=False, rate=240, input_type="joint_state")
+    listener.executor.add_node(node)
+    while not node.finished:
+        listener.executor.spin_once(timeout_sec=1.0)
+    listener.collect(1)
+    node.destroy_node()
+    listener.close()
+    frames = [adapters.decoder_for("joint_state")(data) for data in listener.received["smpl_params"]]
+    assert 1 <= len(frames) <= len(march().resampled(240.0))
+    np.testing.assert_allclose(frames[-1].pose, march().poses[-1], atol=1e-5)
 
 
-@pytest.mark.usefixtures("context")
 @pytest.mark.parametrize(
     ("parameters", "words"),
     [
@@ -153,21 +162,20 @@ def test_ends_with_the_motion(capfd: pytest.CaptureFixture[str]) -> None:
     ],
     ids=lambda value: str(value),
 )
-def test_bad_parameters_are_one_line(capfd: pytest.CaptureFixture[str], parameters: dict[str, Any], words: str) -> None:
-    assert run(**parameters) == 2
-    (line,) = capfd.readouterr().err.strip().splitlines()
-    assert line.startswith("smpl_publisher: error: ")
-    assert words in line
+def test_refuses(context: Context, parameters: dict[str, Any], words: str) -> None:
+    with pytest.raises((RefuError, ParameterException), match=re.escape(words)):
+        publisher(context, **parameters)
 
 
-def run(**parameters: Any) -> int:
-    """The program's exit code, run in this process, whose signal handlers are put back."""
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        return main(ros_arguments(parameters))
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
+def test_bad_parameters_are_one_line() -> None:
+    process = start(motion="nowhere")
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == 2
+    assert errors.splitlines() == ["smpl_publisher: error: nowhere: no such file or directory"]
+
+
+def publisher(context: Context, **parameters: Any) -> SmplPublisher:
+    return SmplPublisher(context=context, cli_args=ros_arguments(parameters))
 
 
 def test_in_place_holds_the_ground_and_not_the_height() -> None:
