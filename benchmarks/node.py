@@ -116,8 +116,9 @@ def operate(options: argparse.Namespace, sender: subprocess.Popen[bytes]) -> dic
 
     def note(array: DiagnosticArray) -> None:
         for status in array.status:
-            if "Hz" in status.message and not status.message.startswith("0.0"):
-                statuses[status.name] = {"message": status.message, **{item.key: item.value for item in status.values}}
+            values = {item.key: item.value for item in status.values}
+            if float(values.get("rate [Hz]", "1")) > 0:
+                statuses[status.name] = {"message": status.message, **values}
 
     node.create_subscription(DiagnosticArray, "/diagnostics", note, 10)
     client = node.create_client(SetParameters, "garment_node/set_parameters")

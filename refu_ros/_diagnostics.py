@@ -27,13 +27,14 @@ def statuses(
     state: str,
     persons: Sequence[str],
     recording: RecorderState | None,
+    recording_error: str,
 ) -> list[DiagnosticStatus]:
     """Input, output and recording; `state` is the lifecycle's, `persons` are those in the scene."""
     active = state == "active"
     return [
         _input(report, settings, f"{node}: input", persons=persons, active=active),
         _output(report, settings, f"{node}: garments", state=state),
-        _recording(recording, f"{node}: recording"),
+        _recording(recording, f"{node}: recording", error=recording_error),
     ]
 
 
@@ -100,16 +101,16 @@ def _output(report: Report, settings: NodeSettings, name: str, *, state: str) ->
     return DiagnosticStatus(level, name, message, values=values)
 
 
-def _recording(state: RecorderState | None, name: str) -> DiagnosticStatus:
+def _recording(state: RecorderState | None, name: str, *, error: str) -> DiagnosticStatus:
+    level, message = (ERROR, f"not recording: {error}") if error else (OK, "not recording")
     if state is None:
-        return DiagnosticStatus(OK, name, "not recording")
-    level, message = OK, f"{state.written} messages in {state.path}"
-    if state.error:
-        level, message = ERROR, f"recording stopped: {state.error}"
-    elif state.free_bytes is not None and state.free_bytes < _LOW_DISK_BYTES:
-        level, message = WARN, f"disk nearly full: {state.free_bytes / 1e6:.0f} MB left"
-    elif state.dropped:
-        level, message = WARN, f"{state.dropped} messages not recorded: the disk is too slow"
+        return DiagnosticStatus(level, name, message)
+    if not error:
+        message = f"{state.written} messages in {state.path}"
+        if state.free_bytes is not None and state.free_bytes < _LOW_DISK_BYTES:
+            level, message = WARN, f"disk nearly full: {state.free_bytes / 1e6:.0f} MB left"
+        elif state.dropped:
+            level, message = WARN, f"{state.dropped} messages not recorded: the disk is too slow"
     values = {
         "path": str(state.path),
         "messages": str(state.written),

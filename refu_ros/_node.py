@@ -21,7 +21,7 @@ from refu_ros._loader import PipelineLoader
 from refu_ros._parameters import declare_settings
 from refu_ros._recorder import Recorder
 from refu_ros._scene import Scene, check_plausible
-from refu_ros._statistics import Statistics
+from refu_ros._statistics import Statistics, printable
 from refu_ros._worker import Worker
 
 if TYPE_CHECKING:
@@ -53,6 +53,7 @@ class GarmentNode(LifecycleNode):  # type: ignore[misc]
         self._loader: PipelineLoader | None = None
         self._pipeline: GarmentPipeline | None = None
         self._recorder: Recorder | None = None
+        self._recording_error = ""
         self._closing: list[Recorder] = []
         self._inputs: dict[str, Any] = {}
         self._garments: Any = None
@@ -96,11 +97,8 @@ class GarmentNode(LifecycleNode):  # type: ignore[misc]
         if self.settings.record and not self._recording:
             try:
                 self._start_recording(self.settings.record)
-            except RefuError as error:
-                self.get_logger().error(f"can't record: {error}")
-                self._statistics.drop("recording", str(error))
-                super().on_deactivate(state)
-                return TransitionCallbackReturn.FAILURE
+            except RefuError as error:  # no reason to leave people undressed
+                self._recording_error = printable(error)
         self._scene = Scene(self._statistics)
         self._worker = Worker(self._scene, self._statistics, self, settings=self.settings, pipeline=self._pipeline)
         self._worker.start()
@@ -180,7 +178,7 @@ class GarmentNode(LifecycleNode):  # type: ignore[misc]
             check_plausible(frame)
         except (adapters.AdapterError, FrameError) as error:
             self._statistics.drop("invalid", str(error))
-            self.get_logger().warning(f"{topic}: {error}", throttle_duration_sec=_LOG_PERIOD_S)
+            self.get_logger().warning(f"{topic}: {printable(error)}", throttle_duration_sec=_LOG_PERIOD_S)
             return
         self._scene.put(person, frame)
 
@@ -257,9 +255,11 @@ class GarmentNode(LifecycleNode):  # type: ignore[misc]
 
     def _start_recording(self, path: str) -> None:
         self._recorder = Recorder(path)
+        self._recording_error = ""
         self.get_logger().info(f"recording to {self._recorder.path}")
 
     def _stop_recording(self) -> None:
+        self._recording_error = ""
         if self._recorder is not None:
             self._recorder.stop()
             self._closing.append(self._recorder)
@@ -300,9 +300,10 @@ class GarmentNode(LifecycleNode):  # type: ignore[misc]
             self._follow_humans()
         self._closing = [recorder for recorder in self._closing if not recorder.finished]
         report = self._statistics.report()
-        state = None if self._recorder is None else self._recorder.state()
-        if state is not None and state.error:
-            self.get_logger().error(f"recording stopped: {state.error}", throttle_duration_sec=60.0)
+        recording = None if self._recorder is None else self._recorder.state()
+        error = recording.error if recording is not None else self._recording_error
+        if error:
+            self.get_logger().error(f"not recording: {error}", throttle_duration_sec=60.0)
         if report.recent["drop.failed"]:
             self.get_logger().error(report.reasons["failed"], throttle_duration_sec=_LOG_PERIOD_S)
         data = adapters.encode_diagnostics(
@@ -312,7 +313,8 @@ class GarmentNode(LifecycleNode):  # type: ignore[misc]
                 node=self.get_name(),
                 state=self._state,
                 persons=() if self._scene is None else self._scene.persons,
-                recording=state,
+                recording=recording,
+                recording_error=error,
             ),
             stamp_ns=self.now_ns(),
         )

@@ -15,6 +15,12 @@ if TYPE_CHECKING:
 
 _WINDOW = 1000
 """Latencies that percentiles are taken of."""
+_MAX_TEXT = 300
+
+
+def printable(text: object) -> str:
+    """A line for logs and diagnostics, whatever a hostile message has put into the text."""
+    return "".join(c if c.isprintable() else "?" for c in str(text)[:_MAX_TEXT])
 
 
 @dataclass(frozen=True)
@@ -70,7 +76,7 @@ class Statistics:
         with self._lock:
             self._total[f"drop.{cause}"] += 1
             if reason:
-                self._reasons[cause] = reason
+                self._reasons[cause] = printable(reason)
 
     def skip(self, kind: str) -> None:
         """Work was left out that nobody needed."""
@@ -86,11 +92,10 @@ class Statistics:
             self._total["penetration.unresolved"] += unresolved
             self._latencies.extend(latencies_ms)
 
-    def set_error(self, text: str) -> bool:
-        """What keeps the node from its work, or empty; returns whether it is news."""
+    def set_error(self, text: str) -> None:
+        """What keeps the node from doing as it was asked, or empty."""
         with self._lock:
-            news, self._error = text != self._error, text
-            return news
+            self._error = printable(text)
 
     def report(self) -> Report:
         """What there is to say, once a second."""

@@ -411,6 +411,7 @@ def report_of(statistics: Statistics, recording: RecorderState | None = None, **
         state="active",
         persons=("",),
         recording=recording,
+        recording_error=recording.error if recording else "",
     )
     return {status.name.removeprefix("n: "): status for status in found}
 

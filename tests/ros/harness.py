@@ -69,12 +69,13 @@ def _yaml(value: Any) -> str:
 class Peer:
     """Sender, raw subscriber and operator."""
 
-    def __init__(self, *persons: str) -> None:
+    def __init__(self, *persons: str, topic: str = "{}/smpl_params") -> None:
         self.node = rclpy.create_node("peer")
-        prefixes = {person: f"{person}/" if person else "" for person in persons or ("",)}
         self._publishers = {
-            person: self.node.create_publisher(JointState, f"{prefix}smpl_params", QoSProfile(depth=1))
-            for person, prefix in prefixes.items()
+            person: self.node.create_publisher(
+                JointState, topic.format(person) if person else "smpl_params", QoSProfile(depth=1)
+            )
+            for person in persons or ("",)
         }
         self.garments: list[list[Marker]] = []
         self.diagnostics: list[DiagnosticArray] = []
@@ -116,6 +117,10 @@ class Peer:
             "the node listens",
             timeout=40.0,
         )
+
+    def fall_silent(self, person: str) -> None:
+        """A person's topic is gone."""
+        self.node.destroy_publisher(self._publishers.pop(person))
 
     def send(self, frame: SmplFrame, person: str = "") -> None:
         """A good frame."""

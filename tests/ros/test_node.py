@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import struct
 from typing import TYPE_CHECKING
 
@@ -174,3 +175,24 @@ def test_a_bad_start_is_one_line(ros: None, tmp_path: Path) -> None:  # noqa: AR
         assert node.process.wait(timeout=40) == 2
         assert "no garment 'cape'" in node.log
         assert "Traceback" not in node.log
+
+
+def test_humans_come_and_go(ros: None, tmp_path: Path) -> None:  # noqa: ARG001
+    peer = Peer("ann", "bob", topic="/humans/bodies/{}/joint_states")
+    parameters = {"input_type": "joint_state", "follow_humans": True, "garments": [GARMENTS[0]], "person_timeout": 0.5}
+    with NodeProcess(tmp_path / "log.txt", **parameters) as node:
+        peer.wait_for_node()
+        peer.dress(frame(1), "ann")
+        peer.dress(frame(2), "bob")
+        peer.fall_silent("ann")
+        peer.garments.clear()
+
+        def left() -> bool:
+            peer.send(frame(3), "bob")
+            gone = f"ann/{GARMENTS[0]}"
+            return any(m.ns == gone and m.action == 2 for markers in peer.garments for m in markers)
+
+        peer.spin_until(left, "ann is taken out of the scene")
+        peer.dress(frame(4), "bob")
+        assert node.stop(signal.SIGINT) == 0, node.log
+    peer.close()
