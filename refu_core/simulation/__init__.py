@@ -1,12 +1,14 @@
 """Ground truth: simulated garments for any body, pose, shape and style, checked to be free of collisions."""
 
 from refu_core.simulation._cloth import ClothSettings
+from refu_core.simulation._dataset import GarmentDataset, GarmentSample
 from refu_core.simulation._drape import Drape, Draper, DrapeSettings, canonical_pose
 from refu_core.simulation._errors import SimulationError
 from refu_core.simulation._plan import Plan
 from refu_core.simulation._poses import Clip, RoomSettings, load_clips, split_clips
 from refu_core.simulation._run import Progress, simulate_dataset, summarise
 from refu_core.simulation._selection import CAUSES, SelectionSettings
+from refu_core.simulation._sheet import contact_sheet
 from refu_core.simulation._styles import StyleBasis, Tailoring, build_styles, tailoring_of
 from refu_core.simulation._worker import SimulationSettings
 
@@ -17,6 +19,8 @@ __all__ = [
     "Drape",
     "DrapeSettings",
     "Draper",
+    "GarmentDataset",
+    "GarmentSample",
     "Plan",
     "Progress",
     "RoomSettings",
@@ -27,6 +31,7 @@ __all__ = [
     "Tailoring",
     "build_styles",
     "canonical_pose",
+    "contact_sheet",
     "load_clips",
     "simulate_dataset",
     "split_clips",

@@ -1,0 +1,522 @@
+"""Simulated garments: the same every time, free of collisions by three judges, and sets that survive interruption."""
+
+from __future__ import annotations
+
+import errno
+import multiprocessing
+import os
+import shutil
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import fcl
+import igl
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+import refu_core
+from refu_core.body import load_body
+from refu_core.errors import MeshError
+from refu_core.evaluation import CollisionChecker
+from refu_core.garments import load_garment
+from refu_core.simulation import (
+    CAUSES,
+    Drape,
+    Draper,
+    GarmentDataset,
+    GarmentSample,
+    Plan,
+    Progress,
+    SimulationError,
+    SimulationSettings,
+    contact_sheet,
+    load_clips,
+    simulate_dataset,
+    split_clips,
+    summarise,
+)
+from refu_core.simulation._drape import canonical_pose, comfort_poses
+from refu_core.simulation._plan import TEST, TRAIN
+from refu_core.simulation._selection import Selector, SelfIntersection
+from refu_core.simulation._store import DONE, QUANTUM, TO_DO, Shard, dequantise, locked, quantise
+
+GARMENT = "short-pant-male"
+COUNT = 6
+TEST_SHARE = 1 / 3
+
+
+def write_clip(path: Path, rng: np.random.Generator, **replaced: Any) -> None:
+    poses = rng.normal(0, 0.15, (5, 72))
+    poses[:, :3] = 0
+    arrays = {"poses": poses, "trans": np.zeros((5, 3)), "mocap_framerate": np.array(30.0)} | replaced
+    np.savez(path, **{key: value for key, value in arrays.items() if value is not None})
+
+
+@pytest.fixture(scope="module")
+def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("motions")
+    rng = np.random.default_rng(0)
+    for name in ("walk", "wave"):
+        write_clip(folder / f"{name}.npz", rng)
+    return folder
+
+
+def simulate(output: Path, clips: Path, **options: Any) -> dict[str, Any]:
+    return simulate_dataset(GARMENT, COUNT, output, motions=clips, **({"test_share": TEST_SHARE} | options))
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory, clips: Path) -> Path:
+    """A set made as two shards, one after the other."""
+    output = tmp_path_factory.mktemp("sets") / "in-shards"
+    simulate(output, clips, shard=(0, 2))
+    simulate(output, clips, shard=(1, 2))
+    return output
+
+
+@pytest.fixture(scope="module")
+def dataset(simulated: Path) -> GarmentDataset:
+    return GarmentDataset(simulated)
+
+
+@pytest.fixture(scope="module")
+def samples(dataset: GarmentDataset) -> list[GarmentSample]:
+    return [dataset.sample(i) for i in range(len(dataset))]
+
+
+def body_of(sample: GarmentSample) -> NDArray[np.float64]:
+    vertices = load_body("male")(sample.pose[None], torch.from_numpy(sample.betas)[None]).vertices[0]
+    return vertices.numpy().astype(np.float64)
+
+
+def fcl_pairs(first: NDArray[Any], first_faces: NDArray[Any], second: NDArray[Any], second_faces: NDArray[Any]) -> Any:
+    def model(vertices: NDArray[Any], faces: NDArray[Any]) -> fcl.CollisionObject:
+        bvh = fcl.BVHModel()
+        bvh.beginModel(len(vertices), len(faces))
+        bvh.addSubModel(vertices.astype(np.float64), faces.astype(np.int64))
+        bvh.endModel()
+        return fcl.CollisionObject(bvh, fcl.Transform())
+
+    request = fcl.CollisionRequest(num_max_contacts=1_000_000, enable_contact=True)
+    result = fcl.CollisionResult()
+    fcl.collide(model(first, first_faces), model(second, second_faces), request, result)
+    return np.array([(contact.b1, contact.b2) for contact in result.contacts], np.int64).reshape(-1, 2)
+
+
+# What is simulated ----------------------------------------------------------------------------------------------------
+
+
+def test_nothing_collides_by_three_judges(samples: list[GarmentSample]) -> None:
+    garment, body = load_garment(GARMENT), load_body("male")
+    faces, body_faces = garment.faces.numpy(), body.faces.numpy()
+    checker = CollisionChecker(body.faces)
+    for sample in samples:
+        posed = body_of(sample)
+        checker.update(posed.astype(np.float32))
+        assert checker.check(sample.vertices, faces).is_free
+        assert not len(fcl_pairs(sample.vertices, faces, posed, body_faces))
+        winding = igl.fast_winding_number(posed, body_faces, sample.vertices.astype(np.float64))
+        assert np.abs(winding).max() < 0.5
+        own = fcl_pairs(sample.vertices, faces, sample.vertices, faces)
+        shared = (faces[own[:, 0]][:, :, None] == faces[own[:, 1]][:, None]).any((1, 2))
+        assert shared.all()
+
+
+def test_cloth_stretches_little(samples: list[GarmentSample]) -> None:
+    """Measured anew: an edge against the longest that it is in the cut and in the poses that the cut has room for."""
+    garment, body = load_garment(GARMENT), load_body("male")
+    faces = garment.faces.numpy()
+    edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1), axis=0)
+
+    def length(vertices: torch.Tensor | NDArray[Any]) -> NDArray[Any]:
+        points = np.asarray(vertices)
+        return np.linalg.norm(points[..., edges[:, 0], :] - points[..., edges[:, 1], :], axis=-1)
+
+    for sample in samples:
+        shape = torch.from_numpy(sample.betas)[None]
+        rest = garment.rest(shape, torch.from_numpy(sample.style)[None])
+        comfort = comfort_poses()
+        transforms = body(comfort, shape).transforms
+        eased = length(garment.pose(rest.expand(len(comfort), -1, -1), transforms)).max(0)
+        cut = length(rest[0])
+        stretch = length(sample.vertices) / np.clip(eased, cut, 1.15 * cut)
+        assert np.percentile(stretch, 99.9) <= 1.15
+        assert np.percentile(stretch, 50) > 0.9  # nor is it crumpled up
+
+
+def test_sample_depends_on_nothing_but_its_parameters(samples: list[GarmentSample]) -> None:
+    """Draped after another pose, and by another draper: the bytes of the stored one, which came another way."""
+    sample = samples[-1]
+    draper = Draper(load_garment(GARMENT), load_body("male"))
+    other = canonical_pose()
+    other[1, 0] = -0.6
+    before = draper.drape(other, sample.betas, sample.style)
+    drape = draper.drape(sample.pose, sample.betas, sample.style)
+    assert np.abs(before.vertices - drape.vertices).max() > 0.02
+    np.testing.assert_array_equal(dequantise(quantise(drape.vertices)), sample.vertices)
+
+
+def test_selector_names_the_cause(samples: list[GarmentSample]) -> None:
+    garment, body = load_garment(GARMENT), load_body("male")
+    selector = Selector(body.faces, garment.faces)
+    sample = samples[0]
+    posed = body_of(sample).astype(np.float32)
+
+    def cause(vertices: NDArray[Any], *, speed: float = 0.0, stretch: float = 1.0) -> str | None:
+        vertices = vertices.astype(np.float32)
+        return selector.cause(vertices, posed, Drape(vertices, speed, stretch, 1))
+
+    assert cause(sample.vertices) is None
+    assert cause(sample.vertices + np.array((0.02, 0, 0))) == "body_collision"
+    assert cause(sample.vertices, stretch=1.2) == "stretch"
+    assert cause(sample.vertices, speed=0.2) == "unsettled"
+    through = sample.vertices.copy()
+    through[np.argmax(through[:, 0])] = through[np.argmin(through[:, 0])] - [0.05, 0, 0]
+    assert cause(through + np.array((5, 0, 0))) == "self_intersection"
+    assert {"body_collision", "stretch", "unsettled", "self_intersection"} < set(CAUSES)
+
+
+def test_self_intersection_is_that_of_fcl(samples: list[GarmentSample]) -> None:
+    faces = load_garment(GARMENT).faces.numpy()
+    rng = np.random.default_rng(0)
+    rough = samples[0].vertices + rng.normal(0, 0.006, samples[0].vertices.shape).astype(np.float32)
+    pairs = fcl_pairs(rough, faces, rough, faces)
+    apart = ~(faces[pairs[:, 0]][:, :, None] == faces[pairs[:, 1]][:, None]).any((1, 2))
+    wanted = {(min(pair), max(pair)) for pair in pairs[apart].tolist()}
+    found = SelfIntersection(faces).pairs(rough)
+    mine = ~(faces[found[:, 0]][:, :, None] == faces[found[:, 1]][:, None]).any((1, 2))
+    assert len(wanted) > 20
+    assert {(min(pair), max(pair)) for pair in found[mine].tolist()} == wanted
+
+
+# Sets -----------------------------------------------------------------------------------------------------------------
+
+
+def columns(path: Path) -> dict[str, NDArray[Any]]:
+    """All rows of all shards by slot; without the seconds, which no two runs share."""
+    shards = [Shard(directory).arrays for directory in sorted(path.glob("shard-*-of-*"))]
+    order = np.argsort(np.concatenate([shard["slot"] for shard in shards]), kind="stable")
+    return {name: np.concatenate([s[name] for s in shards])[order] for name in shards[0] if name != "seconds"}
+
+
+def test_two_shards_are_all_slots(simulated: Path) -> None:
+    np.testing.assert_array_equal(columns(simulated)["slot"], np.arange(COUNT))
+    assert (columns(simulated)["state"] == DONE).all()
+
+
+def test_killed_run_goes_on_to_the_same_samples(simulated: Path, clips: Path, tmp_path: Path) -> None:
+    output = tmp_path / "killed"
+    kept: list[dict[str, NDArray[Any]]] = []
+
+    def kill(_: Progress) -> None:
+        if not kept:
+            for process in multiprocessing.active_children():
+                process.kill()
+            kept.append(columns(output))
+
+    with pytest.raises(SimulationError, match="killed"):
+        simulate(output, clips, processes=2, progress=kill)
+    shard = Shard(output / "shard-0-of-1", mode="r+")
+    survivors = kept[0]["state"] == DONE
+    assert 0 < survivors.sum() < COUNT
+    half_written = int(np.flatnonzero(shard.arrays["state"] == TO_DO)[0])
+    shard.arrays["vertices"][half_written] = 12345
+    del shard
+
+    seen: list[Progress] = []
+    card = simulate(output, clips, progress=seen.append)
+    assert seen[-1].done == seen[-1].total == COUNT
+    assert len(seen) <= COUNT - survivors.sum()
+    assert card["counts"] == {
+        "train": 4,
+        "test": 2,
+        "given_up": 0,
+        "to_do": 0,
+        "held_back": card["counts"]["held_back"],
+    }
+    resumed, wanted = columns(output), columns(simulated)
+    for name, array in wanted.items():
+        np.testing.assert_array_equal(resumed[name], array, err_msg=name)
+
+    before = {path.name: path.read_bytes() for path in (output / "shard-0-of-1").glob("*.npy")}
+    simulate(output, clips, progress=lambda _: pytest.fail("a finished set has nothing left to simulate"))
+    assert {path.name: path.read_bytes() for path in (output / "shard-0-of-1").glob("*.npy")} == before
+
+
+def test_card_counts_what_is_there(simulated: Path, samples: list[GarmentSample]) -> None:
+    card = summarise(simulated)
+    stored = columns(simulated)
+    assert card["counts"]["train"] + card["counts"]["test"] == len(samples) == COUNT
+    assert card["yield"]["simulated"] == COUNT + stored["dropped"][:, 1:].sum()
+    assert card["figures"]["stretch_p999_largest"] == pytest.approx(stored["stretch"].max())
+    assert card["clips"] == {"train": ["walk"], "test": ["wave"]}
+    assert card["plan"] == asdict(Plan(GARMENT, COUNT, test_share=TEST_SHARE))
+
+
+def test_dataset_reads_what_was_written(dataset: GarmentDataset, samples: list[GarmentSample], simulated: Path) -> None:
+    stored = columns(simulated)
+    plan = Plan(GARMENT, COUNT, test_share=TEST_SHARE)
+    assert len(dataset) == COUNT
+    np.testing.assert_array_equal(dataset.test, ~dataset.train)
+    np.testing.assert_array_equal(dataset.column("pose"), stored["pose"])
+    for slot, sample in enumerate(samples):
+        assert sample.slot == slot
+        assert sample.pair == plan.pair_of(slot)
+        assert sample.split == ("test" if plan.split_of(slot) == TEST else "train")
+        assert dataset.test[slot] == (sample.split == "test")
+        betas, style = plan.style_shape(sample.pair)
+        np.testing.assert_array_equal(sample.betas, betas)
+        np.testing.assert_array_equal(sample.style, style)
+        np.testing.assert_array_equal(sample.vertices, stored["vertices"][slot] * np.float32(QUANTUM))
+        assert sample.vertices.dtype == np.float32
+        assert sample.clip in ({"test": "wave", "train": "walk"}[sample.split], None)
+        assert (sample.frame is None) == (sample.clip is None)
+    with pytest.raises(ValueError, match="read-only"):
+        dataset._shards[0].arrays["pose"][0] = 0
+
+
+def test_unseen_distance_is_to_the_nearest_training_sample(samples: list[GarmentSample]) -> None:
+    def parameters(sample: GarmentSample) -> NDArray[np.float32]:
+        return np.concatenate((sample.pose.ravel(), sample.betas, sample.style))
+
+    train = [parameters(sample) for sample in samples if sample.split == "train"]
+    for sample in samples:
+        if sample.split == "train":
+            assert np.isnan(sample.unseen)
+        else:
+            nearest = min(float(np.linalg.norm(parameters(sample) - other)) for other in train)
+            assert sample.unseen == pytest.approx(nearest, rel=1e-5)
+
+
+def test_only_finished_samples_are_read(simulated: Path, samples: list[GarmentSample], tmp_path: Path) -> None:
+    path = shutil.copytree(simulated, tmp_path / "partial")
+    (path / "unseen.npy").unlink()
+    shard = Shard(path / "shard-0-of-2", mode="r+")
+    missing = int(shard.arrays["slot"][0])
+    shard.arrays["state"][0] = TO_DO
+    shard.arrays["state"].flush()
+    partial = GarmentDataset(path)
+    assert [partial.sample(i).slot for i in range(len(partial))] == [s.slot for s in samples if s.slot != missing]
+    assert np.isnan(partial.sample(-1).unseen)
+    with pytest.raises(SimulationError, match="none of the index"):
+        partial.sample(len(partial))
+    with pytest.raises(SimulationError, match="columns"):
+        partial.column("colour")
+
+
+def test_slot_of_two_divisions_is_read_once(simulated: Path, tmp_path: Path) -> None:
+    path = shutil.copytree(simulated, tmp_path / "both")
+    shutil.copytree(path / "shard-0-of-2", path / "shard-0-of-1")
+    assert len(GarmentDataset(path)) == COUNT
+
+
+def test_damaged_sets_are_refused(simulated: Path, tmp_path: Path) -> None:
+    with pytest.raises(SimulationError, match="card"):
+        GarmentDataset(tmp_path)
+    shutil.copy(simulated / "card.json", tmp_path)
+    with pytest.raises(SimulationError, match="no shard"):
+        GarmentDataset(tmp_path)
+    for damage in ("missing", "shape", "unseen"):
+        path = shutil.copytree(simulated, tmp_path / damage)
+        if damage == "missing":
+            (path / "shard-1-of-2" / "betas.npy").unlink()
+        elif damage == "shape":
+            np.save(path / "shard-1-of-2" / "betas.npy", np.zeros((3, 9), np.float32))
+        else:
+            (path / "unseen.npy").write_bytes(b"not an array")
+        with pytest.raises(SimulationError, match=r"betas|unseen"):
+            GarmentDataset(path)
+    (tmp_path / "card.json").write_text('{"format": "other"}')
+    with pytest.raises(SimulationError, match="format"):
+        GarmentDataset(tmp_path)
+
+
+def test_contact_sheet_shows_each_sample_twice(dataset: GarmentDataset) -> None:
+    sheet = contact_sheet(dataset, count=2, columns=1)
+    assert sheet.dtype == np.uint8
+    height, width = sheet.shape[0] // 2, sheet.shape[1] // 2
+    views = [sheet[y : y + height, x : x + width] for y in (0, height) for x in (0, width)]
+    assert all(view.std() > 10 for view in views)
+    assert len({view.tobytes() for view in views}) == 4
+    with pytest.raises(SimulationError, match="count"):
+        contact_sheet(dataset, count=0)
+    with pytest.raises(SimulationError, match="body"):
+        contact_sheet(dataset, body="female")
+
+
+# The plan and the files -----------------------------------------------------------------------------------------------
+
+plans = st.builds(
+    Plan,
+    st.just(GARMENT),
+    st.integers(1, 400),
+    seed=st.integers(0, 5),
+    test_share=st.floats(0, 0.9),
+    pivots=st.integers(1, 30),
+    poses_per_pair=st.integers(1, 9),
+    block=st.integers(1, 15),
+)
+
+
+@given(plans, st.integers(1, 4))
+def test_blocks_of_all_shards_cover_each_slot_once(plan: Plan, n_shards: int) -> None:
+    blocks = [block for i in range(n_shards) for block in plan.blocks()[i::n_shards]]
+    assert sorted(slot for block in blocks for slot in block) == list(range(plan.count))
+    assert all(1 <= len(block) <= plan.block for block in blocks)
+    assert all(len({plan.pair_of(slot) for slot in block}) == 1 for block in blocks)
+
+
+@given(plans)
+def test_train_and_test_share_no_pair(plan: Plan) -> None:
+    pairs = {
+        split: {plan.pair_of(s) for s in range(plan.count) if plan.split_of(s) == split} for split in (TRAIN, TEST)
+    }
+    assert not pairs[TRAIN] & pairs[TEST]
+    assert all(pair >= plan.pivots for pair in pairs[TEST])
+    assert sum(plan.split_of(slot) == TEST for slot in range(plan.count)) == plan.n_test
+
+
+@given(plans)
+def test_pivots_share_half_of_the_training(plan: Plan) -> None:
+    poses = np.bincount([plan.pair_of(slot) for slot in range(plan.n_pivot)], minlength=plan.pivots)
+    assert poses.sum() == plan.n_pivot == (plan.count - plan.n_test) // 2
+    assert len(poses) == plan.pivots
+    assert poses.max() - poses.min() <= 1
+    others = np.bincount([plan.pair_of(slot) for slot in range(plan.n_pivot, plan.count)], minlength=1)
+    assert others.max(initial=0) <= plan.poses_per_pair
+    assert not others[: plan.pivots].any()
+
+
+@settings(max_examples=20)
+@given(plans, st.integers(0, 60))
+def test_style_shapes_are_within_two_deviations(plan: Plan, pair: int) -> None:
+    betas, style = plan.style_shape(pair)
+    assert betas.shape == (10,)
+    assert style.shape == (4,)
+    assert np.abs(np.concatenate((betas, style))).max() <= 2
+    again = Plan(GARMENT, plan.count + 7, seed=plan.seed, pivots=plan.pivots).style_shape(pair)
+    np.testing.assert_array_equal(np.concatenate(again), np.concatenate((betas, style)))
+
+
+def test_pivots_are_spread_over_each_coordinate() -> None:
+    plan = Plan(GARMENT, 100)
+    values = np.stack([np.concatenate(plan.style_shape(pair)) for pair in range(plan.pivots)])
+    ranks = values.argsort(0).argsort(0)
+    assert all(len(set(column)) == plan.pivots for column in ranks.T)
+    # One in each of twenty equally likely cells: mean and spread are those of the cut normal distribution.
+    np.testing.assert_allclose(values.mean(0), 0, atol=0.1)
+    np.testing.assert_allclose(values.std(0), 0.97, atol=0.1)
+
+
+def test_recorded_and_drawn_poses_are_mixed(clips: Path) -> None:
+    train, _ = split_clips(load_clips(clips))
+    plan = Plan(GARMENT, 400)
+    recorded = np.mean([plan.pose(slot, 0, train)[1] >= 0 for slot in range(400)])
+    assert recorded == pytest.approx(plan.recorded_share, abs=0.1)
+    first, second = (plan.pose(3, attempt, train)[0] for attempt in (0, 1))
+    assert np.abs(first - second).max() > 0.01
+    np.testing.assert_array_equal(first, plan.pose(3, 0, train)[0])
+
+
+@given(st.lists(st.floats(-1.99, 1.99), min_size=3, max_size=30))
+def test_rounding_moves_a_vertex_by_half_a_quantum(values: list[float]) -> None:
+    vertices = np.array(values[: len(values) // 3 * 3]).reshape(-1, 3)
+    stored = quantise(vertices)
+    assert stored.dtype == np.int16
+    assert np.abs(dequantise(stored) - vertices).max() <= QUANTUM / 2
+    np.testing.assert_array_equal(quantise(dequantise(stored)), stored)
+
+
+def test_far_vertices_dont_fit() -> None:
+    with pytest.raises(SimulationError, match="2 m"):
+        quantise(np.array([[0, -2.1, 0]]))
+    with pytest.raises(SimulationError, match="2 m"):
+        quantise(np.array([[0, np.nan, 0]]))
+
+
+# What is refused ------------------------------------------------------------------------------------------------------
+
+
+def test_body_with_a_hole_is_refused(clips: Path, tmp_path: Path) -> None:
+    with np.load(Path(refu_core.__file__).parent / "assets" / "body_male.npz", allow_pickle=False) as data:
+        arrays = {key: data[key] for key in data.files}
+    arrays["f"] = arrays["f"][1:]
+    np.savez(tmp_path / "open.npz", **arrays)
+    with pytest.raises(MeshError, match="watertight"):
+        simulate(tmp_path / "set", clips, body=tmp_path / "open.npz")
+    assert not (tmp_path / "set").exists()
+
+
+def test_folder_without_motions_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(SimulationError, match="found none"):
+        simulate(tmp_path / "set", tmp_path)
+    write_clip(tmp_path / "only.npz", np.random.default_rng(0))
+    with pytest.raises(SimulationError, match="two motions"):
+        simulate(tmp_path / "set", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("replaced", "match"),
+    [
+        ({"poses": np.zeros((5, 70))}, "72"),
+        ({"poses": np.zeros((5, 72), int)}, "72"),
+        ({"poses": None}, "no poses"),
+        ({"poses": np.full((5, 72), np.nan)}, "finite"),
+        ({"trans": np.zeros((4, 3))}, "trans"),
+        ({"mocap_framerate": None}, "mocap_framerate"),
+        ({"mocap_framerate": np.array(0.0)}, "mocap_framerate"),
+    ],
+)
+def test_motions_of_another_layout_are_refused(replaced: dict[str, Any], match: str, tmp_path: Path) -> None:
+    write_clip(tmp_path / "bad.npz", np.random.default_rng(0), **replaced)
+    with pytest.raises(SimulationError, match=match) as caught:
+        load_clips(tmp_path)
+    assert "bad.npz" in str(caught.value)
+
+
+def test_other_set_in_the_directory_is_left_alone(simulated: Path, clips: Path, tmp_path: Path) -> None:
+    before = {path: path.read_bytes() for path in simulated.rglob("*.npy")}
+    with pytest.raises(SimulationError, match=r"another set.*plan"):
+        simulate(simulated, clips, seed=1)
+    with pytest.raises(SimulationError, match=r"another set.*settings"):
+        simulate(simulated, clips, settings=SimulationSettings(attempts=3))
+    (tmp_path / "thesis.txt").write_text("precious")
+    with pytest.raises(SimulationError, match="neither empty"):
+        simulate(tmp_path, clips)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
+    assert {path: path.read_bytes() for path in simulated.rglob("*.npy")} == before
+
+
+def test_shard_is_written_by_one_run_at_a_time(simulated: Path, clips: Path) -> None:
+    with locked(simulated / "shard-0-of-2"), pytest.raises(SimulationError, match="another run"):
+        simulate(simulated, clips, shard=(0, 2))
+    simulate(simulated, clips, shard=(0, 2))  # free again
+
+
+def test_full_disk_is_said_before_anything_is_simulated(
+    clips: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_room(*_: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "posix_fallocate", no_room)
+    with pytest.raises(SimulationError, match="no room for 6 samples"):
+        simulate(tmp_path / "set", clips)
+    assert not list((tmp_path / "set").glob("shard-*"))
+
+
+@pytest.mark.parametrize("options", [{"shard": (2, 2)}, {"shard": (-1, 2)}, {"processes": 0}])
+def test_impossible_divisions_are_refused(options: dict[str, Any], clips: Path, tmp_path: Path) -> None:
+    with pytest.raises(SimulationError, match="shard"):
+        simulate(tmp_path / "set", clips, **options)
+
+
+@pytest.mark.parametrize("numbers", [{"count": 0}, {"pivots": 0}, {"block": 0}, {"test_share": 1.0}, {"spread": 0.0}])
+def test_impossible_plans_are_refused(numbers: dict[str, Any]) -> None:
+    with pytest.raises(SimulationError, match="got"):
+        Plan(GARMENT, **({"count": 10} | numbers))
