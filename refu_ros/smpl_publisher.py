@@ -153,8 +153,12 @@ class SmplPublisher(Node):  # type: ignore[misc]  # rclpy has no types
             values[field.name] = float(value) if number and type(value) is int else value
         values["persons"] = tuple(name for name in values["persons"] if name)
         options = PublisherOptions(**values)
-        if not (isinstance(options.rate, float) and options.rate >= 0 and isinstance(options.spacing, float)):
-            msg = f"wanted numbers, rate >= 0, got rate {options.rate!r}, spacing {options.spacing!r}"
+        numbers = (options.rate, options.spacing)
+        if not all(isinstance(n, float) and np.isfinite(n) for n in numbers) or options.rate < 0:
+            msg = f"wanted finite numbers, rate >= 0, got rate {options.rate!r}, spacing {options.spacing!r}"
+            raise RefuError(msg)
+        if not all(name.isidentifier() for name in options.persons):
+            msg = f"persons: wanted names of letters, digits and underscores, got {list(options.persons)}"
             raise RefuError(msg)
         if options.input_axes not in ("smpl", "frame"):
             msg = f"wanted input_axes smpl or frame, got {options.input_axes!r}"
