@@ -129,7 +129,7 @@ def operate(options: argparse.Namespace, sender: subprocess.Popen[bytes]) -> dic
         while time.monotonic() < end:
             rclpy.spin_once(node, timeout_sec=0.1)
         i += 1
-        change = {"max_distance": float(i)} if not options.reload else {"margin": 0.004 + 1e-4 * (i % 5)}
+        change = {"max_distance": float(i)} if not options.reload else {"sdf": ("accurate", "none")[i % 2]}
         request = SetParameters.Request(
             parameters=[Parameter(k, value=v).to_parameter_msg() for k, v in change.items()]
         )

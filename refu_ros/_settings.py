@@ -8,9 +8,12 @@ from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from typing import TYPE_CHECKING, Any, cast
 
+import numpy as np
+
 from msg_adapters import INPUT_TYPES, InputAxes, InputType
-from refu_core import GarmentPipeline, RefuError, load_garment
+from refu_core import GarmentPipeline, RefuError, SmplFrame, load_garment
 from refu_core.backbones import BACKBONES
+from refu_core.frames import N_JOINTS
 from refu_core.realtime import SDF_MODES
 from refu_core.repulsion import DEFAULT_MARGIN
 
@@ -49,14 +52,16 @@ class PipelineKey:
     garments: tuple[str, ...]
     sdf: str
     backbone: str
-    margin: float
     device: str
 
     def load(self) -> GarmentPipeline:
-        """Loads it, which takes some tenths of a second. Raises `RefuError`."""
-        return GarmentPipeline.load(
-            self.garments, sdf=self.sdf, backbone=self.backbone, margin=self.margin, device=self.device
-        )
+        """Loads it, which takes some tenths of a second, and runs it once: the first frame is the slowest.
+
+        Raises `RefuError`.
+        """
+        pipeline = GarmentPipeline.load(self.garments, sdf=self.sdf, backbone=self.backbone, device=self.device)
+        pipeline(SmplFrame(np.zeros((N_JOINTS, 3), np.float32)))
+        return pipeline
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,9 +159,7 @@ class NodeSettings:
     @property
     def pipeline(self) -> PipelineKey:
         """What the pipeline depends on."""
-        return PipelineKey(
-            garments=self.garments, sdf=self.sdf, backbone=self.backbone, margin=self.margin, device=self.device
-        )
+        return PipelineKey(garments=self.garments, sdf=self.sdf, backbone=self.backbone, device=self.device)
 
     @property
     def axes(self) -> InputAxes:

@@ -115,6 +115,9 @@ class Worker:
             self._pipeline = self._next_pipeline
             self._dressed.clear()
             self._encoders.clear()
+        if settings.margin != self._pipeline.margin:
+            self._pipeline.margin = settings.margin
+            self._dressed.clear()
         self._remove(self._scene.leave(settings.person_timeout))
         arrivals = self._near(arrivals, settings)
         if not arrivals:

@@ -342,12 +342,22 @@ def test_parameters_replace_shape_and_style(pipeline: GarmentPipeline) -> None:
     np.testing.assert_allclose(setup.viewer.messages[0][0].points, mesh.vertices[mesh.faces.ravel()][:, [2, 0, 1]])
 
 
+def test_the_margin_needs_no_other_pipeline() -> None:
+    setup = Setup(GarmentPipeline.load([GARMENT]), margin=0.02)
+    setup.tick(ann=frame())
+    mesh = GarmentPipeline.load([GARMENT], margin=0.02)(frame())[GARMENT]
+    np.testing.assert_allclose(setup.viewer.messages[0][0].points, mesh.vertices[mesh.faces.ravel()][:, [2, 0, 1]])
+    setup.worker.settings = setup.worker.settings.changed({"margin": 0.0})
+    setup.tick(ann=frame())
+    assert not np.allclose(setup.viewer.messages[1][0].points, setup.viewer.messages[0][0].points)
+
+
 class Choosy:
     """A pipeline that fails for some poses."""
 
     def __init__(self, pipeline: GarmentPipeline) -> None:
         self._pipeline = pipeline
-        self.body, self.garments = pipeline.body, pipeline.garments
+        self.body, self.garments, self.margin = pipeline.body, pipeline.garments, pipeline.margin
 
     def __call__(self, frames: list[SmplFrame]) -> list[Any]:
         if any(frame.pose[1, 0] > 1 for frame in frames):
