@@ -40,7 +40,7 @@ def contact_sheet(
     Raises:
         SimulationError: the set is empty, `count` or `columns` is below 1, or the set was made for another body.
     """
-    from refu_core.evaluation.render import Camera, RenderMesh, render
+    from refu_core.evaluation.render import Camera, RenderMesh, Stage, render
 
     if not len(dataset) or count < 1 or columns < 1:
         msg = f"wanted a sample, a count and columns of 1 at least, got {len(dataset)}, {count} and {columns}"
@@ -66,5 +66,6 @@ def contact_sheet(
         for side, yaw in enumerate((20.0, 200.0)):
             camera = Camera.framing(sample.vertices, size=_TILE, yaw=yaw, margin=1.45)
             start = left + side * width
-            sheet[top : top + height, start : start + width] = render(meshes, camera=camera, size=_TILE, samples=4)
+            view = render(meshes, camera=camera, size=_TILE, samples=4, stage=Stage(show_ground=False))
+            sheet[top : top + height, start : start + width] = view
     return sheet
