@@ -240,6 +240,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except OSError as error:
         print(f"refu: error: {error}", file=sys.stderr)
         return EXIT_BAD_INPUT
+    except ModuleNotFoundError as error:  # an extra's package; those of the core are imported by every command
+        print(f'refu: error: {error.name} is not installed: pip install "refu-ros[train]"', file=sys.stderr)
+        return EXIT_BAD_INPUT
     except KeyboardInterrupt:
         print("refu: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
