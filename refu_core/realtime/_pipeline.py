@@ -164,9 +164,11 @@ class GarmentPipeline:
             msg = f"one person wears garments of one body: got {cut_for}"
             raise GarmentError(msg)
         body = load_body(worn_by.pop(), device=torch_device)
+        rest = ExactSdf(body.faces, device=body.device)
+        rest.update(body.v_template)
         wearables = {
             name: _Wearable(
-                t, load_backbone(backbone, name, device=torch_device), _limbs(body, t), t.faces.cpu().numpy()
+                t, load_backbone(backbone, name, device=torch_device), _limbs(body, rest, t), t.faces.cpu().numpy()
             )
             for name, t in templates.items()
         }
@@ -263,9 +265,8 @@ def _dress(
     return template.pose(unposed, transforms)
 
 
-def _limbs(body: SmplBody, garment: GarmentTemplate) -> Limbs:
-    rest = ExactSdf(body.faces, device=body.device)
-    rest.update(body.v_template)
+def _limbs(body: SmplBody, rest: ExactSdf, garment: GarmentTemplate) -> Limbs:
+    """The limbs of a garment on a body, whose rest pose `rest` was updated with."""
     clearance = rest.query(garment.v_template).distance
     return Limbs.of(body.weights, body.faces, garment.weights, garment.faces, clearance=clearance)
 
