@@ -1,0 +1,104 @@
+"""Weights are what was written, or one clear error."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from refu_core.errors import WeightsError
+from refu_core.weights import load_weights, save_weights
+
+TENSORS = {"low.0.weight": torch.arange(6.0).view(2, 3), "basis": torch.randn(4, 5).half(), "mask": torch.tensor([1])}
+CARD = {"garment": "tshirt-male", "body_fingerprint": "abc", "mode": "hybrid"}
+
+
+@pytest.fixture
+def stem(tmp_path: Path) -> Path:
+    stem = tmp_path / "weights" / "tailornet-hybrid.v2"  # a dot in the name is no suffix
+    save_weights(stem, TENSORS, CARD)
+    return stem
+
+
+def test_what_was_saved_is_loaded(stem: Path) -> None:
+    weights = load_weights(stem, expect={"garment": "tshirt-male", "body_fingerprint": "abc"})
+    assert weights.tensors.keys() == TENSORS.keys()
+    for name, tensor in TENSORS.items():
+        assert weights.tensors[name].dtype == tensor.dtype
+        assert torch.equal(weights.tensors[name], tensor)
+    assert weights.card.items() >= CARD.items()
+    assert "torch" in weights.card["versions"]
+
+
+def test_nothing_else_is_left_in_the_folder(stem: Path) -> None:
+    save_weights(stem, TENSORS, CARD)
+    assert sorted(p.name for p in stem.parent.iterdir()) == [f"{stem.name}.json", f"{stem.name}.safetensors"]
+
+
+def test_weights_of_another_body_are_refused_with_what_to_do(stem: Path) -> None:
+    with pytest.raises(WeightsError, match=r"body_fingerprint is other, got abc; train some with `refu train`"):
+        load_weights(stem, expect={"body_fingerprint": "other"})
+
+
+def test_missing_weights(tmp_path: Path) -> None:
+    with pytest.raises(WeightsError, match="no such weights"):
+        load_weights(tmp_path / "none")
+
+
+def test_weights_and_card_must_belong_together(stem: Path) -> None:
+    other = stem.with_name("other")
+    save_weights(other, {"a": torch.zeros(2)}, CARD)
+    (stem.parent / f"{other.name}.safetensors").replace(stem.parent / f"{stem.name}.safetensors")
+    with pytest.raises(WeightsError, match="damaged, or not the file"):
+        load_weights(stem)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_weights_that_are_not_finite_are_never_written(stem: Path, value: float) -> None:
+    before = (stem.parent / f"{stem.name}.safetensors").read_bytes()
+    with pytest.raises(WeightsError, match="NaN or infinity in b"):
+        save_weights(stem, {"a": torch.zeros(1), "b": torch.tensor([value])}, CARD)
+    assert (stem.parent / f"{stem.name}.safetensors").read_bytes() == before
+
+
+def test_a_disk_that_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(WeightsError, match="can't be written"):
+        save_weights(tmp_path / "file" / "weights", TENSORS, CARD)
+
+
+@pytest.mark.parametrize("card", ["", "[1]", '{"format": "other"}', "[" * 100_000, "\x00"])
+def test_cards_of_another_kind(stem: Path, card: str) -> None:
+    (stem.parent / f"{stem.name}.json").write_text(card)
+    with pytest.raises(WeightsError, match="card"):
+        load_weights(stem)
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(cut=st.integers(0, 400), flip=st.integers(0, 10_000), bit=st.integers(0, 7))
+def test_damaged_bytes_never_pass(stem: Path, cut: int, flip: int, bit: int) -> None:
+    path = stem.parent / f"{stem.name}.safetensors"
+    good = path.read_bytes()
+    data = bytearray(good[: max(1, len(good) - cut)])
+    if cut == 0:
+        data[flip % len(data)] ^= 1 << bit
+    try:
+        path.write_bytes(bytes(data))
+        with pytest.raises(WeightsError):
+            load_weights(stem)
+    finally:
+        path.write_bytes(good)
+
+
+def test_a_forged_sum_does_not_help_a_broken_file(stem: Path) -> None:
+    data = b"\xff" * 64
+    card = json.loads((stem.parent / f"{stem.name}.json").read_text())
+    (stem.parent / f"{stem.name}.safetensors").write_bytes(data)
+    (stem.parent / f"{stem.name}.json").write_text(json.dumps(card | {"sha256": hashlib.sha256(data).hexdigest()}))
+    with pytest.raises(WeightsError, match="not a safetensors file"):
+        load_weights(stem)
