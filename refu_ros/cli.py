@@ -138,7 +138,10 @@ def _add_simulate(commands: Any) -> None:
     )
     parser.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder of the data set")
     parser.add_argument(
-        "--motions", type=Path, required=True, metavar="DIR", help="folder of AMASS-style .npz files, two at least"
+        "--motions",
+        type=Path,
+        metavar="DIR",
+        help="folder of AMASS-style .npz files, two at least (default: drawn poses alone)",
     )
     parser.add_argument(
         "--body", metavar="BODY", help="a body's name or file (default: the one the garment is cut for)"

@@ -19,7 +19,7 @@ def simulate(
     count: int,
     output: Path,
     *,
-    motions: Path,
+    motions: Path | None,
     body: str | None,
     seed: int,
     processes: int,

@@ -6,10 +6,12 @@ from refu_core.simulation._drape import Drape, Draper, DrapeSettings, canonical_
 from refu_core.simulation._errors import SimulationError
 from refu_core.simulation._plan import Plan
 from refu_core.simulation._poses import Clip, RoomSettings, load_clips, split_clips
-from refu_core.simulation._run import Progress, simulate_dataset, summarise
+from refu_core.simulation._produce import Progress
+from refu_core.simulation._run import simulate_dataset
 from refu_core.simulation._selection import CAUSES, SelectionSettings
 from refu_core.simulation._sheet import contact_sheet
 from refu_core.simulation._styles import StyleBasis, Tailoring, build_styles, tailoring_of
+from refu_core.simulation._summary import summarise
 from refu_core.simulation._worker import SimulationSettings
 
 __all__ = [

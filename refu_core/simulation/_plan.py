@@ -9,7 +9,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,7 +118,3 @@ class Plan:
         if rng.random() < self.recorded_share and clips:
             return clip_pose(clips, rng)
         return random_pose(rng), -1, -1
-
-    def as_dict(self) -> dict[str, Any]:
-        """The plan as it stands in a data set's card."""
-        return asdict(self)

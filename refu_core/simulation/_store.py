@@ -2,6 +2,7 @@
 
     SET/card.json                       plan, settings, versions, hashes, counts, yield
     SET/unseen.npy                      (count,) distance of each test sample to the training set, NaN for the others
+    SET/asked.npy                       (count, 24, 3) float32, poses before limbs were held back, NaN where not done
     SET/shard-I-of-N/slot.npy           (S,) int32, number of each row's slot in the plan
                      state.npy          (S,) uint8, 0 to do, 1 done, 2 given up
                      vertices.npy       (S, N, 3) int16, posed garment in units of 2^-14 m, see `QUANTUM`
@@ -13,6 +14,8 @@
                      dropped.npy        (S, 5) uint8, attempts that failed, by cause
                      share.npy stretch.npy speed.npy seconds.npy      (S,) float32
 
+A set of sequences has the format `SEQUENCES`, one row a sequence, and other columns: see `sequence_columns`.
+
 A row is written before its state is: what a killed process leaves half written is written again, to the same bytes.
 """
 
@@ -22,7 +25,7 @@ import contextlib
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,14 +36,20 @@ from refu_core.simulation._errors import SimulationError
 from refu_core.simulation._selection import CAUSES
 
 FORMAT = "refu-garments-1"
+SEQUENCES = "refu-sequences-1"
 QUANTUM = 2.0**-14
 """Unit of stored positions [m]: 0.06 mm, so ±2 m fit and rounding moves a vertex by at most 0.03 mm an axis."""
 TO_DO, DONE, GIVEN_UP = 0, 1, 2
 
 
-def _columns(n_vertices: int) -> dict[str, tuple[tuple[int, ...], str]]:
+Columns = dict[str, tuple[tuple[int, ...], str]]
+"""Shape of a row and type, by the name of the file."""
+
+
+def sample_columns(shape: tuple[int, ...]) -> Columns:
+    """Columns of a set of samples with garments of this shape, (N, 3)."""
     return {
-        "vertices": ((n_vertices, 3), "<i2"),
+        "vertices": (shape, "<i2"),
         "pose": ((24, 3), "<f4"),
         "betas": ((10,), "<f4"),
         "style": ((4,), "<f4"),
@@ -52,6 +61,32 @@ def _columns(n_vertices: int) -> dict[str, tuple[tuple[int, ...], str]]:
         "share": ((), "<f4"),
         "stretch": ((), "<f4"),
         "speed": ((), "<f4"),
+        "seconds": ((), "<f4"),
+        "slot": ((), "<i4"),
+        "state": ((), "|u1"),
+    }
+
+
+def sequence_columns(shape: tuple[int, ...]) -> Columns:
+    """Columns of a set of sequences with garments of this shape, (T, N, 3): T frames each."""
+    frames = shape[:1]
+    return {
+        "vertices": (shape, "<i2"),
+        "pose": ((*frames, 24, 3), "<f4"),
+        "asked": ((*frames, 24, 3), "<f4"),
+        "transl": ((*frames, 3), "<f4"),
+        "cause": (frames, "|u1"),  # 0 a frame in the set, 1 and above: why not, by the order of `CAUSES`
+        "share": (frames, "<f4"),
+        "stretch": (frames, "<f4"),
+        "speed": (frames, "<f4"),
+        "betas": ((10,), "<f4"),
+        "style": ((4,), "<f4"),
+        "shape": ((), "<i4"),
+        "clip": ((), "<i4"),
+        "start": ((), "<f4"),
+        "mirrored": ((), "|u1"),
+        "split": ((), "|u1"),
+        "dropped": ((len(CAUSES),), "<i4"),
         "seconds": ((), "<f4"),
         "slot": ((), "<i4"),
         "state": ((), "|u1"),
@@ -77,7 +112,10 @@ def dequantise(units: NDArray[np.int16]) -> NDArray[np.float32]:
 
 
 class Shard:
-    """The rows of one shard."""
+    """The rows of one shard of a set of samples."""
+
+    columns: Callable[[tuple[int, ...]], Columns] = staticmethod(sample_columns)
+    what = "samples"
 
     def __init__(self, directory: Path, *, mode: str = "r") -> None:
         """Opens an existing shard to read (`r`) or to write (`r+`).
@@ -87,12 +125,12 @@ class Shard:
         self.directory = directory
         self.arrays: dict[str, Any] = {}
         try:
-            for name in _columns(0):
+            for name in self.columns(()):
                 self.arrays[name] = np.load(directory / f"{name}.npy", mmap_mode=mode)  # type: ignore[arg-type]
         except (OSError, ValueError) as error:
             msg = f"{directory}: not a shard of a data set, or a damaged one: {error}"
             raise SimulationError(msg) from error
-        wanted = _columns(self.arrays["vertices"].shape[1])
+        wanted = self.columns(self.arrays["vertices"].shape[1:])
         n = len(self.arrays["slot"])
         for name, (shape, kind) in wanted.items():
             array = self.arrays[name]
@@ -102,21 +140,20 @@ class Shard:
                 )
                 raise SimulationError(msg)
 
-    @staticmethod
-    def create(directory: Path, slots: NDArray[np.int32], n_vertices: int) -> None:
-        """Lays out a shard for these slots (S,), with all its room on disk reserved.
+    @classmethod
+    def create(cls, directory: Path, slots: NDArray[np.int32], shape: tuple[int, ...]) -> None:
+        """Lays out a shard for these slots (S,) with garments of this shape, with all its room on disk reserved.
 
         Raises `SimulationError` when the disk hasn't the room, or can't be written.
         """
-        size = sum(
-            len(slots) * int(np.prod(shape)) * np.dtype(kind).itemsize for shape, kind in _columns(n_vertices).values()
-        )
+        columns = cls.columns(shape)
+        size = sum(len(slots) * int(np.prod(row)) * np.dtype(kind).itemsize for row, kind in columns.values())
         partial = directory.with_name(directory.name + ".new")
         try:
             partial.mkdir(parents=True, exist_ok=True)
-            for name, (shape, kind) in _columns(n_vertices).items():
+            for name, (row, kind) in columns.items():
                 path = partial / f"{name}.npy"
-                array = np.lib.format.open_memmap(path, "w+", np.dtype(kind), (len(slots), *shape))
+                array = np.lib.format.open_memmap(path, "w+", np.dtype(kind), (len(slots), *row))
                 del array
                 # A memory map on a full disk kills its process with SIGBUS; reserving first turns that into an error.
                 with path.open("r+b") as file:
@@ -127,7 +164,9 @@ class Shard:
             partial.rename(directory)
         except OSError as error:
             shutil.rmtree(partial, ignore_errors=True)
-            msg = f"{directory}: no room for {len(slots)} samples ({size / 1e6:.0f} MB), or no right to write: {error}"
+            msg = (
+                f"{directory}: no room for {len(slots)} {cls.what} ({size / 1e6:.0f} MB), or no right to write: {error}"
+            )
             raise SimulationError(msg) from error
 
     def write(self, row: int, values: dict[str, Any]) -> None:
@@ -139,6 +178,44 @@ class Shard:
                 self.arrays[name].flush()
         self.arrays["state"][row] = state
         self.arrays["state"].flush()
+
+
+class SequenceShard(Shard):
+    """The rows of one shard of a set of sequences."""
+
+    columns: Callable[[tuple[int, ...]], Columns] = staticmethod(sequence_columns)
+    what = "sequences"
+
+
+def shards_of(directory: Path, kind: type[Shard] = Shard) -> list[Shard]:
+    """The shards of a set, by name; none that is only being laid out."""
+    return [kind(path) for path in sorted(directory.glob("shard-*-of-*")) if path.suffix != ".new"]
+
+
+def rows_of(shards: Sequence[Shard], states: tuple[int, ...]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Shard and row of each slot in one of `states`, by slot.
+
+    Shards of two divisions, 0/1 and 0/2 say, may both hold a slot. Finished, it has the same bytes in both; where it is
+    finished in one only, that one counts.
+    """
+    slot = np.concatenate([shard.arrays["slot"] for shard in shards])
+    state = np.concatenate([shard.arrays["state"] for shard in shards])
+    where = np.concatenate([np.full(len(shard.arrays["slot"]), k) for k, shard in enumerate(shards)])
+    row = np.concatenate([np.arange(len(shard.arrays["slot"])) for shard in shards])
+    order = np.lexsort((state == TO_DO, slot))
+    order = order[np.unique(slot[order], return_index=True)[1]]
+    order = order[np.isin(state[order], states)]
+    return where[order], row[order]
+
+
+def gather(shards: Sequence[Shard], where: NDArray[np.intp], row: NDArray[np.intp], name: str) -> NDArray[Any]:
+    """A column at these rows of these shards, as `rows_of` names them, shape (M, ...)."""
+    column = shards[0].arrays[name]
+    out = np.empty((len(row), *column.shape[1:]), column.dtype)
+    for k, shard in enumerate(shards):
+        here = where == k
+        out[here] = shard.arrays[name][row[here]]
+    return out
 
 
 @contextlib.contextmanager
@@ -158,16 +235,17 @@ def locked(directory: Path) -> Iterator[None]:
         yield
 
 
-def read_card(directory: Path) -> dict[str, Any]:
-    """The card of a data set. Raises `SimulationError` when there is none, or it can't be read."""
+def read_card(directory: Path, kind: str = FORMAT) -> dict[str, Any]:
+    """The card of a data set of the format `kind`. Raises `SimulationError` when there is none, or it can't be read."""
     path = directory / "card.json"
     try:
         card = json.loads(path.read_text())
     except (OSError, ValueError) as error:
         msg = f"{path}: wanted the card of a simulated data set: {error}"
         raise SimulationError(msg) from error
-    if not isinstance(card, dict) or card.get("format") != FORMAT:
-        msg = f"{path}: wanted the card of a data set of the format {FORMAT}, got another format"
+    if not isinstance(card, dict) or card.get("format") != kind:
+        got = card.get("format") if isinstance(card, dict) else None
+        msg = f"{path}: wanted the card of a data set of the format {kind}, got the format {got!r}"
         raise SimulationError(msg)
     return card
 
@@ -177,3 +255,30 @@ def write_card(directory: Path, card: dict[str, Any]) -> None:
     partial = directory / f"card.json.{os.getpid()}"
     partial.write_text(json.dumps(card, indent=1) + "\n")
     partial.replace(directory / "card.json")
+
+
+def write_by_slot(directory: Path, name: str, values: NDArray[np.float32]) -> None:
+    """Writes `name`.npy of a set, one row a slot, in one step."""
+    partial = directory / f"{name}.npy.{os.getpid()}"
+    with partial.open("wb") as file:
+        np.save(file, values)
+    partial.replace(directory / f"{name}.npy")
+
+
+def read_by_slot(directory: Path, name: str, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """`name`.npy of a set, of this shape; NaN where it hasn't been written yet.
+
+    Raises `SimulationError` for a damaged file.
+    """
+    path = directory / f"{name}.npy"
+    if not path.exists():
+        return np.full(shape, np.nan, np.float32)
+    try:
+        values = np.load(path)
+    except (OSError, ValueError) as error:
+        msg = f"{path}: can't be read: {error}"
+        raise SimulationError(msg) from error
+    if values.shape != shape or values.dtype != np.float32:
+        msg = f"{path}: wanted float32 of shape {shape}, got {values.dtype} of {values.shape}"
+        raise SimulationError(msg)
+    return np.asarray(values)

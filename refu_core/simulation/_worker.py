@@ -1,11 +1,11 @@
-"""One process that simulates slots: draws, drapes, checks, and the row that comes of them."""
+"""Simulates slots of a set of samples: draws, drapes, checks, and the row that comes of them."""
 
 from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -88,36 +88,23 @@ class SlotSimulator:
 
 
 @dataclass(frozen=True, eq=False)
-class Job:
-    """All that a process needs to make its simulator; small, for it is sent to each of them."""
+class SampleJob:
+    """What a process needs to simulate slots of a set of samples."""
 
     plan: Plan
     clips: tuple[list[Clip], list[Clip]]
     settings: SimulationSettings
     body: str | Path
 
+    rows: ClassVar[type[Shard]] = Shard
+
+    def simulator(self) -> SlotSimulator:
+        """The simulator of this process."""
+        garment, body = load_pair(self.plan.garment, self.body)
+        return SlotSimulator(self.plan, garment, body, self.clips, self.settings)
+
 
 def load_pair(garment: str, body: str | Path | None) -> tuple[GarmentTemplate, SmplBody]:
     """The garment and the body it is worn on: its own if `body` is None."""
     template = load_garment(garment)
     return template, load_body(template.body if body is None else body)
-
-
-_state: tuple[SlotSimulator, Shard] | None = None
-
-
-def start_process(job: Job, directory: Path) -> None:
-    """Prepares this process, once. One thread: the processes are the parallelism."""
-    global _state
-    torch.set_num_threads(1)
-    garment, body = load_pair(job.plan.garment, job.body)
-    _state = SlotSimulator(job.plan, garment, body, job.clips, job.settings), Shard(directory, mode="r+")
-
-
-def simulate_block(rows: list[int]) -> int:
-    """Simulates and writes some rows of this process's shard; their number."""
-    assert _state is not None
-    simulator, shard = _state
-    for row in rows:
-        shard.write(row, simulator.simulate(int(shard.arrays["slot"][row])))
-    return len(rows)

@@ -34,6 +34,7 @@ from refu_core.simulation import (
     Progress,
     SimulationError,
     SimulationSettings,
+    _produce,
     contact_sheet,
     load_clips,
     simulate_dataset,
@@ -42,6 +43,7 @@ from refu_core.simulation import (
 )
 from refu_core.simulation._drape import canonical_pose, comfort_poses
 from refu_core.simulation._plan import TEST, TRAIN
+from refu_core.simulation._poses import RoomMaker
 from refu_core.simulation._selection import Selector, SelfIntersection
 from refu_core.simulation._store import DONE, QUANTUM, TO_DO, Shard, dequantise, locked, quantise
 
@@ -314,6 +316,64 @@ def test_slot_of_two_divisions_is_read_once(simulated: Path, tmp_path: Path) -> 
     assert len(GarmentDataset(path)) == COUNT
 
 
+def test_slot_of_two_divisions_counts_once(simulated: Path, tmp_path: Path) -> None:
+    """Also where one division has finished it and the other hasn't."""
+    path = shutil.copytree(simulated, tmp_path / "both")
+    (path / "shard-0-of-1").mkdir()
+    both = [Shard(path / f"shard-{i}-of-2").arrays for i in range(2)]
+    for name in both[0]:
+        np.save(path / "shard-0-of-1" / f"{name}.npy", np.concatenate([shard[name] for shard in both]))
+    before = summarise(simulated)
+    after = summarise(path)
+    assert {key: after[key] for key in ("counts", "yield")} == {key: before[key] for key in ("counts", "yield")}
+    assert after["figures"] == pytest.approx(before["figures"])
+    shard = Shard(path / "shard-0-of-1", mode="r+")
+    shard.arrays["state"][:] = TO_DO
+    shard.arrays["dropped"][:] = 7
+    shard.arrays["state"].flush()
+    assert summarise(path)["counts"] == before["counts"]
+    assert summarise(path)["yield"] == before["yield"]
+    np.testing.assert_array_equal(GarmentDataset(path).column("vertices"), GarmentDataset(simulated).column("vertices"))
+
+
+def test_asked_pose_is_the_one_that_was_drawn(samples: list[GarmentSample], simulated: Path, clips: Path) -> None:
+    plan, both = Plan(GARMENT, COUNT, test_share=TEST_SHARE), split_clips(load_clips(clips))
+    stored = columns(simulated)
+    for slot, sample in enumerate(samples):
+        attempt = int(stored["dropped"][slot].sum())
+        pose, clip, frame = plan.pose(slot, attempt, both[sample.split == "test"])
+        np.testing.assert_array_equal(sample.asked, pose)
+        assert (clip, frame) == (stored["clip"][slot], stored["frame"][slot])
+        if stored["share"][slot] == 1:
+            np.testing.assert_array_equal(sample.asked, sample.pose)
+    assert (stored["share"] == 1).any()
+    before = (simulated / "asked.npy").read_bytes()
+    (simulated / "asked.npy").unlink()
+    assert np.isnan(GarmentDataset(simulated).column("asked")).all()
+    simulate(simulated, clips, shard=(1, 2), progress=lambda _: pytest.fail("finished"))
+    assert (simulated / "asked.npy").read_bytes() == before
+
+
+def test_asked_pose_of_other_draws_is_refused(simulated: Path, clips: Path, tmp_path: Path) -> None:
+    path = shutil.copytree(simulated, tmp_path / "other")
+    shard = Shard(path / "shard-0-of-2", mode="r+")
+    shard.arrays["clip"][:] += 1
+    shard.arrays["clip"].flush()
+    with pytest.raises(SimulationError, match="draws another pose"):
+        simulate(path, clips, shard=(0, 2))
+
+
+def test_asked_and_simulated_differ_where_a_limb_was_held_back() -> None:
+    """An arm through the flank comes back out; what was asked for stays known."""
+    plan = Plan("tshirt-male", 1)
+    pose = canonical_pose()
+    pose[16, 2] = -1.45
+    made = RoomMaker(load_garment("tshirt-male"), load_body("male")).make_room(pose, *plan.style_shape(0))
+    assert made is not None
+    assert made[1] < 1
+    assert np.abs(made[0] - pose)[16].max() > 0.1
+
+
 def test_damaged_sets_are_refused(simulated: Path, tmp_path: Path) -> None:
     with pytest.raises(SimulationError, match="card"):
         GarmentDataset(tmp_path)
@@ -449,6 +509,21 @@ def test_body_with_a_hole_is_refused(clips: Path, tmp_path: Path) -> None:
     with pytest.raises(MeshError, match="watertight"):
         simulate(tmp_path / "set", clips, body=tmp_path / "open.npz")
     assert not (tmp_path / "set").exists()
+
+
+def test_set_without_motions_has_drawn_poses(tmp_path: Path) -> None:
+    def nothing_is_simulated(*_: Any) -> Any:
+        return iter(())
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_produce, "_simulate", nothing_is_simulated)
+        card = simulate_dataset(GARMENT, 7, tmp_path / "set")
+    assert card["plan"]["recorded_share"] == 0
+    assert card["clips"] == {"train": [], "test": []}
+    assert card["counts"]["to_do"] == 7
+    plan = Plan(**card["plan"])
+    assert {plan.pose(slot, 0, [])[1:] for slot in range(7)} == {(-1, -1)}
+    assert plan.n_test == 1
 
 
 def test_folder_without_motions_is_refused(tmp_path: Path) -> None:

@@ -1,0 +1,104 @@
+"""What there is in a set of samples: counts and yield for its card, and what is known of each slot once it is done."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from refu_core.frames import N_JOINTS
+from refu_core.simulation._errors import SimulationError
+from refu_core.simulation._plan import TEST, Plan
+from refu_core.simulation._selection import CAUSES
+from refu_core.simulation._store import (
+    DONE,
+    GIVEN_UP,
+    gather,
+    read_card,
+    rows_of,
+    shards_of,
+    write_by_slot,
+    write_card,
+)
+
+if TYPE_CHECKING:
+    from refu_core.simulation._poses import Clip
+
+
+def _finished(output: Path) -> dict[str, NDArray[Any]]:
+    """The columns of all slots that are done or given up, by slot; without the garments."""
+    shards = shards_of(output)
+    if not shards:
+        msg = f"{output}: a card and no shard; wanted shard-I-of-N directories beside it"
+        raise SimulationError(msg)
+    where, row = rows_of(shards, (DONE, GIVEN_UP))
+    return {name: gather(shards, where, row, name) for name in shards[0].arrays if name != "vertices"}
+
+
+def summarise(output: str | Path) -> dict[str, Any]:
+    """Brings the card of a set of samples up to date (counts, yield by cause, stretch, pace), and `unseen.npy`.
+
+    A test sample's distance to the training set is the smallest Euclidean one in (θ, β, γ), as in the paper's
+    supplement; it is in `unseen.npy`, by slot.
+
+    A slot that two divisions into shards both hold counts once.
+
+    Raises `SimulationError` when `output` holds no set.
+    """
+    output = Path(output)
+    card = read_card(output)
+    column = _finished(output)
+    kept = column["state"] == DONE
+    train, test = (kept & (column["split"] == k) for k in (0, 1))
+    unseen = np.full(card["plan"]["count"], np.nan, np.float32)
+    parameters = np.concatenate([column["pose"].reshape(len(kept), 3 * N_JOINTS), column["betas"], column["style"]], 1)
+    if train.any():
+        for row in np.flatnonzero(test):
+            unseen[column["slot"][row]] = np.sqrt(((parameters[train] - parameters[row]) ** 2).sum(1).min())
+    write_by_slot(output, "unseen", unseen)
+    dropped = column["dropped"].sum(0, dtype=np.int64)
+    simulated = int(kept.sum() + dropped[1:].sum())
+    card["counts"] = {
+        "train": int(train.sum()),
+        "test": int(test.sum()),
+        "given_up": int((column["state"] == GIVEN_UP).sum()),
+        "to_do": int(card["plan"]["count"] - len(kept)),
+        "held_back": int((column["share"][kept] < 1).sum()),
+    }
+    card["yield"] = {
+        "simulated": simulated,
+        "kept_share": float(kept.sum() / max(simulated, 1)),
+        "dropped": dict(zip(CAUSES, dropped.tolist(), strict=True)),
+    }
+    if kept.any():
+        card["figures"] = {
+            "seconds_a_sample": float(column["seconds"].sum() / kept.sum()),
+            "stretch_p999_median": float(np.median(column["stretch"][kept])),
+            "stretch_p999_largest": float(column["stretch"][kept].max()),
+            "speed_m_s_median": float(np.median(column["speed"][kept])),
+        }
+    write_card(output, card)
+    return card
+
+
+def write_asked(output: Path, plan: Plan, clips: tuple[list[Clip], list[Clip]]) -> None:
+    """Writes `asked.npy`: by slot, the pose that was asked for before limbs were held back.
+
+    It follows from the plan alone: the pose that the slot draws at its first attempt that wasn't dropped.
+
+    Raises `SimulationError` when what is drawn here isn't what was drawn when the set was made.
+    """
+    column = _finished(output)
+    asked = np.full((plan.count, N_JOINTS, 3), np.nan, np.float32)
+    for row in np.flatnonzero(column["state"] == DONE):
+        slot = int(column["slot"][row])
+        attempt = int(column["dropped"][row].sum(dtype=np.int64))
+        pose, clip, frame = plan.pose(slot, attempt, clips[plan.split_of(slot) == TEST])
+        drawn = (clip, frame) == (column["clip"][row], column["frame"][row])
+        if not drawn or (column["share"][row] == 1 and np.abs(pose - column["pose"][row]).max() > 1e-5):
+            msg = f"{output}: slot {slot} draws another pose here than when it was made; use the card's `versions`"
+            raise SimulationError(msg)
+        asked[slot] = pose
+    write_by_slot(output, "asked", asked)
