@@ -80,34 +80,50 @@ def crossings(
     return Crossings(np.ascontiguousarray(rows[:, :2]), bits[:, :3], bits[:, 3:])
 
 
-def inside_by_components(
-    n_vertices: int,
-    faces: NDArray[np.int32],
-    pierced: NDArray[np.int64],
-    ask: Callable[[NDArray[np.int64]], NDArray[np.bool_]],
-) -> NDArray[np.bool_]:
-    """Which vertices of a mesh are inside the body, asked for a few only; bool, shape (n_vertices,).
+class EdgeGraph:
+    """A mesh as a graph of its edges, prepared once for many frames.
 
     The winding number of a closed surface is constant wherever that surface isn't crossed: along every edge that
-    pierces no body face, and so on each component of the mesh without the `pierced` edges, shape (E, 2). `ask` answers
-    for given vertices; up to three of each component are asked. Should they disagree, a crossing was lost to rounding,
-    and all of that component's are.
+    pierces no body face, and so on each component of the mesh without the pierced edges.
     """
-    edges = faces[:, _CORNERS].reshape(-1, 2).astype(np.int64)
-    if len(pierced):
-        edges = edges[~np.isin(_keys(edges, n_vertices), _keys(pierced, n_vertices))]
-    graph = coo_array((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(n_vertices, n_vertices))
-    n, component = connected_components(graph, directed=False)
-    order = np.argsort(component, kind="stable")
-    first = np.searchsorted(component[order], np.arange(n))
-    last = np.append(first[1:], n_vertices) - 1
-    asked = order[np.stack([first, (first + last) // 2, last], axis=1)]
-    answers = ask(asked.reshape(-1)).reshape(n, 3)
-    inside: NDArray[np.bool_] = answers[component, 0]
-    doubtful = np.flatnonzero((answers != answers[:, :1]).any(axis=1)[component])
-    if len(doubtful):
-        inside[doubtful] = ask(doubtful)
-    return inside
+
+    def __init__(self, n_vertices: int, faces: NDArray[np.int32]) -> None:
+        """Prepares for a mesh of `n_vertices` and `faces`, shape (F, 3)."""
+        self.n_vertices = n_vertices
+        self.faces = faces
+        self._keys = np.unique(_keys(faces[:, _CORNERS].reshape(-1, 2).astype(np.int64), n_vertices))
+        self._whole = self._parts(np.ones(len(self._keys), np.bool_))
+
+    def inside(
+        self, pierced: NDArray[np.int64], ask: Callable[[NDArray[np.int64]], NDArray[np.bool_]]
+    ) -> NDArray[np.bool_]:
+        """Which vertices are inside the body, asked for a few only; bool, shape (n_vertices,).
+
+        `pierced` are the edges that pierce a body face, as vertex pairs (E, 2). `ask` answers for given vertices; up to
+        three of each component are asked. Should they disagree, a crossing was lost to rounding, and all of that
+        component's are.
+        """
+        component, asked = self._whole
+        if len(pierced):
+            kept = np.ones(len(self._keys), np.bool_)
+            kept[np.searchsorted(self._keys, _keys(pierced, self.n_vertices))] = False
+            component, asked = self._parts(kept)
+        answers = ask(asked.reshape(-1)).reshape(-1, 3)
+        inside: NDArray[np.bool_] = answers[component, 0]
+        doubtful = np.flatnonzero((answers != answers[:, :1]).any(axis=1)[component])
+        if len(doubtful):
+            inside[doubtful] = ask(doubtful)
+        return inside
+
+    def _parts(self, kept: NDArray[np.bool_]) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+        """Each vertex's component along the kept edges, (n_vertices,), and three vertices of each component, (C, 3)."""
+        start, end = np.divmod(self._keys[kept], self.n_vertices)
+        size = (self.n_vertices, self.n_vertices)
+        n, component = connected_components(coo_array((np.ones(len(start), np.int8), (start, end)), size), False)
+        order = np.argsort(component, kind="stable")
+        first = np.searchsorted(component[order], np.arange(n))
+        last = np.append(first[1:], self.n_vertices) - 1
+        return component, order[np.stack([first, (first + last) // 2, last], axis=1)]
 
 
 def pierced_edges(

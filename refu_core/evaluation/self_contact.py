@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from refu_core._warp import as_warp
 from refu_core.errors import MeshError
-from refu_core.evaluation._intersect import as_vertices, crossings, inside_by_components, pierced_edges
+from refu_core.evaluation._intersect import EdgeGraph, as_vertices, crossings, pierced_edges
 from refu_core.evaluation._near import near_kernel
 from refu_core.sdf import ExactSdf
 
@@ -87,7 +87,9 @@ class SelfContactDetector:
         """
         self._body = ExactSdf(body_faces, sign="winding")
         self._faces = self._body.faces.numpy()
-        pairs, buried = self._contacts(as_vertices("rest_vertices", rest_vertices))
+        rest = as_vertices("rest_vertices", rest_vertices)
+        self._graph = EdgeGraph(len(rest), self._faces)
+        pairs, buried = self._contacts(rest)
         self._rest_pairs = self._keys(pairs)
         self._rest_buried = buried
 
@@ -117,11 +119,8 @@ class SelfContactDetector:
             ]
         )
         above = vertices + _OFF_SURFACE * _vertex_normals(vertices, self._faces)
-        buried = inside_by_components(
-            len(vertices),
-            self._faces,
-            pierced,
-            lambda rows: (self._body.closest(torch.from_numpy(above[rows])).sign < 0).numpy(),
+        buried = self._graph.inside(
+            pierced, lambda rows: (self._body.closest(torch.from_numpy(above[rows])).sign < 0).numpy()
         )
         return found.pairs, buried
 

@@ -136,6 +136,16 @@ def test_a_piece_wholly_inside_is_not_free() -> None:
     assert check(ball(0.3, at=(3, 0, 0)), ball()).is_free
 
 
+def test_garments_of_one_size_take_turns() -> None:
+    body, garment = ball(), ball(0.7, at=(0.5, 0, 0))
+    checker = CollisionChecker(body.faces)
+    checker.update(body.vertices)
+    for faces in (garment.faces, garment.faces[::-1], garment.faces):
+        found = checker.check(garment.vertices, faces)
+        wanted = all_pairs(garment.vertices, np.asarray(faces), body.vertices, body.faces)
+        assert dict(zip(map(tuple, found.pairs.tolist()), found.pair_is_vf.tolist(), strict=True)) == wanted
+
+
 TETRAHEDRON = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, -1]], np.float32)
 TETRAHEDRON_FACES = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])
 
