@@ -73,6 +73,10 @@ class Limbs:
         mean: Tensor = torch.where(count[:, None] > 0, total / count.clamp_min(1)[:, None], points[rows])
         return mean
 
+    def is_foreign(self, rows: Tensor, body_face: Tensor) -> Tensor:
+        """Whether the face (R,) that is closest to each vertex of `rows` (R,) is of a limb that it doesn't lie on."""
+        return ~self.own[rows, self.of_face[body_face.long()]]
+
     def crosses(self, rows: Tensor, body_face: Tensor, gradient: Tensor, outward: Tensor) -> Tensor:
         """Whether a push along `gradient` (R, 3) would take vertices `rows` (R,) out through a limb they don't lie on.
 
@@ -82,7 +86,7 @@ class Limbs:
         """
         limb = self.of_face[body_face.long()]
         along = (gradient * outward[rows]).sum(-1)
-        foreign = ~self.own[rows, limb]
+        foreign = self.is_foreign(rows, body_face)
         # A limb that nearly all of the cloth would leave outwards is under the cloth, as a hand in a fold of a skirt:
         # there the gradient is right.
         inward = torch.zeros(len(_LIMBS), device=rows.device)

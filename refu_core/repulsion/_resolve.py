@@ -7,7 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from refu_core.repulsion._blend import Blend
 from refu_core.repulsion._limbs import Limbs
+from refu_core.repulsion._scale import VertexScale
 from refu_core.repulsion._unit import DEFAULT_MARGIN, MAX_DISPLACEMENT, repulse
 from refu_core.sdf import BodySdf, SdfSample
 
@@ -23,11 +25,11 @@ class Resolution:
     vertices: Tensor
     """Garment vertices [m], shape (N, 3)."""
     distance: Tensor
-    """Their signed distance [m], shape (N,)."""
+    """Their signed distance [m], shape (N,); of some that are beyond the margin, a lower bound of it."""
     n_inside: int
     """Vertices inside the body before."""
     n_pushed: int
-    """Vertices that were moved."""
+    """Vertices nearer than the margin before, that were moved."""
     rounds: int
     """How often moved vertices were asked for their distance again."""
     max_depth: float
@@ -42,7 +44,10 @@ def resolve(
     sdf: BodySdf,
     *,
     margin: float = DEFAULT_MARGIN,
-    scale: float | Tensor = 1.0,
+    scale: float | Tensor | VertexScale = 1.0,
+    start: SdfSample | None = None,
+    near: Tensor | None = None,
+    blend: Blend | None = None,
     max_pushes: int = 4,
     tolerance: float = 2e-4,
     max_displacement: float = MAX_DISPLACEMENT,
@@ -61,7 +66,12 @@ def resolve(
         points: Garment vertices [m], shape (N, 3), in the frame of the body last given to `sdf`.
         sdf: The body's signed distance; an approximate one is only as safe as it is right.
         margin: ε ≥ 0 [m].
-        scale: α of the first push, one number or shape (N,).
+        scale: α of the first push: one number, shape (N,), or what predicts it for the vertices that are pushed
+            (`Refu.of_body`). Where it is below 1 a vertex that got as far as predicted is left in peace, if outside.
+        start: What is known already of the points' distances; those beyond `margin` + 2 mm may be clipped from above.
+        near: A body face near each vertex, shape (N,), where `sdf` asks for such hints.
+        blend: Where given, the neighbourhood of pushed vertices gives way with them: folds are kept, and the edges
+            between pushed vertices and others don't cut through the skin.
         max_pushes: Upper bound on pushes of one vertex.
         tolerance: Shortfall of the margin that is let pass [m].
         max_displacement: Bound on each vertex's movement [m], all pushes together.
@@ -71,12 +81,22 @@ def resolve(
         limbs: Where given, a vertex that the gradient would take out on the far side of a limb it doesn't lie on is
             moved towards its own skin instead, so that an arm in the flank dents a shirt and doesn't tear it.
     """
-    start = sdf.query(points)
-    state = _State(points.clone(), start.distance.clone(), points, sdf, margin, tolerance, max_displacement)
+    if start is None:
+        start = sdf.query(points) if near is None else sdf.query(points, near=near)
+    state = _State(
+        vertices=points.clone(),
+        distance=start.distance.clone(),
+        near=None if near is None else start.face.clone() if start.face is not None else near,
+        origin=points,
+        sdf=sdf,
+        margin=margin,
+        tolerance=tolerance,
+        max_displacement=max_displacement,
+    )
     rows = torch.nonzero(start.distance < margin)[:, 0]
     first = start.rows(rows)
     rounds = 0
-    if limbs is not None and first.face is not None and len(rows):
+    if limbs is not None and first.face is not None and limbs.is_foreign(rows, first.face).any():
         outward = limbs.outward(points)
         crossing = limbs.crosses(rows, first.face, first.gradient, outward)
         rounds += _retreat(state, rows[crossing], outward, limbs, max_pushes)
@@ -84,7 +104,10 @@ def resolve(
         others = torch.nonzero(~crossing | (state.distance[rows] < 0))[:, 0]
         rows, first = rows[others], first.rows(others)
         state.vertices[rows], state.distance[rows] = points[rows], first.distance
-    alpha = scale[rows] if isinstance(scale, Tensor) and scale.ndim else scale
+    alpha = state.first_scale(scale, rows, first.distance)
+    if blend is not None and len(rows):
+        rows, first, alpha = _push_blended(state, rows, first, alpha, blend)
+        rounds += 1
     rounds += _push(state, rows, first, alpha, max_pushes)
     stuck = state.distance < 0
     state.vertices[stuck], state.distance[stuck] = points[stuck], start.distance[stuck]
@@ -95,7 +118,7 @@ def resolve(
         vertices,
         distance,
         n_inside=int((start.distance < 0).sum()),
-        n_pushed=int((vertices != points).any(dim=-1).sum()),
+        n_pushed=int(((vertices != points).any(dim=-1) & (start.distance < margin)).sum()),
         rounds=rounds,
         max_depth=max(0.0, -float(start.distance.min())) if len(points) else 0.0,
         n_unresolved=int((distance < 0).sum()),
@@ -108,6 +131,8 @@ class _State:
 
     vertices: Tensor
     distance: Tensor
+    near: Tensor | None
+    """Closest face of each vertex as last known, where the distance asks for such hints."""
     origin: Tensor
     sdf: BodySdf
     margin: float
@@ -121,25 +146,87 @@ class _State:
         bounded: Tensor = self.origin[rows] + way * (self.max_displacement / length.clamp_min(1e-12)).clamp_max(1.0)
         return bounded
 
-    def keep_better(self, rows: Tensor, moved: Tensor, distance: Tensor) -> None:
-        better = distance > self.distance[rows]
-        self.vertices[rows[better]] = moved[better]
-        self.distance[rows[better]] = distance[better]
+    def query(self, points: Tensor, rows: Tensor) -> SdfSample:
+        """The distance of `points` (R, 3), which are where vertices `rows` (R,) are or near there."""
+        return self.sdf.query(points) if self.near is None else self.sdf.query(points, near=self.near[rows])
+
+    def keep_better(self, rows: Tensor, moved: Tensor, sample: SdfSample) -> None:
+        better = sample.distance > self.distance[rows]
+        self.keep(rows[better], moved[better], sample.rows(better))
+
+    def keep(self, rows: Tensor, moved: Tensor, sample: SdfSample) -> None:
+        self.vertices[rows], self.distance[rows] = moved, sample.distance
+        if self.near is not None and sample.face is not None:
+            self.near[rows] = sample.face.to(self.near)
+
+    def first_scale(self, scale: float | Tensor | VertexScale, rows: Tensor, distance: Tensor) -> Tensor:
+        """α of the first push of `rows`, whose distance is given, shape (R,); large enough to take them outside."""
+        if callable(scale) and not isinstance(scale, Tensor):
+            alpha = scale(rows, distance)
+        elif isinstance(scale, Tensor) and scale.ndim:
+            alpha = scale[rows]
+        else:
+            alpha = torch.full_like(distance, float(scale))
+        # Where α is below 1, the distance was predicted to exaggerate; its sign is trusted all the same.
+        deficit = self.margin - distance
+        return torch.maximum(alpha, (min(self.tolerance, self.margin) - distance) / deficit)
 
 
-def _push(state: _State, rows: Tensor, sample: SdfSample, scale: float | Tensor, max_pushes: int) -> int:
+def _push_blended(
+    state: _State, rows: Tensor, sample: SdfSample, scale: Tensor, blend: Blend
+) -> tuple[Tensor, SdfSample, Tensor]:
+    """Pushes `rows` with their neighbourhood; returns those that aren't clear yet, their distances, and their α."""
+    goal = torch.full_like(state.distance, state.margin)
+    goal[rows] = (sample.distance + scale * (state.margin - sample.distance)).clamp_max(state.margin)
+    is_pushed = torch.zeros_like(goal, dtype=torch.bool)
+    is_pushed[rows] = True
+    push = state.vertices - state.origin
+    # What has left another limb on its near side stays there; its neighbours follow.
+    has_left = (push != 0).any(dim=-1)
+    moved = repulse(
+        state.vertices[rows], sample, scale=scale, margin=state.margin, max_displacement=state.max_displacement
+    )
+    push[rows] = moved - state.vertices[rows]
+    field = blend.spread(push[:, None])[:, 0]
+    everyone = torch.nonzero((field != 0).any(dim=-1) & ~has_left)[:, 0]
+    moved = state.bounded(state.origin[everyone] + field[everyone], everyone)
+    # No vertex gets nearer by more than it moves: those that stay beyond the margin needn't be asked.
+    floor = state.distance[everyone] - torch.linalg.vector_norm(moved - state.origin[everyone], dim=-1)
+    is_near = is_pushed[everyone] | (floor < state.margin + state.tolerance)
+    far = everyone[~is_near]
+    state.vertices[far], state.distance[far] = moved[~is_near], floor[~is_near]
+
+    asked, moved = everyone[is_near], moved[is_near]
+    found = state.query(moved, asked)
+    is_clear = found.distance >= goal[asked] - state.tolerance
+    state.keep(asked[is_clear], moved[is_clear], found.rows(is_clear))
+    # A neighbour that would come too close stays where it was; a pushed one goes on from the better of its two places.
+    again = torch.nonzero(~is_clear & is_pushed[asked])[:, 0]
+    is_better = found.distance[again] > state.distance[asked[again]]
+    state.keep_better(asked[again], moved[again], found.rows(again))
+    place = torch.empty_like(is_pushed, dtype=torch.int64)
+    place[rows] = torch.arange(len(rows), device=rows.device)
+    before = sample.rows(place[asked[again]])
+    distance = torch.where(is_better, found.distance[again], before.distance)
+    gradient = torch.where(is_better[:, None], found.gradient[again], before.gradient)
+    rows = asked[again]
+    return rows, SdfSample(distance, gradient), (goal[rows] - distance) / (state.margin - distance)
+
+
+def _push(state: _State, rows: Tensor, sample: SdfSample, scale: Tensor, max_pushes: int) -> int:
     """Pushes `rows`, whose distance and gradient are `sample`, until they are clear; returns the rounds it took."""
     here, push, last = state.vertices[rows], scale, torch.zeros_like(sample.gradient)
+    goal = (sample.distance + scale * (state.margin - sample.distance)).clamp_max(state.margin)
     for round_ in range(max_pushes):
         if not len(rows):
             return round_
         moved = repulse(here, sample, scale=push, margin=state.margin, max_displacement=state.max_displacement)
         here = state.bounded(moved, rows)
         last = sample.gradient
-        sample = state.sdf.query(here)
-        state.keep_better(rows, here, sample.distance)
-        unclear = torch.nonzero(sample.distance < state.margin - state.tolerance)[:, 0]
-        rows, here, last = rows[unclear], here[unclear], last[unclear]
+        sample = state.query(here, rows)
+        state.keep_better(rows, here, sample)
+        unclear = torch.nonzero(sample.distance < goal - state.tolerance)[:, 0]
+        rows, here, last, goal = rows[unclear], here[unclear], last[unclear], goal[unclear]
         sample = sample.rows(unclear)
         push = torch.where((last * sample.gradient).sum(-1) < 0, 0.5, 1.0)
     return max_pushes
@@ -147,6 +234,8 @@ def _push(state: _State, rows: Tensor, sample: SdfSample, scale: float | Tensor,
 
 def _retreat(state: _State, rows: Tensor, outward: Tensor, limbs: Limbs, max_pushes: int) -> int:
     """Moves `rows` against `outward` (N, 3) out of a limb, as far as there is room; returns the rounds it took."""
+    if not len(rows):
+        return 0
     walker, here = rows, state.vertices[rows]
     distance, way = state.distance[rows], torch.zeros_like(state.distance[rows])
     rounds = 0
@@ -157,17 +246,19 @@ def _retreat(state: _State, rows: Tensor, outward: Tensor, limbs: Limbs, max_pus
         step = torch.minimum(-distance + _STEP_ON, limbs.clearance[walker] + _STEP_ON - way)
         here = here - step[:, None] * outward[walker]
         way = way + step
-        distance = state.sdf.query(here).distance
-        state.keep_better(walker, here, distance)
+        sample = state.query(here, walker)
+        state.keep_better(walker, here, sample)
+        distance = sample.distance
         going = torch.nonzero((distance <= 0) & (way < limbs.clearance[walker]))[:, 0]
         walker, here, distance, way = walker[going], here[going], distance[going], way[going]
     # The few that missed it go where their neighbours went.
     missed = rows[state.distance[rows] < 0]
     filled = limbs.mean_of_neighbours(state.vertices, missed)
-    state.keep_better(missed, filled, state.sdf.query(filled).distance)
+    state.keep_better(missed, filled, state.query(filled, missed))
     # In the room between limb and skin the gradient keeps to the middle, or at the margin where that is wide enough.
     found = rows[state.distance[rows] > 0]
-    return rounds + _push(state, found, state.sdf.query(state.vertices[found]), 1.0, max_pushes)
+    again = state.query(state.vertices[found], found)
+    return rounds + _push(state, found, again, torch.ones_like(again.distance), max_pushes)
 
 
 def _raise_edges(state: _State, edges: Tensor, max_rounds: int) -> int:
@@ -180,7 +271,7 @@ def _raise_edges(state: _State, edges: Tensor, max_rounds: int) -> int:
     closer = state.distance[edges].amin(dim=1)
     low = edges[(closer < state.margin + state.tolerance) & (closer >= 0)]
     for round_ in range(max_rounds):
-        middle = state.sdf.query(state.vertices[low].mean(dim=1))
+        middle = state.query(state.vertices[low].mean(dim=1), low[:, 0])
         is_low = middle.distance < wanted
         if not bool(is_low.any()):
             return round_
@@ -194,11 +285,10 @@ def _raise_edges(state: _State, edges: Tensor, max_rounds: int) -> int:
         moves = torch.zeros_like(state.vertices).index_copy(0, ends[wins], rise[wins])
         rows = torch.nonzero(largest)[:, 0]
         moved = state.bounded(state.vertices[rows] + moves[rows], rows)
-        distance = state.sdf.query(moved).distance
-        clear = distance >= state.distance[rows].clamp_max(state.margin - state.tolerance)
+        sample = state.query(moved, rows)
+        clear = sample.distance >= state.distance[rows].clamp_max(state.margin - state.tolerance)
         raised = rows[clear]
-        state.vertices[raised] = moved[clear]
-        state.distance[raised] = distance[clear]
+        state.keep(raised, moved[clear], sample.rows(clear))
         # Edges of which neither end could move are between two limbs, and stay there.
         low = low[torch.isin(low, raised).any(dim=1)]
     return max_rounds

@@ -1,4 +1,4 @@
-"""The ReFU layer in its first form: one push along the gradient, by a given scale of the distance to a margin."""
+"""The repulsive force itself: one push along the gradient, by a scale of the distance to a margin."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def repulse(
     sample: SdfSample,
     *,
     scale: float | Tensor = 1.0,
-    margin: float = 0.0,
+    margin: float | Tensor = 0.0,
     max_displacement: float = MAX_DISPLACEMENT,
     fallback: Tensor | None = None,
 ) -> Tensor:
@@ -31,13 +31,14 @@ def repulse(
 
     Treats f - ε as the field whose zero level is to be reached (the paper's Eq. refu, gradient and offset; ε = 0 is the
     paper's): x' = x - α (f(x) - ε) ∇f/|∇f| where f(x) < ε, x elsewhere. Differentiable with respect to the points, the
-    sample and the scale. Only the rows with f < ε are touched.
+    sample, the scale and the margin; at f = ε, where the two branches meet, the derivative is that of the outer one.
+    Only the rows with f < ε are touched.
 
     Args:
         points: Garment vertices [m], shape (N, 3).
         sample: Signed distance and gradient at the points; the gradient needs no unit length.
         scale: α, one number or shape (N,); 1 is the paper's "fixed scale".
-        margin: ε ≥ 0 [m].
+        margin: ε ≥ 0 [m]; a tensor of shape () where it is learned.
         max_displacement: Bound on each point's movement [m].
         fallback: Direction where the gradient is zero or not finite, shape (3,) or (N, 3); up by default.
 
@@ -45,7 +46,7 @@ def repulse(
         MeshError: Arrays whose shapes don't belong together, or a negative margin or bound.
     """
     _check(points, sample, scale, margin, max_displacement)
-    rows = torch.nonzero(sample.distance.detach() < margin)[:, 0]
+    rows = pushed_rows(sample.distance, margin)
     if not len(rows):
         return points
     deficit = margin - sample.distance[rows]
@@ -58,6 +59,11 @@ def repulse(
     return pushed
 
 
+def pushed_rows(distance: Tensor, margin: float | Tensor) -> Tensor:
+    """Which points a push moves, int64, shape (R,): those with f < ε."""
+    return torch.nonzero(distance.detach() < margin)[:, 0]
+
+
 def unit_direction(gradient: Tensor, fallback: Tensor) -> Tensor:
     """∇f/|∇f| (Eq. gradient), shape (N, 3); `fallback` where that isn't defined. Finite, and so are its derivatives."""
     length = torch.linalg.vector_norm(gradient.detach(), dim=-1, keepdim=True)
@@ -68,7 +74,9 @@ def unit_direction(gradient: Tensor, fallback: Tensor) -> Tensor:
     return direction
 
 
-def _check(points: Tensor, sample: SdfSample, scale: float | Tensor, margin: float, max_displacement: float) -> None:
+def _check(
+    points: Tensor, sample: SdfSample, scale: float | Tensor, margin: float | Tensor, max_displacement: float
+) -> None:
     n = len(points)
     if points.shape != (n, 3) or sample.distance.shape != (n,) or sample.gradient.shape != (n, 3):
         msg = (
@@ -79,6 +87,6 @@ def _check(points: Tensor, sample: SdfSample, scale: float | Tensor, margin: flo
     if isinstance(scale, Tensor) and scale.shape not in ((), (n,)):
         msg = f"scale must be one number or have the shape ({n},), got {tuple(scale.shape)}"
         raise MeshError(msg)
-    if not (margin >= 0 and max_displacement >= 0):
-        msg = f"margin and max_displacement must not be negative, got {margin} and {max_displacement}"
+    if not (float(margin) >= 0 and max_displacement >= 0):
+        msg = f"margin and max_displacement must not be negative, got {float(margin)} and {max_displacement}"
         raise MeshError(msg)

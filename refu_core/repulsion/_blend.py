@@ -1,0 +1,74 @@
+"""Pushed vertices take their neighbours along, so that cloth gives way as cloth and not vertex by vertex."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from refu_core.errors import MeshError
+
+BLEND_ROUNDS = 6
+"""How far the neighbourhood reaches that gives way with a pushed vertex [edges]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Blend:
+    """Spreads the pushes of some vertices over the garment's mesh.
+
+    Vertices pushed one by one to the margin lie flat on it, and are torn from neighbours that were just outside: folds
+    are lost, and the edges between cut through the skin. So the displacement is made smooth, under the condition that
+    every vertex goes at least as far along its gradient as it has to: a few Jacobi sweeps for the smoothest field with
+    nᵢᵀdᵢ ≥ pᵢ. It is the smoothness term of DRAPE's optimisation (Guan et al. 2012) at the price of a few averages.
+    """
+
+    neighbours: Tensor
+    """The neighbours of each vertex along edges, one vertex after another, int64, shape (2 E,)."""
+    start: Tensor
+    """Where in `neighbours` each vertex's begin, int64, shape (N,)."""
+    share: Tensor
+    """One divided by their number, shape (N, 1)."""
+
+    @classmethod
+    def of_faces(cls, faces: Tensor, n_vertices: int) -> Blend:
+        """For garments of these `faces`, shape (G, 3), and `n_vertices` N.
+
+        Raises:
+            MeshError: A face that names a vertex there isn't.
+        """
+        corners = faces.cpu().numpy()
+        if corners.ndim != 2 or corners.shape[1] != 3 or not ((corners >= 0) & (corners < n_vertices)).all():
+            msg = f"faces must be triangles of {n_vertices} vertices, got {corners.shape} of {corners.max(initial=-1)}"
+            raise MeshError(msg)
+        half_edges = np.concatenate([corners[:, [a, b]] for a in range(3) for b in range(3) if a != b])
+        here, there = np.unique(half_edges, axis=0).T
+        start = np.searchsorted(here, np.arange(n_vertices))
+        number = np.diff(start, append=len(here))[:, None]
+        return cls(
+            torch.as_tensor(there.astype(np.int64), device=faces.device),
+            torch.as_tensor(start, device=faces.device),
+            torch.as_tensor((1 / np.maximum(number, 1)).astype(np.float32), device=faces.device),
+        )
+
+    def mean(self, field: Tensor) -> Tensor:
+        """Mean of each vertex's neighbours, shape (N, C), of a field of the same shape; zero where there are none."""
+        total = functional.embedding_bag(self.neighbours, field, self.start, mode="sum")
+        return total * self.share.to(field)
+
+    def spread(self, push: Tensor, *, rounds: int = BLEND_ROUNDS) -> Tensor:
+        """Displacements [m], shape (N, B, 3), smooth and nowhere less than the pushes [m] of the same shape.
+
+        N vertices of B garments; zero is no push. Differentiable.
+        """
+        length = torch.linalg.vector_norm(push, dim=-1, keepdim=True)
+        direction = push / length.clamp_min(torch.finfo(push.dtype).tiny ** 0.5)
+        field = push
+        for _ in range(rounds):
+            field = self.mean(field.flatten(1)).view_as(push)
+            lack = (length - (field * direction).sum(-1, keepdim=True)).clamp_min(0)
+            # Vertices without a push have no direction, and lack nothing.
+            field = field + lack * direction
+        return field
