@@ -134,7 +134,7 @@ def _add_simulate(commands: Any) -> None:
     )
     parser.add_argument("garment", metavar="GARMENT", help="tshirt-male or another built-in garment")
     parser.add_argument(
-        "--count", type=_positive, required=True, metavar="N", help="samples, training and test together"
+        "--count", type=_positive, required=True, metavar="N", help="samples (or sequences), training and test together"
     )
     parser.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder of the data set")
     parser.add_argument(
@@ -149,6 +149,11 @@ def _add_simulate(commands: Any) -> None:
     parser.add_argument("--seed", type=int, default=0, metavar="S", help="of everything that is drawn (0)")
     parser.add_argument("--processes", type=_positive, default=1, metavar="P", help="processes, a thread each (1)")
     parser.add_argument("--shard", type=_shard, default=(0, 1), metavar="I/N", help="make the I-th of N parts, from 0")
+    parser.add_argument(
+        "--sequences", action="store_true", help="continuous motions at 30 Hz with dynamics, instead of poses at rest"
+    )
+    parser.add_argument("--shapes", type=_positive, default=5, metavar="K", help="body shapes of the sequences (5)")
+    parser.add_argument("--seconds", type=float, default=10.0, metavar="T", help="length of each sequence [s] (10)")
     _add_common(parser)
     parser.set_defaults(run=_simulate)
 
@@ -192,6 +197,9 @@ def _simulate(args: argparse.Namespace) -> int:
         seed=args.seed,
         processes=args.processes,
         shard=args.shard,
+        sequences=args.sequences,
+        shapes=args.shapes,
+        seconds=args.seconds,
         progress=not args.quiet,
     )
     print(simulation_table(card, args.output))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
-from refu_core.simulation import Progress, simulate_dataset
+from refu_core.simulation import Progress, simulate_dataset, simulate_sequences
 from refu_ros.tables import format_table
 
 if TYPE_CHECKING:
@@ -24,28 +24,26 @@ def simulate(
     seed: int,
     processes: int,
     shard: tuple[int, int],
+    sequences: bool,
+    shapes: int,
+    seconds: float,
     progress: bool,
 ) -> dict[str, Any]:
     """Simulates with a progress bar that shows what was dropped; returns the set's card. Raises `RefuError`."""
     with ExitStack() as stack:
-        bar = stack.enter_context(tqdm(total=None, unit="sample", disable=None if progress else True))
+        unit = "sequence" if sequences else "sample"
+        bar = stack.enter_context(tqdm(total=None, unit=unit, disable=None if progress else True))
 
         def show(state: Progress) -> None:
             bar.total = state.total
             bar.set_postfix(state.dropped, refresh=False)
             bar.update(state.done - bar.n)
 
-        return simulate_dataset(
-            garment,
-            count,
-            output,
-            motions=motions,
-            body=body,
-            seed=seed,
-            processes=processes,
-            shard=shard,
-            progress=show,
-        )
+        options: dict[str, Any] = {"motions": motions, "body": body, "seed": seed, "progress": show}
+        options |= {"processes": processes, "shard": shard}
+        if sequences:
+            return simulate_sequences(garment, count, output, shapes=shapes, seconds=seconds, **options)
+        return simulate_dataset(garment, count, output, **options)
 
 
 def simulation_table(card: dict[str, Any], output: Path) -> str:

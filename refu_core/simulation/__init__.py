@@ -9,6 +9,13 @@ from refu_core.simulation._poses import Clip, RoomSettings, load_clips, split_cl
 from refu_core.simulation._produce import Progress
 from refu_core.simulation._run import simulate_dataset
 from refu_core.simulation._selection import CAUSES, SelectionSettings
+from refu_core.simulation._sequence_data import GarmentSequence, GarmentSequences
+from refu_core.simulation._sequences import (
+    SequencePlan,
+    SequenceSettings,
+    simulate_sequences,
+    summarise_sequences,
+)
 from refu_core.simulation._sheet import contact_sheet
 from refu_core.simulation._styles import StyleBasis, Tailoring, build_styles, tailoring_of
 from refu_core.simulation._summary import summarise
@@ -23,10 +30,14 @@ __all__ = [
     "Draper",
     "GarmentDataset",
     "GarmentSample",
+    "GarmentSequence",
+    "GarmentSequences",
     "Plan",
     "Progress",
     "RoomSettings",
     "SelectionSettings",
+    "SequencePlan",
+    "SequenceSettings",
     "SimulationError",
     "SimulationSettings",
     "StyleBasis",
@@ -36,7 +47,9 @@ __all__ = [
     "contact_sheet",
     "load_clips",
     "simulate_dataset",
+    "simulate_sequences",
     "split_clips",
     "summarise",
+    "summarise_sequences",
     "tailoring_of",
 ]

@@ -163,7 +163,7 @@ class Draper:
         shape = torch.as_tensor(betas, dtype=torch.float32).view(1, N_BETAS)
         rest = self.rest(betas, style)
         body: F32 = self.body.rest_vertices(shape)[0].numpy()
-        self._start(rest, betas, style, body)
+        self.begin(rest, betas, style, body)
         gravity = np.array([0, -GRAVITY, 0], np.float32)
         for _ in range(s.dress_frames):
             self.cloth.frame(body, body, gravity=gravity, drag=s.drag[0])
@@ -177,7 +177,8 @@ class Draper:
                 break
         return self.cloth.positions.copy(), body, speed
 
-    def _start(self, positions: F32, betas: NDArray[np.floating], style: NDArray[np.floating], body: F32) -> None:
+    def begin(self, positions: F32, betas: NDArray[np.floating], style: NDArray[np.floating], body: F32) -> None:
+        """Puts the cloth of a shape and style at `positions` (N, 3), at rest, for the body's vertices (V, 3) [m]."""
         rest = self.rest(betas, style)
         shape = torch.as_tensor(betas, dtype=torch.float32).view(1, N_BETAS)
         transforms = self.body(self._comfort, shape).transforms
@@ -186,6 +187,10 @@ class Draper:
         self._sdf.update(torch.from_numpy(body_rest))
         self._sdf.rebuild()
         self.cloth.start(rest, positions, eased=list(eased), waist=self.waist, body_rest=body_rest)
+        self.rebuild(body)
+
+    def rebuild(self, body: F32) -> None:
+        """Builds the tree of triangles anew on this body (V, 3) [m]; it is only refitted from then on."""
         self._sdf.update(torch.from_numpy(np.ascontiguousarray(body)))
         self._sdf.rebuild()
 
@@ -204,7 +209,7 @@ class Draper:
         poses = pose_path(canonical_pose(), target, n)
         tilts = pose_path(np.zeros((1, 3)), root.as_rotvec()[None], n)
         bodies = self._bodies(poses, betas)
-        self._start(start, betas, style, bodies[-1])
+        self.begin(start, betas, style, bodies[-1])
         down = np.array([0, -GRAVITY, 0])
         gravity = np.zeros(3, np.float32)
         for after, tilt in zip(bodies, tilts, strict=True):

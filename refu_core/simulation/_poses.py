@@ -241,25 +241,45 @@ class RoomMaker:
         limbs = np.unique(self._limb[contact.faces[close]])
         return int(near.sum()), limbs[limbs >= 0]
 
+    @property
+    def n_limbs(self) -> int:
+        """Limbs that can be held back."""
+        return len(_LIMBS)
+
     def make_room(
         self, pose: NDArray[np.float32], betas: NDArray[np.floating], style: NDArray[np.floating]
     ) -> tuple[NDArray[np.float32], float] | None:
         """The pose with limbs moved back until the garment has room, and the share of the way that the most held-back
         limb goes; None where that isn't enough (the trunk folds, or a limb is back in the canonical pose)."""
-        ends = Rotation.from_rotvec(pose.astype(np.float64))
-        start = Rotation.from_rotvec(canonical_pose().astype(np.float64))
-        turn = (start.inv() * ends).as_rotvec()
-        share = np.ones(len(_LIMBS))
-        now = pose
+        share = self.shares(pose, betas, style)
+        return None if share is None else (self.held_back(pose, share), float(share.min()))
+
+    def shares(
+        self,
+        pose: NDArray[np.float32],
+        betas: NDArray[np.floating],
+        style: NDArray[np.floating],
+        *,
+        start: NDArray[np.floating] | None = None,
+    ) -> NDArray[np.float64] | None:
+        """The share of its way that each limb may go, shape (4,), none of them above `start`; None as `make_room`."""
+        share = np.ones(len(_LIMBS)) if start is None else np.array(start, np.float64)
         while True:
-            count, limbs = self.crowded(now, betas, style)
+            count, limbs = self.crowded(self.held_back(pose, share), betas, style)
             if count <= self.settings.tolerated:
-                return now, float(share.min())
+                return share
             share[limbs] -= self.settings.step
             if not len(limbs) or share.min() < self.settings.least - 1e-6:
                 return None
-            now = pose.copy()
-            for k, joints in enumerate(_LIMBS.values()):
-                if share[k] < 1:
-                    j = list(joints)
-                    now[j] = (start[j] * Rotation.from_rotvec(turn[j] * share[k])).as_rotvec()
+
+    def held_back(self, pose: NDArray[np.float32], share: NDArray[np.floating]) -> NDArray[np.float32]:
+        """The pose with each limb at its share, (4,), of its way from the canonical pose."""
+        held = pose
+        for k, joints in enumerate(_LIMBS.values()):
+            if share[k] < 1:
+                j = list(joints)
+                held = pose.copy() if held is pose else held
+                first = Rotation.from_rotvec(canonical_pose()[j].astype(np.float64))
+                turn = (first.inv() * Rotation.from_rotvec(pose[j].astype(np.float64))).as_rotvec()
+                held[j] = (first * Rotation.from_rotvec(turn * share[k])).as_rotvec()
+        return held

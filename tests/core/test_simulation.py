@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import errno
+import importlib.util
 import multiprocessing
 import os
 import shutil
+import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -181,6 +183,51 @@ def test_selector_names_the_cause(samples: list[GarmentSample]) -> None:
     through[np.argmax(through[:, 0])] = through[np.argmin(through[:, 0])] - [0.05, 0, 0]
     assert cause(through + np.array((5, 0, 0))) == "self_intersection"
     assert {"body_collision", "stretch", "unsettled", "self_intersection"} < set(CAUSES)
+
+
+@pytest.fixture(scope="module")
+def verifier() -> Any:
+    """The script that judges whole sets."""
+    path = Path(refu_core.__file__).parents[1] / "scripts" / "verify_dataset.py"
+    spec = importlib.util.spec_from_file_location("verify_dataset", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_verifier_finds_nothing_in_a_set_and_every_fault(verifier: Any, simulated: Path, tmp_path: Path) -> None:
+    report = verifier.summary(list(verifier.verdicts(simulated)))
+    assert (report["garments"], report["bad"]) == (COUNT, [])
+    assert 0 < report["smallest_clearance_mm"] < 4
+    path = shutil.copytree(simulated, tmp_path / "spoilt")
+    vertices = Shard(path / "shard-0-of-2", mode="r+").arrays["vertices"]
+    vertices[0, :, 0] += round(0.02 / QUANTUM)
+    vertices[1] = np.rint(vertices[1] * 1.3)
+    faces = load_garment(GARMENT).faces.numpy()
+    one, other = faces[0], faces[len(faces) // 2]
+    vertices[2, one] = vertices[2, other][[1, 2, 0]]
+    vertices[2, one[0]] += np.array((40, 90, 70), np.int16)
+    vertices[2, one[1]] -= np.array((80, 40, 90), np.int16)
+    vertices.flush()
+    report = verifier.summary(list(verifier.verdicts(path)))
+    assert len(report["bad"]) == 3
+    assert report["with_body_pairs"] >= 1
+    assert report["with_vertices_inside"] >= 1
+    assert report["stretched"] >= 1
+    assert report["with_self_intersections"] >= 1
+
+
+def test_verifier_counts_self_intersections_as_fcl_does(verifier: Any, samples: list[GarmentSample]) -> None:
+    faces = load_garment(GARMENT).faces.numpy()
+    rough = samples[0].vertices + np.random.default_rng(1).normal(0, 0.005, samples[0].vertices.shape)
+    pairs = fcl_pairs(rough, faces, rough, faces)
+    apart = ~(faces[pairs[:, 0]][:, :, None] == faces[pairs[:, 1]][:, None]).any((1, 2))
+    wanted = {(min(pair), max(pair)) for pair in pairs[apart].tolist()}
+    assert len(wanted) > 20
+    assert verifier.self_intersections(rough, faces.astype(np.int64)) == len(wanted)
 
 
 def test_self_intersection_is_that_of_fcl(samples: list[GarmentSample]) -> None:

@@ -1,0 +1,348 @@
+"""A second kind of set: continuous motions with dynamics, the cloth carried from frame to frame."""
+
+from __future__ import annotations
+
+import math
+import time
+import zlib
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.special import ndtr, ndtri
+
+from refu_core.frames import N_BETAS
+from refu_core.garments import N_STYLES
+from refu_core.simulation._cloth import ClothSettings
+from refu_core.simulation._drape import GRAVITY, Drape, Draper, DrapeSettings
+from refu_core.simulation._errors import SimulationError
+from refu_core.simulation._motion import FPS, STEPS, Motion, draw_motion, make_room_for
+from refu_core.simulation._plan import TEST, TRAIN
+from refu_core.simulation._poses import Clip, RoomMaker, RoomSettings, load_clips, split_clips
+from refu_core.simulation._produce import Progress, check_division, make_card, produce
+from refu_core.simulation._selection import CAUSES, SelectionSettings, Selector
+from refu_core.simulation._store import (
+    DONE,
+    GIVEN_UP,
+    SEQUENCES,
+    SequenceShard,
+    dequantise,
+    gather,
+    quantise,
+    read_card,
+    rows_of,
+    shards_of,
+    write_card,
+)
+from refu_core.simulation._worker import load_pair
+
+if TYPE_CHECKING:
+    from refu_core.body import SmplBody
+    from refu_core.garments import GarmentTemplate
+    from refu_core.simulation._cloth import F32
+    from refu_core.simulation._store import Shard
+
+
+@dataclass(frozen=True)
+class SequencePlan:
+    """Sequence k is on shape k % `shapes`, in the mean style, and has a stretch of motion of its own.
+
+    Shapes are drawn one by one: those of a set of 5 are the first of a set of 17.
+    """
+
+    garment: str
+    count: int
+    """Sequences in the set, training and test together."""
+    shapes: int = 5
+    seconds: float = 10.0
+    """Of each sequence."""
+    seed: int = 0
+    test_share: float = 1 / 4
+    """Share of each shape's sequences, rounded up, whose motions are of clips kept for the test; not all of them."""
+    spread: float = 1.2
+    """Standard deviation of β before it is cut off at ±2."""
+
+    def __post_init__(self) -> None:
+        """Raises `SimulationError` for numbers that make no plan."""
+        if self.count < 1 or self.shapes < 1 or not 0 < self.seconds <= 600 or self.n_frames < 2:
+            msg = f"wanted a sequence and a shape at least, and two frames to 600 s, got {asdict(self)}"
+            raise SimulationError(msg)
+        if not (0 <= self.test_share < 1 and self.spread > 0):
+            msg = f"the test's share must lie in [0, 1) and the spread above 0, got {asdict(self)}"
+            raise SimulationError(msg)
+
+    @property
+    def n_frames(self) -> int:
+        """Frames of a sequence."""
+        return round(self.seconds * FPS)
+
+    def split_of(self, slot: int) -> int:
+        """`TRAIN` or `TEST`: the last sequences of each shape are the test's."""
+        rounds = math.ceil(self.count / self.shapes)
+        n_test = min(math.ceil(rounds * self.test_share), rounds - 1)
+        return TEST if slot // self.shapes >= rounds - n_test else TRAIN
+
+    def blocks(self) -> list[list[int]]:
+        """Each sequence by itself, in an order that mixes shapes and motions."""
+        order = np.random.default_rng(self._key(0)).permutation(self.count)
+        return [[int(slot)] for slot in order]
+
+    def _key(self, *numbers: int) -> list[int]:
+        return [self.seed, zlib.crc32(f"{self.garment} sequences".encode()), *numbers]
+
+    def style_shape(self, slot: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """β (10,), normal, cut off at ±2, and γ (4,), zero."""
+        edge = ndtr(2 / self.spread)
+        u = np.random.default_rng(self._key(1, slot % self.shapes)).random(N_BETAS)
+        betas = self.spread * ndtri((1 - edge) + u * (2 * edge - 1))
+        return np.clip(betas, -2, 2).astype(np.float32), np.zeros(N_STYLES, np.float32)
+
+    def motion(self, slot: int, attempt: int, clips: list[Clip]) -> Motion:
+        """What a sequence shows at its `attempt`. Raises `SimulationError` when no clip is long enough."""
+        rng = np.random.default_rng(self._key(2, slot, attempt))
+        return draw_motion(clips, self.n_frames, rng)
+
+
+@dataclass(frozen=True)
+class SequenceSettings:
+    """All settings of a set of sequences but its plan."""
+
+    drape: DrapeSettings = field(default_factory=lambda: DrapeSettings(cloth=ClothSettings(refresh=10)))
+    """A moving body is looked at for contacts four times a simulated frame."""
+    drag: float = 6.0
+    """Rate at which the cloth's velocity fades in the air that goes with the body [1/s]."""
+    rebuild_every: int = 10
+    """Simulated frames after which the body's tree of triangles is built anew."""
+    room: RoomSettings = field(default_factory=RoomSettings)
+    selection: SelectionSettings = field(default_factory=SelectionSettings)
+    attempts: int = 8
+    """Stretches of motion that a sequence tries for a first pose with room for the cloth, before it is given up."""
+
+
+class SequenceSimulator:
+    """Simulates whole sequences, in any order, each with the same result every time."""
+
+    def __init__(
+        self,
+        plan: SequencePlan,
+        garment: GarmentTemplate,
+        body: SmplBody,
+        clips: tuple[list[Clip], list[Clip]],
+        settings: SequenceSettings,
+    ) -> None:
+        """For the clips of the training and of the test set.
+
+        Raises `SimulationError` when those of a split are too short.
+        """
+        self.plan = plan
+        self.settings = settings
+        self._clips = clips
+        self._body = body
+        self._draper = Draper(garment, body, settings=settings.drape)
+        self._room = RoomMaker(garment, body, settings=settings.room)
+        self._selector = Selector(body.faces, garment.faces, settings=settings.selection)
+        for slot in (0, plan.count - 1):
+            plan.motion(slot, 0, clips[plan.split_of(slot) == TEST])
+
+    def simulate(self, slot: int) -> dict[str, Any]:
+        """The columns of a sequence's row (see `_store`)."""
+        started = time.perf_counter()
+        plan = self.plan
+        split = plan.split_of(slot)
+        betas, style = plan.style_shape(slot)
+        row: dict[str, Any] = {"slot": slot, "shape": slot % plan.shapes, "split": split, "betas": betas}
+        row |= {"style": style, "state": GIVEN_UP, "dropped": np.zeros(len(CAUSES), np.int32)}
+        for attempt in range(self.settings.attempts):
+            motion = plan.motion(slot, attempt, self._clips[split == TEST])
+            first = make_room_for(self._room, motion.poses[:1], betas, style)
+            if first[2][0]:
+                continue
+            poses, share, crowded = make_room_for(self._room, motion.poses, betas, style)
+            vertices, cause, stretch, speed = self._play(poses, motion.acceleration(), crowded, betas, style)
+            row |= {"vertices": vertices, "cause": cause, "stretch": stretch, "speed": speed}
+            row |= {"pose": poses[::STEPS], "asked": motion.poses[::STEPS], "transl": motion.transl[::STEPS]}
+            row |= {"share": share[::STEPS], "clip": motion.clip, "start": motion.start, "mirrored": motion.mirrored}
+            row |= {"dropped": np.bincount(cause, minlength=len(CAUSES) + 1)[1:], "state": DONE}
+            break
+        return row | {"seconds": time.perf_counter() - started}
+
+    def _play(
+        self,
+        poses: NDArray[np.float32],
+        acceleration: NDArray[np.float64],
+        crowded: NDArray[np.bool_],
+        betas: NDArray[np.float32],
+        style: NDArray[np.float32],
+    ) -> tuple[NDArray[np.int16], NDArray[np.uint8], F32, F32]:
+        """Garments (T, N, 3), causes, stretch and speed (T,) of a motion of n simulated frames.
+
+        The cloth lives in a frame of reference that goes with the root and doesn't turn: there, the body's acceleration
+        is a gravity of the other sign, and the air is still. It starts at rest in the first pose.
+        """
+        s, cloth = self.settings, self._draper.cloth
+        shape = torch.from_numpy(betas)[None]
+        drape = self._draper.drape(poses[0], betas, style)
+        bodies = np.concatenate(
+            [self._body(poses[k : k + 50], shape).vertices.numpy() for k in range(0, len(poses), 50)]
+        )
+        self._draper.begin(drape.vertices, betas, style, bodies[0])
+        gravity = (np.array([0, -GRAVITY, 0]) - acceleration).astype(np.float32)
+        n = len(poses[::STEPS])
+        vertices = np.zeros((n, *drape.vertices.shape), np.int16)
+        cause = np.full(n, 1 + CAUSES.index("unsettled"), np.uint8)
+        stretch, speed = np.full((2, n), np.nan, np.float32)
+        for k, body in enumerate(bodies):
+            now = 0.0
+            if k:
+                if k % s.rebuild_every == 0:
+                    self._draper.rebuild(bodies[k - 1])
+                careful = k % STEPS == 0  # where a frame is taken; elsewhere it would only take time
+                now = cloth.frame(bodies[k - 1], body, gravity=gravity[k], drag=s.drag, careful=careful)
+            if not np.isfinite(cloth.positions).all() or np.abs(cloth.positions).max() > 1.9:
+                break  # the cloth is lost, and with it the rest of the sequence
+            if k % STEPS == 0:
+                t = k // STEPS
+                vertices[t] = quantise(cloth.positions)
+                stretch[t], speed[t] = np.percentile(cloth.stretch(), 99.9), now
+                cause[t] = self._examine(dequantise(vertices[t]), body, float(stretch[t]), crowded=bool(crowded[k]))
+        return vertices, cause, stretch, speed
+
+    def _examine(self, stored: F32, body: F32, stretch: float, *, crowded: bool) -> int:
+        """0, or 1 and above for the cause why a frame isn't in the set; a moving cloth may be fast."""
+        cause = "no_room" if crowded else self._selector.cause(stored, body, Drape(stored, 0.0, stretch, 1))
+        return 0 if cause is None else 1 + CAUSES.index(cause)
+
+
+@dataclass(frozen=True, eq=False)
+class SequenceJob:
+    """What a process needs to simulate sequences."""
+
+    plan: SequencePlan
+    clips: tuple[list[Clip], list[Clip]]
+    settings: SequenceSettings
+    body: str | Path
+
+    rows: ClassVar[type[Shard]] = SequenceShard
+
+    def simulator(self) -> SequenceSimulator:
+        """The simulator of this process."""
+        garment, body = load_pair(self.plan.garment, self.body)
+        return SequenceSimulator(self.plan, garment, body, self.clips, self.settings)
+
+
+def simulate_sequences(
+    garment: str,
+    count: int,
+    output: str | Path,
+    *,
+    motions: str | Path | None,
+    shapes: int = 5,
+    seconds: float = 10.0,
+    body: str | Path | None = None,
+    seed: int = 0,
+    processes: int = 1,
+    shard: tuple[int, int] = (0, 1),
+    settings: SequenceSettings | None = None,
+    progress: Callable[[Progress], None] | None = None,
+) -> dict[str, Any]:
+    """Simulates a set of `count` sequences of a built-in garment, or goes on with one that was interrupted.
+
+    What holds for `simulate_dataset` holds here; the unit that is finished or not is a whole sequence.
+
+    Args:
+        garment: `tshirt-male` or another built-in garment.
+        count: sequences in the set, training and test together, over all shards; best a multiple of `shapes`.
+        output: directory of the set; it is made, or must hold the beginning of the same set.
+        motions: a folder of AMASS-style `.npz` files, two at least, of `seconds` or more.
+        shapes: body shapes in the set.
+        seconds: length of each sequence.
+        body: name or file of a body; None for the one the garment was cut for.
+        seed: of everything that is drawn.
+        processes: how many processes share the work, one thread each.
+        shard: (i, n): this run makes the i-th of n parts of the set, counted from 0.
+        settings: of simulation and selection.
+        progress: called in this process after each sequence.
+
+    Returns:
+        The card of the set, as it stands in `card.json`.
+
+    Raises:
+        SimulationError: as `simulate_dataset`, and for motions that are too short.
+        MeshError: the body isn't watertight.
+        BodyError, GarmentError: no such body or garment.
+    """
+    check_division(shard, processes)
+    output = Path(output)
+    plan = SequencePlan(garment, count, shapes=shapes, seconds=seconds, seed=seed)
+    if motions is None:
+        msg = f"sequences need recorded motion: give a folder of AMASS-style .npz files, of {seconds:g} s or more each"
+        raise SimulationError(msg)
+    settings = settings or SequenceSettings()
+    clips = split_clips(load_clips(motions))
+    template, worn_by = load_pair(garment, body)
+    job = SequenceJob(plan, clips, settings, template.body if body is None else body)
+    simulator = SequenceSimulator(plan, template, worn_by, clips, settings)
+    produce(
+        job,
+        simulator,
+        output,
+        card=make_card(SEQUENCES, plan, settings, clips, template, worn_by) | {"fps": FPS},
+        blocks=plan.blocks(),
+        shape=(plan.n_frames, template.n_vertices, 3),
+        processes=processes,
+        shard=shard,
+        progress=progress,
+    )
+    return summarise_sequences(output)
+
+
+def summarise_sequences(output: str | Path) -> dict[str, Any]:
+    """Brings the card of a set of sequences up to date: counts, the frames that are in the set and why others aren't.
+
+    Raises `SimulationError` when `output` holds no set of sequences.
+    """
+    output = Path(output)
+    card = read_card(output, SEQUENCES)
+    shards = shards_of(output, SequenceShard)
+    if not shards:
+        msg = f"{output}: a card and no shard; wanted shard-I-of-N directories beside it"
+        raise SimulationError(msg)
+    where, row = rows_of(shards, (DONE, GIVEN_UP))
+    names = ("state", "split", "cause", "dropped", "share", "stretch", "speed", "seconds")
+    column = {name: gather(shards, where, row, name) for name in names}
+    done = column["state"] == DONE
+    good = column["cause"] == 0
+    frames = int(done.sum()) * int(card["plan"]["seconds"] * FPS + 0.5)
+    card["counts"] = {
+        "train": int((done & (column["split"] == TRAIN)).sum()),
+        "test": int((done & (column["split"] == TEST)).sum()),
+        "given_up": int((column["state"] == GIVEN_UP).sum()),
+        "to_do": int(card["plan"]["count"] - len(done)),
+        "frames": frames,
+        "frames_kept": int(good[done].sum()),
+    }
+    dropped = column["dropped"][done].sum(0, dtype=np.int64).tolist()
+    card["yield"] = {
+        "simulated": frames,
+        "kept_share": float(good[done].sum() / max(frames, 1)),
+        "dropped": dict(zip(CAUSES, dropped, strict=True)),
+    }
+    if done.any():
+        kept = good & done[:, None]
+        card["figures"] = {
+            "seconds_a_frame": float(column["seconds"].sum() / frames),
+            "kept_share_of_worst_sequence": float(good[done].mean(1).min()),
+            "kept_share_of_median_sequence": float(np.median(good[done].mean(1))),
+        }
+        if kept.any():
+            card["figures"] |= {
+                "stretch_p999_median": float(np.median(column["stretch"][kept])),
+                "stretch_p999_largest": float(column["stretch"][kept].max()),
+                "speed_m_s_median": float(np.median(column["speed"][kept])),
+            }
+    write_card(output, card)
+    return card

@@ -1,0 +1,252 @@
+#!/usr/bin/env python3
+"""Judges every stored garment of a simulated set anew, by code that had no part in making it.
+
+Body and garment: python-fcl (pairs of triangles) and libigl (signed distance, its sign by winding number). The garment
+itself: edges against triangles in double precision. Stretch: edges of the stored garment against its cut.
+
+    python scripts/verify_dataset.py data/tshirt-male --processes 2 --json report.json
+
+The set's files are read as docs/dataset.md describes them, not through the project's own reader. Exit code 1 where a
+sample isn't what it should be.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from functools import cache
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import fcl
+import igl
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from tqdm import tqdm
+
+from refu_core.body import load_body
+from refu_core.garments import load_garment
+from refu_core.simulation._drape import comfort_poses
+
+F64 = NDArray[np.float64]
+MOST_STRETCH = 1.15
+Place = tuple[Path, int, int]
+"""Shard, row, and frame of a sequence (-1 in a set of samples)."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What was found in one garment."""
+
+    place: str
+    slot: int
+    body_pairs: int
+    """Triangles of garment and body that intersect, by fcl."""
+    inside: int
+    """Vertices inside the body, by libigl."""
+    clearance_mm: float
+    """Smallest signed distance of a vertex to the skin."""
+    self_pairs: int
+    """Pairs of the garment's triangles, without a common vertex, that intersect."""
+    stretch: float
+    """99.9th percentile over the edges."""
+
+    @property
+    def is_good(self) -> bool:
+        """Nothing against it."""
+        return not (self.body_pairs or self.inside or self.self_pairs) and self.stretch <= MOST_STRETCH
+
+
+class Judge:
+    """Judges garments of one kind on one body."""
+
+    def __init__(self, garment: str, body: str) -> None:
+        self._garment = load_garment(garment)
+        self._body = load_body(body)
+        self._faces = self._garment.faces.numpy().astype(np.int64)
+        self._body_faces = self._body.faces.numpy().astype(np.int64)
+        half = np.sort(self._faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        self._edges = np.unique(half, axis=0)
+        self._lengths: tuple[bytes, F64] | None = None
+
+    def judge(self, place: str, slot: int, vertices: F64, pose: Any, betas: Any, style: Any) -> Verdict:
+        """One garment (N, 3) [m] on the body of this pose (24, 3), shape (10,) and style (4,)."""
+        shape = torch.from_numpy(np.array(betas))[None]
+        body = self._body(np.array(pose)[None], shape).vertices[0].numpy().astype(np.float64)
+        distance = igl.signed_distance(vertices, body, self._body_faces, igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER)
+        length = np.linalg.norm(vertices[self._edges[:, 0]] - vertices[self._edges[:, 1]], axis=1)
+        return Verdict(
+            place,
+            slot,
+            body_pairs=len(_fcl_contacts(vertices, self._faces, body, self._body_faces)),
+            inside=int((distance[0] <= 0).sum()),
+            clearance_mm=float(1e3 * distance[0].min()),
+            self_pairs=self_intersections(vertices, self._faces),
+            stretch=float(np.percentile(length / self._rest_lengths(shape, np.array(style)), 99.9)),
+        )
+
+    def _rest_lengths(self, shape: torch.Tensor, style: NDArray[np.float32]) -> F64:
+        """Of the cut, with the room that it has for raised arms and bent elbows, up to 15 %; shape (E,)."""
+        key = shape.numpy().tobytes() + style.tobytes()
+        if self._lengths is None or self._lengths[0] != key:
+            rest = self._garment.rest(shape, torch.from_numpy(style)[None])
+            poses = comfort_poses()
+            eased = self._garment.pose(rest.expand(len(poses), -1, -1), self._body(poses, shape).transforms)
+            both = torch.cat((rest, eased)).numpy().astype(np.float64)
+            length = np.linalg.norm(both[:, self._edges[:, 0]] - both[:, self._edges[:, 1]], axis=-1)
+            self._lengths = key, np.clip(length.max(0), length[0], MOST_STRETCH * length[0])
+        return self._lengths[1]
+
+
+def _fcl_contacts(first: F64, first_faces: Any, second: F64, second_faces: Any) -> list[Any]:
+    def model(vertices: F64, faces: Any) -> Any:
+        bvh = fcl.BVHModel()
+        bvh.beginModel(len(vertices), len(faces))
+        bvh.addSubModel(vertices, faces)
+        bvh.endModel()
+        return fcl.CollisionObject(bvh, fcl.Transform())
+
+    request = fcl.CollisionRequest(num_max_contacts=1_000_000, enable_contact=True)  # the default stops counting early
+    result = fcl.CollisionResult()
+    fcl.collide(model(first, first_faces), model(second, second_faces), request, result)
+    contacts: list[Any] = result.contacts
+    return contacts
+
+
+def self_intersections(vertices: F64, faces: NDArray[np.int64]) -> int:
+    """Pairs of triangles without a common vertex of which an edge of one pierces the other."""
+    corners = vertices[faces]
+    centre = corners.mean(1)
+    radius = np.linalg.norm(corners - centre[:, None], axis=2).max(1)
+    large = radius > 2 * np.median(radius)  # few; a search as wide as the largest would find far too many
+    small, few = np.flatnonzero(~large), np.flatnonzero(large)
+    tree = cKDTree(centre[small])
+    pairs = [small[tree.query_pairs(2 * radius[small].max(), output_type="ndarray")]]
+    for face in few:
+        near = np.flatnonzero(np.linalg.norm(centre - centre[face], axis=1) < radius + radius[face])
+        near = near[(near != face) & ~(large[near] & (near < face))]
+        pairs.append(np.stack((np.full(len(near), face), near), 1))
+    i, j = np.concatenate(pairs).T
+    low, high = corners.min(1), corners.max(1)
+    keep = ((low[i] <= high[j]) & (low[j] <= high[i])).all(1)
+    i, j = i[keep], j[keep]
+    keep = ~(faces[i][:, :, None] == faces[j][:, None, :]).any((1, 2))
+    i, j = i[keep], j[keep]
+    return int((_pierces(corners[i], corners[j]) | _pierces(corners[j], corners[i])).sum())
+
+
+def _pierces(first: F64, second: F64) -> NDArray[np.bool_]:
+    """Whether an edge of `first` (K, 3, 3) crosses the triangle `second` (K, 3, 3); shape (K,)."""
+    a, b, c = second.transpose(1, 0, 2)
+    normal = np.cross(b - a, c - a)
+    height = np.einsum("kec,kc->ke", first - a[:, None], normal)
+    out = np.zeros(len(first), np.bool_)
+    for start, end in ((0, 1), (1, 2), (2, 0)):
+        across = np.flatnonzero(height[:, start] * height[:, end] < 0)
+        p, q = first[across, start], first[across, end]
+        turns = [
+            np.einsum("kc,kc->k", np.cross(u[across] - p, v[across] - p), q - p) for u, v in ((a, b), (b, c), (c, a))
+        ]
+        signs = np.sign(turns)
+        out[across] |= (signs >= 0).all(0) | (signs <= 0).all(0)
+    return out
+
+
+def places(directory: Path, card: dict[str, Any]) -> list[Place]:
+    """All garments that are in the set."""
+    found: list[Place] = []
+    for shard in sorted(directory.glob("shard-*-of-*")):
+        done = np.load(shard / "state.npy", mmap_mode="r") == 1
+        if card["format"] == "refu-sequences-1":
+            kept = (np.load(shard / "cause.npy", mmap_mode="r") == 0) & done[:, None]
+            found += [(shard, int(row), int(frame)) for row, frame in np.argwhere(kept)]
+        else:
+            found += [(shard, int(row), -1) for row in np.flatnonzero(done)]
+    return found
+
+
+@cache
+def _judge(garment: str, body: str) -> Judge:
+    torch.set_num_threads(1)
+    return Judge(garment, body)
+
+
+@cache
+def _columns(shard: Path) -> dict[str, Any]:
+    return {
+        name: np.load(shard / f"{name}.npy", mmap_mode="r") for name in ("slot", "vertices", "pose", "betas", "style")
+    }
+
+
+def _verdict(task: tuple[Place, str, str, float]) -> Verdict:
+    (shard, row, frame), garment, body, quantum = task
+    column = _columns(shard)
+    at = (row,) if frame < 0 else (row, frame)
+    place = f"{shard.name} row {row}" + ("" if frame < 0 else f" frame {frame}")
+    vertices = column["vertices"][at].astype(np.float64) * quantum
+    slot = int(column["slot"][row])
+    return _judge(garment, body).judge(
+        place, slot, vertices, column["pose"][at], column["betas"][row], column["style"][row]
+    )
+
+
+def verdicts(directory: Path, *, body: str | None = None, processes: int = 1, every: int = 1) -> Iterator[Verdict]:
+    """Judges every `every`-th garment of a set."""
+    card = json.loads((directory / "card.json").read_text())
+    body = body or load_garment(card["garment"]).body
+    if load_body(body).fingerprint != card["body_fingerprint"]:
+        sys.exit(f"{directory}: made for another body than {body!r}: name its file as --body")
+    tasks = [(place, card["garment"], body, float(card["quantum_m"])) for place in places(directory, card)[::every]]
+    bar = tqdm(total=len(tasks), unit="garment", disable=None)
+    if processes == 1:
+        for task in tasks:
+            yield _verdict(task)
+            bar.update()
+        return
+    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+        for verdict in pool.map(_verdict, tasks, chunksize=16):
+            yield verdict
+            bar.update()
+
+
+def summary(found: list[Verdict]) -> dict[str, Any]:
+    """Counts, extremes, and each garment that isn't good."""
+    return {
+        "garments": len(found),
+        "with_body_pairs": sum(v.body_pairs > 0 for v in found),
+        "with_vertices_inside": sum(v.inside > 0 for v in found),
+        "with_self_intersections": sum(v.self_pairs > 0 for v in found),
+        "stretched": sum(v.stretch > MOST_STRETCH for v in found),
+        "smallest_clearance_mm": min((v.clearance_mm for v in found), default=None),
+        "stretch_p999_median": float(np.median([v.stretch for v in found])) if found else None,
+        "stretch_p999_largest": max((v.stretch for v in found), default=None),
+        "bad": [asdict(v) for v in found if not v.is_good],
+    }
+
+
+def main() -> int:
+    """Judges a set and says what was found."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("directory", type=Path)
+    parser.add_argument("--body", help="name or file of the body, where it isn't the garment's own")
+    parser.add_argument("--processes", type=int, default=1)
+    parser.add_argument("--every", type=int, default=1, metavar="K", help="only every K-th garment")
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    options = {"body": arguments.body, "processes": arguments.processes, "every": arguments.every}
+    report = {"set": arguments.directory.name, **summary(list(verdicts(arguments.directory, **options)))}
+    print(json.dumps(report, indent=1))
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps(report, indent=1) + "\n")
+    return int(bool(report["bad"]))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

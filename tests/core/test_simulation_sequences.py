@@ -1,0 +1,250 @@
+"""Simulated sequences: continuous, the same every time, each frame judged, and sets that survive interruption."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from refu_core.body import load_body
+from refu_core.garments import load_garment
+from refu_core.simulation import (
+    Clip,
+    GarmentDataset,
+    GarmentSequence,
+    GarmentSequences,
+    Progress,
+    SequencePlan,
+    SimulationError,
+    load_clips,
+    simulate_sequences,
+    split_clips,
+    summarise_sequences,
+)
+from refu_core.simulation._drape import canonical_pose
+from refu_core.simulation._motion import FPS, STEPS, draw_motion, make_room_for, n_steps
+from refu_core.simulation._plan import TEST
+from refu_core.simulation._poses import RoomMaker
+from refu_core.simulation._selection import Selector
+from refu_core.simulation._store import TO_DO, SequenceShard
+from refu_ros.cli import main
+
+GARMENT = "short-pant-male"
+SECONDS = 0.3
+FRAMES = 9
+
+
+def write_clip(path: Path, phase: float, *, frames: int = 40) -> None:
+    """Somebody runs on the spot and turns about."""
+    t = np.arange(frames) / 60
+    pose = np.tile(canonical_pose(), (frames, 1, 1)).astype(np.float64)
+    pose[:, 0, 1] = 0.8 + 0.5 * t
+    pose[:, 1, 0] = -0.5 * np.sin(9 * t + phase)
+    pose[:, 2, 0] = 0.5 * np.sin(9 * t + phase)
+    transl = np.stack((1.5 * t, 0.9 + 0.02 * np.sin(18 * t), 0 * t), 1)
+    np.savez(path, poses=pose.reshape(frames, 72), trans=transl, mocap_framerate=np.array(60.0))
+
+
+@pytest.fixture(scope="module")
+def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("motions")
+    for name, phase in (("a", 0.0), ("b", 1.0)):
+        write_clip(folder / f"{name}.npz", phase)
+    return folder
+
+
+def simulate(output: Path, clips: Path, **options: Any) -> dict[str, Any]:
+    return simulate_sequences(GARMENT, 2, output, motions=clips, **({"shapes": 1, "seconds": SECONDS} | options))
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory, clips: Path) -> Path:
+    """A training and a test sequence, made as two shards."""
+    output = tmp_path_factory.mktemp("sets") / "sequences"
+    simulate(output, clips, shard=(0, 2))
+    simulate(output, clips, shard=(1, 2))
+    return output
+
+
+@pytest.fixture(scope="module")
+def sequences(simulated: Path) -> list[GarmentSequence]:
+    found = GarmentSequences(simulated)
+    return [found.sequence(i) for i in range(len(found))]
+
+
+def test_sequences_are_what_was_planned(sequences: list[GarmentSequence], simulated: Path) -> None:
+    card = json.loads((simulated / "card.json").read_text())
+    assert card["fps"] == FPS
+    assert card["plan"] == asdict(SequencePlan(GARMENT, 2, shapes=1, seconds=SECONDS))
+    assert [(s.number, s.split, s.clip, s.shape) for s in sequences] == [(0, "train", "a", 0), (1, "test", "b", 0)]
+    np.testing.assert_array_equal(sequences[0].betas, sequences[1].betas)
+    for sequence in sequences:
+        assert len(sequence) == FRAMES
+        assert sequence.vertices().shape == (FRAMES, load_garment(GARMENT).n_vertices, 3)
+        np.testing.assert_array_equal(sequence.vertices(3), sequence.vertices()[3])
+        assert sequence.vertices(np.array([1, 4])).dtype == np.float32
+        assert not sequence.style.any()
+        # Mirrored or not, it faces forward at first, and goes on from where it is.
+        facing = Rotation.from_rotvec(sequence.pose[0, 0]).apply([0, 0, 1])
+        np.testing.assert_allclose(facing, [0, 0, 1], atol=1e-5)
+        np.testing.assert_allclose(sequence.transl[0, [0, 2]], 0, atol=1e-6)
+        turn = Rotation.from_rotvec(sequence.pose[-1, 0]).apply([0, 0, 1])[0]
+        assert np.sign(turn) == (-1 if sequence.mirrored else 1)
+        way = np.linalg.norm(sequence.transl[-1, [0, 2]])
+        assert way == pytest.approx(1.5 * (FRAMES - 1) / FPS, rel=0.01)
+
+
+def test_frames_in_the_set_are_free_and_others_are_marked(sequences: list[GarmentSequence], simulated: Path) -> None:
+    garment, body = load_garment(GARMENT), load_body("male")
+    selector = Selector(body.faces, garment.faces)
+    for sequence in sequences:
+        assert sequence.kept.mean() > 0.5
+        assert all((cause is None) == kept for cause, kept in zip(sequence.cause, sequence.kept, strict=True))
+        posed = body(sequence.pose, torch.from_numpy(sequence.betas)[None]).vertices.numpy()
+        for t in range(len(sequence)):
+            found = selector.cause(sequence.vertices(t), posed[t])
+            if sequence.kept[t]:
+                assert found is None
+            elif sequence.cause[t] in ("body_collision", "self_intersection"):
+                assert found == sequence.cause[t]
+    counts = summarise_sequences(simulated)["counts"]
+    assert counts["frames"] == 2 * FRAMES
+    assert counts["frames_kept"] == sum(int(s.kept.sum()) for s in sequences)
+
+
+def test_cloth_moves_on_and_lags(sequences: list[GarmentSequence]) -> None:
+    """No jumps; and moving cloth isn't the skinned one: dynamics are in it."""
+    garment, body = load_garment(GARMENT), load_body("male")
+    for sequence in sequences:
+        vertices = sequence.vertices()
+        step = np.linalg.norm(np.diff(vertices, axis=0), axis=2)
+        assert np.median(step[-1]) > 0.001
+        assert step.max() < 6.0 / FPS  # [m]: the solver's limit of the speed
+        shape = torch.from_numpy(sequence.betas)[None]
+        posed = body(sequence.pose, shape)
+        rest = garment.rest(shape, torch.from_numpy(sequence.style)[None]).expand(FRAMES, -1, -1)
+        beyond = vertices - garment.pose(rest, posed.transforms).numpy()
+        assert np.linalg.norm(np.diff(beyond, axis=0), axis=2).max() > 0.003
+
+
+def arrays(path: Path) -> dict[str, NDArray[Any]]:
+    shards = [SequenceShard(directory).arrays for directory in sorted(path.glob("shard-*-of-*"))]
+    order = np.argsort(np.concatenate([shard["slot"] for shard in shards]))
+    return {name: np.concatenate([s[name] for s in shards])[order] for name in shards[0] if name != "seconds"}
+
+
+def test_interrupted_run_goes_on_to_the_same_bytes(simulated: Path, clips: Path, tmp_path: Path) -> None:
+    """A whole set in one shard, stopped after a sequence; its other one begun and not finished."""
+    output = tmp_path / "again"
+
+    def stop(_: Progress) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        simulate(output, clips, progress=stop)
+    shard = SequenceShard(output / "shard-0-of-1", mode="r+")
+    half_written = int(np.flatnonzero(shard.arrays["state"] == TO_DO)[0])
+    shard.arrays["vertices"][half_written, :3] = 12345
+    del shard
+    assert len(GarmentSequences(output)) == 1
+    seen: list[Progress] = []
+    card = simulate(output, clips, progress=seen.append)
+    assert [p.done for p in seen] == [2]
+    assert {key: card["counts"][key] for key in ("train", "test", "to_do")} == {"train": 1, "test": 1, "to_do": 0}
+    found, wanted = arrays(output), arrays(simulated)
+    for name, column in wanted.items():
+        np.testing.assert_array_equal(found[name], column, err_msg=name)
+    simulate(output, clips, progress=lambda _: pytest.fail("a finished set has nothing left to simulate"))
+
+
+def test_other_kinds_of_set_are_refused(simulated: Path, clips: Path, tmp_path: Path) -> None:
+    with pytest.raises(SimulationError, match="refu-garments-1"):
+        GarmentDataset(simulated)
+    with pytest.raises(SimulationError, match="plan"):
+        simulate(simulated, clips, seconds=0.2)
+    with pytest.raises(SimulationError, match="none of the index"):
+        GarmentSequences(simulated).sequence(2)
+    with pytest.raises(SimulationError, match="columns"):
+        GarmentSequences(simulated).column("pair")
+    with pytest.raises(SimulationError, match="card"):
+        GarmentSequences(tmp_path)
+
+
+def test_motions_must_be_there_and_long_enough(clips: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SimulationError, match=r"5 s at least.*0\.7 s"):
+        simulate(tmp_path / "set", clips, seconds=5.0)
+    options = ["--count", "2", "--output", str(tmp_path / "set"), "--sequences", "--quiet"]
+    assert main(["simulate", GARMENT, *options]) == 2
+    assert "sequences need recorded motion" in capsys.readouterr().err
+    assert not (tmp_path / "set").exists()
+
+
+@pytest.mark.parametrize(
+    "numbers", [{"count": 0}, {"shapes": 0}, {"seconds": 0.03}, {"test_share": 1.0}, {"spread": 0.0}]
+)
+def test_impossible_plans_are_refused(numbers: dict[str, Any]) -> None:
+    with pytest.raises(SimulationError, match="got"):
+        SequencePlan(**({"garment": GARMENT, "count": 10} | numbers))
+
+
+@given(st.integers(1, 60), st.integers(1, 20), st.integers(0, 3))
+def test_plan_keeps_whole_clips_apart_and_shapes_together(count: int, shapes: int, seed: int) -> None:
+    plan = SequencePlan(GARMENT, count, shapes=shapes, seed=seed)
+    assert sorted(slot for block in plan.blocks() for slot in block) == list(range(count))
+    splits = [plan.split_of(slot) for slot in range(count)]
+    assert splits == sorted(splits)
+    assert splits[0] != TEST
+    assert (TEST in splits) == (count > shapes)
+    larger = SequencePlan(GARMENT, count, shapes=shapes + 3, seed=seed)
+    for shape in range(min(shapes, 3)):
+        np.testing.assert_array_equal(plan.style_shape(shape)[0], larger.style_shape(shape)[0])
+        assert np.abs(plan.style_shape(shape)[0]).max() <= 2
+
+
+def test_stretches_are_those_of_the_clip(clips: Path) -> None:
+    train, _ = split_clips(load_clips(clips))
+    for seed in range(6):
+        motion = draw_motion(train, FRAMES, np.random.default_rng(seed))
+        n = n_steps(FRAMES)
+        assert motion.poses.shape == (n, 24, 3)
+        first = round(motion.start * FPS * STEPS)
+        side = 2 if motion.mirrored else 1
+        np.testing.assert_allclose(motion.poses[:, side, 0], train[0].poses[first : first + n, 1, 0], atol=1e-5)
+
+
+def test_acceleration_is_that_of_the_way() -> None:
+    t = np.arange(120) / (FPS * STEPS)
+    way = np.stack((2.0 * t**2, 0 * t, 0 * t), 1)
+    clip = Clip("fall", np.zeros((120, 24, 3), np.float32), way, FPS * STEPS)
+    motion = draw_motion([clip], 60, np.random.default_rng(1))
+    inner = motion.acceleration()[10:-10]
+    np.testing.assert_allclose(np.abs(inner[:, 0]), 4.0, rtol=1e-3)
+    np.testing.assert_allclose(inner[:, 1:], 0, atol=1e-6)
+
+
+def test_room_comes_and_goes_smoothly() -> None:
+    """An arm swings into the flank and out: held back by enough everywhere, without a jump."""
+    body, garment = load_body("male"), load_garment("tshirt-male")
+    room = RoomMaker(garment, body)
+    betas, style = np.zeros(10, np.float32), np.zeros(4, np.float32)
+    n = 61
+    poses = np.tile(canonical_pose(), (n, 1, 1))
+    poses[:, 16, 2] -= 0.75 * np.exp(-(((np.arange(n) - 30) / 9) ** 2))
+    held, share, none = make_room_for(room, poses, betas, style)
+    assert not none.any()
+    assert share.min() < 0.9
+    assert np.abs(np.diff(share)).max() < 0.1
+    narrow = room.shares(poses[28], betas, style)
+    assert narrow is not None
+    assert share[28] <= narrow.min() + 1e-9
+    assert room.crowded(held[28], betas, style)[0] <= room.settings.tolerated
+    np.testing.assert_array_equal(held[:, [0, 1, 2, 17]], poses[:, [0, 1, 2, 17]])
