@@ -34,6 +34,8 @@ class FrameMetrics:
     energy: float
     """Penetration energy, sum of max(0, -f)^2 over the vertices [m^2]. The paper takes its energy from another work
     without giving the formula: this one is ours."""
+    collision_error_mm: float
+    """The paper's collision loss with the exact distance, sum of max(0, -f) over the vertices [mm]."""
     mpve_mm: float | None
     """Mean distance of the vertices to the true ones [mm]; None without a truth."""
     laplacian_mm: float | None
@@ -61,6 +63,8 @@ class Figures:
     """Depth of the deepest vertex of all frames [mm]."""
     mean_energy: float | None
     """Mean penetration energy [m^2], by our own definition (see `FrameMetrics.energy`)."""
+    mean_collision_error_mm: float | None
+    """Mean collision error [mm] (see `FrameMetrics.collision_error_mm`)."""
     laplacian_mm: float | None
     """Local Laplacian error [mm], mean over the frames that have one."""
 
@@ -81,6 +85,7 @@ class Figures:
             avg_ee=mean([frame.n_ee for frame in kept]),
             max_depth_mm=max((frame.max_depth_mm for frame in kept), default=None),
             mean_energy=mean([frame.energy for frame in kept]),
+            mean_collision_error_mm=mean([frame.collision_error_mm for frame in kept]),
             laplacian_mm=mean([frame.laplacian_mm for frame in kept if frame.laplacian_mm is not None]),
         )
 
@@ -198,6 +203,7 @@ class GarmentMetrics:
             n_ee=len(np.unique(pairs[~is_vf])),
             max_depth_mm=1e3 * float(depth.max(initial=0.0)),
             energy=float((depth**2).sum()),
+            collision_error_mm=1e3 * float(depth.sum()),
             mpve_mm=None if errors is None or not kept.any() else 1e3 * float(errors[kept].mean()),
             laplacian_mm=None if laplacians is None or not region.any() else 1e3 * float(laplacians[region].mean()),
         )

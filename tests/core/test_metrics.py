@@ -64,6 +64,7 @@ def test_equals_the_slow_reference(seed: int, n_frames: int) -> None:
                     "avg_vf": len({face for face, is_vf in pairs if is_vf}),
                     "avg_ee": len({face for face, is_vf in pairs if not is_vf}),
                     "mean_energy": sum(float(collisions.depth[i]) ** 2 for i in kept),
+                    "mean_collision_error_mm": 1e3 * sum(float(collisions.depth[i]) for i in kept),
                     "max_depth_mm": 1e3 * max(float(collisions.depth[i]) for i in kept),
                     "laplacian_mm": 1e3
                     * float(np.mean([np.linalg.norm(laplacian(a, i) - laplacian(b, i)) for i in kept if region[i]])),
@@ -116,6 +117,7 @@ def test_nothing_added_and_everything_near() -> None:
         "avg_ee": None,
         "max_depth_mm": None,
         "mean_energy": None,
+        "mean_collision_error_mm": None,
         "laplacian_mm": None,
     }
     vertices, collisions = random_frame(np.random.default_rng(2))
