@@ -87,6 +87,7 @@ def _check(
     if isinstance(scale, Tensor) and scale.shape not in ((), (n,)):
         msg = f"scale must be one number or have the shape ({n},), got {tuple(scale.shape)}"
         raise MeshError(msg)
-    if not (float(margin) >= 0 and max_displacement >= 0):
-        msg = f"margin and max_displacement must not be negative, got {float(margin)} and {max_displacement}"
+    epsilon = float(margin.detach()) if isinstance(margin, Tensor) else margin
+    if not (epsilon >= 0 and max_displacement >= 0):
+        msg = f"margin and max_displacement must not be negative, got {epsilon} and {max_displacement}"
         raise MeshError(msg)
