@@ -22,12 +22,14 @@ from msg_adapters.inputs import INPUT_TYPES, Decoder, Encoder, InputType, decode
 from msg_adapters.joints import SMPL_JOINTS
 from msg_adapters.markers import (
     MARKER_ARRAY,
+    POINTS,
     Marker,
     MarkerArrayEncoder,
     MarkerMesh,
     decode_marker_array,
     encode_delete,
     encode_delete_all,
+    encode_points,
     garment_namespace,
     vertices_from_points,
 )
@@ -38,6 +40,7 @@ __all__ = [
     "DIAGNOSTIC_ARRAY",
     "INPUT_TYPES",
     "MARKER_ARRAY",
+    "POINTS",
     "SMPL_JOINTS",
     "AdapterError",
     "BagError",
@@ -66,6 +69,7 @@ __all__ = [
     "encode_delete",
     "encode_delete_all",
     "encode_diagnostics",
+    "encode_points",
     "encoder_for",
     "garment_namespace",
     "iter_smpl_frames",

@@ -18,7 +18,10 @@ if TYPE_CHECKING:
     from refu_core import SmplFrame
 
 TOPIC = "/ground_truth"
-"""A MarkerArray a frame, stamped as its body parameters are; a marker's `ns` is the garment's name."""
+"""A MarkerArray a frame, stamped as its body parameters are; a marker's `ns` is the garment's name.
+
+Its points are the garment's vertices (type POINTS), or the corners of its triangles (TRIANGLE_LIST).
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +47,7 @@ class GroundTruth:
             for message in reader.messages([TOPIC]):
                 for marker in adapters.decode_marker_array(message.data):
                     if marker.ns in faces:
-                        vertices = adapters.vertices_from_points(marker.points, faces[marker.ns])
+                        vertices = _vertices(marker, faces[marker.ns])
                         if axes == "smpl":
                             vertices = adapters.vertices_smpl_from_ros(vertices)
                         garments[marker.ns][marker.stamp_ns] = np.ascontiguousarray(vertices)
@@ -54,3 +57,13 @@ class GroundTruth:
         """The true garment without the translation [m], shape (V, 3); None where the bag has none at that stamp."""
         vertices = self.garments.get(garment, {}).get(frame.stamp_ns)
         return None if vertices is None else vertices - frame.transl
+
+
+def _vertices(marker: adapters.Marker, faces: NDArray[np.int64]) -> NDArray[np.float64]:
+    if marker.type != adapters.POINTS:
+        return adapters.vertices_from_points(marker.points, faces)
+    count = int(faces.max()) + 1
+    if marker.points.shape != (count, 3):
+        msg = f"{TOPIC}: wanted the {count} vertices of {marker.ns}, got points {marker.points.shape}"
+        raise adapters.DecodeError(msg)
+    return marker.points

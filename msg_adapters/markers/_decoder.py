@@ -20,7 +20,7 @@ _MIN_MARKER_BYTES = 180
 
 @dataclass(frozen=True, eq=False)
 class Marker:
-    """The parts of visualization_msgs/Marker that a triangle list uses."""
+    """The parts of visualization_msgs/Marker that triangle lists and points use."""
 
     stamp_ns: int
     frame_id: str
@@ -36,7 +36,8 @@ class Marker:
     lifetime_ns: int
     frame_locked: bool
     points: NDArray[np.float64]
-    """Triangle corners [m], shape (3F, 3), in the axes of `frame_id`: a read-only view of the message."""
+    """Triangle corners [m], shape (3F, 3), or the points of POINTS, (V, 3), in the axes of `frame_id`: a read-only view
+    of the message."""
     colors: NDArray[np.float32]
     """Colour of each corner, shape (3F, 4), or (0, 4): a read-only view of the message."""
 

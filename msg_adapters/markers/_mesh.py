@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 Rgba = tuple[float, float, float, float]
-_CLOTH: Rgba = (0.55, 0.63, 0.75, 1.0)
+CLOTH: Rgba = (0.55, 0.63, 0.75, 1.0)
 
 
 def garment_namespace(garment: str, person: str = "") -> str:
@@ -34,7 +34,7 @@ class MarkerMesh:
     """Vertex indices of the triangles, shape (F, 3), F > 0."""
     n_vertices: int
     """Number of vertices each frame will bring."""
-    color: Rgba = _CLOTH
+    color: Rgba = CLOTH
     """Red, green, blue, alpha in [0, 1]."""
     id: int = 0
     vertex_colors: bool = False

@@ -14,6 +14,7 @@ from reference import deserialise, header, make, serialise, stamps, texts
 from msg_adapters import (
     DIAGNOSTIC_ARRAY,
     MARKER_ARRAY,
+    POINTS,
     DecodeError,
     DiagnosticStatus,
     EncodeError,
@@ -23,6 +24,7 @@ from msg_adapters import (
     encode_delete,
     encode_delete_all,
     encode_diagnostics,
+    encode_points,
     garment_namespace,
     vertices_from_points,
     vertices_ros_from_smpl,
@@ -33,7 +35,17 @@ TRIANGLE = np.array([[0, 1, 2]])
 
 
 def reference_marker(
-    *, ns: str, marker_id: int, action: int, stamp_ns: int, frame_id: str, color: Any, points: Any, colors: Any
+    *,
+    ns: str,
+    marker_id: int,
+    action: int,
+    stamp_ns: int,
+    frame_id: str,
+    color: Any,
+    points: Any,
+    colors: Any,
+    kind: int = 11,
+    size: float = 1.0,
 ) -> Any:
     """The message as ROS code would build it: one object a point."""
     point, rgba = "geometry_msgs/msg/Point", "std_msgs/msg/ColorRGBA"
@@ -46,10 +58,10 @@ def reference_marker(
         header(stamp_ns, frame_id),
         ns,
         marker_id,
-        11,
+        kind,
         action,
         pose,
-        make("geometry_msgs/msg/Vector3", 1.0, 1.0, 1.0),
+        make("geometry_msgs/msg/Vector3", size, size, size),
         make(rgba, *color),
         make("builtin_interfaces/msg/Duration", 0, 0),
         False,
@@ -129,6 +141,25 @@ def test_bytes_are_the_reference_serialisers(scene: dict[str, Any]) -> None:
         assert (decoded.pose, decoded.scale, decoded.color) == ((0, 0, 0, 0, 0, 0, 1), (1, 1, 1), mesh.color)
         np.testing.assert_array_equal(decoded.points, [(p.x, p.y, p.z) for p in marker.points])
         assert decoded.colors.shape == ((3 * len(mesh.faces), 4) if mesh.vertex_colors else (0, 4))
+
+
+@given(texts, texts, stamps, st.integers(1, 9))
+def test_points(ns: str, frame_id: str, stamp_ns: int, count: int) -> None:
+    points = np.random.default_rng(count).normal(size=(count, 3))
+    color = (0.25, 0.5, 1.0, 1.0)
+    data = encode_points(points, ns=ns, stamp_ns=stamp_ns, frame_id=frame_id, color=color, size=0.01)
+    rest: dict[str, Any] = {"ns": ns, "stamp_ns": stamp_ns, "frame_id": frame_id, "color": color, "colors": []}
+    wanted = reference_marker(marker_id=0, action=0, points=points, kind=8, size=0.01, **rest)
+    assert data == serialise(make(MARKER_ARRAY, [wanted]), MARKER_ARRAY)
+    (marker,) = decode_marker_array(data)
+    assert marker.type == POINTS
+    np.testing.assert_array_equal(marker.points, points)
+
+
+@pytest.mark.parametrize("points", [np.zeros((0, 3)), np.zeros((4, 2)), np.full((2, 3), np.nan)])
+def test_points_that_cant_be_drawn_are_refused(points: Any) -> None:
+    with pytest.raises(EncodeError, match="finite points"):
+        encode_points(points, ns="a", stamp_ns=0)
 
 
 @given(st.lists(st.tuples(texts, st.integers(-(2**31), 2**31 - 1)), max_size=3), texts, stamps)

@@ -1,0 +1,123 @@
+"""Write bags with ground truth from simulated sets: `eval_<garment>` and `eval_<garment>_sequence`.
+
+    python bags/make_evaluation_bags.py data/tshirt-male data/skirt-female       # 96 unseen test samples of each
+    python bags/make_evaluation_bags.py data/tshirt-male-sequences-5             # one unseen test sequence
+
+A bag carries SMPL parameters with the style on /smpl_params and the simulated garment on /ground_truth, so
+`refu replay BAG --garments GARMENT` says how far (MPVE) a prediction is off. The garment is a marker of points: its
+triangles would take four times the room.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from msg_adapters import INPUT_TYPES, MARKER_ARRAY, BagWriter, encode_points, encoder_for, vertices_ros_from_smpl
+from refu_core import SmplFrame, load_body, load_garment
+from refu_core.evaluation.render import GARMENT_COLOURS
+from refu_core.simulation import GarmentDataset, GarmentSequences
+from refu_ros.truth import TOPIC as TRUTH_TOPIC
+
+START_NS = 1_700_000_000_000_000_000
+TOPIC = "/smpl_params"
+SAMPLES_A_SECOND = 2
+TRUTH_EVERY = 3
+"""A sequence's ground truth is in each third frame: 10 a second."""
+MOST_BYTES = 8_000_000
+Moment = tuple[SmplFrame, NDArray[np.float32] | None]
+"""A frame, and its garment at zero translation [m], shape (N, 3), where there is one."""
+
+
+def spread_samples(dataset: GarmentDataset, count: int, seed: int) -> NDArray[np.intp]:
+    """Test samples, recorded and drawn ones and those of all style-shape pairs in their proportions.
+
+    Every so-many-th of an ordered list, from a random one on.
+    """
+    test = np.flatnonzero(dataset.test)
+    recorded = dataset.column("clip")[test] >= 0
+    ordered = test[np.lexsort((dataset.column("slot")[test], dataset.column("pair")[test], recorded))]
+    count = min(count, len(ordered))
+    first = np.random.default_rng(seed).random()
+    return ordered[((np.arange(count) + first) * len(ordered) / count).astype(np.intp)]
+
+
+def sample_moments(dataset: GarmentDataset, count: int, seed: int) -> Iterator[Moment]:
+    """Unrelated frames, each standing on the floor."""
+    body = load_body(load_garment(dataset.card["garment"]).body)
+    quantum = dataset.card["quantum_m"]
+    for k, index in enumerate(spread_samples(dataset, count, seed)):
+        sample = dataset.sample(int(index))
+        posed = body(sample.pose[None], torch.from_numpy(sample.betas)[None]).vertices[0]
+        # As round as the garment's own numbers: what isn't can hardly be compressed.
+        height = np.round(-float(posed[:, 1].min()) / quantum) * quantum
+        stamp = START_NS + k * 10**9 // SAMPLES_A_SECOND
+        frame = SmplFrame(sample.pose, sample.betas, np.array([0, height, 0]), style=sample.style, stamp_ns=stamp)
+        yield frame, sample.vertices
+
+
+def sequence_moments(sequences: GarmentSequences, seed: int) -> Iterator[Moment]:
+    """A test sequence, drawn by the seed; ground truth in every third frame, as far as those are in the set."""
+    test = np.flatnonzero(sequences.test)
+    sequence = sequences.sequence(int(np.random.default_rng(seed).choice(test)))
+    quantum = sequences.card["quantum_m"]
+    for t in range(len(sequence)):
+        transl = np.round(sequence.transl[t].astype(np.float64) / quantum) * quantum
+        stamp = START_NS + round(t * 1e9 / sequence.fps)
+        frame = SmplFrame(sequence.pose[t], sequence.betas, transl, style=sequence.style, stamp_ns=stamp)
+        yield frame, sequence.vertices(t) if t % TRUTH_EVERY == 0 and sequence.kept[t] else None
+
+
+def write_bag(path: Path, garment: str, moments: Iterator[Moment]) -> tuple[int, int]:
+    """One bag as a rosbag2 directory; returns the number of frames and of those with ground truth."""
+    encode = encoder_for("multiarray")
+    frames = truths = 0
+    with BagWriter(path, overwrite=True) as bag:
+        bag.add_topic(TOPIC, INPUT_TYPES["multiarray"])
+        bag.add_topic(TRUTH_TOPIC, MARKER_ARRAY)
+        for frame, vertices in moments:
+            frames += 1
+            bag.write(TOPIC, encode(frame), log_time_ns=frame.stamp_ns)
+            if vertices is not None:
+                truths += 1
+                points = vertices_ros_from_smpl(vertices.astype(np.float64) + frame.transl)
+                color = (*GARMENT_COLOURS[garment], 1.0)
+                data = encode_points(points, ns=garment, stamp_ns=frame.stamp_ns, color=color)
+                bag.write(TRUTH_TOPIC, data, log_time_ns=frame.stamp_ns)
+    return frames, truths
+
+
+def main() -> None:
+    """Write a bag for each set."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument(
+        "sets", nargs="+", type=Path, help="folders that refu simulate made, with or without --sequences"
+    )
+    parser.add_argument("--output", type=Path, default=Path(__file__).parent)
+    parser.add_argument("--count", type=int, default=96, help="test samples of each set (96)")
+    parser.add_argument("--seed", type=int, default=0, help="of their choice (0)")
+    arguments = parser.parse_args()
+    for directory in arguments.sets:
+        card = json.loads((directory / "card.json").read_text())
+        garment = card["garment"]
+        path = arguments.output / f"eval_{garment.replace('-', '_')}"
+        if card["format"] == "refu-sequences-1":
+            path = path.with_name(path.name + "_sequence")
+            moments = sequence_moments(GarmentSequences(directory), arguments.seed)
+        else:
+            moments = sample_moments(GarmentDataset(directory), arguments.count, arguments.seed)
+        frames, truths = write_bag(path, garment, moments)
+        size = sum(file.stat().st_size for file in path.iterdir())
+        print(f"{path}: {frames} frames, {truths} with ground truth, {size / 1e6:.1f} MB")
+        if size > MOST_BYTES:
+            parser.exit(1, f"{path}: larger than {MOST_BYTES / 1e6:g} MB, give a smaller --count\n")
+
+
+if __name__ == "__main__":
+    main()
