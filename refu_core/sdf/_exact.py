@@ -12,10 +12,8 @@ from torch import Tensor
 
 from refu_core._warp import as_warp, torch_stream
 from refu_core.errors import MeshError
-from refu_core.sdf._analytic import Feature, signed_distance
 from refu_core.sdf._kernels import closest_kernel
-from refu_core.sdf._protocol import SdfSample
-from refu_core.sdf._topology import Topology
+from refu_core.sdf._mesh import Found, MeshSdf
 
 REBUILD_DISTANCE = 0.4
 """How far a vertex may move, on a CPU, before the BVH is built anew [m]. A refit costs 0.2 ms and leaves the tree as it
@@ -39,7 +37,7 @@ class ClosestPoints(NamedTuple):
     """+1 outside, -1 inside, shape (N,); +1 where `face` is -1, which says nothing."""
 
 
-class ExactSdf:
+class ExactSdf(MeshSdf):
     """Exact signed distance to a watertight body, on CPU and CUDA with the same kernels (the paper's "Acc. SDF").
 
     The distance is that to the closest triangle. Its sign is that of the angle-weighted pseudo-normal at the closest
@@ -68,40 +66,15 @@ class ExactSdf:
         if sign not in ("normal", "winding"):
             msg = f'sign must be "normal" or "winding", got {sign!r}'
             raise MeshError(msg)
-        topology = Topology.of_closed_mesh(faces.cpu() if isinstance(faces, Tensor) else faces)
-        self.device = torch.device(device)
+        super().__init__(faces, device=device)
         self.sign: Sign = sign
-        self.n_vertices = topology.n_vertices
-        self.faces = torch.as_tensor(topology.faces, device=self.device)
         self._by_winding = sign == "winding"
-        self._topology = [
-            wp.array(array, dtype=wp.int32, device=str(self.device))
-            for array in (topology.across, topology.fan_start, topology.fan_face)
-        ]
         self._rebuild_distance = rebuild_distance
-        self._vertices: Tensor | None = None  # as given, with its graph
-        self._points: Tensor | None = None  # float32 copy that the BVH reads
         self._built_at = torch.empty(0, 3)  # the pose the BVH was built for
         self._mesh: Any = None
 
-    def update(self, vertices: Tensor) -> None:
-        """Takes over a new pose: `vertices` [m], shape (V, 3). The first call builds the BVH, most others refit it.
-
-        Raises `MeshError` for a wrong shape, values that aren't finite, or a body turned inside out.
-        """
-        if vertices.ndim != 2 or vertices.shape[1] != 3 or len(vertices) < self.n_vertices:
-            msg = f"the body's vertices must have the shape ({self.n_vertices}, 3), got {tuple(vertices.shape)}"
-            raise MeshError(msg)
-        _require_finite("the body's vertices", vertices)
-        if self._points is None or len(vertices) != len(self._points):
-            self._points = torch.empty(len(vertices), 3, device=self.device)
-            self._mesh = None
-        self._vertices = vertices
-        self._points.copy_(vertices.detach())
-        if self._mesh is None:
-            self._require_outward()
-            self.rebuild()
-        elif self._has_drifted():
+    def _take_pose(self, *, is_new: bool) -> None:
+        if is_new or self._has_drifted():
             self.rebuild()
         else:
             with torch_stream(self.device):
@@ -109,13 +82,10 @@ class ExactSdf:
 
     def rebuild(self) -> None:
         """Builds the BVH anew for the present pose; answers don't depend on it. Raises `MeshError` before `update`."""
-        points = self._require_update()
-        self._built_at = points.clone()
+        self._built_at = self._require_update().clone()
         with torch_stream(self.device):
             self._mesh = wp.Mesh(
-                as_warp(points, wp.vec3),
-                as_warp(self.faces.view(-1), wp.int32),
-                support_winding_number=self._by_winding,
+                self._points_wp, as_warp(self.faces.view(-1), wp.int32), support_winding_number=self._by_winding
             )
 
     def _has_drifted(self) -> bool:
@@ -124,85 +94,49 @@ class ExactSdf:
             return False
         return float((self._points - self._built_at).abs().max()) > self._rebuild_distance
 
-    def _require_outward(self) -> None:
-        a, b, c = self._require_update().double()[self.faces.long()].unbind(1)
-        if (a * torch.linalg.cross(b, c)).sum() <= 0:
-            msg = "the body's faces must be counter-clockwise seen from outside: this body has a negative volume"
-            raise MeshError(msg)
-
     @property
     def mesh_id(self) -> int:
         """The body as kernels of one's own take it (`wp.uint64`). Raises `MeshError` before the first `update`."""
         self._require_update()
         return int(self._mesh.id)
 
-    def query(self, points: Tensor) -> SdfSample:
-        """Signed distance and gradient at `points` [m], shape (N, 3), differentiable as the class says.
-
-        Raises `MeshError` for a wrong shape, values that aren't finite, or when no body was set with `update`.
-        """
-        face, feature, barycentrics, normal, distance, gradient = self._search(points, math.inf)
-        assert self._vertices is not None  # _search has seen to it
-        tracked = torch.is_grad_enabled() and (points.requires_grad or self._vertices.requires_grad)
-        if not tracked and points.dtype == torch.float32:
-            return SdfSample(distance, gradient, face)
-        corners = self._vertices.to(points)[self.faces.long()[face.long()]]
-        found = Feature(feature, normal.to(points), distance.sign().to(points), barycentrics.to(points))
-        return signed_distance(points, corners, found)._replace(face=face)
-
     def closest(self, points: Tensor, *, max_distance: float = math.inf) -> ClosestPoints:
         """The closest point of the body to each of `points` [m], shape (N, 3), where one is within `max_distance` [m].
 
         Not differentiable; raises as `query`.
         """
-        face, _, barycentrics, _, distance, _ = self._search(points, max_distance)
-        sign = torch.where(distance < 0, -1.0, 1.0)
-        return ClosestPoints(face, barycentrics, distance.abs(), sign)
-
-    def _search(self, points: Tensor, max_distance: float) -> tuple[Tensor, ...]:
-        self._require_update()
-        if points.ndim != 2 or points.shape[1] != 3:
-            msg = f"points must have the shape (N, 3), got {tuple(points.shape)}"
-            raise MeshError(msg)
         if not max_distance > 0:
             msg = f"max_distance must be positive, got {max_distance}"
             raise MeshError(msg)
-        _require_finite("points", points)
-        n = len(points)
-        where = points.detach().to(device=self.device, dtype=torch.float32).contiguous()
-        ints = torch.empty(2, n, dtype=torch.int32, device=self.device)
-        vectors = torch.empty(3, n, 3, device=self.device)
-        distance = torch.empty(n, device=self.device)
-        if n:
-            outputs = [ints[0], ints[1], vectors[0], vectors[1], distance, vectors[2]]
-            kinds = [wp.int32, wp.int32, wp.vec3, wp.vec3, wp.float32, wp.vec3]
+        found = self._search(points, max_distance)
+        sign = torch.where(found.distance < 0, -1.0, 1.0)
+        return ClosestPoints(found.face, found.barycentrics, found.distance.abs(), sign)
+
+    def _search(self, points: Tensor, max_distance: float) -> Found:
+        self._require_update()
+        return self._launch(self._checked(points), max_distance)
+
+    def _find(self, points: Tensor, near: Tensor | None) -> Found:
+        del near  # the tree finds the way by itself
+        return self._launch(points, math.inf)
+
+    def _launch(self, points: Tensor, max_distance: float) -> Found:
+        found = Found.empty(len(points), self.device)
+        if len(points):
             with torch_stream(self.device):
                 wp.launch(
                     closest_kernel,
-                    dim=n,
+                    dim=len(points),
                     inputs=[
                         self._mesh.id,
+                        self._points_wp,
+                        self._faces,
                         *self._topology,
-                        as_warp(where, wp.vec3),
+                        as_warp(points, wp.vec3),
                         min(max_distance, _UNLIMITED),
                         self._by_winding,
                     ],
-                    outputs=[as_warp(tensor, kind) for tensor, kind in zip(outputs, kinds, strict=True)],
+                    outputs=found.as_warp(),
                     device=str(self.device),
                 )
-        return ints[0], ints[1], vectors[0], vectors[1], distance, vectors[2]
-
-    def _require_update(self) -> Tensor:
-        if self._points is None:
-            msg = "no body yet: call update(vertices) before asking for distances"
-            raise MeshError(msg)
-        return self._points
-
-
-def _require_finite(name: str, values: Tensor) -> None:
-    if values.is_cuda and torch.cuda.is_current_stream_capturing():
-        return  # a CUDA graph can't wait for the answer; what it replays was checked where it came in
-    if not bool(torch.isfinite(values).all()):
-        bad = int((~torch.isfinite(values)).any(dim=-1).sum())
-        msg = f"{name} must be finite, got {bad} of {len(values)} with NaN or infinite coordinates"
-        raise MeshError(msg)
+        return found

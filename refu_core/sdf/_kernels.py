@@ -63,29 +63,27 @@ def closest_on_triangle(p: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3):
 
 
 @wp.func
-def corner(mesh: wp.uint64, face: int, k: int):
-    """Vertex number of corner k of a face."""
-    return wp.mesh_get_index(mesh, 3 * face + k)
+def face_normal(face: int, points: wp.array(dtype=wp.vec3), faces: wp.array2d(dtype=int)):
+    a = points[faces[face, 0]]
+    return wp.normalize(wp.cross(points[faces[face, 1]] - a, points[faces[face, 2]] - a))
 
 
 @wp.func
-def face_normal(mesh: wp.uint64, face: int):
-    a = wp.mesh_get_point(mesh, 3 * face)
-    b = wp.mesh_get_point(mesh, 3 * face + 1)
-    c = wp.mesh_get_point(mesh, 3 * face + 2)
-    return wp.normalize(wp.cross(b - a, c - a))
-
-
-@wp.func
-def vertex_normal(mesh: wp.uint64, vertex: int, fan_start: wp.array(dtype=int), fan_face: wp.array(dtype=int)):
+def vertex_normal(
+    vertex: int,
+    points: wp.array(dtype=wp.vec3),
+    faces: wp.array2d(dtype=int),
+    fan_start: wp.array(dtype=int),
+    fan_face: wp.array(dtype=int),
+):
     """Sum of the normals of the faces around a vertex, weighted by their angles there (Baerentzen and Aanaes, 2005)."""
+    here = points[vertex]
     total = wp.vec3(0.0, 0.0, 0.0)
     for i in range(fan_start[vertex], fan_start[vertex + 1]):
         face = fan_face[i]
-        k = wp.where(corner(mesh, face, 1) == vertex, 1, wp.where(corner(mesh, face, 2) == vertex, 2, 0))
-        here = wp.mesh_get_point(mesh, 3 * face + k)
-        to_next = wp.mesh_get_point(mesh, 3 * face + (k + 1) % 3) - here
-        to_last = wp.mesh_get_point(mesh, 3 * face + (k + 2) % 3) - here
+        k = wp.where(faces[face, 1] == vertex, 1, wp.where(faces[face, 2] == vertex, 2, 0))
+        to_next = points[faces[face, (k + 1) % 3]] - here
+        to_last = points[faces[face, (k + 2) % 3]] - here
         normal = wp.cross(to_next, to_last)
         total += wp.atan2(wp.length(normal), wp.dot(to_next, to_last)) * wp.normalize(normal)
     return total
@@ -93,29 +91,53 @@ def vertex_normal(mesh: wp.uint64, vertex: int, fan_start: wp.array(dtype=int), 
 
 @wp.func
 def pseudo_normal(
-    mesh: wp.uint64,
     face: int,
     feature: int,
+    points: wp.array(dtype=wp.vec3),
+    faces: wp.array2d(dtype=int),
     across: wp.array2d(dtype=int),
     fan_start: wp.array(dtype=int),
     fan_face: wp.array(dtype=int),
 ):
     """Unit vector whose side of the closest feature is the outside, for every point that feature is closest to."""
-    normal = face_normal(mesh, face)
+    normal = face_normal(face, points, faces)
     if feature >= EDGE:
-        normal += face_normal(mesh, across[face, feature - EDGE])
+        normal += face_normal(across[face, feature - EDGE], points, faces)
     elif feature >= VERTEX:
-        normal = vertex_normal(mesh, corner(mesh, face, feature - VERTEX), fan_start, fan_face)
+        normal = vertex_normal(faces[face, feature - VERTEX], points, faces, fan_start, fan_face)
     return wp.normalize(normal)
+
+
+@wp.func
+def offset_from(p: wp.vec3, face: int, w: wp.vec3, points: wp.array(dtype=wp.vec3), faces: wp.array2d(dtype=int)):
+    """From a place on a face, given by its barycentrics, to p."""
+    # Relative to a vertex: a difference of nearby positions keeps the digits that absolute ones lose.
+    a = points[faces[face, 0]]
+    return (p - a) - (w[1] * (points[faces[face, 1]] - a) + w[2] * (points[faces[face, 2]] - a))
+
+
+@wp.func
+def distance_and_gradient(offset: wp.vec3, feature: int, normal: wp.vec3, outside: float):
+    """Signed distance and its unit gradient from the closest point's offset, feature and normal, and the side it is."""
+    height = wp.dot(offset, normal)
+    distance = wp.length(offset)
+    if feature == FACE:
+        distance = wp.abs(height)
+    if feature == FACE or distance < ON_SURFACE:
+        # On the surface the two signs may differ by rounding alone, and the way out is the normal.
+        return outside * distance, wp.where(distance > ON_SURFACE and height * outside < 0.0, -normal, normal)
+    return outside * distance, offset * (outside / distance)
 
 
 @wp.kernel(enable_backward=False)
 def closest_kernel(
     mesh: wp.uint64,
+    points: wp.array(dtype=wp.vec3),
+    faces: wp.array2d(dtype=int),
     across: wp.array2d(dtype=int),
     fan_start: wp.array(dtype=int),
     fan_face: wp.array(dtype=int),
-    points: wp.array(dtype=wp.vec3),
+    queries: wp.array(dtype=wp.vec3),
     max_distance: float,
     by_winding: bool,
     # outputs
@@ -128,7 +150,7 @@ def closest_kernel(
 ):
     """Closest point, pseudo-normal there, signed distance and its gradient; face -1 where nothing is close enough."""
     i = wp.tid()
-    p = points[i]
+    p = queries[i]
     if by_winding:
         hit = wp.mesh_query_point_sign_winding_number(mesh, p, max_distance)
     else:
@@ -143,31 +165,17 @@ def closest_kernel(
         return
 
     face = hit.face
-    a = wp.mesh_get_point(mesh, 3 * face)
-    b = wp.mesh_get_point(mesh, 3 * face + 1)
-    c = wp.mesh_get_point(mesh, 3 * face + 2)
-    w, feature = closest_on_triangle(p, a, b, c)
-    normal = pseudo_normal(mesh, face, feature, across, fan_start, fan_face)
-    # Relative to a vertex: a difference of nearby positions keeps the digits that absolute ones lose.
-    offset = (p - a) - (w[1] * (b - a) + w[2] * (c - a))
-    height = wp.dot(offset, normal)
-    outside = wp.where(height < 0.0, -1.0, 1.0)
+    w, feature = closest_on_triangle(p, points[faces[face, 0]], points[faces[face, 1]], points[faces[face, 2]])
+    normal = pseudo_normal(face, feature, points, faces, across, fan_start, fan_face)
+    offset = offset_from(p, face, w, points, faces)
+    outside = wp.where(wp.dot(offset, normal) < 0.0, -1.0, 1.0)
     if by_winding:
         outside = hit.sign
-
-    distance = wp.length(offset)
-    gradient = wp.vec3()
-    if feature == FACE:
-        distance = wp.abs(height)
-    if feature == FACE or distance < ON_SURFACE:
-        # On the surface the two signs may differ by rounding alone, and the way out is the normal.
-        gradient = wp.where(distance > ON_SURFACE and height * outside < 0.0, -normal, normal)
-    else:
-        gradient = offset * (outside / distance)
+    distance, gradient = distance_and_gradient(offset, feature, normal, outside)
 
     out_face[i] = face
     out_feature[i] = feature
     out_barycentrics[i] = w
     out_normal[i] = normal
-    out_distance[i] = outside * distance
+    out_distance[i] = distance
     out_gradient[i] = gradient

@@ -1,0 +1,59 @@
+"""Which face of the body a garment's vertex is near before it is posed: where `ApproxSdf` begins its walk."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from scipy.ndimage import binary_dilation, distance_transform_edt
+from torch import Tensor
+
+from refu_core.sdf._exact import ExactSdf
+
+if TYPE_CHECKING:
+    from refu_core.body import SmplBody
+
+_CELL = 0.02
+"""Edge of the grid's cells [m]: as long as the body's longer edges, so a look-up is one or two faces off."""
+_BAND = 2
+"""Cells around the skin whose closest face is asked for; those farther out take that of the nearest such cell."""
+_ROOM = 0.1
+"""How far the grid reaches beyond the body [m]; places outside of it are looked up at its border."""
+
+
+class RestFaces:
+    """A grid of the rest pose's space that names a near body face, built once a body in a tenth of a second.
+
+    A start need not be the closest face, so one grid of the mean shape does for all shapes: of a garment vertex
+    t(β, γ) + D it wants the place on the mean shape, which is what `GarmentTemplate.rest` adds for β taken off:
+
+        near = rest_faces(unposed - (betas @ garment.shapedirs.T).view(-1, 3))
+        sample = approx_sdf.query(posed, near=near)
+    """
+
+    def __init__(self, body: SmplBody) -> None:
+        """Asks for the closest faces around the mean shape of `body`, on its device."""
+        exact = ExactSdf(body.faces, device=body.device)
+        exact.update(body.v_template.float())
+        low = body.v_template.float().amin(0).cpu() - _ROOM
+        high = body.v_template.float().amax(0).cpu() + _ROOM
+        shape = ((high - low) / _CELL).ceil().long()
+        middles = body.v_template.float()[body.faces].mean(1).cpu()
+        on_skin = np.zeros(shape.tolist(), np.bool_)
+        on_skin[tuple(((middles - low) / _CELL).long().numpy().T)] = True
+        band = binary_dilation(on_skin, np.ones((3, 3, 3), np.bool_), iterations=_BAND)
+        centres = low + (torch.from_numpy(np.argwhere(band)) + 0.5).float() * _CELL
+        face = np.zeros(shape.tolist(), np.int32)
+        face[band] = exact.closest(centres).face.cpu().numpy()
+        nearest = distance_transform_edt(~band, return_distances=False, return_indices=True)
+        self._face = torch.from_numpy(face[tuple(nearest)].reshape(-1)).to(body.device)
+        self._low = low.to(body.device)
+        self._last = (shape - 1).float().to(body.device)
+        self._stride = torch.tensor([shape[1] * shape[2], shape[2], 1], dtype=torch.float32, device=body.device)
+
+    def __call__(self, unposed: Tensor) -> Tensor:
+        """Near body faces, int32 of shape (...,), of places on the mean shape in the rest pose [m], shape (..., 3)."""
+        cell = ((unposed.detach().float() - self._low) / _CELL).floor().clamp_min(0).minimum(self._last)
+        near: Tensor = self._face[(cell @ self._stride).long()]
+        return near

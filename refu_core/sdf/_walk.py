@@ -1,0 +1,245 @@
+# mypy: ignore-errors
+# ruff: noqa: RUF046, SIM108, UP018
+# (Warp reads a kernel's annotations as array types of its own; a type checker can't. A variable that changes in a loop
+# has to be called int or float there.)
+"""Closest point by walking over a posed triangle mesh from faces that are near already: one code for CPU and CUDA.
+
+`links` has a row of eight a face, half a cache line: its vertices, the faces across its edges (0, 1), (1, 2), (2, 0),
+its part, and nothing. `table` has a row of sixteen a cell of space, one cache line: by part the guide closest to the
+cell's centre, and in the last column a bit for each part that has none.
+"""
+
+import warp as wp
+
+from refu_core.sdf._kernels import (
+    EDGE,
+    FACE,
+    VERTEX,
+    closest_on_triangle,
+    distance_and_gradient,
+    offset_from,
+    pseudo_normal,
+)
+
+ROWS = 1 << 13
+COLUMNS = 16
+MAX_PARTS = wp.constant(10)
+ABSENT = wp.constant(15)  # the column of bits
+EMPTY = wp.constant(0x7FFFFFFF)  # also: every part is absent
+
+# An entry is the squared distance of guide and cell's centre in these units a square metre, above the face's bits.
+FACE_BITS = wp.constant(20)
+UNITS = wp.constant(65536.0)
+MAX_FACES = 1 << 20
+# How far a guide is entered: up to this squared distance, in edges of a cell, between its middle and a cell's centre.
+ENTER = wp.constant(2.6)
+
+# No walk takes more steps than this; one over half a body's height does.
+MAX_STEPS = wp.constant(64)
+# A guide is of use if it is no farther than the best distance so far and the way to the part's closest face [m].
+REACH = wp.constant(0.06)
+# A step must shorten the squared distance by more than rounding does, or two faces of one edge take turns.
+SHORTER = wp.constant(1.0 - 1e-6)
+
+
+@wp.func
+def cell_of(p: wp.vec3, cell: float):
+    return wp.vec3i(int(wp.floor(p[0] / cell)), int(wp.floor(p[1] / cell)), int(wp.floor(p[2] / cell)))
+
+
+@wp.func
+def row_of(x: int, y: int, z: int):
+    """Row of a cell. The table repeats itself in space, at distances at which a body has no second of a part."""
+    return ((x & 15) << 9) | ((y & 31) << 4) | (z & 15)
+
+
+@wp.kernel(enable_backward=False)
+def enter_kernel(
+    points: wp.array(dtype=wp.vec3),
+    links: wp.array2d(dtype=int),
+    guides: wp.array(dtype=int),
+    cell: float,
+    depth: float,
+    # outputs
+    table: wp.array2d(dtype=int),
+):
+    """Enters guide faces into the cell of a place below them and into its neighbours."""
+    face = guides[wp.tid()]
+    part = links[face, 6]
+    a = points[links[face, 0]]
+    b = points[links[face, 1]]
+    c = points[links[face, 2]]
+    middle = (a + b + c) / 3.0
+    home = cell_of(middle - depth * wp.normalize(wp.cross(b - a, c - a)), cell)
+    for i in range(27):
+        x = home[0] + i % 3 - 1
+        y = home[1] + (i // 3) % 3 - 1
+        z = home[2] + i // 9 - 1
+        away = middle - cell * wp.vec3(float(x) + 0.5, float(y) + 0.5, float(z) + 0.5)
+        squared = wp.dot(away, away)
+        if squared < ENTER * cell * cell:
+            row = row_of(x, y, z)
+            wp.atomic_min(table, row, part, (int(UNITS * squared) << FACE_BITS) | face)
+            wp.atomic_and(table, row, ABSENT, ~(1 << part))
+
+
+@wp.func
+def walk_under(p: wp.vec3, start: int, barred: int, points: wp.array(dtype=wp.vec3), links: wp.array2d(dtype=int)):
+    """The face that p is above or below, each step over the edge that p is most beyond; -1 for one of part `barred`.
+
+    Also the weights of its vertices 1 and 2 where p is, and its normal, of twice its area; negative weights say that p
+    is above or below none of the faces where the walk ended.
+    """
+    face = start
+    last = int(-1)
+    normal = wp.vec3()
+    weight_b = float(0.0)
+    weight_c = float(0.0)
+    for _step in range(MAX_STEPS):
+        a = points[links[face, 0]]
+        ab = points[links[face, 1]] - a
+        ac = points[links[face, 2]] - a
+        normal = wp.cross(ab, ac)
+        around = wp.cross(p - a, normal)
+        area = wp.dot(normal, normal)
+        weight_b = -wp.dot(around, ac)
+        weight_c = wp.dot(around, ab)
+        weight_a = area - weight_b - weight_c
+        lowest = wp.min(weight_a, wp.min(weight_b, weight_c))
+        if lowest >= 0.0 and area > 0.0:
+            break
+        edge = wp.where(lowest == weight_a, 1, wp.where(lowest == weight_b, 2, 0))
+        ahead = links[face, 3 + edge]
+        weight_b = -1.0
+        if ahead == last:
+            break
+        last = face
+        face = ahead
+        if links[face, 6] == barred:
+            return -1, weight_b, weight_c, normal
+    return face, weight_b, weight_c, normal
+
+
+@wp.func
+def descend(
+    p: wp.vec3,
+    start: int,
+    points: wp.array(dtype=wp.vec3),
+    faces: wp.array2d(dtype=int),
+    across: wp.array2d(dtype=int),
+    fan_start: wp.array(dtype=int),
+    fan_face: wp.array(dtype=int),
+):
+    """The face, and the place on it, from which no neighbouring face is closer to p."""
+    face = start
+    w, feature = closest_on_triangle(p, points[faces[face, 0]], points[faces[face, 1]], points[faces[face, 2]])
+    offset = offset_from(p, face, w, points, faces)
+    squared = wp.dot(offset, offset)
+    for _step in range(MAX_STEPS):
+        if feature == FACE:
+            break
+        here = face
+        first = int(0)
+        n = int(1)
+        if feature < EDGE:
+            vertex = faces[here, feature - VERTEX]
+            first = fan_start[vertex]
+            n = fan_start[vertex + 1] - first
+        edge = feature - EDGE
+        for k in range(n):
+            ahead = int(0)
+            if edge >= 0:
+                ahead = across[here, edge]
+            else:
+                ahead = fan_face[first + k]
+            w_, feature_ = closest_on_triangle(
+                p, points[faces[ahead, 0]], points[faces[ahead, 1]], points[faces[ahead, 2]]
+            )
+            offset = offset_from(p, ahead, w_, points, faces)
+            squared_ = wp.dot(offset, offset)
+            if squared_ < SHORTER * squared:
+                face = ahead
+                w = w_
+                feature = feature_
+                squared = squared_
+        if face == here:
+            break
+    return face, w, feature, squared
+
+
+@wp.kernel(enable_backward=False)
+def walk_kernel(
+    points: wp.array(dtype=wp.vec3),
+    faces: wp.array2d(dtype=int),
+    across: wp.array2d(dtype=int),
+    fan_start: wp.array(dtype=int),
+    fan_face: wp.array(dtype=int),
+    links: wp.array2d(dtype=int),
+    table: wp.array2d(dtype=int),
+    cell: float,
+    queries: wp.array(dtype=wp.vec3),
+    near: wp.array(dtype=int),
+    # outputs
+    out_face: wp.array(dtype=int),
+    out_feature: wp.array(dtype=int),
+    out_barycentrics: wp.array(dtype=wp.vec3),
+    out_normal: wp.array(dtype=wp.vec3),
+    out_distance: wp.array(dtype=float),
+    out_gradient: wp.array(dtype=wp.vec3),
+):
+    """The closest of the points that walks from `near` and from other parts' guides end at, as `closest_kernel`'s."""
+    i = wp.tid()
+    p = queries[i]
+    home = cell_of(p, cell)
+    row = row_of(home[0], home[1], home[2])
+    absent = int(table[row, ABSENT])
+    face = int(-1)
+    feature = int(FACE)
+    w = wp.vec3()
+    squared = float(1.0e12)
+    distance = float(1.0e6)
+    own = int(-1)
+    # -1 is the walk from `near`. One loop with one call of each function: so a compiler puts them in place.
+    for part in range(-1, MAX_PARTS):
+        start = int(near[i])
+        walks = bool(part < 0)
+        if part >= 0 and (absent >> part) & 1 == 0 and part != own:
+            start = table[row, part] & ((1 << FACE_BITS) - 1)
+            walks = wp.length(points[links[start, 0]] - p) < distance + REACH
+        if walks:
+            start, weight_b, weight_c, normal = walk_under(p, start, own, points, links)
+            if start >= 0 and start != face:
+                face_ = start
+                feature_ = int(FACE)
+                w_ = wp.vec3()
+                squared_ = float(0.0)
+                if weight_b >= 0.0:
+                    area = wp.dot(normal, normal)
+                    height = wp.dot(p - points[links[start, 0]], normal)
+                    squared_ = height * height / area
+                    weight_b = weight_b / area
+                    weight_c = weight_c / area
+                    w_ = wp.vec3(1.0 - weight_b - weight_c, weight_b, weight_c)
+                else:
+                    face_, w_, feature_, squared_ = descend(p, start, points, faces, across, fan_start, fan_face)
+                if squared_ < squared:
+                    face = face_
+                    w = w_
+                    feature = feature_
+                    squared = squared_
+                    distance = wp.sqrt(squared)
+        if part < 0:
+            own = links[face, 6]
+            if (absent | (1 << own)) == EMPTY:
+                break
+
+    normal = pseudo_normal(face, feature, points, faces, across, fan_start, fan_face)
+    offset = offset_from(p, face, w, points, faces)
+    outside = wp.where(wp.dot(offset, normal) < 0.0, -1.0, 1.0)
+    distance_, gradient = distance_and_gradient(offset, feature, normal, outside)
+    out_face[i] = face
+    out_feature[i] = feature
+    out_barycentrics[i] = w
+    out_normal[i] = normal
+    out_distance[i] = distance_
+    out_gradient[i] = gradient
