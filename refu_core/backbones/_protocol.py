@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple, Protocol
 
-import torch
 from torch import Tensor
-
-from refu_core.errors import WeightsError
 
 
 class Prediction(NamedTuple):
@@ -33,18 +30,3 @@ class Skinned:
     def __call__(self, betas: Tensor, pose: Tensor, style: Tensor | None) -> Prediction:  # noqa: ARG002
         """Predicts no displacement."""
         return Prediction(None, None)
-
-
-BACKBONES: tuple[str, ...] = ("skinned",)
-
-
-def load_backbone(name: str, garment: str, *, device: str | torch.device = "cpu") -> Backbone:  # noqa: ARG001
-    """The backbone `name` of a garment.
-
-    Raises:
-        WeightsError: there is no backbone of that name.
-    """
-    if name == "skinned":
-        return Skinned()
-    msg = f"no backbone {name!r} for {garment}: wanted {' or '.join(BACKBONES)}"
-    raise WeightsError(msg)

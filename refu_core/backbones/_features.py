@@ -1,0 +1,82 @@
+"""What a backbone sees of a body: pose features of the joints that move a garment, and style and shape."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from refu_core.body import rotvec_to_rotmat
+from refu_core.errors import RefuError
+from refu_core.frames import N_BETAS, N_STYLES
+
+N_STYLE_SHAPE = N_BETAS + N_STYLES
+"""Width of (β, γ)."""
+
+GARMENT_JOINTS: dict[str, tuple[int, ...]] = {
+    "shirt-male": (0, 1, 2, 3, 6, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21),
+    "tshirt-male": (0, 1, 2, 3, 6, 9, 12, 13, 14, 16, 17, 18, 19),
+    "short-pant-male": (0, 1, 2, 4, 5),
+    "skirt-female": (0, 1, 2, 4, 5),
+}
+"""Joints that a garment can feel (Patel et al. 2020); the others would only be a source of overfitting."""
+
+ENCODINGS: tuple[str, ...] = ("matrix", "rotvec")
+
+
+def up_in_root(pose: Tensor) -> Tensor:
+    """World up as the root sees it, unit, shape (B, 3), of poses (B, 24, 3) [rad].
+
+    All that cloth can know of the root's rotation: it tilts gravity, and the heading changes nothing.
+    """
+    return rotvec_to_rotmat(pose[:, 0])[:, 1]
+
+
+def tilt_rotvec(up: Tensor) -> Tensor:
+    """The smallest rotation that turns `up` to +y, as a rotation vector [rad]; both of the shape (B, 3).
+
+    This is a root's rotation without its heading. Half a turn has no axis of its own: any in the plane will do there.
+    """
+    x, y, z = up.unbind(-1)
+    sine = (x * x + z * z).clamp_min(1e-12).sqrt()
+    factor = torch.where(sine > 1e-5, torch.atan2(sine, y) / sine, torch.ones_like(sine))
+    return torch.stack((-z * factor, torch.zeros_like(x), x * factor), -1)
+
+
+class PoseFeatures(nn.Module):
+    """θ as a network's input.
+
+    `matrix`: world up in the root's frame, then R - 1 of every other joint of `joints`, nine numbers each: free of the
+    jumps of rotation vectors and, with few samples, the representation that generalises best (docs/training.md).
+    `rotvec`: the paper's 72 numbers, heading removed from the root, joints that aren't in `joints` zeroed.
+    """
+
+    def __init__(self, joints: tuple[int, ...], encoding: str) -> None:
+        super().__init__()
+        if encoding not in ENCODINGS:
+            msg = f"no pose encoding {encoding!r}: wanted {' or '.join(ENCODINGS)}"
+            raise RefuError(msg)
+        self.encoding = encoding
+        self.joints = tuple(j for j in joints if j != 0)
+        self.size = 3 + 9 * len(self.joints) if encoding == "matrix" else 72
+        keep = torch.zeros(24, 1)
+        keep[list(joints)] = 1.0
+        self.register_buffer("_index", torch.tensor((0, *self.joints)), persistent=False)
+        self.register_buffer("_keep", keep, persistent=False)
+        self._index: Tensor
+        self._keep: Tensor
+
+    def forward(self, pose: Tensor) -> Tensor:
+        """Features, shape (B, size), of poses (B, 24, 3) [rad]."""
+        if self.encoding == "rotvec":
+            whole = torch.cat((tilt_rotvec(up_in_root(pose))[:, None], pose[:, 1:]), 1)
+            return (whole * self._keep).flatten(1)
+        rotations = rotvec_to_rotmat(pose[:, self._index])  # the root's first
+        eye = torch.eye(3, dtype=pose.dtype, device=pose.device)
+        return torch.cat((rotations[:, 0, 1], (rotations[:, 1:] - eye).flatten(1)), 1)
+
+
+def style_shape(betas: Tensor, style: Tensor | None) -> Tensor:
+    """(β, γ) side by side, shape (B, 14), of betas (B, 10) and style (B, 4); no style is the mean style."""
+    if style is None:
+        style = betas.new_zeros(len(betas), N_STYLES)
+    return torch.cat((betas, style.expand(len(betas), -1)), 1)

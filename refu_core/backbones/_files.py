@@ -1,0 +1,157 @@
+"""Backbones on disk: `<name>-<mode>` and, shared by all with low-rank heads, `basis`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from refu_core.backbones._decoder import BasisDecoder
+from refu_core.backbones._presets import backbone_name, build_backbone, config_from_card, config_to_card
+from refu_core.backbones._protocol import Backbone, Skinned
+from refu_core.errors import WeightsError
+from refu_core.garments import GarmentTemplate, load_garment
+from refu_core.weights import Weights, load_weights, save_weights, shipped_weights
+
+BACKBONES: tuple[str, ...] = ("skinned", "tailornet", "mlp", "gcnn")
+MODES: tuple[str, ...] = ("none", "approx", "accurate", "hybrid")
+"""What a backbone was trained with: nothing, or ReFU with one SDF or the other (paper, Sec. 4.1)."""
+
+_PREFIX = "backbone."
+
+
+def save_basis(folder: Path, basis: BasisDecoder, card: Mapping[str, Any]) -> Path:
+    """Writes the output basis of a garment, `folder`/basis.
+
+    Raises:
+        WeightsError: it isn't finite, or can't be written.
+    """
+    return save_weights(folder / "basis", basis.tensors(), {**card, "rank": basis.size})
+
+
+def load_basis(folder: Path, *, expect: Mapping[str, Any]) -> tuple[BasisDecoder, str]:
+    """The output basis of a garment and its hash.
+
+    Raises:
+        WeightsError: missing, damaged, or not as expected (`refu_core.weights.load_weights`).
+    """
+    weights = load_weights(folder / "basis", expect=expect)
+    basis = BasisDecoder(_tensor(weights, "mean"), _tensor(weights, "components"))
+    return basis, str(weights.card["sha256"])
+
+
+def save_backbone(
+    stem: Path,
+    backbone: nn.Module,
+    card: Mapping[str, Any],
+    *,
+    others: Mapping[str, Tensor] | None = None,
+    half: bool = True,
+) -> Path:
+    """Writes a backbone, without its basis, and its card.
+
+    Args:
+        stem: path without suffix; the basis of a low-rank head lies in the same folder.
+        backbone: a `TailorNet`, `Mlp` or `Gcnn`.
+        card: `garment`, `body_fingerprint`, and whatever else is known.
+        others: tensors that belong with it, the ReFU layer's for instance; their names start with another prefix.
+        half: store the parameters in half precision.
+
+    Raises:
+        WeightsError: the weights aren't finite, can't be written, or the basis in the folder is another one.
+    """
+    parameters = dict(backbone.named_parameters())
+    state = {k: v for k, v in backbone.state_dict().items() if not k.startswith("decoder.")}
+    # Buffers (pivots, standardisation) stay exact: the kernel of the mixture is narrow.
+    tensors = {_PREFIX + k: v.half() if half and k in parameters else v for k, v in state.items()}
+    config = getattr(backbone, "config", None)
+    described: dict[str, Any] = {"backbone": backbone_name(backbone), "config": config_to_card(config)}  # type: ignore[arg-type]
+    decoder = getattr(backbone, "decoder", None)
+    if isinstance(decoder, BasisDecoder):
+        stored, described["basis_sha256"] = load_basis(stem.parent, expect={"garment": card["garment"]})
+        if not torch.equal(stored.components, decoder.components.cpu()):
+            msg = f"{stem}: the basis in this folder isn't the one that the backbone was trained with; use a new folder"
+            raise WeightsError(msg)
+    return save_weights(stem, {**tensors, **(others or {})}, {**described, **card})
+
+
+def read_backbone(
+    stem: Path, garment: GarmentTemplate, *, expect: Mapping[str, Any], device: str | torch.device = "cpu"
+) -> nn.Module:
+    """Reads what `save_backbone` wrote, in float32 and ready for use (`eval`).
+
+    Raises:
+        WeightsError: missing, damaged, not as expected, or of another version.
+    """
+    weights = load_weights(stem, expect=expect)
+    config = config_from_card(str(weights.card.get("backbone")), weights.card.get("config") or {})
+    basis = None
+    if "basis_sha256" in weights.card:
+        basis, digest = load_basis(stem.parent, expect=expect)
+        if digest != weights.card["basis_sha256"]:
+            msg = f"{weights.path}: made for another basis than the one beside it; get both files again"
+            raise WeightsError(msg)
+    tensors = {k[len(_PREFIX) :]: v for k, v in weights.tensors.items() if k.startswith(_PREFIX)}
+    module = build_backbone(config, garment, basis=basis, pivots=tensors.get("pivots"))
+    own = {k for k in module.state_dict() if not k.startswith("decoder.")}
+    try:
+        if own != set(tensors):
+            msg = f"wanted {len(own)} tensors, got {len(tensors)}, {len(own ^ set(tensors))} of other names"
+            raise RuntimeError(msg)
+        module.load_state_dict(tensors, strict=False)
+    except RuntimeError as error:
+        msg = f"{weights.path}: doesn't fit {garment.name}: {error}; train it again"
+        raise WeightsError(msg) from error
+    return module.float().to(device).eval()
+
+
+def load_backbone(
+    name: str,
+    garment: str | GarmentTemplate,
+    *,
+    mode: str = "none",
+    body_fingerprint: str | None = None,
+    folder: Path | None = None,
+    device: str | torch.device = "cpu",
+) -> Backbone:
+    """The trained backbone `name` of a garment.
+
+    Args:
+        name: `skinned`, `tailornet`, `mlp` or `gcnn`.
+        garment: name of a built-in garment, or a template.
+        mode: what it was trained with: `none`, `approx`, `accurate` or `hybrid`.
+        body_fingerprint: `SmplBody.fingerprint` of the body that wears it; weights for another body are refused.
+        folder: where its files lie; the shipped weights if not given.
+        device: where it computes.
+
+    Raises:
+        GarmentError: there is no such garment.
+        WeightsError: there is no such backbone or mode, no weights of it, or they are for another body.
+    """
+    if name not in BACKBONES:
+        msg = f"no backbone {name!r}: wanted {', '.join(BACKBONES)}"
+        raise WeightsError(msg)
+    if mode not in MODES:
+        msg = f"no mode {mode!r} of a backbone: wanted {', '.join(MODES)}"
+        raise WeightsError(msg)
+    if name == "skinned":
+        return Skinned()
+    template = load_garment(garment) if isinstance(garment, str) else garment
+    folder = shipped_weights(template.name) if folder is None else folder
+    expect = {"garment": template.name}
+    if body_fingerprint is not None:
+        expect["body_fingerprint"] = body_fingerprint
+    module = read_backbone(folder / f"{name}-{mode}", template.to(device="cpu"), expect=expect, device=device)
+    module.requires_grad_(False)
+    backbone: Backbone = module
+    return backbone
+
+
+def _tensor(weights: Weights, name: str) -> Tensor:
+    if name not in weights.tensors:
+        msg = f"{weights.path}: has no {name}: not an output basis"
+        raise WeightsError(msg)
+    return weights.tensors[name].float()

@@ -1,0 +1,57 @@
+"""Frequency division (Patel et al. 2020): what Laplacian smoothing leaves of a garment, and what it takes."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import sparse
+from torch import Tensor
+
+from refu_core.garments import GarmentTemplate
+
+STEPS = 80
+STEP_SIZE = 0.15
+
+
+class LaplacianSmoothing:
+    """Moves vertices towards the mean of their neighbours; those at a border along the border only.
+
+    All garments are smoothed unposed, the skirt too, which the original smooths posed: so smoothing is one linear map
+    of displacements and can be applied to a basis of them instead of to every sample.
+    """
+
+    def __init__(self, garment: GarmentTemplate, *, steps: int = STEPS, step_size: float = STEP_SIZE) -> None:
+        self._map = _one_step(garment.faces.cpu().numpy(), garment.n_vertices, step_size)
+        self._steps = steps
+
+    def __call__(self, vertices: Tensor) -> Tensor:
+        """Smoothed vertices [m] of the same shape (..., V, 3)."""
+        columns = vertices.detach().cpu().movedim(-2, 0)
+        return self._apply(self._map, columns).movedim(0, -2).to(vertices)
+
+    def transposed(self, components: Tensor) -> Tensor:
+        """`components` @ S of the same shape (R, 3 V), where S smooths: (components @ S) @ x = components @ (S x)."""
+        columns = components.detach().cpu().view(len(components), -1, 3).movedim(-2, 0)
+        return self._apply(self._map.T.tocsr(), columns).movedim(0, -2).reshape(components.shape).to(components)
+
+    def _apply(self, matrix: sparse.csr_array, columns: Tensor) -> Tensor:
+        x = columns.double().numpy().reshape(len(columns), -1)
+        for _ in range(self._steps):
+            x = matrix @ x
+        return torch.as_tensor(x).view(columns.shape)
+
+
+def _one_step(faces: NDArray[np.int64], n_vertices: int, step_size: float) -> sparse.csr_array:
+    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1)
+    edges, count = np.unique(edges, axis=0, return_counts=True)
+    border = np.zeros(n_vertices, bool)
+    border[edges[count == 1]] = True
+    ends = np.concatenate((edges, edges[:, ::-1]))
+    along = np.concatenate((count, count)) == 1
+    ends = ends[along | ~border[ends[:, 0]]]  # row: the vertex that moves, column: a neighbour that it listens to
+    links = sparse.csr_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(n_vertices, n_vertices))
+    mean = sparse.diags_array(1 / np.maximum(links.sum(1), 1)) @ links
+    eye = sparse.eye_array(n_vertices)
+    listens = sparse.diags_array((links.sum(1) > 0).astype(float))
+    return sparse.csr_array(eye + step_size * (mean - listens))

@@ -1,0 +1,119 @@
+"""Mesh convolutions whose coefficients vary from vertex to vertex (Zhou et al. 2020; paper, supplement, "GCNN")."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from refu_core.backbones._features import N_STYLE_SHAPE, PoseFeatures, style_shape
+from refu_core.backbones._graph import MeshGraph, Neighbours
+from refu_core.backbones._perceptron import Perceptron
+from refu_core.backbones._protocol import Prediction
+from refu_core.garments import GarmentTemplate
+
+
+@dataclass(frozen=True)
+class GcnnConfig:
+    """Sizes of the network; the defaults, the preset `realtime`, are what a CPU trains in minutes."""
+
+    joints: tuple[int, ...]
+    encoding: str = "matrix"
+    hidden: tuple[int, ...] = (256, 256)
+    """Hidden layers of the perceptron before the mesh."""
+    channels: tuple[int, ...] = (9, 32, 16, 16)
+    """Of the coarsest graph first; every layer but the last one goes up a level, to three channels at the end."""
+    bases: int = 8
+    """M, the number of shared weight matrices that a vertex' own coefficients mix."""
+    residual: float = 0.5
+    """r, the share of the residual path."""
+    stride: int = 2
+    activation: str = "silu"
+    dropout: float = 0.1
+
+    @classmethod
+    def paper(cls, joints: tuple[int, ...]) -> GcnnConfig:
+        """The decoder half of the original's `10_conv_res`."""
+        return cls(joints, "rotvec", (1024, 1024), (9, 128, 64, 32), bases=17, activation="relu", dropout=0.2)
+
+
+class UpConv(nn.Module):
+    """vcConv from a coarse graph to a finer one: y_i = Σ_{j ∈ N(i)} (Σ_m α_ijm B_m) x_j + b, with a residual path.
+
+    The residual is vdUnpool, Σ_j |ρ_ij| x_j / Σ_j |ρ_ij|, and the sum y = √(1 - r) conv + √r residual.
+    """
+
+    def __init__(self, up: Neighbours, inputs: int, outputs: int, *, bases: int, residual: float) -> None:
+        super().__init__()
+        self.residual = residual
+        n_out, n = up.index.shape
+        self.register_buffer("index", torch.as_tensor(up.index), persistent=False)
+        self.register_buffer("valid", torch.as_tensor(up.valid, dtype=torch.float32), persistent=False)
+        self.index: Tensor
+        self.valid: Tensor
+        self.coefficients = nn.Parameter(torch.randn(n_out, n, bases) / (up.mean_count * bases))
+        self.basis = nn.Parameter(torch.empty(bases, inputs, outputs))
+        nn.init.normal_(self.basis, std=math.sqrt(up.mean_count * bases / inputs))  # keeps the size of the signal
+        self.bias = nn.Parameter(torch.zeros(outputs))
+        self.density = nn.Parameter(torch.ones(n_out, n))
+        self.across = nn.Linear(inputs, outputs, bias=False) if inputs != outputs else nn.Identity()
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Shape (B, V_coarse, I) -> (B, V_fine, O)."""
+        alpha = self.coefficients * self.valid[..., None]
+        bases, inputs, outputs = self.basis.shape
+        if outputs < inputs:  # the smaller array is the one that is gathered over the neighbours
+            mixed = torch.einsum("bvi,mio->bvmo", x, self.basis)[:, self.index]  # (B, V_fine, n, M, O)
+            conv = torch.einsum("bvnmo,vnm->bvo", mixed, alpha)
+        else:
+            gathered = torch.einsum("bvni,vnm->bvmi", x[:, self.index], alpha)
+            conv = gathered.flatten(2) @ self.basis.reshape(bases * inputs, outputs)
+        rho = self.density.abs() * self.valid
+        rho = rho / rho.sum(1, keepdim=True).clamp_min(1e-6)
+        passed = torch.einsum("bvno,vn->bvo", self.across(x)[:, self.index], rho)
+        return math.sqrt(1 - self.residual) * (conv + self.bias) + math.sqrt(self.residual) * passed
+
+
+class Gcnn(nn.Module):
+    """A mesh decoder conditioned on (θ, β, γ).
+
+    The original is an autoencoder of meshes, and there is no mesh to encode at run time: how (θ, β, γ) enter is this
+    project's choice. A perceptron fills the latent of the coarsest graph, which is also the global feature z of ReFU.
+    """
+
+    def __init__(self, config: GcnnConfig, garment: GarmentTemplate) -> None:
+        super().__init__()
+        self.config = config
+        self.n_vertices = garment.n_vertices
+        faces = garment.faces.cpu().numpy()
+        graph = MeshGraph.of(faces, garment.n_vertices, levels=len(config.channels), stride=config.stride)
+        self.features = PoseFeatures(config.joints, config.encoding)
+        self.feature_size = graph.sizes[-1] * config.channels[0]
+        """M, the size of z."""
+        self.head = Perceptron(
+            self.features.size + N_STYLE_SHAPE,
+            config.hidden,
+            self.feature_size,
+            activation=config.activation,
+            dropout=config.dropout,
+        )
+        ends = (*config.channels[1:], 3)
+        self.layers = nn.ModuleList(
+            UpConv(up, a, b, bases=config.bases, residual=config.residual)
+            for up, a, b in zip(reversed(graph.ups), config.channels, ends, strict=True)
+        )
+        self.register_buffer("mean", torch.zeros(garment.n_vertices, 3))
+        self.register_buffer("scale", torch.tensor(0.02))
+        self.mean: Tensor
+        self.scale: Tensor
+
+    def forward(self, betas: Tensor, pose: Tensor, style: Tensor | None) -> Prediction:
+        """Predicts for betas (B, 10), pose (B, 24, 3) [rad] and style (B, 4)."""
+        z = self.head(torch.cat((self.features(pose), style_shape(betas, style)), 1))
+        x = z.view(len(z), -1, self.config.channels[0])
+        for layer in self.layers[:-1]:
+            x = functional.elu(layer(x))
+        return Prediction(self.mean + self.scale * self.layers[-1](x), z)

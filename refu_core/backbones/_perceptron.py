@@ -1,0 +1,101 @@
+"""Perceptrons: one, and several of the same size side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+ACTIVATIONS = {"relu": functional.relu, "silu": functional.silu}
+
+
+class Perceptron(nn.Module):
+    """Linear layers with an activation and dropout between them, on standardised input."""
+
+    def __init__(
+        self, inputs: int, hidden: Sequence[int], outputs: int, *, activation: str = "relu", dropout: float = 0.0
+    ) -> None:
+        super().__init__()
+        sizes = (inputs, *hidden, outputs)
+        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(sizes))
+        self.activation = ACTIVATIONS[activation]
+        self.dropout = dropout
+        self.register_buffer("shift", torch.zeros(inputs))
+        self.register_buffer("scale", torch.ones(inputs))
+        self.shift: Tensor
+        self.scale: Tensor
+
+    def standardise(self, inputs: Tensor) -> None:
+        """Takes shift and scale from the inputs of the training set, shape (N, I)."""
+        _standardise(self.shift, self.scale, inputs)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Shape (B, I) -> (B, O)."""
+        x = (x - self.shift) * self.scale
+        for layer in self.layers[:-1]:
+            x = functional.dropout(self.activation(layer(x)), self.dropout, self.training)
+        out: Tensor = self.layers[-1](x)
+        return out
+
+
+class StackedPerceptrons(nn.Module):
+    """K perceptrons of one shape on one input, and their weighted sum."""
+
+    def __init__(
+        self,
+        count: int,
+        inputs: int,
+        hidden: Sequence[int],
+        outputs: int,
+        *,
+        activation: str = "relu",
+        dropout: float = 0.0,
+    ) -> None:
+        super().__init__()
+        self.activation = ACTIVATIONS[activation]
+        self.dropout = dropout
+        sizes = (inputs, *hidden, outputs)
+        self.weights = nn.ParameterList()
+        self.biases = nn.ParameterList()
+        for a, b in pairwise(sizes):
+            bound = a**-0.5  # as nn.Linear
+            self.weights.append(nn.Parameter(torch.empty(count, a, b).uniform_(-bound, bound)))
+            self.biases.append(nn.Parameter(torch.empty(count, b).uniform_(-bound, bound)))
+        self.register_buffer("shift", torch.zeros(inputs))
+        self.register_buffer("scale", torch.ones(inputs))
+        self.shift: Tensor
+        self.scale: Tensor
+
+    def standardise(self, inputs: Tensor) -> None:
+        """Takes shift and scale from the inputs of the training set, shape (N, I)."""
+        _standardise(self.shift, self.scale, inputs)
+
+    def select(self, active: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """Weights (A, I, O) and biases (A, O) of the perceptrons `active` (A,), layer by layer: copies."""
+        return [(w[active], b[active]) for w, b in zip(self.weights, self.biases, strict=True)]
+
+    def forward(self, x: Tensor, mixture: Tensor, selected: list[tuple[Tensor, Tensor]] | None = None) -> Tensor:
+        """Σ_k mixture[:, k] · perceptron_k(x), shape (B, O), of x (B, I) and mixture (B, K).
+
+        With `selected`, the perceptrons are those that `select` gave, and the mixture's columns are theirs.
+        """
+        layers = selected or list(zip(self.weights, self.biases, strict=True))
+        h = ((x - self.shift) * self.scale).expand(mixture.shape[1], -1, -1)  # (K, B, I)
+        for weight, bias in layers[:-1]:
+            h = functional.dropout(
+                self.activation(torch.baddbmm(bias[:, None], h, weight)), self.dropout, self.training
+            )
+        weight, bias = layers[-1]
+        # Mixing before the last layer makes one product of it, and no (K, B, O) array, large with dense heads.
+        mixed = (h * mixture.T[..., None]).transpose(0, 1).flatten(1)  # (B, K * H)
+        return torch.addmm(mixture @ bias, mixed, weight.flatten(0, 1))
+
+
+def _standardise(shift: Tensor, scale: Tensor, inputs: Tensor) -> None:
+    with torch.no_grad():
+        shift.copy_(inputs.mean(0))
+        # What hardly varies in the training set says little: it isn't blown up to the others' size.
+        scale.copy_(1 / (inputs.std(0) + 1e-3))

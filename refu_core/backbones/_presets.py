@@ -1,0 +1,108 @@
+"""Backbones by name and preset, untrained."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+from torch import Tensor, nn
+
+from refu_core.backbones._decoder import BasisDecoder, Decoder, DenseDecoder
+from refu_core.backbones._features import GARMENT_JOINTS
+from refu_core.backbones._gcnn import Gcnn, GcnnConfig
+from refu_core.backbones._mlp import Mlp, MlpConfig
+from refu_core.backbones._tailornet import TailorNet, TailorNetConfig
+from refu_core.errors import WeightsError
+from refu_core.garments import GarmentTemplate
+
+PRESETS: tuple[str, ...] = ("realtime", "paper")
+"""`realtime` has low-rank heads and sizes for a CPU, `paper` the sizes of the paper."""
+
+_CONFIGS: dict[str, type[TailorNetConfig] | type[MlpConfig] | type[GcnnConfig]] = {
+    "tailornet": TailorNetConfig,
+    "mlp": MlpConfig,
+    "gcnn": GcnnConfig,
+}
+TRAINABLE: tuple[str, ...] = tuple(_CONFIGS)
+"""Backbones that have weights."""
+
+BackboneConfig = TailorNetConfig | MlpConfig | GcnnConfig
+
+
+def backbone_config(name: str, garment: str, *, preset: str = "realtime") -> BackboneConfig:
+    """The configuration of the backbone `name` for a garment.
+
+    A garment that isn't built in gets the joints of the shirt, which has the most.
+
+    Raises:
+        WeightsError: no such backbone, or no such preset.
+    """
+    if name not in _CONFIGS:
+        msg = f"no backbone {name!r} that could be trained: wanted {', '.join(TRAINABLE)}"
+        raise WeightsError(msg)
+    if preset not in PRESETS:
+        msg = f"no preset {preset!r}: wanted {' or '.join(PRESETS)}"
+        raise WeightsError(msg)
+    joints = GARMENT_JOINTS.get(garment, GARMENT_JOINTS["shirt-male"])
+    config = _CONFIGS[name]
+    return config.paper(joints) if preset == "paper" else config(joints)
+
+
+def uses_basis(config: BackboneConfig, preset: str) -> bool:
+    """Whether the backbone's head is low-rank, that is needs an output basis."""
+    return preset == "realtime" and not isinstance(config, GcnnConfig)
+
+
+def build_backbone(
+    config: BackboneConfig,
+    garment: GarmentTemplate,
+    *,
+    basis: BasisDecoder | None = None,
+    pivots: Tensor | None = None,
+) -> TailorNet | Mlp | Gcnn:
+    """An untrained backbone.
+
+    Args:
+        config: from `backbone_config`, or one's own.
+        garment: the template that it is for.
+        basis: output basis of low-rank heads; dense heads without one. The gcnn has no head and takes none.
+        pivots: (β, γ) of the pivots of a tailornet, shape (K, 14).
+
+    Raises:
+        WeightsError: a tailornet without pivots.
+    """
+    if isinstance(config, GcnnConfig):
+        return Gcnn(config, garment)
+    decoder: Decoder = basis if basis is not None else DenseDecoder(garment.n_vertices)
+    if isinstance(config, MlpConfig):
+        return Mlp(config, decoder)
+    if pivots is None:
+        msg = "a tailornet needs pivots: (β, γ) of the style-shape pairs of its high-frequency nets"
+        raise WeightsError(msg)
+    return TailorNet(config, garment, decoder, pivots)
+
+
+def backbone_name(module: nn.Module) -> str:
+    """The name of a backbone."""
+    names: Mapping[type[nn.Module], str] = {TailorNet: "tailornet", Mlp: "mlp", Gcnn: "gcnn"}
+    return names[type(module)]
+
+
+def config_to_card(config: BackboneConfig) -> dict[str, Any]:
+    """What a card says of a configuration."""
+    return asdict(config)
+
+
+def config_from_card(name: str, values: Mapping[str, Any]) -> BackboneConfig:
+    """The inverse of `config_to_card`.
+
+    Raises:
+        WeightsError: the card doesn't describe such a backbone.
+    """
+    lists: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
+    try:
+        return _CONFIGS[name](**lists)
+    except (KeyError, TypeError) as error:
+        msg = f"a card of a backbone {name!r} that this version doesn't know: {error}; train it again"
+        raise WeightsError(msg) from error

@@ -1,0 +1,152 @@
+"""TailorNet (Patel et al. 2020), the paper's main backbone: a coarse shape and a mixture of folds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from refu_core.backbones._decoder import Decoder
+from refu_core.backbones._features import N_STYLE_SHAPE, PoseFeatures, style_shape
+from refu_core.backbones._perceptron import Perceptron, StackedPerceptrons
+from refu_core.backbones._protocol import Prediction
+from refu_core.garments import GarmentTemplate
+
+
+@dataclass(frozen=True)
+class TailorNetConfig:
+    """Sizes and habits of a TailorNet; the defaults are the preset `realtime`."""
+
+    joints: tuple[int, ...]
+    encoding: str = "matrix"
+    low: tuple[int, ...] = (768, 768)
+    """Hidden layers of the low-frequency net."""
+    high: tuple[int, ...] = (64, 64)
+    """Hidden layers of every high-frequency net."""
+    style_shape: tuple[int, ...] = (64, 64)
+    """Hidden layers of the style-shape net."""
+    activation: str = "silu"
+    dropout: float = 0.1
+    sigma: float = 0.01
+    """Width of the kernel of the mixture."""
+    skipped: float = 1e-3
+    """At run time, pivots are left out whose mixture weights together are at most this."""
+
+    @classmethod
+    def paper(cls, joints: tuple[int, ...]) -> TailorNetConfig:
+        """The original's sizes: 31 million parameters a net with a shirt's dense head."""
+        return cls(joints, "rotvec", (1024, 1024), (1024, 1024), (128, 128), "relu", 0.2, skipped=0.0)
+
+
+class TailorNet(nn.Module):
+    """D = D_LF(θ, β, γ) + Σ_k Ψ_k(β, γ) D_HF,k(θ), added to the garment's template before it is posed.
+
+    Ψ = softmax(-dist_k / σ) over K pivots, with dist_k = 1000 · mean_v |G(β, γ)_v - G(β_k, γ_k)_v|² [m²] between the
+    mean drapes G of a style and shape, which the style-shape net predicts.
+    """
+
+    def __init__(self, config: TailorNetConfig, garment: GarmentTemplate, decoder: Decoder, pivots: Tensor) -> None:
+        """`pivots` are the (β, γ) of the pivots, shape (K, 14)."""
+        super().__init__()
+        self.config = config
+        self.decoder = decoder
+        self.features = PoseFeatures(config.joints, config.encoding)
+        options: dict[str, Any] = {"activation": config.activation, "dropout": config.dropout}
+        self.low = Perceptron(self.features.size + N_STYLE_SHAPE, config.low, decoder.size, **options)
+        self.high = StackedPerceptrons(len(pivots), self.features.size, config.high, decoder.size, **options)
+        self.style_shape = Perceptron(N_STYLE_SHAPE, config.style_shape, decoder.size, activation=config.activation)
+        self.register_buffer("pivots", pivots.clone())
+        self.register_buffer("_directions", decoder.directions(garment), persistent=False)
+        self.pivots: Tensor
+        self._directions: Tensor
+        self._cache: _Mixture | None = None
+
+    def forward(self, betas: Tensor, pose: Tensor, style: Tensor | None) -> Prediction:
+        """Predicts for betas (B, 10), pose (B, 24, 3) [rad] and style (B, 4)."""
+        x, s = self.features(pose), style_shape(betas, style)
+        return Prediction(self.decoder(self.low_code(x, s) + self.high_code(x, s)), None)
+
+    def low_code(self, x: Tensor, s: Tensor) -> Tensor:
+        """Code of D_LF, shape (B, C), of pose features (B, I) and (β, γ) (B, 14)."""
+        code: Tensor = self.low(torch.cat((x, s), 1))
+        return code
+
+    def high_code(self, x: Tensor, s: Tensor) -> Tensor:
+        """Code of Σ_k Ψ_k D_HF,k, shape (B, C), as `low_code`.
+
+        While nothing is being trained, what depends on (β, γ) only is kept for the next call with the same, and pivots
+        of negligible weight are left out. By the triangle inequality no vertex moves by more than `config.skipped`
+        times the largest displacement that a left-out pivot predicts there.
+        """
+        if self.training or torch.is_grad_enabled():
+            mixed: Tensor = self.high(x, self.mixture(s))
+            return mixed
+        state = self._state()
+        if self._cache is None or not self._cache.holds_for(s, state):
+            self._cache = self._mix(s, state)
+        sparse: Tensor = self.high(x, self._cache.weights, self._cache.selected)
+        return sparse
+
+    def drapes(self, s: Tensor) -> Tensor:
+        """Mean drapes G, shape (B, C'), of (β, γ) (B, 14), in coordinates isometric to the vertices [m]."""
+        code = self.style_shape(s)
+        drape = s @ self._directions
+        drape[:, : code.shape[1]] += code
+        return drape
+
+    def distances(self, s: Tensor) -> Tensor:
+        """dist_k to the pivots, shape (B, K), of (β, γ) (B, 14)."""
+        gap = (self.drapes(s)[:, None] - self.drapes(self.pivots)).square().sum(-1)
+        return 1000.0 / self.decoder.n_vertices * gap
+
+    @torch.no_grad()
+    def mixture(self, s: Tensor) -> Tensor:
+        """Ψ, shape (B, K), of (β, γ) (B, 14); rows sum to one however far a style is from all pivots.
+
+        Not differentiable: the kernel is so narrow that its gradient is nothing nearly everywhere and huge elsewhere.
+        """
+        return kernel_weights(self.distances(s), self.config.sigma)
+
+    def _mix(self, s: Tensor, state: tuple[object, ...]) -> _Mixture:
+        mixture = self.mixture(s)
+        active = non_negligible(mixture, self.config.skipped)
+        return _Mixture(s.clone(), state, mixture[:, active].contiguous(), self.high.select(active))
+
+    def _state(self) -> tuple[object, ...]:
+        """Changes whenever a tensor that the mixture depends on is written to, or moved."""
+        tensors = (self.pivots, self._directions, *self.style_shape.parameters(), *self.high.parameters())
+        return tuple((t._version, t.data_ptr(), t.dtype) for t in tensors)
+
+
+@dataclass(frozen=True, eq=False)
+class _Mixture:
+    """What depends on (β, γ) only."""
+
+    style_shape: Tensor
+    state: tuple[object, ...]
+    weights: Tensor
+    """Ψ of the pivots that count, shape (B, A)."""
+    selected: list[tuple[Tensor, Tensor]]
+
+    def holds_for(self, s: Tensor, state: tuple[object, ...]) -> bool:
+        return self.state == state and torch.equal(self.style_shape, s)
+
+
+def kernel_weights(distances: Tensor, sigma: float) -> Tensor:
+    """softmax(-dist / σ) over the last axis, safe where every exp(-dist / σ) is zero."""
+    nearest = distances.amin(-1, keepdim=True)
+    kernel = torch.exp((nearest - distances) / sigma)
+    return kernel / kernel.sum(-1, keepdim=True)
+
+
+def non_negligible(mixture: Tensor, skipped: float) -> Tensor:
+    """Indices of the pivots that count, shape (A,), for a mixture (B, K).
+
+    Those left out are the lightest ones that weigh at most `skipped` together in every row.
+    """
+    heaviest = mixture.amax(0)
+    order = heaviest.argsort()
+    left_out = heaviest[order].cumsum(0) <= skipped
+    return order[~left_out].sort().values

@@ -1,0 +1,27 @@
+"""Training of backbones, SDF networks and ReFU; needs the extra `train`."""
+
+from refu_core.training._checkpoint import load_checkpoint, save_checkpoint
+from refu_core.training._data import Samples, output_basis, read_samples, split_validation
+from refu_core.training._figures import displacements, posed_errors, test_figures
+from refu_core.training._loop import LoopSettings
+from refu_core.training._mirror import Mirror, mirror_pose
+from refu_core.training._pretrain import PretrainSettings, pretrain
+from refu_core.training._progress import TrainingLog
+
+__all__ = [
+    "LoopSettings",
+    "Mirror",
+    "PretrainSettings",
+    "Samples",
+    "TrainingLog",
+    "displacements",
+    "load_checkpoint",
+    "mirror_pose",
+    "output_basis",
+    "posed_errors",
+    "pretrain",
+    "read_samples",
+    "save_checkpoint",
+    "split_validation",
+    "test_figures",
+]

@@ -1,0 +1,46 @@
+"""Checkpoints that training resumes from, bit for bit."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from refu_core.errors import WeightsError
+
+
+def save_checkpoint(path: Path, state: Mapping[str, Any]) -> None:
+    """Writes tensors and plain values; the file is never half written.
+
+    Raises:
+        WeightsError: the disk can't be written.
+    """
+    part = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        torch.save(dict(state), part)
+        part.replace(path)
+    except OSError as error:
+        msg = f"{path}: the checkpoint can't be written: {error}"
+        raise WeightsError(msg) from error
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def load_checkpoint(path: Path) -> dict[str, Any] | None:
+    """What `save_checkpoint` wrote; None where there is nothing. No pickled code is run.
+
+    Raises:
+        WeightsError: the file is damaged.
+    """
+    if not path.exists():
+        return None
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch raises whatever its readers do
+        msg = f"{path}: a damaged checkpoint; delete it to start anew: {error}"
+        raise WeightsError(msg) from error
+    return dict(state)

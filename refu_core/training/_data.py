@@ -1,0 +1,150 @@
+"""What backbones learn from: unposed displacements of a simulated set, mirrored, split, and as codes of a basis."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from refu_core.backbones import BasisDecoder, style_shape
+from refu_core.body import SmplBody
+from refu_core.errors import RefuError
+from refu_core.garments import GarmentTemplate
+from refu_core.simulation import GarmentDataset
+from refu_core.training._mirror import Mirror, mirror_pose
+
+_CHUNK = 64
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """N bodies and the displacement that their garment has on each."""
+
+    pose: Tensor
+    """θ that was simulated, rotation vectors [rad], shape (N, 24, 3)."""
+    asked: Tensor
+    """θ before limbs were held back to make room for the cloth, shape (N, 24, 3); NaN where the set doesn't say."""
+    betas: Tensor
+    """β, shape (N, 10)."""
+    style: Tensor
+    """γ, shape (N, 4)."""
+    displacement: Tensor
+    """D = unpose(x) - t(β, γ) of the simulated garment x [m], shape (N, V, 3)."""
+    pair: Tensor
+    """Number of the style-shape pair, shape (N,), int64."""
+
+    def __len__(self) -> int:
+        """N."""
+        return len(self.pose)
+
+    @property
+    def style_shape(self) -> Tensor:
+        """(β, γ), shape (N, 14)."""
+        return style_shape(self.betas, self.style)
+
+    def take(self, which: Tensor) -> Samples:
+        """The samples of these indices, or of this mask."""
+        return Samples(*(getattr(self, field.name)[which] for field in fields(self)))
+
+    def joined(self, other: Samples) -> Samples:
+        """These samples and those of `other`."""
+        pairs = ((getattr(self, field.name), getattr(other, field.name)) for field in fields(self))
+        return Samples(*(torch.cat(pair) for pair in pairs))
+
+
+def read_samples(dataset: GarmentDataset, body: SmplBody, garment: GarmentTemplate, *, split: str) -> Samples:
+    """The samples of one split, `train` or `test`, with the poses that were simulated.
+
+    Raises:
+        RefuError: the set is of another garment or body, or the split has no finished sample.
+    """
+    check_dataset(dataset, body, garment)
+    rows = np.flatnonzero(dataset.train if split == "train" else dataset.test)
+    if not len(rows):
+        msg = f"the set of {garment.name} has no finished sample to {split} on: let `refu simulate` run longer"
+        raise RefuError(msg)
+    column = {name: torch.as_tensor(dataset.column(name)[rows]) for name in ("pose", "asked", "betas", "style", "pair")}
+    stored = dataset.column("vertices")
+    displacement = torch.empty(len(rows), garment.n_vertices, 3)
+    with torch.no_grad():
+        for start in range(0, len(rows), _CHUNK):
+            chunk = slice(start, start + _CHUNK)
+            posed = torch.as_tensor(stored[rows[chunk]].astype(np.float32) * float(dataset.card["quantum_m"]))
+            betas = column["betas"][chunk]
+            transforms = body(column["pose"][chunk], betas).transforms
+            rest = garment.rest(betas, column["style"][chunk])
+            displacement[chunk] = garment.unpose(posed, transforms) - rest
+    return Samples(
+        column["pose"], column["asked"], column["betas"], column["style"], displacement, column["pair"].long()
+    )
+
+
+def with_asked_poses(samples: Samples) -> Samples:
+    """The samples, and those whose limbs were held back once more: the same displacement at the pose that was asked.
+
+    So that what live motion is full of, hanging arms, is among a network's inputs although no cloth can be simulated
+    there (docs/dataset.md, "Room for the cloth"). Sets that don't say what was asked give the samples as they are.
+    """
+    return samples.joined(asked_only(samples))
+
+
+def asked_only(samples: Samples) -> Samples:
+    """Those of the samples whose limbs were held back, at the pose that was asked."""
+    held_back = (samples.asked - samples.pose).abs().amax((1, 2)) > 1e-3  # false for NaN
+    return replace(samples, pose=samples.asked).take(held_back)
+
+
+def mirrored(samples: Samples, mirror: Mirror) -> Samples:
+    """The samples as a mirror shows them."""
+    displacement = torch.empty_like(samples.displacement)
+    for start in range(0, len(samples), _CHUNK):
+        chunk = slice(start, start + _CHUNK)
+        displacement[chunk] = mirror.displacement(samples.displacement[chunk])
+    return replace(samples, pose=mirror_pose(samples.pose), asked=mirror_pose(samples.asked), displacement=displacement)
+
+
+def split_validation(samples: Samples, *, share: float, seed: int) -> tuple[Samples, Samples]:
+    """Samples to learn from and samples to choose by; whole style-shape pairs go to one or the other.
+
+    Pairs are drawn until `share` of the samples is reached; 0 gives an empty validation part.
+    """
+    pairs = torch.unique(samples.pair)
+    order = pairs[torch.randperm(len(pairs), generator=torch.Generator().manual_seed(seed))]
+    counts = torch.stack([(samples.pair == pair).sum() for pair in order])
+    chosen = order[counts.cumsum(0) <= share * len(samples)]
+    held_out = torch.isin(samples.pair, chosen)
+    return samples.take(~held_out), samples.take(held_out)
+
+
+def output_basis(displacement: Tensor, *, rank: int) -> BasisDecoder:
+    """The `rank` principal components of displacements (N, V, 3) [m].
+
+    Raises:
+        RefuError: there are fewer samples than components.
+    """
+    n = len(displacement)
+    if n <= rank:
+        msg = f"an output basis of {rank} components needs more samples than that, got {n}: simulate more"
+        raise RefuError(msg)
+    mean = displacement.mean(0)
+    centred = (displacement - mean).flatten(1)
+    # The samples' products instead of the vertices': N is smaller than 3 V.
+    values, vectors = torch.linalg.eigh((centred @ centred.T).double())
+    values, vectors = values[-rank:].flip(0), vectors[:, -rank:].flip(1)
+    components = (vectors / values.clamp_min(1e-12).sqrt()).float().T @ centred
+    return BasisDecoder(mean, components)
+
+
+def check_dataset(dataset: GarmentDataset, body: SmplBody, garment: GarmentTemplate) -> None:
+    """Checks that a set was simulated for this garment on this body.
+
+    Raises:
+        RefuError: it wasn't.
+    """
+    for what, wanted in (("garment", garment.name), ("body_fingerprint", body.fingerprint)):
+        got = dataset.card.get(what)
+        if got != wanted:
+            msg = f"wanted a set whose {what} is {wanted}, got {got}: simulate one with `refu simulate {garment.name}`"
+            raise RefuError(msg)

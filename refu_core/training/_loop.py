@@ -1,0 +1,219 @@
+"""The loop that trains one stage: AdamW, a cosine of learning rates, checkpoints, the best by validation is kept."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.distributed as dist
+from torch import Tensor, nn
+
+from refu_core.errors import RefuError
+from refu_core.training._checkpoint import load_checkpoint, save_checkpoint
+from refu_core.training._progress import TrainingLog
+
+
+@dataclass(frozen=True)
+class LoopSettings:
+    """How a stage is trained."""
+
+    batch_size: int = 64
+    """Over all processes."""
+    learning_rate: float = 1e-3
+    """At its highest; it rises over the first twentieth of the steps and falls to nothing as a cosine."""
+    weight_decay: float = 1.0
+    """Decoupled from the gradient (AdamW): a weight shrinks by this times the learning rate a step."""
+    check_every: int = 100
+    """Steps between validations, which are also the checkpoints."""
+    patience: int = 15
+    """A stage ends early after so many validations without a better one."""
+    seed: int = 0
+
+
+class Objective(nn.Module):
+    """Networks and their loss as one module: what a step is, and what is wrapped for several GPUs."""
+
+    def __init__(self, nets: Sequence[nn.Module], predict: Callable[..., Tensor], loss: Callable[..., Tensor]) -> None:
+        super().__init__()
+        self.nets = nn.ModuleList(nets)
+        self._predict = predict
+        self._loss = loss
+
+    def forward(self, *batch: Tensor) -> Tensor:
+        """Mean loss [mm] of a batch: all but the last tensor are the network's input, the last one is the target."""
+        return self._loss(self._predict(*batch[:-1]), batch[-1])
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What is trained on what."""
+
+    name: str
+    objective: Objective
+    steps: int
+    train: tuple[Tensor, ...]
+    """Inputs and, last, targets; each of the shape (N, ...)."""
+    validation: tuple[Tensor, ...]
+    """The same of the samples to choose by; possibly none."""
+
+
+class Loop:
+    """Runs stages one after another; interrupted, goes on where the last checkpoint was, to the same weights."""
+
+    def __init__(
+        self,
+        model: nn.Module,
+        settings: LoopSettings,
+        *,
+        checkpoint: Path,
+        identity: str,
+        log: TrainingLog | None,
+        device: torch.device,
+    ) -> None:
+        """`identity` says what is trained how and on what: a checkpoint of anything else is refused.
+
+        Raises:
+            RefuError: the checkpoint there is of another training.
+            WeightsError: it is damaged.
+        """
+        self._model, self._settings, self._path, self._log, self._device = model, settings, checkpoint, log, device
+        self._identity = identity
+        self._done: list[str] = []
+        self._resumed: dict[str, Any] | None = None
+        saved = load_checkpoint(checkpoint)
+        if saved is not None:
+            if saved["identity"] != identity:
+                msg = f"{checkpoint}: of a training with other settings or data; delete it to start anew"
+                raise RefuError(msg)
+            model.load_state_dict(saved["model"])
+            self._done = list(saved["done"])
+            self._resumed = saved["stage"]
+
+    def run(self, stage: Stage) -> None:
+        """Trains a stage, or what is left of it.
+
+        The model ends with the stage's best weights by validation, or with its last ones where none is held out.
+        """
+        if stage.name in self._done:
+            return
+        rank, world = _ranks()
+        cuda = [self._device] if self._device.type == "cuda" else []
+        # The caller's random numbers stay as they were.
+        with torch.random.fork_rng(devices=cuda):
+            torch.manual_seed(self._settings.seed * 1000 + 10 * len(self._done) + rank)
+            self._train(stage, rank, world)
+        self._done.append(stage.name)
+        self._save(None)
+
+    def _train(self, stage: Stage, rank: int, world: int) -> None:
+        settings, objective = self._settings, stage.objective
+        parameters = [p for p in objective.parameters() if p.requires_grad]
+        optimiser = torch.optim.AdamW(parameters, lr=settings.learning_rate, weight_decay=settings.weight_decay)
+        order = torch.Generator().manual_seed(settings.seed * 1000 + len(self._done))
+        step, best, best_state, since = 0, math.inf, None, 0
+        if self._resumed is not None and self._resumed["name"] == stage.name:
+            saved, self._resumed = self._resumed, None
+            optimiser.load_state_dict(saved["optimiser"])
+            order.set_state(saved["order"])
+            torch.set_rng_state(saved["rng"])
+            step, best, best_state, since = saved["step"], saved["best"], saved["best_state"], saved["since"]
+        if self._log is not None:
+            self._log.begin(stage.name, step=step, steps=stage.steps)
+        stepper: nn.Module = objective
+        if world > 1:
+            stepper = nn.parallel.DistributedDataParallel(objective, find_unused_parameters=True)
+        n, losses = len(stage.train[0]), []
+        while step < stage.steps and since < settings.patience:
+            objective.train()
+            for group in optimiser.param_groups:
+                group["lr"] = settings.learning_rate * _schedule(step, stage.steps)
+            rows = torch.randint(n, (settings.batch_size,), generator=order)[rank::world].to(stage.train[0].device)
+            with torch.autocast(self._device.type, torch.bfloat16, enabled=self._device.type == "cuda"):
+                loss = stepper(*(t[rows].to(self._device) for t in stage.train))
+            optimiser.zero_grad(set_to_none=True)
+            loss.backward()
+            optimiser.step()
+            losses.append(loss.detach())
+            step += 1
+            if self._log is not None:
+                self._log.step(step)
+            if step % settings.check_every == 0 or step == stage.steps:
+                train_loss = float(torch.stack(losses).mean())
+                losses.clear()
+                if not math.isfinite(train_loss):
+                    msg = f"the loss of {stage.name} is {train_loss} at step {step}: try a smaller learning rate"
+                    raise RefuError(msg)
+                held_out = self._validate(stage)
+                since += 1
+                if held_out is not None and held_out < best:
+                    best, since = held_out, 0
+                    best_state = {k: v.detach().clone() for k, v in objective.state_dict().items()}
+                if held_out is None:
+                    since = 0
+                if self._log is not None:
+                    shown = {} if held_out is None else {"validation": held_out}
+                    self._log.check(stage.name, step, train=train_loss, **shown)
+                self._save(
+                    {
+                        "name": stage.name,
+                        "step": step,
+                        "best": best,
+                        "best_state": best_state,
+                        "since": since,
+                        "optimiser": optimiser.state_dict(),
+                        "order": order.get_state(),
+                        "rng": torch.get_rng_state(),
+                    }
+                )
+        if best_state is not None:
+            objective.load_state_dict(best_state)
+        if self._log is not None:
+            self._log.end()
+
+    @torch.no_grad()
+    def _validate(self, stage: Stage) -> float | None:
+        n = len(stage.validation[0])
+        if n == 0:
+            return None
+        stage.objective.eval()
+        size, total = 256, 0.0
+        for start in range(0, n, size):
+            batch = [t[start : start + size].to(self._device) for t in stage.validation]
+            total += float(stage.objective(*batch)) * len(batch[0])
+        return total / n
+
+    def _save(self, stage: dict[str, Any] | None) -> None:
+        # One process' word is enough: after a step all have the same weights. Its random state is its own, though, so
+        # a resumed parallel run is sound but not the same bit for bit.
+        if _ranks()[0] == 0:
+            state = {"identity": self._identity, "done": self._done, "stage": stage, "model": self._model.state_dict()}
+            save_checkpoint(self._path, state)
+
+
+def start_parallel(device: torch.device) -> tuple[bool, torch.device]:
+    """Joins the other processes of a `torchrun`; whether this one writes files, and the device that is its own."""
+    world = int(os.environ.get("WORLD_SIZE", "1"))
+    if world == 1:
+        return True, device
+    if device.type == "cuda":
+        device = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
+        torch.cuda.set_device(device)
+    if not dist.is_initialized():
+        dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
+    return dist.get_rank() == 0, device
+
+
+def _ranks() -> tuple[int, int]:
+    return (dist.get_rank(), dist.get_world_size()) if dist.is_available() and dist.is_initialized() else (0, 1)
+
+
+def _schedule(step: int, steps: int) -> float:
+    warm = max(1, steps // 20)
+    if step < warm:
+        return (step + 1) / warm
+    return 0.5 * (1 + math.cos(math.pi * (step - warm) / max(1, steps - warm)))

@@ -1,0 +1,305 @@
+"""Pre-training of backbones on unposed displacements, before ReFU comes in (paper, Sec. 3.2; Patel et al. 2020)."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from refu_core.backbones import (
+    BackboneConfig,
+    BasisDecoder,
+    Gcnn,
+    LaplacianSmoothing,
+    Mlp,
+    TailorNet,
+    backbone_config,
+    build_backbone,
+    load_basis,
+    save_backbone,
+    save_basis,
+    uses_basis,
+)
+from refu_core.body import SmplBody, load_body
+from refu_core.errors import RefuError
+from refu_core.garments import GarmentTemplate, load_garment
+from refu_core.simulation import GarmentDataset
+from refu_core.training._data import (
+    Samples,
+    mirrored,
+    output_basis,
+    read_samples,
+    split_validation,
+    with_asked_poses,
+)
+from refu_core.training._figures import test_figures
+from refu_core.training._loop import Loop, LoopSettings, Objective, Stage, start_parallel
+from refu_core.training._mirror import Mirror
+from refu_core.training._progress import TrainingLog
+
+N_PIVOTS = 20
+PIVOT_TRAINING: tuple[str, ...] = ("joint", "separate")
+
+
+@dataclass(frozen=True)
+class PretrainSettings:
+    """How a backbone is pre-trained; the defaults are those of the shipped weights (preset `realtime`)."""
+
+    loop: LoopSettings = field(default_factory=LoopSettings)
+    rank: int = 128
+    """R, components of the output basis."""
+    style_shape_steps: int = 800
+    low_steps: int = 2500
+    steps: int = 2500
+    """Of the last stage; of the only one for backbones other than the tailornet."""
+    pivots: str = "joint"
+    """`joint`: the high-frequency nets are trained through the mixture, on all samples and together with the
+    low-frequency net. `separate`: each on its own pivot's samples, as in the original."""
+    is_mirrored: bool = True
+    asks: bool = True
+    """Whether samples whose limbs were held back are shown at the pose that was asked, too."""
+    validation_share: float = 0.08
+
+    @classmethod
+    def paper(cls) -> PretrainSettings:
+        """TailorNet's own settings."""
+        loop = LoopSettings(batch_size=32, learning_rate=1e-4, weight_decay=1e-6, check_every=1000)
+        return cls(loop, style_shape_steps=100_000, low_steps=300_000, steps=300_000, pivots="separate")
+
+
+def pretrain(
+    garment: str | GarmentTemplate,
+    dataset: str | Path | GarmentDataset,
+    output: str | Path,
+    *,
+    backbone: str = "tailornet",
+    preset: str = "realtime",
+    settings: PretrainSettings | None = None,
+    config: BackboneConfig | None = None,
+    body: SmplBody | None = None,
+    device: str = "cpu",
+    quiet: bool = False,
+) -> dict[str, Any]:
+    """Trains the backbone of one garment and writes `output`/basis and `output`/<backbone>-none.
+
+    A basis that is there already is used, so that all backbones and modes in a folder share it. Interrupted, the same
+    call goes on from the last checkpoint. Under `torchrun` all processes make one training.
+
+    Args:
+        garment: name of a built-in garment, or a template.
+        dataset: simulated set (`refu simulate`).
+        output: folder of the weights, of the checkpoint while it is needed, and of the loss curves.
+        backbone: `tailornet`, `mlp` or `gcnn`.
+        preset: `realtime` or `paper`.
+        settings: the preset's own if not given.
+        config: sizes of the network; the preset's if not given.
+        body: the body that the set was simulated on; the garment's built-in one if not given.
+        device: `cpu` or `cuda`.
+        quiet: show no progress.
+
+    Returns:
+        The card: what was trained on what, and its figures on the test split.
+
+    Raises:
+        RefuError: the set is of another garment or body or too small, or a checkpoint there is of another training.
+        WeightsError: no such backbone or preset, or files in `output` are damaged or of another garment.
+    """
+    template = load_garment(garment) if isinstance(garment, str) else garment
+    body = load_body(template.body) if body is None else body
+    settings = _settings(settings, preset)
+    config = backbone_config(backbone, template.name, preset=preset) if config is None else config
+    is_writer, torch_device = start_parallel(torch.device(device))
+    output = Path(output)
+    opened = dataset if isinstance(dataset, GarmentDataset) else GarmentDataset(dataset)
+    samples = read_samples(opened, body, template, split="train")
+    identity = {"garment": template.name, "body_fingerprint": body.fingerprint}
+
+    basis, mirror = None, Mirror.of(template) if settings.is_mirrored else None
+    if uses_basis(config, preset):
+        basis = _basis(output, samples, mirror, settings.rank, identity, len(opened), is_writer=is_writer)
+    # Which pairs are held out mustn't depend on what is made of the samples afterwards.
+    train, validation = split_validation(samples, share=settings.validation_share, seed=settings.loop.seed)
+    if settings.asks:
+        train = with_asked_poses(train)
+    if mirror is not None:
+        train = train.joined(mirrored(train, mirror))
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(settings.loop.seed)
+        model = build_backbone(config, template, basis=basis, pivots=pivots_of(samples))
+    mean = samples.displacement.mean(0)
+    described = {
+        **identity,
+        "backbone": backbone,
+        "preset": preset,
+        "settings": asdict(settings),
+        "samples": len(train),
+    }
+    loop = Loop(
+        model,
+        settings.loop,
+        checkpoint=output / f"{backbone}-none.checkpoint",
+        identity=json.dumps([described, asdict(config)], sort_keys=True, default=str),
+        log=TrainingLog(output, name=f"{backbone}-none", quiet=quiet) if is_writer else None,
+        device=torch_device,
+    )
+    found = stages(model, train, validation, template, settings)
+    model.to(torch_device)
+    for stage in found:
+        loop.run(stage)
+    model.to("cpu").eval()
+    card = {
+        **described,
+        "mode": "none",
+        "dataset": {key: opened.card.get(key) for key in ("garment_fingerprint", "motions_fingerprint", "plan")},
+        "figures": test_figures(model, read_samples(opened, body, template, split="test"), body, template, mean=mean),
+    }
+    if is_writer:
+        save_backbone(output / f"{backbone}-none", model, card, half=preset != "paper")
+        (output / f"{backbone}-none.checkpoint").unlink(missing_ok=True)
+    return card
+
+
+def _settings(settings: PretrainSettings | None, preset: str) -> PretrainSettings:
+    if settings is None:
+        settings = PretrainSettings.paper() if preset == "paper" else PretrainSettings()
+    if settings.pivots not in PIVOT_TRAINING:
+        msg = f"pivots are trained {' or '.join(PIVOT_TRAINING)}, got {settings.pivots!r}"
+        raise RefuError(msg)
+    return settings
+
+
+def _basis(
+    folder: Path,
+    samples: Samples,
+    mirror: Mirror | None,
+    rank: int,
+    identity: dict[str, Any],
+    count: int,
+    *,
+    is_writer: bool,
+) -> BasisDecoder:
+    """The folder's basis, made if it isn't there."""
+    if (folder / "basis.json").exists():
+        return load_basis(folder, expect=identity)[0]
+    displacement = samples.displacement
+    if mirror is not None:
+        displacement = torch.cat((displacement, mirrored(samples, mirror).displacement))
+    basis = output_basis(displacement, rank=rank)
+    if is_writer:
+        save_basis(folder, basis, {**identity, "samples": len(displacement), "set": count})
+    return basis
+
+
+def pivots_of(samples: Samples) -> Tensor:
+    """(β, γ) of a set's pivots, its pairs below 20, shape (K, 14); of all pairs where it has none (docs/dataset.md)."""
+    pairs = [k for k in torch.unique(samples.pair).tolist() if k < N_PIVOTS]
+    pairs = pairs or torch.unique(samples.pair)[:N_PIVOTS].tolist()
+    return torch.stack([samples.style_shape[samples.pair == k][0] for k in pairs])
+
+
+def stages(
+    model: TailorNet | Mlp | Gcnn,
+    train: Samples,
+    validation: Samples,
+    garment: GarmentTemplate,
+    settings: PretrainSettings,
+) -> list[Stage]:
+    """What is trained in which order."""
+    if isinstance(model, Gcnn):
+        mean = train.displacement.mean(0)
+        model.mean.copy_(mean)
+        model.scale.copy_((train.displacement - mean).std())
+        model.head.standardise(torch.cat((_features(model, train), train.style_shape), 1))
+        parts = [(s.betas, s.pose, s.style, s.displacement) for s in (train, validation)]
+        objective = Objective([model], lambda *inputs: model(*inputs).displacement, _vertex_loss)
+        return [Stage("all", objective, settings.steps, *parts)]
+    inputs = [(_features(model, s), s.style_shape) for s in (train, validation)]
+    codes = [_encode(model, s) for s in (train, validation)]
+    loss = _CodeLoss(model)
+    both = [(x, s, code) for (x, s), code in zip(inputs, codes, strict=True)]
+    if isinstance(model, Mlp):
+        model.net.standardise(torch.cat(inputs[0], 1))
+        return [Stage("all", Objective([model.net], model.code, loss), settings.steps, *both)]
+
+    model.low.standardise(torch.cat(inputs[0], 1))
+    model.high.standardise(inputs[0][0])
+    model.style_shape.standardise(inputs[0][1])
+    smooth = LaplacianSmoothing(garment)
+    coarse = [low_frequency_code(model, smooth, garment, s) for s in (train, validation)]
+    drape = [(s, code) for _, s, code in both]
+    low = [(x, s, code) for (x, s, _), code in zip(both, coarse, strict=True)]
+    found = [
+        Stage(
+            "style-shape", Objective([model.style_shape], model.style_shape, loss), *drape, settings.style_shape_steps
+        ),
+        Stage("low", Objective([model.low], model.low_code, loss), *low, settings.low_steps),
+    ]
+    if settings.pivots == "joint":
+
+        def whole(x: Tensor, s: Tensor) -> Tensor:
+            return model.low_code(x, s) + model.high(x, model.mixture(s))
+
+        return [*found, Stage("joint", Objective([model.low, model.high], whole, loss), settings.steps, *both)]
+    fine = []
+    for (x, s, code), low_code in zip(both, coarse, strict=True):
+        own = (s[:, None] == model.pivots).all(-1)  # (N, K): whose sample it is
+        kept = own.any(1)
+        fine.append((x[kept], own[kept].float(), (code - low_code)[kept]))
+    return [*found, Stage("high", Objective([model.high], model.high, loss), settings.steps, *fine)]
+
+
+class _CodeLoss:
+    """Distance of garments [mm].
+
+    Dense codes are vertices: L1, as the original. In an orthonormal basis, distances between codes are root mean square
+    distances of vertices; trained on those instead of on L1 of vertices, networks are as good (docs/training.md) in a
+    quarter of the time.
+    """
+
+    def __init__(self, model: TailorNet | Mlp) -> None:
+        self._is_low_rank = isinstance(model.decoder, BasisDecoder)
+        self._n_vertices = model.decoder.n_vertices
+
+    def __call__(self, predicted: Tensor, target: Tensor) -> Tensor:
+        if self._is_low_rank:
+            return 1e3 * (predicted - target).norm(dim=1).mean() / self._n_vertices**0.5
+        return _vertex_loss(predicted, target)
+
+
+def _vertex_loss(predicted: Tensor, target: Tensor) -> Tensor:
+    return 1e3 * (predicted - target).abs().mean()
+
+
+def low_frequency_code(
+    model: TailorNet, smooth: LaplacianSmoothing, garment: GarmentTemplate, samples: Samples
+) -> Tensor:
+    """Code of D_LF, shape (N, C): the garment smoothed, less its template (Patel et al. 2020)."""
+    decoder = model.decoder
+    parts: list[Tensor] = []
+    if isinstance(decoder, BasisDecoder):
+        smoothed = smooth.transposed(decoder.components)
+    for start in range(0, max(len(samples), 1), 64):
+        chunk = slice(start, start + 64)
+        rest = garment.rest(samples.betas[chunk], samples.style[chunk])
+        whole = rest + samples.displacement[chunk]
+        if isinstance(decoder, BasisDecoder):
+            code = whole.flatten(1) @ smoothed.T - (rest.flatten(1) + decoder.mean) @ decoder.components.T
+        else:
+            code = decoder.encode(smooth(whole) - rest)
+        parts.append(code)
+    return torch.cat(parts)
+
+
+def _features(model: TailorNet | Mlp | Gcnn, samples: Samples) -> Tensor:
+    features: Tensor = model.features(samples.pose)
+    return features
+
+
+def _encode(model: TailorNet | Mlp, samples: Samples) -> Tensor:
+    """Codes of the samples' displacements, shape (N, C)."""
+    starts = range(0, max(len(samples), 1), 256)
+    return torch.cat([model.decoder.encode(samples.displacement[i : i + 256]) for i in starts])

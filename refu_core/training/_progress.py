@@ -1,0 +1,77 @@
+"""How a training goes: a bar, a line a check, and a picture of the loss curves."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+
+class TrainingLog:
+    """Loss curves of the stages of a training, as a JSON lines file and a picture.
+
+    Used by one process; the others of a parallel training pass `None` where a log is wanted.
+    """
+
+    def __init__(self, folder: Path, *, name: str, quiet: bool = False) -> None:
+        """Writes `folder`/`name`.jsonl and `folder`/`name`.png; what an earlier run wrote is continued."""
+        self._lines = folder / f"{name}.jsonl"
+        self.picture = folder / f"{name}.png"
+        """Where the picture is."""
+        self._quiet = quiet
+        self._bar: Any = None
+        self._entries: list[dict[str, Any]] = []
+        folder.mkdir(parents=True, exist_ok=True)
+        if self._lines.exists():
+            self._entries = [json.loads(line) for line in self._lines.read_text().splitlines() if line]
+
+    def begin(self, stage: str, *, step: int, steps: int) -> None:
+        """A stage of `steps` steps goes on at `step`; entries after it are of an interrupted run and dropped."""
+        self._entries = [e for e in self._entries if e["stage"] != stage or e["step"] <= step]
+        if not self._quiet:
+            from tqdm import tqdm
+
+            self._bar = tqdm(total=steps, initial=step, desc=stage, unit="step", leave=True)
+
+    def step(self, done: int) -> None:
+        """`done` steps of the stage are done."""
+        if self._bar is not None:
+            self._bar.update(done - self._bar.n)
+
+    def check(self, stage: str, step: int, **values: float) -> None:
+        """Losses at a step, by name [mm]."""
+        self._entries.append({"stage": stage, "step": step, **{k: round(v, 5) for k, v in values.items()}})
+        self._lines.write_text("".join(json.dumps(entry) + "\n" for entry in self._entries))
+        if self._bar is not None:
+            self._bar.set_postfix({k: f"{v:.2f}" for k, v in values.items()})
+
+    def end(self) -> None:
+        """The stage is done: the bar is closed and the picture drawn."""
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None
+        self.draw()
+
+    def draw(self) -> None:
+        """Draws all curves so far, a panel a stage."""
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+        stages: dict[str, list[dict[str, Any]]] = defaultdict(list)
+        for entry in self._entries:
+            stages[entry["stage"]].append(entry)
+        if not stages:
+            return
+        figure = Figure(figsize=(4.2 * len(stages), 3.2), layout="constrained")
+        FigureCanvasAgg(figure)
+        for axes, (stage, entries) in zip(
+            figure.subplots(1, len(stages), squeeze=False)[0], stages.items(), strict=True
+        ):
+            for name in sorted({key for entry in entries for key in entry} - {"stage", "step"}):
+                points = [(entry["step"], entry[name]) for entry in entries if name in entry]
+                axes.plot(*zip(*points, strict=True), label=name, linewidth=1.4)
+            axes.set(title=stage, xlabel="step", ylabel="loss [mm]", yscale="log")
+            axes.grid(visible=True, which="both", alpha=0.25)
+            axes.legend(frameon=False)
+        figure.savefig(self.picture, dpi=120)
