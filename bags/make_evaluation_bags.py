@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from msg_adapters import INPUT_TYPES, MARKER_ARRAY, BagWriter, encode_points, encoder_for, vertices_ros_from_smpl
 from refu_core import SmplFrame, load_body, load_garment
 from refu_core.evaluation.render import GARMENT_COLOURS
-from refu_core.simulation import GarmentDataset, GarmentSequences
+from refu_core.simulation import GarmentDataset, GarmentSequences, SequencePlan
+from refu_core.simulation._plan import TEST
 from refu_ros.truth import TOPIC as TRUTH_TOPIC
 
 START_NS = 1_700_000_000_000_000_000
@@ -62,10 +63,12 @@ def sample_moments(dataset: GarmentDataset, count: int, seed: int) -> Iterator[M
         yield frame, sample.vertices
 
 
-def sequence_moments(sequences: GarmentSequences, seed: int) -> Iterator[Moment]:
-    """A test sequence, drawn by the seed; ground truth in every third frame, as far as those are in the set."""
-    test = np.flatnonzero(sequences.test)
-    sequence = sequences.sequence(int(np.random.default_rng(seed).choice(test)))
+def sequence_moments(sequences: GarmentSequences) -> Iterator[Moment]:
+    """The test sequence that is simulated first; ground truth in each third frame, as far as those are in the set."""
+    plan = SequencePlan(**sequences.card["plan"])
+    first = next(number for block in plan.blocks() for number in block if plan.split_of(number) == TEST)
+    (index,) = np.flatnonzero(sequences.column("slot") == first)
+    sequence = sequences.sequence(int(index))
     quantum = sequences.card["quantum_m"]
     for t in range(len(sequence)):
         transl = np.round(sequence.transl[t].astype(np.float64) / quantum) * quantum
@@ -109,7 +112,7 @@ def main() -> None:
         path = arguments.output / f"eval_{garment.replace('-', '_')}"
         if card["format"] == "refu-sequences-1":
             path = path.with_name(path.name + "_sequence")
-            moments = sequence_moments(GarmentSequences(directory), arguments.seed)
+            moments = sequence_moments(GarmentSequences(directory))
         else:
             moments = sample_moments(GarmentDataset(directory), arguments.count, arguments.seed)
         frames, truths = write_bag(path, garment, moments)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from rosbags.rosbag2 import Reader as RosbagsReader
 import msg_adapters as adapters
 from refu_core import load_body, load_garment
 from refu_core.evaluation import CollisionChecker
-from refu_core.simulation import GarmentDataset, GarmentSequences
+from refu_core.simulation import GarmentDataset, GarmentSequences, SequencePlan
 from refu_core.simulation._store import DONE, FORMAT, QUANTUM, SEQUENCES, SequenceShard, Shard, quantise, write_card
 from refu_ros.cli import main
 from refu_ros.truth import GroundTruth
@@ -84,7 +85,8 @@ def script() -> Any:
 
 def card(kind: str) -> dict[str, Any]:
     clips = {"train": ["a"], "test": ["b"]}
-    return {"format": kind, "garment": GARMENT, "quantum_m": QUANTUM, "clips": clips, "plan": {"count": 12}}
+    plan = asdict(SequencePlan(GARMENT, 12, shapes=6)) if kind == SEQUENCES else {"count": 12}
+    return {"format": kind, "garment": GARMENT, "quantum_m": QUANTUM, "clips": clips, "plan": plan}
 
 
 def rows(directory: Path, kind: type[Shard], shape: tuple[int, ...], **columns: Any) -> None:
@@ -136,8 +138,10 @@ def test_sequence_has_truth_in_each_third_frame_of_the_set(script: Any, tmp_path
     rows(directory, SequenceShard, (7, load_garment(GARMENT).n_vertices, 3), cause=cause, transl=transl)
     sequences = GarmentSequences(directory)
     bag = tmp_path / "eval_short_pant_male_sequence"
-    assert script.write_bag(bag, GARMENT, script.sequence_moments(sequences, 0)) == (7, 2)
+    assert script.write_bag(bag, GARMENT, script.sequence_moments(sequences)) == (7, 2)
     frames, truth = moments(bag)
     np.testing.assert_allclose([frame.transl[1] for frame in frames], np.linspace(0, 1, 7), atol=QUANTUM)
     assert [truth.of(GARMENT, frame) is not None for frame in frames] == [True, *[False] * 5, True]
-    np.testing.assert_array_equal(truth.of(GARMENT, frames[6]), sequences.sequence(-1).vertices(6))
+    (shown,) = np.flatnonzero((sequences.column("betas") == frames[0].betas).all(1))
+    assert sequences.test[shown]
+    np.testing.assert_array_equal(truth.of(GARMENT, frames[6]), sequences.sequence(int(shown)).vertices(6))
