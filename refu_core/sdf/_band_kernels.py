@@ -1,0 +1,293 @@
+# mypy: ignore-errors
+# ruff: noqa: RUF046, UP018  (to Warp, int(0) is a variable and 0 a constant)
+# (Warp reads a kernel's annotations as array types of its own; a type checker can't.)
+"""Closest faces within a band of the skin: the points lie in cells, the faces look for them there. For one CPU core.
+
+Cells are those of a grid that repeats itself after 64 × 128 × 64 of them, so that no place is outside of it and
+nothing is sized by a pose; two places that share a cell cost a test and change no answer. One word says which of the 64
+cells of a row hold a point: most of what a face passes is empty, and is passed a row at a time.
+"""
+
+import warp as wp
+
+from refu_core.sdf._kernels import closest_on_triangle, distance_and_gradient, offset_from, pseudo_normal
+
+wp.set_module_options({"enable_backward": False})
+
+ROWS_X = wp.constant(64)
+ROWS_Y = wp.constant(128)
+ROW = wp.constant(64)
+_LAST_X = wp.constant(63)
+_LAST_Y = wp.constant(127)
+_LAST = wp.constant(63)
+
+NEAR = wp.constant(0)  # closest face within the band: distance and side are known
+INSIDE_MAYBE = wp.constant(1)  # reached from a vertex inside: must be asked
+OUTSIDE = wp.constant(2)  # reached from a vertex outside, and from none inside
+UNREACHED = wp.constant(3)  # 3 + number of its patch
+
+_MOST_CELLS = wp.constant(1.0e9)  # farther from the origin a cell's number would overflow; far means far there
+
+
+@wp.func
+def cell_number(x: float, per_metre: float):
+    return int(wp.floor(wp.clamp(x * per_metre, -_MOST_CELLS, _MOST_CELLS)))
+
+
+@wp.func
+def row_of(i: int, j: int):
+    return (i & _LAST_X) * ROWS_Y + (j & _LAST_Y)
+
+
+@wp.func
+def row_mask(first: int, last: int):
+    """The bits of cells `first` to `last` in a row that repeats itself."""
+    if last - first >= _LAST:
+        return ~wp.uint64(0)
+    bits = (wp.uint64(1) << wp.uint64(last - first + 1)) - wp.uint64(1)
+    shift = wp.uint64(first & _LAST)
+    if shift == wp.uint64(0):
+        return bits
+    return (bits << shift) | (bits >> (wp.uint64(ROW) - shift))
+
+
+@wp.kernel
+def bin_kernel(
+    points: wp.array(dtype=wp.vec3),
+    limit: float,
+    n_before: int,
+    n: int,
+    per_metre: float,
+    # what the last call left, to be replaced
+    cell: wp.array(dtype=int),
+    first_in_cell: wp.array(dtype=int),
+    next_in_cell: wp.array(dtype=int),
+    occupied: wp.array(dtype=wp.uint64),
+    squared: wp.array(dtype=float),
+    face: wp.array(dtype=int),
+    extent: wp.array(dtype=wp.vec3),
+):
+    """Empties the cells of the points before, and puts the new ones into theirs; `extent` becomes their bounds."""
+    for q in range(n_before):
+        first_in_cell[cell[q]] = -1
+        occupied[cell[q] / ROW] = wp.uint64(0)
+    low = points[0]
+    high = points[0]
+    for q in range(n):
+        p = points[q]
+        low = wp.min(low, p)
+        high = wp.max(high, p)
+        r = row_of(cell_number(p[0], per_metre), cell_number(p[1], per_metre))
+        k = cell_number(p[2], per_metre) & _LAST
+        c = r * ROW + k
+        cell[q] = c
+        next_in_cell[q] = first_in_cell[c]
+        first_in_cell[c] = q
+        occupied[r] = occupied[r] | (wp.uint64(1) << wp.uint64(k))
+        squared[q] = limit * limit
+        face[q] = -1
+    extent[0] = low
+    extent[1] = high
+
+
+@wp.kernel
+def scan_kernel(
+    body: wp.array(dtype=wp.vec3),
+    faces: wp.array2d(dtype=int),
+    limit: float,
+    per_metre: float,
+    points: wp.array(dtype=wp.vec3),
+    extent: wp.array(dtype=wp.vec3),
+    first_in_cell: wp.array(dtype=int),
+    next_in_cell: wp.array(dtype=int),
+    occupied: wp.array(dtype=wp.uint64),
+    # kept up to date
+    squared: wp.array(dtype=float),
+    face: wp.array(dtype=int),
+):
+    """Each face asks the points in the cells around it whether it is the closest one so far."""
+    f = wp.tid()
+    a = body[faces[f, 0]]
+    b = body[faces[f, 1]]
+    c = body[faces[f, 2]]
+    wide = limit * 1.0001  # a hair more, for rounding
+    reach = wp.vec3(wide, wide, wide)
+    box_low = wp.min(wp.min(a, b), c)
+    box_high = wp.max(wp.max(a, b), c)
+    low = wp.max(box_low - reach, extent[0])
+    high = wp.min(box_high + reach, extent[1])
+    if low[0] > high[0] or low[1] > high[1] or low[2] > high[2]:
+        return
+    i0 = cell_number(low[0], per_metre)
+    j0 = cell_number(low[1], per_metre)
+    k0 = cell_number(low[2], per_metre)
+    # Once around the grid is enough, however large the face.
+    i1 = wp.min(cell_number(high[0], per_metre), i0 + _LAST_X)
+    j1 = wp.min(cell_number(high[1], per_metre), j0 + _LAST_Y)
+    k1 = wp.min(cell_number(high[2], per_metre), k0 + _LAST)
+    mask = row_mask(k0, k1)
+    normal = wp.normalize(wp.cross(b - a, c - a))
+    for i in range(i0, i1 + 1):
+        for j in range(j0, j1 + 1):
+            r = row_of(i, j)
+            if (occupied[r] & mask) != wp.uint64(0):
+                for k in range(k0, k1 + 1):
+                    q = first_in_cell[r * ROW + (k & _LAST)]
+                    while q >= 0:
+                        p = points[q]
+                        height = wp.dot(normal, p - a)
+                        # Neither its plane nor its box is ever farther than a face.
+                        beside = wp.max(wp.max(box_low - p, p - box_high), wp.vec3(0.0, 0.0, 0.0))
+                        if height * height < squared[q] and wp.dot(beside, beside) <= squared[q]:
+                            w, _feature = closest_on_triangle(p, a, b, c)
+                            offset = (p - a) - (w[1] * (b - a) + w[2] * (c - a))
+                            length = wp.dot(offset, offset)
+                            if length < squared[q]:
+                                squared[q] = length
+                                face[q] = f
+                        q = next_in_cell[q]
+
+
+@wp.kernel
+def finish_kernel(
+    body: wp.array(dtype=wp.vec3),
+    faces: wp.array2d(dtype=int),
+    across: wp.array2d(dtype=int),
+    fan_start: wp.array(dtype=int),
+    fan_face: wp.array(dtype=int),
+    points: wp.array(dtype=wp.vec3),
+    face: wp.array(dtype=int),
+    beyond: float,
+    # outputs
+    out_face: wp.array(dtype=int),
+    out_feature: wp.array(dtype=int),
+    out_barycentrics: wp.array(dtype=wp.vec3),
+    out_normal: wp.array(dtype=wp.vec3),
+    out_distance: wp.array(dtype=float),
+    out_gradient: wp.array(dtype=wp.vec3),
+):
+    """Signed distance and gradient from the closest faces; `beyond` where there is none."""
+    q = wp.tid()
+    f = face[q]
+    out_face[q] = f
+    if f < 0:
+        out_feature[q] = 0
+        out_barycentrics[q] = wp.vec3(1.0, 0.0, 0.0)
+        out_normal[q] = wp.vec3(0.0, 1.0, 0.0)
+        out_distance[q] = beyond
+        out_gradient[q] = wp.vec3(0.0, 1.0, 0.0)
+        return
+    p = points[q]
+    w, feature = closest_on_triangle(p, body[faces[f, 0]], body[faces[f, 1]], body[faces[f, 2]])
+    normal = pseudo_normal(f, feature, body, faces, across, fan_start, fan_face)
+    offset = offset_from(p, f, w, body, faces)
+    outside = wp.where(wp.dot(offset, normal) < 0.0, -1.0, 1.0)
+    distance, gradient = distance_and_gradient(offset, feature, normal, outside)
+    out_feature[q] = feature
+    out_barycentrics[q] = w
+    out_normal[q] = normal
+    out_distance[q] = distance
+    out_gradient[q] = gradient
+
+
+@wp.func
+def is_free(p: wp.vec3, q: wp.vec3, distances: float):
+    """Whether no skin can lie between two points whose distances to it add up to `distances`."""
+    # The balls around them are free of it, and they overlap; less a hair for rounding.
+    way = q - p
+    return wp.dot(way, way) < distances * distances * 0.9999
+
+
+@wp.func
+def spread(
+    points: wp.array(dtype=wp.vec3),
+    link_start: wp.array(dtype=int),
+    linked: wp.array(dtype=int),
+    distance: wp.array(dtype=float),
+    state: wp.array(dtype=int),
+    queue: wp.array(dtype=int),
+    end: int,
+    band: float,
+    given: int,
+):
+    """Gives the state `given` to all that the queue's vertices reach along free edges; the queue's new end."""
+    here = int(0)
+    tail = int(end)
+    while here < tail:
+        q = queue[here]
+        here += 1
+        for n in range(link_start[q], link_start[q + 1]):
+            other = linked[n]
+            if state[other] < 0 and is_free(points[q], points[other], wp.abs(distance[q]) + band):
+                state[other] = given
+                queue[tail] = other
+                tail += 1
+    return tail
+
+
+@wp.kernel
+def spread_kernel(
+    points: wp.array(dtype=wp.vec3),
+    n: int,
+    link_start: wp.array(dtype=int),
+    linked: wp.array(dtype=int),
+    parents: wp.array2d(dtype=int),
+    face: wp.array(dtype=int),
+    distance: wp.array(dtype=float),
+    band: float,
+    # outputs
+    state: wp.array(dtype=int),
+    queue: wp.array(dtype=int),
+    asked: wp.array(dtype=int),
+    counts: wp.array(dtype=int),
+):
+    """On which side of the skin the vertices beyond the band are, by way of the garment's edges.
+
+    `asked` lists those that may be inside, and one of each patch that no vertex of the band reaches; `counts` says how
+    many of either kind there are.
+    """
+    tail = int(0)
+    for q in range(n):
+        state[q] = -1
+        if face[q] >= 0:
+            state[q] = NEAR
+            if distance[q] < 0.0:
+                queue[tail] = q
+                tail += 1
+    # From the inside first: what both sides reach lies where the body runs into itself, and is asked.
+    first = tail
+    tail = spread(points, link_start, linked, distance, state, queue, tail, band, INSIDE_MAYBE)
+    inside = tail - first
+    for k in range(inside):
+        asked[k] = queue[first + k]
+    # Most of a garment is reached from the outside along one tree of its edges, at one look a vertex.
+    for k in range(n):
+        q = parents[k, 0]
+        parent = parents[k, 1]
+        if state[q] < 0 and parent >= 0:
+            is_outside = state[parent] == OUTSIDE or (state[parent] == NEAR and distance[parent] >= 0.0)
+            if is_outside and is_free(points[q], points[parent], wp.abs(distance[parent]) + band):
+                state[q] = OUTSIDE
+    # The rest asks all of its neighbours, and spreads what they say.
+    for q in range(n):
+        if state[q] < 0:
+            reached = int(0)
+            for m in range(link_start[q], link_start[q + 1]):
+                other = linked[m]
+                is_outside = state[other] == OUTSIDE or (state[other] == NEAR and distance[other] >= 0.0)
+                if is_outside and is_free(points[q], points[other], wp.abs(distance[other]) + band):
+                    reached = 1
+            if reached == 1:
+                state[q] = OUTSIDE
+                queue[0] = q
+                spread(points, link_start, linked, distance, state, queue, 1, band, OUTSIDE)
+    patches = int(0)
+    for q in range(n):
+        if state[q] < 0:
+            state[q] = UNREACHED + patches
+            queue[0] = q
+            spread(points, link_start, linked, distance, state, queue, 1, band, UNREACHED + patches)
+            asked[inside + patches] = q
+            patches += 1
+    counts[0] = inside
+    counts[1] = patches
