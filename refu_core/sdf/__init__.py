@@ -1,8 +1,16 @@
-"""Signed distance to the posed body: the protocol, the exact and the approximate implementation."""
+"""Signed distance to the posed body: the protocol, and its exact, approximate and neural implementations."""
 
 from refu_core.sdf._approx import ApproxSdf as ApproxSdf
 from refu_core.sdf._exact import ClosestPoints as ClosestPoints
 from refu_core.sdf._exact import ExactSdf as ExactSdf
+from refu_core.sdf._neural import SDF_PRESETS as SDF_PRESETS
+from refu_core.sdf._neural import NeuralSdf as NeuralSdf
+from refu_core.sdf._neural import SdfNetwork as SdfNetwork
+from refu_core.sdf._neural import SdfNetworkConfig as SdfNetworkConfig
+from refu_core.sdf._neural import body_frame as body_frame
+from refu_core.sdf._neural import load_sdf_network as load_sdf_network
+from refu_core.sdf._neural import save_sdf_network as save_sdf_network
+from refu_core.sdf._neural import with_gradient as with_gradient
 from refu_core.sdf._protocol import BodySdf as BodySdf
 from refu_core.sdf._protocol import SdfSample as SdfSample
 from refu_core.sdf._protocol import query_batch as query_batch

@@ -1,0 +1,194 @@
+"""The paper's network for the signed distance to the body, conditioned on β and θ (supplement, "SDF Network")."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor, nn
+
+from refu_core.body import SmplBody, rotvec_to_rotmat
+from refu_core.errors import MeshError, WeightsError
+from refu_core.frames import N_BETAS, N_JOINTS
+from refu_core.sdf._mesh import require_finite
+from refu_core.sdf._protocol import SdfSample
+from refu_core.weights import Weights, load_weights, save_weights
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+    from typing import Any
+
+_CONDITION = N_BETAS + 3 * (N_JOINTS - 1)
+_CHUNK = 4096  # points whose activations are held at a time where none are kept: 150 MB of the paper's
+
+
+@dataclass(frozen=True)
+class SdfNetworkConfig:
+    """Sizes of the network; the defaults are the paper's."""
+
+    width: int = 1024
+    hidden: int = 9
+    """Hidden layers."""
+    skip: int = 4
+    """Layer whose input is joined by the query point."""
+    sharpness: float = 100.0
+    """β of the softplus, which is a ReLU for large ones."""
+    radius: float = 0.5
+    """Of the sphere that an untrained network is the distance to [m]."""
+
+    def __post_init__(self) -> None:
+        """Raises `WeightsError` for sizes of which there is no network."""
+        if self.width < 1 or not 0 < self.skip < self.hidden or not (self.sharpness > 0 and self.radius > 0):
+            msg = f"wanted positive sizes and a skip among the hidden layers after the first, got {asdict(self)}"
+            raise WeightsError(msg)
+
+
+SDF_PRESETS: dict[str, SdfNetworkConfig] = {
+    "paper": SdfNetworkConfig(),
+    "small": SdfNetworkConfig(width=256, hidden=6, skip=3),
+    "tiny": SdfNetworkConfig(width=64, hidden=4, skip=2),
+}
+"""The paper's network; one that a CPU can train; one for tests."""
+
+
+class SdfNetwork(nn.Module):
+    """f(x, β, θ): fully connected, softplus between the layers, the point joined again at the layer `skip`.
+
+    Drawn as the distance to a sphere (Atzmon and Lipman 2020; the paper follows Gropp et al. 2020, who do so, too).
+    """
+
+    def __init__(self, config: SdfNetworkConfig | None = None) -> None:
+        super().__init__()
+        self.config = config = config or SdfNetworkConfig()
+        # The first layer's weights of point and condition are kept apart: a body's share is computed once for all
+        # its points.
+        self.point = nn.Linear(3, config.width)
+        self.condition = nn.Linear(_CONDITION, config.width, bias=False)
+        layers = [
+            nn.Linear(config.width + 3 * (layer == config.skip), config.width) for layer in range(1, config.hidden)
+        ]
+        self.layers = nn.ModuleList(layers)
+        self.last = nn.Linear(config.width, 1)
+        self.activation = nn.Softplus(beta=config.sharpness)
+        with torch.no_grad():
+            for layer in (self.point, *layers):
+                nn.init.normal_(layer.weight, 0.0, math.sqrt(2 / config.width))
+                nn.init.zeros_(layer.bias)
+            nn.init.zeros_(layers[config.skip - 1].weight[:, config.width :])
+            nn.init.zeros_(self.condition.weight)
+            nn.init.normal_(self.last.weight, math.sqrt(math.pi / config.width), 1e-5)
+            nn.init.constant_(self.last.bias, -config.radius)
+
+    def forward(self, points: Tensor, betas: Tensor, pose: Tensor) -> Tensor:
+        """Distances [m], shape (B, N), of points [m], shape (B, N, 3), to bodies of `betas` (B, 10) and `pose`.
+
+        `pose`, shape (B, 23, 3) [rad], is without the root's rotation, which is to be undone in the points.
+        """
+        condition = self.condition(torch.cat((betas, pose.flatten(1)), 1))
+        h = self.activation(self.point(points) + condition[:, None])
+        for number, layer in enumerate(self.layers, start=1):
+            h = self.activation(layer(torch.cat((h, points.to(h.dtype)), -1) if number == self.config.skip else h))
+        distance: Tensor = self.last(h)[..., 0]
+        return distance
+
+
+def with_gradient(
+    network: SdfNetwork, points: Tensor, betas: Tensor, pose: Tensor, *, keep_graph: bool
+) -> tuple[Tensor, Tensor]:
+    """The network's distances (B, N) and their gradients (B, N, 3), which aren't normalised; arguments as `forward`'s.
+
+    `keep_graph` keeps what derivatives of both are computed from; without it neither has any.
+    """
+    with torch.enable_grad():
+        if not (keep_graph and points.requires_grad):
+            points = points.detach().requires_grad_()
+        distance = network(points, betas, pose)
+        (gradient,) = torch.autograd.grad(distance.sum(), points, create_graph=keep_graph)
+    return (distance, gradient) if keep_graph else (distance.detach(), gradient)
+
+
+class NeuralSdf:
+    """Signed distance by a trained `SdfNetwork` (the paper's "Approx. SDF"): it stands for the body, faces and all.
+
+    The gradient is the network's own, by backpropagation, normalised (Eq. gradient). Both are differentiable with
+    respect to the points and the network's weights.
+    """
+
+    def __init__(self, network: SdfNetwork, body: SmplBody) -> None:
+        """For bodies of the model that the network was trained on."""
+        self.network = network
+        self._body = body
+        self._posed: tuple[Tensor, Tensor, Tensor, Tensor] | None = None
+
+    def update(self, vertices: Tensor, *, pose: Tensor | None = None, betas: Tensor | None = None) -> None:
+        """Takes over a new body: `pose` (24, 3) [rad] and `betas` (10,); its vertices aren't looked at.
+
+        Raises `MeshError` when one of the two is missing or of another shape.
+        """
+        del vertices
+        if pose is None or betas is None or pose.shape != (N_JOINTS, 3) or betas.shape != (N_BETAS,):
+            shapes = [None if value is None else tuple(value.shape) for value in (pose, betas)]
+            msg = f"a neural distance needs pose (24, 3) and betas (10,) of the body, got {shapes[0]} and {shapes[1]}"
+            raise MeshError(msg)
+        rotation, root = body_frame(self._body, pose[None], betas[None])
+        self._posed = rotation[0], root[0], betas, pose[1:]
+
+    def query(self, points: Tensor, *, near: Tensor | None = None) -> SdfSample:
+        """Distance and unit gradient at `points` [m], shape (N, 3); `near` is of no use here.
+
+        Raises `MeshError` for a wrong shape, values that aren't finite, or when no body was set with `update`.
+        """
+        del near
+        if self._posed is None:
+            msg = "no body yet: call update(vertices, pose=..., betas=...) before asking for distances"
+            raise MeshError(msg)
+        if points.ndim != 2 or points.shape[1] != 3:
+            msg = f"points must have the shape (N, 3), got {tuple(points.shape)}"
+            raise MeshError(msg)
+        require_finite("points", points)
+        rotation, root, betas, pose = (value.to(points) for value in self._posed)
+        own = (points - root) @ rotation + root
+        weights_learn = next(self.network.parameters()).requires_grad
+        tracked = torch.is_grad_enabled() and (points.requires_grad or weights_learn)
+        parts = [
+            with_gradient(self.network, chunk[None], betas[None], pose[None], keep_graph=tracked)
+            for chunk in ([own] if tracked else torch.split(own, _CHUNK))
+        ]
+        distance = torch.cat([part[0][0] for part in parts])
+        gradient = torch.cat([part[1][0] for part in parts]) @ rotation.T
+        return SdfSample(distance, torch.nn.functional.normalize(gradient, dim=-1))
+
+
+def body_frame(body: SmplBody, pose: Tensor, betas: Tensor) -> tuple[Tensor, Tensor]:
+    """How the roots of bodies of `pose` (B, 24, 3) and `betas` (B, 10) are turned, (B, 3, 3), and about which points
+    [m], (B, 3): (x - root) @ rotation + root undoes it. A distance doesn't depend on it, so no network need learn it.
+    """
+    return rotvec_to_rotmat(pose[:, 0]), body.rest_joints(betas.to(body.dtype))[:, 0].to(pose)
+
+
+def save_sdf_network(stem: Path, network: SdfNetwork, card: Mapping[str, Any]) -> None:
+    """Writes `stem`.safetensors and `stem`.json. Raises `WeightsError` when a weight isn't finite or the disk fails."""
+    save_weights(stem, network.state_dict(), {**card, "network": asdict(network.config)})
+
+
+def load_sdf_network(stem: Path, body: SmplBody) -> SdfNetwork:
+    """The network that `save_sdf_network` wrote, for a body with the fingerprint it was trained on.
+
+    Raises:
+        WeightsError: nothing there, damaged, or trained on another body.
+    """
+    weights: Weights = load_weights(stem)
+    trained_on = weights.card.get("body_fingerprint")
+    if trained_on != body.fingerprint:
+        msg = f"{stem}: trained on the body {trained_on}, this one is {body.fingerprint}: train one for it"
+        raise WeightsError(msg)
+    try:
+        network = SdfNetwork(SdfNetworkConfig(**weights.card["network"]))
+        network.load_state_dict(dict(weights.tensors))
+    except (KeyError, TypeError, RuntimeError) as error:
+        msg = f"{stem}: not the weights of a distance network: {error}"
+        raise WeightsError(msg) from error
+    return network.to(device=body.device, dtype=body.dtype)

@@ -1,0 +1,294 @@
+"""Training of the paper's network for the body's signed distance (supplement, "SDF Network")."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.distributed as dist
+from torch import Tensor, nn
+
+from refu_core.body import SmplBody
+from refu_core.errors import RefuError
+from refu_core.garments import GarmentTemplate
+from refu_core.sdf import SDF_PRESETS, ExactSdf, SdfNetwork, body_frame, query_batch, save_sdf_network, with_gradient
+from refu_core.simulation import GarmentDataset
+from refu_core.training._checkpoint import load_checkpoint, save_checkpoint
+from refu_core.training._loop import start_parallel
+from refu_core.training._progress import TrainingLog
+
+VALUE_WEIGHT, NORMAL_WEIGHT, EIKONAL_WEIGHT = 2.0, 1.0, 0.1
+"""λ_a, λ_b and λ_c of the paper's loss."""
+BOX = 4.0
+"""Edge of the box around the origin that points are drawn in [m]."""
+_SHARES = (0.25, 0.25, 0.125, 0.125)
+"""Of a body's points, those on its surface, near it, on the garment and near that; the rest is anywhere in the box."""
+_NEAR = 0.02  # [m]; where the error counts
+
+
+@dataclass(frozen=True)
+class SdfSettings:
+    """How the network is trained; the defaults are the paper's, as far as it says."""
+
+    preset: str = "paper"
+    steps: int = 200_000
+    batch_size: int = 32
+    """Bodies a step, over all processes."""
+    points: int = 4000
+    """Points a body."""
+    learning_rate: float = 1e-5
+    noise: float = 0.02
+    """Standard deviation of the disturbance of surface points, each coordinate [m]."""
+    check_every: int = 1000
+    """Steps between validations, which are also the checkpoints."""
+    validation_share: float = 0.05
+    """Of the training split's style-shape pairs, held out whole."""
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Raises `RefuError` for numbers that make no training."""
+        if self.preset not in SDF_PRESETS:
+            msg = f"no preset {self.preset!r} of the distance network: wanted one of {', '.join(SDF_PRESETS)}"
+            raise RefuError(msg)
+        if min(self.steps, self.batch_size, self.check_every) < 1 or self.points < 8 or not self.learning_rate > 0:
+            msg = f"steps, batch_size, points (8 or more) and rates must be positive, got {asdict(self)}"
+            raise RefuError(msg)
+
+
+@dataclass(frozen=True, eq=False)
+class SdfBatch:
+    """Points around B bodies whose roots aren't turned, and their true distances; all [m]."""
+
+    betas: Tensor
+    """Shape (B, 10)."""
+    pose: Tensor
+    """Of all joints but the root [rad], shape (B, 23, 3)."""
+    points: Tensor
+    """Shape (B, N, 3); the first S of each body are on its surface (the paper's I_S, the others I_E)."""
+    distance: Tensor
+    """Shape (B, N)."""
+    normals: Tensor
+    """The body's normals at the first S points, shape (B, S, 3)."""
+
+    def to(self, device: torch.device) -> SdfBatch:
+        """The same on another device."""
+        return SdfBatch(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
+
+
+class SdfSampler:
+    """Draws points of the paper's three kinds around bodies of a data set: body, garment, box."""
+
+    def __init__(self, dataset: GarmentDataset, body: SmplBody, garment: GarmentTemplate, rows: Tensor) -> None:
+        """For the samples `rows` of a set of `garment`."""
+        self.rows = rows
+        self._dataset = dataset
+        self._body = body
+        self._garment = garment
+        self._exact = ExactSdf(body.faces, device=body.device)
+
+    def draw(self, generator: torch.Generator, *, bodies: int, points: int, noise: float) -> SdfBatch:
+        """`points` around each of `bodies` bodies, all drawn by the generator."""
+        chosen = self.rows[torch.randint(len(self.rows), (bodies,), generator=generator)]
+        return self.around(chosen, generator, points=points, noise=noise)
+
+    @torch.no_grad()
+    def around(self, rows: Tensor, generator: torch.Generator, *, points: int, noise: float) -> SdfBatch:
+        """`points` around the bodies of these samples."""
+        samples = [self._dataset.sample(int(row)) for row in rows]
+        betas = torch.from_numpy(np.stack([sample.betas for sample in samples]))
+        pose = torch.from_numpy(np.stack([sample.pose for sample in samples]))
+        rotation, root = body_frame(self._body, pose, betas)
+        worn = torch.from_numpy(np.stack([sample.vertices for sample in samples]))
+        worn = (worn - root[:, None]) @ rotation + root[:, None]
+        pose = torch.cat((torch.zeros_like(pose[:, :1]), pose[:, 1:]), 1)
+        skins = self._body(pose, betas).vertices
+        counts = [int(share * points) for share in _SHARES]
+        drawn, normals = [], []
+        for skin, cloth in zip(skins, worn, strict=True):
+            on_skin, normal = _on_surface(skin, self._body.faces, counts[0], generator)
+            near_skin, _ = _on_surface(skin, self._body.faces, counts[1], generator)
+            on_cloth, _ = _on_surface(cloth, self._garment.faces, counts[2], generator)
+            near_cloth, _ = _on_surface(cloth, self._garment.faces, counts[3], generator)
+            disturbed = torch.cat((near_skin, near_cloth))
+            disturbed = disturbed + noise * torch.randn(disturbed.shape, generator=generator)
+            anywhere = BOX * (torch.rand(points - sum(counts), 3, generator=generator) - 0.5)
+            drawn.append(torch.cat((on_skin, disturbed, on_cloth, anywhere)))
+            normals.append(normal)
+        where = torch.stack(drawn)
+        distance = query_batch(self._exact, skins, where).distance
+        distance[:, : counts[0]] = 0.0  # by rounding it isn't quite
+        return SdfBatch(betas, pose[:, 1:], where, distance, torch.stack(normals))
+
+
+def _on_surface(vertices: Tensor, faces: Tensor, n: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """n points spread evenly over a surface, (n, 3), and the normals of their faces, (n, 3)."""
+    a, b, c = vertices[faces].unbind(1)
+    normal = torch.linalg.cross(b - a, c - a)
+    face = torch.multinomial(normal.norm(dim=1), n, replacement=True, generator=generator)
+    u, v = torch.rand(2, n, 1, generator=generator)
+    root = u.sqrt()
+    place = (1 - root) * a[face] + root * (1 - v) * b[face] + root * v * c[face]
+    return place, nn.functional.normalize(normal[face], dim=1)
+
+
+def sdf_loss(distance: Tensor, gradient: Tensor, batch: SdfBatch) -> Tensor:
+    """L_SDF = λ_a L_v + λ_b L_sg + λ_c L_se of distances (B, N) and gradients (B, N, 3) at the batch's points."""
+    on_surface = batch.normals.shape[1]
+    value = (distance - batch.distance).abs().mean()
+    normal = (gradient[:, :on_surface] - batch.normals).norm(dim=-1).mean()
+    eikonal = (gradient[:, on_surface:].norm(dim=-1) - 1).square().mean()
+    loss: Tensor = VALUE_WEIGHT * value + NORMAL_WEIGHT * normal + EIKONAL_WEIGHT * eikonal
+    return loss
+
+
+@torch.no_grad()
+def sdf_figures(network: SdfNetwork, batch: SdfBatch) -> dict[str, float]:
+    """The supplement's figures of a network: mean absolute error [mm] and mean relative error [%], of all points that
+    aren't on the surface; and the mean absolute error within 2 cm of the skin [mm]."""
+    found = torch.cat(
+        [
+            network(points[None], betas[None], pose[None])
+            for points, betas, pose in zip(batch.points, batch.betas, batch.pose, strict=True)
+        ]
+    )
+    off = batch.normals.shape[1]
+    error, truth = (found - batch.distance).abs(), batch.distance.abs()
+    return {
+        "absolute_mm": float(1e3 * error.mean()),
+        "relative_percent": float(100 * (error[:, off:] / truth[:, off:].clamp_min(1e-6)).mean()),
+        "near_mm": float(1e3 * error[truth < _NEAR].mean()),
+    }
+
+
+class _Step(nn.Module):
+    """The network and its loss as one module, which is what is wrapped for several processes."""
+
+    def __init__(self, network: SdfNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, batch: SdfBatch) -> Tensor:
+        distance, gradient = with_gradient(self.network, batch.points, batch.betas, batch.pose, keep_graph=True)
+        return sdf_loss(distance.float(), gradient.float(), batch)
+
+
+def train_sdf(
+    dataset: GarmentDataset,
+    body: SmplBody,
+    garment: GarmentTemplate,
+    output: Path,
+    *,
+    settings: SdfSettings | None = None,
+    device: str = "cpu",
+    quiet: bool = False,
+) -> dict[str, Any]:
+    """Trains the network on the training split of a set and writes it to `output`, with its checkpoint and loss curves.
+
+    Interrupted, it goes on where the last checkpoint was, to the same weights; what is drawn for a step depends on the
+    seed and the number of the step alone. Under `torchrun` every process takes its share of the bodies. On a GPU it
+    computes in bfloat16, weights in float32.
+
+    Returns what is in the card: settings and figures, on held-out pairs of the training split and on the test split.
+
+    Raises:
+        RefuError: a checkpoint of another training, a split without samples, or a loss that isn't finite.
+        WeightsError: a damaged checkpoint, or a disk that can't be written.
+    """
+    settings = settings or SdfSettings()
+    is_writer, where = start_parallel(torch.device(device))
+    rank, world = (dist.get_rank(), dist.get_world_size()) if dist.is_initialized() else (0, 1)
+    if settings.batch_size % world:
+        msg = f"a batch of {settings.batch_size} bodies can't be shared evenly by {world} processes"
+        raise RefuError(msg)
+    splits = _split(dataset, settings)
+    samplers = {name: SdfSampler(dataset, body, garment, rows) for name, rows in splits.items()}
+    checks = {name: _fixed_batch(samplers[name], settings).to(where) for name in ("validation", "test")}
+
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(settings.seed)
+        network = SdfNetwork(SDF_PRESETS[settings.preset]).to(where)
+    optimiser = torch.optim.Adam(network.parameters(), lr=settings.learning_rate)
+    identity = json.dumps(
+        {**asdict(settings), "body": body.fingerprint, "garment": garment.name, "samples": len(splits["train"])}
+    )
+    checkpoint = output / "sdf.checkpoint"
+    step = _resume(checkpoint, identity, network, optimiser)
+    module: Callable[[SdfBatch], Tensor] = _Step(network)
+    if world > 1:
+        module = nn.parallel.DistributedDataParallel(_Step(network))
+    log = TrainingLog(output, name="sdf", quiet=quiet) if is_writer else None
+    if log is not None:
+        log.begin("sdf", step=step, steps=settings.steps)
+    while step < settings.steps:
+        generator = torch.Generator().manual_seed((settings.seed * 1_000_003 + step) * world + rank)
+        batch = samplers["train"].draw(
+            generator, bodies=settings.batch_size // world, points=settings.points, noise=settings.noise
+        )
+        with torch.autocast(where.type, torch.bfloat16, enabled=where.type == "cuda"):
+            loss = module(batch.to(where))
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        optimiser.step()
+        step += 1
+        if log is not None:
+            log.step(step)
+        if step % settings.check_every == 0 or step == settings.steps:
+            if not math.isfinite(float(loss)):
+                msg = f"the loss of the distance network is {float(loss)} at step {step}: try a smaller learning rate"
+                raise RefuError(msg)
+            if log is not None:
+                found = sdf_figures(network, checks["validation"])
+                log.check("sdf", step, absolute=found["absolute_mm"], near_skin=found["near_mm"])
+                state = {"network": network.state_dict(), "optimiser": optimiser.state_dict()}
+                save_checkpoint(checkpoint, {"identity": identity, "step": step, **state})
+    card = {
+        "kind": "sdf",
+        "body_fingerprint": body.fingerprint,
+        "dataset": {"garment": garment.name, "samples": len(splits["train"])},
+        "settings": asdict(settings),
+        "figures": {name: sdf_figures(network, batch) for name, batch in checks.items()},
+    }
+    if log is not None:
+        log.end()
+        save_sdf_network(output / "sdf", network, card)
+    return card
+
+
+def _split(dataset: GarmentDataset, settings: SdfSettings) -> dict[str, Tensor]:
+    """Rows to learn from, to choose by (whole style-shape pairs), and to test on."""
+    pairs = torch.as_tensor(dataset.column("pair"))
+    train, test = torch.from_numpy(dataset.train), torch.from_numpy(dataset.test)
+    known = torch.unique(pairs[train])
+    order = known[torch.randperm(len(known), generator=torch.Generator().manual_seed(settings.seed))]
+    held_out = torch.isin(pairs, order[: max(1, round(settings.validation_share * len(known)))])
+    splits = {"train": train & ~held_out, "validation": train & held_out, "test": test}
+    for name, mask in splits.items():
+        if not bool(mask.any()):
+            msg = f"the set has no finished sample for the {name} part: let `refu simulate` run longer"
+            raise RefuError(msg)
+    return {name: torch.nonzero(mask)[:, 0] for name, mask in splits.items()}
+
+
+def _fixed_batch(sampler: SdfSampler, settings: SdfSettings) -> SdfBatch:
+    """The same bodies and points at every check."""
+    generator = torch.Generator().manual_seed(settings.seed + 1)
+    rows = sampler.rows[torch.linspace(0, len(sampler.rows) - 1, min(32, len(sampler.rows))).long()]
+    return sampler.around(rows, generator, points=settings.points, noise=settings.noise)
+
+
+def _resume(path: Path, identity: str, network: SdfNetwork, optimiser: torch.optim.Optimizer) -> int:
+    saved = load_checkpoint(path)
+    if saved is None:
+        return 0
+    if saved["identity"] != identity:
+        msg = f"{path}: of a training with other settings or data; delete it to start anew"
+        raise RefuError(msg)
+    network.load_state_dict(saved["network"])
+    optimiser.load_state_dict(saved["optimiser"])
+    return int(saved["step"])
