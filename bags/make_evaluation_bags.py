@@ -5,7 +5,7 @@
 
 A bag carries SMPL parameters with the style on /smpl_params and the simulated garment on /ground_truth, so
 `refu replay BAG --garments GARMENT` says how far (MPVE) a prediction is off. The garment is a marker of points: its
-triangles would take four times the room.
+triangles would take more than three times the room.
 """
 
 from __future__ import annotations
