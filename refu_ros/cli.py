@@ -16,8 +16,13 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from types import FrameType
 
+EXIT_CHECK_FAILED = 1
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
+EVALUATION_TABLES = (
+    *("comparison", "ablation", "gcnn", "sequence", "alpha", "sdf", "time", "laplacian", "unseen", "energy", "motion"),
+)
+"""As `refu_core.evaluation.reproduction.TABLES`, which isn't imported for every command."""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -73,6 +78,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Parser)
     _add_replay(commands)
     _add_simulate(commands)
+    _add_evaluate(commands)
     _add_info(commands)
     return parser
 
@@ -158,6 +164,48 @@ def _add_simulate(commands: Any) -> None:
     parser.set_defaults(run=_simulate)
 
 
+def _add_evaluate(commands: Any) -> None:
+    parser = commands.add_parser(
+        "evaluate",
+        help="make the paper's tables and figures on own data, beside the paper's figures",
+        description="Run every method on the test samples of data sets, and write a page and a JSON file a table. "
+        "A method whose networks aren't trained stays in its table, with the command that trains it.",
+    )
+    parser.add_argument(
+        "--data", type=Path, nargs="+", default=[], metavar="DIR", help="data sets of refu simulate, one a garment"
+    )
+    parser.add_argument("--table", choices=(*EVALUATION_TABLES, "all"), default="all", help="one table (default: all)")
+    parser.add_argument(
+        "--weights",
+        type=Path,
+        nargs="+",
+        default=[],
+        metavar="DIR",
+        help="folders with GARMENT/NAME.safetensors that are looked at before the weights that ship",
+    )
+    parser.add_argument("--motions", type=Path, metavar="DIR", help="folder of AMASS-style .npz files, for motion")
+    parser.add_argument("--output", type=Path, metavar="DIR", help="where the pages go (docs/results)")
+    parser.add_argument("--cache", type=Path, metavar="DIR", help="keep what was measured, and use it again")
+    parser.add_argument("--every", type=_positive, default=1, metavar="N", help="every N-th test sample (1)")
+    parser.add_argument(
+        "--motion-every", type=_positive, default=10, metavar="N", help="every N-th frame of a motion (10)"
+    )
+    parser.add_argument(
+        "--quick",
+        action="store_true",
+        help="measure the bags of --data (default: bags) instead, and exit with 1 where a figure has fallen",
+    )
+    parser.add_argument(
+        "--reference",
+        type=Path,
+        metavar="FILE",
+        help="figures that --quick holds its own against (in the bags' folder)",
+    )
+    parser.add_argument("--set-reference", action="store_true", help="write that file instead of comparing with it")
+    _add_common(parser)
+    parser.set_defaults(run=_evaluate)
+
+
 def _add_info(commands: Any) -> None:
     parser = commands.add_parser(
         "info", help="what is installed, built in and usable", description="What is installed."
@@ -204,6 +252,35 @@ def _simulate(args: argparse.Namespace) -> int:
     )
     print(simulation_table(card, args.output))
     _write_json(args.json, card)
+    return 0
+
+
+def _evaluate(args: argparse.Namespace) -> int:
+    for path in (args.json, args.output, args.cache):
+        _check_writable(path)
+    if args.quick:
+        from refu_ros.quick import quick_check, quick_table
+
+        result = quick_check(args.data, reference=args.reference, renew=args.set_reference, progress=not args.quiet)
+        print(quick_table(result))
+        _write_json(args.json, result.as_dict())
+        return 0 if result.is_passed else EXIT_CHECK_FAILED
+    from refu_ros.evaluate import OUTPUT, EvaluateOptions, evaluate, results_dict, results_text
+
+    output = args.output or OUTPUT
+    options = EvaluateOptions(
+        data=tuple(args.data),
+        table=args.table,
+        weights=tuple(args.weights),
+        motions=args.motions,
+        output=output,
+        cache=args.cache,
+        every=args.every,
+        motion_every=args.motion_every,
+    )
+    tables = evaluate(options, progress=not args.quiet)
+    print(results_text(tables, output))
+    _write_json(args.json, results_dict(tables))
     return 0
 
 

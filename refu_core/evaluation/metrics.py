@@ -14,6 +14,9 @@ from refu_core.evaluation._intersect import as_vertices
 from refu_core.evaluation.collisions import Collisions
 from refu_core.sdf import check_faces
 
+ON_SKIN = 1e-6
+"""Vertices no deeper than this [m] lie on the skin and not inside: positions of a metre are stored to a tenth of it."""
+
 
 @dataclass(frozen=True)
 class FrameMetrics:
@@ -22,7 +25,7 @@ class FrameMetrics:
     n_vertices: int
     """Vertices the figures are over."""
     n_inside: int
-    """Of these, inside the body; as a percentage of all, VFCP."""
+    """Of these, inside the body (deeper than `ON_SKIN`); as a percentage of all, VFCP."""
     is_free: bool
     """No vertex inside and no pair of triangles intersects; as a percentage of frames, CFMP."""
     n_vf: int
@@ -193,12 +196,11 @@ class GarmentMetrics:
         of_kept = kept[self.faces[collisions.pairs[:, 0]]].all(axis=1)
         pairs, is_vf = collisions.pairs[of_kept, 0], collisions.pair_is_vf[of_kept]
         depth = collisions.depth[kept].astype(np.float64)
-        n_inside = int(collisions.inside[kept].sum())
         region = region & kept
         return FrameMetrics(
             n_vertices=int(kept.sum()),
-            n_inside=n_inside,
-            is_free=not len(pairs) and not n_inside,
+            n_inside=int((depth > ON_SKIN).sum()),
+            is_free=not len(pairs) and not collisions.inside[kept].any(),
             n_vf=len(np.unique(pairs[is_vf])),
             n_ee=len(np.unique(pairs[~is_vf])),
             max_depth_mm=1e3 * float(depth.max(initial=0.0)),

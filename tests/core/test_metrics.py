@@ -99,6 +99,20 @@ def test_figures_of_one_frame() -> None:
     assert frame.laplacian_mm is None
 
 
+def test_a_vertex_on_the_skin_is_not_inside_but_not_free() -> None:
+    """A vertex pushed onto the skin lands a rounding error on either side of it."""
+    vertices, _ = random_frame(np.random.default_rng(4))
+    depth = np.zeros(N, np.float32)
+    depth[:3] = 1e-8, 1e-7, 1e-3
+    none = np.zeros((0, 2), np.int32)
+    frame = GarmentMetrics(MESH.faces).add(vertices, Collisions(none, np.zeros(0, np.bool_), depth > 0, depth))
+    assert frame.n_inside == 1
+    assert not frame.is_free
+    depth[2] = 0
+    frame = GarmentMetrics(MESH.faces).add(vertices, Collisions(none, np.zeros(0, np.bool_), depth > 0, depth))
+    assert (frame.n_inside, frame.is_free) == (0, False)
+
+
 def test_laplacian_error_ignores_translation_and_mpve_does_not() -> None:
     vertices, collisions = random_frame(np.random.default_rng(1))
     frame = GarmentMetrics(MESH.faces).add(vertices + np.float32(0.125), collisions, truth=vertices)

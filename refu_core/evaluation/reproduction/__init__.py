@@ -1,0 +1,37 @@
+"""The paper's tables and figures on our own data, each figure beside the paper's; `refu evaluate` is made of this."""
+
+from refu_core.evaluation.reproduction._build import SAMPLE_BUILDERS as SAMPLE_BUILDERS
+from refu_core.evaluation.reproduction._build import sequence_table as sequence_table
+from refu_core.evaluation.reproduction._cache import Cache as Cache
+from refu_core.evaluation.reproduction._load import Library as Library
+from refu_core.evaluation.reproduction._load import Network as Network
+from refu_core.evaluation.reproduction._methods import METHODS as METHODS
+from refu_core.evaluation.reproduction._methods import SAMPLE_TABLES as SAMPLE_TABLES
+from refu_core.evaluation.reproduction._methods import SEQUENCE_SHAPES as SEQUENCE_SHAPES
+from refu_core.evaluation.reproduction._methods import Method as Method
+from refu_core.evaluation.reproduction._motion import Clip as Clip
+from refu_core.evaluation.reproduction._motion import motion_table as motion_table
+from refu_core.evaluation.reproduction._paper import PAPER as PAPER
+from refu_core.evaluation.reproduction._paper import TEST_COUNTS as TEST_COUNTS
+from refu_core.evaluation.reproduction._paper import paper_figure as paper_figure
+from refu_core.evaluation.reproduction._pictures import PICTURES as PICTURES
+from refu_core.evaluation.reproduction._plots import PLOTS as PLOTS
+from refu_core.evaluation.reproduction._runs import Run as Run
+from refu_core.evaluation.reproduction._runs import Study as Study
+from refu_core.evaluation.reproduction._runs import run_methods as run_methods
+from refu_core.evaluation.reproduction._samples import Sample as Sample
+from refu_core.evaluation.reproduction._samples import Samples as Samples
+from refu_core.evaluation.reproduction._sdf import neural_time_rows as neural_time_rows
+from refu_core.evaluation.reproduction._sdf import sdf_table as sdf_table
+from refu_core.evaluation.reproduction._tables import ALL as ALL
+from refu_core.evaluation.reproduction._tables import METRICS as METRICS
+from refu_core.evaluation.reproduction._tables import Missing as Missing
+from refu_core.evaluation.reproduction._tables import Row as Row
+from refu_core.evaluation.reproduction._tables import Table as Table
+from refu_core.evaluation.reproduction._tables import format_value as format_value
+from refu_core.evaluation.reproduction._tables import label_of as label_of
+from refu_core.evaluation.reproduction._write import TABLES as TABLES
+from refu_core.evaluation.reproduction._write import labels_of as labels_of
+from refu_core.evaluation.reproduction._write import read_table as read_table
+from refu_core.evaluation.reproduction._write import write_summary as write_summary
+from refu_core.evaluation.reproduction._write import write_table as write_table

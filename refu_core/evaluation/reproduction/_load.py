@@ -1,0 +1,67 @@
+"""Finding and loading what training made."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from refu_core.backbones import Backbone, read_backbone
+from refu_core.body import SmplBody
+from refu_core.errors import WeightsError
+from refu_core.evaluation.reproduction._methods import Method
+from refu_core.garments import GarmentTemplate
+from refu_core.repulsion import Refu, read_refu
+from refu_core.sdf import BodySdf, NeuralSdf, load_sdf_network
+from refu_core.weights import shipped_weights
+
+
+class Network(NamedTuple):
+    """What training made."""
+
+    backbone: Backbone
+    refu: Refu | None
+    """None where there is none in it."""
+
+
+class Library:
+    """Trained weights: those of some folders, `<folder>/<garment>/<weights>`, before those that ship."""
+
+    def __init__(self, folders: Sequence[Path] = ()) -> None:
+        """Looks into `folders` first, in their order."""
+        self._folders = tuple(folders)
+
+    def find(self, method: Method, garment: str) -> Path:
+        """The weights' files without suffix. Raises `WeightsError` where there are none."""
+        assert method.weights is not None
+        return self._find(method.weights, garment)
+
+    def key(self, method: Method, garment: str) -> str:
+        """What tells these weights from others of the same name; empty where there are none."""
+        if method.weights is None:
+            return ""
+        try:
+            card = json.loads(self.find(method, garment).with_suffix(".json").read_bytes())
+            return str(card.get("sha256", ""))
+        except (WeightsError, OSError, ValueError):
+            return ""
+
+    def load(self, method: Method, garment: GarmentTemplate, body: SmplBody) -> Network:
+        """A method's networks. Raises `WeightsError` where they are missing, damaged or of another body."""
+        stem = self.find(method, garment.name)
+        expect = {"garment": garment.name, "body_fingerprint": body.fingerprint}
+        backbone: Backbone = read_backbone(stem, garment, expect=expect).requires_grad_(False)
+        return Network(backbone, read_refu(stem, expect=expect))
+
+    def load_neural_sdf(self, preset: str, garment: str, body: SmplBody) -> BodySdf:
+        """A distance network trained on a garment's set, `sdf-<preset>`. Raises `WeightsError` where there is none."""
+        stem = self._find(f"sdf-{preset}", garment)
+        return NeuralSdf(load_sdf_network(stem, body).eval().requires_grad_(False), body)
+
+    def _find(self, name: str, garment: str) -> Path:
+        for folder in (*(f / garment for f in self._folders), shipped_weights(garment)):
+            if (folder / f"{name}.json").exists():
+                return folder / name
+        msg = "not trained"
+        raise WeightsError(msg)

@@ -1,0 +1,206 @@
+"""A method at work: one sample's body in, the garment that the method makes of it out, each stage timed."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from refu_core.backbones import Skinned
+from refu_core.body import RigidTransforms, SmplBody
+from refu_core.errors import WeightsError
+from refu_core.evaluation.reproduction._load import Library, Network
+from refu_core.frames import SmplFrame
+from refu_core.garments import GarmentTemplate
+from refu_core.realtime import GarmentPipeline
+from refu_core.repulsion import Blend, PostProcess, Refu, push_naively
+from refu_core.sdf import ApproxSdf, BodySdf, ExactSdf, RestFaces, SdfSample
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from refu_core.evaluation.reproduction._methods import Method
+
+
+@dataclass(eq=False)
+class Wardrobe:
+    """What all methods share for one garment: template, body, distances, and the hints that the fast one asks for."""
+
+    template: GarmentTemplate
+    body: SmplBody
+    exact: ExactSdf
+    approx: ApproxSdf
+    rest_faces: RestFaces
+    post_process: PostProcess
+    blend: Blend
+
+    @classmethod
+    def of(cls, template: GarmentTemplate, body: SmplBody) -> Wardrobe:
+        """Prepares a garment on a body."""
+        return cls(
+            template,
+            body,
+            ExactSdf(body.faces),
+            ApproxSdf(body),
+            RestFaces(body),
+            PostProcess.of_faces(template.faces, template.n_vertices),
+            Blend.of_faces(template.faces, template.n_vertices),
+        )
+
+    def near(self, unposed: Tensor, betas: Tensor) -> Tensor:
+        """A body face near each vertex of an unposed garment [m], shape (N, 3), for betas (1, 10); shape (N,)."""
+        return self.rest_faces(unposed - (betas @ self.template.shapedirs.T).view(-1, 3))
+
+
+@dataclass(eq=False)
+class Scene:
+    """One sample's body, posed; the distances to it are made ready when the first method asks."""
+
+    wardrobe: Wardrobe
+    pose: Tensor
+    """θ [rad], shape (1, 24, 3)."""
+    betas: Tensor
+    """β, shape (1, 10)."""
+    style: Tensor
+    """γ, shape (1, 4)."""
+    vertices: Tensor = field(init=False)
+    """Body [m], shape (V, 3)."""
+    transforms: RigidTransforms = field(init=False)
+    _update_ms: dict[str, float] = field(default_factory=dict, init=False)
+
+    def __post_init__(self) -> None:
+        posed = self.wardrobe.body(self.pose, self.betas)
+        self.vertices, self.transforms = posed.vertices[0], posed.transforms
+
+    @classmethod
+    def of(cls, wardrobe: Wardrobe, pose: ArrayLike, betas: ArrayLike, style: ArrayLike) -> Scene:
+        """A scene of a pose (24, 3) [rad], betas (10,) and style (4,)."""
+        values = (torch.from_numpy(np.asarray(value, np.float32))[None] for value in (pose, betas, style))
+        return cls(wardrobe, *values)
+
+    def sdf(self, name: str) -> tuple[BodySdf, float]:
+        """The distance of that name to this body, and how long it took to take over the body [ms]."""
+        sdf: BodySdf = self.wardrobe.exact if name == "accurate" else self.wardrobe.approx
+        if name not in self._update_ms:
+            start = time.perf_counter()
+            sdf.update(self.vertices, pose=self.pose[0], betas=self.betas[0])
+            self._update_ms[name] = 1e3 * (time.perf_counter() - start)
+        return sdf, self._update_ms[name]
+
+
+class Outcome(NamedTuple):
+    """What a method made of a scene."""
+
+    vertices: Tensor
+    """Garment [m], shape (N, 3)."""
+    ms: Mapping[str, float]
+    """Wall time by component: backbone (with posing), sdf, refu, post-process, node [ms]."""
+    scale: Tensor
+    """α of the vertices that ReFU pushed, shape (R,); empty for other methods."""
+    approx: Tensor
+    """Their signed distance as ReFU saw it [m], shape (R,)."""
+    accurate: Tensor
+    """And the accurate one [m], shape (R,)."""
+
+
+class Predictor:
+    """One method for one garment."""
+
+    def __init__(self, method: Method, wardrobe: Wardrobe, library: Library) -> None:
+        """Loads what the method needs. Raises `WeightsError` for networks that aren't trained."""
+        self._method = method
+        self._wardrobe = wardrobe
+        self._pipeline: GarmentPipeline | None = None
+        self._network = Network(Skinned(), None)
+        if method.handling == "node":
+            self._pipeline = GarmentPipeline.load(
+                [wardrobe.template.name], sdf=method.variant, backbone=method.backbone
+            )
+        elif method.backbone != "skinned":
+            self._network = library.load(method, wardrobe.template, wardrobe.body)
+        self._refu: Refu | None = None
+        if method.handling == "refu":
+            if self._network.refu is None:
+                msg = f"{method.weights}: weights of a backbone alone, wanted those of one with ReFU"
+                raise WeightsError(msg)
+            self._refu = _with_margin(self._network.refu, method.margin)
+
+    @torch.no_grad()
+    def __call__(self, scene: Scene) -> Outcome:
+        """The garment in a scene."""
+        if self._pipeline is not None:
+            return self._of_node(self._pipeline, scene)
+        start = time.perf_counter()
+        predicted = self._network.backbone(scene.betas, scene.pose, scene.style)
+        unposed = self._wardrobe.template.rest(scene.betas, scene.style)
+        if predicted.displacement is not None:
+            unposed = unposed + predicted.displacement
+        points = self._wardrobe.template.pose(unposed, scene.transforms)[0]
+        ms = {"backbone": 1e3 * (time.perf_counter() - start)}
+        if self._method.handling == "none" or self._method.sdf is None:
+            return _outcome(points, ms)
+        sdf, update_ms = scene.sdf(self._method.sdf)
+        start = time.perf_counter()
+        near = self._wardrobe.near(unposed[0], scene.betas) if self._method.sdf == "approx" else None
+        if self._refu is not None:
+            sample = sdf.query(points, near=near)
+            ms["sdf"] = update_ms + 1e3 * (time.perf_counter() - start)
+            return self._push(self._refu, scene, points, sample, predicted.feature, ms)
+        if self._method.handling == "naive":
+            done = push_naively(points, sdf, near=near)
+        else:
+            done = self._wardrobe.post_process.optimise(points, sdf, near=near)
+        ms["post-process"] = update_ms + 1e3 * (time.perf_counter() - start)
+        return _outcome(done, ms)
+
+    def _push(
+        self,
+        refu: Refu,
+        scene: Scene,
+        points: Tensor,
+        sample: SdfSample,
+        feature: Tensor | None,
+        ms: dict[str, float],
+    ) -> Outcome:
+        """ReFU as in training: one push, no second look."""
+        start = time.perf_counter()
+        z = refu.feature(scene.betas, scene.pose, scene.style, feature)
+        batch = SdfSample(sample.distance[None], sample.gradient[None])
+        done = refu(points[None], batch, z, blend=self._wardrobe.blend if self._method.is_blended else None)[0]
+        ms["refu"] = 1e3 * (time.perf_counter() - start)
+        rows = torch.nonzero(sample.distance < float(refu.margin))[:, 0]
+        scale, f = refu.of_body(z), sample.distance[rows]
+        exact, _ = scene.sdf("accurate")
+        return Outcome(
+            done,
+            ms,
+            torch.full_like(f, scale) if isinstance(scale, float) else scale(rows, f),
+            f,
+            exact.query(points[rows]).distance,
+        )
+
+    def _of_node(self, pipeline: GarmentPipeline, scene: Scene) -> Outcome:
+        frame = SmplFrame(pose=scene.pose[0].numpy(), betas=scene.betas[0].numpy(), style=scene.style[0].numpy())
+        start = time.perf_counter()
+        output = pipeline(frame)
+        ms = {"node": 1e3 * (time.perf_counter() - start)}
+        return _outcome(torch.from_numpy(output[self._wardrobe.template.name].local), ms)
+
+
+def _with_margin(refu: Refu, margin: float | None) -> Refu:
+    """The layer with another ε; itself for None."""
+    if margin is None:
+        return refu
+    other = Refu.from_config({**refu.config, "margin": margin, "learn_margin": False})
+    other.load_state_dict({name: t for name, t in refu.state_dict().items() if name != "log_margin"})
+    return other.eval()
+
+
+def _outcome(vertices: Tensor, ms: Mapping[str, float]) -> Outcome:
+    none = vertices.new_zeros(0)
+    return Outcome(vertices, ms, none, none, none)

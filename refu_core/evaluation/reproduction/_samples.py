@@ -1,0 +1,101 @@
+"""Test samples that methods are run on: those of a set of poses, or the frames of a set of sequences."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from refu_core.errors import RefuError
+from refu_core.simulation import GarmentDataset, GarmentSequences
+
+
+class Sample(NamedTuple):
+    """One body and the garment that was simulated on it."""
+
+    vertices: NDArray[np.float32]
+    """The true garment [m], shape (N, 3)."""
+    pose: NDArray[np.float32]
+    """θ [rad], shape (24, 3)."""
+    betas: NDArray[np.float32]
+    """β, shape (10,)."""
+    style: NDArray[np.float32]
+    """γ, shape (4,)."""
+    unseen: float
+    """Distance to the nearest training sample in (θ, β, γ); NaN where it isn't known."""
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """The test samples of one garment, read one at a time."""
+
+    garment: str
+    count: int
+    key: str
+    """What tells these samples from others."""
+    shapes: int | None
+    """Body shapes of a set of sequences; None for a set of poses."""
+    read: Callable[[int], Sample]
+    """The sample of a number from 0 to `count` - 1."""
+
+    def __len__(self) -> int:
+        return self.count
+
+    @classmethod
+    def open(cls, path: Path, *, every: int = 1) -> Samples:
+        """Every `every`-th test sample of the set in the folder `path`, finished so far.
+
+        Raises:
+            RefuError: no such set, a damaged one, or one without a finished test sample.
+        """
+        samples = _of_sequences(path, every) if _is_of_sequences(path) else _of_poses(path, every)
+        if not samples.count:
+            msg = f"{path}: no test sample in it is finished yet"
+            raise RefuError(msg)
+        return samples
+
+
+def _is_of_sequences(path: Path) -> bool:
+    try:
+        return "sequences" in str(json.loads((path / "card.json").read_text(encoding="utf-8"))["format"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return False  # whoever opens it as a set of poses says what is wrong
+
+
+def _of_poses(path: Path, every: int) -> Samples:
+    dataset = GarmentDataset(path)
+    rows = np.flatnonzero(dataset.test)[::every]
+
+    def read(number: int) -> Sample:
+        sample = dataset.sample(int(rows[number]))
+        return Sample(sample.vertices, sample.pose, sample.betas, sample.style, sample.unseen)
+
+    key = _key(dataset.column("slot")[rows], dataset.column("pose")[rows])
+    return Samples(str(dataset.card["garment"]), len(rows), key, None, read)
+
+
+def _of_sequences(path: Path, every: int) -> Samples:
+    dataset = GarmentSequences(path)
+    sequences = [dataset.sequence(int(row)) for row in np.flatnonzero(dataset.test)]
+    frames = [(k, int(t)) for k, sequence in enumerate(sequences) for t in np.flatnonzero(sequence.kept)][::every]
+
+    def read(number: int) -> Sample:
+        sequence, t = sequences[frames[number][0]], frames[number][1]
+        return Sample(sequence.vertices(t), sequence.pose[t], sequence.betas, sequence.style, float("nan"))
+
+    key = _key(np.array(frames), np.array([sequence.number for sequence in sequences]))
+    plan = dataset.card["plan"]
+    return Samples(str(plan["garment"]), len(frames), key, int(plan["shapes"]), read)
+
+
+def _key(*arrays: NDArray[np.generic]) -> str:
+    digest = hashlib.sha256()
+    for array in arrays:
+        digest.update(array.tobytes())
+    return digest.hexdigest()
