@@ -166,6 +166,19 @@ def test_interrupted_run_goes_on_to_the_same_bytes(simulated: Path, clips: Path,
     simulate(output, clips, progress=lambda _: pytest.fail("a finished set has nothing left to simulate"))
 
 
+def test_command_accepts_the_finished_set(
+    simulated: Path, clips: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plan = ["--count", "2", "--sequences", "--shapes", "1", "--seconds", str(SECONDS)]
+    paths = ["--output", str(simulated), "--motions", str(clips), "--json", str(tmp_path / "card.json")]
+    before = arrays(simulated)
+    assert main(["simulate", GARMENT, *plan, *paths, "--shard", "1/2", "--quiet"]) == 0
+    assert "frames kept" in capsys.readouterr().out
+    assert json.loads((tmp_path / "card.json").read_text()) == json.loads((simulated / "card.json").read_text())
+    for name, column in arrays(simulated).items():
+        np.testing.assert_array_equal(column, before[name])
+
+
 def test_other_kinds_of_set_are_refused(simulated: Path, clips: Path, tmp_path: Path) -> None:
     with pytest.raises(SimulationError, match="refu-garments-1"):
         GarmentDataset(simulated)
