@@ -52,5 +52,6 @@ def count_held(table: Table, orders: Sequence[Order]) -> tuple[int, int]:
 
 
 def is_as_good(metric: str, better: float, worse: float) -> bool:
-    """Whether the first figure is at least as good as the second."""
+    """Whether the first figure is at least as good as the second, both rounded as they are written."""
+    better, worse = (round(value, METRICS[metric].digits) for value in (better, worse))
     return better >= worse if METRICS[metric].higher_is_better else better <= worse

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
+from refu_core.repulsion import DEFAULT_MARGIN
+
 Handling = Literal["none", "naive", "optimisation", "refu", "node"]
 SdfName = Literal["approx", "accurate"]
 
@@ -26,7 +28,7 @@ class Method:
     sdf: SdfName | None = None
     """Signed distance at run time."""
     margin: float | None = None
-    """ε in place of the trained one [m]."""
+    """ε in place of the trained one, or of the optimisation's own 1 mm [m]."""
     is_blended: bool = True
     """Whether ReFU's pushes take the neighbourhood along, which the paper's don't."""
     base: str = "tailornet"
@@ -57,6 +59,25 @@ def _tailornet() -> list[Method]:
             ),
             Method(name=f"collision-loss-{sdf}", label=f"collision loss, {sdf}", variant=f"collision-loss-{sdf}"),
         ]
+        methods.append(
+            Method(
+                name=f"optimisation-{sdf}-margin",
+                label=f"optimisation post-process, {sdf}, with ReFU's margin",
+                handling="optimisation",
+                sdf=sdf,
+                margin=DEFAULT_MARGIN,
+            )
+        )
+    methods.append(
+        Method(
+            name="optimisation-on-hybrid",
+            label="optimisation post-process, approx, with ReFU's margin, of what ReFU hybrid's own backbone predicts",
+            variant="hybrid",
+            handling="optimisation",
+            sdf="approx",
+            margin=DEFAULT_MARGIN,
+        )
+    )
     for mode, sdf in _RUN_TIME_SDF.items():
         methods += _ablated(f"refu-{mode}", f"ReFU, {mode}", mode, sdf)
         methods.append(Method(name=f"node-{mode}", label=f"the node, {mode}", variant=mode, handling="node", sdf=sdf))
@@ -165,6 +186,9 @@ SAMPLE_TABLES: Mapping[str, tuple[str, ...]] = {
         "naive-accurate",
         "optimisation-approx",
         "optimisation-accurate",
+        "optimisation-approx-margin",
+        "optimisation-accurate-margin",
+        "optimisation-on-hybrid",
         "collision-loss-approx",
         "collision-loss-accurate",
         "refu-approx",
@@ -188,9 +212,13 @@ SAMPLE_TABLES: Mapping[str, tuple[str, ...]] = {
         "skinned-optimisation",
         "optimisation-approx",
         "optimisation-accurate",
+        "optimisation-approx-margin",
+        "optimisation-accurate-margin",
+        "optimisation-on-hybrid",
         "refu-approx",
         "refu-accurate",
         "refu-hybrid",
+        "node-hybrid",
     ),
     "energy": ("skinned", "tailornet", "refu-approx", "refu-accurate", "refu-hybrid"),
     "unseen": ("tailornet", "collision-loss-approx", "collision-loss-accurate", "refu-approx", "refu-hybrid"),

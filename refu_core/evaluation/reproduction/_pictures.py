@@ -125,7 +125,8 @@ def _camera(scene: Scene, garment: NDArray[np.float32], focus: NDArray[np.float3
     exact, _ = scene.sdf("accurate")
     outward = exact.query(scene.vertices.new_tensor(focus)[None]).gradient[0].numpy()
     yaw = float(np.degrees(np.arctan2(outward[0], outward[2])))
-    return Camera.looking_at(focus, distance=_CLOSE_UP / np.tan(np.radians(13.0)), yaw=yaw, pitch=5.0)
+    pitch = float(np.degrees(np.arcsin(np.clip(outward[1], -0.8, 0.8))))
+    return Camera.looking_at(focus, distance=_CLOSE_UP / np.tan(np.radians(13.0)), yaw=yaw, pitch=pitch)
 
 
 def _plain(method: str) -> str:

@@ -154,7 +154,8 @@ class Predictor:
         if self._method.handling == "naive":
             done = push_naively(points, sdf, near=near)
         else:
-            done = self._wardrobe.post_process.optimise(points, sdf, near=near)
+            clearance = {} if self._method.margin is None else {"clearance": self._method.margin}
+            done = self._wardrobe.post_process.optimise(points, sdf, near=near, **clearance)
         ms["post-process"] = update_ms + 1e3 * (time.perf_counter() - start)
         return _outcome(done, ms)
 

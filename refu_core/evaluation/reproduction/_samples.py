@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -46,6 +46,13 @@ class Samples:
 
     def __len__(self) -> int:
         return self.count
+
+    def thinned(self, most: int) -> Samples:
+        """At most so many of these samples, evenly spread."""
+        rows = np.unique(np.linspace(0, self.count - 1, min(most, self.count)).round().astype(int))
+        return replace(
+            self, count=len(rows), key=f"{self.key} {most}", read=lambda number: self.read(int(rows[number]))
+        )
 
     @classmethod
     def open(cls, path: Path, *, every: int = 1) -> Samples:

@@ -45,11 +45,17 @@ GOALS: tuple[Goal, ...] = (
             Goal("comparison", hybrid, "mpve_mm", None, than="tailornet"),
             Goal("comparison", hybrid, "vfcp_percent", 0.05),
             Goal("comparison", hybrid, "cfmp_percent", 95.0),
-            Goal("comparison", hybrid, "cfmp_percent", None, than="optimisation-approx"),
-            Goal("comparison", hybrid, "mpve_mm", None, than="optimisation-approx"),
+            *(
+                Goal(table, hybrid, metric, None, than=than)
+                for table, metric in (
+                    ("comparison", "cfmp_percent"),
+                    ("comparison", "mpve_mm"),
+                    ("laplacian", "laplacian_mm"),
+                )
+                for than in ("optimisation-approx", "optimisation-on-hybrid")
+            ),
         )
     ),
-    Goal("laplacian", "refu-hybrid", "laplacian_mm", None, than="optimisation-approx"),
     Goal("comparison", "refu-approx", "cfmp_percent", 90.0),
     Goal("comparison", "refu-accurate", "vfcp_percent", 0.0),
     Goal("comparison", "refu-accurate", "cfmp_percent", 99.0),
