@@ -2,6 +2,8 @@
 
 from refu_core.repulsion._blend import BLEND_ROUNDS as BLEND_ROUNDS
 from refu_core.repulsion._blend import Blend as Blend
+from refu_core.repulsion._files import read_refu as read_refu
+from refu_core.repulsion._files import refu_tensors as refu_tensors
 from refu_core.repulsion._limbs import Limbs as Limbs
 from refu_core.repulsion._postprocess import PostProcess as PostProcess
 from refu_core.repulsion._postprocess import push_naively as push_naively

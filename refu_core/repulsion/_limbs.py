@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -52,6 +54,12 @@ class Limbs:
             groups[list(joints), limb] = 1
         of_face = (body_weights @ groups)[body_faces].sum(1).argmax(1)
         return cls(of_face, garment_weights @ groups > _OWN, garment_faces, clearance.clamp_min(0.0))
+
+    @cached_property
+    def edges(self) -> Tensor:
+        """The garment's edges, each once, shape (E, 2)."""
+        pairs = np.sort(self.faces.cpu().numpy()[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        return torch.as_tensor(np.unique(pairs, axis=0), device=self.faces.device)
 
     def outward(self, points: Tensor) -> Tensor:
         """Unit normals of the garment [m], away from the skin it lies on, shape (N, 3), for its vertices (N, 3)."""

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from refu_core.repulsion._blend import Blend
 from refu_core.repulsion._limbs import Limbs
+from refu_core.repulsion._mend import mend
 from refu_core.repulsion._scale import VertexScale
 from refu_core.repulsion._unit import DEFAULT_MARGIN, MAX_DISPLACEMENT, repulse
 from refu_core.sdf import BodySdf, SdfSample
@@ -83,6 +84,9 @@ def resolve(
     """
     if start is None:
         start = sdf.query(points) if near is None else sdf.query(points, near=near)
+    if limbs is not None:
+        look = None if near is None else lambda here, faces: sdf.query(here, near=faces)
+        start = mend(points, start, limbs, margin=margin, look=look)
     state = _State(
         vertices=points.clone(),
         distance=start.distance.clone(),

@@ -3,24 +3,33 @@
 from refu_core.training._checkpoint import load_checkpoint, save_checkpoint
 from refu_core.training._data import Samples, output_basis, read_samples, split_validation
 from refu_core.training._figures import displacements, posed_errors, test_figures
+from refu_core.training._finetune import FINETUNE_MODES, FinetuneSettings, finetune
 from refu_core.training._loop import LoopSettings
+from refu_core.training._losses import Losses, collision_loss, reconstruction_loss, refu_loss
 from refu_core.training._mirror import Mirror, mirror_pose
 from refu_core.training._pretrain import PretrainSettings, pretrain
 from refu_core.training._progress import TrainingLog
 
 __all__ = [
+    "FINETUNE_MODES",
+    "FinetuneSettings",
     "LoopSettings",
+    "Losses",
     "Mirror",
     "PretrainSettings",
     "Samples",
     "TrainingLog",
+    "collision_loss",
     "displacements",
+    "finetune",
     "load_checkpoint",
     "mirror_pose",
     "output_basis",
     "posed_errors",
     "pretrain",
     "read_samples",
+    "reconstruction_loss",
+    "refu_loss",
     "save_checkpoint",
     "split_validation",
     "test_figures",

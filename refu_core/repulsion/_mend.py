@@ -1,0 +1,102 @@
+"""Distances that can't be true, because a neighbour's says so, and what the neighbour's makes of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from refu_core.repulsion._limbs import Limbs
+from refu_core.sdf import SdfSample
+
+_LOOKS = 3
+"""How far into a patch of wrong closest faces is looked from its rim [edges]."""
+_ROUNDS = 8
+"""How far into a patch of wrong sides is looked from its rim [edges]."""
+_TOLERANCE = 1e-3
+"""Disagreement that is let pass [m]: an approximate distance is never quite consistent."""
+
+
+def mend(
+    points: Tensor,
+    sample: SdfSample,
+    limbs: Limbs,
+    *,
+    margin: float,
+    look: Callable[[Tensor, Tensor], SdfSample] | None = None,
+) -> SdfSample:
+    """The distances of a garment's vertices, made consistent along its edges where these are at the skin.
+
+    Distances of two points differ by no more than the points are apart. Where the ends of an edge contradict that,
+
+    - an approximate distance has found another face than the closest for one of them, and never one that is nearer: the
+      end farther from its face looks again, from the other end's face;
+    - or, where that is of no avail, the skin that one end is near isn't the body's surface. Where a bent arm runs into
+      itself, the upper arm's skin is within the forearm, and a vertex deep in there is said to be outside of it. The
+      end inside is right; the other one gets its distance to the tangent plane of the skin that the one inside is at,
+      and leaves the body with it. That is so within a limb only: between two limbs cloth may well be outside of one
+      and within the other.
+
+    Args:
+        points: Garment vertices [m], shape (N, 3).
+        sample: Their distances, with faces.
+        limbs: The garment's edges, which limb a vertex lies on, and which a face is of.
+        margin: Distances above it are of no interest [m].
+        look: The distance of points (R, 3) from faces near by (R,); None where it needs no such hints.
+    """
+    if sample.face is None:
+        return sample
+    for _ in range(_LOOKS if look is not None else 0):
+        first, second = _contradictions(points, sample.distance, limbs.edges, margin)
+        is_nearer = sample.distance[first].abs() < sample.distance[second].abs()
+        trusted, other = torch.where(is_nearer, first, second), torch.where(is_nearer, second, first)
+        if look is None or not len(other):
+            break
+        again = look(points[other], sample.face[trusted])
+        sample, changed = _replaced(sample, other, again, again.distance.abs() < sample.distance[other].abs())
+        if not changed:
+            break
+    for _ in range(_ROUNDS):
+        first, second = _contradictions(points, sample.distance, limbs.edges, margin)
+        is_lower = sample.distance[first] < sample.distance[second]
+        low, high = torch.where(is_lower, first, second), torch.where(is_lower, second, first)
+        within = sample.rows(low)
+        if not len(high) or within.face is None:
+            break
+        to_plane = within.distance + ((points[high] - points[low]) * within.gradient).sum(-1)
+        is_own = limbs.own[high, limbs.of_face[within.face.long()]]
+        is_wrong = is_own & (within.distance < 0) & (to_plane < sample.distance[high] - _TOLERANCE)
+        sample, changed = _replaced(sample, high, within._replace(distance=to_plane), is_wrong)
+        if not changed:
+            break
+    return sample
+
+
+def _contradictions(points: Tensor, distance: Tensor, edges: Tensor, margin: float) -> tuple[Tensor, Tensor]:
+    """Ends of the edges whose distances differ by more than their length, and of which one is below `margin`."""
+    ends = distance[edges]
+    differs = (ends[:, 0] - ends[:, 1]).abs() > _TOLERANCE
+    suspects = edges[torch.nonzero(differs & (ends.amin(1) < margin))[:, 0]]
+    first, second = suspects.unbind(1)
+    length = torch.linalg.vector_norm(points[first] - points[second], dim=-1)
+    first, second = suspects[(distance[first] - distance[second]).abs() > length + _TOLERANCE].unbind(1)
+    return first, second
+
+
+def _replaced(sample: SdfSample, rows: Tensor, by: SdfSample, which: Tensor) -> tuple[SdfSample, bool]:
+    """The sample with those of `rows` replaced that `which` says; of several for one row, the nearest one."""
+    rows, by = rows[which], by.rows(which)
+    if not len(rows) or sample.face is None or by.face is None:
+        return sample, False
+    size = by.distance.abs()
+    nearest = torch.full_like(sample.distance, torch.inf).scatter_reduce(0, rows, size, "amin")
+    wins = size == nearest[rows]
+    rows, by = rows[wins], by.rows(wins)
+    assert by.face is not None
+    replaced = SdfSample(
+        sample.distance.index_copy(0, rows, by.distance),
+        sample.gradient.index_copy(0, rows, by.gradient),
+        sample.face.index_copy(0, rows, by.face.to(sample.face)),
+    )
+    return replaced, True

@@ -1,0 +1,247 @@
+"""Training with ReFU: of a pre-trained backbone (paper, Sec. 3.2), or from scratch (supplement)."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from refu_core.backbones import backbone_config, build_backbone, read_backbone, save_backbone, uses_basis
+from refu_core.body import SmplBody, load_body
+from refu_core.errors import RefuError
+from refu_core.garments import GarmentTemplate, load_garment
+from refu_core.repulsion import DEFAULT_MARGIN, SCALE_PRESETS, Refu, refu_tensors
+from refu_core.simulation import GarmentDataset
+from refu_core.training._data import Samples, mirrored, read_samples, split_validation
+from refu_core.training._dresser import Dresser, Sdf
+from refu_core.training._loop import Loop, LoopSettings, Objective, Stage, start_parallel
+from refu_core.training._losses import COLLISION_WEIGHT, RECONSTRUCTION_WEIGHT, refu_loss
+from refu_core.training._mirror import Mirror
+from refu_core.training._pretrain import PretrainSettings, pivots_of, stages
+from refu_core.training._pretrain import _basis as basis_of
+from refu_core.training._progress import TrainingLog
+
+_CHUNK = 64
+_UNIT = 1e3
+"""What the loss is multiplied by, so that its curves are numbers to read. Adam doesn't see it."""
+
+
+@dataclass(frozen=True)
+class _Mode:
+    in_refu: Sdf | None
+    in_loss: Sdf
+    least: float
+
+
+_MODES: dict[str, _Mode] = {
+    "approx": _Mode("approx", "approx", 0.0),
+    "accurate": _Mode("accurate", "accurate", 1.0),
+    "hybrid": _Mode("approx", "accurate", 0.0),
+    "collision-approx": _Mode(None, "approx", 1.0),
+    "collision-accurate": _Mode(None, "accurate", 1.0),
+}
+FINETUNE_MODES: tuple[str, ...] = tuple(_MODES)
+"""The paper's three settings: approximate or accurate distance everywhere; hybrid, accurate in the loss and approximate
+in ReFU. And its baseline, a collision loss without ReFU, by either distance."""
+
+
+@dataclass(frozen=True)
+class FinetuneSettings:
+    """How a backbone is trained with ReFU; the defaults are those of the shipped weights."""
+
+    loop: LoopSettings = field(
+        default_factory=lambda: LoopSettings(batch_size=16, learning_rate=3e-4, weight_decay=0.1, check_every=100)
+    )
+    steps: int = 600
+    reconstruction_weight: float = RECONSTRUCTION_WEIGHT
+    collision_weight: float = COLLISION_WEIGHT
+    scale: str | None = "realtime"
+    """Preset of the scale networks; None fixes α at 1."""
+    margin: float = DEFAULT_MARGIN
+    """ε [m]."""
+    learn_margin: bool = False
+    is_blended: bool = True
+    """Whether pushed vertices take their neighbourhood along in training, as they do at run time."""
+    is_mirrored: bool = True
+    validation_share: float = 0.08
+    """The share that pre-training held out, so that it is the same samples: see `split_validation`."""
+
+    @classmethod
+    def paper(cls) -> FinetuneSettings:
+        """The paper's own (Sec. Implementation): Adam with 1e-5, networks of 1024, ε = 0, no blending."""
+        loop = LoopSettings(batch_size=32, learning_rate=1e-5, weight_decay=0.0, check_every=1000)
+        return cls(loop, steps=100_000, scale="paper", margin=0.0, is_blended=False, is_mirrored=False)
+
+
+def finetune(
+    garment: str | GarmentTemplate,
+    dataset: str | Path | GarmentDataset,
+    weights: str | Path | None,
+    output: str | Path,
+    *,
+    mode: str = "hybrid",
+    backbone: str = "tailornet",
+    preset: str = "realtime",
+    settings: FinetuneSettings | None = None,
+    body: SmplBody | None = None,
+    device: str = "cpu",
+    quiet: bool = False,
+) -> dict[str, Any]:
+    """Trains a backbone together with ReFU and writes `output`/<backbone>-<mode>.
+
+    Interrupted, the same call goes on from the last checkpoint. Under `torchrun` all processes make one training.
+
+    Args:
+        garment: name of a built-in garment, or a template.
+        dataset: simulated set (`refu simulate`).
+        weights: folder with <backbone>-none and its basis, as `pretrain` wrote them; None to train from scratch, as the
+            supplement does with the gcnn.
+        output: folder of the weights, of the checkpoint while it is needed, and of the loss curves; may be `weights`.
+        mode: one of `FINETUNE_MODES`.
+        backbone: `tailornet`, `mlp` or `gcnn`.
+        preset: `realtime` or `paper`, of ReFU and of a backbone from scratch.
+        settings: the preset's own if not given.
+        body: the body that the set was simulated on; the garment's built-in one if not given.
+        device: `cpu` or `cuda`.
+        quiet: show no progress.
+
+    Returns:
+        The card: what was trained on what.
+
+    Raises:
+        RefuError: no such mode, the set is of another garment or body or too small, or a checkpoint there is of another
+            training.
+        WeightsError: no such backbone or preset, weights that are missing, damaged or of another garment.
+    """
+    if mode not in _MODES:
+        msg = f"no mode {mode!r} of training: wanted {', '.join(FINETUNE_MODES)}"
+        raise RefuError(msg)
+    if settings is None:
+        settings = FinetuneSettings.paper() if preset == "paper" else FinetuneSettings()
+    template = load_garment(garment) if isinstance(garment, str) else garment
+    body = load_body(template.body) if body is None else body
+    is_writer, torch_device = start_parallel(torch.device(device))
+    output = Path(output)
+    opened = dataset if isinstance(dataset, GarmentDataset) else GarmentDataset(dataset)
+    identity = {"garment": template.name, "body_fingerprint": body.fingerprint}
+    samples = read_samples(opened, body, template, split="train")
+    train, validation = split_validation(samples, share=settings.validation_share, seed=settings.loop.seed)
+    if settings.is_mirrored:
+        train = train.joined(mirrored(train, Mirror.of(template)))
+    network: nn.Module
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(settings.loop.seed)
+        if weights is None:
+            config = backbone_config(backbone, template.name, preset=preset)
+            basis = None
+            if uses_basis(config, preset):
+                rank = PretrainSettings().rank
+                basis = basis_of(output, samples, None, rank, identity, len(opened), is_writer=is_writer)
+            network = fresh = build_backbone(config, template, basis=basis, pivots=pivots_of(samples))
+            # For the scale of inputs and outputs, which it sets; the stages themselves aren't run.
+            stages(fresh, train, validation, template, PretrainSettings())
+        else:
+            network = read_backbone(Path(weights) / f"{backbone}-none", template, expect=identity)
+            _bring_basis(Path(weights), output, is_writer=is_writer)
+        refu = _layer(mode, settings, template.n_vertices)
+    described = {
+        **identity,
+        "backbone": backbone,
+        "preset": preset,
+        "mode": mode,
+        "settings": asdict(settings),
+        "samples": len(train),
+        "from_scratch": weights is None,
+    }
+    found = _MODES[mode]
+    dresser = Dresser(
+        network,
+        refu,
+        template.to(device=torch_device),
+        body.to(device=torch_device),
+        in_refu=found.in_refu or found.in_loss,
+        in_loss=found.in_loss,
+        is_blended=settings.is_blended,
+    ).to(torch_device)
+    name = f"{backbone}-{mode}"
+    loop = Loop(
+        dresser,
+        settings.loop,
+        checkpoint=output / f"{name}.checkpoint",
+        identity=json.dumps(described, sort_keys=True, default=str),
+        log=TrainingLog(output, name=name, quiet=quiet) if is_writer else None,
+        device=torch_device,
+    )
+    objective = Objective([dresser], dresser, _Loss(settings))
+    data = [_tensors(part, body, template) for part in (train, validation)]
+    loop.run(Stage("refu", objective, settings.steps, train=data[0], validation=data[1]))
+    dresser.to("cpu").eval()
+    card = {
+        **described,
+        "refu": None if refu is None else refu.config,
+        "dataset": {key: opened.card.get(key) for key in ("garment_fingerprint", "motions_fingerprint", "plan")},
+    }
+    if is_writer:
+        others = None if refu is None else refu_tensors(refu, half=preset != "paper")
+        save_backbone(output / name, network, card, others=others, half=preset != "paper")
+        (output / f"{name}.checkpoint").unlink(missing_ok=True)
+    return card
+
+
+class _Loss:
+    """The paper's loss of garments with their distance, (B, N, 4), and the true garments, (B, N, 3) [m]."""
+
+    def __init__(self, settings: FinetuneSettings) -> None:
+        self._settings = settings
+
+    def __call__(self, dressed: Tensor, truth: Tensor) -> Tensor:
+        losses = refu_loss(
+            dressed[..., :3],
+            truth,
+            dressed[..., 3],
+            reconstruction_weight=self._settings.reconstruction_weight,
+            collision_weight=self._settings.collision_weight,
+        )
+        return _UNIT * losses.total
+
+
+def _tensors(samples: Samples, body: SmplBody, garment: GarmentTemplate) -> tuple[Tensor, ...]:
+    """What the loop draws from: β, θ, γ and the posed true garments [m], shape (N, V, 3)."""
+    posed = torch.empty_like(samples.displacement)
+    style = None if garment.styledirs is None else samples.style
+    with torch.no_grad():
+        for start in range(0, len(samples), _CHUNK):
+            chunk = slice(start, start + _CHUNK)
+            rest = garment.rest(samples.betas[chunk], None if style is None else style[chunk])
+            transforms = body(samples.pose[chunk], samples.betas[chunk]).transforms
+            posed[chunk] = garment.pose(rest + samples.displacement[chunk], transforms)
+    return samples.betas, samples.pose, samples.style, posed
+
+
+def _layer(mode: str, settings: FinetuneSettings, n_vertices: int) -> Refu | None:
+    if _MODES[mode].in_refu is None:
+        return None
+    if settings.scale is not None and settings.scale not in SCALE_PRESETS:
+        msg = f"no preset {settings.scale!r} of the scale networks: wanted {', '.join(SCALE_PRESETS)} or None"
+        raise RefuError(msg)
+    return Refu(
+        n_vertices,
+        least=_MODES[mode].least,
+        scale=None if settings.scale is None else SCALE_PRESETS[settings.scale],
+        margin=settings.margin,
+        learn_margin=settings.learn_margin,
+    )
+
+
+def _bring_basis(source: Path, target: Path, *, is_writer: bool) -> None:
+    """Copies the output basis beside the weights that will need it."""
+    if not is_writer or source.resolve() == target.resolve() or not (source / "basis.json").exists():
+        return
+    target.mkdir(parents=True, exist_ok=True)
+    for name in ("basis.safetensors", "basis.json"):
+        shutil.copyfile(source / name, target / name)

@@ -1,0 +1,59 @@
+"""The losses that a backbone with ReFU is trained by (paper, Sec. Train Backbone with ReFU)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from torch import Tensor
+
+RECONSTRUCTION_WEIGHT = 1.5
+"""λ₁ of the paper (Sec. Implementation)."""
+COLLISION_WEIGHT = 0.5
+"""λ₂ of the paper."""
+
+
+class Losses(NamedTuple):
+    """The loss of a batch and its terms, each of shape ()."""
+
+    total: Tensor
+    reconstruction: Tensor
+    collision: Tensor
+
+
+def refu_loss(
+    vertices: Tensor,
+    truth: Tensor,
+    distance: Tensor,
+    *,
+    reconstruction_weight: float = RECONSTRUCTION_WEIGHT,
+    collision_weight: float = COLLISION_WEIGHT,
+) -> Losses:
+    """L = λ₁ L_r + λ₂ L_c of garments after ReFU.
+
+    L_r is `reconstruction_loss`, L_c `collision_loss`. With positions in metres both are about 1e-4 for a good
+    backbone, which is what the paper's weights balance.
+
+    Args:
+        vertices: Garments after ReFU [m], shape (B, N, 3).
+        truth: The true ones [m], shape (B, N, 3).
+        distance: Signed distance of `vertices` [m], shape (B, N).
+        reconstruction_weight: λ₁.
+        collision_weight: λ₂.
+    """
+    reconstruction = reconstruction_loss(vertices, truth)
+    collision = collision_loss(distance)
+    return Losses(reconstruction_weight * reconstruction + collision_weight * collision, reconstruction, collision)
+
+
+def reconstruction_loss(vertices: Tensor, truth: Tensor) -> Tensor:
+    """L_r: squared distance to the truth [m²], shape ().
+
+    The paper's sum over vertices is divided by their number, here and in L_c: Adam doesn't see a common factor, and the
+    figures of garments of different sizes can be compared.
+    """
+    return (vertices - truth).square().sum(dim=-1).mean()
+
+
+def collision_loss(distance: Tensor) -> Tensor:
+    """L_c: depth inside the body, max(-f, 0) (Eq. collisionloss), mean over vertices [m], shape ()."""
+    return (-distance).clamp_min(0).mean()

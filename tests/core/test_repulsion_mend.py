@@ -1,0 +1,95 @@
+"""Distances that contradict each other along the garment's edges."""
+
+from __future__ import annotations
+
+import torch
+import trimesh
+from torch import Tensor
+
+from refu_core.evaluation import CollisionChecker
+from refu_core.repulsion import Blend, Limbs, resolve
+from refu_core.repulsion._mend import mend
+from refu_core.sdf import ExactSdf, SdfSample
+
+
+def sheet(n: int, spacing: float) -> tuple[Tensor, Tensor]:
+    """A square sheet of n × n vertices around the origin in the plane y = 0, and its faces, seen from above."""
+    x, z = torch.meshgrid(torch.arange(n), torch.arange(n), indexing="ij")
+    points = torch.stack((x, torch.zeros_like(x), z), dim=-1).view(-1, 3) - torch.tensor([n - 1, 0, n - 1]) / 2
+    corner = (x * n + z)[:-1, :-1].reshape(-1, 1)
+    return points * spacing, torch.cat((corner + torch.tensor([0, 1, n]), corner + torch.tensor([1, n + 1, n])))
+
+
+def one_limb(faces: Tensor, n_vertices: int, n_body_faces: int, *, foreign: bool = False) -> Limbs:
+    own = torch.zeros(n_vertices, 4, dtype=torch.bool)
+    own[:, 1 if foreign else 0] = True
+    return Limbs(torch.zeros(n_body_faces, dtype=torch.int64), own, faces, torch.full((n_vertices,), 0.01))
+
+
+def boxes() -> tuple[Tensor, Tensor]:
+    """Two boxes of 4 cm height, of which the lower one's top is 1 cm within the upper one: a body that meets itself."""
+    upper = trimesh.creation.box((0.3, 0.04, 0.3))
+    lower = trimesh.creation.box((0.28, 0.04, 0.28))
+    lower.apply_translation((0, -0.03, 0))
+    both = trimesh.util.concatenate([upper.subdivide(), lower.subdivide()])
+    return torch.tensor(both.vertices, dtype=torch.float32), torch.tensor(both.faces)
+
+
+def test_a_vertex_within_flesh_that_meets_itself_leaves_with_its_neighbours() -> None:
+    """At y = -2 mm a point is in the upper box, and nearest to the lower one's top: outside of that."""
+    body, body_faces = boxes()
+    points, faces = sheet(21, 0.01)
+    points[:, 1] = 0.03 - 0.036 * torch.exp(-((points.norm(dim=1) / 0.06) ** 2))  # from 3 cm down to -6 mm
+    sdf = ExactSdf(body_faces)
+    sdf.update(body)
+    checker = CollisionChecker(body_faces)
+    checker.update(body)
+    sample = sdf.query(points)
+    is_inside = torch.from_numpy(checker.check(points, faces).inside)
+    assert (is_inside & (sample.distance > 0)).sum() > 3  # what the test is about
+    limbs = one_limb(faces, len(points), len(body_faces))
+    mended = mend(points, sample, limbs, margin=0.004)
+    assert torch.equal(mended.distance < 0, is_inside)
+    blend = Blend.of_faces(faces, len(points))
+    assert checker.check(resolve(points, sdf, limbs=limbs, blend=blend).vertices, faces).is_free
+    assert not checker.check(resolve(points, sdf, blend=blend).vertices, faces).is_free
+    # The same between two limbs is left alone.
+    assert mend(points, sample, one_limb(faces, len(points), len(body_faces), foreign=True), margin=0.004) is sample
+
+
+def test_a_closest_face_that_was_missed_is_found_from_a_neighbours() -> None:
+    mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.1)
+    sdf = ExactSdf(mesh.faces)
+    sdf.update(torch.tensor(mesh.vertices, dtype=torch.float32))
+    points, faces = sheet(15, 0.01)
+    points[:, 1] += 0.097
+    true = sdf.query(points)
+    assert true.face is not None
+    missed = (points[:, 0] > 0) & (points[:, 2].abs() < 0.015)
+    wrong = true._replace(distance=torch.where(missed, 0.05, true.distance))
+    asked: list[int] = []
+
+    def look(here: Tensor, near: Tensor) -> SdfSample:
+        asked.append(len(here))
+        assert set(near.tolist()) <= set(true.face.tolist())  # type: ignore[union-attr]
+        return sdf.query(here)
+
+    limbs = one_limb(faces, len(points), len(mesh.faces))
+    mended = mend(points, wrong, limbs, margin=0.004, look=look)
+    at_the_skin = missed & (true.distance < 0.004)
+    torch.testing.assert_close(mended.distance[at_the_skin], true.distance[at_the_skin])
+    torch.testing.assert_close(mended.gradient[at_the_skin], true.gradient[at_the_skin])
+    assert 0 < sum(asked) < 3 * len(points)
+    assert at_the_skin.sum() > 3
+
+
+def test_consistent_distances_are_left_as_they_are() -> None:
+    mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.1)
+    sdf = ExactSdf(mesh.faces)
+    sdf.update(torch.tensor(mesh.vertices, dtype=torch.float32))
+    points, faces = sheet(15, 0.01)
+    points[:, 1] += 0.09
+    sample = sdf.query(points)
+    limbs = one_limb(faces, len(points), len(mesh.faces))
+    assert mend(points, sample, limbs, margin=0.004, look=lambda here, _: sdf.query(here)) is sample
+    assert mend(points, sample._replace(face=None), limbs, margin=0.004).face is None
