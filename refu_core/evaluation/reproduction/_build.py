@@ -310,8 +310,8 @@ def _ratio_finding(run: Run | None) -> list[str]:
     share = 100.0 * run.scales.count[right] / run.scales.count.sum()
     return [
         f"{run.garment}, {LABELS[run.method]}: of the vertices inside the body, {share:.1f} % are given 0.75 to 1.25 "
-        "of their accurate distance. The paper's network is off by a quarter on average: α has more to make up for there."
-    there." ]
+        "of their accurate distance. The paper's network is off by a quarter on average, which leaves α more to do."
+    ]
 
 
 def _finished(study: Study, table: Table) -> Table:
