@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, overload
 
 import numpy as np
@@ -16,14 +17,19 @@ from refu_core.body import RigidTransforms, SmplBody, load_body
 from refu_core.errors import GarmentError, RefuError
 from refu_core.frames import SmplFrame
 from refu_core.garments import N_STYLES, GarmentTemplate, load_garment
-from refu_core.repulsion import DEFAULT_MARGIN, Limbs, resolve
+from refu_core.realtime._collisions import Collisions, Fabric
+from refu_core.repulsion import DEFAULT_MARGIN, Refu, VertexScale, read_refu
 from refu_core.sdf import ExactSdf
+from refu_core.weights import shipped_weights
 
 if TYPE_CHECKING:
+    from os import PathLike
+
     from numpy.typing import ArrayLike, NDArray
 
-SDF_MODES: tuple[str, ...] = ("accurate", "none")
-"""How collisions are found: with the exact signed distance, or not at all (the raw backbone)."""
+SDF_MODES: tuple[str, ...] = ("hybrid", "approx", "accurate", "none")
+"""How collisions are found (paper, Sec. 4.1): with the approximate signed distance, by weights that were trained with
+the accurate one in the loss or without it; with the accurate one; or not at all (the raw backbone)."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +53,7 @@ class FrameStats:
     """How long the stages of one frame took, and what they did."""
 
     stage_ms: Mapping[str, float]
-    """Wall time of each stage, all garments together [ms]: body, backbone, sdf (refit), refu."""
+    """Wall time of each stage, all garments together [ms]: body, backbone, sdf (new pose), refu (distances, pushes)."""
     garments: Mapping[str, GarmentStats] = field(default_factory=dict)
 
 
@@ -91,12 +97,28 @@ class PipelineOutput(Mapping[str, GarmentMesh]):
 
 @dataclass(frozen=True, eq=False)
 class _Wearable:
-    """A loaded garment and its network."""
+    """A loaded garment, its networks, and what collision handling knows of it."""
 
     template: GarmentTemplate
     backbone: Backbone
-    limbs: Limbs
+    refu: Refu | None
+    fabric: Fabric
     faces: NDArray[np.int64]
+    margin: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Dressed:
+    """One garment on a batch of bodies, before collisions are handled."""
+
+    posed: Tensor
+    """Vertices [m], shape (B, V, 3)."""
+    near: Tensor | None
+    """A body face near each vertex, shape (B, V), where the distance wants to know."""
+    scale: list[float | VertexScale]
+    """α of each body."""
+    ms: float
+    """Wall time of one of the bodies [ms]."""
 
 
 class GarmentPipeline:
@@ -110,14 +132,20 @@ class GarmentPipeline:
     """
 
     def __init__(
-        self, body: SmplBody, wearables: Mapping[str, _Wearable], *, sdf: str, margin: float, style: Tensor | None
+        self,
+        body: SmplBody,
+        wearables: Mapping[str, _Wearable],
+        *,
+        collisions: Collisions | None,
+        margin: float | None,
+        style: Tensor | None,
     ) -> None:
         self.body = body
-        self.sdf_mode = sdf
         self.margin = margin
+        """Clearance that is kept from the skin [m]; None for what each garment's weights were trained with."""
         self._wearables = wearables
         self._style = style
-        self._sdf = ExactSdf(body.faces, device=str(body.device)) if sdf == "accurate" else None
+        self._collisions = collisions
 
     @classmethod
     def load(
@@ -127,22 +155,24 @@ class GarmentPipeline:
         sdf: str = "accurate",
         backbone: str = "skinned",
         style: ArrayLike | None = None,
-        margin: float = DEFAULT_MARGIN,
+        margin: float | None = None,
+        weights: str | PathLike[str] | None = None,
         device: str = "cpu",
     ) -> GarmentPipeline:
         """Loads garments and what they need.
 
         Args:
             garments: names of built-in garments of one body.
-            sdf: `accurate` or `none`.
-            backbone: `skinned`.
+            sdf: `hybrid`, `approx`, `accurate` or `none`.
+            backbone: `tailornet`, `mlp`, `gcnn`, or `skinned`, which needs no weights.
             style: γ of all garments, shape (4,); the mean style if not given.
-            margin: clearance ε that is kept from the skin [m].
+            margin: clearance ε that is kept from the skin [m]; by default what the weights were trained with.
+            weights: folder with a folder a garment of weights of one's own (`refu train`); those that ship by default.
             device: torch device, `cpu` or `cuda`.
 
         Raises:
             GarmentError: no garment, an unknown one, garments of two bodies, or a bad style.
-            WeightsError: no such backbone for a garment.
+            WeightsError: no such backbone, or no weights of it for a garment, a mode, and the garment's body.
             RefuError: an unknown mode, margin or device.
         """
         if isinstance(garments, str):
@@ -151,9 +181,9 @@ class GarmentPipeline:
             msg = "no garment was asked for: name at least one"
             raise GarmentError(msg)
         if sdf not in SDF_MODES:
-            msg = f"no sdf mode {sdf!r}: wanted {' or '.join(SDF_MODES)}"
+            msg = f"no sdf mode {sdf!r}: wanted {', '.join(SDF_MODES)}"
             raise RefuError(msg)
-        if not 0 <= margin <= 0.05:
+        if margin is not None and not 0 <= margin <= 0.05:
             msg = f"the margin must be between 0 and 0.05 m, got {margin}"
             raise RefuError(msg)
         torch_device = _device(device)
@@ -166,17 +196,29 @@ class GarmentPipeline:
         body = load_body(worn_by.pop(), device=torch_device)
         rest = ExactSdf(body.faces, device=body.device)
         rest.update(body.v_template)
-        wearables = {
-            name: _Wearable(
-                t, load_backbone(backbone, name, device=torch_device), _limbs(body, rest, t), t.faces.cpu().numpy()
+        wearables: dict[str, _Wearable] = {}
+        for name, template in templates.items():
+            folder = shipped_weights(name) if weights is None else Path(weights) / name
+            network = load_backbone(
+                backbone, template, mode=sdf, body_fingerprint=body.fingerprint, folder=folder, device=torch_device
             )
-            for name, t in templates.items()
-        }
+            refu = None
+            if backbone != "skinned" and sdf != "none":
+                refu = read_refu(folder / f"{backbone}-{sdf}", device=torch_device)
+            wearables[name] = _Wearable(
+                template,
+                network,
+                refu,
+                Fabric.of(template, body, rest),
+                template.faces.cpu().numpy(),
+                DEFAULT_MARGIN if refu is None else float(refu.margin),
+            )
         gamma = None if style is None else _style(style, torch_device)
         if gamma is not None:
             for template in templates.values():
                 template.rest(gamma.new_zeros(1, 10), gamma)  # says now, not in the first frame, if it has no styles
-        return cls(body, wearables, sdf=sdf, margin=margin, style=gamma)
+        collisions = None if sdf == "none" else Collisions(body, is_accurate=sdf == "accurate")
+        return cls(body, wearables, collisions=collisions, margin=margin, style=gamma)
 
     @property
     def garments(self) -> dict[str, GarmentTemplate]:
@@ -204,16 +246,32 @@ class GarmentPipeline:
         posed = self.body(pose, betas)
         stages = {"body": clock.lap() / len(frames)}
         style = self._styles(frames)
-        raw: dict[str, Tensor] = {}
-        dress_ms: dict[str, float] = {}
+        dressed: dict[str, _Dressed] = {}
         for name, wearable in self._wearables.items():
-            raw[name] = _dress(wearable, pose, betas, style, posed.transforms)
-            dress_ms[name] = clock.lap() / len(frames)
-        stages["backbone"] = sum(dress_ms.values())
-        return [
-            self._handle_collisions(frame, posed.vertices[i], {name: x[i] for name, x in raw.items()}, stages, dress_ms)
-            for i, frame in enumerate(frames)
-        ]
+            dressed[name] = self._dress(wearable, pose, betas, style, posed.transforms, clock)
+        stages["backbone"] = sum(one.ms for one in dressed.values())
+        return [self._handle_collisions(i, frame, posed.vertices[i], dressed, stages) for i, frame in enumerate(frames)]
+
+    def _dress(
+        self,
+        wearable: _Wearable,
+        pose: Tensor,
+        betas: Tensor,
+        style: Tensor | None,
+        transforms: RigidTransforms,
+        clock: _StageClock,
+    ) -> _Dressed:
+        template, refu, n = wearable.template, wearable.refu, len(pose)
+        unposed = template.rest(betas, style)
+        predicted = wearable.backbone(betas, pose, style)
+        if predicted.displacement is not None:
+            unposed = unposed + predicted.displacement
+        near = None if self._collisions is None else self._collisions.near(wearable.fabric, unposed, betas)
+        scale: list[float | VertexScale] = [1.0] * n
+        if refu is not None:
+            z = refu.feature(betas, pose, style, predicted.feature)
+            scale = [refu.of_body(None if z is None else z[i]) for i in range(n)]
+        return _Dressed(template.pose(unposed, transforms), near, scale, clock.lap() / n)
 
     def _styles(self, frames: Sequence[SmplFrame]) -> Tensor | None:
         """γ of each frame, shape (B, 4): its own, else the pipeline's; None where nobody gave any."""
@@ -225,50 +283,37 @@ class GarmentPipeline:
 
     def _handle_collisions(
         self,
+        person: int,
         frame: SmplFrame,
         body: Tensor,
-        raw: Mapping[str, Tensor],
+        dressed: Mapping[str, _Dressed],
         stages: Mapping[str, float],
-        dress_ms: Mapping[str, float],
     ) -> PipelineOutput:
         clock = _StageClock()
-        if self._sdf is not None:
-            self._sdf.update(body)
+        if self._collisions is not None:
+            self._collisions.update(body)
         sdf_ms = clock.lap()
         meshes: dict[str, GarmentMesh] = {}
         stats: dict[str, GarmentStats] = {}
         refu_ms = 0.0
         for name, wearable in self._wearables.items():
-            vertices, counts = raw[name], GarmentStats()
-            if self._sdf is not None:
-                done = resolve(
-                    vertices, self._sdf, margin=self.margin, edges=wearable.template.edges, limbs=wearable.limbs
+            one, counts = dressed[name], GarmentStats()
+            raw = vertices = one.posed[person]
+            if self._collisions is not None:
+                done = self._collisions.resolve(
+                    wearable.fabric,
+                    raw,
+                    margin=wearable.margin if self.margin is None else self.margin,
+                    scale=one.scale[person],
+                    near=None if one.near is None else one.near[person],
                 )
                 vertices = done.vertices
                 counts = GarmentStats(done.n_inside, done.n_pushed, done.n_unresolved, done.max_depth)
-            meshes[name] = GarmentMesh(vertices.cpu().numpy(), raw[name].cpu().numpy(), wearable.faces, frame.transl)
+            meshes[name] = GarmentMesh(vertices.cpu().numpy(), raw.cpu().numpy(), wearable.faces, frame.transl)
             own_ms = clock.lap()
             refu_ms += own_ms
-            stats[name] = replace(counts, ms=dress_ms[name] + own_ms)
+            stats[name] = replace(counts, ms=one.ms + own_ms)
         return PipelineOutput(meshes, body.cpu().numpy(), FrameStats({**stages, "sdf": sdf_ms, "refu": refu_ms}, stats))
-
-
-def _dress(
-    wearable: _Wearable, pose: Tensor, betas: Tensor, style: Tensor | None, transforms: RigidTransforms
-) -> Tensor:
-    """Posed garments before collision handling [m], shape (B, V, 3)."""
-    template = wearable.template
-    unposed = template.rest(betas, style)
-    displacement = wearable.backbone(betas, pose, style).displacement
-    if displacement is not None:
-        unposed = unposed + displacement
-    return template.pose(unposed, transforms)
-
-
-def _limbs(body: SmplBody, rest: ExactSdf, garment: GarmentTemplate) -> Limbs:
-    """The limbs of a garment on a body, whose rest pose `rest` was updated with."""
-    clearance = rest.query(garment.v_template).distance
-    return Limbs.of(body.weights, body.faces, garment.weights, garment.faces, clearance=clearance)
 
 
 def _device(name: str) -> torch.device:

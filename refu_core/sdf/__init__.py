@@ -1,6 +1,9 @@
 """Signed distance to the posed body: the protocol, and its exact, approximate and neural implementations."""
 
 from refu_core.sdf._approx import ApproxSdf as ApproxSdf
+from refu_core.sdf._band import BAND as BAND
+from refu_core.sdf._band import BandSdf as BandSdf
+from refu_core.sdf._band import Links as Links
 from refu_core.sdf._exact import ClosestPoints as ClosestPoints
 from refu_core.sdf._exact import ExactSdf as ExactSdf
 from refu_core.sdf._neural import SDF_PRESETS as SDF_PRESETS

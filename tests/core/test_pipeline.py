@@ -117,7 +117,7 @@ def test_the_same_frame_gives_the_same_bits(pipeline: GarmentPipeline) -> None:
         ([], {}, GarmentError, "name at least one"),
         (["kilt"], {}, GarmentError, "no garment 'kilt'"),
         (["tshirt-male", "skirt-female"], {}, GarmentError, r"tshirt-male \(male\), skirt-female \(female\)"),
-        (["tshirt-male"], {"sdf": "exact"}, RefuError, "no sdf mode 'exact': wanted accurate"),
+        (["tshirt-male"], {"sdf": "exact"}, RefuError, "no sdf mode 'exact': wanted hybrid, approx, accurate, none"),
         (["tshirt-male"], {"backbone": "resnet"}, WeightsError, "no backbone 'resnet'"),
         (["tshirt-male"], {"margin": -1}, RefuError, "margin must be between"),
         (["tshirt-male"], {"margin": float("nan")}, RefuError, "margin must be between"),

@@ -1,0 +1,79 @@
+"""Which signed distance a mode uses, and how a garment's vertices are asked for it and pushed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from refu_core.body import SmplBody
+from refu_core.garments import GarmentTemplate
+from refu_core.repulsion import Blend, Limbs, Resolution, VertexScale, resolve
+from refu_core.sdf import ApproxSdf, BandSdf, ExactSdf, Links, RestFaces
+
+
+@dataclass(frozen=True, eq=False)
+class Fabric:
+    """What collision handling must know of a garment, once and for all poses."""
+
+    shapedirs: Tensor
+    """The garment's displacement a unit of each beta [m], shape (V * 3, 10)."""
+    links: Links
+    blend: Blend
+    limbs: Limbs
+
+    @classmethod
+    def of(cls, garment: GarmentTemplate, body: SmplBody, rest: ExactSdf) -> Fabric:
+        """Of a garment on a body, whose rest pose `rest` was updated with."""
+        clearance = rest.query(garment.v_template).distance
+        return cls(
+            garment.shapedirs,
+            Links.of(garment.edges, garment.n_vertices),
+            Blend.of_faces(garment.faces, garment.n_vertices),
+            Limbs.of(body.weights, body.faces, garment.weights, garment.faces, clearance=clearance),
+        )
+
+
+class Collisions:
+    """Brings garments off one posed body at a time."""
+
+    def __init__(self, body: SmplBody, *, is_accurate: bool) -> None:
+        """With the exact signed distance to `body`, or the approximate one."""
+        self._band: BandSdf | None = None
+        self._rest_faces: RestFaces | None = None
+        self._sdf: BandSdf | ExactSdf | ApproxSdf
+        if not is_accurate:
+            self._sdf = ApproxSdf(body)
+            self._rest_faces = RestFaces(body)
+        elif body.device.type == "cpu":
+            self._sdf = self._band = BandSdf(body.faces)
+        else:  # thousands of threads walk the tree faster than one sorts what needn't
+            self._sdf = ExactSdf(body.faces, device=body.device)
+
+    def near(self, fabric: Fabric, unposed: Tensor, betas: Tensor) -> Tensor | None:
+        """A face of the body near each vertex of unposed garments (B, V, 3) on shapes (B, 10), where that is of use."""
+        if self._rest_faces is None:
+            return None
+        return self._rest_faces(unposed - (betas @ fabric.shapedirs.T).view_as(unposed))
+
+    def update(self, vertices: Tensor) -> None:
+        """Takes over the body's new pose, shape (V, 3) [m]. Raises `MeshError` for one that isn't finite."""
+        self._sdf.update(vertices)
+
+    def resolve(
+        self, fabric: Fabric, points: Tensor, *, margin: float, scale: float | VertexScale, near: Tensor | None
+    ) -> Resolution:
+        """The garment with vertices [m], shape (N, 3), off the body (`refu_core.repulsion.resolve`)."""
+        start = None
+        if self._band is not None and margin + 2e-3 <= self._band.band:
+            start = self._band.clipped(points, fabric.links)
+        return resolve(
+            points,
+            self._sdf,
+            margin=margin,
+            scale=scale,
+            start=start,
+            near=near,
+            blend=fabric.blend,
+            limbs=fabric.limbs,
+        )
