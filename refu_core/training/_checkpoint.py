@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -27,7 +28,8 @@ def save_checkpoint(path: Path, state: Mapping[str, Any]) -> None:
         msg = f"{path}: the checkpoint can't be written: {error}"
         raise WeightsError(msg) from error
     finally:
-        part.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            part.unlink()
 
 
 def load_checkpoint(path: Path) -> dict[str, Any] | None:

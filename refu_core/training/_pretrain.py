@@ -232,16 +232,16 @@ def stages(
     coarse = [low_frequency_code(model, smooth, garment, s) for s in (train, validation)]
     drape = [(s, code) for _, s, code in both]
     low = [(x, s, code) for (x, s, _), code in zip(both, coarse, strict=True)]
+    shape_net = model.style_shape
     found = [
-        Stage(
-            "style-shape", Objective([model.style_shape], model.style_shape, loss), *drape, settings.style_shape_steps
-        ),
-        Stage("low", Objective([model.low], model.low_code, loss), *low, settings.low_steps),
+        Stage("style-shape", Objective([shape_net], shape_net, loss), settings.style_shape_steps, *drape),
+        Stage("low", Objective([model.low], model.low_code, loss), settings.low_steps, *low),
     ]
     if settings.pivots == "joint":
 
         def whole(x: Tensor, s: Tensor) -> Tensor:
-            return model.low_code(x, s) + model.high(x, model.mixture(s))
+            code: Tensor = model.low_code(x, s) + model.high(x, model.mixture(s))
+            return code
 
         return [*found, Stage("joint", Objective([model.low, model.high], whole, loss), settings.steps, *both)]
     fine = []
@@ -266,7 +266,8 @@ class _CodeLoss:
 
     def __call__(self, predicted: Tensor, target: Tensor) -> Tensor:
         if self._is_low_rank:
-            return 1e3 * (predicted - target).norm(dim=1).mean() / self._n_vertices**0.5
+            distance: Tensor = 1e3 * (predicted - target).norm(dim=1).mean() / self._n_vertices**0.5
+            return distance
         return _vertex_loss(predicted, target)
 
 

@@ -1,0 +1,518 @@
+"""Backbones: against slow references, what they may and may not depend on, and what loading refuses."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from refu_core import WeightsError, load_body, load_garment
+from refu_core.backbones import (
+    BACKBONES,
+    GARMENT_JOINTS,
+    TRAINABLE,
+    BasisDecoder,
+    DenseDecoder,
+    Gcnn,
+    GcnnConfig,
+    LaplacianSmoothing,
+    Mlp,
+    MlpConfig,
+    PoseFeatures,
+    TailorNet,
+    TailorNetConfig,
+    backbone_config,
+    build_backbone,
+    kernel_weights,
+    load_backbone,
+    load_basis,
+    non_negligible,
+    read_backbone,
+    save_backbone,
+    save_basis,
+    style_shape,
+    tilt_rotvec,
+    up_in_root,
+)
+from refu_core.backbones._gcnn import UpConv
+from refu_core.backbones._graph import MeshGraph
+from refu_core.backbones._perceptron import StackedPerceptrons
+from refu_core.body import rotvec_to_rotmat
+from refu_core.errors import RefuError
+from refu_core.garments import GarmentTemplate
+from refu_core.weights import load_weights
+
+GARMENT = "short-pant-male"
+RANK = 24
+IDENTITY = {"garment": GARMENT, "body_fingerprint": "0123456789abcdef"}
+seeds = st.integers(0, 2**32 - 1)
+
+
+@pytest.fixture(scope="module")
+def garment() -> GarmentTemplate:
+    return load_garment(GARMENT)
+
+
+@pytest.fixture(scope="module")
+def made_basis(garment: GarmentTemplate) -> BasisDecoder:
+    generator = torch.Generator().manual_seed(1)
+    columns = torch.linalg.qr(torch.randn(3 * garment.n_vertices, RANK, generator=generator)).Q
+    return BasisDecoder(0.01 * torch.randn(garment.n_vertices, 3, generator=generator), columns.T)
+
+
+@pytest.fixture
+def basis(made_basis: BasisDecoder) -> BasisDecoder:
+    return copy.deepcopy(made_basis)
+
+
+@pytest.fixture(autouse=True)
+def _seeded() -> Iterator[None]:
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        yield
+
+
+def bodies(n: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
+    """β (n, 10), θ (n, 24, 3) and γ (n, 4)."""
+    generator = torch.Generator().manual_seed(seed)
+    return (
+        torch.randn(n, 10, generator=generator),
+        0.5 * torch.randn(n, 24, 3, generator=generator),
+        torch.randn(n, 4, generator=generator),
+    )
+
+
+def tailornet(garment: GarmentTemplate, basis: BasisDecoder | None, **changes: object) -> TailorNet:
+    config = TailorNetConfig(GARMENT_JOINTS[GARMENT], low=(32,), high=(16, 16), style_shape=(16,))
+    net = build_backbone(replace(config, **changes), garment, basis=basis, pivots=0.3 * torch.randn(20, 14))  # type: ignore[arg-type]
+    assert isinstance(net, TailorNet)
+    return net.eval()
+
+
+# TailorNet
+
+
+@pytest.mark.parametrize("low_rank", [True, False])
+def test_tailornet_is_the_sum_that_the_paper_writes(
+    garment: GarmentTemplate, basis: BasisDecoder, low_rank: bool
+) -> None:
+    net = tailornet(garment, basis if low_rank else None, sigma=0.5, skipped=0.0)
+    betas, pose, style = bodies(3)
+    with torch.no_grad():
+        got = net.train(False)(betas, pose, style).displacement
+
+        def decode(code: Tensor) -> Tensor:
+            return net.decoder(code)[0] - (net.decoder.mean.view(-1, 3) if low_rank else 0)
+
+        def drape(s: Tensor) -> Tensor:
+            return garment.rest(s[None, :10], s[None, 10:])[0] + decode(net.style_shape(s[None]))
+
+        assert got is not None
+        for i in range(3):
+            s = torch.cat((betas[i], style[i]))
+            x = net.features(pose[i : i + 1])
+            wanted = net.decoder(net.low(torch.cat((x, s[None]), 1)))[0]
+            distances = torch.stack([1000 * (drape(s) - drape(p)).square().sum(1).mean() for p in net.pivots])
+            mixture = torch.softmax(-distances.double() / 0.5, 0).float()
+            for k in range(20):
+                h = (x - net.high.shift) * net.high.scale
+                for layer, (weight, bias) in enumerate(zip(net.high.weights, net.high.biases, strict=True)):
+                    h = h @ weight[k] + bias[k]
+                    h = torch.nn.functional.silu(h) if layer < 2 else h
+                wanted = wanted + mixture[k] * decode(h)
+            torch.testing.assert_close(got[i], wanted, atol=2e-4, rtol=1e-3)
+
+
+def test_far_styles_have_a_mixture_too(garment: GarmentTemplate, basis: BasisDecoder) -> None:
+    net = tailornet(garment, basis)
+    mixture = net.mixture(torch.full((1, 14), 8.0))
+    assert torch.exp(-net.distances(torch.full((1, 14), 8.0)) / 0.01).sum() == 0  # the naive kernel is 0 / 0 here
+    assert mixture.sum() == pytest.approx(1.0)
+
+
+@given(seed=seeds, sigma=st.floats(1e-3, 10.0))
+def test_kernel_weights_are_a_softmax(seed: int, sigma: float) -> None:
+    distances = torch.as_tensor(np.random.default_rng(seed).uniform(0, 5, (4, 7)))
+    wanted = torch.softmax(-distances / sigma, 1)
+    torch.testing.assert_close(kernel_weights(distances, sigma), wanted, atol=1e-12, rtol=1e-9)
+
+
+@given(seed=seeds, skipped=st.floats(0.0, 0.5))
+def test_what_is_left_out_weighs_no_more_than_was_allowed(seed: int, skipped: float) -> None:
+    rng = np.random.default_rng(seed)
+    mixture = torch.as_tensor(rng.dirichlet(np.full(20, 0.1), size=rng.integers(1, 4)))
+    active = non_negligible(mixture, skipped)
+    assert len(active) > 0
+    assert bool((1 - mixture[:, active].sum(1) <= skipped + 1e-12).all())
+
+
+def test_leaving_pivots_out_moves_vertices_within_the_bound(garment: GarmentTemplate, basis: BasisDecoder) -> None:
+    skipped = 0.2
+    net = tailornet(garment, basis, sigma=0.5, skipped=skipped)
+    betas, pose, style = bodies(1)
+    s = style_shape(betas, style)
+    with torch.no_grad():
+        fast = net(betas, pose, style).displacement
+        x = net.features(pose)
+        whole = net.decoder(net.low_code(x, s) + net.high(x, net.mixture(s)))
+        alone = net.decoder(net.high(x.expand(20, -1), torch.eye(20))) - net.decoder.mean.view(-1, 3)
+        active = non_negligible(net.mixture(s), skipped)
+    assert 0 < len(active) < 20
+    left_out = torch.tensor([k for k in range(20) if k not in active.tolist()])
+    bound = skipped * alone[left_out].norm(dim=-1).amax(0)
+    moved = (fast - whole).norm(dim=-1)[0]
+    assert moved.max() > 1e-5
+    assert bool((moved <= bound + 1e-6).all())
+
+
+def test_what_is_kept_between_frames_follows_style_shape_and_weights(
+    garment: GarmentTemplate, basis: BasisDecoder
+) -> None:
+    net = tailornet(garment, basis, sigma=0.5, skipped=0.0)
+    betas, pose, style = bodies(1)
+
+    def fresh(betas: Tensor, pose: Tensor, style: Tensor | None) -> Tensor:
+        return net(betas, pose, style).displacement.detach()  # with gradients nothing is kept
+
+    def kept(*args: Tensor | None) -> Tensor:
+        with torch.no_grad():
+            return net(*args).displacement
+
+    other = bodies(1, seed=5)
+    first = kept(betas, pose, style)
+    for args in ((betas, other[1], style), (other[0], pose, style), (other[0], pose, other[2]), (other[0], pose, None)):
+        torch.testing.assert_close(kept(*args), fresh(*args), atol=1e-6, rtol=1e-5)
+    args = (betas, pose, style)
+    torch.testing.assert_close(kept(*args), first)
+    with torch.no_grad():
+        net.high.weights[0].mul_(1.5)
+    changed = kept(*args)
+    assert not torch.equal(changed, first)
+    torch.testing.assert_close(changed, fresh(*args), atol=1e-6, rtol=1e-5)
+    net.load_state_dict({k: v * 1.1 if k.startswith("style_shape.layers") else v for k, v in net.state_dict().items()})
+    torch.testing.assert_close(kept(*args), fresh(*args), atol=1e-6, rtol=1e-5)
+    net.double()
+    assert kept(*(t.double() for t in args)).dtype == torch.float64
+
+
+def test_a_batch_is_its_rows(garment: GarmentTemplate, basis: BasisDecoder) -> None:
+    net = tailornet(garment, basis, sigma=0.5)
+    betas, pose, style = bodies(4)
+    with torch.no_grad():
+        whole = net(betas, pose, style).displacement
+        rows = [net(betas[i : i + 1], pose[i : i + 1], style[i : i + 1]).displacement[0] for i in range(4)]
+    torch.testing.assert_close(whole, torch.stack(rows), atol=2e-3, rtol=0)  # other pivots are left out
+
+
+def test_stacked_perceptrons_are_perceptrons() -> None:
+    stack = StackedPerceptrons(3, 5, (4,), 6, activation="relu")
+    x, mixture = torch.randn(7, 5), torch.rand(7, 3)
+    wanted = torch.zeros(7, 6)
+    for k in range(3):
+        hidden = torch.relu(x @ stack.weights[0][k] + stack.biases[0][k])
+        wanted += mixture[:, k : k + 1] * (hidden @ stack.weights[1][k] + stack.biases[1][k])
+    torch.testing.assert_close(stack(x, mixture), wanted, atol=1e-5, rtol=1e-4)
+    some = torch.tensor([0, 2])
+    mixture[:, 1] = 0
+    torch.testing.assert_close(stack(x, mixture[:, some], stack.select(some)), stack(x, mixture), atol=1e-5, rtol=1e-4)
+
+
+def test_papers_preset_has_its_sizes_and_takes_a_step() -> None:
+    garment = load_garment(GARMENT)
+    config = backbone_config("tailornet", GARMENT, preset="paper")
+    net = build_backbone(config, garment, pivots=torch.randn(3, 14))  # 20 of them take 2 GB
+    assert isinstance(net, TailorNet)
+    outputs = 3 * garment.n_vertices
+    assert [tuple(layer.weight.shape) for layer in net.low.layers] == [(1024, 86), (1024, 1024), (outputs, 1024)]
+    assert [tuple(w.shape) for w in net.high.weights] == [(3, 72, 1024), (3, 1024, 1024), (3, 1024, outputs)]
+    assert [tuple(layer.weight.shape) for layer in net.style_shape.layers] == [(128, 14), (128, 128), (outputs, 128)]
+    net.train()
+    displacement = net(*bodies(2)).displacement
+    displacement.abs().mean().backward()
+    trained = (*net.low.parameters(), *net.high.parameters())
+    assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in trained)
+
+
+# What a network sees
+
+
+@pytest.mark.parametrize("encoding", ["matrix", "rotvec"])
+def test_heading_changes_nothing_and_tilt_does(encoding: str) -> None:
+    features = PoseFeatures(GARMENT_JOINTS[GARMENT], encoding)
+    _, pose, _ = bodies(5)
+    turned = pose.clone()
+    heading = rotvec_to_rotmat(torch.tensor((0.0, 0.9, 0.0)))
+    turned[:, 0] = _rotvec(heading @ rotvec_to_rotmat(pose[:, 0]))
+    torch.testing.assert_close(features(turned), features(pose), atol=1e-5, rtol=0)
+    turned[:, 0, 0] += 0.3
+    assert bool(((features(turned) - features(pose)).abs().amax(1) > 0.05).all())
+
+
+def test_tilt_is_the_root_without_its_heading() -> None:
+    _, pose, _ = bodies(20)
+    up = up_in_root(pose)
+    tilt = rotvec_to_rotmat(tilt_rotvec(up))
+    torch.testing.assert_close(tilt @ up[..., None], torch.tensor((0.0, 1.0, 0.0))[None, :, None].expand(20, -1, -1))
+    torch.testing.assert_close(up_in_root(tilt_rotvec(up)[:, None].expand(-1, 24, -1)), up, atol=1e-5, rtol=0)
+    upright = tilt_rotvec(torch.tensor([[0.0, 1.0, 0.0]]))
+    torch.testing.assert_close(upright, torch.zeros(1, 3))
+    assert torch.isfinite(tilt_rotvec(torch.tensor([[0.0, -1.0, 0.0]]))).all()
+
+
+@pytest.mark.parametrize("encoding", ["matrix", "rotvec"])
+@pytest.mark.parametrize("name", sorted(GARMENT_JOINTS))
+def test_only_the_garments_joints_are_seen(name: str, encoding: str) -> None:
+    features = PoseFeatures(GARMENT_JOINTS[name], encoding)
+    _, pose, _ = bodies(1)
+    before = features(pose)
+    assert before.shape == (1, features.size)
+    for joint in range(1, 24):
+        moved = pose.clone()
+        moved[:, joint] += 0.2
+        assert bool(torch.equal(features(moved), before)) == (joint not in GARMENT_JOINTS[name])
+
+
+def test_no_style_is_the_mean_style() -> None:
+    betas, _, _ = bodies(2)
+    assert torch.equal(style_shape(betas, None), style_shape(betas, torch.zeros(2, 4)))
+    with pytest.raises(RefuError, match="no pose encoding 'euler'"):
+        PoseFeatures((0, 1), "euler")
+
+
+# Codes
+
+
+def test_codes_of_a_basis_measure_vertices(garment: GarmentTemplate, basis: BasisDecoder) -> None:
+    a, b = torch.randn(2, RANK), torch.randn(2, RANK)
+    torch.testing.assert_close(basis.encode(basis(a)), a, atol=2e-3, rtol=0)
+    in_vertices = (basis(a) - basis(b)).square().sum((1, 2))
+    torch.testing.assert_close((a - b).square().sum(1), in_vertices, rtol=2e-3, atol=0)
+    dense = DenseDecoder(garment.n_vertices)
+    displacement = torch.randn(2, garment.n_vertices, 3)
+    assert torch.equal(dense(dense.encode(displacement)), displacement)
+    s = torch.randn(3, 14)
+    rest = garment.rest(s[:, :10], s[:, 10:]) - garment.v_template
+    for decoder in (basis, dense):
+        norms = (s @ decoder.directions(garment)).square().sum(1)
+        torch.testing.assert_close(norms, rest.square().sum((1, 2)), rtol=1e-2, atol=0)
+
+
+def test_a_basis_that_does_not_fit_is_refused() -> None:
+    with pytest.raises(WeightsError, match=r"wanted a basis of \(R, 30\)"):
+        BasisDecoder(torch.zeros(10, 3), torch.zeros(4, 33))
+
+
+# Smoothing
+
+
+def test_smoothing_is_what_a_loop_does(garment: GarmentTemplate) -> None:
+    steps, size = 3, 0.15
+    faces = garment.faces.numpy()
+    count: dict[tuple[int, int], int] = {}
+    for face in faces:
+        for k in range(3):
+            a, b = sorted((int(face[k]), int(face[k - 1])))
+            count[a, b] = count.get((a, b), 0) + 1
+    border = {v for edge, n in count.items() if n == 1 for v in edge}
+    neighbours: dict[int, set[int]] = {v: set() for v in range(garment.n_vertices)}
+    for (a, b), n in count.items():
+        for i, j in ((a, b), (b, a)):
+            if i not in border or n == 1:
+                neighbours[i].add(j)
+    x = garment.v_template.double().numpy().copy()
+    for _ in range(steps):
+        x = np.stack([v + size * (x[sorted(neighbours[i])].mean(0) - v) for i, v in enumerate(x)])
+    smooth = LaplacianSmoothing(garment, steps=steps, step_size=size)
+    torch.testing.assert_close(smooth(garment.v_template), torch.as_tensor(x).float(), atol=1e-6, rtol=0)
+
+
+def test_smoothing_of_a_basis_is_smoothing(garment: GarmentTemplate) -> None:
+    smooth = LaplacianSmoothing(garment)
+    x, components = torch.randn(2, garment.n_vertices, 3), torch.randn(4, 3 * garment.n_vertices)
+    torch.testing.assert_close(
+        x.flatten(1) @ smooth.transposed(components).T, smooth(x).flatten(1) @ components.T, atol=2e-3, rtol=1e-3
+    )
+
+
+# GCNN
+
+
+@pytest.mark.parametrize("stride", [2, 3])
+def test_sampled_graphs_cover_the_mesh(garment: GarmentTemplate, stride: int) -> None:
+    graph = MeshGraph.of(garment.faces.numpy(), garment.n_vertices, levels=2, stride=stride)
+    assert graph.sizes[0] == garment.n_vertices
+    assert graph.sizes[0] > 3 * graph.sizes[1] > 9 * graph.sizes[2] > 0
+    for fine, coarse, up in zip(graph.sizes[:-1], graph.sizes[1:], graph.ups, strict=True):
+        assert up.index.shape[0] == fine
+        assert up.valid[:, 0].all()  # everyone hears someone
+        assert set(up.index[up.valid]) == set(range(coarse))  # and everyone is heard
+
+
+def test_up_convolution_is_what_the_formula_says(garment: GarmentTemplate) -> None:
+    graph = MeshGraph.of(garment.faces.numpy(), garment.n_vertices, levels=3)
+    up = graph.ups[2]
+    for inputs, outputs in ((3, 5), (5, 3), (4, 4)):
+        layer = UpConv(up, inputs, outputs, bases=4, residual=0.3)
+        torch.nn.init.normal_(layer.density)
+        torch.nn.init.normal_(layer.bias)
+        x = torch.randn(2, graph.sizes[3], inputs)
+        got = layer(x)
+        for i in range(0, graph.sizes[2], 7):
+            conv, passed, total = layer.bias.clone(), torch.zeros(outputs), torch.zeros(())
+            for n in np.flatnonzero(up.valid[i]):
+                j = int(up.index[i, n])
+                weight = sum(layer.coefficients[i, n, m] * layer.basis[m] for m in range(4))
+                conv = conv + x[1, j] @ weight
+                rho = layer.density[i, n].abs()
+                passed, total = passed + rho * layer.across(x[1, j]), total + rho
+            wanted = 0.7**0.5 * conv + 0.3**0.5 * passed / total
+            torch.testing.assert_close(got[1, i], wanted, atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["tshirt-male", "skirt-female"])
+def test_gcnn_learns_on_a_real_garment(name: str) -> None:
+    garment = load_garment(name)
+    net = build_backbone(GcnnConfig(GARMENT_JOINTS[name], hidden=(32,), channels=(9, 8, 8), bases=4), garment)
+    assert isinstance(net, Gcnn)
+    betas, pose, style = bodies(4)
+    target = 0.03 * torch.sin(3 * garment.v_template + pose[:, 1:2])
+    optimiser = torch.optim.Adam(net.parameters(), lr=1e-2)
+    losses = []
+    for _ in range(12):
+        prediction = net(betas, pose, style)
+        loss = (prediction.displacement - target).abs().mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        losses.append(loss.item())
+    assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in net.parameters())
+    assert losses[-1] < 0.7 * losses[0]
+    assert prediction.feature.shape == (4, net.feature_size)
+
+
+def test_papers_gcnn_and_mlp_take_a_step(garment: GarmentTemplate) -> None:
+    for name in ("gcnn", "mlp"):
+        net = build_backbone(backbone_config(name, GARMENT, preset="paper"), garment)
+        net(*bodies(2)).displacement.abs().mean().backward()
+        assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in net.parameters())
+    assert isinstance(net, Mlp)
+    assert len(net.net.layers) == 5
+
+
+# Files
+
+
+def write(folder: Path, net: torch.nn.Module, basis: BasisDecoder | None, *, mode: str = "none") -> Path:
+    if basis is not None and not (folder / "basis.json").exists():
+        save_basis(folder, basis, IDENTITY)
+    return save_backbone(folder / f"{_name(net)}-{mode}", net, IDENTITY, others={"refu.k": torch.ones(3)})
+
+
+def _name(net: torch.nn.Module) -> str:
+    return {TailorNet: "tailornet", Mlp: "mlp", Gcnn: "gcnn"}[type(net)]  # type: ignore[index]
+
+
+@pytest.fixture
+def nets(garment: GarmentTemplate, basis: BasisDecoder) -> dict[str, torch.nn.Module]:
+    joints = GARMENT_JOINTS[GARMENT]
+    return {
+        "tailornet": tailornet(garment, basis),
+        "mlp": build_backbone(MlpConfig(joints, hidden=(16,)), garment, basis=basis).eval(),
+        "gcnn": build_backbone(GcnnConfig(joints, hidden=(16,), channels=(4, 4), bases=2), garment).eval(),
+    }
+
+
+@pytest.mark.parametrize("name", TRAINABLE)
+def test_saved_and_loaded_it_predicts_the_same(
+    tmp_path: Path, nets: dict[str, torch.nn.Module], basis: BasisDecoder, name: str
+) -> None:
+    path = write(tmp_path, nets[name], None if name == "gcnn" else basis, mode="hybrid")
+    loaded = load_backbone(name, GARMENT, mode="hybrid", body_fingerprint=IDENTITY["body_fingerprint"], folder=tmp_path)
+    with torch.no_grad():
+        got, wanted = loaded(*bodies(2)), nets[name](*bodies(2))
+    torch.testing.assert_close(got.displacement, wanted.displacement, atol=5e-3, rtol=0)  # half precision
+    assert not got.displacement.requires_grad
+    assert torch.equal(load_weights(path.with_suffix("")).tensors["refu.k"], torch.ones(3))
+    assert not any(k.startswith("backbone.decoder") for k in load_weights(path.with_suffix("")).tensors)
+
+
+def test_modes_share_the_basis_and_no_other(
+    tmp_path: Path, garment: GarmentTemplate, nets: dict[str, torch.nn.Module], basis: BasisDecoder
+) -> None:
+    write(tmp_path, nets["tailornet"], basis)
+    write(tmp_path, nets["tailornet"], basis, mode="approx")
+    stored, digest = load_basis(tmp_path, expect=IDENTITY)
+    assert torch.equal(stored.components, basis.components)
+    assert json.loads((tmp_path / "tailornet-approx.json").read_text())["basis_sha256"] == digest
+    other = BasisDecoder(torch.zeros(garment.n_vertices, 3), basis.components.roll(1, 0))
+    with pytest.raises(WeightsError, match="isn't the one that the backbone was trained with"):
+        write(tmp_path, tailornet(garment, other), None)
+    save_basis(tmp_path, other, IDENTITY)
+    with pytest.raises(WeightsError, match="made for another basis"):
+        load_backbone("tailornet", GARMENT, folder=tmp_path)
+
+
+def test_weights_of_another_body_are_refused(
+    tmp_path: Path, nets: dict[str, torch.nn.Module], basis: BasisDecoder
+) -> None:
+    write(tmp_path, nets["mlp"], basis)
+    with pytest.raises(WeightsError, match="refu train"):
+        load_backbone("mlp", GARMENT, body_fingerprint=load_body("male").fingerprint, folder=tmp_path)
+    with pytest.raises(WeightsError, match="refu train"):
+        load_backbone("mlp", GARMENT, mode="hybrid", folder=tmp_path)
+    with pytest.raises(WeightsError, match="garment is tshirt-male"):
+        load_backbone("mlp", "tshirt-male", folder=tmp_path)
+
+
+def test_weights_of_another_network_are_refused(
+    tmp_path: Path, garment: GarmentTemplate, nets: dict[str, torch.nn.Module], basis: BasisDecoder
+) -> None:
+    path = write(tmp_path, nets["mlp"], basis)
+    weights = load_weights(path.with_suffix(""))
+    card = dict(weights.card)
+    for change, message in (({"config": {"joints": [0], "depth": 3}}, "doesn't know"), ({"backbone": "fit"}, "'fit'")):
+        path.with_suffix(".json").write_text(json.dumps({**card, **change}))
+        with pytest.raises(WeightsError, match=message):
+            read_backbone(path.with_suffix(""), garment, expect={})
+    config = {**card["config"], "hidden": [17]}
+    path.with_suffix(".json").write_text(json.dumps({**card, "config": config}))
+    with pytest.raises(WeightsError, match="doesn't fit short-pant-male"):
+        read_backbone(path.with_suffix(""), garment, expect={})
+
+
+def test_unknown_names_are_refused(garment: GarmentTemplate) -> None:
+    assert load_backbone("skinned", GARMENT)(*bodies(1)) == (None, None)
+    with pytest.raises(WeightsError, match="no backbone 'bert'"):
+        load_backbone("bert", GARMENT)
+    with pytest.raises(WeightsError, match="no mode 'fast'"):
+        load_backbone("mlp", GARMENT, mode="fast")
+    with pytest.raises(WeightsError, match="could be trained"):
+        backbone_config("skinned", GARMENT)
+    with pytest.raises(WeightsError, match="no preset 'tiny'"):
+        backbone_config("mlp", GARMENT, preset="tiny")
+    with pytest.raises(WeightsError, match="needs pivots"):
+        build_backbone(backbone_config("tailornet", GARMENT), garment)
+    assert set(TRAINABLE) | {"skinned"} == set(BACKBONES)
+
+
+def _rotvec(rotation: Tensor) -> Tensor:
+    """Rotation vectors (B, 3) of matrices (B, 3, 3), off zero and half a turn."""
+    angle = torch.acos(((rotation.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2).clamp(-1, 1))
+    axis = torch.stack(
+        (
+            rotation[:, 2, 1] - rotation[:, 1, 2],
+            rotation[:, 0, 2] - rotation[:, 2, 0],
+            rotation[:, 1, 0] - rotation[:, 0, 1],
+        ),
+        1,
+    )
+    return axis / (2 * angle.sin())[:, None] * angle[:, None]

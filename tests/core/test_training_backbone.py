@@ -1,0 +1,340 @@
+"""Pre-training: mirrored and split samples, a basis, and trainings that resume to the same weights."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from refu_core import GarmentError, WeightsError, load_body, load_garment
+from refu_core.backbones import GcnnConfig, LaplacianSmoothing, MlpConfig, TailorNetConfig, load_backbone
+from refu_core.body import SmplBody
+from refu_core.errors import RefuError
+from refu_core.garments import GarmentTemplate
+from refu_core.simulation import GarmentDataset
+from refu_core.training import (
+    LoopSettings,
+    Mirror,
+    PretrainSettings,
+    TrainingLog,
+    displacements,
+    load_checkpoint,
+    mirror_pose,
+    output_basis,
+    posed_errors,
+    pretrain,
+    read_samples,
+    save_checkpoint,
+    split_validation,
+)
+from refu_core.training import _loop as loop_module
+from refu_core.training._data import asked_only, mirrored, with_asked_poses
+from refu_core.weights import load_weights
+
+GARMENT = "short-pant-male"
+N, N_PAIRS = 240, 24
+JOINTS = (0, 1, 2, 4, 5)
+SMALL = TailorNetConfig(JOINTS, low=(24,), high=(8,), style_shape=(8,), dropout=0.05)
+QUICK = PretrainSettings(
+    LoopSettings(batch_size=16, learning_rate=1e-2, weight_decay=0.01, check_every=20),
+    rank=8,
+    style_shape_steps=40,
+    low_steps=80,
+    steps=80,
+    validation_share=0.2,
+)
+
+
+@pytest.fixture(scope="module")
+def garment() -> GarmentTemplate:
+    return load_garment(GARMENT)
+
+
+@pytest.fixture(scope="module")
+def body(garment: GarmentTemplate) -> SmplBody:
+    return load_body(garment.body)
+
+
+def cloth(garment: GarmentTemplate, pose: Tensor) -> Tensor:
+    """Displacements (N, V, 3) that both knees and hips make, symmetric in left and right, four waves in all."""
+    x = garment.v_template
+    waves = torch.stack((torch.sin(9 * x[:, 1]), torch.cos(9 * x[:, 1])), 1)
+    left, right = torch.sigmoid(20 * x[:, :1]), torch.sigmoid(-20 * x[:, :1])
+    bend = pose[:, [1, 2], 0] + 0.5 * pose[:, [4, 5], 0]
+    height = 0.03 * (bend[:, 0, None, None] * left * waves + bend[:, 1, None, None] * right * waves)
+    return torch.stack((torch.zeros_like(height[..., 0]), height[..., 0], height[..., 1]), -1)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory, garment: GarmentTemplate, body: SmplBody) -> Path:
+    """A set in the documented format, written without the project's writer."""
+    folder = tmp_path_factory.mktemp("set")
+    rng = np.random.default_rng(0)
+    pair = np.repeat(np.arange(N_PAIRS), N // N_PAIRS).astype("<i4")
+    betas = rng.normal(size=(N_PAIRS, 10)).astype("<f4")[pair]
+    style = rng.normal(size=(N_PAIRS, 4)).astype("<f4")[pair]
+    pose = rng.normal(0, 0.4, (N, 24, 3)).astype("<f4")
+    asked = pose.copy()
+    asked[::4, 1, 2] += 0.3
+    with torch.no_grad():
+        b, p = torch.as_tensor(betas), torch.as_tensor(pose)
+        unposed = garment.rest(b, torch.as_tensor(style)) + cloth(garment, p)
+        posed = garment.pose(unposed, body(p, b).transforms).numpy()
+    quantum = 2.0**-14
+    columns: dict[str, Any] = {
+        "vertices": np.rint(posed / quantum).astype("<i2"),
+        "pose": pose,
+        "betas": betas,
+        "style": style,
+        "pair": pair,
+        "slot": np.arange(N, dtype="<i4"),
+        "clip": np.full(N, -1, "<i4"),
+        "frame": np.full(N, -1, "<i4"),
+        "split": (pair >= 20).astype("|u1"),
+        "state": np.ones(N, "|u1"),
+        "dropped": np.zeros((N, 5), "|u1"),
+        **{name: np.ones(N, "<f4") for name in ("share", "stretch", "speed", "seconds")},
+    }
+    shard = folder / "shard-0-of-1"
+    shard.mkdir()
+    for name, array in columns.items():
+        np.save(shard / f"{name}.npy", array)
+    np.save(folder / "asked.npy", asked)
+    card = {
+        "format": "refu-garments-1",
+        "garment": GARMENT,
+        "body": garment.body,
+        "body_fingerprint": body.fingerprint,
+        "quantum_m": quantum,
+        "plan": {"count": N, "pivots": 4},
+    }
+    (folder / "card.json").write_text(json.dumps(card))
+    return folder
+
+
+# Samples
+
+
+def test_samples_are_unposed_displacements(dataset: Path, garment: GarmentTemplate, body: SmplBody) -> None:
+    opened = GarmentDataset(dataset)
+    samples = read_samples(opened, body, garment, split="train")
+    assert len(samples) == 200
+    torch.testing.assert_close(samples.displacement, cloth(garment, samples.pose), atol=2e-4, rtol=0)
+    wrong = torch.zeros_like(samples.displacement)
+    errors = posed_errors(wrong, samples, body, garment)
+    transforms = body(samples.pose[:1], samples.betas[:1]).transforms
+    rest = garment.rest(samples.betas[:1], samples.style[:1])
+    distance = garment.pose(rest + samples.displacement[:1], transforms) - garment.pose(rest, transforms)
+    torch.testing.assert_close(errors[0], 1e3 * distance[0].norm(dim=-1), atol=1e-3, rtol=1e-4)
+    with pytest.raises(RefuError, match="wanted a set whose garment is skirt-female"):
+        read_samples(opened, load_body("female"), load_garment("skirt-female"), split="train")
+
+
+@pytest.mark.parametrize("name", ["shirt-male", "tshirt-male", "short-pant-male", "skirt-female"])
+def test_built_in_garments_and_bodies_are_their_own_mirror_images(name: str) -> None:
+    garment = load_garment(name)
+    body = load_body(garment.body)
+    mirror = Mirror.of(garment)
+    flip = torch.tensor((-1.0, 1.0, 1.0))
+    generator = torch.Generator().manual_seed(0)
+    betas, style = torch.randn(1, 10, generator=generator), torch.randn(1, 4, generator=generator)
+    pose = 0.5 * torch.randn(1, 24, 3, generator=generator)
+    pose[:, 0] = torch.tensor((0.3, 0.2, -0.1))
+
+    smooth = 0.02 * torch.sin(5 * garment.v_template + 1.0)[None]
+    posed = garment.pose(garment.rest(betas, style) + smooth, body(pose, betas).transforms)
+    other = garment.pose(
+        garment.rest(betas, style) + mirror.displacement(smooth), body(mirror_pose(pose), betas).transforms
+    )
+    # The mirrored garment is the garment in the mirror: vertex i lies where its triangle's mixture lies, flipped.
+    wanted = (mirror.barycentrics[..., None] * posed[0][mirror.corners]).sum(1) * flip
+    away = (other[0] - wanted).norm(dim=-1)
+    assert away.mean() < 4e-4
+    assert away.max() < 8e-3
+    torch.testing.assert_close(mirror_pose(mirror_pose(pose)), pose)
+    body_mirrored = body(mirror_pose(pose), betas).vertices[0] * flip
+    body_posed = body(pose, betas).vertices[0]
+    torch.testing.assert_close(body_mirrored.sum(0), body_posed.sum(0), atol=1e-2, rtol=1e-3)
+
+
+def test_an_asymmetric_garment_has_no_mirror_image(garment: GarmentTemplate) -> None:
+    leaning = replace(garment, v_template=garment.v_template + 0.1 * garment.v_template[:, [1, 0, 2]])
+    with pytest.raises(GarmentError, match="train it without mirroring"):
+        Mirror.of(leaning)
+
+
+def test_asked_poses_are_added_where_limbs_were_held_back(
+    dataset: Path, garment: GarmentTemplate, body: SmplBody
+) -> None:
+    samples = read_samples(GarmentDataset(dataset), body, garment, split="train")
+    asked = asked_only(samples)
+    assert len(asked) == 50
+    both = with_asked_poses(samples)
+    assert len(both) == 250
+    torch.testing.assert_close(both.pose[200:, 1, 2], samples.pose[::4, 1, 2] + 0.3)
+    assert torch.equal(both.displacement[200:], samples.displacement[::4])
+    unsaid = replace(samples, asked=torch.full_like(samples.asked, torch.nan))
+    assert len(with_asked_poses(unsaid)) == 200
+
+
+def test_pairs_are_held_out_whole(dataset: Path, garment: GarmentTemplate, body: SmplBody) -> None:
+    samples = read_samples(GarmentDataset(dataset), body, garment, split="train")
+    train, validation = split_validation(samples, share=0.3, seed=1)
+    assert not set(train.pair.tolist()) & set(validation.pair.tolist())
+    assert len(train) + len(validation) == 200
+    assert len(validation) == 60
+    assert set(split_validation(samples, share=0.3, seed=2)[1].pair.tolist()) != set(validation.pair.tolist())
+    assert len(split_validation(samples, share=0.0, seed=1)[1]) == 0
+
+
+def test_the_basis_is_the_principal_components(dataset: Path, garment: GarmentTemplate, body: SmplBody) -> None:
+    samples = read_samples(GarmentDataset(dataset), body, garment, split="train")
+    both = samples.joined(mirrored(samples, Mirror.of(garment)))
+    basis = output_basis(both.displacement, rank=2)
+    torch.testing.assert_close(basis.components @ basis.components.T, torch.eye(2), atol=2e-3, rtol=0)
+    centred = (both.displacement - both.displacement.mean(0)).flatten(1).double()
+    wanted = torch.linalg.eigh(centred @ centred.T).eigenvectors[:, -2:].T @ centred
+    same_plane = (torch.nn.functional.normalize(wanted).float() @ basis.components[:2].T).det().abs()
+    torch.testing.assert_close(same_plane, torch.tensor(1.0), atol=0.02, rtol=0)
+    rebuilt = basis(basis.encode(both.displacement))
+    assert (rebuilt - both.displacement).norm(dim=-1).mean() < 8e-3
+    with pytest.raises(RefuError, match="more samples than that, got 200"):
+        output_basis(samples.displacement, rank=200)
+
+
+# Training
+
+
+@pytest.mark.parametrize("pivots", ["joint", "separate"])
+def test_a_trained_tailornet_beats_the_mean(
+    tmp_path: Path, dataset: Path, garment: GarmentTemplate, body: SmplBody, pivots: str
+) -> None:
+    card = pretrain(GARMENT, dataset, tmp_path, settings=replace(QUICK, pivots=pivots), config=SMALL, quiet=True)
+    figures = card["figures"]
+    assert figures["mpve_mm"] < 0.95 * figures["mean_mm"]
+    assert figures["basis_mm"] < 1.0
+    assert figures["samples"] == 40
+    assert figures["asked_samples"] == 10
+    assert card["body_fingerprint"] == body.fingerprint
+    samples = read_samples(GarmentDataset(dataset), body, garment, split="test")
+    loaded = load_backbone("tailornet", GARMENT, body_fingerprint=body.fingerprint, folder=tmp_path)
+    again = posed_errors(displacements(loaded, samples), samples, body, garment).mean().item()
+    assert again == pytest.approx(figures["mpve_mm"], abs=0.3)  # half precision
+    assert (tmp_path / "tailornet-none.png").read_bytes()[:4] == b"\x89PNG"
+    assert not (tmp_path / "tailornet-none.checkpoint").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "config"),
+    [
+        ("mlp", MlpConfig(JOINTS, hidden=(24, 24), dropout=0.0)),
+        ("gcnn", GcnnConfig(JOINTS, hidden=(24,), channels=(6, 6, 6), bases=2, dropout=0.0)),
+    ],
+)
+def test_other_backbones_are_trained_the_same_way(
+    tmp_path: Path, dataset: Path, name: str, config: MlpConfig | GcnnConfig
+) -> None:
+    settings = replace(QUICK, steps=40, loop=replace(QUICK.loop, batch_size=8, learning_rate=1e-2))
+    card = pretrain(GARMENT, dataset, tmp_path, backbone=name, settings=settings, config=config, quiet=True)
+    figures = card["figures"]
+    assert figures["mpve_mm"] < 0.85 * figures["mean_mm"]
+
+
+def weights(folder: Path) -> dict[str, Tensor]:
+    return dict(load_weights(folder / "tailornet-none").tensors)
+
+
+def test_interrupted_it_resumes_to_the_same_weights(
+    tmp_path: Path, dataset: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def train(folder: Path, seed: int = 0) -> None:
+        loop = replace(QUICK.loop, seed=seed, check_every=10)
+        settings = PretrainSettings(
+            loop, rank=8, style_shape_steps=20, low_steps=20, steps=20, is_mirrored=False, validation_share=0.2
+        )
+        pretrain(GARMENT, dataset, folder, settings=settings, config=SMALL, quiet=True)
+
+    random_state = torch.get_rng_state()
+    train(tmp_path / "whole")
+    assert torch.equal(torch.get_rng_state(), random_state)
+
+    real, calls = loop_module.save_checkpoint, 0
+
+    def interrupted(*args: Any) -> None:
+        nonlocal calls
+        real(*args)
+        calls += 1
+        if calls in (1, 4):  # in the first stage, and in the second
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(loop_module, "save_checkpoint", interrupted)
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            train(tmp_path / "parts")
+    with pytest.raises(RefuError, match="other settings or data"):
+        train(tmp_path / "parts", seed=1)
+    torch.manual_seed(123)
+    train(tmp_path / "parts")
+    whole, parts = weights(tmp_path / "whole"), weights(tmp_path / "parts")
+    assert all(torch.equal(whole[k], parts[k]) for k in whole)
+    lines = [(tmp_path / folder / "tailornet-none.jsonl").read_text() for folder in ("whole", "parts")]
+    assert lines[0] == lines[1]
+    train(tmp_path / "other", seed=1)
+    assert any(not torch.equal(t, whole[k]) for k, t in weights(tmp_path / "other").items())
+
+
+def test_low_frequency_targets_are_smoothed_garments(dataset: Path, garment: GarmentTemplate, body: SmplBody) -> None:
+    from refu_core.backbones import TailorNet, build_backbone
+    from refu_core.training._pretrain import low_frequency_code, pivots_of
+
+    samples = read_samples(GarmentDataset(dataset), body, garment, split="train").take(torch.arange(20))
+    smooth = LaplacianSmoothing(garment)
+    rest = garment.rest(samples.betas, samples.style)
+    wanted = smooth(rest + samples.displacement) - rest
+    for basis in (None, output_basis(wanted, rank=12)):
+        net = build_backbone(SMALL, garment, basis=basis, pivots=pivots_of(samples))
+        assert isinstance(net, TailorNet)
+        code = low_frequency_code(net, smooth, garment, samples)
+        torch.testing.assert_close(code, net.decoder.encode(wanted), atol=2e-4, rtol=0)
+
+
+def test_it_stops_when_nothing_gets_better(tmp_path: Path, dataset: Path) -> None:
+    loop = replace(QUICK.loop, learning_rate=0.0, check_every=5, patience=2)
+    settings = replace(QUICK, loop=loop, is_mirrored=False)
+    pretrain(GARMENT, dataset, tmp_path, settings=settings, config=SMALL, quiet=True)
+    entries = [json.loads(line) for line in (tmp_path / "tailornet-none.jsonl").read_text().splitlines()]
+    assert max(entry["step"] for entry in entries) == 15
+
+
+def test_bad_settings_and_files_are_refused(tmp_path: Path, dataset: Path) -> None:
+    with pytest.raises(RefuError, match="pivots are trained joint or separate"):
+        pretrain(GARMENT, dataset, tmp_path, settings=replace(QUICK, pivots="both"), quiet=True)
+    with pytest.raises(WeightsError, match="no backbone 'bert'"):
+        pretrain(GARMENT, dataset, tmp_path, backbone="bert", quiet=True)
+    (tmp_path / "x.checkpoint").write_bytes(b"PK\x03\x04nothing")
+    with pytest.raises(WeightsError, match="damaged checkpoint"):
+        load_checkpoint(tmp_path / "x.checkpoint")
+    assert load_checkpoint(tmp_path / "none.checkpoint") is None
+    (tmp_path / "file").touch()
+    with pytest.raises(WeightsError, match="can't be written"):
+        save_checkpoint(tmp_path / "file" / "x.checkpoint", {"step": 1})
+
+
+def test_a_log_goes_on_where_its_run_was_interrupted(tmp_path: Path) -> None:
+    log = TrainingLog(tmp_path, name="run", quiet=True)
+    log.begin("a", step=0, steps=4)
+    for step in (1, 2, 3):
+        log.check("a", step, train=4.0 - step)
+    again = TrainingLog(tmp_path, name="run", quiet=True)
+    again.begin("a", step=2, steps=4)
+    again.check("a", 3, train=0.5, validation=0.7)
+    again.end()
+    entries = [json.loads(line) for line in (tmp_path / "run.jsonl").read_text().splitlines()]
+    assert [entry["train"] for entry in entries] == [3.0, 2.0, 0.5]
+    assert again.picture.exists()
