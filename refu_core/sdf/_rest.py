@@ -6,10 +6,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+import warp as wp
 from scipy.ndimage import binary_dilation, distance_transform_edt
 from torch import Tensor
 
+from refu_core._warp import as_warp, torch_stream
 from refu_core.sdf._exact import ExactSdf
+from refu_core.sdf._walk import look_up_kernel
 
 if TYPE_CHECKING:
     from refu_core.body import SmplBody
@@ -47,13 +50,21 @@ class RestFaces:
         face = np.zeros(shape.tolist(), np.int32)
         face[band] = exact.closest(centres).face.cpu().numpy()
         nearest = distance_transform_edt(~band, return_distances=False, return_indices=True)
-        self._face = torch.from_numpy(face[tuple(nearest)].reshape(-1)).to(body.device)
-        self._low = low.to(body.device)
-        self._last = (shape - 1).float().to(body.device)
-        self._stride = torch.tensor([shape[1] * shape[2], shape[2], 1], dtype=torch.float32, device=body.device)
+        self._device = torch.device(body.device)
+        self._low = wp.vec3(*low.tolist())
+        self._grid = wp.array(face[tuple(nearest)], dtype=wp.int32, device=str(self._device))
 
     def __call__(self, unposed: Tensor) -> Tensor:
         """Near body faces, int32 of shape (...,), of places on the mean shape in the rest pose [m], shape (..., 3)."""
-        cell = ((unposed.detach().float() - self._low) / _CELL).floor().clamp_min(0).minimum(self._last)
-        near: Tensor = self._face[(cell @ self._stride).long()]
-        return near
+        places = unposed.detach().to(device=self._device, dtype=torch.float32).reshape(-1, 3).contiguous()
+        near = torch.empty(len(places), dtype=torch.int32, device=self._device)
+        if len(places):
+            with torch_stream(self._device):
+                wp.launch(
+                    look_up_kernel,
+                    dim=len(places),
+                    inputs=[as_warp(places, wp.vec3), self._low, _CELL, self._grid],
+                    outputs=[as_warp(near, wp.int32)],
+                    device=str(self._device),
+                )
+        return near.view(unposed.shape[:-1])

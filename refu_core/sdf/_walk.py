@@ -54,6 +54,24 @@ def row_of(x: int, y: int, z: int):
 
 
 @wp.kernel(enable_backward=False)
+def look_up_kernel(
+    places: wp.array(dtype=wp.vec3),
+    low: wp.vec3,
+    cell: float,
+    grid: wp.array3d(dtype=int),
+    # outputs
+    near: wp.array(dtype=int),
+):
+    """What a grid with the corner `low` says of places; at its border, where they are outside."""
+    i = wp.tid()
+    p = places[i]
+    x = wp.clamp((p[0] - low[0]) / cell, 0.0, float(grid.shape[0] - 1))
+    y = wp.clamp((p[1] - low[1]) / cell, 0.0, float(grid.shape[1] - 1))
+    z = wp.clamp((p[2] - low[2]) / cell, 0.0, float(grid.shape[2] - 1))
+    near[i] = grid[int(x), int(y), int(z)]
+
+
+@wp.kernel(enable_backward=False)
 def enter_kernel(
     points: wp.array(dtype=wp.vec3),
     links: wp.array2d(dtype=int),
@@ -84,8 +102,8 @@ def enter_kernel(
 
 
 @wp.func
-def walk_under(p: wp.vec3, start: int, barred: int, points: wp.array(dtype=wp.vec3), links: wp.array2d(dtype=int)):
-    """The face that p is above or below, each step over the edge that p is most beyond; -1 for one of part `barred`.
+def walk_under(p: wp.vec3, start: int, points: wp.array(dtype=wp.vec3), links: wp.array2d(dtype=int)):
+    """The face that p is above or below, each step over the edge that p is most beyond.
 
     Also the weights of its vertices 1 and 2 where p is, and its normal, of twice its area; negative weights say that p
     is above or below none of the faces where the walk ended.
@@ -115,8 +133,6 @@ def walk_under(p: wp.vec3, start: int, barred: int, points: wp.array(dtype=wp.ve
             break
         last = face
         face = ahead
-        if links[face, 6] == barred:
-            return -1, weight_b, weight_c, normal
     return face, weight_b, weight_c, normal
 
 
@@ -199,6 +215,7 @@ def walk_kernel(
     squared = float(1.0e12)
     distance = float(1.0e6)
     own = int(-1)
+    above = wp.vec3()
     # -1 is the walk from `near`. One loop with one call of each function: so a compiler puts them in place.
     for part in range(-1, MAX_PARTS):
         start = int(near[i])
@@ -207,8 +224,8 @@ def walk_kernel(
             start = table[row, part] & ((1 << FACE_BITS) - 1)
             walks = wp.length(points[links[start, 0]] - p) < distance + REACH
         if walks:
-            start, weight_b, weight_c, normal = walk_under(p, start, own, points, links)
-            if start >= 0 and start != face:
+            start, weight_b, weight_c, normal = walk_under(p, start, points, links)
+            if start != face:
                 face_ = start
                 feature_ = int(FACE)
                 w_ = wp.vec3()
@@ -222,24 +239,31 @@ def walk_kernel(
                     w_ = wp.vec3(1.0 - weight_b - weight_c, weight_b, weight_c)
                 else:
                     face_, w_, feature_, squared_ = descend(p, start, points, faces, across, fan_start, fan_face)
+                    a = points[links[face_, 0]]
+                    normal = wp.cross(points[links[face_, 1]] - a, points[links[face_, 2]] - a)
                 if squared_ < squared:
                     face = face_
                     w = w_
                     feature = feature_
                     squared = squared_
                     distance = wp.sqrt(squared)
+                    above = normal
         if part < 0:
             own = links[face, 6]
             if (absent | (1 << own)) == EMPTY:
                 break
 
-    normal = pseudo_normal(face, feature, points, faces, across, fan_start, fan_face)
-    offset = offset_from(p, face, w, points, faces)
-    outside = wp.where(wp.dot(offset, normal) < 0.0, -1.0, 1.0)
-    distance_, gradient = distance_and_gradient(offset, feature, normal, outside)
+    offset = p - points[links[face, 0]]
+    if feature == FACE:
+        above = wp.normalize(above)
+    else:
+        above = pseudo_normal(face, feature, points, faces, across, fan_start, fan_face)
+        offset = offset_from(p, face, w, points, faces)
+    outside = wp.where(wp.dot(offset, above) < 0.0, -1.0, 1.0)
+    distance_, gradient = distance_and_gradient(offset, feature, above, outside)
     out_face[i] = face
     out_feature[i] = feature
     out_barycentrics[i] = w
-    out_normal[i] = normal
+    out_normal[i] = above
     out_distance[i] = distance_
     out_gradient[i] = gradient

@@ -239,8 +239,8 @@ def train_sdf(
         if log is not None:
             log.step(step)
         if step % settings.check_every == 0 or step == settings.steps:
-            if not math.isfinite(float(loss)):
-                msg = f"the loss of the distance network is {float(loss)} at step {step}: try a smaller learning rate"
+            if not math.isfinite(float(loss.detach())):
+                msg = f"the loss of the distance network is {float(loss.detach())} at step {step}: try a smaller learning rate"
                 raise RefuError(msg)
             if log is not None:
                 found = sdf_figures(network, checks["validation"])
