@@ -13,6 +13,7 @@ import torch
 
 import msg_adapters as adapters
 from refu_core import SmplFrame, load_body, load_garment
+from refu_core.evaluation.reproduction import _pictures
 from refu_ros import quick
 from refu_ros.cli import EVALUATION_TABLES, main
 from refu_ros.truth import TOPIC
@@ -84,7 +85,10 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_tables_of_a_data_set(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_tables_of_a_data_set(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_pictures, "_SIZE", (60, 80))
     out, file, cache = tmp_path / "results", tmp_path / "rows.json", tmp_path / "cache"
     assert run("--data", dataset, "--table", "comparison", "--output", out, "--json", file, "--cache", cache) == 0
     printed = capsys.readouterr().out

@@ -21,7 +21,7 @@ from refu_core.backbones import Prediction
 from refu_core.body import SmplBody, load_body
 from refu_core.errors import RefuError, WeightsError
 from refu_core.evaluation import reproduction as rp
-from refu_core.evaluation.reproduction import _build, _claims, _runs, _tables
+from refu_core.evaluation.reproduction import _build, _claims, _pictures, _runs, _tables
 from refu_core.garments import GarmentTemplate, load_garment
 from refu_core.repulsion import SCALE_PRESETS, Refu
 
@@ -94,8 +94,8 @@ class Emulated(rp.Library):
             raise WeightsError(msg)
         self.loaded += 1
         torch.manual_seed(0)
-        amplitude = 0.006 if method.variant == "none" else 0.005
-        scale = None if "fixed" in method.variant else SCALE_PRESETS["realtime"]
+        amplitude = 0.006 if method.mode == "none" else 0.005
+        scale = None if method.folder == "fixed" else SCALE_PRESETS["realtime"]
         least = 1.0 if method.sdf == "accurate" else 0.0
         refu = Refu(garment.n_vertices, least=least, scale=scale).eval().requires_grad_(False)
         return rp.Network(Noisy(garment, amplitude), refu if method.handling == "refu" else None)
@@ -194,7 +194,11 @@ def test_what_is_not_trained_says_so_in_its_row(study: rp.Study, tmp_path: Path)
     assert table.value(GARMENT, "refu-hybrid", "vfcp_percent") is not None
     page = table.markdown(rp.labels_of("comparison"), source="")
     assert "| collision loss, approx (not measured) | – | *6.79* |" in page
-    assert "`refu train short-pant-male --data DIR --backbone tailornet --mode collision-loss-approx`" in page
+    assert (
+    command = "refu train short-pant-male --data DIR --backbone tailornet --mode collision-approx"
+    assert f"`{command} --output weights/short-pant-male`" in page
+        in page
+    )
     assert "| ReFU, hybrid | " in page
     rows = table.as_dict()["rows"]
     assert {tuple(row) for row in rows} == {("table", "garment", "method", "metric", "value", "paper")}
@@ -234,7 +238,10 @@ def test_plots_of_the_same_figures_are_the_same_files(study: rp.Study, tmp_path:
     assert contents[0] == contents[1]
 
 
-def test_pictures(study: rp.Study, samples: rp.Samples, tmp_path: Path) -> None:
+def test_pictures(
+    study: rp.Study, samples: rp.Samples, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_pictures, "_SIZE", (60, 80))
     ((file, caption),) = rp.PICTURES["comparison"](study, [samples], tmp_path, library=Emulated())
     assert (tmp_path / file).read_bytes().startswith(b"\x89PNG")
     assert "ReFU, hybrid" in caption
@@ -360,8 +367,10 @@ def test_shipped_weights_are_found_by_name(tmp_path: Path) -> None:
     library = rp.Library([tmp_path])
     with pytest.raises(WeightsError, match="not trained"):
         library.find(rp.METHODS["alt1-approx"], "tshirt-male")
-    (tmp_path / "tshirt-male").mkdir()
-    (tmp_path / "tshirt-male" / "tailornet-alt1-approx.json").write_text('{"sha256": "abc"}', encoding="utf-8")
-    assert library.find(rp.METHODS["alt1-approx"], "tshirt-male") == tmp_path / "tshirt-male" / "tailornet-alt1-approx"
+    (tmp_path / "tshirt-male" / "alt1").mkdir(parents=True)
+    (tmp_path / "tshirt-male" / "alt1" / "tailornet-approx.json").write_text('{"sha256": "abc"}', encoding="utf-8")
+    assert (
+        library.find(rp.METHODS["alt1-approx"], "tshirt-male") == tmp_path / "tshirt-male" / "alt1" / "tailornet-approx"
+    )
     assert library.key(rp.METHODS["alt1-approx"], "tshirt-male") == "abc"
     assert library.key(rp.METHODS["skinned"], "tshirt-male") == ""

@@ -19,12 +19,13 @@ class Method:
     name: str
     label: str
     backbone: str = "tailornet"
-    variant: str = "none"
-    """How the backbone was trained; `none` without collision handling. Weights are called `<backbone>-<variant>`."""
+    mode: str = "none"
+    """How the backbone was trained; `none` without collision handling. Weights are called `<backbone>-<mode>`."""
+    folder: str = ""
+    """Folder below the garment's that they lie in, where they were trained other than those that ship."""
     handling: Handling = "none"
     """What happens to the backbone's garment: nothing; x - f ∇f (naive); sparse least squares (optimisation); ReFU as
-    in the paper; or whatever the node does, in the mode `variant`: ReFU, a second look at what it moved, edges,
-    limbs."""
+    in the paper; or whatever the node does, in that mode: ReFU, a second look at what it moved, edges, limbs."""
     sdf: SdfName | None = None
     """Signed distance at run time."""
     margin: float | None = None
@@ -36,16 +37,29 @@ class Method:
 
     @property
     def weights(self) -> str | None:
-        """Name of the weights' files without suffix; None where no network is needed."""
-        return None if self.backbone == "skinned" else f"{self.backbone}-{self.variant}"
+        """Path of the weights' files below the garment's folder, without suffix; None where no network is needed."""
+        return None if self.backbone == "skinned" else f"{self.folder}/{self.backbone}-{self.mode}".lstrip("/")
 
     def train_command(self, garment: str) -> str:
         """The command that makes the weights; empty where none are needed."""
         if self.weights is None:
             return ""
-        return f"refu train {garment} --data DIR --backbone {self.backbone} --mode {self.variant}"
+        folder = f"weights/{garment}" + (f"/{self.folder}" if self.folder else "")
+        special = f" {_TRAINING[self.folder]}" if self.folder else ""
+        return (
+            f"refu train {garment} --data DIR --backbone {self.backbone} --mode {self.mode}{special} --output {folder}"
+        )
 
 
+_TRAINING: Mapping[str, str] = {
+    "fixed": "--scale fixed",
+    "alt1": "--scale shared",
+    "alt2": "--scale distance",
+    "bare": "--margin 0 --unblended",
+    "sequence-5": "--sequences",
+    "sequence-17": "--sequences",
+}
+"""What is special about the training of the weights in each folder, as options of `refu train`."""
 _SDFS: tuple[SdfName, ...] = ("approx", "accurate")
 
 
@@ -57,7 +71,7 @@ def _tailornet() -> list[Method]:
             Method(
                 name=f"optimisation-{sdf}", label=f"optimisation post-process, {sdf}", handling="optimisation", sdf=sdf
             ),
-            Method(name=f"collision-loss-{sdf}", label=f"collision loss, {sdf}", variant=f"collision-loss-{sdf}"),
+            Method(name=f"collision-loss-{sdf}", label=f"collision loss, {sdf}", mode=f"collision-{sdf}"),
         ]
         methods.append(
             Method(
@@ -72,31 +86,49 @@ def _tailornet() -> list[Method]:
         Method(
             name="optimisation-on-hybrid",
             label="optimisation post-process, approx, with ReFU's margin, of what ReFU hybrid's own backbone predicts",
-            variant="hybrid",
+            mode="hybrid",
             handling="optimisation",
             sdf="approx",
             margin=DEFAULT_MARGIN,
         )
     )
     for mode, sdf in _RUN_TIME_SDF.items():
-        methods += _ablated(f"refu-{mode}", f"ReFU, {mode}", mode, sdf)
-        methods.append(Method(name=f"node-{mode}", label=f"the node, {mode}", variant=mode, handling="node", sdf=sdf))
+        refu = Method(name=f"refu-{mode}", label=f"ReFU, {mode}", mode=mode, handling="refu", sdf=sdf)
+        methods += [
+            *_ablated(refu),
+            replace(refu, name=f"node-{mode}", label=f"the node, {mode}", handling="node"),
+            replace(
+                refu,
+                name=f"bare-{mode}",
+                label=f"ReFU, {mode}, not blended, ε = 0, trained so (the paper's)",
+                folder="bare",
+                is_blended=False,
+            ),
+        ]
     for sdf in _SDFS:
-        methods += _ablated(f"fixed-{sdf}", f"fixed scale, {sdf}", f"fixed-{sdf}", sdf)
-    for number in (1, 2):
-        name = f"alt{number}-approx"
-        methods.append(Method(name=name, label=f"Alt. {number}, approx", variant=name, handling="refu", sdf="approx"))
+        label = f"fixed scale, {sdf}"
+        methods += _ablated(
+            Method(name=f"fixed-{sdf}", label=label, mode=sdf, folder="fixed", handling="refu", sdf=sdf)
+        )
+    methods += [
+        Method(
+            name=f"alt{number}-approx",
+            label=f"Alt. {number}, approx",
+            mode="approx",
+            folder=f"alt{number}",
+            handling="refu",
+            sdf="approx",
+        )
+        for number in (1, 2)
+    ]
     return methods
 
 
-def _ablated(name: str, label: str, variant: str, sdf: SdfName) -> list[Method]:
+def _ablated(whole: Method) -> list[Method]:
     """A ReFU with all it has, without the blending, and with neither that nor a margin: exactly the paper's layer."""
-    whole = Method(name=name, label=label, variant=variant, handling="refu", sdf=sdf)
-    return [
-        whole,
-        replace(whole, name=f"{name}-unblended", label=f"{label}, not blended", is_blended=False),
-        replace(whole, name=f"{name}-bare", label=f"{label}, not blended, ε = 0", is_blended=False, margin=0.0),
-    ]
+    unblended = replace(whole, name=f"{whole.name}-unblended", label=f"{whole.label}, not blended", is_blended=False)
+    bare = replace(unblended, name=f"{whole.name}-bare", label=f"{whole.label}, not blended, ε = 0", margin=0.0)
+    return [whole, unblended, bare]
 
 
 def _with_refu(backbone: str, label: str, modes: tuple[str, ...]) -> list[Method]:
@@ -107,7 +139,7 @@ def _with_refu(backbone: str, label: str, modes: tuple[str, ...]) -> list[Method
                 name=f"{backbone}-refu-{mode}",
                 label=f"{label} with ReFU, {mode}",
                 backbone=backbone,
-                variant=mode,
+                mode=mode,
                 handling="refu",
                 sdf=_RUN_TIME_SDF[mode],
                 base=backbone,
@@ -122,14 +154,14 @@ def _sequence() -> list[Method]:
     methods = []
     for shapes in SEQUENCE_SHAPES:
         name = f"mlp-{shapes}"
-        alone = Method(name=name, label=f"MLP, {shapes} shapes", backbone="mlp", variant=f"none-{shapes}", base=name)
+        alone = Method(name=name, label=f"MLP, {shapes} shapes", backbone="mlp", folder=f"sequence-{shapes}", base=name)
         methods += [
             alone,
             replace(
                 alone,
                 name=f"{name}-refu-approx",
                 label=f"MLP with ReFU, approx, {shapes} shapes",
-                variant=f"approx-{shapes}",
+                mode="approx",
                 handling="refu",
                 sdf="approx",
             ),
@@ -166,7 +198,7 @@ METHODS: Mapping[str, Method] = {
             name="node-skinned",
             label="the node, skinned, accurate",
             backbone="skinned",
-            variant="accurate",
+            mode="accurate",
             handling="node",
             sdf="accurate",
             base="skinned",
@@ -202,6 +234,7 @@ SAMPLE_TABLES: Mapping[str, tuple[str, ...]] = {
     "ablation": (
         "tailornet",
         *(f"fixed-{sdf}{kind}" for kind in ("-bare", "-unblended", "") for sdf in _SDFS),
+        *(f"bare-{mode}" for mode in _RUN_TIME_SDF),
         *(f"refu-{mode}{kind}" for kind in ("-bare", "-unblended", "") for mode in _RUN_TIME_SDF),
     ),
     "alpha": ("tailornet", "alt1-approx", "alt2-approx", "refu-approx"),

@@ -71,7 +71,7 @@ def motion_table(
         for name in MOTION_METHODS:
             method = METHODS[name]
             try:
-                sdf = method.variant if method.handling == "node" else "none"
+                sdf = method.mode if method.handling == "node" else "none"
                 pipelines[name] = GarmentPipeline.load([garment], sdf=sdf, backbone=method.backbone)
             except RefuError as error:
                 table.missing.append(Missing(garment, name, str(error), method.train_command(garment)))
