@@ -13,6 +13,7 @@ from refu_core.repulsion._resolve import resolve as resolve
 from refu_core.repulsion._scale import PAPER as PAPER
 from refu_core.repulsion._scale import REALTIME as REALTIME
 from refu_core.repulsion._scale import SCALE_PRESETS as SCALE_PRESETS
+from refu_core.repulsion._scale import ScaleKind as ScaleKind
 from refu_core.repulsion._scale import ScaleNet as ScaleNet
 from refu_core.repulsion._scale import ScaleSettings as ScaleSettings
 from refu_core.repulsion._scale import VertexScale as VertexScale

@@ -16,6 +16,13 @@ _ROUNDS = 8
 """How far into a patch of wrong sides is looked from its rim [edges]."""
 _TOLERANCE = 1e-3
 """Disagreement that is let pass [m]: an approximate distance is never quite consistent."""
+DEEP = 0.008
+"""How deep a vertex is whose way out may be through the other side of its limb [m]."""
+_STEPS = 8
+_STEP_ON = 1e-3
+"""What is added to each step [m], so that the steps end."""
+_FARTHEST = 0.08
+"""A way out of its own that is longer is none [m]."""
 
 
 def mend(
@@ -71,6 +78,37 @@ def mend(
         if not changed:
             break
     return sample
+
+
+def turn_outward(
+    points: Tensor, sample: SdfSample, outward: Tensor, query: Callable[[Tensor, Tensor], SdfSample]
+) -> tuple[SdfSample, int]:
+    """The distances of vertices (R, 3), with the way out turned to the cloth's own side where it leads to the other.
+
+    In the middle of a thin limb the closest skin of one vertex is in front and that of the next one behind: they would
+    be torn apart, and the cloth between them end within the limb. So what is deep, and would leave against the outward
+    normal of the cloth (R, 3), goes along that normal instead; its distance is then how far that is.
+
+    `query` gives the distances of points (R', 3), which are those number `at` (R',). Returns how often it was asked,
+    too.
+    """
+    against = (sample.gradient * outward).sum(-1) < 0
+    rows = torch.nonzero(against & (sample.distance < -DEEP))[:, 0]
+    way, going = -sample.distance[rows], torch.arange(len(rows), device=rows.device)
+    looks = 0
+    while len(going) and looks < _STEPS:
+        at = rows[going]
+        # No skin is nearer than |f|.
+        height = query(points[at] + way[going, None] * outward[at], at).distance
+        way[going] = way[going] - height + (height < 0) * _STEP_ON
+        going = going[(height < 0) & (way[going] < _FARTHEST)]
+        looks += 1
+    found = torch.ones_like(way, dtype=torch.bool).index_fill(0, going, False) & (way < _FARTHEST)
+    rows, way = rows[found], way[found]
+    turned = sample._replace(
+        distance=sample.distance.index_copy(0, rows, -way), gradient=sample.gradient.index_copy(0, rows, outward[rows])
+    )
+    return turned, looks
 
 
 def _contradictions(points: Tensor, distance: Tensor, edges: Tensor, margin: float) -> tuple[Tensor, Tensor]:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from refu_core.repulsion._blend import Blend
 from refu_core.repulsion._limbs import Limbs
-from refu_core.repulsion._mend import mend
+from refu_core.repulsion._mend import DEEP, mend, turn_outward
 from refu_core.repulsion._scale import VertexScale
 from refu_core.repulsion._unit import DEFAULT_MARGIN, MAX_DISPLACEMENT, repulse
 from refu_core.sdf import BodySdf, SdfSample
@@ -108,6 +108,11 @@ def resolve(
         others = torch.nonzero(~crossing | (state.distance[rows] < 0))[:, 0]
         rows, first = rows[others], first.rows(others)
         state.vertices[rows], state.distance[rows] = points[rows], first.distance
+    if limbs is not None and bool((first.distance < -DEEP).any()):
+        turned, looks = turn_outward(
+            points[rows], first, limbs.outward(points)[rows], lambda x, at: state.query(x, rows[at])
+        )
+        first, rounds = turned, rounds + looks
     alpha = state.first_scale(scale, rows, first.distance)
     if blend is not None and len(rows):
         rows, first, alpha = _push_blended(state, rows, first, alpha, blend)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from refu_core.evaluation import CollisionChecker
 from refu_core.repulsion import Blend, Limbs, resolve
-from refu_core.repulsion._mend import mend
+from refu_core.repulsion._mend import mend, turn_outward
 from refu_core.sdf import ExactSdf, SdfSample
 
 
@@ -93,3 +93,39 @@ def test_consistent_distances_are_left_as_they_are() -> None:
     limbs = one_limb(faces, len(points), len(mesh.faces))
     assert mend(points, sample, limbs, margin=0.004, look=lambda here, _: sdf.query(here)) is sample
     assert mend(points, sample._replace(face=None), limbs, margin=0.004).face is None
+
+
+def test_cloth_deep_in_a_thin_limb_leaves_to_its_own_side() -> None:
+    mesh = trimesh.creation.box((0.3, 0.06, 0.3))
+    for _ in range(3):
+        mesh = mesh.subdivide()
+    sdf = ExactSdf(mesh.faces)
+    sdf.update(torch.tensor(mesh.vertices, dtype=torch.float32))
+    checker = CollisionChecker(mesh.faces)
+    checker.update(mesh.vertices)
+    points, faces = sheet(15, 0.01)
+    # A sheet over the box that sinks in beyond its middle: the way down is shorter there.
+    points[:, 1] = 0.034 - 0.036 * torch.exp(-((points.norm(dim=1) / 0.03) ** 2))
+    sample = sdf.query(points)
+    up = torch.tensor([0.0, 1.0, 0.0]).expand_as(points)
+    downward = (sample.distance < 0) & (sample.gradient[:, 1] < -0.5)
+    assert downward.any()
+    turned, looks = turn_outward(points, sample, up, lambda here, _: sdf.query(here))
+    torch.testing.assert_close(turned.distance[downward], points[downward, 1] - 0.03, atol=2e-3, rtol=0)
+    torch.testing.assert_close(turned.gradient[downward], up[downward])
+    assert torch.equal(turned.distance[~downward], sample.distance[~downward])
+    assert 0 < looks < 8
+    limbs, blend = one_limb(faces, len(points), len(mesh.faces)), Blend.of_faces(faces, len(points))
+    assert checker.check(resolve(points, sdf, limbs=limbs, blend=blend).vertices, faces).is_free
+    assert not checker.check(resolve(points, sdf, blend=blend).vertices, faces).is_free
+
+
+def test_without_a_way_out_on_its_own_side_a_vertex_keeps_the_other() -> None:
+    mesh = trimesh.creation.box((0.3, 0.3, 0.3))
+    sdf = ExactSdf(mesh.faces)
+    sdf.update(torch.tensor(mesh.vertices, dtype=torch.float32))
+    point = torch.tensor([[0.0, -0.1, 0.0]])
+    sample = sdf.query(point)
+    turned, _ = turn_outward(point, sample, torch.tensor([[0.0, 1.0, 0.0]]), lambda here, _: sdf.query(here))
+    assert torch.equal(turned.distance, sample.distance)
+    assert torch.equal(turned.gradient, sample.gradient)

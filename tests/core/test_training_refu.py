@@ -1,0 +1,277 @@
+"""Training with ReFU: losses, what a batch goes through, and fine-tuning of every mode."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from refu_core import load_body, load_garment
+from refu_core.backbones import MlpConfig, Prediction, read_backbone
+from refu_core.body import SmplBody
+from refu_core.errors import RefuError, WeightsError
+from refu_core.garments import GarmentTemplate
+from refu_core.repulsion import Blend, Refu, read_refu
+from refu_core.sdf import ApproxSdf, ExactSdf, RestFaces, SdfSample
+from refu_core.training import (
+    FINETUNE_MODES,
+    FinetuneSettings,
+    LoopSettings,
+    PretrainSettings,
+    collision_loss,
+    finetune,
+    pretrain,
+    reconstruction_loss,
+    refu_loss,
+)
+from refu_core.training import _loop as loop_module
+from refu_core.training._dresser import Dresser
+from refu_core.weights import load_weights
+
+GARMENT = "short-pant-male"
+N, N_PAIRS = 30, 10
+QUICK = FinetuneSettings(
+    LoopSettings(batch_size=3, learning_rate=3e-3, weight_decay=0.0, check_every=2),
+    steps=4,
+    validation_share=0.2,
+)
+
+
+def test_losses_are_the_papers() -> None:
+    generator = torch.Generator().manual_seed(0)
+    vertices, truth = torch.randn(2, 3, 5, 3, generator=generator)
+    distance = torch.randn(3, 5, generator=generator)
+    squares = sum(float((vertices[b, i] - truth[b, i]).norm() ** 2) for b in range(3) for i in range(5))
+    depths = sum(max(0.0, -float(distance[b, i])) for b in range(3) for i in range(5))
+    assert float(reconstruction_loss(vertices, truth)) == pytest.approx(squares / 15)
+    assert float(collision_loss(distance)) == pytest.approx(depths / 15)
+    losses = refu_loss(vertices, truth, distance)
+    assert float(losses.total) == pytest.approx((1.5 * squares + 0.5 * depths) / 15)
+    other = refu_loss(vertices, truth, distance, reconstruction_weight=0.0, collision_weight=2.0)
+    assert float(other.total) == pytest.approx(2 * depths / 15)
+
+
+@pytest.fixture(scope="module")
+def garment() -> GarmentTemplate:
+    return load_garment(GARMENT)
+
+
+@pytest.fixture(scope="module")
+def body(garment: GarmentTemplate) -> SmplBody:
+    return load_body(garment.body)
+
+
+class Tight(nn.Module):
+    """A backbone whose garment is everywhere `depth` [m] nearer to the skin than the template."""
+
+    def __init__(self, garment: GarmentTemplate, body: SmplBody, depth: float) -> None:
+        super().__init__()
+        sdf = ExactSdf(body.faces)
+        sdf.update(body.v_template)
+        self.inward = nn.Parameter(-depth * sdf.query(garment.v_template).gradient)
+
+    def forward(self, betas: Tensor, pose: Tensor, style: Tensor | None) -> Prediction:
+        del pose, style
+        return Prediction(self.inward.expand(len(betas), -1, -1), None)
+
+
+def bodies(batch: int) -> tuple[Tensor, Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(3)
+    betas, style = torch.randn(batch, 10, generator=generator), torch.randn(batch, 4, generator=generator)
+    pose = 0.15 * torch.randn(batch, 24, 3, generator=generator)
+    return betas, pose, style
+
+
+def assert_nearly_all_close(actual: Tensor, wanted: Tensor, tolerance: float) -> None:
+    """Where two parts of the skin are equally near, rounding decides which is the closest: for a few vertices."""
+    assert ((actual - wanted).abs() < tolerance).float().mean() > 0.99
+
+
+@pytest.mark.parametrize("in_refu", ["accurate", "approx"])
+def test_a_batch_is_dressed_as_the_parts_would_one_by_one(
+    garment: GarmentTemplate, body: SmplBody, in_refu: Any
+) -> None:
+    backbone = Tight(garment, body, 0.03)
+    refu = Refu(garment.n_vertices, least=1.0)
+    nn.init.normal_(dict(refu.named_parameters())["scale.g.2.weight"], std=0.3)
+    dresser = Dresser(backbone, refu, garment, body, in_refu=in_refu, in_loss="accurate")
+    betas, pose, style = bodies(2)
+    dressed = dresser(betas, pose, style)
+    posed, exact, approx, rest_faces = body(pose, betas), ExactSdf(body.faces), ApproxSdf(body), RestFaces(body)
+    unposed = garment.rest(betas, style) + backbone.inward
+    raw = garment.pose(unposed, posed.transforms)
+    for b in range(2):
+        exact.update(posed.vertices[b])
+        approx.update(posed.vertices[b])
+        near = rest_faces(unposed[b] - (garment.shapedirs @ betas[b]).view(-1, 3))
+        sample = (exact if in_refu == "accurate" else approx).query(raw[b].detach(), near=near)
+        z = refu.feature(betas, pose, style)
+        assert z is not None
+        wanted = refu(
+            raw[b : b + 1],
+            SdfSample(sample.distance[None], sample.gradient[None]),
+            z[b : b + 1],
+            blend=Blend.of_faces(garment.faces, garment.n_vertices),
+        )[0]
+        assert_nearly_all_close(dressed[b, :, :3], wanted, 1e-4)
+        distance = exact.query(wanted.detach()).distance
+        assert_nearly_all_close(dressed[b, :, 3].clamp_max(0.004), distance.clamp_max(0.004), 1e-4)
+        assert (sample.distance < 0).sum() > 100
+
+
+def test_the_distance_has_its_own_derivative(garment: GarmentTemplate, body: SmplBody) -> None:
+    backbone = Tight(garment, body, 0.03)
+    dresser = Dresser(backbone, None, garment, body, in_refu="accurate", in_loss="accurate")
+    betas, pose, style = bodies(1)
+    distance = dresser(betas, pose, style)[0, :, 3]
+    (derivative,) = torch.autograd.grad(distance[distance < 0].sum(), backbone.inward)
+    step = 1e-4 * torch.randn(backbone.inward.shape, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        backbone.inward += step
+        moved = dresser(betas, pose, style)[0, :, 3]
+    numeric = (moved - distance)[distance < 0].detach()
+    analytic = (derivative * step).sum(-1)[distance < 0]
+    assert len(numeric) > 100
+    assert_nearly_all_close(analytic, numeric, 2e-5)
+
+
+def test_without_refu_the_garment_is_the_backbones(garment: GarmentTemplate, body: SmplBody) -> None:
+    backbone = Tight(garment, body, 0.01)
+    dresser = Dresser(backbone, None, garment, body, in_refu="approx", in_loss="approx")
+    betas, pose, style = bodies(2)
+    raw = garment.pose(garment.rest(betas, style) + backbone.inward, body(pose, betas).transforms)
+    torch.testing.assert_close(dresser(betas, pose, style)[..., :3], raw)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory, garment: GarmentTemplate, body: SmplBody) -> Path:
+    """A set in the documented format: shorts that follow the skin."""
+    folder = tmp_path_factory.mktemp("set")
+    rng = np.random.default_rng(0)
+    pair = np.repeat(np.arange(N_PAIRS), N // N_PAIRS).astype("<i4")
+    betas = rng.normal(size=(N_PAIRS, 10)).astype("<f4")[pair]
+    style = rng.normal(size=(N_PAIRS, 4)).astype("<f4")[pair]
+    pose = rng.normal(0, 0.15, (N, 24, 3)).astype("<f4")
+    with torch.no_grad():
+        b, p = torch.as_tensor(betas), torch.as_tensor(pose)
+        posed = garment.pose(garment.rest(b, torch.as_tensor(style)), body(p, b).transforms).numpy()
+    quantum = 2.0**-14
+    columns: dict[str, Any] = {
+        "vertices": np.rint(posed / quantum).astype("<i2"),
+        "pose": pose,
+        "betas": betas,
+        "style": style,
+        "pair": pair,
+        "slot": np.arange(N, dtype="<i4"),
+        "clip": np.full(N, -1, "<i4"),
+        "frame": np.full(N, -1, "<i4"),
+        "split": (pair >= 9).astype("|u1"),
+        "state": np.ones(N, "|u1"),
+        "dropped": np.zeros((N, 5), "|u1"),
+        **{name: np.ones(N, "<f4") for name in ("share", "stretch", "speed", "seconds")},
+    }
+    shard = folder / "shard-0-of-1"
+    shard.mkdir()
+    for name, array in columns.items():
+        np.save(shard / f"{name}.npy", array)
+    card = {
+        "format": "refu-garments-1",
+        "garment": GARMENT,
+        "body": garment.body,
+        "body_fingerprint": body.fingerprint,
+        "quantum_m": quantum,
+        "plan": {"count": N, "pivots": 4},
+    }
+    (folder / "card.json").write_text(json.dumps(card))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def pretrained(tmp_path_factory: pytest.TempPathFactory, dataset: Path) -> Path:
+    """A small backbone, hardly trained."""
+    folder = tmp_path_factory.mktemp("weights")
+    settings = PretrainSettings(LoopSettings(batch_size=8, check_every=10), rank=8, steps=10, validation_share=0.2)
+    config = MlpConfig((0, 1, 2, 4, 5), hidden=(16,))
+    pretrain(GARMENT, dataset, folder, backbone="mlp", settings=settings, config=config, quiet=True)
+    return folder
+
+
+@pytest.mark.parametrize("mode", FINETUNE_MODES)
+def test_every_mode_writes_what_can_be_read(
+    tmp_path: Path, dataset: Path, pretrained: Path, garment: GarmentTemplate, body: SmplBody, mode: str
+) -> None:
+    card = finetune(GARMENT, dataset, pretrained, tmp_path, mode=mode, backbone="mlp", settings=QUICK, quiet=True)
+    expect = {"garment": GARMENT, "body_fingerprint": body.fingerprint}
+    stem = tmp_path / f"mlp-{mode}"
+    network, refu = read_backbone(stem, garment, expect=expect), read_refu(stem, expect=expect)
+    betas, pose, style = bodies(2)
+    before = read_backbone(pretrained / "mlp-none", garment, expect=expect)
+    assert not torch.equal(network(betas, pose, style).displacement, before(betas, pose, style).displacement)
+    assert card["mode"] == load_weights(stem).card["mode"] == mode
+    assert (tmp_path / f"mlp-{mode}.png").exists()
+    assert not (tmp_path / f"mlp-{mode}.checkpoint").exists()
+    if mode.startswith("collision"):
+        assert refu is None
+        return
+    assert refu is not None
+    assert refu.config["least"] == (1.0 if mode == "accurate" else 0.0)
+    assert not any(parameter.requires_grad for parameter in refu.parameters())
+
+
+def test_interrupted_it_resumes_to_the_same_weights(
+    tmp_path: Path, dataset: Path, pretrained: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def train(folder: str) -> dict[str, Tensor]:
+        finetune(
+            GARMENT, dataset, pretrained, tmp_path / folder, mode="accurate", backbone="mlp", settings=QUICK, quiet=True
+        )
+        return dict(load_weights(tmp_path / folder / "mlp-accurate").tensors)
+
+    whole = train("whole")
+    real = loop_module.save_checkpoint
+
+    def interrupted(*args: Any) -> None:
+        real(*args)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(loop_module, "save_checkpoint", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            train("parts")
+    torch.manual_seed(99)
+    parts = train("parts")
+    assert whole.keys() == parts.keys()
+    assert any(name.startswith("refu.") for name in whole)
+    assert all(torch.equal(whole[name], parts[name]) for name in whole)
+
+
+def test_training_brings_the_cloth_out_and_nearer_to_the_truth(tmp_path: Path, dataset: Path, pretrained: Path) -> None:
+    settings = replace(QUICK, steps=40, loop=replace(QUICK.loop, check_every=20))
+    finetune(GARMENT, dataset, pretrained, tmp_path, mode="hybrid", backbone="mlp", settings=settings, quiet=True)
+    lines = [json.loads(line) for line in (tmp_path / "mlp-hybrid.jsonl").read_text().splitlines()]
+    finetune(GARMENT, dataset, pretrained, tmp_path / "x", mode="hybrid", backbone="mlp", settings=QUICK, quiet=True)
+    first = json.loads((tmp_path / "x" / "mlp-hybrid.jsonl").read_text().splitlines()[0])
+    assert lines[-1]["validation"] < 0.8 * first["validation"]
+
+
+def test_a_gcnn_is_trained_from_scratch(tmp_path: Path, dataset: Path, garment: GarmentTemplate) -> None:
+    settings = replace(QUICK, steps=2, is_mirrored=False, loop=replace(QUICK.loop, batch_size=1))
+    card = finetune(GARMENT, dataset, None, tmp_path, mode="approx", backbone="gcnn", settings=settings, quiet=True)
+    assert card["from_scratch"]
+    network = read_backbone(tmp_path / "gcnn-approx", garment, expect={})
+    assert torch.isfinite(network(*bodies(1)).displacement).all()
+
+
+def test_says_what_it_knows(tmp_path: Path, dataset: Path, pretrained: Path) -> None:
+    with pytest.raises(RefuError, match="no mode 'exact' of training: wanted approx, accurate"):
+        finetune(GARMENT, dataset, pretrained, tmp_path, mode="exact")
+    with pytest.raises(RefuError, match="no preset 'huge' of the scale networks"):
+        finetune(GARMENT, dataset, pretrained, tmp_path, backbone="mlp", settings=replace(QUICK, scale="huge"))
+    with pytest.raises(WeightsError, match="tailornet-none"):
+        finetune(GARMENT, dataset, pretrained, tmp_path, settings=QUICK)
