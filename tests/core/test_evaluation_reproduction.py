@@ -194,11 +194,8 @@ def test_what_is_not_trained_says_so_in_its_row(study: rp.Study, tmp_path: Path)
     assert table.value(GARMENT, "refu-hybrid", "vfcp_percent") is not None
     page = table.markdown(rp.labels_of("comparison"), source="")
     assert "| collision loss, approx (not measured) | – | *6.79* |" in page
-    assert (
     command = "refu train short-pant-male --data DIR --backbone tailornet --mode collision-approx"
     assert f"`{command} --output weights/short-pant-male`" in page
-        in page
-    )
     assert "| ReFU, hybrid | " in page
     rows = table.as_dict()["rows"]
     assert {tuple(row) for row in rows} == {("table", "garment", "method", "metric", "value", "paper")}
@@ -238,9 +235,7 @@ def test_plots_of_the_same_figures_are_the_same_files(study: rp.Study, tmp_path:
     assert contents[0] == contents[1]
 
 
-def test_pictures(
-    study: rp.Study, samples: rp.Samples, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pictures(study: rp.Study, samples: rp.Samples, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_pictures, "_SIZE", (60, 80))
     ((file, caption),) = rp.PICTURES["comparison"](study, [samples], tmp_path, library=Emulated())
     assert (tmp_path / file).read_bytes().startswith(b"\x89PNG")
