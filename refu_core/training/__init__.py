@@ -9,6 +9,7 @@ from refu_core.training._losses import Losses, collision_loss, reconstruction_lo
 from refu_core.training._mirror import Mirror, mirror_pose
 from refu_core.training._pretrain import PretrainSettings, pretrain
 from refu_core.training._progress import TrainingLog
+from refu_core.training._sdf import SdfSettings, train_sdf
 
 __all__ = [
     "FINETUNE_MODES",
@@ -18,6 +19,7 @@ __all__ = [
     "Mirror",
     "PretrainSettings",
     "Samples",
+    "SdfSettings",
     "TrainingLog",
     "collision_loss",
     "displacements",
@@ -33,4 +35,5 @@ __all__ = [
     "save_checkpoint",
     "split_validation",
     "test_figures",
+    "train_sdf",
 ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from refu_core.backbones import backbone_config, build_backbone, read_backbone, 
 from refu_core.body import SmplBody, load_body
 from refu_core.errors import RefuError
 from refu_core.garments import GarmentTemplate, load_garment
-from refu_core.repulsion import DEFAULT_MARGIN, SCALE_PRESETS, Refu, refu_tensors
+from refu_core.repulsion import DEFAULT_MARGIN, SCALE_PRESETS, Refu, ScaleKind, refu_tensors
 from refu_core.simulation import GarmentDataset
 from refu_core.training._data import Samples, mirrored, read_samples, split_validation
 from refu_core.training._dresser import Dresser, Sdf
@@ -62,6 +62,8 @@ class FinetuneSettings:
     collision_weight: float = COLLISION_WEIGHT
     scale: str | None = "realtime"
     """Preset of the scale networks; None fixes α at 1."""
+    scale_kind: ScaleKind = "vertex"
+    """What α is predicted from: see `refu_core.repulsion.ScaleSettings`."""
     margin: float = DEFAULT_MARGIN
     """ε [m]."""
     learn_margin: bool = False
@@ -232,7 +234,7 @@ def _layer(mode: str, settings: FinetuneSettings, n_vertices: int) -> Refu | Non
     return Refu(
         n_vertices,
         least=_MODES[mode].least,
-        scale=None if settings.scale is None else SCALE_PRESETS[settings.scale],
+        scale=None if settings.scale is None else replace(SCALE_PRESETS[settings.scale], kind=settings.scale_kind),
         margin=settings.margin,
         learn_margin=settings.learn_margin,
     )

@@ -188,7 +188,7 @@ def train_sdf(
     device: str = "cpu",
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """Trains the network on the training split of a set and writes it to `output`, with its checkpoint and loss curves.
+    """Trains the network on the training split of a set; writes `output`/sdf-PRESET, a checkpoint, and loss curves.
 
     Interrupted, it goes on where the last checkpoint was, to the same weights; what is drawn for a step depends on the
     seed and the number of the step alone. Under `torchrun` every process takes its share of the bodies. On a GPU it
@@ -201,14 +201,15 @@ def train_sdf(
         WeightsError: a damaged checkpoint, or a disk that can't be written.
     """
     settings = settings or SdfSettings()
+    name = f"sdf-{settings.preset}"
     is_writer, where = start_parallel(torch.device(device))
     rank, world = (dist.get_rank(), dist.get_world_size()) if dist.is_initialized() else (0, 1)
     if settings.batch_size % world:
         msg = f"a batch of {settings.batch_size} bodies can't be shared evenly by {world} processes"
         raise RefuError(msg)
     splits = _split(dataset, settings)
-    samplers = {name: SdfSampler(dataset, body, garment, rows) for name, rows in splits.items()}
-    checks = {name: _fixed_batch(samplers[name], settings).to(where) for name in ("validation", "test")}
+    samplers = {part: SdfSampler(dataset, body, garment, rows) for part, rows in splits.items()}
+    checks = {part: _fixed_batch(samplers[part], settings).to(where) for part in ("validation", "test")}
 
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
@@ -217,12 +218,12 @@ def train_sdf(
     identity = json.dumps(
         {**asdict(settings), "body": body.fingerprint, "garment": garment.name, "samples": len(splits["train"])}
     )
-    checkpoint = output / "sdf.checkpoint"
+    checkpoint = output / f"{name}.checkpoint"
     step = _resume(checkpoint, identity, network, optimiser)
     module: Callable[[SdfBatch], Tensor] = _Step(network)
     if world > 1:
         module = nn.parallel.DistributedDataParallel(_Step(network))
-    log = TrainingLog(output, name="sdf", quiet=quiet) if is_writer else None
+    log = TrainingLog(output, name=name, quiet=quiet) if is_writer else None
     if log is not None:
         log.begin("sdf", step=step, steps=settings.steps)
     while step < settings.steps:
@@ -240,7 +241,8 @@ def train_sdf(
             log.step(step)
         if step % settings.check_every == 0 or step == settings.steps:
             if not math.isfinite(float(loss.detach())):
-                msg = f"the loss of the distance network is {float(loss.detach())} at step {step}: try a smaller learning rate"
+                lost = float(loss.detach())
+                msg = f"the loss of the distance network is {lost} at step {step}: try a smaller learning rate"
                 raise RefuError(msg)
             if log is not None:
                 found = sdf_figures(network, checks["validation"])
@@ -252,11 +254,11 @@ def train_sdf(
         "body_fingerprint": body.fingerprint,
         "dataset": {"garment": garment.name, "samples": len(splits["train"])},
         "settings": asdict(settings),
-        "figures": {name: sdf_figures(network, batch) for name, batch in checks.items()},
+        "figures": {part: sdf_figures(network, batch) for part, batch in checks.items()},
     }
     if log is not None:
         log.end()
-        save_sdf_network(output / "sdf", network, card)
+        save_sdf_network(output / name, network, card)
     return card
 
 

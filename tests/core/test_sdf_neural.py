@@ -224,12 +224,12 @@ def test_training_lowers_the_error_and_resumes_to_the_same_weights(
         preset="tiny", steps=40, batch_size=2, points=160, learning_rate=3e-3, check_every=20, validation_share=0.25
     )
     card = train_sdf(dataset, body, garment, tmp_path / "once", settings=settings, quiet=True)
-    checks = [json.loads(line) for line in (tmp_path / "once" / "sdf.jsonl").read_text().splitlines()]
+    checks = [json.loads(line) for line in (tmp_path / "once" / "sdf-tiny.jsonl").read_text().splitlines()]
     assert [check["step"] for check in checks] == [20, 40]
     sampler = SdfSampler(dataset, body, garment, torch.arange(8, 12))
     batch = sampler.draw(torch.Generator().manual_seed(1), bodies=4, points=400, noise=0.02)
     before = sdf_figures(untrained(width=64, hidden=4, skip=2), batch)
-    trained = load_sdf_network(tmp_path / "once" / "sdf", body)
+    trained = load_sdf_network(tmp_path / "once" / "sdf-tiny", body)
     after = sdf_figures(trained, batch)
     assert after["absolute_mm"] < 0.8 * before["absolute_mm"]
     assert card["figures"]["test"]["absolute_mm"] < 0.8 * before["absolute_mm"]
@@ -240,7 +240,7 @@ def test_training_lowers_the_error_and_resumes_to_the_same_weights(
         with pytest.raises(KeyboardInterrupt):
             train_sdf(dataset, body, garment, tmp_path / "twice", settings=settings, quiet=True)
     train_sdf(dataset, body, garment, tmp_path / "twice", settings=settings, quiet=True)
-    resumed = load_sdf_network(tmp_path / "twice" / "sdf", body)
+    resumed = load_sdf_network(tmp_path / "twice" / "sdf-tiny", body)
     for name, tensor in trained.state_dict().items():
         assert torch.equal(tensor, resumed.state_dict()[name]), name
     with pytest.raises(RefuError, match=r"other settings or data"):
