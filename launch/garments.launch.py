@@ -15,7 +15,7 @@ from launch_ros.actions import Node
 
 from launch import LaunchContext, LaunchDescription
 
-TEXTS = ("backbone", "betas_source", "device", "frame_id", "input_axes", "input_type", "record", "sdf")
+TEXTS = ("backbone", "betas_source", "device", "frame_id", "input_axes", "input_type", "record", "sdf", "weights")
 NUMBERS = ("margin", "max_distance", "max_rate", "person_timeout")
 YAML = ("betas", "follow_humans", "garments", "persons", "style")
 PARAMETERS = TEXTS + NUMBERS + YAML

@@ -52,6 +52,7 @@ class PipelineKey:
     garments: tuple[str, ...]
     sdf: str
     backbone: str
+    weights: str
     device: str
 
     def load(self) -> GarmentPipeline:
@@ -59,7 +60,13 @@ class PipelineKey:
 
         Raises `RefuError`.
         """
-        pipeline = GarmentPipeline.load(self.garments, sdf=self.sdf, backbone=self.backbone, device=self.device)
+        pipeline = GarmentPipeline.load(
+            self.garments,
+            sdf=self.sdf,
+            backbone=self.backbone,
+            weights=self.weights or None,
+            device=self.device,
+        )
         pipeline(SmplFrame(np.zeros((N_JOINTS, 3), np.float32)))
         return pipeline
 
@@ -76,6 +83,9 @@ class NodeSettings:
     )
     backbone: str = _parameter(
         "skinned", "What predicts the garment before collisions are handled.", choices=tuple(BACKBONES)
+    )
+    weights: str = _parameter(
+        "", "Folder with a folder a garment of weights of one's own (refu train); empty for those that ship."
     )
     sdf: str = _parameter("accurate", "How collisions are found.", choices=SDF_MODES)
     margin: float = _parameter(DEFAULT_MARGIN, "Clearance that is kept from the skin [m].", low=0.0, high=0.05)
@@ -128,8 +138,8 @@ class NodeSettings:
         if self.follow_humans and self.input_type != "joint_state":
             msg = f"follow_humans: REP-155 has bodies as joint_state, but input_type is {self.input_type}"
             raise SettingsError(msg)
-        if not self.frame_id or "\0" in self.frame_id + self.record:
-            msg = f"frame_id, record: wanted names without NUL, the frame's not empty, got {self.frame_id!r}"
+        if not self.frame_id or "\0" in self.frame_id + self.record + self.weights:
+            msg = f"frame_id, record, weights: wanted names without NUL, the frame's not empty, got {self.frame_id!r}"
             raise SettingsError(msg)
         self._check_garments()
 
@@ -159,7 +169,9 @@ class NodeSettings:
     @property
     def pipeline(self) -> PipelineKey:
         """What the pipeline depends on."""
-        return PipelineKey(garments=self.garments, sdf=self.sdf, backbone=self.backbone, device=self.device)
+        return PipelineKey(
+            garments=self.garments, sdf=self.sdf, backbone=self.backbone, weights=self.weights, device=self.device
+        )
 
     @property
     def axes(self) -> InputAxes:

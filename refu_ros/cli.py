@@ -108,8 +108,15 @@ def _add_replay(commands: Any) -> None:
         metavar="A,B",
         help="garments of one body (default: tshirt-male,short-pant-male)",
     )
-    parser.add_argument("--backbone", default="skinned", metavar="NAME", help="skinned (default)")
-    parser.add_argument("--sdf", default="accurate", metavar="MODE", help="accurate (default) or none")
+    parser.add_argument(
+        "--backbone", default="skinned", metavar="NAME", help="skinned (default), tailornet, mlp or gcnn"
+    )
+    parser.add_argument(
+        "--sdf", default="accurate", metavar="MODE", help="accurate (default), hybrid, approx, or none for no ReFU"
+    )
+    parser.add_argument(
+        "--weights", type=Path, metavar="DIR", help="folder with a folder a garment of weights of one's own"
+    )
     parser.add_argument("--margin", type=float, default=0.004, metavar="M", help="clearance from the skin [m] (0.004)")
     parser.add_argument("--betas", type=_numbers(10), metavar="B0,…", help="shape to use instead of the recorded one")
     parser.add_argument("--style", type=_numbers(4), metavar="G0,…", help="garment style γ")

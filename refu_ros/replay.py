@@ -45,6 +45,7 @@ class ReplayOptions:
     output: Path | None = None
     backbone: str = "skinned"
     sdf: str = "accurate"
+    weights: Path | None = None
     margin: float = DEFAULT_MARGIN
     betas: tuple[float, ...] | None = None
     style: tuple[float, ...] | None = None
@@ -65,6 +66,7 @@ class ReplayOptions:
             backbone=self.backbone,
             style=self.style,
             margin=self.margin,
+            weights=self.weights,
             device=self.device,
         )
 
