@@ -15,6 +15,8 @@ from refu_core.repulsion._unit import DEFAULT_MARGIN, MAX_DISPLACEMENT, repulse
 from refu_core.sdf import BodySdf, SdfSample
 
 _RETREAT_STEPS = 8
+_BENT = 0.9
+"""Cosine between the skin's normals below its ends under which an edge may cut a corner."""
 _STEP_ON = 1e-3
 """What is added to each step of a retreat [m], so that it ends."""
 
@@ -90,6 +92,7 @@ def resolve(
     state = _State(
         vertices=points.clone(),
         distance=start.distance.clone(),
+        gradient=start.gradient.clone(),
         near=None if near is None else start.face.clone() if start.face is not None else near,
         origin=points,
         sdf=sdf,
@@ -140,6 +143,8 @@ class _State:
 
     vertices: Tensor
     distance: Tensor
+    gradient: Tensor
+    """Of the distance; beyond the margin it may be that of an earlier place."""
     near: Tensor | None
     """Closest face of each vertex as last known, where the distance asks for such hints."""
     origin: Tensor
@@ -164,7 +169,7 @@ class _State:
         self.keep(rows[better], moved[better], sample.rows(better))
 
     def keep(self, rows: Tensor, moved: Tensor, sample: SdfSample) -> None:
-        self.vertices[rows], self.distance[rows] = moved, sample.distance
+        self.vertices[rows], self.distance[rows], self.gradient[rows] = moved, sample.distance, sample.gradient
         if self.near is not None and sample.face is not None:
             self.near[rows] = sample.face.to(self.near)
 
@@ -274,11 +279,17 @@ def _raise_edges(state: _State, edges: Tensor, max_rounds: int) -> int:
     """Raises both ends of the edges whose middle is closer to the body than half the margin; returns the rounds.
 
     Only edges with an end at the margin are looked at: skin would have to bulge by more than the margin between two
-    vertices further off, as only a finger does.
+    vertices further off, as only a finger does. And of these the ones whose ends are above different sides of the body,
+    and so short of it that the middle may be too low.
     """
     wanted = 0.5 * state.margin
-    closer = state.distance[edges].amin(dim=1)
-    low = edges[(closer < state.margin + state.tolerance) & (closer >= 0)]
+    ends = state.distance[edges]
+    closer, farther = ends.amin(dim=1), ends.amax(dim=1)
+    low = torch.nonzero((closer < state.margin + state.tolerance) & (closer >= 0))[:, 0]
+    first, second = edges[low].unbind(1)
+    length = torch.linalg.vector_norm(state.vertices[first] - state.vertices[second], dim=-1)
+    is_bent = (state.gradient[first] * state.gradient[second]).sum(-1) < _BENT
+    low = edges[low[is_bent & (farther[low] < wanted + 0.5 * length)]]
     for round_ in range(max_rounds):
         middle = state.query(state.vertices[low].mean(dim=1), low[:, 0])
         is_low = middle.distance < wanted
