@@ -58,6 +58,11 @@ class PoseFeatures(nn.Module):
         self.encoding = encoding
         self.joints = tuple(j for j in joints if j != 0)
         self.size = 3 + 9 * len(self.joints) if encoding == "matrix" else 72
+        per_joint = torch.arange(24).repeat_interleave(3)
+        if encoding == "matrix":
+            per_joint = torch.cat((torch.zeros(3), 1 + torch.arange(len(self.joints)).repeat_interleave(9))).long()
+        self.groups = torch.cat((per_joint, per_joint[-1] + 1 + torch.arange(N_STYLE_SHAPE)))
+        """Which numbers of (features, β, γ) belong together, shape (size + 14,): those of one joint."""
         keep = torch.zeros(24, 1)
         keep[list(joints)] = 1.0
         self.register_buffer("_index", torch.tensor((0, *self.joints)), persistent=False)

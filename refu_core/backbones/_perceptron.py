@@ -28,9 +28,9 @@ class Perceptron(nn.Module):
         self.shift: Tensor
         self.scale: Tensor
 
-    def standardise(self, inputs: Tensor) -> None:
-        """Takes shift and scale from the inputs of the training set, shape (N, I)."""
-        _standardise(self.shift, self.scale, inputs)
+    def standardise(self, inputs: Tensor, groups: Tensor | None = None) -> None:
+        """Takes shift and scale from the inputs of the training set, shape (N, I); one scale a group (I,) of inputs."""
+        _standardise(self.shift, self.scale, inputs, groups)
 
     def forward(self, x: Tensor) -> Tensor:
         """Shape (B, I) -> (B, O)."""
@@ -69,9 +69,9 @@ class StackedPerceptrons(nn.Module):
         self.shift: Tensor
         self.scale: Tensor
 
-    def standardise(self, inputs: Tensor) -> None:
-        """Takes shift and scale from the inputs of the training set, shape (N, I)."""
-        _standardise(self.shift, self.scale, inputs)
+    def standardise(self, inputs: Tensor, groups: Tensor | None = None) -> None:
+        """Takes shift and scale from the inputs of the training set, shape (N, I); one scale a group (I,) of inputs."""
+        _standardise(self.shift, self.scale, inputs, groups)
 
     def select(self, active: Tensor) -> list[tuple[Tensor, Tensor]]:
         """Weights (A, I, O) and biases (A, O) of the perceptrons `active` (A,), layer by layer: copies."""
@@ -94,8 +94,11 @@ class StackedPerceptrons(nn.Module):
         return torch.addmm(mixture @ bias, mixed, weight.flatten(0, 1))
 
 
-def _standardise(shift: Tensor, scale: Tensor, inputs: Tensor) -> None:
+def _standardise(shift: Tensor, scale: Tensor, inputs: Tensor, groups: Tensor | None) -> None:
+    groups = torch.arange(inputs.shape[1]) if groups is None else groups
     with torch.no_grad():
         shift.copy_(inputs.mean(0))
-        # What hardly varies in the training set says little: it isn't blown up to the others' size.
-        scale.copy_(1 / (inputs.std(0) + 1e-3))
+        # Within a group the sizes stay as they are: what of a joint's rotation hardly varies says little, and isn't
+        # blown up to the size of the rest. The same for groups that don't vary at all.
+        variance = inputs.new_zeros(int(groups.max()) + 1).index_add(0, groups, inputs.var(0))
+        scale.copy_(1 / ((variance / torch.bincount(groups)).sqrt() + 1e-3)[groups])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -29,6 +28,8 @@ class TailorNetConfig:
     """Hidden layers of the style-shape net."""
     activation: str = "silu"
     dropout: float = 0.1
+    high_dropout: float = 0.3
+    """Of the high-frequency nets, each of which sees a small part of the samples."""
     sigma: float = 0.01
     """Width of the kernel of the mixture."""
     skipped: float = 1e-3
@@ -37,7 +38,7 @@ class TailorNetConfig:
     @classmethod
     def paper(cls, joints: tuple[int, ...]) -> TailorNetConfig:
         """The original's sizes: 31 million parameters a net with a shirt's dense head."""
-        return cls(joints, "rotvec", (1024, 1024), (1024, 1024), (128, 128), "relu", 0.2, skipped=0.0)
+        return cls(joints, "rotvec", (1024, 1024), (1024, 1024), (128, 128), "relu", 0.2, 0.2, skipped=0.0)
 
 
 class TailorNet(nn.Module):
@@ -53,9 +54,18 @@ class TailorNet(nn.Module):
         self.config = config
         self.decoder = decoder
         self.features = PoseFeatures(config.joints, config.encoding)
-        options: dict[str, Any] = {"activation": config.activation, "dropout": config.dropout}
-        self.low = Perceptron(self.features.size + N_STYLE_SHAPE, config.low, decoder.size, **options)
-        self.high = StackedPerceptrons(len(pivots), self.features.size, config.high, decoder.size, **options)
+        activation = config.activation
+        self.low = Perceptron(
+            self.features.size + N_STYLE_SHAPE, config.low, decoder.size, activation=activation, dropout=config.dropout
+        )
+        self.high = StackedPerceptrons(
+            len(pivots),
+            self.features.size,
+            config.high,
+            decoder.size,
+            activation=activation,
+            dropout=config.high_dropout,
+        )
         self.style_shape = Perceptron(N_STYLE_SHAPE, config.style_shape, decoder.size, activation=config.activation)
         self.register_buffer("pivots", pivots.clone())
         self.register_buffer("_directions", decoder.directions(garment), persistent=False)

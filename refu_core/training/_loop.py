@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +60,8 @@ class Stage:
     """Inputs and, last, targets; each of the shape (N, ...)."""
     validation: tuple[Tensor, ...]
     """The same of the samples to choose by; possibly none."""
+    rate: float = field(default=1.0, kw_only=True)
+    """Learning rate, relative to the settings'."""
 
 
 class Loop:
@@ -131,7 +133,7 @@ class Loop:
         while step < stage.steps and since < settings.patience:
             objective.train()
             for group in optimiser.param_groups:
-                group["lr"] = settings.learning_rate * _schedule(step, stage.steps)
+                group["lr"] = settings.learning_rate * stage.rate * _schedule(step, stage.steps)
             rows = torch.randint(n, (settings.batch_size,), generator=order)[rank::world].to(stage.train[0].device)
             with torch.autocast(self._device.type, torch.bfloat16, enabled=self._device.type == "cuda"):
                 loss = stepper(*(t[rows].to(self._device) for t in stage.train))

@@ -54,11 +54,13 @@ class PretrainSettings:
     """R, components of the output basis."""
     style_shape_steps: int = 800
     low_steps: int = 2500
-    steps: int = 2500
+    steps: int = 1500
     """Of the last stage; of the only one for backbones other than the tailornet."""
     pivots: str = "joint"
     """`joint`: the high-frequency nets are trained through the mixture, on all samples and together with the
     low-frequency net. `separate`: each on its own pivot's samples, as in the original."""
+    joint_rate: float = 0.3
+    """Learning rate of the last stage with `joint` pivots, relative: the low-frequency net is only tuned there."""
     is_mirrored: bool = True
     asks: bool = True
     """Whether samples whose limbs were held back are shown at the pose that was asked, too."""
@@ -213,7 +215,7 @@ def stages(
         mean = train.displacement.mean(0)
         model.mean.copy_(mean)
         model.scale.copy_((train.displacement - mean).std())
-        model.head.standardise(torch.cat((_features(model, train), train.style_shape), 1))
+        model.head.standardise(torch.cat((_features(model, train), train.style_shape), 1), model.features.groups)
         parts = [(s.betas, s.pose, s.style, s.displacement) for s in (train, validation)]
         objective = Objective([model], lambda *inputs: model(*inputs).displacement, _vertex_loss)
         return [Stage("all", objective, settings.steps, *parts)]
@@ -222,11 +224,11 @@ def stages(
     loss = _CodeLoss(model)
     both = [(x, s, code) for (x, s), code in zip(inputs, codes, strict=True)]
     if isinstance(model, Mlp):
-        model.net.standardise(torch.cat(inputs[0], 1))
+        model.net.standardise(torch.cat(inputs[0], 1), model.features.groups)
         return [Stage("all", Objective([model.net], model.code, loss), settings.steps, *both)]
 
-    model.low.standardise(torch.cat(inputs[0], 1))
-    model.high.standardise(inputs[0][0])
+    model.low.standardise(torch.cat(inputs[0], 1), model.features.groups)
+    model.high.standardise(inputs[0][0], model.features.groups[: model.features.size])
     model.style_shape.standardise(inputs[0][1])
     smooth = LaplacianSmoothing(garment)
     coarse = [low_frequency_code(model, smooth, garment, s) for s in (train, validation)]
@@ -243,7 +245,8 @@ def stages(
             code: Tensor = model.low_code(x, s) + model.high(x, model.mixture(s))
             return code
 
-        return [*found, Stage("joint", Objective([model.low, model.high], whole, loss), settings.steps, *both)]
+        joint = Objective([model.low, model.high], whole, loss)
+        return [*found, Stage("joint", joint, settings.steps, *both, rate=settings.joint_rate)]
     fine = []
     for (x, s, code), low_code in zip(both, coarse, strict=True):
         own = (s[:, None] == model.pivots).all(-1)  # (N, K): whose sample it is

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import runpy
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -338,3 +341,35 @@ def test_a_log_goes_on_where_its_run_was_interrupted(tmp_path: Path) -> None:
     entries = [json.loads(line) for line in (tmp_path / "run.jsonl").read_text().splitlines()]
     assert [entry["train"] for entry in entries] == [3.0, 2.0, 0.5]
     assert again.picture.exists()
+
+
+_PARALLEL = """
+import sys, torch
+from refu_core.backbones import MlpConfig
+from refu_core.training import LoopSettings, PretrainSettings, pretrain
+
+def train(dataset, folder):
+    loop = LoopSettings(batch_size=16, weight_decay=0.01, check_every=10)
+    settings = PretrainSettings(loop, rank=8, steps=20, is_mirrored=False, validation_share=0.2)
+    config = MlpConfig((0, 1, 2, 4, 5), hidden=(24, 24), dropout=0.0)
+    pretrain("short-pant-male", dataset, folder, backbone="mlp", settings=settings, config=config, quiet=True)
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    train(*sys.argv[1:])
+"""
+
+
+@pytest.mark.skipif(not torch.distributed.is_available(), reason="this torch build has no torch.distributed")
+def test_two_processes_make_the_training_of_one(tmp_path: Path, dataset: Path) -> None:
+    script = tmp_path / "train.py"
+    script.write_text(_PARALLEL)
+    torchrun = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
+    command = [*torchrun, str(script), str(dataset), str(tmp_path / "two")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    runpy.run_path(str(script))["train"](str(dataset), str(tmp_path / "one"))
+    one, two = (load_weights(tmp_path / folder / "mlp-none").tensors for folder in ("one", "two"))
+    assert set(one) == set(two)
+    for name, tensor in one.items():
+        torch.testing.assert_close(two[name].float(), tensor.float(), atol=3e-3, rtol=0)
