@@ -103,19 +103,8 @@ def resolve(
     rows = torch.nonzero(start.distance < margin)[:, 0]
     first = start.rows(rows)
     rounds = 0
-    if limbs is not None and first.face is not None and limbs.is_foreign(rows, first.face).any():
-        outward = limbs.outward(points)
-        crossing = limbs.crosses(rows, first.face, first.gradient, outward)
-        rounds += _retreat(state, rows[crossing], outward, limbs, max_pushes)
-        # Those without any room: out on the far side after all.
-        others = torch.nonzero(~crossing | (state.distance[rows] < 0))[:, 0]
-        rows, first = rows[others], first.rows(others)
-        state.vertices[rows], state.distance[rows] = points[rows], first.distance
-    if limbs is not None and bool((first.distance < -DEEP).any()):
-        turned, looks = turn_outward(
-            points[rows], first, limbs.outward(points)[rows], lambda x, at: state.query(x, rows[at])
-        )
-        first, rounds = turned, rounds + looks
+    if limbs is not None and first.face is not None:
+        rows, first, rounds = _keep_sides(state, rows, first, limbs, max_pushes)
     alpha = state.first_scale(scale, rows, first.distance)
     if blend is not None and len(rows):
         rows, first, alpha = _push_blended(state, rows, first, alpha, blend)
@@ -184,6 +173,28 @@ class _State:
         # Where α is below 1, the distance was predicted to exaggerate; its sign is trusted all the same.
         deficit = self.margin - distance
         return torch.maximum(alpha, (min(self.tolerance, self.margin) - distance) / deficit)
+
+
+def _keep_sides(
+    state: _State, rows: Tensor, sample: SdfSample, limbs: Limbs, max_pushes: int
+) -> tuple[Tensor, SdfSample, int]:
+    """Sees to it that cloth stays on its side of a limb; returns what is to be pushed, its distances, and the rounds.
+
+    What the gradient would take around another limb has left that on the near side then, and isn't to be pushed.
+    """
+    assert sample.face is not None  # the caller has seen to it
+    is_foreign = limbs.is_foreign(rows, sample.face)
+    if not bool((is_foreign | (sample.distance < -DEEP)).any()):
+        return rows, sample, 0
+    outward = limbs.outward(state.origin)
+    crossing = limbs.crosses(rows, sample.face, sample.gradient, outward)
+    rounds = _retreat(state, rows[crossing], outward, limbs, max_pushes)
+    # Those without any room: out on the far side after all.
+    others = torch.nonzero(~crossing | (state.distance[rows] < 0))[:, 0]
+    rows, sample = rows[others], sample.rows(others)
+    state.vertices[rows], state.distance[rows] = state.origin[rows], sample.distance
+    sample, looks = turn_outward(state.origin[rows], sample, outward[rows], lambda x, at: state.query(x, rows[at]))
+    return rows, sample, rounds + looks
 
 
 def _push_blended(
