@@ -2,7 +2,7 @@
 
 from refu_core.training._checkpoint import load_checkpoint, save_checkpoint
 from refu_core.training._data import Samples, output_basis, read_samples, split_validation
-from refu_core.training._figures import displacements, posed_errors, test_figures
+from refu_core.training._figures import backbone_figures, displacements, posed_errors
 from refu_core.training._finetune import FINETUNE_MODES, FinetuneSettings, finetune
 from refu_core.training._loop import LoopSettings
 from refu_core.training._losses import Losses, collision_loss, reconstruction_loss, refu_loss
@@ -21,6 +21,7 @@ __all__ = [
     "Samples",
     "SdfSettings",
     "TrainingLog",
+    "backbone_figures",
     "collision_loss",
     "displacements",
     "finetune",
@@ -34,6 +35,5 @@ __all__ = [
     "refu_loss",
     "save_checkpoint",
     "split_validation",
-    "test_figures",
     "train_sdf",
 ]

@@ -38,7 +38,7 @@ def posed_errors(predicted: Tensor, samples: Samples, body: SmplBody, garment: G
     return torch.cat(parts)
 
 
-def test_figures(
+def backbone_figures(
     backbone: Backbone, samples: Samples, body: SmplBody, garment: GarmentTemplate, *, mean: Tensor
 ) -> dict[str, Any]:
     """MPVE on the test split [mm], beside what it is to be measured against.

@@ -36,7 +36,7 @@ from refu_core.training._data import (
     split_validation,
     with_asked_poses,
 )
-from refu_core.training._figures import test_figures
+from refu_core.training._figures import backbone_figures
 from refu_core.training._loop import Loop, LoopSettings, Objective, Stage, start_parallel
 from refu_core.training._mirror import Mirror
 from refu_core.training._progress import TrainingLog
@@ -153,11 +153,14 @@ def pretrain(
     for stage in found:
         loop.run(stage)
     model.to("cpu").eval()
+    test = read_samples(opened, body, template, split="test")
     card = {
         **described,
         "mode": "none",
         "dataset": {key: opened.card.get(key) for key in ("garment_fingerprint", "motions_fingerprint", "plan")},
-        "figures": test_figures(model, read_samples(opened, body, template, split="test"), body, template, mean=mean),
+        "figures": backbone_figures(
+            model, read_samples(opened, body, template, split="test"), body, template, mean=mean
+        ),
     }
     if is_writer:
         save_backbone(output / f"{backbone}-none", model, card, half=preset != "paper")
