@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from refu_core import GarmentError, RefuError, load_body, load_garment
+from refu_core._device import checked_device
 from refu_core.backbones import PRESETS
 from refu_core.garments import BUILTIN_GARMENTS
 from refu_core.sdf import SDF_PRESETS
@@ -85,6 +86,10 @@ def train(options: TrainOptions, *, progress: bool) -> dict[str, Any]:
 
 
 def _check(options: TrainOptions) -> None:
+    checked_device(options.device)
+    if options.margin is not None and not 0 <= options.margin <= 0.05:
+        msg = f"the margin must be between 0 and 0.05 m, got {options.margin}"
+        raise RefuError(msg)
     if options.garment not in BUILTIN_GARMENTS:
         msg = f"no garment {options.garment!r}: wanted one of {', '.join(BUILTIN_GARMENTS)}"
         raise GarmentError(msg)

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from refu_core._device import checked_device
 from refu_core.backbones import Backbone, load_backbone
 from refu_core.body import RigidTransforms, SmplBody, load_body
 from refu_core.errors import GarmentError, RefuError
@@ -186,7 +187,7 @@ class GarmentPipeline:
         if margin is not None and not 0 <= margin <= 0.05:
             msg = f"the margin must be between 0 and 0.05 m, got {margin}"
             raise RefuError(msg)
-        torch_device = _device(device)
+        torch_device = checked_device(device)
         templates = {name: load_garment(name, device=torch_device) for name in dict.fromkeys(garments)}
         worn_by = {template.body for template in templates.values()}
         if len(worn_by) > 1:
@@ -314,18 +315,6 @@ class GarmentPipeline:
             refu_ms += own_ms
             stats[name] = replace(counts, ms=one.ms + own_ms)
         return PipelineOutput(meshes, body.cpu().numpy(), FrameStats({**stages, "sdf": sdf_ms, "refu": refu_ms}, stats))
-
-
-def _device(name: str) -> torch.device:
-    try:
-        device = torch.device(name)
-    except RuntimeError as error:
-        msg = f"no device {name!r}: wanted cpu or cuda"
-        raise RefuError(msg) from error
-    if device.type == "cuda" and not torch.cuda.is_available():
-        msg = f"no device {name!r}: this torch build or machine has no CUDA; use cpu"
-        raise RefuError(msg)
-    return device
 
 
 def _style(value: ArrayLike, device: torch.device) -> Tensor:

@@ -1,0 +1,78 @@
+"""A data set in the documented format (docs/dataset.md), written without the project's writer."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from refu_core.body import SmplBody
+from refu_core.garments import GarmentTemplate
+
+QUANTUM = 2.0**-14
+
+
+def write_set(
+    folder: Path,
+    garment: GarmentTemplate,
+    body: SmplBody,
+    *,
+    pairs: int = 12,
+    poses: int = 6,
+    test_pairs: int = 3,
+    spread: float = 0.2,
+    displacement: Callable[[Tensor], Tensor] | None = None,
+) -> Path:
+    """Writes garments that follow the skin, displaced by a function of the poses (N, 24, 3) to (N, V, 3) [m].
+
+    `pairs` style-shape pairs with `poses` poses each, whose angles spread by `spread` [rad]; the last `test_pairs` are
+    for the test. Every fourth sample asked for another left thigh than it got.
+    """
+    rng = np.random.default_rng(0)
+    n = pairs * poses
+    pair = np.repeat(np.arange(pairs), poses).astype("<i4")
+    betas = rng.normal(size=(pairs, 10)).astype("<f4")[pair]
+    style = rng.normal(size=(pairs, 4)).astype("<f4")[pair]
+    pose = rng.normal(0, spread, (n, 24, 3)).astype("<f4")
+    asked = pose.copy()
+    asked[::4, 1, 2] += 0.3
+    with torch.no_grad():
+        b, p = torch.as_tensor(betas), torch.as_tensor(pose)
+        unposed = garment.rest(b, torch.as_tensor(style))
+        if displacement is not None:
+            unposed = unposed + displacement(p)
+        posed = garment.pose(unposed, body(p, b).transforms).numpy()
+    columns = {
+        "vertices": np.rint(posed / QUANTUM).astype("<i2"),
+        "pose": pose,
+        "betas": betas,
+        "style": style,
+        "pair": pair,
+        "slot": np.arange(n, dtype="<i4"),
+        "clip": np.full(n, -1, "<i4"),
+        "frame": np.full(n, -1, "<i4"),
+        "split": (pair >= pairs - test_pairs).astype("|u1"),
+        "state": np.ones(n, "|u1"),
+        "dropped": np.zeros((n, 5), "|u1"),
+        **{name: np.ones(n, "<f4") for name in ("share", "stretch", "speed", "seconds")},
+    }
+    shard = folder / "shard-0-of-1"
+    shard.mkdir(parents=True)
+    for name, array in columns.items():
+        np.save(shard / f"{name}.npy", array)
+    np.save(folder / "asked.npy", asked)
+    card = {
+        "format": "refu-garments-1",
+        "garment": garment.name,
+        "body": garment.body,
+        "body_fingerprint": body.fingerprint,
+        "quantum_m": QUANTUM,
+        "plan": {"count": n, "pivots": 4},
+        "clips": {"train": [], "test": []},
+    }
+    (folder / "card.json").write_text(json.dumps(card))
+    return folder
