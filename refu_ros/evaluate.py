@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -70,64 +71,106 @@ def evaluate(options: EvaluateOptions, *, progress: bool) -> list[rp.Table]:
         RefuError: there is nothing to make them of, a data set or motion can't be read, or the results can't be
         written.
     """
-    names = options.tables
+    wanted = options.tables
     sets = [rp.Samples.open(path, every=options.every) for path in options.data]
-    posed = [samples for samples in sets if samples.shapes is None]
-    moving = [samples for samples in sets if samples.shapes is not None]
-    _check_sets(posed, moving)
-    library = rp.Library(options.weights)
-    cache = rp.Cache(options.cache) if options.cache is not None else None
-
-    def run(study: rp.Study, samples: rp.Samples, methods: Sequence[str]) -> None:
-        with _bar(samples.garment, progress) as advance:
-            rp.run_methods(study, samples, methods, library=library, cache=cache, progress=advance)
-
-    study = rp.Study()
-    studies: dict[int, rp.Study] = {}
-    sampled = [rp.SAMPLE_TABLES[name] for name in names if name in rp.SAMPLE_BUILDERS and name != "time"]
-    for samples in posed if sampled else []:
-        run(study, samples, list(dict.fromkeys(chain.from_iterable(sampled))))
-    for samples in moving if "sequence" in names else []:
-        shapes = samples.shapes or 0
-        run(studies.setdefault(shapes, rp.Study()), samples, (f"mlp-{shapes}", f"mlp-{shapes}-refu-approx"))
-    tables = []
+    maker = _Maker(options, sets, progress)
+    if options.table == "all":
+        wanted = [name for name in wanted if maker.has_data_for(name)]
+    elif not maker.has_data_for(options.table):
+        kind = "sequences (refu simulate --sequences)" if options.table == "sequence" else "poses"
+        msg = f"the table {options.table} needs a data set of {kind} in --data"
+        raise RefuError(msg)
     options.output.mkdir(parents=True, exist_ok=True)
-    for name in names:
-        samples_of = study.n_samples
-        if name == "sequence":
-            table = rp.sequence_table(studies)
-            samples_of = {f"{s.garment}, {s.shapes} shapes": len(s) for s in moving}
-        elif name == "sdf":
-            with _bar(name, progress) as advance:
-                table = rp.sdf_table(posed, library=library, progress=advance)
-            samples_of = {s.garment: len(s) for s in posed}
-        elif name == "motion":
-            with _bar(name, progress) as advance:
-                table = _motion(options, [s.garment for s in posed] or BUILTIN_GARMENTS, advance)
-        elif name == "time":
-            table, samples_of = _time(posed, library, progress=progress)
-        else:
-            table = rp.SAMPLE_BUILDERS[name](study)
-        if name in rp.PLOTS:
-            table.plots = rp.PLOTS[name](study, options.output)
-        if name in rp.PICTURES:
-            table.plots += rp.PICTURES[name](study, posed, options.output, library=library)
-        rp.write_table(table, options.output, command=options.command(name), facts={"samples": samples_of})
-        tables.append(table)
+    tables = [maker.make(name) for name in wanted]
     rp.write_summary(options.output)
     return tables
 
 
-def _time(sets: Sequence[rp.Samples], library: rp.Library, *, progress: bool) -> tuple[rp.Table, dict[str, int]]:
-    """Measured now, never taken from a cache, with nothing else in the same run."""
-    study = rp.Study()
-    for samples in sets:
-        with _bar(f"time, {samples.garment}", progress) as advance:
-            few = samples.thinned(_TIMED)
-            rp.run_methods(study, few, rp.SAMPLE_TABLES["time"], library=library, progress=advance)
-    table = rp.SAMPLE_BUILDERS["time"](study)
-    table.rows += rp.neural_time_rows(sets)
-    return table, study.n_samples
+class _Maker:
+    """Makes tables of what was opened; methods are run when the first table needs them."""
+
+    def __init__(self, options: EvaluateOptions, sets: Sequence[rp.Samples], progress: bool) -> None:
+        self._options = options
+        self._progress = progress
+        self._posed = [samples for samples in sets if samples.shapes is None]
+        self._moving = [samples for samples in sets if samples.shapes is not None]
+        _check_sets(self._posed, self._moving)
+        self._library = rp.Library(options.weights)
+        self._cache = rp.Cache(options.cache) if options.cache is not None else None
+
+    def has_data_for(self, table: str) -> bool:
+        """Whether there are sets of the kind that the table is about."""
+        if table in _NEED_MOTION:
+            return True
+        return bool(self._moving if table == "sequence" else self._posed)
+
+    def make(self, name: str) -> rp.Table:
+        """Makes a table, its plots and pictures, and writes them."""
+        samples_of: dict[str, int] = {}
+        plots: list[tuple[str, str]] = []
+        if name == "sequence":
+            table = rp.sequence_table(self._sequence_studies)
+            samples_of = {f"{s.garment}, {s.shapes} shapes": len(s) for s in self._moving}
+        elif name == "motion":
+            table = self._motion()
+        elif name == "sdf":
+            with _bar(name, self._progress) as advance:
+                table = rp.sdf_table(self._posed, library=self._library, progress=advance)
+            samples_of = {s.garment: len(s) for s in self._posed}
+        elif name == "time":
+            table, samples_of = self._time()
+        else:
+            table = rp.SAMPLE_BUILDERS[name](self._study)
+            samples_of = self._study.n_samples
+            if name in rp.PLOTS:
+                plots += rp.PLOTS[name](self._study, self._options.output)
+            if name in rp.PICTURES:
+                draw = rp.PICTURES[name]
+                plots += draw(self._study, self._posed, self._options.output, library=self._library)
+        table.plots = plots
+        command = self._options.command(name)
+        rp.write_table(table, self._options.output, command=command, facts={"samples": samples_of})
+        return table
+
+    @cached_property
+    def _study(self) -> rp.Study:
+        names = [name for name in self._options.tables if name in rp.SAMPLE_BUILDERS and name != "time"]
+        methods = list(dict.fromkeys(chain.from_iterable(rp.SAMPLE_TABLES[name] for name in names)))
+        study = rp.Study()
+        for samples in self._posed:
+            self._run(study, samples, methods)
+        return study
+
+    @cached_property
+    def _sequence_studies(self) -> dict[int, rp.Study]:
+        studies: dict[int, rp.Study] = {}
+        for samples in self._moving:
+            shapes = samples.shapes or 0
+            study = studies.setdefault(shapes, rp.Study())
+            self._run(study, samples, (f"mlp-{shapes}", f"mlp-{shapes}-refu-approx"))
+        return studies
+
+    def _run(self, study: rp.Study, samples: rp.Samples, methods: Sequence[str]) -> None:
+        with _bar(samples.garment, self._progress) as advance:
+            rp.run_methods(study, samples, methods, library=self._library, cache=self._cache, progress=advance)
+
+    def _motion(self) -> rp.Table:
+        clips = read_clips(self._options.motions or Path())
+        worn = [samples.garment for samples in self._posed] or BUILTIN_GARMENTS
+        every = self._options.motion_every
+        with _bar("motion", self._progress) as advance:
+            return rp.motion_table(clips, worn, library=self._library, every=every, progress=advance)
+
+    def _time(self) -> tuple[rp.Table, dict[str, int]]:
+        """Measured now, never taken from a cache, with nothing else in the same run."""
+        study = rp.Study()
+        for samples in self._posed:
+            with _bar(f"time, {samples.garment}", self._progress) as advance:
+                few = samples.thinned(_TIMED)
+                rp.run_methods(study, few, rp.SAMPLE_TABLES["time"], library=self._library, progress=advance)
+        table = rp.SAMPLE_BUILDERS["time"](study)
+        table.rows += rp.neural_time_rows(self._posed)
+        return table, study.n_samples
 
 
 def _check_sets(posed: Sequence[rp.Samples], moving: Sequence[rp.Samples]) -> None:
@@ -169,11 +212,6 @@ def results_dict(tables: Sequence[rp.Table]) -> dict[str, Any]:
         "missing": [{"table": table.name, **missing.as_dict()} for table in tables for missing in table.missing],
         "findings": {table.name: table.findings for table in tables},
     }
-
-
-def _motion(options: EvaluateOptions, garments: Sequence[str], advance: Callable[[int, int], None] | None) -> rp.Table:
-    assert options.motions is not None
-    return rp.motion_table(read_clips(options.motions), garments, every=options.motion_every, progress=advance)
 
 
 def read_clips(folder: Path) -> list[rp.Clip]:

@@ -236,6 +236,8 @@ def test_a_damaged_reference_is_one_line(bag: Path, tmp_path: Path, capsys: pyte
 def test_two_sets_of_one_garment_are_refused(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("--data", dataset, dataset, "--output", tmp_path / "out") == 2
     assert "one data set a garment" in capsys.readouterr().err
+    assert run("--data", dataset, "--table", "sequence", "--output", tmp_path / "out") == 2
+    assert "needs a data set of sequences" in capsys.readouterr().err
 
 
 def test_the_command_line_knows_the_tables() -> None:

@@ -334,7 +334,7 @@ def test_distance_table(samples: rp.Samples) -> None:
 
 
 def test_motion_table(clip: Callable[[int], rp.Clip]) -> None:
-    table = rp.motion_table([clip(9), clip(3)], [GARMENT], every=3)
+    table = rp.motion_table([clip(9), clip(3)], [GARMENT], library=rp.Library(), every=3)
     groups = list(dict.fromkeys(row.garment for row in table.rows))
     assert groups == [f"{GARMENT}, all clips", f"{GARMENT}, clip 9", f"{GARMENT}, clip 3"]
     for method in ("skinned", "node-skinned"):

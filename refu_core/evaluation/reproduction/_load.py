@@ -12,6 +12,7 @@ from refu_core.body import SmplBody
 from refu_core.errors import WeightsError
 from refu_core.evaluation.reproduction._methods import Method
 from refu_core.garments import GarmentTemplate
+from refu_core.realtime import GarmentPipeline
 from refu_core.repulsion import Refu, read_refu
 from refu_core.sdf import BodySdf, NeuralSdf, load_sdf_network
 from refu_core.weights import shipped_weights
@@ -53,6 +54,12 @@ class Library:
         expect = {"garment": garment.name, "body_fingerprint": body.fingerprint}
         backbone: Backbone = read_backbone(stem, garment, expect=expect).requires_grad_(False)
         return Network(backbone, read_refu(stem, expect=expect))
+
+    def pipeline(self, method: Method, garment: str) -> GarmentPipeline:
+        """What the node runs, in the method's mode; `none` without handling of collisions. Raises `RefuError`."""
+        weights = None if method.weights is None else self.find(method, garment).parent.parent
+        sdf = method.mode if method.handling == "node" else "none"
+        return GarmentPipeline.load([garment], sdf=sdf, backbone=method.backbone, weights=weights)
 
     def load_neural_sdf(self, preset: str, garment: str, body: SmplBody) -> BodySdf:
         """A distance network trained on a garment's set, `sdf-<preset>`. Raises `WeightsError` where there is none."""

@@ -45,7 +45,7 @@ class Method:
         if self.weights is None:
             return ""
         folder = f"weights/{garment}" + (f"/{self.folder}" if self.folder else "")
-        special = f" {_TRAINING[self.folder]}" if self.folder else ""
+        special = f" {_TRAINING[self.folder]}" if self.folder in _TRAINING else ""
         return (
             f"refu train {garment} --data DIR --backbone {self.backbone} --mode {self.mode}{special} --output {folder}"
         )
@@ -56,8 +56,6 @@ _TRAINING: Mapping[str, str] = {
     "alt1": "--scale shared",
     "alt2": "--scale distance",
     "bare": "--margin 0 --unblended",
-    "sequence-5": "--sequences",
-    "sequence-17": "--sequences",
 }
 """What is special about the training of the weights in each folder, as options of `refu train`."""
 _SDFS: tuple[SdfName, ...] = ("approx", "accurate")
@@ -85,7 +83,7 @@ def _tailornet() -> list[Method]:
     methods.append(
         Method(
             name="optimisation-on-hybrid",
-            label="optimisation post-process, approx, with ReFU's margin, of what ReFU hybrid's own backbone predicts",
+            label="optimisation post-process, approx, with ReFU's margin, on ReFU hybrid's backbone",
             mode="hybrid",
             handling="optimisation",
             sdf="approx",

@@ -13,6 +13,7 @@ from refu_core.errors import RefuError
 from refu_core.evaluation.collisions import CollisionChecker
 from refu_core.evaluation.jitter import temporal_jitter
 from refu_core.evaluation.metrics import GarmentMetrics
+from refu_core.evaluation.reproduction._load import Library
 from refu_core.evaluation.reproduction._methods import METHODS
 from refu_core.evaluation.reproduction._tables import Missing, Row, Table, weighted
 from refu_core.evaluation.self_contact import SelfContactDetector
@@ -44,6 +45,7 @@ def motion_table(
     clips: Sequence[Clip],
     garments: Sequence[str],
     *,
+    library: Library,
     every: int,
     progress: Callable[[int, int], None] | None = None,
 ) -> Table:
@@ -52,6 +54,7 @@ def motion_table(
     Args:
         clips: Recorded motions.
         garments: Built-in garments, each worn alone.
+        library: Where trained networks are.
         every: Every so many frames three consecutive ones are dressed; the middle one is checked for collisions.
         progress: Called with (frames done, frames in all).
     """
@@ -71,8 +74,7 @@ def motion_table(
         for name in MOTION_METHODS:
             method = METHODS[name]
             try:
-                sdf = method.mode if method.handling == "node" else "none"
-                pipelines[name] = GarmentPipeline.load([garment], sdf=sdf, backbone=method.backbone)
+                pipelines[name] = library.pipeline(method, garment)
             except RefuError as error:
                 table.missing.append(Missing(garment, name, str(error), method.train_command(garment)))
         rows: list[Row] = []

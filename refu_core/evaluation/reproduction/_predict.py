@@ -118,7 +118,7 @@ class Predictor:
         self._pipeline: GarmentPipeline | None = None
         self._network = Network(Skinned(), None)
         if method.handling == "node":
-            self._pipeline = GarmentPipeline.load([wardrobe.template.name], sdf=method.mode, backbone=method.backbone)
+            self._pipeline = library.pipeline(method, wardrobe.template.name)
         elif method.backbone != "skinned":
             self._network = library.load(method, wardrobe.template, wardrobe.body)
         self._refu: Refu | None = None
