@@ -10,8 +10,7 @@ from torch import Tensor, nn
 from refu_core.body import SmplBody
 from refu_core.garments import GarmentTemplate
 from refu_core.repulsion import Blend, Refu
-from refu_core.sdf import ApproxSdf, BodySdf, ExactSdf, RestFaces, SdfSample
-from refu_core.sdf._band import BandSdf, Links
+from refu_core.sdf import ApproxSdf, BandSdf, BodySdf, ExactSdf, Links, RestFaces, SdfSample
 
 Sdf = Literal["accurate", "approx"]
 

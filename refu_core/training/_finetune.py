@@ -55,7 +55,7 @@ class FinetuneSettings:
     """How a backbone is trained with ReFU; the defaults are those of the shipped weights."""
 
     loop: LoopSettings = field(
-        default_factory=lambda: LoopSettings(batch_size=16, learning_rate=3e-4, weight_decay=0.1, check_every=100)
+        default_factory=lambda: LoopSettings(batch_size=16, learning_rate=1e-4, weight_decay=0.1, check_every=100)
     )
     steps: int = 600
     reconstruction_weight: float = RECONSTRUCTION_WEIGHT
