@@ -158,9 +158,7 @@ def pretrain(
         **described,
         "mode": "none",
         "dataset": {key: opened.card.get(key) for key in ("garment_fingerprint", "motions_fingerprint", "plan")},
-        "figures": backbone_figures(
-            model, read_samples(opened, body, template, split="test"), body, template, mean=mean
-        ),
+        "figures": backbone_figures(model, test, body, template, mean=mean),
     }
     if is_writer:
         save_backbone(output / f"{backbone}-none", model, card, half=preset != "paper")
