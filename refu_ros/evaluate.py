@@ -11,6 +11,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
+import torch
 from tqdm import tqdm
 
 import msg_adapters as adapters
@@ -164,12 +165,14 @@ class _Maker:
     def _time(self) -> tuple[rp.Table, dict[str, int]]:
         """Measured now, never taken from a cache, with nothing else in the same run."""
         study = rp.Study()
-        for samples in self._posed:
-            with _bar(f"time, {samples.garment}", self._progress) as advance:
-                few = samples.thinned(_TIMED)
-                rp.run_methods(study, few, rp.SAMPLE_TABLES["time"], library=self._library, progress=advance)
+        with _one_thread():
+            for samples in self._posed:
+                with _bar(f"time, {samples.garment}", self._progress) as advance:
+                    few = samples.thinned(_TIMED)
+                    rp.run_methods(study, few, rp.SAMPLE_TABLES["time"], library=self._library, progress=advance)
+            neural = rp.neural_time_rows(self._posed)
         table = rp.SAMPLE_BUILDERS["time"](study)
-        table.rows += rp.neural_time_rows(self._posed)
+        table.rows += neural
         return table, study.n_samples
 
 
@@ -226,6 +229,17 @@ def read_clips(folder: Path) -> list[rp.Clip]:
         raise RefuError(msg)
     motions = [(path.stem, adapters.read_motion(path)) for path in paths]
     return [rp.Clip(name, [motion.frame(i) for i in range(len(motion))]) for name, motion in motions]
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """As the node runs."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 @contextmanager

@@ -260,6 +260,7 @@ SAMPLE_TABLES: Mapping[str, tuple[str, ...]] = {
         "optimisation-accurate",
         "refu-accurate",
         "refu-hybrid",
+        "node-hybrid",
     ),
 }
 """Which methods each table over test samples is about, in the order of its rows."""

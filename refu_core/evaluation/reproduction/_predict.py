@@ -99,7 +99,7 @@ class Outcome(NamedTuple):
     vertices: Tensor
     """Garment [m], shape (N, 3)."""
     ms: Mapping[str, float]
-    """Wall time by component: backbone (with posing), sdf, refu, post-process, node [ms]."""
+    """Wall time by component: backbone (with posing), sdf, refu, post-process; node and its stages [ms]."""
     scale: Tensor
     """α of the vertices that ReFU pushed, shape (R,); empty for other methods."""
     approx: Tensor
@@ -188,6 +188,7 @@ class Predictor:
         start = time.perf_counter()
         output = pipeline(frame)
         ms = {"node": 1e3 * (time.perf_counter() - start)}
+        ms |= {f"node {stage}": spent for stage, spent in output.stats.stage_ms.items()}
         return _outcome(torch.from_numpy(output[self._wardrobe.template.name].local), ms)
 
 
