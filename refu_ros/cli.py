@@ -251,7 +251,7 @@ def _add_evaluate(commands: Any) -> None:
         "--reference",
         type=Path,
         metavar="FILE",
-        help="figures that --quick holds its own against (in the bags' folder)",
+        help="figures that --quick holds its own against (docs/results/quick.json)",
     )
     parser.add_argument("--set-reference", action="store_true", help="write that file instead of comparing with it")
     _add_common(parser)
