@@ -193,7 +193,10 @@ def _keep_sides(
     others = torch.nonzero(~crossing | (state.distance[rows] < 0))[:, 0]
     rows, sample = rows[others], sample.rows(others)
     state.vertices[rows], state.distance[rows] = state.origin[rows], sample.distance
-    sample, looks = turn_outward(state.origin[rows], sample, outward[rows], lambda x, at: state.query(x, rows[at]))
+    # Out of another limb the way against the cloth's normal, towards its own skin, is the right one.
+    is_own = ~is_foreign[others] & (limbs.own[rows].sum(1) == 1)
+    side = torch.where(is_own[:, None], outward[rows], sample.gradient)
+    sample, looks = turn_outward(state.origin[rows], sample, side, lambda x, at: state.query(x, rows[at]))
     return rows, sample, rounds + looks
 
 
