@@ -333,6 +333,29 @@ def test_distance_table(samples: rp.Samples) -> None:
     assert next(row.paper for row in table.rows if row.method == "neural") == 2.46
 
 
+def test_sequence_table_has_both_numbers_of_shapes(samples: rp.Samples) -> None:
+    study = rp.Study()
+    rp.run_methods(study, samples, ("mlp-5", "mlp-5-refu-approx"), library=Emulated())
+    table = rp.sequence_table({5: study})
+    assert [row.paper for row in table.rows if row.metric == "cfmp_percent"] == [18.69, 52.53, 13.30, 38.39]
+    assert table.value(GARMENT, "mlp-5", "mpve_mm") == study.runs[GARMENT, "mlp-5"].figures.mpve_mm
+    assert {m.method: m.reason for m in table.missing} == dict.fromkeys(
+        ("mlp-17", "mlp-17-refu-approx"), "no set of 17 shapes was given"
+    )
+
+
+def test_two_garments_are_weighted_by_their_samples(study: rp.Study) -> None:
+    both = rp.Study(dict(study.runs), dict(study.missing), {GARMENT: N_SAMPLES, "shirt-male": 2 * N_SAMPLES})
+    for method in METHODS:
+        run = study.runs[GARMENT, method]
+        both.runs["shirt-male", method] = rp.Run("shirt-male", method, run.samples[:1] * (2 * N_SAMPLES), [1.0] * 6)
+    table = rp.SAMPLE_BUILDERS["comparison"](both)
+    for method in METHODS[:5]:
+        every = [s.mpve_mm for g in (GARMENT, "shirt-male") for s in both.runs[g, method].samples]
+        assert table.value(rp.ALL, method, "mpve_mm") == pytest.approx(np.mean(every))
+    assert table.value(rp.ALL, "collision-loss-approx", "mpve_mm") is None
+
+
 def test_motion_table(clip: Callable[[int], rp.Clip]) -> None:
     table = rp.motion_table([clip(9), clip(3)], [GARMENT], library=rp.Library(), every=3)
     groups = list(dict.fromkeys(row.garment for row in table.rows))

@@ -11,7 +11,7 @@ from refu_core.evaluation.reproduction._claims import Order, findings
 from refu_core.evaluation.reproduction._methods import METHODS, SAMPLE_TABLES, SEQUENCE_SHAPES
 from refu_core.evaluation.reproduction._paper import OPTIMISATION_MS
 from refu_core.evaluation.reproduction._runs import RATIO_EDGES, Run, Study
-from refu_core.evaluation.reproduction._tables import ALL, Row, Table, weighted
+from refu_core.evaluation.reproduction._tables import ALL, Missing, Row, Table, weighted
 
 LABELS: Mapping[str, str] = {name: method.label for name, method in METHODS.items()}
 """The methods' names for people."""
@@ -275,11 +275,20 @@ def sequence_table(studies: Mapping[int, Study]) -> Table:
         "Every frame of test sequences with motions of their own: simulated with dynamics, where the networks see the "
         "pose of that frame alone. The paper's figures are of another data set (VTO).",
     )
-    for shapes, study in studies.items():
-        for garment in study.garments:
-            for method in (f"mlp-{shapes}", f"mlp-{shapes}-refu-approx"):
-                table.rows += [Row.of("sequence", garment, method, m, study.figure(garment, method, m)) for m in _MAIN]
-        table.missing += study.missing.values()
+    garments = dict.fromkeys(garment for study in studies.values() for garment in study.garments)
+    for garment in garments:
+        for shapes in SEQUENCE_SHAPES:
+            study = studies.get(shapes, Study())
+            methods = (f"mlp-{shapes}", f"mlp-{shapes}-refu-approx")
+            if garment not in study.n_samples:
+                command = f"refu simulate {garment} --sequences --shapes {shapes} --count N --output DIR"
+                table.missing += [Missing(garment, m, f"no set of {shapes} shapes was given", command) for m in methods]
+            table.rows += [
+                Row.of("sequence", garment, method, m, study.figure(garment, method, m))
+                for method in methods
+                for m in _MAIN
+            ]
+    table.missing += [missing for study in studies.values() for missing in study.missing.values()]
     table.findings = findings(table, ORDERS["sequence"], LABELS)
     return table
 
