@@ -85,6 +85,11 @@ class Limbs:
         """Whether the face (R,) that is closest to each vertex of `rows` (R,) is of a limb that it doesn't lie on."""
         return ~self.own[rows, self.of_face[body_face.long()]]
 
+    def is_sole(self, rows: Tensor, body_face: Tensor) -> Tensor:
+        """Whether the face (R,) that is closest to each vertex of `rows` (R,) is of the only limb that it lies on."""
+        own = self.own[rows]
+        return own.gather(1, self.of_face[body_face.long()][:, None])[:, 0] & (own.sum(1) == 1)
+
     def crosses(self, rows: Tensor, body_face: Tensor, gradient: Tensor, outward: Tensor) -> Tensor:
         """Whether a push along `gradient` (R, 3) would take vertices `rows` (R,) out through a limb they don't lie on.
 

@@ -72,8 +72,9 @@ def mend(
         if not len(high) or within.face is None:
             break
         to_plane = within.distance + ((points[high] - points[low]) * within.gradient).sum(-1)
-        is_own = limbs.own[high, limbs.of_face[within.face.long()]]
-        is_wrong = is_own & (within.distance < 0) & (to_plane < sample.distance[high] - _TOLERANCE)
+        is_wrong = (
+            limbs.is_sole(high, within.face) & (within.distance < 0) & (to_plane < sample.distance[high] - _TOLERANCE)
+        )
         sample, changed = _replaced(sample, high, within._replace(distance=to_plane), is_wrong)
         if not changed:
             break

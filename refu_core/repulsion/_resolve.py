@@ -194,8 +194,8 @@ def _keep_sides(
     rows, sample = rows[others], sample.rows(others)
     state.vertices[rows], state.distance[rows] = state.origin[rows], sample.distance
     # Out of another limb the way against the cloth's normal, towards its own skin, is the right one.
-    is_own = ~is_foreign[others] & (limbs.own[rows].sum(1) == 1)
-    side = torch.where(is_own[:, None], outward[rows], sample.gradient)
+    assert sample.face is not None
+    side = torch.where(limbs.is_sole(rows, sample.face)[:, None], outward[rows], sample.gradient)
     sample, looks = turn_outward(state.origin[rows], sample, side, lambda x, at: state.query(x, rows[at]))
     return rows, sample, rounds + looks
 
