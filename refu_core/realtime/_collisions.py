@@ -18,6 +18,8 @@ class Fabric:
 
     shapedirs: Tensor
     """The garment's displacement a unit of each beta [m], shape (V * 3, 10)."""
+    edges: Tensor
+    """Shape (E, 2)."""
     links: Links
     blend: Blend
     limbs: Limbs
@@ -28,6 +30,7 @@ class Fabric:
         clearance = rest.query(garment.v_template).distance
         return cls(
             garment.shapedirs,
+            garment.edges,
             Links.of(garment.edges, garment.n_vertices),
             Blend.of_faces(garment.faces, garment.n_vertices),
             Limbs.of(body.weights, body.faces, garment.weights, garment.faces, clearance=clearance),
@@ -75,5 +78,6 @@ class Collisions:
             start=start,
             near=near,
             blend=fabric.blend,
+            edges=fabric.edges,
             limbs=fabric.limbs,
         )
