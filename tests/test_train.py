@@ -17,7 +17,9 @@ GARMENT = "short-pant-male"
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_set(tmp_path_factory.mktemp("data") / GARMENT, load_garment(GARMENT), load_body("male"), pairs=20, poses=6)
+    return write_set(
+        tmp_path_factory.mktemp("data") / GARMENT, load_garment(GARMENT), load_body("male"), pairs=20, poses=6
+    )
 
 
 @pytest.fixture(scope="module")

@@ -22,8 +22,7 @@ from refu_core.training._dresser import Dresser, Sdf
 from refu_core.training._loop import Loop, LoopSettings, Objective, Stage, start_parallel
 from refu_core.training._losses import COLLISION_WEIGHT, RECONSTRUCTION_WEIGHT, refu_loss
 from refu_core.training._mirror import Mirror
-from refu_core.training._pretrain import PretrainSettings, pivots_of, stages
-from refu_core.training._pretrain import _basis as basis_of
+from refu_core.training._pretrain import PretrainSettings, basis_of, pivots_of, stages
 from refu_core.training._progress import TrainingLog
 
 _CHUNK = 64

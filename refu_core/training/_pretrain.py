@@ -122,7 +122,7 @@ def pretrain(
 
     basis, mirror = None, Mirror.of(template) if settings.is_mirrored else None
     if uses_basis(config, preset):
-        basis = _basis(output, samples, mirror, settings.rank, identity, len(opened), is_writer=is_writer)
+        basis = basis_of(output, samples, mirror, settings.rank, identity, len(opened), is_writer=is_writer)
     # Which pairs are held out mustn't depend on what is made of the samples afterwards.
     train, validation = split_validation(samples, share=settings.validation_share, seed=settings.loop.seed)
     if settings.asks:
@@ -175,7 +175,7 @@ def _settings(settings: PretrainSettings | None, preset: str) -> PretrainSetting
     return settings
 
 
-def _basis(
+def basis_of(
     folder: Path,
     samples: Samples,
     mirror: Mirror | None,

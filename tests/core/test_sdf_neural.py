@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from small_set import write_set
 from torch import Tensor
 
 from refu_core.body import SmplBody, load_body, rotvec_to_rotmat
@@ -27,8 +28,6 @@ from refu_core.sdf import (
 from refu_core.simulation import GarmentDataset
 from refu_core.training._sdf import SdfBatch, SdfSampler, SdfSettings, sdf_figures, sdf_loss, train_sdf
 
-QUANTUM = 2.0**-14
-
 
 @pytest.fixture(scope="module")
 def body() -> SmplBody:
@@ -42,35 +41,9 @@ def garment() -> GarmentTemplate:
 
 @pytest.fixture(scope="module")
 def dataset(body: SmplBody, garment: GarmentTemplate, tmp_path_factory: pytest.TempPathFactory) -> GarmentDataset:
-    """Skinned garments in the files of a data set, as docs/dataset.md has them."""
-    folder = tmp_path_factory.mktemp("set")
-    n = 12
-    generator = torch.Generator().manual_seed(0)
-    pose = 0.2 * torch.randn(n, 24, 3, generator=generator)
-    betas = torch.randn(n, 10, generator=generator)
-    worn = garment.pose(garment.rest(betas), body(pose, betas).transforms)
-    pair = np.arange(n, dtype=np.int32) // 2
-    columns = {
-        "vertices": np.rint(worn.numpy() / QUANTUM).astype(np.int16),
-        "pose": pose.numpy(),
-        "betas": betas.numpy(),
-        "style": np.zeros((n, 4), np.float32),
-        "pair": pair,
-        "slot": np.arange(n, dtype=np.int32),
-        "state": np.ones(n, np.uint8),
-        "split": (pair >= 4).astype(np.uint8),
-        "clip": np.full(n, -1, np.int32),
-        "frame": np.full(n, -1, np.int32),
-        "dropped": np.zeros((n, 5), np.uint8),
-        **{name: np.zeros(n, np.float32) for name in ("share", "stretch", "speed", "seconds")},
-    }
-    shard = folder / "shard-0-of-1"
-    shard.mkdir()
-    for name, values in columns.items():
-        np.save(shard / f"{name}.npy", values)
-    card = {"format": "refu-garments-1", "garment": garment.name, "quantum_m": QUANTUM, "clips": {}}
-    (folder / "card.json").write_text(json.dumps({**card, "plan": {"count": n}}))
-    return GarmentDataset(folder)
+    """Twelve skinned garments, eight to learn from."""
+    folder = tmp_path_factory.mktemp("set") / garment.name
+    return GarmentDataset(write_set(folder, garment, body, pairs=6, poses=2, test_pairs=2))
 
 
 def untrained(**sizes: int) -> SdfNetwork:

@@ -10,9 +10,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
+from small_set import write_set
 from torch import Tensor
 
 from refu_core import GarmentError, WeightsError, load_body, load_garment
@@ -76,49 +76,17 @@ def cloth(garment: GarmentTemplate, pose: Tensor) -> Tensor:
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory, garment: GarmentTemplate, body: SmplBody) -> Path:
-    """A set in the documented format, written without the project's writer."""
-    folder = tmp_path_factory.mktemp("set")
-    rng = np.random.default_rng(0)
-    pair = np.repeat(np.arange(N_PAIRS), N // N_PAIRS).astype("<i4")
-    betas = rng.normal(size=(N_PAIRS, 10)).astype("<f4")[pair]
-    style = rng.normal(size=(N_PAIRS, 4)).astype("<f4")[pair]
-    pose = rng.normal(0, 0.4, (N, 24, 3)).astype("<f4")
-    asked = pose.copy()
-    asked[::4, 1, 2] += 0.3
-    with torch.no_grad():
-        b, p = torch.as_tensor(betas), torch.as_tensor(pose)
-        unposed = garment.rest(b, torch.as_tensor(style)) + cloth(garment, p)
-        posed = garment.pose(unposed, body(p, b).transforms).numpy()
-    quantum = 2.0**-14
-    columns: dict[str, Any] = {
-        "vertices": np.rint(posed / quantum).astype("<i2"),
-        "pose": pose,
-        "betas": betas,
-        "style": style,
-        "pair": pair,
-        "slot": np.arange(N, dtype="<i4"),
-        "clip": np.full(N, -1, "<i4"),
-        "frame": np.full(N, -1, "<i4"),
-        "split": (pair >= 20).astype("|u1"),
-        "state": np.ones(N, "|u1"),
-        "dropped": np.zeros((N, 5), "|u1"),
-        **{name: np.ones(N, "<f4") for name in ("share", "stretch", "speed", "seconds")},
-    }
-    shard = folder / "shard-0-of-1"
-    shard.mkdir()
-    for name, array in columns.items():
-        np.save(shard / f"{name}.npy", array)
-    np.save(folder / "asked.npy", asked)
-    card = {
-        "format": "refu-garments-1",
-        "garment": GARMENT,
-        "body": garment.body,
-        "body_fingerprint": body.fingerprint,
-        "quantum_m": quantum,
-        "plan": {"count": N, "pivots": 4},
-    }
-    (folder / "card.json").write_text(json.dumps(card))
-    return folder
+    """Shorts with waves that knees and hips make."""
+    return write_set(
+        tmp_path_factory.mktemp("set") / GARMENT,
+        garment,
+        body,
+        pairs=N_PAIRS,
+        poses=N // N_PAIRS,
+        test_pairs=N_PAIRS - 20,
+        spread=0.4,
+        displacement=lambda pose: cloth(garment, pose),
+    )
 
 
 # Samples
