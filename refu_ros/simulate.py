@@ -7,11 +7,15 @@ from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
-from refu_core.simulation import Progress, simulate_dataset, simulate_sequences
+from refu_core.evaluation.render import save_png
+from refu_core.simulation import GarmentDataset, Progress, contact_sheet, simulate_dataset, simulate_sequences
 from refu_ros.tables import format_table
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+SHEET = "samples.png"
+"""Random samples of a finished set, to look at before anything is trained on it."""
 
 
 def simulate(
@@ -29,7 +33,12 @@ def simulate(
     seconds: float,
     progress: bool,
 ) -> dict[str, Any]:
-    """Simulates with a progress bar that shows what was dropped; returns the set's card. Raises `RefuError`."""
+    """Simulates with a progress bar that shows what was dropped; returns the set's card.
+
+    A finished set of samples gets its picture, `samples.png`.
+
+    Raises `RefuError`.
+    """
     with ExitStack() as stack:
         unit = "sequence" if sequences else "sample"
         bar = stack.enter_context(tqdm(total=None, unit=unit, disable=None if progress else True))
@@ -43,7 +52,10 @@ def simulate(
         options |= {"processes": processes, "shard": shard}
         if sequences:
             return simulate_sequences(garment, count, output, shapes=shapes, seconds=seconds, **options)
-        return simulate_dataset(garment, count, output, **options)
+        card = simulate_dataset(garment, count, output, **options)
+    if not card["counts"]["to_do"]:
+        save_png(contact_sheet(GarmentDataset(output), body=body), output / SHEET)
+    return card
 
 
 def simulation_table(card: dict[str, Any], output: Path) -> str:

@@ -20,6 +20,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from PIL import Image
 
 import refu_core
 from refu_core.body import load_body
@@ -48,6 +49,7 @@ from refu_core.simulation._plan import TEST, TRAIN
 from refu_core.simulation._poses import RoomMaker
 from refu_core.simulation._selection import Selector, SelfIntersection
 from refu_core.simulation._store import DONE, QUANTUM, TO_DO, Shard, dequantise, locked, quantise
+from refu_ros.cli import main
 
 GARMENT = "short-pant-male"
 COUNT = 5
@@ -641,3 +643,15 @@ def test_impossible_divisions_are_refused(options: dict[str, Any], clips: Path, 
 def test_impossible_plans_are_refused(numbers: dict[str, Any]) -> None:
     with pytest.raises(SimulationError, match="got"):
         Plan(GARMENT, **({"count": 10} | numbers))
+
+
+def test_command_makes_a_set_and_its_picture(clips: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["simulate", GARMENT, "--count", "2", "--motions", str(clips), "--output", str(tmp_path / "set")]
+    assert main([*arguments, "--shard", "0/2", "--quiet"]) == 0
+    assert not (tmp_path / "set" / "samples.png").exists()
+    assert main([*arguments, "--shard", "1/2", "--quiet", "--json", str(tmp_path / "card.json")]) == 0
+    assert "yield" in capsys.readouterr().out
+    card = json.loads((tmp_path / "card.json").read_text())
+    assert card["counts"]["train"] + card["counts"]["test"] == 2
+    picture = np.asarray(Image.open(tmp_path / "set" / "samples.png"))
+    assert picture.std() > 10
