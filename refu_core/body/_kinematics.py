@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import NamedTuple
 
 import torch
@@ -82,13 +83,27 @@ def forward_kinematics(rotations: Tensor, joints: Tensor) -> tuple[Tensor, Rigid
         Posed joints [m], shape (B, 24, 3), and the transforms that take a rest-pose point of each joint's bone to its
         posed place.
     """
-    world_rotation = [rotations[:, 0]]
-    world_joint = [joints[:, 0]]
-    for j, parent in enumerate(PARENTS[1:], start=1):
-        offset = joints[:, j] - joints[:, parent]
-        world_rotation.append(world_rotation[parent] @ rotations[:, j])
-        world_joint.append(world_joint[parent] + (world_rotation[parent] @ offset.unsqueeze(-1)).squeeze(-1))
-    rotation = torch.stack(world_rotation, 1)
-    posed = torch.stack(world_joint, 1)
-    translation = posed - (rotation @ joints.unsqueeze(-1)).squeeze(-1)
-    return posed, RigidTransforms(rotation, translation)
+    batch, n = joints.shape[:2]
+    chains = _chains(joints.device)
+    # Homogeneous, with a joint that stays where it is as the root's parent.
+    pose = torch.eye(4, dtype=joints.dtype, device=joints.device).repeat(batch, n + 1, 1, 1)
+    pose[:, :n, :3, :3] = rotations
+    pose[:, 0, :3, 3] = joints[:, 0]
+    pose[:, 1:n, :3, 3] = joints[:, 1:] - joints[:, chains[0][1:n]]
+    # Each round multiplies the chain that a joint has by the one that ends where its own begins, and so doubles it:
+    # four products in place of 23, one after another.
+    for above in chains:
+        pose = pose[:, above] @ pose
+    rotation, posed = pose[:, :n, :3, :3], pose[:, :n, :3, 3]
+    return posed, RigidTransforms(rotation, posed - (rotation @ joints.unsqueeze(-1)).squeeze(-1))
+
+
+@cache
+def _chains(device: torch.device) -> tuple[Tensor, ...]:
+    """For each round the joint above the chain of each joint, which is 1, 2, 4, … joints long; the last is no joint."""
+    end = len(PARENTS)
+    chains = [[end if parent < 0 else parent for parent in (*PARENTS, -1)]]
+    while any(joint != end for joint in chains[-1]):
+        chains.append([chains[-1][joint] for joint in chains[-1]])
+    with torch.inference_mode(False):  # who asks first may not track gradients, and the next one may
+        return tuple(torch.tensor(chain, device=device) for chain in chains[:-1])

@@ -136,7 +136,8 @@ class SmplBody:
         self.v_template = tensor(arrays.v_template)
         self.weights = tensor(arrays.weights)
         n = len(arrays.v_template)
-        self._shapedirs = tensor(arrays.shapedirs.reshape(n * 3, N_BETAS))
+        # Rows are summed faster than columns.
+        self._shapedirs = tensor(arrays.shapedirs.reshape(n * 3, N_BETAS).T.copy())
         self._posedirs = tensor(arrays.posedirs.reshape(n * 3, -1)) if arrays.posedirs is not None else None
         # Joints are linear in β, so the regressor is applied once to the basis and not to each body.
         self._joint_template = tensor(arrays.joint_regressor @ arrays.v_template)
@@ -178,7 +179,7 @@ class SmplBody:
 
     def rest_vertices(self, betas: Tensor) -> Tensor:
         """Unposed bodies without pose blend shapes [m], shape (B, V, 3), for betas (B, 10)."""
-        return self.v_template + (betas @ self._shapedirs.T).view(-1, self.n_vertices, 3)
+        return torch.addmm(self.v_template.view(1, -1), betas, self._shapedirs).view(-1, self.n_vertices, 3)
 
     def __call__(
         self,

@@ -29,7 +29,11 @@ def blend_transforms(weights: Tensor, transforms: RigidTransforms) -> RigidTrans
 
 def apply_transforms(points: Tensor, transforms: RigidTransforms) -> Tensor:
     """Posed points [m], shape (B, V, 3), of rest-pose points of the same shape, by transforms of the shape (B, V)."""
-    return (transforms.rotation @ points.unsqueeze(-1)).squeeze(-1) + transforms.translation
+    posed = transforms.translation
+    # Three sums of columns: a product of thousands of 3 × 3 matrices takes half as long again.
+    for column, coordinate in zip(transforms.rotation.unbind(-1), points.unsqueeze(-1).unbind(-2), strict=True):
+        posed = torch.addcmul(posed, column, coordinate)
+    return posed
 
 
 def unapply_transforms(points: Tensor, transforms: RigidTransforms) -> Tensor:
