@@ -240,9 +240,9 @@ class Cloth:
         )  # fmt: skip
         return (ends[which], *rest)
 
-    def stretch(self) -> F32:
-        """Length of each edge over its rest length, shape (E,)."""
-        ends = self.positions[self.topology.edges]
+    def stretch(self, positions: F32 | None = None) -> F32:
+        """Length of each edge over its rest length, shape (E,); of vertices at `positions` if given, (N, 3) [m]."""
+        ends = (self.positions if positions is None else positions)[self.topology.edges]
         order = self.topology.stretch_order
         ratio = np.empty(len(order), np.float32)
         ratio[order] = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)[order] / self._longest[-len(order) :]

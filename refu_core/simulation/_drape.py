@@ -228,9 +228,13 @@ class Draper:
         return Drape(
             self._with_root(self.cloth.positions, root, betas),
             speed,
-            float(np.percentile(self.cloth.stretch(), 99.9)),
+            self.stretch(),
             n + settled + s.careful_frames,
         )
+
+    def stretch(self, vertices: F32 | None = None) -> float:
+        """99.9th percentile of the last drape's stretch; with its vertices (N, 3) [m] elsewhere, if given."""
+        return float(np.percentile(self.cloth.stretch(vertices), 99.9))
 
     def _with_root(self, points: F32, root: Rotation, betas: NDArray[np.floating]) -> F32:
         pelvis = self.body.rest_joints(torch.as_tensor(betas, dtype=torch.float32).view(1, N_BETAS))[0, 0].numpy()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -84,7 +84,9 @@ class SlotSimulator:
         stored = quantise(drape.vertices)
         body = self._body(pose[None], torch.as_tensor(betas)[None]).vertices[0].numpy()
         # What is checked is what will be read, rounding included.
-        return self._selector.cause(dequantise(stored), body, drape), stored
+        read = dequantise(stored)
+        judged = replace(drape, stretch=max(drape.stretch, self._draper.stretch(read)))
+        return self._selector.cause(read, body, judged), stored
 
 
 @dataclass(frozen=True, eq=False)
