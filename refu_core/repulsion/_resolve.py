@@ -17,6 +17,9 @@ from refu_core.sdf import BodySdf, SdfSample
 _RETREAT_STEPS = 8
 _BENT = 0.9
 """Cosine between the skin's normals below its ends under which an edge may cut a corner."""
+_SURE = 4e-3
+"""How far beyond the margin a distance is trusted to be one from the body [m]. Where a body runs into itself it jumps:
+a vertex within an arm may be said to be 2 cm outside of the flank that the arm is in."""
 _STEP_ON = 1e-3
 """What is added to each step of a retreat [m], so that it ends."""
 
@@ -219,7 +222,8 @@ def _push_blended(
     everyone = torch.nonzero((field != 0).any(dim=-1) & ~has_left)[:, 0]
     moved = state.bounded(state.origin[everyone] + field[everyone], everyone)
     # No vertex gets nearer by more than it moves: those that stay beyond the margin needn't be asked.
-    floor = state.distance[everyone] - torch.linalg.vector_norm(moved - state.origin[everyone], dim=-1)
+    way = torch.linalg.vector_norm(moved - state.origin[everyone], dim=-1)
+    floor = state.distance[everyone].clamp_max(state.margin + _SURE) - way
     is_near = is_pushed[everyone] | (floor < state.margin + state.tolerance)
     far = everyone[~is_near]
     state.vertices[far], state.distance[far] = moved[~is_near], floor[~is_near]

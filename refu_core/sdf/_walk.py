@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-# ruff: noqa: RUF046, SIM108, UP018
+# ruff: noqa: RUF046, UP018
 # (Warp reads a kernel's annotations as array types of its own; a type checker can't. A variable that changes in a loop
 # has to be called int or float there.)
 """Closest point by walking over a posed triangle mesh from faces that are near already: one code for CPU and CUDA.
@@ -38,6 +38,10 @@ ENTER = wp.constant(2.6)
 MAX_STEPS = wp.constant(64)
 # A guide is of use if it is no farther than the best distance so far and the way to the part's closest face [m].
 REACH = wp.constant(0.06)
+# Whoever is deeper than this below a face [m] may be below others, too, as the centre of a sphere is below all of its:
+# the face's neighbours are looked at as well; unless it is by more than CLOSER [m] farther than the best so far.
+DEEP = wp.constant(0.008)
+CLOSER = wp.constant(0.02)
 # A step must shorten the squared distance by more than rounding does, or two faces of one edge take turns.
 SHORTER = wp.constant(1.0 - 1e-6)
 
@@ -152,19 +156,21 @@ def descend(
     offset = offset_from(p, face, w, points, faces)
     squared = wp.dot(offset, offset)
     for _step in range(MAX_STEPS):
-        if feature == FACE:
-            break
         here = face
         first = int(0)
         n = int(1)
-        if feature < EDGE:
+        edge = feature - EDGE
+        if feature == FACE:
+            n = 3
+        elif edge < 0:
             vertex = faces[here, feature - VERTEX]
             first = fan_start[vertex]
             n = fan_start[vertex + 1] - first
-        edge = feature - EDGE
         for k in range(n):
             ahead = int(0)
-            if edge >= 0:
+            if feature == FACE:
+                ahead = across[here, k]
+            elif edge >= 0:
                 ahead = across[here, edge]
             else:
                 ahead = fan_face[first + k]
@@ -230,10 +236,10 @@ def walk_kernel(
                 feature_ = int(FACE)
                 w_ = wp.vec3()
                 squared_ = float(0.0)
-                if weight_b >= 0.0:
-                    area = wp.dot(normal, normal)
-                    height = wp.dot(p - points[links[start, 0]], normal)
-                    squared_ = height * height / area
+                area = wp.dot(normal, normal)
+                depth = wp.dot(points[links[start, 0]] - p, normal) / wp.sqrt(area)
+                if weight_b >= 0.0 and (depth < DEEP or depth > distance + CLOSER):
+                    squared_ = depth * depth
                     weight_b = weight_b / area
                     weight_c = weight_c / area
                     w_ = wp.vec3(1.0 - weight_b - weight_c, weight_b, weight_c)

@@ -113,6 +113,22 @@ def test_is_the_distance_to_the_face_it_names_and_never_too_small(
     assert ((found.gradient * true.gradient).sum(1)[clear] > 0.999).float().mean() > 0.999
 
 
+@pytest.mark.parametrize("pose", ["a-pose", "squat"])
+def test_deep_within_a_limb_a_walk_goes_on_from_the_first_face_above(
+    body: SmplBody, approx: ApproxSdf, exact: ExactSdf, pose: str
+) -> None:
+    skin = body(pose_of(pose)).vertices[0]
+    approx.update(skin)
+    exact.update(skin)
+    a, b, c = skin[body.faces].unbind(1)
+    below = (a + b + c) / 3 - 0.02 * torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=1)
+    found, true = approx.query(below, near=torch.arange(len(below))), exact.query(below)
+    error = (found.distance - true.distance).abs()[true.distance < -0.008]
+    assert len(error) > 5000
+    assert error.mean() < 7e-4  # 1 mm if it stayed there
+    assert (error > 2e-3).float().mean() < 0.1
+
+
 def test_any_start_leads_there(body: SmplBody, approx: ApproxSdf) -> None:
     skin, worn, unposed = dressed(body, load_garment("tshirt-male"), pose_of("a-pose"))
     approx.update(skin)
