@@ -13,7 +13,7 @@ from torch import Tensor
 from refu_core._warp import as_warp, torch_stream
 from refu_core.errors import MeshError
 from refu_core.sdf._kernels import closest_kernel
-from refu_core.sdf._mesh import Found, MeshSdf
+from refu_core.sdf._mesh import FewPoints, Found, MeshSdf
 
 REBUILD_DISTANCE = 0.4
 """How far a vertex may move, on a CPU, before the BVH is built anew [m]. A refit costs 0.2 ms and leaves the tree as it
@@ -72,6 +72,7 @@ class ExactSdf(MeshSdf):
         self._rebuild_distance = rebuild_distance
         self._built_at = torch.empty(0, 3)  # the pose the BVH was built for
         self._mesh: Any = None
+        self._few: FewPoints | None = None  # recorded for the tree as it is now
 
     def _take_pose(self, *, is_new: bool) -> None:
         if is_new or self._has_drifted():
@@ -83,6 +84,7 @@ class ExactSdf(MeshSdf):
     def rebuild(self) -> None:
         """Builds the BVH anew for the present pose; answers don't depend on it. Raises `MeshError` before `update`."""
         self._built_at = self._require_update().clone()
+        self._few = None
         with torch_stream(self.device):
             self._mesh = wp.Mesh(
                 self._points_wp, as_warp(self.faces.view(-1), wp.int32), support_winding_number=self._by_winding
@@ -121,22 +123,23 @@ class ExactSdf(MeshSdf):
         return self._launch(points, math.inf)
 
     def _launch(self, points: Tensor, max_distance: float) -> Found:
+        if 0 < len(points) <= FewPoints.MOST and self.device.type == "cpu" and max_distance == math.inf:
+            if self._few is None:
+                self._few = FewPoints(closest_kernel, lambda few, _: self._inputs(few, _UNLIMITED))
+            return self._few.ask(points)
         found = Found.empty(len(points), self.device)
         if len(points):
             with torch_stream(self.device):
                 wp.launch(
                     closest_kernel,
                     dim=len(points),
-                    inputs=[
-                        self._mesh.id,
-                        self._points_wp,
-                        self._faces,
-                        *self._topology,
-                        as_warp(points, wp.vec3),
-                        min(max_distance, _UNLIMITED),
-                        self._by_winding,
-                    ],
+                    inputs=self._inputs(as_warp(points, wp.vec3), min(max_distance, _UNLIMITED)),
                     outputs=found.as_warp(),
                     device=str(self.device),
                 )
         return found
+
+    def _inputs(self, points: Any, max_distance: float) -> list[Any]:
+        """What `closest_kernel` reads."""
+        body = [self._mesh.id, self._points_wp, self._faces, *self._topology]
+        return [*body, points, max_distance, self._by_winding]

@@ -212,6 +212,22 @@ def test_rebuild_and_refit_answer_alike(body: SmplBody) -> None:
         torch.testing.assert_close(once.query(points).distance, sdf.query(points).distance, atol=1e-7, rtol=0)
 
 
+def test_few_points_are_answered_as_many_are(body: SmplBody) -> None:
+    sdf = ExactSdf(body.faces)
+    for seed in (1, 2, 3):
+        sdf.update(posed(body, seed))
+        if seed == 3:
+            sdf.rebuild()
+        points = around(posed(body, seed), 600, seed)
+        many = sdf.query(points)
+        few = [sdf.query(piece) for piece in points.split((1, 256, 57, 257, 29))]  # none overwrites the one before
+        assert torch.equal(torch.cat([sample.distance for sample in few]), many.distance)
+        assert torch.equal(torch.cat([sample.gradient for sample in few]), many.gradient)
+        faces = [sample.face for sample in few if sample.face is not None]
+        assert many.face is not None
+        assert torch.equal(torch.cat(faces), many.face)
+
+
 def test_no_points_and_satisfies_the_protocol() -> None:
     vertices, faces = sphere()
     sdf = ExactSdf(faces.numpy())
