@@ -7,7 +7,11 @@ from functools import cached_property
 
 import numpy as np
 import torch
+import warp as wp
 from torch import Tensor
+
+from refu_core._warp import as_warp, torch_stream
+from refu_core.repulsion._kernels import add_normals_kernel
 
 _LIMBS: tuple[tuple[int, ...], ...] = (
     (0, 3, 6, 9, 12, 13, 14, 15),  # trunk and head
@@ -63,9 +67,15 @@ class Limbs:
 
     def outward(self, points: Tensor) -> Tensor:
         """Unit normals of the garment [m], away from the skin it lies on, shape (N, 3), for its vertices (N, 3)."""
-        a, b, c = points[self.faces].unbind(1)
-        normal = torch.linalg.cross(b - a, c - a)
-        summed = torch.zeros_like(points).index_add_(0, self.faces.T.reshape(-1), normal.repeat(3, 1))
+        summed = torch.zeros_like(points)
+        with torch_stream(points.device):
+            wp.launch(
+                add_normals_kernel,
+                len(self.faces),
+                [as_warp(points.contiguous(), wp.vec3), as_warp(self.faces, wp.int64)],
+                [as_warp(summed, wp.vec3)],
+                device=str(points.device),
+            )
         return torch.nn.functional.normalize(summed, dim=-1)
 
     def mean_of_neighbours(self, points: Tensor, rows: Tensor) -> Tensor:

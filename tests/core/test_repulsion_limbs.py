@@ -112,3 +112,13 @@ def test_outward_normals_point_away_from_the_skin() -> None:
     np.testing.assert_allclose(outward.norm(dim=-1).numpy(), 1, atol=1e-5)
     aligned = (outward * sdf.query(points).gradient).sum(-1)
     assert float((aligned > 0).float().mean()) > 0.99
+
+
+def test_outward_normals_against_their_definition() -> None:
+    points, _, limbs, _ = dressed(0.4)
+    summed = np.zeros(points.shape)
+    a, b, c = points.double().numpy()[limbs.faces.numpy()].transpose(1, 0, 2)
+    for corner in limbs.faces.numpy().T:
+        np.add.at(summed, corner, np.cross(b - a, c - a))
+    wanted = summed / np.linalg.norm(summed, axis=1, keepdims=True)
+    np.testing.assert_allclose(limbs.outward(points).numpy(), wanted, atol=1e-4)
