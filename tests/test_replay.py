@@ -339,7 +339,11 @@ def test_an_interrupted_replay_leaves_a_readable_bag(kind: signal.Signals, tmp_p
     bag, out = write_bag(tmp_path / "long.mcap", motion(300)), tmp_path / "out.mcap"
     command = [sys.executable, "-m", "refu_ros.cli", "replay", bag, "--output", out, "--speed", "real", "--quiet"]
     process = subprocess.Popen(
-        [*map(str, command), "--garments", "short-pant-male", "--sdf", "none"], stdout=subprocess.PIPE, text=True
+        [*map(str, command), "--garments", "short-pant-male", "--sdf", "none"],
+        stdout=subprocess.PIPE,
+        text=True,
+        # A shell's background jobs, and what they start, ignore SIGINT: so might this test run.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     deadline = time.monotonic() + 60
     while (not out.exists() or out.stat().st_size < 20_000) and time.monotonic() < deadline:
