@@ -207,13 +207,14 @@ class SequenceSimulator:
             if k % STEPS == 0:
                 t = k // STEPS
                 vertices[t] = quantise(cloth.positions)
-                stretch[t], speed[t] = np.percentile(cloth.stretch(), 99.9), now
+                stretch[t], speed[t] = self._draper.stretch(), now
                 cause[t] = self._examine(dequantise(vertices[t]), body, float(stretch[t]), crowded=bool(crowded[k]))
         return vertices, cause, stretch, speed
 
     def _examine(self, stored: F32, body: F32, stretch: float, *, crowded: bool) -> int:
         """0, or 1 and above for the cause why a frame isn't in the set; a moving cloth may be fast."""
-        cause = "no_room" if crowded else self._selector.cause(stored, body, Drape(stored, 0.0, stretch, 1))
+        worst = max(stretch, self._draper.stretch(stored))  # rounding included, as for samples
+        cause = "no_room" if crowded else self._selector.cause(stored, body, Drape(stored, 0.0, worst, 1))
         return 0 if cause is None else 1 + CAUSES.index(cause)
 
 
