@@ -22,6 +22,12 @@ if TYPE_CHECKING:
 BUILTIN_GARMENTS: tuple[str, ...] = ("shirt-male", "tshirt-male", "short-pant-male", "skirt-female")
 
 
+def unique_edges(faces: Tensor) -> Tensor:
+    """The edges of triangles (F, 3), each once, lower vertex first, shape (E, 2), int64."""
+    corners = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).cpu().numpy()
+    return torch.as_tensor(np.unique(np.sort(corners, 1), axis=0), device=faces.device)
+
+
 @dataclass(frozen=True, eq=False)
 class GarmentTemplate:
     """One garment of V vertices and F faces, made for one body.
@@ -52,8 +58,7 @@ class GarmentTemplate:
     @cached_property
     def edges(self) -> Tensor:
         """Each edge once, lower vertex first, shape (E, 2), int64."""
-        corners = self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).cpu().numpy()
-        return torch.as_tensor(np.unique(np.sort(corners, 1), axis=0), device=self.faces.device)
+        return unique_edges(self.faces)
 
     def to(self, *, device: str | torch.device | None = None, dtype: torch.dtype | None = None) -> GarmentTemplate:
         """The same garment on another device or in another precision."""

@@ -57,7 +57,7 @@ class Collisions:
         """A face of the body near each vertex of unposed garments (B, V, 3) on shapes (B, 10), where that is of use."""
         if self._rest_faces is None:
             return None
-        return self._rest_faces(unposed - (betas @ fabric.shapedirs.T).view_as(unposed))
+        return self._rest_faces.under(unposed, betas, fabric.shapedirs)
 
     def update(self, vertices: Tensor) -> None:
         """Takes over the body's new pose, shape (V, 3) [m]. Raises `MeshError` for one that isn't finite."""

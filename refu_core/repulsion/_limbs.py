@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
 
 from refu_core._warp import as_warp, torch_stream
+from refu_core.garments import unique_edges
 from refu_core.repulsion._kernels import add_normals_kernel
 
 _LIMBS: tuple[tuple[int, ...], ...] = (
@@ -62,8 +62,7 @@ class Limbs:
     @cached_property
     def edges(self) -> Tensor:
         """The garment's edges, each once, shape (E, 2)."""
-        pairs = np.sort(self.faces.cpu().numpy()[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-        return torch.as_tensor(np.unique(pairs, axis=0), device=self.faces.device)
+        return unique_edges(self.faces)
 
     def outward(self, points: Tensor) -> Tensor:
         """Unit normals of the garment [m], away from the skin it lies on, shape (N, 3), for its vertices (N, 3)."""

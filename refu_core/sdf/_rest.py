@@ -31,7 +31,7 @@ class RestFaces:
     A start need not be the closest face, so one grid of the mean shape does for all shapes: of a garment vertex
     t(β, γ) + D it wants the place on the mean shape, which is what `GarmentTemplate.rest` adds for β taken off:
 
-        near = rest_faces(unposed - (betas @ garment.shapedirs.T).view(-1, 3))
+        near = rest_faces.under(unposed, betas, garment.shapedirs)
         sample = approx_sdf.query(posed, near=near)
     """
 
@@ -53,6 +53,13 @@ class RestFaces:
         self._device = torch.device(body.device)
         self._low = wp.vec3(*low.tolist())
         self._grid = wp.array(face[tuple(nearest)], dtype=wp.int32, device=str(self._device))
+
+    def under(self, unposed: Tensor, betas: Tensor, shapedirs: Tensor) -> Tensor:
+        """Near body faces, int32 of shape (B, V), of unposed garments [m], shape (B, V, 3), on shapes (B, 10).
+
+        `shapedirs` (V * 3, 10) is how the garment follows β, so what takes it back to the mean shape.
+        """
+        return self(unposed - (betas @ shapedirs.T).view_as(unposed))
 
     def __call__(self, unposed: Tensor) -> Tensor:
         """Near body faces, int32 of shape (...,), of places on the mean shape in the rest pose [m], shape (..., 3)."""

@@ -68,7 +68,7 @@ class Dresser(nn.Module):
             vertices = self._garment.pose(unposed, posed.transforms)
             near = None
             if self._rest_faces is not None:
-                near = self._rest_faces(unposed - (betas @ self._garment.shapedirs.T).view_as(unposed))
+                near = self._rest_faces.under(unposed, betas, self._garment.shapedirs)
             if self.refu is not None:
                 z = self.refu.feature(betas, pose, style, prediction.feature)
                 sample = self._in_refu(posed.vertices, vertices, near)

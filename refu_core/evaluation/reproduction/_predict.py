@@ -54,7 +54,7 @@ class Wardrobe:
 
     def near(self, unposed: Tensor, betas: Tensor) -> Tensor:
         """A body face near each vertex of an unposed garment [m], shape (N, 3), for betas (1, 10); shape (N,)."""
-        return self.rest_faces(unposed - (betas @ self.template.shapedirs.T).view(-1, 3))
+        return self.rest_faces.under(unposed[None], betas, self.template.shapedirs)[0]
 
 
 @dataclass(eq=False)
