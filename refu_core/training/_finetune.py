@@ -54,9 +54,9 @@ class FinetuneSettings:
     """How a backbone is trained with ReFU; the defaults are those of the shipped weights."""
 
     loop: LoopSettings = field(
-        default_factory=lambda: LoopSettings(batch_size=16, learning_rate=1e-4, weight_decay=0.1, check_every=100)
+        default_factory=lambda: LoopSettings(batch_size=16, learning_rate=2e-4, weight_decay=0.1, check_every=100)
     )
-    steps: int = 600
+    steps: int = 1000
     reconstruction_weight: float = RECONSTRUCTION_WEIGHT
     collision_weight: float = COLLISION_WEIGHT
     scale: str | None = "realtime"
