@@ -11,7 +11,7 @@ from refu_core._device import checked_device
 from refu_core.backbones import PRESETS
 from refu_core.garments import BUILTIN_GARMENTS
 from refu_core.sdf import SDF_PRESETS
-from refu_core.simulation import GarmentDataset
+from refu_core.simulation import GarmentDataset, open_dataset
 from refu_core.training import (
     FINETUNE_MODES,
     FinetuneSettings,
@@ -69,10 +69,12 @@ def train(options: TrainOptions, *, progress: bool) -> dict[str, Any]:
     _check(options)
     template = load_garment(options.garment)
     body = load_body(options.body or template.body)
-    dataset = GarmentDataset(options.data)
     common: dict[str, Any] = {"device": options.device, "quiet": not progress}
     if options.network == "sdf":
-        return train_sdf(dataset, body, template, options.folder, settings=_sdf_training(options), **common)
+        return train_sdf(
+            GarmentDataset(options.data), body, template, options.folder, settings=_sdf_training(options), **common
+        )
+    dataset = open_dataset(options.data)
     common |= {"backbone": options.backbone, "preset": options.preset, "body": body}
     source: Path | None = options.folder
     if options.mode == "none":

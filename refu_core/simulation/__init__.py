@@ -4,6 +4,7 @@ from refu_core.simulation._cloth import ClothSettings
 from refu_core.simulation._dataset import GarmentDataset, GarmentSample
 from refu_core.simulation._drape import Drape, Draper, DrapeSettings, canonical_pose
 from refu_core.simulation._errors import SimulationError
+from refu_core.simulation._open import open_dataset
 from refu_core.simulation._plan import Plan
 from refu_core.simulation._poses import Clip, RoomSettings, load_clips, split_clips
 from refu_core.simulation._produce import Progress
@@ -46,6 +47,7 @@ __all__ = [
     "canonical_pose",
     "contact_sheet",
     "load_clips",
+    "open_dataset",
     "simulate_dataset",
     "simulate_sequences",
     "split_clips",

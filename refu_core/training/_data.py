@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from refu_core.backbones import BasisDecoder, style_shape
 from refu_core.body import SmplBody
 from refu_core.errors import RefuError
 from refu_core.garments import GarmentTemplate
-from refu_core.simulation import GarmentDataset
+from refu_core.simulation import GarmentDataset, GarmentSequences
 from refu_core.training._mirror import Mirror, mirror_pose
 
 _CHUNK = 64
@@ -33,7 +35,7 @@ class Samples:
     displacement: Tensor
     """D = unpose(x) - t(β, γ) of the simulated garment x [m], shape (N, V, 3)."""
     pair: Tensor
-    """Number of the style-shape pair, shape (N,), int64."""
+    """Number of the style-shape pair, or of the sequence, shape (N,), int64."""
 
     def __len__(self) -> int:
         """N."""
@@ -54,8 +56,10 @@ class Samples:
         return Samples(*(torch.cat(pair) for pair in pairs))
 
 
-def read_samples(dataset: GarmentDataset, body: SmplBody, garment: GarmentTemplate, *, split: str) -> Samples:
-    """The samples of one split, `train` or `test`, with the poses that were simulated.
+def read_samples(
+    dataset: GarmentDataset | GarmentSequences, body: SmplBody, garment: GarmentTemplate, *, split: str
+) -> Samples:
+    """The samples of one split, `train` or `test`, with the poses that were simulated; of sequences, the good frames.
 
     Raises:
         RefuError: the set is of another garment or body, or the split has no finished sample.
@@ -65,13 +69,14 @@ def read_samples(dataset: GarmentDataset, body: SmplBody, garment: GarmentTempla
     if not len(rows):
         msg = f"the set of {garment.name} has no finished sample to {split} on: let `refu simulate` run longer"
         raise RefuError(msg)
-    column = {name: torch.as_tensor(dataset.column(name)[rows]) for name in ("pose", "asked", "betas", "style", "pair")}
-    stored = dataset.column("vertices")
-    displacement = torch.empty(len(rows), garment.n_vertices, 3)
+    stored = _frames(dataset, rows) if isinstance(dataset, GarmentSequences) else _columns(dataset, rows)
+    vertices = stored.pop("vertices")
+    column = {name: torch.as_tensor(values) for name, values in stored.items()}
+    displacement = torch.empty(len(vertices), garment.n_vertices, 3)
     with torch.no_grad():
-        for start in range(0, len(rows), _CHUNK):
+        for start in range(0, len(vertices), _CHUNK):
             chunk = slice(start, start + _CHUNK)
-            posed = torch.as_tensor(stored[rows[chunk]].astype(np.float32) * float(dataset.card["quantum_m"]))
+            posed = torch.as_tensor(vertices[chunk].astype(np.float32) * float(dataset.card["quantum_m"]))
             betas = column["betas"][chunk]
             transforms = body(column["pose"][chunk], betas).transforms
             rest = garment.rest(betas, column["style"][chunk])
@@ -79,6 +84,18 @@ def read_samples(dataset: GarmentDataset, body: SmplBody, garment: GarmentTempla
     return Samples(
         column["pose"], column["asked"], column["betas"], column["style"], displacement, column["pair"].long()
     )
+
+
+def _columns(dataset: GarmentDataset, rows: NDArray[np.intp]) -> dict[str, NDArray[Any]]:
+    return {name: dataset.column(name)[rows] for name in ("vertices", "pose", "asked", "betas", "style", "pair")}
+
+
+def _frames(dataset: GarmentSequences, rows: NDArray[np.intp]) -> dict[str, NDArray[Any]]:
+    """The same of every frame of some sequences that passed the selection; what a sequence is one of, is its pair."""
+    kept = dataset.column("cause")[rows] == 0
+    found = {name: dataset.column(name)[rows][kept] for name in ("vertices", "pose", "asked")}
+    found |= {name: dataset.column(name)[rows].repeat(kept.sum(1), axis=0) for name in ("betas", "style")}
+    return found | {"pair": dataset.column("slot")[rows].repeat(kept.sum(1))}
 
 
 def with_asked_poses(samples: Samples) -> Samples:
@@ -137,7 +154,7 @@ def output_basis(displacement: Tensor, *, rank: int) -> BasisDecoder:
     return BasisDecoder(mean, components)
 
 
-def check_dataset(dataset: GarmentDataset, body: SmplBody, garment: GarmentTemplate) -> None:
+def check_dataset(dataset: GarmentDataset | GarmentSequences, body: SmplBody, garment: GarmentTemplate) -> None:
     """Checks that a set was simulated for this garment on this body.
 
     Raises:

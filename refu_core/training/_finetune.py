@@ -16,7 +16,7 @@ from refu_core.body import SmplBody, load_body
 from refu_core.errors import RefuError
 from refu_core.garments import GarmentTemplate, load_garment
 from refu_core.repulsion import DEFAULT_MARGIN, SCALE_PRESETS, Refu, ScaleKind, refu_tensors
-from refu_core.simulation import GarmentDataset
+from refu_core.simulation import GarmentDataset, GarmentSequences, open_dataset
 from refu_core.training._data import Samples, mirrored, read_samples, split_validation
 from refu_core.training._dresser import Dresser, Sdf
 from refu_core.training._loop import Loop, LoopSettings, Objective, Stage, start_parallel
@@ -81,7 +81,7 @@ class FinetuneSettings:
 
 def finetune(
     garment: str | GarmentTemplate,
-    dataset: str | Path | GarmentDataset,
+    dataset: str | Path | GarmentDataset | GarmentSequences,
     weights: str | Path | None,
     output: str | Path,
     *,
@@ -99,7 +99,7 @@ def finetune(
 
     Args:
         garment: name of a built-in garment, or a template.
-        dataset: simulated set (`refu simulate`).
+        dataset: simulated set (`refu simulate`), of garments at rest or of sequences.
         weights: folder with <backbone>-none and its basis, as `pretrain` wrote them; None to train from scratch, as the
             supplement does with the gcnn.
         output: folder of the weights, of the checkpoint while it is needed, and of the loss curves; may be `weights`.
@@ -128,7 +128,7 @@ def finetune(
     body = load_body(template.body) if body is None else body
     is_writer, torch_device = start_parallel(torch.device(device))
     output = Path(output)
-    opened = dataset if isinstance(dataset, GarmentDataset) else GarmentDataset(dataset)
+    opened = open_dataset(dataset) if isinstance(dataset, (str, Path)) else dataset
     identity = {"garment": template.name, "body_fingerprint": body.fingerprint}
     samples = read_samples(opened, body, template, split="train")
     train, validation = split_validation(samples, share=settings.validation_share, seed=settings.loop.seed)

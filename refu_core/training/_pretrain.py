@@ -27,7 +27,7 @@ from refu_core.backbones import (
 from refu_core.body import SmplBody, load_body
 from refu_core.errors import RefuError
 from refu_core.garments import GarmentTemplate, load_garment
-from refu_core.simulation import GarmentDataset
+from refu_core.simulation import GarmentDataset, GarmentSequences, open_dataset
 from refu_core.training._data import (
     Samples,
     mirrored,
@@ -75,7 +75,7 @@ class PretrainSettings:
 
 def pretrain(
     garment: str | GarmentTemplate,
-    dataset: str | Path | GarmentDataset,
+    dataset: str | Path | GarmentDataset | GarmentSequences,
     output: str | Path,
     *,
     backbone: str = "tailornet",
@@ -93,7 +93,7 @@ def pretrain(
 
     Args:
         garment: name of a built-in garment, or a template.
-        dataset: simulated set (`refu simulate`).
+        dataset: simulated set (`refu simulate`), of garments at rest or of sequences.
         output: folder of the weights, of the checkpoint while it is needed, and of the loss curves.
         backbone: `tailornet`, `mlp` or `gcnn`.
         preset: `realtime` or `paper`.
@@ -116,7 +116,7 @@ def pretrain(
     config = backbone_config(backbone, template.name, preset=preset) if config is None else config
     is_writer, torch_device = start_parallel(torch.device(device))
     output = Path(output)
-    opened = dataset if isinstance(dataset, GarmentDataset) else GarmentDataset(dataset)
+    opened = open_dataset(dataset) if isinstance(dataset, (str, Path)) else dataset
     samples = read_samples(opened, body, template, split="train")
     identity = {"garment": template.name, "body_fingerprint": body.fingerprint}
 

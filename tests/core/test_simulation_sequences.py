@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ from refu_core.simulation import (
     SequencePlan,
     SimulationError,
     load_clips,
+    open_dataset,
     simulate_sequences,
     split_clips,
     summarise_sequences,
@@ -36,6 +38,7 @@ from refu_core.simulation._plan import TEST
 from refu_core.simulation._poses import RoomMaker
 from refu_core.simulation._selection import Selector
 from refu_core.simulation._store import TO_DO, SequenceShard
+from refu_core.training import read_samples
 from refu_ros.cli import main
 
 GARMENT = "short-pant-male"
@@ -101,6 +104,33 @@ def test_sequences_are_what_was_planned(sequences: list[GarmentSequence], simula
         assert np.sign(turn) == (-1 if sequence.mirrored else 1)
         way = np.linalg.norm(sequence.transl[-1, [0, 2]])
         assert way == pytest.approx(1.5 * (FRAMES - 1) / FPS, rel=0.01)
+
+
+def test_training_reads_the_good_frames(simulated: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "set"
+    shutil.copytree(simulated, copy)
+    (shard,) = [path for path in copy.glob("shard-*") if (np.load(path / "split.npy") != TEST).all()]
+    cause = np.load(shard / "cause.npy")
+    cause[0, 2] = 1
+    np.save(shard / "cause.npy", cause)
+    found = open_dataset(copy)
+    assert isinstance(found, GarmentSequences)
+    assert isinstance(open_dataset(simulated), GarmentSequences)
+    garment = load_garment(GARMENT)
+    body = load_body(garment.body)
+    samples = read_samples(found, body, garment, split="train")
+
+    (sequence,) = [found.sequence(i) for i in np.flatnonzero(found.train)]
+    good = np.flatnonzero(sequence.kept)
+    assert 2 not in good
+    assert len(samples) == len(good)
+    np.testing.assert_array_equal(samples.pose, sequence.pose[good])
+    np.testing.assert_array_equal(samples.asked, sequence.asked[good])
+    assert (samples.betas == torch.tensor(sequence.betas)).all()
+    assert (samples.pair == sequence.number).all()
+    unposed = garment.rest(samples.betas, samples.style) + samples.displacement
+    posed = garment.pose(unposed, body(samples.pose, samples.betas).transforms)
+    np.testing.assert_allclose(posed, sequence.vertices(good), atol=1e-5)
 
 
 def test_frames_in_the_set_are_free_and_others_are_marked(sequences: list[GarmentSequence], simulated: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from refu_core.errors import RefuError
-from refu_core.simulation import GarmentDataset, GarmentSequences
+from refu_core.simulation import GarmentDataset, GarmentSequences, open_dataset
 
 
 class Sample(NamedTuple):
@@ -61,22 +60,15 @@ class Samples:
         Raises:
             RefuError: no such set, a damaged one, or one without a finished test sample.
         """
-        samples = _of_sequences(path, every) if _is_of_sequences(path) else _of_poses(path, every)
+        dataset = open_dataset(path)
+        samples = _of_sequences(dataset, every) if isinstance(dataset, GarmentSequences) else _of_poses(dataset, every)
         if not samples.count:
             msg = f"{path}: no test sample in it is finished yet"
             raise RefuError(msg)
         return samples
 
 
-def _is_of_sequences(path: Path) -> bool:
-    try:
-        return "sequences" in str(json.loads((path / "card.json").read_text(encoding="utf-8"))["format"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return False  # whoever opens it as a set of poses says what is wrong
-
-
-def _of_poses(path: Path, every: int) -> Samples:
-    dataset = GarmentDataset(path)
+def _of_poses(dataset: GarmentDataset, every: int) -> Samples:
     rows = np.flatnonzero(dataset.test)[::every]
 
     def read(number: int) -> Sample:
@@ -87,8 +79,7 @@ def _of_poses(path: Path, every: int) -> Samples:
     return Samples(str(dataset.card["garment"]), len(rows), key, None, read)
 
 
-def _of_sequences(path: Path, every: int) -> Samples:
-    dataset = GarmentSequences(path)
+def _of_sequences(dataset: GarmentSequences, every: int) -> Samples:
     sequences = [dataset.sequence(int(row)) for row in np.flatnonzero(dataset.test)]
     frames = [(k, int(t)) for k, sequence in enumerate(sequences) for t in np.flatnonzero(sequence.kept)][::every]
 
