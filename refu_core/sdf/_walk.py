@@ -157,18 +157,19 @@ def descend(
     squared = wp.dot(offset, offset)
     for _step in range(MAX_STEPS):
         here = face
+        kind = int(feature)  # of here, whatever comes to be closer while its neighbours are looked at
         first = int(0)
         n = int(1)
-        edge = feature - EDGE
-        if feature == FACE:
+        edge = kind - EDGE
+        if kind == FACE:
             n = 3
         elif edge < 0:
-            vertex = faces[here, feature - VERTEX]
+            vertex = faces[here, kind - VERTEX]
             first = fan_start[vertex]
             n = fan_start[vertex + 1] - first
         for k in range(n):
             ahead = int(0)
-            if feature == FACE:
+            if kind == FACE:
                 ahead = across[here, k]
             elif edge >= 0:
                 ahead = across[here, edge]
