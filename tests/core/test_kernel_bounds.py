@@ -1,0 +1,36 @@
+"""No kernel reads or writes beyond an array: run once with Warp's own checks compiled in, which end the process."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+_RUN = """
+import sys
+import warp as wp
+
+wp.config.mode = "debug"
+wp.config.kernel_cache_dir = sys.argv[1]
+import numpy as np
+import torch
+
+from refu_core import GarmentPipeline, SmplFrame
+
+torch.set_num_threads(1)
+rng = np.random.default_rng(0)
+frames = [SmplFrame(pose=rng.normal(0, 0.4, (24, 3)), betas=rng.normal(size=10)) for _ in range(40)]
+for sdf in ("accurate", "hybrid"):
+    pipeline = GarmentPipeline.load(["tshirt-male"], sdf=sdf, backbone="skinned")
+    for frame in frames:
+        pipeline(frame)
+print("in bounds")
+"""
+
+
+def test_kernels_stay_in_bounds_on_bodies_in_a_tangle(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", _RUN, str(tmp_path)], capture_output=True, text=True, timeout=500, check=False
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stdout.endswith("in bounds\n")
