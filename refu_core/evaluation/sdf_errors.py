@@ -29,6 +29,8 @@ class SdfErrors:
     """99th percentile of |f - s| [mm]."""
     missed_percent: float | None
     """Points with |f - s| above 2 mm [%]."""
+    hidden_percent: float | None
+    """Points more than 2 mm inside, s < -2 mm, that are taken for outside, f ≥ 0 [%]: a collision nobody sees."""
 
     @staticmethod
     def between(approximate: ArrayLike, accurate: ArrayLike) -> SdfErrors:
@@ -44,11 +46,12 @@ class SdfErrors:
         error: NDArray[np.float64] = np.abs(f - s)
         off = np.abs(s) > _AT_SURFACE
         if not len(error):
-            return SdfErrors(0, None, None, None, None)
+            return SdfErrors(0, None, None, None, None, None)
         return SdfErrors(
             n_points=len(error),
             mean_absolute_mm=1e3 * float(error.mean()),
             mean_relative_percent=100.0 * float((error[off] / np.abs(s[off])).mean()) if off.any() else None,
             p99_mm=1e3 * float(np.percentile(error, 99)),
             missed_percent=100.0 * float((error > MISS).mean()),
+            hidden_percent=100.0 * float(((s < -MISS) & (f >= 0)).mean()),
         )

@@ -325,6 +325,10 @@ def test_distance_table(samples: rp.Samples) -> None:
     table = rp.sdf_table([samples], library=rp.Library())
     assert table.value(GARMENT, "approx", "mean_absolute_mm") < 2
     assert table.value(GARMENT, "approx, within 2 cm", "missed_percent") < 2
+    assert table.value(GARMENT, "approx, within 2 cm, away from self-contact", "p99_mm") < 1
+    assert table.value(GARMENT, "approx, within 2 cm, away from self-contact", "hidden_percent") == 0
+    for pose in ("squat", "crossed arms", "hands on hips"):
+        assert 0 < table.value(GARMENT, f"approx, {pose}", "mean_absolute_mm") < 2
     assert table.value(GARMENT, "neural", "mean_absolute_mm") is None
     assert [(m.method, m.reason) for m in table.missing] == [
         ("neural", "not trained"),

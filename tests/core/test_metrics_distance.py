@@ -22,15 +22,17 @@ def test_distance_errors_equal_the_slow_reference(seed: int, n: int) -> None:
     accurate[rng.random(n) < 0.3] *= 1e-4  # on the skin, as good as
     approximate = accurate + rng.normal(scale=0.002, size=n)
     found = SdfErrors.between(approximate, accurate)
-    absolute, relative, missed = [], [], 0
+    absolute, relative, missed, hidden = [], [], 0, 0
     for f, s in zip(approximate.tolist(), accurate.tolist(), strict=True):
         absolute.append(abs(f - s))
         missed += abs(f - s) > 0.002
+        hidden += s < -0.002 and f >= 0
         if abs(s) > 0.0001:
             relative.append(abs((f - s) / s))
     assert found.n_points == n
     assert found.mean_absolute_mm == pytest.approx(1000 * sum(absolute) / n)
     assert found.missed_percent == pytest.approx(100 * missed / n)
+    assert found.hidden_percent == pytest.approx(100 * hidden / n)
     assert found.mean_relative_percent == (pytest.approx(100 * sum(relative) / len(relative)) if relative else None)
     # The 99th percentile between two of the sorted errors.
     place = 0.99 * (n - 1)

@@ -36,6 +36,7 @@ METRICS: Mapping[str, Metric] = {
     "mean_relative_percent": Metric("mean relative error [%]", 2),
     "p99_mm": Metric("99th percentile [mm]", 2),
     "missed_percent": Metric("wrong by over 2 mm [%]", 3),
+    "hidden_percent": Metric("over 2 mm inside, taken for outside [%]", 4),
     "ms": Metric("median time [ms]", 2),
     "jitter_mm": Metric("jitter [mm/frame²]", 3),
     "mpve_mm_trend": Metric("MPVE, change [%]", 1),
