@@ -81,6 +81,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_train(commands)
     _add_evaluate(commands)
     _add_info(commands)
+    _add_fuzz(commands)
     return parser
 
 
@@ -267,6 +268,22 @@ def _add_info(commands: Any) -> None:
     parser.set_defaults(run=_info)
 
 
+def _add_fuzz(commands: Any) -> None:
+    parser = commands.add_parser(
+        "fuzz",
+        help="give every reader damaged and hostile input",
+        description="Mutate messages, bags, motions, bodies, weights, data sets and parameters, and read them: what "
+        "ends in anything but a result or a clear refusal is a finding, and the exit code 1.",
+    )
+    parser.add_argument("--target", type=_names, default=(), metavar="A,B", help="what to fuzz (default: everything)")
+    parser.add_argument("--executions", type=_positive, metavar="N", help="of each target (default: its own number)")
+    parser.add_argument("--seed", type=int, default=0, metavar="S", help="of all mutations (0)")
+    parser.add_argument("--hours", type=float, metavar="T", help="go on with other seeds for so long [h]")
+    parser.add_argument("--output", type=Path, metavar="DIR", help="keep the input of each finding")
+    _add_common(parser)
+    parser.set_defaults(run=_fuzz)
+
+
 def _replay(args: argparse.Namespace) -> int:
     from refu_ros.replay import ReplayOptions, replay
     from refu_ros.tables import replay_table
@@ -358,6 +375,21 @@ def _info(args: argparse.Namespace) -> int:
         print(f"{name:>12}  {value}")
     _write_json(args.json, facts)
     return 0
+
+
+def _fuzz(args: argparse.Namespace) -> int:
+    from refu_ros.fuzz import FuzzOptions, fuzz, fuzz_dict, fuzz_progress, fuzz_table
+
+    for path in (args.json, args.output):
+        _check_writable(path)
+    options = FuzzOptions(
+        targets=args.target, executions=args.executions, seed=args.seed, hours=args.hours, output=args.output
+    )
+    with fuzz_progress(quiet=args.quiet) as report:
+        rows = fuzz(options, report=report)
+    print(fuzz_table(rows))
+    _write_json(args.json, fuzz_dict(rows))
+    return EXIT_CHECK_FAILED if any(row.failures for row in rows) else 0
 
 
 def _check_writable(path: Path | None) -> None:

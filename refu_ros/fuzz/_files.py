@@ -1,0 +1,509 @@
+"""Readers of files: bags, motions, bodies, weights and their cards, data sets, what a training goes on from."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import itertools
+import json
+import os
+import pickle
+import struct
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+import msg_adapters as adapters
+from refu_core import FrameError, load_body, load_garment
+from refu_core.backbones import BasisDecoder, MlpConfig, TailorNetConfig, build_backbone, save_backbone, save_basis
+from refu_core.backbones._files import read_backbone
+from refu_core.repulsion import Refu, read_refu, refu_tensors
+from refu_core.sdf._neural import SDF_PRESETS, SdfNetwork, load_sdf_network, save_sdf_network
+from refu_core.simulation import GarmentDataset, GarmentSequences, load_clips
+from refu_core.simulation._store import FORMAT, SEQUENCES, sample_columns, sequence_columns
+from refu_core.training import TrainingLog, load_checkpoint, save_checkpoint
+from refu_ros.fuzz._containers import (
+    GADGETS,
+    join_mcap,
+    mcap_chunk,
+    mutate_mcap,
+    mutate_npy,
+    mutate_pickle,
+    mutate_zip,
+    pack_zip,
+    split_mcap,
+)
+from refu_ros.fuzz._messages import check_frame, some_frame
+from refu_ros.fuzz._mutate import ODD_VALUES, mutate_bytes, mutate_json, mutate_text
+
+if TYPE_CHECKING:
+    import random
+
+    from numpy.typing import NDArray
+
+_GARMENT = "short-pant-male"
+_MOST_READ = 200
+"""Messages, frames or rows that are read of each file."""
+_YAML_WORDS = [
+    b"\n",
+    b":",
+    b"-",
+    b"&a",
+    b"*a",
+    b"<<:",
+    b"!!python/object:os.system",
+    b"[",
+    b"{",
+    b"mcap",
+    b"0",
+    b"~",
+    b"9" * 99,
+]
+_BOMB_YAML = "\n".join(
+    ["rosbag2_bagfile_information:", "  storage_identifier: mcap", "  a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
+    + [f"  a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]" for i in range(1, 10)]
+    + ["  relative_file_paths: [*a9]"]
+).encode()
+_SIZES: list[Any] = [
+    *ODD_VALUES,
+    10**6,
+    10**9,
+    [10**6],
+    [10**9, 10**9],
+    [1] * 3000,
+    "relu",
+    "rotvec",
+    "distance",
+    -5,
+    [0],
+    1e9,
+]
+
+
+class Bag:
+    """An MCAP file: its topics, its messages, and its frames."""
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / "bag.mcap"
+        self.seeds: list[bytes] = []
+        for compression in ("zstd", "none"):
+            with adapters.BagWriter(self._path, compression=compression, chunk_bytes=900, overwrite=True) as writer:
+                for kind in ("multiarray", "smpl_msgs"):
+                    writer.add_topic(f"/{kind}/smpl_params", adapters.INPUT_TYPES[kind])
+                    for i in range(3):
+                        data = adapters.encoder_for(kind)(some_frame(i))
+                        writer.write(f"/{kind}/smpl_params", data, log_time_ns=1 + i)
+            self.seeds.append(self._path.read_bytes())
+        # Bombs: much of nothing, of records that are too small to be any, and of empty messages; and a claim.
+        first = split_mcap(self.seeds[0])[:1]
+        for records in (bytes(128 << 20), b"\x7f" + bytes(8), struct.pack("<BQ", 5, 22) + bytes(22)):
+            many = records * max(1, (48 << 20) // len(records))
+            self.seeds += [
+                join_mcap([*first, (6, mcap_chunk(many))]),
+                join_mcap([*first, (6, mcap_chunk(records, claimed=1 << 60))]),
+            ]
+
+    def mutate(self, rng: random.Random, data: bytes, other: bytes) -> bytes:
+        """Records, the content of chunks, and bytes."""
+        return mutate_mcap(rng, data, other)
+
+    def execute(self, data: bytes) -> None:
+        """Reads all there is."""
+        self._path.write_bytes(data)
+        with adapters.BagReader(self._path) as reader:
+            for topic in reader.topics[:_MOST_READ]:
+                assert topic.message_count >= 0, "a negative count"
+            for message in itertools.islice(reader.messages(), _MOST_READ):
+                assert 0 <= message.log_time_ns < 2**63, "a time that ROS can't hold"
+        for kind in ("multiarray", "smpl_msgs"):
+            try:
+                bag = adapters.open_smpl_bag(self._path, topic=f"/{kind}/smpl_params")
+            except adapters.AdapterError:
+                continue
+            for record in itertools.islice(bag, _MOST_READ):
+                assert (record.frame is None) != (record.error is None), "a record that is neither frame nor error"
+                if record.frame is not None:
+                    check_frame(record.frame)
+
+
+class BagMetadata:
+    """The metadata.yaml of a rosbag2 directory."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder / "bag"
+        with adapters.BagWriter(self._folder) as writer:
+            writer.add_topic("/smpl_params", adapters.INPUT_TYPES["multiarray"])
+            writer.write("/smpl_params", adapters.encoder_for("multiarray")(some_frame()), log_time_ns=5)
+        self._path = self._folder / "metadata.yaml"
+        merged = _BOMB_YAML.replace(b"[*a9]", b"[x]") + b"\n  z: {<<: [*a8, *a9]}"
+        self.seeds = [self._path.read_bytes(), _BOMB_YAML, merged, b"[" * 20_000, b"a: " * 5000]
+
+    def mutate(self, rng: random.Random, data: bytes, other: bytes) -> bytes:  # noqa: ARG002
+        """Text."""
+        return mutate_text(rng, data, _YAML_WORDS)
+
+    def execute(self, data: bytes) -> None:
+        """Opens the directory."""
+        self._path.write_bytes(data)
+        with adapters.BagReader(self._folder) as reader:
+            assert reader.topics is not None
+
+
+class _Archive:
+    """An `.npz` of some arrays."""
+
+    def __init__(self, folder: Path, arrays: list[dict[str, NDArray[Any]]]) -> None:
+        self._path = folder / "file.npz"
+        self.seeds = [_npz(content) for content in arrays]
+        claims = pack_zip([(f"{name}.npy", _claiming(array)) for name, array in arrays[0].items()])
+        size = struct.pack("<II", 1 << 20, (1 << 32) - 2)
+        self.seeds += [claims, self.seeds[0].replace(self.seeds[0][-60:-52], size)]
+
+    def mutate(self, rng: random.Random, data: bytes, other: bytes) -> bytes:
+        """Members, their headers, and bytes."""
+        return mutate_zip(rng, data, other)
+
+
+class MotionFile(_Archive):
+    """An AMASS-style motion, by both of its readers."""
+
+    def __init__(self, folder: Path) -> None:
+        rng = np.random.default_rng(0)
+        common = {"trans": rng.normal(size=(4, 3)), "betas": rng.normal(size=16), "mocap_framerate": np.array(30.0)}
+        motions = [{"poses": rng.normal(size=(4, width)), **common} for width in (72, 156, 165)]
+        motions.append(
+            {"poses": np.zeros((1, 72), np.float32), "mocap_frame_rate": np.array([30]), "gender": np.array(b"male")}
+        )
+        super().__init__(folder, motions)
+
+    def execute(self, data: bytes) -> None:
+        """Reads the motion, its frames, and resamples it."""
+        self._path.write_bytes(data)
+        try:
+            motion = adapters.read_motion(self._path)
+        except adapters.AdapterError:
+            load_clips(self._path)
+            return
+        for i in range(min(len(motion), _MOST_READ)):
+            with contextlib.suppress(FrameError):  # a frame that isn't finite is refused by itself
+                check_frame(motion.frame(i))
+        if len(motion) / motion.fps < 100:
+            motion.resampled(30.0)
+
+
+class BodyArchive(_Archive):
+    """A body model as `.npz`."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder, [_model(8)])
+
+    def execute(self, data: bytes) -> None:
+        """Loads and poses the body."""
+        self._path.write_bytes(data)
+        _pose_body(self._path)
+
+
+class BodyPickle:
+    """A body model as an official `.pkl`."""
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / "file.pkl"
+        self.seeds = [*(pickle.dumps(_model(6), protocol) for protocol in range(5)), _chumpy_pickle()]
+        self.seeds += [self.seeds[2][:-1] + gadget + b"." for gadget in GADGETS]
+        self.seeds.append(
+            b"(dS'f'\n" + b"cchumpy.ch\nCh\n)\x81q\x01}S'x'\nh\x01sbs."
+        )  # a variable that is its own value
+
+    def mutate(self, rng: random.Random, data: bytes, other: bytes) -> bytes:
+        """Opcodes and bytes."""
+        return mutate_pickle(rng, data, other)
+
+    def execute(self, data: bytes) -> None:
+        """Loads and poses the body."""
+        self._path.write_bytes(data)
+        _pose_body(self._path)
+
+
+class WeightTensors:
+    """The tensors of a backbone, with a card that vouches for them."""
+
+    def __init__(self, folder: Path) -> None:
+        self._stem, self._garment = small_weights(folder / "weights", TailorNetConfig)
+        self._path = Path(f"{self._stem}.safetensors")
+        self._card = json.loads(Path(f"{self._stem}.json").read_text())
+        good = self._path.read_bytes()
+        (length,) = struct.unpack_from("<Q", good)
+        self.seeds = [good, good[: 8 + length], struct.pack("<Q", 2) + b"{}", struct.pack("<Q", 1 << 60) + good[8:]]
+
+    def mutate(self, rng: random.Random, data: bytes, other: bytes) -> bytes:
+        """The header as JSON, or bytes."""
+        length = struct.unpack_from("<Q", data)[0] if len(data) > 8 else 0
+        if rng.random() < 0.6 and length < len(data):
+            header = mutate_json(rng, data[8 : 8 + length])
+            return struct.pack("<Q", len(header)) + header + data[8 + length :]
+        return mutate_bytes(rng, data, other)
+
+    def execute(self, data: bytes) -> None:
+        """Loads the backbone and the layer."""
+        self._path.write_bytes(data)
+        card = self._card | {"sha256": hashlib.sha256(data).hexdigest()}
+        Path(f"{self._stem}.json").write_text(json.dumps(card))
+        read_backbone(self._stem, self._garment, expect={"garment": self._garment.name})
+        read_refu(self._stem)
+
+
+class WeightCard:
+    """The card of a backbone: sizes that nobody can have, above all."""
+
+    def __init__(self, folder: Path) -> None:
+        self._pairs = [small_weights(folder / config.__name__, config) for config in (TailorNetConfig, MlpConfig)]
+        self.seeds = [Path(f"{stem}.json").read_bytes() for stem, _ in self._pairs]
+
+    def mutate(self, rng: random.Random, data: bytes, other: bytes) -> bytes:  # noqa: ARG002
+        """Values of the card."""
+        return mutate_json(rng, data, _SIZES)
+
+    def execute(self, data: bytes) -> None:
+        """Loads the backbone and the layer."""
+        stem, garment = self._pairs[b'"mlp"' in data]
+        Path(f"{stem}.json").write_bytes(data)
+        read_refu(stem)
+        read_backbone(stem, garment, expect={"garment": garment.name})
+
+
+class DistanceCard:
+    """The card of a network for the body's distance."""
+
+    def __init__(self, folder: Path) -> None:
+        self._body = load_body("male")
+        self._stem = folder / "sdf"
+        network = SdfNetwork(SDF_PRESETS["tiny"])
+        save_sdf_network(self._stem, network, {"body_fingerprint": self._body.fingerprint})
+        self.seeds = [Path(f"{self._stem}.json").read_bytes()]
+
+    def mutate(self, rng: random.Random, data: bytes, other: bytes) -> bytes:  # noqa: ARG002
+        """Values of the card."""
+        return mutate_json(rng, data, _SIZES)
+
+    def execute(self, data: bytes) -> None:
+        """Loads the network."""
+        Path(f"{self._stem}.json").write_bytes(data)
+        load_sdf_network(self._stem, self._body)
+
+
+class DataSet:
+    """A data set of samples: its card and its arrays, one of them damaged. The first line says which."""
+
+    kind = FORMAT
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder / "set"
+        self._files = {
+            name: content
+            for name, content in _set_files(self.kind).items()
+            if not name.endswith(("seconds.npy", "speed.npy"))
+        }
+        for name, content in _set_files(self.kind).items():
+            path = self._folder / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(content)
+        self.seeds = [name.encode() + b"\n" + content for name, content in self._files.items()]
+
+    def mutate(self, rng: random.Random, data: bytes, other: bytes) -> bytes:  # noqa: ARG002
+        """The card as JSON, an array by its header and its bytes."""
+        name, _, content = data.partition(b"\n")
+        changed = mutate_json(rng, content, _SIZES) if name.endswith(b".json") else mutate_npy(rng, content)
+        return name + b"\n" + changed
+
+    def execute(self, data: bytes) -> None:
+        """Opens the set and reads all rows, then puts the file right again."""
+        first, _, content = data.partition(b"\n")
+        name = first.decode("utf-8", "replace")
+        if name not in self._files:
+            return
+        path = self._folder / name
+        path.write_bytes(content)
+        try:
+            self._read()
+        finally:
+            path.write_bytes(self._files[name])
+
+    def _read(self) -> None:
+        dataset = GarmentDataset(self._folder)
+        for i in range(min(len(dataset), _MOST_READ)):
+            assert np.isfinite(dataset.sample(i).vertices).all(), "a garment that isn't finite"
+        dataset.column("asked")
+
+
+class SequenceSet(DataSet):
+    """A data set of sequences."""
+
+    kind = SEQUENCES
+
+    def _read(self) -> None:
+        sequences = GarmentSequences(self._folder)
+        for i in range(min(len(sequences), _MOST_READ)):
+            assert np.isfinite(sequences.sequence(i).vertices()).all(), "a garment that isn't finite"
+
+
+class Checkpoint:
+    """What a training goes on from."""
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / "checkpoint.pt"
+        save_checkpoint(self._path, {"identity": "x", "done": ["a"], "stage": None, "model": {"w": torch.ones(3, 2)}})
+        good = self._path.read_bytes()
+        self.seeds = [
+            good,
+            *(pack_zip([("archive/data.pkl", gadget + b"."), ("archive/version", b"3\n")]) for gadget in GADGETS),
+        ]
+
+    def mutate(self, rng: random.Random, data: bytes, other: bytes) -> bytes:
+        """Members of the archive, and bytes."""
+        return mutate_zip(rng, data, other)
+
+    def execute(self, data: bytes) -> None:
+        """Loads it."""
+        self._path.write_bytes(data)
+        load_checkpoint(self._path)
+
+
+class LossLog:
+    """The loss curves of a training that was interrupted."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        log = TrainingLog(folder, name="log", quiet=True)
+        for step in (10, 20):
+            log.check("low", step, train=1.0, validation=2.0)
+        self._path = folder / "log.jsonl"
+        self.seeds = [self._path.read_bytes()]
+
+    def mutate(self, rng: random.Random, data: bytes, other: bytes) -> bytes:
+        """Lines and values."""
+        lines = data.split(b"\n")
+        at = rng.randrange(len(lines))
+        lines[at] = mutate_json(rng, lines[at]) if rng.random() < 0.7 else mutate_bytes(rng, lines[at], other)
+        return b"\n".join(lines)
+
+    def execute(self, data: bytes) -> None:
+        """Goes on with it."""
+        self._path.write_bytes(data)
+        TrainingLog(self._folder, name="log", quiet=True).begin("low", step=15, steps=20)
+
+
+def small_weights(folder: Path, kind: type[TailorNetConfig] | type[MlpConfig]) -> tuple[Path, Any]:
+    """Stem of untrained weights with a ReFU layer, small in all but the number of vertices, and their garment."""
+    garment = load_garment(_GARMENT)
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        basis = BasisDecoder(
+            torch.zeros(garment.n_vertices, 3), torch.linalg.qr(torch.randn(3 * garment.n_vertices, 4)).Q.T
+        )
+        sizes: dict[str, Any] = (
+            {"low": (4,), "high": (4,), "style_shape": (4,)} if kind is TailorNetConfig else {"hidden": (4, 4)}
+        )
+        network = build_backbone(kind((0, 1, 2), **sizes), garment, basis=basis, pivots=torch.randn(2, 14))
+        layer = Refu(garment.n_vertices, least=0.0)
+    folder.mkdir(parents=True, exist_ok=True)
+    card = {"garment": garment.name, "body_fingerprint": load_body(garment.body).fingerprint}
+    save_basis(folder, basis, card)
+    name = "tailornet" if kind is TailorNetConfig else "mlp"
+    stem = folder / f"{name}-hybrid"
+    save_backbone(stem, network, {**card, "refu": layer.config}, others=refu_tensors(layer))
+    return stem, garment
+
+
+def _npz(arrays: dict[str, NDArray[Any]]) -> bytes:
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    return buffer.getvalue()
+
+
+def _npy(array: NDArray[Any]) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, array)
+    return buffer.getvalue()
+
+
+def _claiming(array: NDArray[Any]) -> bytes:
+    """An array file that claims to hold a million times as much as there is."""
+    header = _npy(np.zeros((1, *array.shape[1:]), array.dtype)) if array.ndim else _npy(array)
+    return header.replace(b"(1,", b"(1000000000000,").replace(b", }" + b" " * 12, b", }")
+
+
+def _model(n: int) -> dict[str, NDArray[Any]]:
+    """An SMPL-layout body of `n` vertices."""
+    rng = np.random.default_rng(n)
+    weights = rng.random((n, 24))
+    parents = [2**32 - 1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21]
+    return {
+        "v_template": rng.normal(size=(n, 3)),
+        "f": np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]], np.uint32),
+        "weights": weights / weights.sum(1, keepdims=True),
+        "J_regressor": np.full((24, n), 1 / n),
+        "kintree_table": np.array([parents, range(24)]),
+        "shapedirs": rng.normal(size=(n, 3, 10)),
+        "posedirs": rng.normal(size=(n, 3, 207)),
+    }
+
+
+def _chumpy_pickle() -> bytes:
+    """A pickle as the official files are: text opcodes, chumpy variables, a sparse regressor."""
+    model = _model(6)
+    body = b"(d"
+    for name, array in model.items():
+        value = pickle.dumps(array, 2)[2:-1]
+        if name == "shapedirs":
+            value = b"cchumpy.ch\nCh\n)\x81}S'x'\n" + value + b"sb"
+        elif name == "J_regressor":
+            parts = {"data": array.T.ravel(), "indices": np.tile(np.arange(24), 6), "indptr": np.arange(0, 145, 24)}
+            state = b"".join(
+                b"S'%s'\n" % key.encode() + pickle.dumps(part, 2)[2:-1] + b"s" for key, part in parts.items()
+            )
+            value = b"cscipy.sparse.csc\ncsc_matrix\n)\x81}" + state + b"S'_shape'\n(K\x18K\x06tsb"
+        body += b"S'%s'\n" % name.encode() + value + b"s"
+    return body + b"."
+
+
+def _pose_body(path: Path) -> None:
+    body = load_body(path)
+    assert torch.isfinite(body(np.zeros((1, 24, 3))).vertices).all(), "a body that isn't finite"
+
+
+def _set_files(kind: str) -> dict[str, bytes]:
+    """The files of a data set of three rows."""
+    rows, n, frames = 3, 5, 4
+    is_sequences = kind == SEQUENCES
+    columns = sequence_columns((frames, n, 3)) if is_sequences else sample_columns((n, 3))
+    files = {}
+    for name, (shape, dtype) in columns.items():
+        array = np.zeros((rows, *shape), dtype)
+        if name == "slot":
+            array[:] = np.arange(rows)
+        if name == "state":
+            array[:] = 1
+        files[f"shard-0-of-1/{name}.npy"] = _npy(array)
+    if not is_sequences:
+        files["unseen.npy"] = _npy(np.zeros(rows, np.float32))
+        files["asked.npy"] = _npy(np.zeros((rows, 24, 3), np.float32))
+    card = {
+        "format": kind,
+        "garment": _GARMENT,
+        "body": "male",
+        "body_fingerprint": "0",
+        "quantum_m": 2.0**-14,
+        "plan": {"garment": _GARMENT, "count": rows, "seed": 0, "pivots": 4},
+        "clips": {"train": ["walk"], "test": ["run"]},
+        "settings": asdict(MlpConfig((0,))),
+    }
+    return {"card.json": json.dumps(card).encode(), **files}
+
+
+def working_folder() -> str | None:
+    """Where files that live for a millisecond should lie: in memory where there is such a place."""
+    return "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
