@@ -62,6 +62,7 @@ class EvaluateOptions:
         else:
             parts += [f"--data {' '.join(f'data/{path.resolve().name}' for path in self.data)}"]
             parts += [f"--every {self.every}"] if self.every > 1 else []
+        parts += [f"--weights {path.resolve().name}" for path in self.weights]
         return " ".join(parts)
 
 

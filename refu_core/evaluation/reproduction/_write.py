@@ -56,9 +56,15 @@ GOALS: tuple[Goal, ...] = (
             ),
         )
     ),
-    Goal("comparison", "refu-approx", "cfmp_percent", 90.0),
-    Goal("comparison", "refu-accurate", "vfcp_percent", 0.0),
-    Goal("comparison", "refu-accurate", "cfmp_percent", 99.0),
+    *(Goal("comparison", approx, "cfmp_percent", 90.0) for approx in ("refu-approx", "node-approx")),
+    *(
+        goal
+        for accurate in ("refu-accurate", "node-accurate")
+        for goal in (
+            Goal("comparison", accurate, "vfcp_percent", 0.0),
+            Goal("comparison", accurate, "cfmp_percent", 99.0),
+        )
+    ),
 )
 """What the tables must show, over all garments."""
 
