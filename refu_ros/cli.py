@@ -80,6 +80,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_simulate(commands)
     _add_train(commands)
     _add_evaluate(commands)
+    _add_benchmark(commands)
     _add_info(commands)
     _add_fuzz(commands)
     return parser
@@ -259,6 +260,32 @@ def _add_evaluate(commands: Any) -> None:
     parser.set_defaults(run=_evaluate)
 
 
+def _add_benchmark(commands: Any) -> None:
+    parser = commands.add_parser(
+        "benchmark",
+        help="measure run time against error of every mode and signed distance",
+        description="Measure stages, signed distances, modes, persons, growth, skips, memory and errors side by side "
+        "in one process on one core, and write a page, a JSON file and a plot.",
+    )
+    parser.add_argument("--garments", type=_names, metavar="A,B", help="what is worn, the main one first (all)")
+    parser.add_argument("--motions", type=Path, metavar="DIR", help="folder of AMASS-style .npz files (the bags)")
+    parser.add_argument("--bags", type=Path, default=Path("bags"), metavar="DIR", help="the repository's bags (bags)")
+    parser.add_argument("--rounds", type=_positive, default=5, metavar="N", help="times that all motion is run (5)")
+    parser.add_argument(
+        "--quick", action="store_true", help="a tiny round of one garment, as continuous integration runs it"
+    )
+    parser.add_argument(
+        "--no-skip", action="append", default=[], metavar="NAME", help="compute what would be skipped; may be repeated"
+    )
+    parser.add_argument(
+        "--weights", type=Path, metavar="DIR", help="folder with a folder a garment of one's own weights"
+    )
+    parser.add_argument("--device", metavar="DEVICE", help="cpu, or cuda for both (default: cuda where there is one)")
+    parser.add_argument("--output", type=Path, metavar="DIR", help="where page, data and plot go (docs/results)")
+    _add_common(parser)
+    parser.set_defaults(run=_benchmark)
+
+
 def _add_info(commands: Any) -> None:
     parser = commands.add_parser(
         "info", help="what is installed, built in and usable", description="What is installed."
@@ -364,6 +391,20 @@ def _evaluate(args: argparse.Namespace) -> int:
     tables = evaluate(options, progress=not args.quiet)
     print(results_text(tables, output))
     _write_json(args.json, results_dict(tables))
+    return 0
+
+
+def _benchmark(args: argparse.Namespace) -> int:
+    from refu_ros.benchmark import OUTPUT, BenchmarkOptions, benchmark, benchmark_text, write_results
+
+    given = {key: value for key, value in vars(args).items() if key in BenchmarkOptions.__dataclass_fields__}
+    options = BenchmarkOptions(**{**given, "no_skip": tuple(args.no_skip), "output": args.output or OUTPUT})
+    for path in (args.json, options.output):
+        _check_writable(path)
+    result = benchmark(options, progress=not args.quiet)
+    print(benchmark_text(result))
+    print(f"\nwrote {', '.join(map(str, write_results(result, options.output)))}")
+    _write_json(args.json, result.as_dict())
     return 0
 
 

@@ -1,0 +1,130 @@
+"""Whole frames, from a message's bytes to a message's bytes, as `refu replay` and the node make them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
+from itertools import product
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+import msg_adapters as adapters
+from refu_core import GarmentPipeline, SmplFrame, WeightsError
+from refu_core.garments import GarmentTemplate
+from refu_core.realtime import PipelineOutput
+from refu_ros.benchmark._inputs import Moment
+from refu_ros.benchmark._options import BenchmarkOptions
+from refu_ros.benchmark._skips import SKIPS
+
+BACKBONES = ("tailornet", "skinned")
+"""The default one, and the one that needs no weights."""
+
+
+class Clocked(NamedTuple):
+    """Where the time of one frame went."""
+
+    stage_ms: Mapping[str, float]
+    """Wall time [ms]."""
+    wall_ms: float
+    cpu_ms: float
+
+
+class FrameRunner:
+    """Decodes, dresses and encodes; a frame of several persons is one message a person in, and one out."""
+
+    def __init__(
+        self,
+        dress: Callable[[Sequence[SmplFrame]], Sequence[PipelineOutput]],
+        garments: Mapping[str, GarmentTemplate],
+        *,
+        persons: int = 1,
+    ) -> None:
+        """`dress` gives a pipeline's output for each frame; `garments` are those that it holds."""
+        self._dress = dress
+        self._decode = adapters.decoder_for("multiarray").from_bytes
+        self._persons = range(persons)
+        meshes = [
+            adapters.MarkerMesh(
+                ns=adapters.garment_namespace(name, f"p{person}" if persons > 1 else ""),
+                faces=garment.faces.cpu().numpy(),
+                n_vertices=garment.n_vertices,
+            )
+            for person in self._persons
+            for name, garment in garments.items()
+        ]
+        self._encoder = adapters.MarkerArrayEncoder(meshes)
+        self.clocked: list[Clocked] = []
+        """Of all frames that weren't jumps."""
+
+    @classmethod
+    def of(cls, pipeline: GarmentPipeline, *, persons: int = 1) -> FrameRunner:
+        """Of a pipeline."""
+        return cls(lambda frames: pipeline(frames), pipeline.garments, persons=persons)
+
+    def __call__(self, moments: Moment | Sequence[Moment]) -> bytes:
+        """The message that goes out."""
+        given = [moments] if isinstance(moments, Moment) else moments
+        cpu, laps = time.process_time(), [time.perf_counter()]
+        frames = [self._decode(given[i].raw) for i in self._persons]
+        laps.append(time.perf_counter())
+        outputs = self._dress(frames)
+        laps.append(time.perf_counter())
+        data = self._encoder.encode(
+            [mesh.local for output in outputs for mesh in output.values()],
+            stamp_ns=0,
+            transl=[mesh.transl for output in outputs for mesh in output.values()],
+        )
+        laps.append(time.perf_counter())
+        if not given[0].is_jump:
+            decode, _, encode = 1e3 * np.diff(laps)
+            own = _summed([output.stats.stage_ms for output in outputs])
+            stages = {"decode": float(decode), **own, "encode": float(encode)}
+            self.clocked.append(Clocked(stages, 1e3 * (laps[-1] - laps[0]), 1e3 * (time.process_time() - cpu)))
+        return data
+
+    def stage_times(self) -> dict[str, NDArray[np.float64]]:
+        """Wall times of the stages [ms] of the frames that other processes disturbed least: a quarter of all."""
+        order = np.argsort([c.wall_ms / max(c.cpu_ms, 1e-6) for c in self.clocked], kind="stable")
+        calm = [self.clocked[i].stage_ms for i in order[: max(1, len(order) // 4)]]
+        return {stage: np.array([ms[stage] for ms in calm]) for stage in calm[0]}
+
+
+def _summed(stages: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    return {stage: sum(one[stage] for one in stages) for stage in stages[0]}
+
+
+def load_pipeline(
+    garments: Sequence[str],
+    options: BenchmarkOptions,
+    *,
+    mode: str,
+    backbone: str,
+    device: str = "cpu",
+    no_skip: Collection[str] = (),
+) -> GarmentPipeline:
+    """A pipeline that doesn't skip what the options and `no_skip` say.
+
+    Raises:
+        WeightsError: there are no weights of the backbone for a garment and mode.
+    """
+    unskipped: dict[str, Any] = {"no_skip": {*options.no_skip, *no_skip}} if SKIPS else {}
+    return GarmentPipeline.load(
+        garments, sdf=mode, backbone=backbone, weights=options.weights, device=device, **unskipped
+    )
+
+
+def load_pipelines(
+    garment: str, options: BenchmarkOptions, *, modes: Sequence[str], device: str = "cpu"
+) -> tuple[dict[tuple[str, str], GarmentPipeline], dict[str, str]]:
+    """The pipelines of a garment by (backbone, mode), the default backbone first; and what keeps others away."""
+    pipelines: dict[tuple[str, str], GarmentPipeline] = {}
+    missing: dict[str, str] = {}
+    for backbone, mode in product(BACKBONES, modes):
+        with suppress(WeightsError):
+            pipelines[backbone, mode] = load_pipeline([garment], options, mode=mode, backbone=backbone, device=device)
+            continue
+        missing[f"{garment}: {backbone}, {mode}"] = f"refu train {garment} --backbone {backbone} --mode {mode}"
+    return pipelines, missing

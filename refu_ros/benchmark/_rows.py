@@ -1,0 +1,98 @@
+"""What `refu benchmark` measures, as rows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from refu_core.benchmark import Rates, StageWork, Timing
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """How long one thing took."""
+
+    stage: str
+    """What was measured: `sdf`, `frame`, `frame.<stage>`, `persons`, `growth`, `skip`, `unchanged` or `start`."""
+    mode: str
+    """The pipeline's, or `plain`, `paper` or `other`."""
+    garment: str
+    ms_median: float
+    """The processor's time; on a GPU, and of stages and starts, wall time [ms]."""
+    ratio: float
+    """To refitting a BVH and asking it for all vertices of the garment, measured in turn with it."""
+    ms_q1: float | None = None
+    ms_q3: float | None = None
+    wall_ms_median: float | None = None
+    samples: int = 1
+    device: str = "cpu"
+    method: str | None = None
+    backbone: str | None = None
+    persons: int | None = None
+    vertices: int | None = None
+    skip: str | None = None
+    """What wasn't skipped."""
+    figures: Mapping[str, float] = field(default_factory=dict)
+    """Whatever else belongs to it, by name with unit."""
+
+    @classmethod
+    def of(cls, timing: Timing, plain: Timing, **facts: Any) -> Row:
+        """A row of times, and of those of the plain query that were taken in turn with them."""
+        low, high = timing.quartiles
+        return cls(
+            ms_median=timing.median,
+            ratio=timing.median / plain.median,
+            ms_q1=low,
+            ms_q3=high,
+            wall_ms_median=timing.wall_median,
+            samples=len(timing.ms),
+            **facts,
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, ready for JSON; what doesn't apply is left out."""
+        values = {key: value for key, value in vars(self).items() if value is not None and key != "figures"}
+        return {**values, **self.figures}
+
+
+@dataclass(eq=False)
+class BenchmarkResult:
+    """Everything that tables, plot and JSON need."""
+
+    command: str
+    quick: bool
+    machine: dict[str, Any] = field(default_factory=dict)
+    rates: Rates | None = None
+    rows: list[Row] = field(default_factory=list)
+    work: list[StageWork] = field(default_factory=list)
+    """The least that the stages of the main garment's frame need."""
+    skips: Mapping[str, str] = field(default_factory=dict)
+    """What the pipeline skips, by name."""
+    missing: dict[str, str] = field(default_factory=dict)
+    """What wasn't measured, and what it takes."""
+
+    def of(self, stage: str, **facts: Any) -> list[Row]:
+        """The rows of a stage in which these facts hold."""
+        return [
+            row
+            for row in self.rows
+            if row.stage == stage and all(getattr(row, key) == value for key, value in facts.items())
+        ]
+
+    def as_dict(self) -> dict[str, Any]:
+        """The machine-readable result (`--json`)."""
+        rates = {} if self.rates is None else {key: round(value, 2) for key, value in self.rates._asdict().items()}
+        return {
+            "command": self.command,
+            "quick": self.quick,
+            "machine": {**self.machine, **rates},
+            "rows": [row.as_dict() for row in self.rows],
+            "limits": [
+                {**work._asdict(), "limit_ms": self.rates.limit_ms(work.n_bytes, work.flops)}
+                for work in self.work
+                if self.rates is not None
+            ],
+            "skips": dict(self.skips),
+            "missing": self.missing,
+        }
