@@ -82,12 +82,12 @@ class NodeSettings:
         ("tshirt-male", "short-pant-male"), "Garments that every person wears; all of one body."
     )
     backbone: str = _parameter(
-        "skinned", "What predicts the garment before collisions are handled.", choices=tuple(BACKBONES)
+        "tailornet", "What predicts the garment before collisions are handled.", choices=tuple(BACKBONES)
     )
     weights: str = _parameter(
         "", "Folder with a folder a garment of weights of one's own (refu train); empty for those that ship."
     )
-    sdf: str = _parameter("accurate", "How collisions are found.", choices=SDF_MODES)
+    sdf: str = _parameter("hybrid", "How collisions are found.", choices=SDF_MODES)
     margin: float = _parameter(DEFAULT_MARGIN, "Clearance that is kept from the skin [m].", low=0.0, high=0.05)
     device: str = _parameter("cpu", "Torch device: cpu or cuda.")
     style: tuple[float, ...] = _parameter(
@@ -227,7 +227,8 @@ def _coerce(name: str, value: Any) -> Any:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
+    # ROS's whole numbers have 64 bits; longer ones don't even fit a float.
+    return isinstance(value, float) or (isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**64)
 
 
 def _check(name: str, value: Any, spec: ParameterSpec) -> None:

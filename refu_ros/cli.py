@@ -111,10 +111,10 @@ def _add_replay(commands: Any) -> None:
         help="garments of one body (default: tshirt-male,short-pant-male)",
     )
     parser.add_argument(
-        "--backbone", default="skinned", metavar="NAME", help="skinned (default), tailornet, mlp or gcnn"
+        "--backbone", default="tailornet", metavar="NAME", help="tailornet (default), mlp, gcnn, or skinned: no network"
     )
     parser.add_argument(
-        "--sdf", default="accurate", metavar="MODE", help="accurate (default), hybrid, approx, or none for no ReFU"
+        "--sdf", default="hybrid", metavar="MODE", help="hybrid (default), approx, accurate, or none for no ReFU"
     )
     parser.add_argument(
         "--weights", type=Path, metavar="DIR", help="folder with a folder a garment of weights of one's own"
@@ -270,7 +270,7 @@ def _add_benchmark(commands: Any) -> None:
     parser.add_argument("--garments", type=_names, metavar="A,B", help="what is worn, the main one first (all)")
     parser.add_argument("--motions", type=Path, metavar="DIR", help="folder of AMASS-style .npz files (the bags)")
     parser.add_argument("--bags", type=Path, default=Path("bags"), metavar="DIR", help="the repository's bags (bags)")
-    parser.add_argument("--rounds", type=_positive, default=5, metavar="N", help="times that all motion is run (5)")
+    parser.add_argument("--rounds", type=_positive, default=3, metavar="N", help="times that all motion is run (3)")
     parser.add_argument(
         "--quick", action="store_true", help="a tiny round of one garment, as continuous integration runs it"
     )

@@ -43,8 +43,8 @@ class ReplayOptions:
     input: Path
     garments: tuple[str, ...] = ("tshirt-male", "short-pant-male")
     output: Path | None = None
-    backbone: str = "skinned"
-    sdf: str = "accurate"
+    backbone: str = "tailornet"
+    sdf: str = "hybrid"
     weights: Path | None = None
     margin: float = DEFAULT_MARGIN
     betas: tuple[float, ...] | None = None
