@@ -10,6 +10,7 @@ from refu_core.benchmark._machine import measure_rates as measure_rates
 from refu_core.benchmark._measure import Timing as Timing
 from refu_core.benchmark._measure import measure as measure
 from refu_core.benchmark._measure import one_core as one_core
+from refu_core.benchmark._measure import processor_clock as processor_clock
 from refu_core.benchmark._paper import PaperSettings as PaperSettings
 from refu_core.benchmark._paper import PaperStructure as PaperStructure
 from refu_core.benchmark._sdfs import PLAIN_QUERY as PLAIN_QUERY

@@ -8,6 +8,7 @@ import os
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from time import perf_counter, process_time
 from typing import TypeVar
 
 import numpy as np
@@ -67,6 +68,21 @@ def one_core() -> Iterator[int | None]:
         torch.set_num_threads(threads)
 
 
+@contextlib.contextmanager
+def processor_clock() -> Iterator[None]:
+    """Inside, whatever reads `time.perf_counter` gets the processor's time.
+
+    A pipeline notes its stages by the wall clock, as its user wants to know them. On a machine that others use, too,
+    that says more about the others.
+    """
+    clock = time.perf_counter
+    vars(time)["perf_counter"] = time.process_time
+    try:
+        yield
+    finally:
+        vars(time)["perf_counter"] = clock
+
+
 def measure(
     contenders: Mapping[str, Callable[[Input], object]],
     windows: Sequence[Sequence[Input]],
@@ -109,11 +125,11 @@ def measure(
 def _timed(run: Callable[[Input], object], given: Input, *, on_gpu: bool) -> tuple[float, float]:
     if on_gpu:
         torch.cuda.synchronize()
-    wall, cpu = time.perf_counter(), time.process_time()
+    wall, cpu = perf_counter(), process_time()
     run(given)
     if on_gpu:
         torch.cuda.synchronize()
-    return 1e3 * (time.process_time() - cpu), 1e3 * (time.perf_counter() - wall)
+    return 1e3 * (process_time() - cpu), 1e3 * (perf_counter() - wall)
 
 
 @contextlib.contextmanager

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from itertools import product
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,15 +21,6 @@ from refu_ros.benchmark._skips import SKIPS
 
 BACKBONES = ("tailornet", "skinned")
 """The default one, and the one that needs no weights."""
-
-
-class Clocked(NamedTuple):
-    """Where the time of one frame went."""
-
-    stage_ms: Mapping[str, float]
-    """Wall time [ms]."""
-    wall_ms: float
-    cpu_ms: float
 
 
 class FrameRunner:
@@ -56,8 +47,8 @@ class FrameRunner:
             for name, garment in garments.items()
         ]
         self._encoder = adapters.MarkerArrayEncoder(meshes)
-        self.clocked: list[Clocked] = []
-        """Of all frames that weren't jumps."""
+        self.stages: list[dict[str, float]] = []
+        """What each stage took in each frame that wasn't a jump, by the clock that `time.perf_counter` is [ms]."""
 
     @classmethod
     def of(cls, pipeline: GarmentPipeline, *, persons: int = 1) -> FrameRunner:
@@ -67,7 +58,7 @@ class FrameRunner:
     def __call__(self, moments: Moment | Sequence[Moment]) -> bytes:
         """The message that goes out."""
         given = [moments] if isinstance(moments, Moment) else moments
-        cpu, laps = time.process_time(), [time.perf_counter()]
+        laps = [time.perf_counter()]
         frames = [self._decode(given[i].raw) for i in self._persons]
         laps.append(time.perf_counter())
         outputs = self._dress(frames)
@@ -81,15 +72,12 @@ class FrameRunner:
         if not given[0].is_jump:
             decode, _, encode = 1e3 * np.diff(laps)
             own = _summed([output.stats.stage_ms for output in outputs])
-            stages = {"decode": float(decode), **own, "encode": float(encode)}
-            self.clocked.append(Clocked(stages, 1e3 * (laps[-1] - laps[0]), 1e3 * (time.process_time() - cpu)))
+            self.stages.append({"decode": float(decode), **own, "encode": float(encode)})
         return data
 
     def stage_times(self) -> dict[str, NDArray[np.float64]]:
-        """Wall times of the stages [ms] of the frames that other processes disturbed least: a quarter of all."""
-        order = np.argsort([c.wall_ms / max(c.cpu_ms, 1e-6) for c in self.clocked], kind="stable")
-        calm = [self.clocked[i].stage_ms for i in order[: max(1, len(order) // 4)]]
-        return {stage: np.array([ms[stage] for ms in calm]) for stage in calm[0]}
+        """Times of each stage [ms]."""
+        return {stage: np.array([one[stage] for one in self.stages]) for stage in self.stages[0]}
 
 
 def _summed(stages: Sequence[Mapping[str, float]]) -> dict[str, float]:

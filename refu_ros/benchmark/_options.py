@@ -26,7 +26,7 @@ class BenchmarkOptions:
     """Folder of AMASS-style .npz files; None for the bags."""
     bags: Path = BAGS
     """Folder of the repository's bags."""
-    rounds: int = 5
+    rounds: int = 3
     quick: bool = False
     output: Path = OUTPUT
     weights: Path | None = None

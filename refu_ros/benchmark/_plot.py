@@ -26,6 +26,7 @@ def plot_time_against_error(result: BenchmarkResult, folder: Path) -> Path | Non
         return None
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
     figure = Figure(figsize=(12.6, 4.6), layout="constrained")
     FigureCanvasAgg(figure)
@@ -53,7 +54,10 @@ def plot_time_against_error(result: BenchmarkResult, folder: Path) -> Path | Non
         ax.set(xscale="log", xlabel="a frame [ms]", ylabel=label)
         if name == "vfcp_percent":
             ax.set_yscale("symlog", linthresh=1e-3)
-            ax.set_ylim(bottom=0)
+            ax.set_ylim(bottom=-2e-4, top=2 * ax.get_ylim()[1])
+        ax.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        ax.xaxis.set_major_formatter(FormatStrFormatter("%g"))
+        ax.xaxis.set_minor_formatter(NullFormatter())
         ax.spines[["top", "right"]].set_visible(False)
         ax.grid(alpha=0.25)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False, fontsize=8)

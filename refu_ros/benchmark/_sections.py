@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +19,7 @@ from refu_core.benchmark import (
     Timing,
     least_work,
     measure,
+    processor_clock,
     sdf_methods,
 )
 from refu_core.realtime import FrameStats, GarmentMesh, PipelineOutput
@@ -53,14 +55,15 @@ class Section:
         self, contenders: Mapping[str, Callable[[Any], object]], windows: Sequence[Sequence[Any]], **how: Any
     ) -> dict[str, Timing]:
         """`refu_core.benchmark.measure` with this run's rounds."""
-        return measure(
-            contenders,
-            windows,
-            rounds=self.options.sizes.rounds,
-            on_gpu=self.device == "cuda",
-            progress=self.progress,
-            **how,
-        )
+        with nullcontext() if self.device == "cuda" else processor_clock():
+            return measure(
+                contenders,
+                windows,
+                rounds=self.options.sizes.rounds,
+                on_gpu=self.device == "cuda",
+                progress=self.progress,
+                **how,
+            )
 
     def plain(self) -> Callable[[Moment], object]:
         """The plain query on this section's device."""
@@ -112,9 +115,7 @@ def measure_frames(
     main = next(iter(runners))[0]
     for mode in MAIN_MODES:
         for stage, ms in runners[main, mode].stage_times().items():
-            wall = Timing(ms, ms)
-            against = Timing(plain.wall_ms, plain.wall_ms) if section.device == "cuda" else plain
-            section.add(f"frame.{stage}", mode, wall, against, backbone=main, vertices=n)
+            section.add(f"frame.{stage}", mode, Timing(ms, ms), plain, backbone=main, vertices=n)
 
 
 def measure_persons(section: Section, pipelines: Pipelines) -> None:

@@ -61,9 +61,8 @@ def stages(result: BenchmarkResult) -> Table:
         rows.append((stage, *(f"{value:.2f}" for value in ms), *amounts, away, work[stage].counted))
     header = ("stage", "hybrid ms", "accurate ms", "MB", "MFLOP", "limit ms", "times the limit", "what is counted")
     note = (
-        "Wall time of the frames that were disturbed least. MB and MFLOP are the least that a stage must move and "
-        "compute; the limit is the longer of the two at this machine's measured rates. sdf is taking over the "
-        "pose, refu the distances and the pushes."
+        "MB and MFLOP are the least that a stage must move and compute; the limit is the longer of the two at this "
+        "machine's measured rates. sdf is taking over the pose, refu the distances and the pushes."
     )
     return Table("stages", "Stages of a frame, and the machine's limits", note, header, rows)
 
