@@ -129,10 +129,13 @@ def test_motion_files_replay(motions: list[Path], tmp_path: Path) -> None:
     assert [topic for topic, _, _ in decoded(out)] == ["/smpl_params", "/garments"] * 3
 
 
+@pytest.mark.parametrize("backbone", ["skinned", "tailornet"])
 @pytest.mark.parametrize("garment", BUILTIN_GARMENTS)
-def test_nothing_is_inside_the_body_where_it_does_not_touch_itself(garment: str, motions: list[Path]) -> None:
+def test_nothing_is_inside_the_body_where_it_does_not_touch_itself(
+    garment: str, backbone: str, motions: list[Path]
+) -> None:
     """Judged by libigl's signed distance, on frames of every motion and shipped bag."""
-    pipeline = GarmentPipeline.load([garment])
+    pipeline = GarmentPipeline.load([garment], sdf="accurate", backbone=backbone)
     faces = pipeline.body.faces.numpy().astype(np.int64)
     detector = SelfContactDetector(faces, load_body(pipeline.body.name)(np.zeros((1, 72))).vertices[0].numpy())
     checked = 0
