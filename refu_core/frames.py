@@ -15,10 +15,17 @@ if TYPE_CHECKING:
 N_JOINTS = 24
 N_BETAS = 10
 N_STYLES = 4
+MAX_ANGLE = 1e4
+"""Rotation vectors have components up to this [rad]; in float32 larger ones no longer say which way a limb points."""
+MAX_COEFFICIENT = 100.0
+"""β and γ have components up to this: at 20 standard deviations no body is one, at 10,000 it is 500 m long, and a
+signed distance that looks around it centimetre by centimetre would never end."""
 
 
-def _array(name: str, value: Any, shape: tuple[int, ...], dtype: type[np.floating[Any]]) -> NDArray[Any]:
-    """`value` as a read-only, finite array; accepts any layout with the right number of elements."""
+def _array(
+    name: str, value: Any, shape: tuple[int, ...], dtype: type[np.floating[Any]], limit: float = np.inf
+) -> NDArray[Any]:
+    """`value` as a read-only array of numbers up to `limit`; accepts any layout with the right number of elements."""
     try:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -36,6 +43,10 @@ def _array(name: str, value: Any, shape: tuple[int, ...], dtype: type[np.floatin
     if not np.isfinite(array).all():
         msg = f"{name} has values beyond the range of {np.dtype(dtype)}"
         raise FrameError(msg)
+    largest = float(np.abs(array).max())
+    if largest > limit:
+        msg = f"{name} has magnitudes up to {largest:g}, wanted {limit:g} at most"
+        raise FrameError(msg)
     array.setflags(write=False)
     return array
 
@@ -44,7 +55,7 @@ def _array(name: str, value: Any, shape: tuple[int, ...], dtype: type[np.floatin
 class SmplFrame:
     """Parameters of one SMPL body at one time; validated, immutable, in SMPL axes (y up, z forward, left = +x).
 
-    Raises `FrameError` when an array has a wrong number of elements or isn't finite.
+    Raises `FrameError` when an array has a wrong number of elements, isn't finite, or is beyond all bodies.
     """
 
     pose: NDArray[np.float32]
@@ -60,9 +71,9 @@ class SmplFrame:
 
     def __post_init__(self) -> None:
         # A frozen dataclass is normalised through object.__setattr__, once, here.
-        object.__setattr__(self, "pose", _array("pose", self.pose, (N_JOINTS, 3), np.float32))
-        object.__setattr__(self, "betas", _array("betas", self.betas, (N_BETAS,), np.float32))
+        object.__setattr__(self, "pose", _array("pose", self.pose, (N_JOINTS, 3), np.float32, MAX_ANGLE))
+        object.__setattr__(self, "betas", _array("betas", self.betas, (N_BETAS,), np.float32, MAX_COEFFICIENT))
         object.__setattr__(self, "transl", _array("transl", self.transl, (3,), np.float64))
         if self.style is not None:
-            object.__setattr__(self, "style", _array("style", self.style, (N_STYLES,), np.float32))
+            object.__setattr__(self, "style", _array("style", self.style, (N_STYLES,), np.float32, MAX_COEFFICIENT))
         object.__setattr__(self, "stamp_ns", int(self.stamp_ns))

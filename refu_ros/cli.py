@@ -81,6 +81,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_train(commands)
     _add_evaluate(commands)
     _add_benchmark(commands)
+    _add_stress(commands)
     _add_info(commands)
     _add_fuzz(commands)
     return parser
@@ -286,6 +287,48 @@ def _add_benchmark(commands: Any) -> None:
     parser.set_defaults(run=_benchmark)
 
 
+def _add_stress(commands: Any) -> None:
+    parser = commands.add_parser(
+        "stress",
+        help="try to break the pipeline: numbers, guarantees, invariance, endurance",
+        description="Run random and adversarial frames through the pipeline and hold the results against float64 and "
+        "against what is promised; the worst trial of each check is kept as a file. Exits with 1 where one failed.",
+    )
+    parser.add_argument(
+        "--parts",
+        type=_names,
+        default=("numbers", "guarantees", "invariance", "soak"),
+        metavar="A,B",
+        help="numbers, guarantees, invariance, soak (default: all)",
+    )
+    parser.add_argument(
+        "--garments",
+        type=_names,
+        default=("shirt-male", "tshirt-male", "short-pant-male", "skirt-female"),
+        metavar="A,B",
+        help="garments of any body (default: all four)",
+    )
+    parser.add_argument("--backbone", metavar="NAME", help="one mode (default: skinned accurate and tailornet hybrid)")
+    parser.add_argument("--sdf", metavar="MODE", help="accurate, hybrid, approx or none, with --backbone")
+    parser.add_argument(
+        "--weights", type=Path, metavar="DIR", help="folder with a folder a garment of weights of one's own"
+    )
+    length = parser.add_mutually_exclusive_group()
+    length.add_argument("--quick", action="store_true", help="each check once: for CI")
+    length.add_argument("--hours", type=float, metavar="H", help="go on for so long (default: some minutes)")
+    parser.add_argument("--frames", type=_positive, metavar="N", help="frames of each soak (3000)")
+    parser.add_argument("--seed", type=int, default=0, metavar="S", help="of everything that is drawn (0)")
+    parser.add_argument(
+        "--output", type=Path, default=Path("stress"), metavar="DIR", help="where the worst trials go (stress)"
+    )
+    parser.add_argument("--replay", type=Path, metavar="FILE", help="try one of them again, and nothing else")
+    parser.add_argument(
+        "--node", action="store_true", help="instead, the live node at 30 Hz, recording to OUTPUT/node (needs rclpy)"
+    )
+    _add_common(parser)
+    parser.set_defaults(run=_stress)
+
+
 def _add_info(commands: Any) -> None:
     parser = commands.add_parser(
         "info", help="what is installed, built in and usable", description="What is installed."
@@ -416,6 +459,27 @@ def _info(args: argparse.Namespace) -> int:
         print(f"{name:>12}  {value}")
     _write_json(args.json, facts)
     return 0
+
+
+def _stress(args: argparse.Namespace) -> int:
+    from refu_ros.stress import StressOptions, replay_worst, run_stress, stress_table
+
+    for path in (args.json, args.output):
+        _check_writable(path)
+    options = StressOptions(
+        **{key: value for key, value in vars(args).items() if key in StressOptions.__dataclass_fields__}
+    )
+    if args.node:
+        from refu_ros.stress_node import node_options, node_table, soak_node
+
+        soak = soak_node(args.output / "node", **node_options(options), progress=not args.quiet)
+        print(node_table(soak))
+        _write_json(args.json, soak.as_dict())
+        return EXIT_CHECK_FAILED if soak.failures else 0
+    result = run_stress(options, progress=not args.quiet) if args.replay is None else replay_worst(args.replay, options)
+    print(stress_table(result))
+    _write_json(args.json, result.as_dict())
+    return EXIT_CHECK_FAILED if result.failures else 0
 
 
 def _fuzz(args: argparse.Namespace) -> int:

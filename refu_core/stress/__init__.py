@@ -1,0 +1,30 @@
+"""Numerical stability, measured: everyday and hostile frames, what collision handling promises, and endurance."""
+
+from refu_core.stress._frames import FRAMES as FRAMES
+from refu_core.stress._frames import everyday as everyday
+from refu_core.stress._guarantees import guarantee_checks as guarantee_checks
+from refu_core.stress._invariance import invariance_checks as invariance_checks
+from refu_core.stress._invariance import mirror_image as mirror_image
+from refu_core.stress._numbers import numbers_checks as numbers_checks
+from refu_core.stress._run import PARTS as PARTS
+from refu_core.stress._run import Plan as Plan
+from refu_core.stress._run import all_checks as all_checks
+from refu_core.stress._run import replay_trial as replay_trial
+from refu_core.stress._run import run_checks as run_checks
+from refu_core.stress._run import save_worst as save_worst
+from refu_core.stress._soak import SoakResult as SoakResult
+from refu_core.stress._soak import resident_mb as resident_mb
+from refu_core.stress._soak import soak as soak
+from refu_core.stress._soak import soak_frames as soak_frames
+from refu_core.stress._subject import Reference as Reference
+from refu_core.stress._subject import Subject as Subject
+from refu_core.stress._subject import Wardrobe as Wardrobe
+from refu_core.stress._subject import distance_to_mesh as distance_to_mesh
+from refu_core.stress._subject import wardrobes as wardrobes
+from refu_core.stress._trial import Check as Check
+from refu_core.stress._trial import Measurement as Measurement
+from refu_core.stress._trial import StressError as StressError
+from refu_core.stress._trial import Tally as Tally
+from refu_core.stress._trial import Trial as Trial
+from refu_core.stress._trial import load_trial as load_trial
+from refu_core.stress._trial import save_trial as save_trial

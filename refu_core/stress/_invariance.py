@@ -1,0 +1,141 @@
+"""Invariance: where the person stands, which way they face, who else is dressed and what came before."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from refu_core.body import JOINT_NAMES
+from refu_core.frames import N_BETAS, SmplFrame
+from refu_core.stress._frames import FRAMES, everyday, everyday_pose
+from refu_core.stress._subject import distance_to_mesh
+from refu_core.stress._trial import Check, Measurement, Trial
+
+if TYPE_CHECKING:
+    from refu_core.stress._subject import Subject
+
+RIGID = 1e-4
+"""How closely a garment follows the person [m]."""
+_FAR = 1e5  # [m]
+_BATCH = 64
+_MIRROR_POINTS = 32
+ASYMMETRY = 4e-3
+"""What collision handling may add to the asymmetry of body, garment and backbone [m]: as much as the margin."""
+_OTHER_SIDE = {"left": "right", "right": "left"}
+
+
+def invariance_checks() -> list[Check]:
+    """What must not matter."""
+    return [
+        Check(name="invariance: the person turned", draw=_calm, measure=turned, trials=2),
+        Check(name="invariance: the person 100 km away", draw=_calm, measure=moved, trials=2),
+        Check(name="invariance: left and right exchanged", draw=_calm, measure=mirrored),
+        Check(name="invariance: what came before", draw=_teleport, measure=history),
+        Check(name="invariance: a batch of 64", draw=_crowd, measure=batch),
+    ]
+
+
+def _calm(rng: np.random.Generator) -> Trial:
+    frame = SmplFrame(pose=0.6 * everyday_pose(rng), betas=rng.normal(0, 1, N_BETAS))
+    return Trial((frame,), int(rng.integers(2**31)))
+
+
+def _teleport(rng: np.random.Generator) -> Trial:
+    """Frames of which each is far from the last one."""
+    names = ("everyday", "any rotation of any joint", "limbs through the trunk", "betas of 5", "angles beyond a turn")
+    return Trial((*(FRAMES[name](rng) for name in rng.permutation(names)), everyday(rng)))
+
+
+def _crowd(rng: np.random.Generator) -> Trial:
+    return Trial(tuple(_calm(rng).frames[0] for _ in range(_BATCH)))
+
+
+def turned(subject: Subject, trial: Trial) -> Measurement:
+    """The garment of a turned person against the turned garment.
+
+    Networks feel gravity, so that with them the person turns about the vertical; a skinned garment turns any way.
+    """
+    rng, frame = np.random.default_rng(trial.seed), trial.frames[0]
+    is_skinned = subject.wardrobe.backbone == "skinned"
+    turn = Rotation.random(random_state=rng) if is_skinned else Rotation.from_euler("y", rng.uniform(-np.pi, np.pi))
+    pose = np.array(frame.pose, np.float64)
+    pose[0] = (turn * Rotation.from_rotvec(pose[0])).as_rotvec()
+    here, there = subject.pipeline(frame), subject.pipeline(SmplFrame(pose=pose, betas=frame.betas))
+    root = subject.pipeline.body.rest_joints(torch.tensor(frame.betas)[None])[0, 0].double().numpy()
+    deviation = max(_farthest(turn.apply(mesh.local - root) + root, there[name].local) for name, mesh in here.items())
+    return Measurement(runs=2, deviation=deviation, limit=RIGID)
+
+
+def moved(subject: Subject, trial: Trial) -> Measurement:
+    """The garment of a person 100 km away against that of one at the origin."""
+    rng, frame = np.random.default_rng(trial.seed), trial.frames[0]
+    transl = _FAR * rng.uniform(-1, 1, 3)
+    here, there = subject.pipeline(frame), subject.pipeline(SmplFrame(frame.pose, betas=frame.betas, transl=transl))
+    deviation = max(_farthest(mesh.vertices, there[name].vertices - transl) for name, mesh in here.items())
+    return Measurement(runs=2, deviation=deviation, limit=RIGID)
+
+
+def mirrored(subject: Subject, trial: Trial) -> Measurement:
+    """The garment of the mirror image against the garment's mirror image, surface to surface.
+
+    Meshes and networks aren't quite symmetric; so the limit is what the garment is off before collisions are handled,
+    and what handling them may add.
+    """
+    rng, frame = np.random.default_rng(trial.seed), trial.frames[0]
+    here, there = subject.pipeline(frame), subject.pipeline(mirror_image(frame))
+    deviation, own = 0.0, 0.0
+    for name, mesh in here.items():
+        rows = rng.integers(len(mesh.local), size=_MIRROR_POINTS)
+        other = there[name]
+        after, before = (
+            distance_to_mesh(mine[rows] * (-1, 1, 1), theirs, mesh.faces).max()
+            for mine, theirs in ((mesh.local, other.local), (mesh.raw, other.raw))
+        )
+        deviation, own = max(deviation, float(after)), max(own, float(before))
+    return Measurement(runs=2, deviation=deviation, limit=own + ASYMMETRY)
+
+
+def mirror_image(frame: SmplFrame) -> SmplFrame:
+    """The frame in a mirror at x = 0: left and right joints exchanged, rotations turned the other way."""
+    others = []
+    for name in JOINT_NAMES:
+        side, _, rest = name.partition("_")
+        others.append(JOINT_NAMES.index(f"{_OTHER_SIDE[side]}_{rest}" if side in _OTHER_SIDE else name))
+    return SmplFrame(
+        pose=frame.pose[others] * np.array((1, -1, -1), np.float32),
+        betas=frame.betas,
+        transl=frame.transl * (-1, 1, 1),
+        style=frame.style,
+    )
+
+
+def history(subject: Subject, trial: Trial) -> Measurement:
+    """A frame after others, each far from the last, against the same frame after itself: not a bit may differ."""
+    for frame in trial.frames[:-1]:
+        subject.pipeline(frame)
+    last = trial.frames[-1]
+    after, again = subject.pipeline(last), subject.pipeline(last)
+    alone = subject.load()(last)  # a pipeline's first frame
+    deviation = max(
+        _farthest(mesh.local, other[name].local) for other in (again, alone) for name, mesh in after.items()
+    )
+    return Measurement(runs=len(trial.frames) + 2, deviation=deviation, limit=1e-6)
+
+
+def batch(subject: Subject, trial: Trial) -> Measurement:
+    """Persons dressed together against the same persons one by one."""
+    together = subject.pipeline(trial.frames)
+    some = np.random.default_rng(0).choice(len(trial.frames), 8, replace=False)
+    deviation = 0.0
+    for i in some:
+        alone = subject.pipeline(trial.frames[i])
+        deviation = max(deviation, *(_farthest(mesh.local, alone[name].local) for name, mesh in together[i].items()))
+    return Measurement(runs=len(trial.frames) + len(some), deviation=deviation, limit=RIGID)
+
+
+def _farthest(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
+    return float(np.linalg.norm(a - b, axis=1).max())

@@ -1,0 +1,194 @@
+"""The pipeline under test, and all that its results are held against."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from refu_core.backbones import load_backbone
+from refu_core.errors import RefuError
+from refu_core.evaluation import CollisionChecker, SelfContactDetector
+from refu_core.frames import N_STYLES, SmplFrame
+from refu_core.garments import BUILTIN_GARMENTS, load_garment
+from refu_core.realtime import GarmentPipeline
+from refu_core.repulsion import Limbs
+from refu_core.sdf import ApproxSdf, BandSdf, BodySdf, ExactSdf
+from refu_core.weights import shipped_weights
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wardrobe:
+    """Garments of one body, and how they are predicted."""
+
+    garments: tuple[str, ...]
+    backbone: str = "skinned"
+    sdf: str = "accurate"
+
+    @property
+    def mode(self) -> str:
+        """`<backbone>/<sdf>`."""
+        return f"{self.backbone}/{self.sdf}"
+
+
+def wardrobes(
+    garments: Sequence[str], *, backbone: str, sdf: str, weights: Path | None = None
+) -> tuple[list[Wardrobe], list[str]]:
+    """One wardrobe a body, of those `garments` that there are weights for, and the names of the others.
+
+    Raises:
+        GarmentError: a garment that there isn't.
+    """
+    worn: dict[str, list[str]] = {}
+    left_out = []
+    for name in dict.fromkeys(garments):
+        body = load_garment(name).body
+        if backbone == "skinned" or (_folder(name, weights) / f"{backbone}-{sdf}.safetensors").exists():
+            worn.setdefault(body, []).append(name)
+        else:
+            left_out.append(name)
+    return [Wardrobe(garments=tuple(names), backbone=backbone, sdf=sdf) for names in worn.values()], left_out
+
+
+def _folder(garment: str, weights: Path | None) -> Path:
+    return shipped_weights(garment) if weights is None else weights / garment
+
+
+class Subject:
+    """One wardrobe's pipeline and its references, each made when it is first asked for."""
+
+    def __init__(self, wardrobe: Wardrobe, *, weights: Path | None = None) -> None:
+        """Loads the pipeline; raises as `GarmentPipeline.load`."""
+        unknown = [name for name in wardrobe.garments if name not in BUILTIN_GARMENTS]
+        if unknown:
+            msg = f"no garment {unknown[0]!r}: wanted {', '.join(BUILTIN_GARMENTS)}"
+            raise RefuError(msg)
+        self.wardrobe = wardrobe
+        self._weights = weights
+        self.pipeline = self.load()
+
+    def load(self) -> GarmentPipeline:
+        """A pipeline that has never seen a frame."""
+        return GarmentPipeline.load(
+            self.wardrobe.garments, backbone=self.wardrobe.backbone, sdf=self.wardrobe.sdf, weights=self._weights
+        )
+
+    @cached_property
+    def checker(self) -> CollisionChecker:
+        """Exact collisions, by winding number."""
+        return CollisionChecker(self.pipeline.body.faces)
+
+    @cached_property
+    def contacts(self) -> SelfContactDetector:
+        """Where the body touches itself."""
+        return SelfContactDetector(self.pipeline.body.faces, self.pipeline.body.v_template)
+
+    @cached_property
+    def distances(self) -> dict[str, BodySdf]:
+        """The exact signed distance by tree and by cells, and the approximate one."""
+        body = self.pipeline.body
+        return {"exact": ExactSdf(body.faces), "band": BandSdf(body.faces), "approx": ApproxSdf(body)}
+
+    @cached_property
+    def limbs(self) -> dict[str, Limbs]:
+        """Which limbs each garment's vertices lie on, by garment."""
+        body = self.pipeline.body
+        rest = ExactSdf(body.faces)
+        rest.update(body.v_template)
+        return {
+            name: Limbs.of(
+                body.weights,
+                body.faces,
+                garment.weights,
+                garment.faces,
+                clearance=rest.query(garment.v_template).distance,
+            )
+            for name, garment in self.pipeline.garments.items()
+        }
+
+    @cached_property
+    def reference(self) -> Reference:
+        """The same in float64."""
+        return Reference(self.pipeline, self.wardrobe, weights=self._weights)
+
+
+class Reference:
+    """Body, backbone and posed garment in float64, from the same parameters: what float32 is held against."""
+
+    def __init__(self, pipeline: GarmentPipeline, wardrobe: Wardrobe, *, weights: Path | None = None) -> None:
+        """Of the bodies and garments of `pipeline`, with networks of its own."""
+        self._body = pipeline.body.to(dtype=torch.float64)
+        self._garments = {name: garment.to(dtype=torch.float64) for name, garment in pipeline.garments.items()}
+        self._backbones = {}
+        for name, garment in pipeline.garments.items():
+            network = load_backbone(
+                wardrobe.backbone, garment, mode=wardrobe.sdf, folder=_folder(name, weights), device="cpu"
+            )
+            is_module = isinstance(network, torch.nn.Module)
+            self._backbones[name] = copy.deepcopy(network).double() if is_module else network
+
+    @torch.no_grad()
+    def __call__(self, frames: Sequence[SmplFrame]) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]]]:
+        """Bodies [m], shape (B, V, 3), and garments before collision handling by name, (B, N, 3), of B frames."""
+        pose, betas = (
+            torch.as_tensor(np.stack([getattr(frame, key) for frame in frames]).astype(np.float64))
+            for key in ("pose", "betas")
+        )
+        style = None
+        if any(frame.style is not None for frame in frames):
+            own = [np.zeros(N_STYLES) if frame.style is None else frame.style for frame in frames]
+            style = torch.as_tensor(np.stack(own).astype(np.float64))
+        posed = self._body(pose, betas)
+        garments = {}
+        for name, garment in self._garments.items():
+            unposed = garment.rest(betas, style)
+            displacement = self._backbones[name](betas, pose, style).displacement
+            if displacement is not None:
+                unposed = unposed + displacement
+            garments[name] = garment.pose(unposed, posed.transforms).numpy()
+        return posed.vertices.numpy(), garments
+
+
+def distance_to_mesh(
+    points: NDArray[np.floating], vertices: NDArray[np.floating], faces: NDArray[np.integer]
+) -> NDArray[np.float64]:
+    """Distance of `points` [m], shape (N, 3), to a mesh, shape (N,): every triangle is asked, in float64.
+
+    A triangle without area is its edges.
+    """
+    corners = torch.as_tensor(np.asarray(vertices, np.float64)[faces])
+    best = []
+    for chunk in torch.as_tensor(np.asarray(points, np.float64)).split(16):  # bounds the memory: N × F × 3 numbers
+        squared = torch.full((len(chunk),), torch.inf, dtype=torch.float64)
+        for k in range(3):
+            squared = torch.minimum(squared, _to_segments(chunk, corners[:, k], corners[:, (k + 1) % 3]))
+        best.append(torch.minimum(squared, _to_planes(chunk, corners)).sqrt())
+    return torch.cat(best).numpy() if best else np.zeros(0)
+
+
+def _to_segments(points: torch.Tensor, start: torch.Tensor, end: torch.Tensor) -> torch.Tensor:
+    """Squared distance of each point (N, 3) to the closest of F segments."""
+    along = end - start
+    length2 = along.square().sum(-1)
+    away = points[:, None] - start
+    t = ((away * along).sum(-1) / length2.clamp_min(1e-300)).clamp(0, 1)
+    return (away - t[..., None] * along).square().sum(-1).amin(1)
+
+
+def _to_planes(points: torch.Tensor, corners: torch.Tensor) -> torch.Tensor:
+    """Squared distance of each point (N, 3) to the closest of F triangles (F, 3, 3) that it is straight above."""
+    a, b, c = corners.unbind(1)
+    normal = torch.linalg.cross(b - a, c - a)
+    area = torch.linalg.vector_norm(normal, dim=-1)
+    unit = normal / area.clamp_min(1e-300)[:, None]
+    above = torch.ones(len(points), len(a), dtype=torch.bool)
+    for p, q in ((a, b), (b, c), (c, a)):
+        above &= ((points[:, None] - p) * torch.linalg.cross(unit, q - p)).sum(-1) >= 0
+    height2 = ((points[:, None] - a) * unit).sum(-1).square()
+    return torch.where(above & (area > 0), height2, torch.inf).amin(1)
