@@ -2,9 +2,10 @@
 
     python benchmarks/node.py                              # one person, T-shirt and short pant at 30 Hz, 60 s
     python benchmarks/node.py --persons 4 --rate 10        # four persons, two garments each
+    python benchmarks/node.py --nobody                     # nobody listens: what the node costs then
 
-Prints how many frames came out, latencies from the sender's stamp to the subscriber, whether they grow, and how long
-the node takes to answer parameter changes meanwhile. Needs rclpy (extra `ros`).
+Prints how many frames came out, latencies from the sender's stamp to the subscriber, whether they grow, how long the
+node takes to answer parameter changes meanwhile, and its share of a core. Needs rclpy (extra `ros`).
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import os
 import subprocess
 import sys
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -104,7 +106,25 @@ def receive(options: argparse.Namespace) -> dict[str, Any]:
     return {"got": got, "not_finite": bad}
 
 
-def operate(options: argparse.Namespace, sender: subprocess.Popen[bytes]) -> dict[str, Any]:
+def processor_seconds(process: subprocess.Popen[bytes]) -> float:
+    """What a process has used of a core so far [s] (Linux)."""
+    fields = Path(f"/proc/{process.pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")  # in the kernel and out of it
+
+
+def wait(options: argparse.Namespace, sender: subprocess.Popen[bytes], node: subprocess.Popen[bytes]) -> dict[str, Any]:
+    """The node's share of a core in a third of the time that frames are sent."""
+    time.sleep(options.seconds / 3 + 10.0)  # until everything has started and found each other
+    used, start = processor_seconds(node), time.monotonic()
+    time.sleep(options.seconds / 3)
+    share = 100 * (processor_seconds(node) - used) / (time.monotonic() - start)
+    sender.wait()
+    return {"core_percent": round(share, 2)}
+
+
+def operate(
+    options: argparse.Namespace, sender: subprocess.Popen[bytes], of_node: subprocess.Popen[bytes]
+) -> dict[str, Any]:
     """Changes parameters while frames flow, and keeps the node's last word about itself."""
     import rclpy
     from diagnostic_msgs.msg import DiagnosticArray
@@ -124,6 +144,7 @@ def operate(options: argparse.Namespace, sender: subprocess.Popen[bytes]) -> dic
     client = node.create_client(SetParameters, "garment_node/set_parameters")
     client.wait_for_service(timeout_sec=60.0)
     answers, i = [], 0
+    used, began = processor_seconds(of_node), time.monotonic()
     while sender.poll() is None:
         end = time.monotonic() + 1.0
         while time.monotonic() < end:
@@ -136,7 +157,13 @@ def operate(options: argparse.Namespace, sender: subprocess.Popen[bytes]) -> dic
         start = time.perf_counter()
         rclpy.spin_until_future_complete(node, client.call_async(request), timeout_sec=5.0)
         answers.append(1e3 * (time.perf_counter() - start))
-    return {"parameter_ms": percentiles(answers), "parameter_max_ms": max(answers), "diagnostics": statuses}
+    share = 100 * (processor_seconds(of_node) - used) / (time.monotonic() - began)
+    return {
+        "parameter_ms": percentiles(answers),
+        "parameter_max_ms": max(answers),
+        "core_percent": round(share, 1),
+        "diagnostics": statuses,
+    }
 
 
 def percentiles(values: list[float]) -> dict[str, float]:
@@ -170,6 +197,7 @@ def main() -> None:
     parser.add_argument(
         "--reload", action="store_true", help="change a parameter that loads another pipeline each time"
     )
+    parser.add_argument("--nobody", action="store_true", help="leave out the subscriber, and changes of parameters")
     parser.add_argument("--role", choices=("send", "receive"), help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.role:
@@ -192,10 +220,13 @@ def main() -> None:
         f"--seconds={options.seconds}",
     ]
     try:
-        receiver = subprocess.Popen([*same, "--role=receive"], stdout=subprocess.PIPE)
+        receiver = None if options.nobody else subprocess.Popen([*same, "--role=receive"], stdout=subprocess.PIPE)
         sender = subprocess.Popen([*same, "--role=send"], stdout=subprocess.PIPE)
-        operated = operate(options, sender)
+        operated = wait(options, sender, node) if options.nobody else operate(options, sender, node)
         sent = json.loads(sender.communicate()[0])["sent"]
+        if receiver is None:
+            print(json.dumps({"sent": sum(map(len, sent.values())), **operated}, indent=2))
+            return
         received = json.loads(receiver.communicate()[0])
     finally:
         node.terminate()
