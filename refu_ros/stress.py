@@ -85,7 +85,7 @@ class StressResult:
     def as_dict(self) -> dict[str, Any]:
         """Ready for JSON."""
         return {
-            "rows": [row.as_dict() for row in (*self.tallies, *self.soaks)],
+            "rows": [*(tally.as_dict() for tally in self.tallies), *(soak.as_dict() for soak in self.soaks)],
             "left_out": self.left_out,
             "failures": self.failures,
         }

@@ -13,7 +13,7 @@ from refu_core.body import JOINT_NAMES
 from refu_core.frames import N_BETAS, N_JOINTS, N_STYLES, SmplFrame
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
 
 Draw = Callable[[np.random.Generator], SmplFrame]
 
@@ -31,6 +31,22 @@ _LIMBS = tuple(JOINT_NAMES.index(f"{side}_{joint}") for side in ("left", "right"
 _SERIES_SWITCH = 1e-2  # [rad]; where Rodrigues' formula goes over to its series
 
 
+def frame_of(
+    pose: ArrayLike,
+    *,
+    betas: ArrayLike | None = None,
+    transl: ArrayLike | None = None,
+    style: ArrayLike | None = None,
+) -> SmplFrame:
+    """A frame of numbers of any kind; raises `FrameError` as `SmplFrame`."""
+    return SmplFrame(
+        pose=np.asarray(pose, np.float32),
+        betas=np.zeros(N_BETAS, np.float32) if betas is None else np.asarray(betas, np.float32),
+        transl=np.zeros(3) if transl is None else np.asarray(transl, np.float64),
+        style=None if style is None else np.asarray(style, np.float32),
+    )
+
+
 def everyday_pose(rng: np.random.Generator) -> NDArray[np.float64]:
     """Arms half lowered, all joints a little off that [rad], shape (24, 3)."""
     spread = np.array([_SPREAD.get(name.split("_")[-1], 0.0) for name in JOINT_NAMES])
@@ -41,8 +57,8 @@ def everyday_pose(rng: np.random.Generator) -> NDArray[np.float64]:
 
 def everyday(rng: np.random.Generator) -> SmplFrame:
     """A person of any shape in an everyday pose, somewhere in a room; every other one with a style of their own."""
-    return SmplFrame(
-        pose=everyday_pose(rng),
+    return frame_of(
+        everyday_pose(rng),
         betas=rng.normal(0, 1, N_BETAS),
         transl=rng.normal(0, 3, 3),
         style=rng.normal(0, 1, N_STYLES) if rng.random() < 0.5 else None,
@@ -61,7 +77,7 @@ def _one_of(*lengths: float, jitter: float = 0.0) -> Draw:
 
     def draw(rng: np.random.Generator) -> SmplFrame:
         angles = rng.choice(lengths, N_JOINTS) + jitter * rng.normal(size=N_JOINTS)
-        return SmplFrame(pose=_directions(rng, angles), betas=rng.normal(0, 1, N_BETAS))
+        return frame_of(_directions(rng, angles), betas=rng.normal(0, 1, N_BETAS))
 
     return draw
 
@@ -71,26 +87,26 @@ def _wrapped(rng: np.random.Generator) -> SmplFrame:
     pose = everyday_pose(rng)
     angle = np.maximum(np.linalg.norm(pose, axis=1, keepdims=True), 1e-6)
     turns = rng.choice((-1, 0, 1), (N_JOINTS, 1))
-    return SmplFrame(pose=pose * (1 + 2 * np.pi * turns / angle), betas=rng.normal(0, 1, N_BETAS))
+    return frame_of(pose * (1 + 2 * np.pi * turns / angle), betas=rng.normal(0, 1, N_BETAS))
 
 
 def _betas(size: float) -> Draw:
     def draw(rng: np.random.Generator) -> SmplFrame:
-        return SmplFrame(pose=everyday_pose(rng), betas=rng.choice((-size, size), N_BETAS) * rng.random(N_BETAS) ** 0.1)
+        return frame_of(everyday_pose(rng), betas=rng.choice((-size, size), N_BETAS) * rng.random(N_BETAS) ** 0.1)
 
     return draw
 
 
 def _styles(size: float) -> Draw:
     def draw(rng: np.random.Generator) -> SmplFrame:
-        return SmplFrame(pose=everyday_pose(rng), style=rng.uniform(-size, size, N_STYLES))
+        return frame_of(everyday_pose(rng), style=rng.uniform(-size, size, N_STYLES))
 
     return draw
 
 
 def _far(rng: np.random.Generator) -> SmplFrame:
     transl = rng.choice((-1, 1), 3) * 10.0 ** rng.uniform(0, 7, 3)
-    return SmplFrame(pose=everyday_pose(rng), betas=rng.normal(0, 1, N_BETAS), transl=transl)
+    return frame_of(everyday_pose(rng), betas=rng.normal(0, 1, N_BETAS), transl=transl)
 
 
 def _self_penetrating(rng: np.random.Generator) -> SmplFrame:
@@ -100,18 +116,22 @@ def _self_penetrating(rng: np.random.Generator) -> SmplFrame:
     pose[_SHOULDERS, 1] += (-rng.uniform(0, 1.5), rng.uniform(0, 1.5))
     pose[_HIPS, 2] += (-rng.uniform(0, 0.6), rng.uniform(0, 0.6))
     pose[list(_LIMBS)] += rng.normal(0, 0.5, (len(_LIMBS), 3))
-    return SmplFrame(pose=pose, betas=rng.normal(0, 1.5, N_BETAS))
+    return frame_of(pose, betas=rng.normal(0, 1.5, N_BETAS))
 
 
 def _anything(rng: np.random.Generator) -> SmplFrame:
     """Any rotation of any joint."""
-    return SmplFrame(pose=Rotation.random(N_JOINTS, random_state=rng).as_rotvec(), betas=rng.normal(0, 2, N_BETAS))
+    return frame_of(Rotation.random(N_JOINTS, random_state=rng).as_rotvec(), betas=rng.normal(0, 2, N_BETAS))
 
 
 def _denormal(rng: np.random.Generator) -> SmplFrame:
     tiny = np.float64(np.finfo(np.float32).smallest_subnormal)
-    shape = lambda *size: tiny * rng.integers(-1000, 1000, size)  # noqa: E731
-    return SmplFrame(pose=shape(N_JOINTS, 3), betas=shape(N_BETAS), transl=shape(3), style=shape(N_STYLES))
+
+    def draw(*shape: int) -> NDArray[np.float64]:
+        numbers: NDArray[np.float64] = tiny * rng.integers(-1000, 1000, shape)
+        return numbers
+
+    return frame_of(draw(N_JOINTS, 3), betas=draw(N_BETAS), transl=draw(3), style=draw(N_STYLES))
 
 
 def _absurd(rng: np.random.Generator) -> SmplFrame:
@@ -120,7 +140,7 @@ def _absurd(rng: np.random.Generator) -> SmplFrame:
     pose, betas, transl = np.array(frame.pose, np.float64), np.array(frame.betas, np.float64), np.array(frame.transl)
     target = (pose.reshape(-1), betas, transl)[rng.integers(3)]
     target[rng.integers(len(target))] = rng.choice((-1, 1)) * 10.0 ** rng.uniform(3, 38)
-    return SmplFrame(pose=pose, betas=betas, transl=transl, style=frame.style)
+    return frame_of(pose, betas=betas, transl=transl, style=frame.style)
 
 
 FRAMES: Mapping[str, Draw] = {

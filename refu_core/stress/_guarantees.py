@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from refu_core.frames import N_BETAS, SmplFrame
+from refu_core.frames import N_BETAS
 from refu_core.repulsion import DEFAULT_MARGIN, MAX_DISPLACEMENT, Blend, resolve
-from refu_core.stress._frames import FRAMES, between, everyday, everyday_pose
+from refu_core.stress._frames import FRAMES, between, everyday, everyday_pose, frame_of
 from refu_core.stress._numbers import n_not_finite
 from refu_core.stress._trial import Check, Measurement, Trial
 
@@ -62,7 +62,7 @@ def _any_day(rng: np.random.Generator) -> Trial:
 
 def _calm_day(rng: np.random.Generator) -> Trial:
     """Poses in which most bodies don't touch themselves."""
-    frame = SmplFrame(pose=0.6 * everyday_pose(rng), betas=rng.normal(0, 1, N_BETAS), transl=rng.normal(0, 3, 3))
+    frame = frame_of(0.6 * everyday_pose(rng), betas=rng.normal(0, 1, N_BETAS), transl=rng.normal(0, 3, 3))
     return Trial((frame,), int(rng.integers(2**31)))
 
 
@@ -74,14 +74,14 @@ def _any_frame(rng: np.random.Generator) -> Trial:
 def _motion(rng: np.random.Generator) -> Trial:
     betas, style = rng.normal(0, 1, N_BETAS), rng.normal(0, 1, 4)
     poses: list[NDArray[np.floating]] = [0.7 * everyday_pose(rng) for _ in range(2)]
-    return Trial(tuple(SmplFrame(pose=pose, betas=betas, style=style) for pose in between(poses, _STEPS)))
+    return Trial(tuple(frame_of(pose, betas=betas, style=style) for pose in between(poses, _STEPS)))
 
 
 def _folding(rng: np.random.Generator) -> Trial:
     """From an everyday pose to one with limbs through the trunk."""
     last = FRAMES["limbs through the trunk"](rng)
     poses: list[NDArray[np.floating]] = [0.7 * everyday_pose(rng), last.pose]
-    return Trial(tuple(SmplFrame(pose=pose, betas=last.betas) for pose in between(poses, _STEPS)))
+    return Trial(tuple(frame_of(pose, betas=last.betas) for pose in between(poses, _STEPS)))
 
 
 def nothing_inside(subject: Subject, trial: Trial) -> Measurement:

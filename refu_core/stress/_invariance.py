@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from refu_core.body import JOINT_NAMES
 from refu_core.frames import N_BETAS, SmplFrame
-from refu_core.stress._frames import FRAMES, everyday, everyday_pose
+from refu_core.stress._frames import FRAMES, everyday, everyday_pose, frame_of
 from refu_core.stress._subject import distance_to_mesh
 from refu_core.stress._trial import Check, Measurement, Trial
 
@@ -40,7 +40,7 @@ def invariance_checks() -> list[Check]:
 
 
 def _calm(rng: np.random.Generator) -> Trial:
-    frame = SmplFrame(pose=0.6 * everyday_pose(rng), betas=rng.normal(0, 1, N_BETAS))
+    frame = frame_of(0.6 * everyday_pose(rng), betas=rng.normal(0, 1, N_BETAS))
     return Trial((frame,), int(rng.integers(2**31)))
 
 
@@ -64,7 +64,7 @@ def turned(subject: Subject, trial: Trial) -> Measurement:
     turn = Rotation.random(random_state=rng) if is_skinned else Rotation.from_euler("y", rng.uniform(-np.pi, np.pi))
     pose = np.array(frame.pose, np.float64)
     pose[0] = (turn * Rotation.from_rotvec(pose[0])).as_rotvec()
-    here, there = subject.pipeline(frame), subject.pipeline(SmplFrame(pose=pose, betas=frame.betas))
+    here, there = subject.pipeline(frame), subject.pipeline(frame_of(pose, betas=frame.betas))
     root = subject.pipeline.body.rest_joints(torch.tensor(frame.betas)[None])[0, 0].double().numpy()
     deviation = max(_farthest(turn.apply(mesh.local - root) + root, there[name].local) for name, mesh in here.items())
     return Measurement(runs=2, deviation=deviation, limit=RIGID)
@@ -74,7 +74,7 @@ def moved(subject: Subject, trial: Trial) -> Measurement:
     """The garment of a person 100 km away against that of one at the origin."""
     rng, frame = np.random.default_rng(trial.seed), trial.frames[0]
     transl = _FAR * rng.uniform(-1, 1, 3)
-    here, there = subject.pipeline(frame), subject.pipeline(SmplFrame(frame.pose, betas=frame.betas, transl=transl))
+    here, there = subject.pipeline(frame), subject.pipeline(frame_of(frame.pose, betas=frame.betas, transl=transl))
     deviation = max(_farthest(mesh.vertices, there[name].vertices - transl) for name, mesh in here.items())
     return Measurement(runs=2, deviation=deviation, limit=RIGID)
 
@@ -105,8 +105,8 @@ def mirror_image(frame: SmplFrame) -> SmplFrame:
     for name in JOINT_NAMES:
         side, _, rest = name.partition("_")
         others.append(JOINT_NAMES.index(f"{_OTHER_SIDE[side]}_{rest}" if side in _OTHER_SIDE else name))
-    return SmplFrame(
-        pose=frame.pose[others] * np.array((1, -1, -1), np.float32),
+    return frame_of(
+        frame.pose[others] * np.array((1, -1, -1), np.float32),
         betas=frame.betas,
         transl=frame.transl * (-1, 1, 1),
         style=frame.style,

@@ -9,9 +9,8 @@ import torch
 from numpy.typing import NDArray
 
 from refu_core.errors import FrameError
-from refu_core.frames import SmplFrame
 from refu_core.sdf import ExactSdf
-from refu_core.stress._frames import FRAMES, Draw, everyday_pose
+from refu_core.stress._frames import FRAMES, Draw, everyday_pose, frame_of
 from refu_core.stress._subject import Subject, distance_to_mesh
 from refu_core.stress._trial import Check, Measurement, Trial
 
@@ -49,7 +48,7 @@ def _drawn(draw: Draw) -> Callable[[np.random.Generator], Trial]:
 
 
 def _standing(rng: np.random.Generator) -> Trial:
-    frame = SmplFrame(pose=0.5 * everyday_pose(rng), betas=rng.normal(0, 1, 10))
+    frame = frame_of(0.5 * everyday_pose(rng), betas=rng.normal(0, 1, 10))
     return Trial((frame,), int(rng.integers(2**31)))
 
 
@@ -97,7 +96,8 @@ def _on_edges(vertices: NDArray[np.float32], faces: NDArray[np.int64], rng: np.r
 def _mixed(
     vertices: NDArray[np.float32], faces: NDArray[np.int64], weights: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    return (vertices[faces].astype(np.float64) * weights[..., None]).sum(1)
+    mixed: NDArray[np.float64] = (vertices[faces].astype(np.float64) * weights[..., None]).sum(1)
+    return mixed
 
 
 def _medial(vertices: NDArray[np.float32], faces: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.float64]:
@@ -116,7 +116,8 @@ def _medial(vertices: NDArray[np.float32], faces: NDArray[np.int64], rng: np.ran
         points = torch.from_numpy((start + middle[:, None] * inward).astype(np.float32))
         is_under = sdf.query(points).distance.abs().numpy() >= middle - 1e-6
         low, high = np.where(is_under, middle, low), np.where(is_under, high, middle)
-    return start + ((low + high) / 2)[:, None] * inward
+    halfway: NDArray[np.float64] = start + ((low + high) / 2)[:, None] * inward
+    return halfway
 
 
 def _hair(vertices: NDArray[np.float32], faces: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.float64]:

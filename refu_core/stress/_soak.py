@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from refu_core.frames import SmplFrame
 from refu_core.realtime import GarmentPipeline
-from refu_core.stress._frames import between, everyday_pose
+from refu_core.stress._frames import between, everyday_pose, frame_of
 from refu_core.stress._numbers import n_not_finite
 from refu_core.stress._trial import StressError
 
@@ -81,7 +81,7 @@ def soak_frames(rng: np.random.Generator) -> list[SmplFrame]:
     """A motion of 200 frames whose end joins its beginning, on one body."""
     poses: list[NDArray[np.floating]] = [everyday_pose(rng) for _ in range(_POSES)]
     betas = rng.normal(0, 1, 10)
-    return [SmplFrame(pose=pose, betas=betas) for pose in between([*poses, poses[0]], _STEPS)]
+    return [frame_of(pose, betas=betas) for pose in between([*poses, poses[0]], _STEPS)]
 
 
 def soak(

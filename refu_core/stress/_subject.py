@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -130,8 +129,7 @@ class Reference:
             network = load_backbone(
                 wardrobe.backbone, garment, mode=wardrobe.sdf, folder=_folder(name, weights), device="cpu"
             )
-            is_module = isinstance(network, torch.nn.Module)
-            self._backbones[name] = copy.deepcopy(network).double() if is_module else network
+            self._backbones[name] = network.double() if isinstance(network, torch.nn.Module) else network
 
     @torch.no_grad()
     def __call__(self, frames: Sequence[SmplFrame]) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]]]:
@@ -164,7 +162,9 @@ def distance_to_mesh(
     """
     corners = torch.as_tensor(np.asarray(vertices, np.float64)[faces])
     best = []
-    for chunk in torch.as_tensor(np.asarray(points, np.float64)).split(16):  # bounds the memory: N × F × 3 numbers
+    for chunk in torch.split(
+        torch.as_tensor(np.asarray(points, np.float64)), 16
+    ):  # bounds the memory: N × F × 3 numbers
         squared = torch.full((len(chunk),), torch.inf, dtype=torch.float64)
         for k in range(3):
             squared = torch.minimum(squared, _to_segments(chunk, corners[:, k], corners[:, (k + 1) % 3]))
