@@ -49,7 +49,7 @@ class Collisions:
             self._sdf = ApproxSdf(body)
             self._rest_faces = RestFaces(body)
         elif body.device.type == "cpu":
-            self._sdf = self._band = BandSdf(body.faces)
+            self._sdf = self._band = BandSdf(body.faces, rest=body.v_template)
         else:  # thousands of threads walk the tree faster than one sorts what needn't
             self._sdf = ExactSdf(body.faces, device=body.device)
 

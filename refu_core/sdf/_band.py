@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -16,10 +17,10 @@ from torch import Tensor
 
 from refu_core._warp import as_warp
 from refu_core.errors import MeshError
-from refu_core.sdf._band_kernels import ROW, ROWS_X, ROWS_Y, bin_kernel, finish_kernel, scan_kernel, spread_kernel
 from refu_core.sdf._exact import ExactSdf
 from refu_core.sdf._mesh import Found, MeshSdf
 from refu_core.sdf._protocol import SdfSample
+from refu_core.sdf._scan import Scan
 
 BAND = 0.008
 """Width of the band on either side of the skin [m]. It must hold the margin that is kept; and a garment's edges must be
@@ -53,6 +54,11 @@ class Links:
         parents = np.concatenate([np.zeros((0, 2)), *pairs]).astype(np.int32)
         return Links(*map(torch.from_numpy, (start, linked, parents)))
 
+    @cached_property
+    def arrays(self) -> list[Any]:
+        """The same as kernels take them."""
+        return [as_warp(tensor, wp.int32) for tensor in (self.start, self.linked, self.parents)]
+
 
 class BandSdf(MeshSdf):
     """The exact signed distance, for garments on one CPU core: what lies farther off the skin than a band isn't asked.
@@ -71,8 +77,11 @@ class BandSdf(MeshSdf):
     vertex deep in a flank may be next to an arm's skin, outside of that. What is reached from both sides is asked.)
     """
 
-    def __init__(self, faces: Tensor | NDArray[Any], *, band: float = BAND) -> None:
+    def __init__(self, faces: Tensor | NDArray[Any], *, band: float = BAND, rest: Tensor | None = None) -> None:
         """For bodies of these `faces`, shape (F, 3), counter-clockwise seen from outside; `band` in metres.
+
+        `rest` are vertices [m], shape (V, 3), of a pose with the limbs apart. It is a matter of speed: a tree built for
+        it groups no two limbs, and fits whatever pose comes better than one that is built for the first that does.
 
         Raises `MeshError` when the faces aren't a closed, consistently oriented surface, or the band isn't positive.
         """
@@ -81,18 +90,12 @@ class BandSdf(MeshSdf):
             raise MeshError(msg)
         super().__init__(faces)
         self.band = band
-        self._per_metre = 0.5 / band  # a cell is twice as wide as the band
         # Few points are asked in the tree: one that fits its pose loosely costs less than another one does.
         self._tree = ExactSdf(faces, rebuild_distance=math.inf)
+        if rest is not None:
+            self._tree.update(rest.detach())
         self._tree_is_posed = False
-        self._first_in_cell = wp.full(ROWS_X * ROWS_Y * ROW, -1, dtype=wp.int32, device="cpu")
-        self._occupied = wp.zeros(ROWS_X * ROWS_Y, dtype=wp.uint64, device="cpu")
-        self._extent = wp.zeros(2, dtype=wp.vec3, device="cpu")
-        self._counts = torch.zeros(2, dtype=torch.int32)
-        self._cells = torch.zeros(0, dtype=torch.int32)
-        self._n_binned = 0
-        self._room = 0
-        self._make_room(1024)
+        self._scan: Scan | None = None
 
     def clipped(self, points: Tensor, links: Links) -> SdfSample:
         """The signed distance and gradient of a garment's vertices [m], shape (N, 3), clipped from above.
@@ -106,108 +109,53 @@ class BandSdf(MeshSdf):
         where = self._checked(points)
         if not len(where):
             return SdfSample(where[:, 0], where, torch.empty(0, dtype=torch.int32))
-        found = self._scan(where, beyond=self.band)
-        deep, patches = self._uncertain(where, found, links)
-        if len(deep):
-            self._ask(where, found, deep)
-        if len(patches):
-            # One of a patch that nothing reaches is asked; if it is inside, so may be all of them.
-            self._ask(where, found, patches)
-            inside = self._state[patches][found.distance[patches] < 0]
-            rest = torch.isin(self._state[: len(where)], inside)
+        if len(links.start) != len(where) + 1:
+            msg = f"the links are of {len(links.start) - 1} vertices, got {len(where)}"
+            raise MeshError(msg)
+        scan = self._scan_of_pose()
+        found = scan.near(where, beyond=self.band)
+        n_inside, n_patches = scan.spread(links.arrays)
+        if n_inside or n_patches:
+            self._pose_tree()
+            scan.ask(n_inside + n_patches)
+        if n_patches:
+            # One of a patch that nothing reaches was asked; if it is inside, so may be all of them.
+            patches, patch_of = scan.asked(n_inside + n_patches)[n_inside:], scan.patch_of(len(where))
+            rest = torch.isin(patch_of, patch_of[patches][found.distance[patches] < 0])
             rest[patches] = False
-            self._ask(where, found, torch.nonzero(rest)[:, 0])
-        if len(deep) or len(patches):
+            rows = torch.nonzero(rest)[:, 0]
+            scan.ask(len(rows), rows)
+        if n_inside or n_patches:
             # Farther out than the band a distance is clipped where it happens to be known, too.
             found.distance.clamp_(max=self.band)
-        return SdfSample(found.distance, found.gradient, found.face)
+        return found.sample()
 
     def _take_pose(self, *, is_new: bool) -> None:
-        del is_new
+        if is_new:
+            self._scan = None
         self._tree_is_posed = False
 
     def _find(self, points: Tensor, near: Tensor | None) -> Found:
-        if len(points) < _FEW:
-            return self._in_tree(points, near)
-        found = self._scan(points, beyond=math.inf)
-        self._ask(points, found, torch.nonzero(found.face < 0)[:, 0])
+        if near is not None or len(points) < _FEW:
+            self._pose_tree()
+            return self._tree._find(points, near)
+        scan = self._scan_of_pose()
+        found = scan.near(points, beyond=math.inf)
+        far = torch.nonzero(found.face < 0)[:, 0]
+        if len(far):
+            self._pose_tree()
+            scan.ask(len(far), far)
         return found
 
-    def _in_tree(self, points: Tensor, near: Tensor | None = None) -> Found:
+    def _pose_tree(self) -> None:
         if not self._tree_is_posed:
             assert self._vertices is not None  # callers have seen to it
             self._tree.update(self._vertices.detach())
             self._tree_is_posed = True
-        return self._tree._find(points, near)
 
-    def _ask(self, points: Tensor, found: Found, rows: Tensor) -> None:
-        """Replaces `rows` of `found` by what the tree says of them."""
-        if len(rows):
-            found.replace(rows, self._in_tree(points[rows]))
-
-    def _scan(self, points: Tensor, *, beyond: float) -> Found:
-        """What is closest to each point within the band; the distance `beyond` where nothing is."""
-        n = len(points)
-        self._make_room(n)
-        found = Found.empty(n, self.device)
-        where = as_warp(points, wp.vec3)
-        cells = [self._first_in_cell, self._next_in_cell, self._occupied]
-        best = [self._squared, self._face]
-        wp.launch(
-            bin_kernel,
-            1,
-            [where, self.band, self._n_binned, n, self._per_metre, self._cell, *cells, *best, self._extent],
-            device="cpu",
-        )
-        self._n_binned = n
-        wp.launch(
-            scan_kernel,
-            len(self.faces),
-            [self._points_wp, self._faces, self.band, self._per_metre, where, self._extent, *cells],
-            best,
-            device="cpu",
-        )
-        wp.launch(
-            finish_kernel,
-            n,
-            [self._points_wp, self._faces, *self._topology, where, self._face, beyond],
-            found.as_warp(),
-            device="cpu",
-        )
-        return found
-
-    def _uncertain(self, points: Tensor, found: Found, links: Links) -> tuple[Tensor, Tensor]:
-        """The vertices that may be inside, and one of each patch that nothing reaches."""
-        if len(links.start) != len(points) + 1:
-            msg = f"the links are of {len(links.start) - 1} vertices, got {len(points)}"
-            raise MeshError(msg)
-        wp.launch(
-            spread_kernel,
-            1,
-            [
-                as_warp(points, wp.vec3),
-                len(points),
-                as_warp(links.start, wp.int32),
-                as_warp(links.linked, wp.int32),
-                as_warp(links.parents, wp.int32),
-                as_warp(found.face, wp.int32),
-                as_warp(found.distance, wp.float32),
-                self.band,
-            ],
-            self._spread_outputs,
-            device="cpu",
-        )
-        n_inside, n_patches = self._counts.tolist()
-        asked = self._asked[: n_inside + n_patches].long()
-        return asked[:n_inside], asked[n_inside:]
-
-    def _make_room(self, n: int) -> None:
-        if n <= self._room:
-            return
-        self._room = max(n, 2 * self._room)
-        ints = torch.zeros(6, self._room, dtype=torch.int32)
-        ints[0, : self._n_binned] = self._cells[: self._n_binned]  # those that are to be emptied
-        self._cells, _, _, _, self._state, self._asked = ints
-        self._cell, self._next_in_cell, self._face, queue, state, asked = (as_warp(row, wp.int32) for row in ints)
-        self._squared = wp.zeros(self._room, dtype=wp.float32, device="cpu")
-        self._spread_outputs = [state, queue, asked, as_warp(self._counts, wp.int32)]
+    def _scan_of_pose(self) -> Scan:
+        if self._scan is None:
+            self._pose_tree()  # the recorded launch knows which it is
+            body = [self._points_wp, self._faces, *self._topology]
+            self._scan = Scan(body, len(self.faces), self.band, self._tree.record)
+        return self._scan

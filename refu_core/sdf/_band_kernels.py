@@ -3,9 +3,10 @@
 # (Warp reads a kernel's annotations as array types of its own; a type checker can't.)
 """Closest faces within a band of the skin: the points lie in cells, the faces look for them there. For one CPU core.
 
-Cells are those of a grid that repeats itself after 64 × 128 × 64 of them, so that no place is outside of it and
-nothing is sized by a pose; two places that share a cell cost a test and change no answer. One word says which of the 64
-cells of a row hold a point: most of what a face passes is empty, and is passed a row at a time.
+Cells are those of a grid that repeats itself after 128 × 64 × 64 of them, so that no place is outside of it and
+nothing is sized by a pose; two places that share a cell cost a test and change no answer. They are kept by rows along
+y: one word says which of a row's 64 cells hold a point, since most of what a face passes is empty and is passed a row
+at a time, and the points lie sorted by row and cell, so that what a face sees of a row is read in one go.
 """
 
 import warp as wp
@@ -14,11 +15,11 @@ from refu_core.sdf._kernels import closest_on_triangle, distance_and_gradient, o
 
 wp.set_module_options({"enable_backward": False})
 
-ROWS_X = wp.constant(64)
-ROWS_Y = wp.constant(128)
+ROWS_X = wp.constant(128)
+ROWS_Z = wp.constant(64)
 ROW = wp.constant(64)
-_LAST_X = wp.constant(63)
-_LAST_Y = wp.constant(127)
+_LAST_X = wp.constant(127)
+_LAST_Z = wp.constant(63)
 _LAST = wp.constant(63)
 
 NEAR = wp.constant(0)  # closest face within the band: distance and side are known
@@ -36,7 +37,7 @@ def cell_number(x: float, per_metre: float):
 
 @wp.func
 def row_of(i: int, j: int):
-    return (i & _LAST_X) * ROWS_Y + (j & _LAST_Y)
+    return (i & _LAST_X) * ROWS_Z + (j & _LAST_Z)
 
 
 @wp.func
@@ -52,40 +53,67 @@ def row_mask(first: int, last: int):
 
 
 @wp.kernel
-def bin_kernel(
+def sort_kernel(
     points: wp.array(dtype=wp.vec3),
+    sizes: wp.array(dtype=int),
     limit: float,
-    n_before: int,
-    n: int,
     per_metre: float,
     # what the last call left, to be replaced
-    cell: wp.array(dtype=int),
-    first_in_cell: wp.array(dtype=int),
-    next_in_cell: wp.array(dtype=int),
+    number_of_row: wp.array(dtype=int),
+    rows: wp.array(dtype=int),
     occupied: wp.array(dtype=wp.uint64),
+    start: wp.array2d(dtype=int),
+    # outputs
+    slot: wp.array(dtype=int),
+    sorted_points: wp.array(dtype=wp.vec3),
     squared: wp.array(dtype=float),
     face: wp.array(dtype=int),
     extent: wp.array(dtype=wp.vec3),
 ):
-    """Empties the cells of the points before, and puts the new ones into theirs; `extent` becomes their bounds."""
-    for q in range(n_before):
-        first_in_cell[cell[q]] = -1
-        occupied[cell[q] / ROW] = wp.uint64(0)
+    """Sorts the first `sizes[0]` points into cells; `extent` becomes their bounds, `sizes[1]` the number of rows.
+
+    Cell k of the row numbered r holds the sorted points `start[r, k]` to `start[r, k + 1]`, point q lies at `slot[q]`.
+    """
+    for r in range(sizes[1]):
+        number_of_row[rows[r]] = -1
+    n = sizes[0]
+    n_rows = int(0)
     low = points[0]
     high = points[0]
     for q in range(n):
         p = points[q]
         low = wp.min(low, p)
         high = wp.max(high, p)
-        r = row_of(cell_number(p[0], per_metre), cell_number(p[1], per_metre))
-        k = cell_number(p[2], per_metre) & _LAST
-        c = r * ROW + k
-        cell[q] = c
-        next_in_cell[q] = first_in_cell[c]
-        first_in_cell[c] = q
-        occupied[r] = occupied[r] | (wp.uint64(1) << wp.uint64(k))
-        squared[q] = limit * limit
-        face[q] = -1
+        row = row_of(cell_number(p[0], per_metre), cell_number(p[2], per_metre))
+        r = number_of_row[row]
+        if r < 0:
+            r = n_rows
+            n_rows += 1
+            number_of_row[row] = r
+            rows[r] = row
+            occupied[r] = wp.uint64(0)
+            for k in range(ROW + 2):
+                start[r, k] = 0
+        cell = cell_number(p[1], per_metre) & _LAST
+        occupied[r] = occupied[r] | (wp.uint64(1) << wp.uint64(cell))
+        start[r, cell + 2] = start[r, cell + 2] + 1
+        slot[q] = r * ROW + cell
+    sizes[1] = n_rows
+    before = int(0)
+    for r in range(n_rows):
+        for k in range(ROW + 2):
+            before += start[r, k]
+            start[r, k] = before
+    # Now cell k begins at start[r, k + 1], which is counted up to where it ends, and so to where cell k + 1 begins.
+    for q in range(n):
+        r = slot[q] / ROW
+        cell = slot[q] & _LAST
+        s = start[r, cell + 1]
+        start[r, cell + 1] = s + 1
+        slot[q] = s
+        sorted_points[s] = points[q]
+        squared[s] = limit * limit
+        face[s] = -1
     extent[0] = low
     extent[1] = high
 
@@ -96,16 +124,16 @@ def scan_kernel(
     faces: wp.array2d(dtype=int),
     limit: float,
     per_metre: float,
-    points: wp.array(dtype=wp.vec3),
     extent: wp.array(dtype=wp.vec3),
-    first_in_cell: wp.array(dtype=int),
-    next_in_cell: wp.array(dtype=int),
+    number_of_row: wp.array(dtype=int),
     occupied: wp.array(dtype=wp.uint64),
+    start: wp.array2d(dtype=int),
+    points: wp.array(dtype=wp.vec3),
     # kept up to date
     squared: wp.array(dtype=float),
     face: wp.array(dtype=int),
 ):
-    """Each face asks the points in the cells around it whether it is the closest one so far."""
+    """Each face asks the sorted points in the cells around it whether it is the closest one so far."""
     f = wp.tid()
     a = body[faces[f, 0]]
     b = body[faces[f, 1]]
@@ -119,33 +147,42 @@ def scan_kernel(
     if low[0] > high[0] or low[1] > high[1] or low[2] > high[2]:
         return
     i0 = cell_number(low[0], per_metre)
-    j0 = cell_number(low[1], per_metre)
-    k0 = cell_number(low[2], per_metre)
+    j0 = cell_number(low[2], per_metre)
+    k0 = cell_number(low[1], per_metre)
     # Once around the grid is enough, however large the face.
     i1 = wp.min(cell_number(high[0], per_metre), i0 + _LAST_X)
-    j1 = wp.min(cell_number(high[1], per_metre), j0 + _LAST_Y)
-    k1 = wp.min(cell_number(high[2], per_metre), k0 + _LAST)
+    j1 = wp.min(cell_number(high[2], per_metre), j0 + _LAST_Z)
+    k1 = wp.min(cell_number(high[1], per_metre), k0 + _LAST)
     mask = row_mask(k0, k1)
+    first_cell = k0 & _LAST
+    last_cell = first_cell + (k1 - k0)
     normal = wp.normalize(wp.cross(b - a, c - a))
     for i in range(i0, i1 + 1):
         for j in range(j0, j1 + 1):
-            r = row_of(i, j)
-            if (occupied[r] & mask) != wp.uint64(0):
-                for k in range(k0, k1 + 1):
-                    q = first_in_cell[r * ROW + (k & _LAST)]
-                    while q >= 0:
-                        p = points[q]
-                        height = wp.dot(normal, p - a)
-                        # Neither its plane nor its box is ever farther than a face.
-                        beside = wp.max(wp.max(box_low - p, p - box_high), wp.vec3(0.0, 0.0, 0.0))
-                        if height * height < squared[q] and wp.dot(beside, beside) <= squared[q]:
-                            w, _feature = closest_on_triangle(p, a, b, c)
-                            offset = (p - a) - (w[1] * (b - a) + w[2] * (c - a))
-                            length = wp.dot(offset, offset)
-                            if length < squared[q]:
-                                squared[q] = length
-                                face[q] = f
-                        q = next_in_cell[q]
+            r = number_of_row[row_of(i, j)]
+            if r >= 0 and (occupied[r] & mask) != wp.uint64(0):
+                here = start[r, first_cell]
+                end = start[r, wp.min(last_cell, _LAST) + 1]
+                rest = int(0)  # of a row that repeats itself: its beginning
+                if last_cell > _LAST:
+                    rest = start[r, last_cell - _LAST] - start[r, 0]
+                while here < end or rest > 0:
+                    if here == end:
+                        here = start[r, 0]
+                        end = here + rest
+                        rest = 0
+                    p = points[here]
+                    height = wp.dot(normal, p - a)
+                    beside = wp.max(wp.max(box_low - p, p - box_high), wp.vec3(0.0, 0.0, 0.0))
+                    # Neither its plane nor its box is ever farther than a face.
+                    if wp.max(height * height, wp.dot(beside, beside)) < squared[here]:
+                        w, _feature = closest_on_triangle(p, a, b, c)
+                        offset = (p - a) - (w[1] * (b - a) + w[2] * (c - a))
+                        length = wp.dot(offset, offset)
+                        if length < squared[here]:
+                            squared[here] = length
+                            face[here] = f
+                    here += 1
 
 
 @wp.kernel
@@ -156,8 +193,9 @@ def finish_kernel(
     fan_start: wp.array(dtype=int),
     fan_face: wp.array(dtype=int),
     points: wp.array(dtype=wp.vec3),
+    slot: wp.array(dtype=int),
     face: wp.array(dtype=int),
-    beyond: float,
+    beyond: wp.array(dtype=float),
     # outputs
     out_face: wp.array(dtype=int),
     out_feature: wp.array(dtype=int),
@@ -166,15 +204,12 @@ def finish_kernel(
     out_distance: wp.array(dtype=float),
     out_gradient: wp.array(dtype=wp.vec3),
 ):
-    """Signed distance and gradient from the closest faces; `beyond` where there is none."""
+    """Signed distance and gradient from the closest faces; where there is none, the distance `beyond` and no more."""
     q = wp.tid()
-    f = face[q]
+    f = face[slot[q]]
     out_face[q] = f
     if f < 0:
-        out_feature[q] = 0
-        out_barycentrics[q] = wp.vec3(1.0, 0.0, 0.0)
-        out_normal[q] = wp.vec3(0.0, 1.0, 0.0)
-        out_distance[q] = beyond
+        out_distance[q] = beyond[0]
         out_gradient[q] = wp.vec3(0.0, 1.0, 0.0)
         return
     p = points[q]
@@ -204,13 +239,17 @@ def spread(
     link_start: wp.array(dtype=int),
     linked: wp.array(dtype=int),
     distance: wp.array(dtype=float),
+    face: wp.array(dtype=int),
     state: wp.array(dtype=int),
     queue: wp.array(dtype=int),
     end: int,
     band: float,
     given: int,
 ):
-    """Gives the state `given` to all that the queue's vertices reach along free edges; the queue's new end."""
+    """Gives the state `given` to all that the queue's vertices reach along free edges; the queue's new end.
+
+    What will be asked in the tree is told the face of whom it was reached from: it is not far from there.
+    """
     here = int(0)
     tail = int(end)
     while here < tail:
@@ -220,6 +259,8 @@ def spread(
             other = linked[n]
             if state[other] < 0 and is_free(points[q], points[other], wp.abs(distance[q]) + band):
                 state[other] = given
+                if given == INSIDE_MAYBE:
+                    face[other] = face[q]
                 queue[tail] = other
                 tail += 1
     return tail
@@ -228,24 +269,25 @@ def spread(
 @wp.kernel
 def spread_kernel(
     points: wp.array(dtype=wp.vec3),
-    n: int,
+    sizes: wp.array(dtype=int),
     link_start: wp.array(dtype=int),
     linked: wp.array(dtype=int),
     parents: wp.array2d(dtype=int),
-    face: wp.array(dtype=int),
     distance: wp.array(dtype=float),
     band: float,
+    # kept up to date
+    face: wp.array(dtype=int),
     # outputs
     state: wp.array(dtype=int),
     queue: wp.array(dtype=int),
     asked: wp.array(dtype=int),
-    counts: wp.array(dtype=int),
 ):
     """On which side of the skin the vertices beyond the band are, by way of the garment's edges.
 
-    `asked` lists those that may be inside, and one of each patch that no vertex of the band reaches; `counts` says how
-    many of either kind there are.
+    `asked` lists those that may be inside, and one of each patch that no vertex of the band reaches; `sizes[2]` and
+    `sizes[3]` say how many of either kind there are.
     """
+    n = sizes[0]
     tail = int(0)
     for q in range(n):
         state[q] = -1
@@ -256,7 +298,7 @@ def spread_kernel(
                 tail += 1
     # From the inside first: what both sides reach lies where the body runs into itself, and is asked.
     first = tail
-    tail = spread(points, link_start, linked, distance, state, queue, tail, band, INSIDE_MAYBE)
+    tail = spread(points, link_start, linked, distance, face, state, queue, tail, band, INSIDE_MAYBE)
     inside = tail - first
     for k in range(inside):
         asked[k] = queue[first + k]
@@ -280,14 +322,14 @@ def spread_kernel(
             if reached == 1:
                 state[q] = OUTSIDE
                 queue[0] = q
-                spread(points, link_start, linked, distance, state, queue, 1, band, OUTSIDE)
+                spread(points, link_start, linked, distance, face, state, queue, 1, band, OUTSIDE)
     patches = int(0)
     for q in range(n):
         if state[q] < 0:
             state[q] = UNREACHED + patches
             queue[0] = q
-            spread(points, link_start, linked, distance, state, queue, 1, band, UNREACHED + patches)
+            spread(points, link_start, linked, distance, face, state, queue, 1, band, UNREACHED + patches)
             asked[inside + patches] = q
             patches += 1
-    counts[0] = inside
-    counts[1] = patches
+    sizes[2] = inside
+    sizes[3] = patches

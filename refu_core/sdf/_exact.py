@@ -13,13 +13,15 @@ from torch import Tensor
 from refu_core._warp import as_warp, torch_stream
 from refu_core.errors import MeshError
 from refu_core.sdf._kernels import closest_kernel
-from refu_core.sdf._mesh import FewPoints, Found, MeshSdf
+from refu_core.sdf._mesh import Found, MeshSdf, Recorded
 
 REBUILD_DISTANCE = 0.4
 """How far a vertex may move, on a CPU, before the BVH is built anew [m]. A refit costs 0.2 ms and leaves the tree as it
 was; once the limbs it grouped have parted its boxes overlap, and queries take 1.5 to 2.5 times as long. Building takes
 about as long as asking for one garment does, and at this distance is called for every 10 to 30 frames of a motion."""
 
+_FEW = 2048
+"""More points than this are worth a launch of their own."""
 _UNLIMITED = 1e18  # [m]; its square is still a float32
 Sign = Literal["normal", "winding"]
 
@@ -72,7 +74,8 @@ class ExactSdf(MeshSdf):
         self._rebuild_distance = rebuild_distance
         self._built_at = torch.empty(0, 3)  # the pose the BVH was built for
         self._mesh: Any = None
-        self._few: FewPoints | None = None  # recorded for the tree as it is now
+        self._none = wp.empty(0, dtype=wp.int32, device=str(self.device))
+        self._few: Recorded | None = None  # recorded for the tree as it is now
 
     def _take_pose(self, *, is_new: bool) -> None:
         if is_new or self._has_drifted():
@@ -92,7 +95,7 @@ class ExactSdf(MeshSdf):
 
     def _has_drifted(self) -> bool:
         # A GPU would have to be waited for to know, and hides a loose tree better.
-        if self.device.type != "cpu" or self._points is None:
+        if self.device.type != "cpu" or self._points is None or self._rebuild_distance == math.inf:
             return False
         return float((self._points - self._built_at).abs().max()) > self._rebuild_distance
 
@@ -116,30 +119,46 @@ class ExactSdf(MeshSdf):
 
     def _search(self, points: Tensor, max_distance: float) -> Found:
         self._require_update()
-        return self._launch(self._checked(points), max_distance)
+        return self._launch(self._checked(points), min(max_distance, _UNLIMITED))
 
     def _find(self, points: Tensor, near: Tensor | None) -> Found:
-        del near  # the tree finds the way by itself
-        return self._launch(points, math.inf)
-
-    def _launch(self, points: Tensor, max_distance: float) -> Found:
-        if 0 < len(points) <= FewPoints.MOST and self.device.type == "cpu" and max_distance == math.inf:
+        if self.device.type == "cpu" and len(points) <= _FEW:
             if self._few is None:
-                self._few = FewPoints(closest_kernel, lambda few, _: self._inputs(few, _UNLIMITED))
-            return self._few.ask(points)
+                self._few = Recorded(closest_kernel, self._inputs)
+            return self._few.ask(points, near)
+        return self._launch(points, _UNLIMITED, near)
+
+    def record(self, points: Any, rows: Any, answers: Found) -> Any:
+        """A launch on a CPU to be repeated, for those of the points that are in rows; the BVH must not be rebuilt.
+
+        What the answers' faces are before counts as near.
+        """
+        outputs = answers.as_warp()
+        inputs = self._inputs(points, outputs[0], rows=rows)
+        return wp.launch(closest_kernel, len(rows), inputs, outputs, device="cpu", record_cmd=True)
+
+    def _launch(self, points: Tensor, max_distance: float, near: Tensor | None = None) -> Found:
         found = Found.empty(len(points), self.device)
         if len(points):
+            near = self._none if near is None else as_warp(near, wp.int32)
             with torch_stream(self.device):
                 wp.launch(
                     closest_kernel,
                     dim=len(points),
-                    inputs=self._inputs(as_warp(points, wp.vec3), min(max_distance, _UNLIMITED)),
+                    inputs=self._inputs(as_warp(points, wp.vec3), near, max_distance=max_distance),
                     outputs=found.as_warp(),
                     device=str(self.device),
                 )
         return found
 
-    def _inputs(self, points: Any, max_distance: float) -> list[Any]:
-        """What `closest_kernel` reads."""
+    def _inputs(
+        self,
+        points: Any,
+        near: Any,
+        *,
+        rows: Any = None,
+        max_distance: float = _UNLIMITED,
+    ) -> list[Any]:
+        """What `closest_kernel` reads, for points with or without near faces, all of them or some rows."""
         body = [self._mesh.id, self._points_wp, self._faces, *self._topology]
-        return [*body, points, max_distance, self._by_winding]
+        return [*body, points, near, self._none if rows is None else rows, max_distance, self._by_winding]

@@ -129,6 +129,12 @@ def distance_and_gradient(offset: wp.vec3, feature: int, normal: wp.vec3, outsid
     return outside * distance, offset * (outside / distance)
 
 
+@wp.func
+def distance_to_face(p: wp.vec3, face: int, points: wp.array(dtype=wp.vec3), faces: wp.array2d(dtype=int)):
+    w, _feature = closest_on_triangle(p, points[faces[face, 0]], points[faces[face, 1]], points[faces[face, 2]])
+    return wp.length(offset_from(p, face, w, points, faces))
+
+
 @wp.kernel(enable_backward=False)
 def closest_kernel(
     mesh: wp.uint64,
@@ -138,6 +144,8 @@ def closest_kernel(
     fan_start: wp.array(dtype=int),
     fan_face: wp.array(dtype=int),
     queries: wp.array(dtype=wp.vec3),
+    near: wp.array(dtype=int),
+    rows: wp.array(dtype=int),
     max_distance: float,
     by_winding: bool,
     # outputs
@@ -148,13 +156,24 @@ def closest_kernel(
     out_distance: wp.array(dtype=float),
     out_gradient: wp.array(dtype=wp.vec3),
 ):
-    """Closest point, pseudo-normal there, signed distance and its gradient; face -1 where nothing is close enough."""
+    """Closest point, pseudo-normal there, signed distance and its gradient; face -1 where nothing is close enough.
+
+    Of the queries numbered `rows`, or of all where there are no rows. Where a face `near` is known (not -1), nothing
+    farther away than that is looked at.
+    """
     i = wp.tid()
+    if rows.shape[0] > 0:
+        i = rows[i]
     p = queries[i]
+    limit = float(max_distance)
+    if near.shape[0] > 0 and near[i] >= 0:
+        # More by what rounding may come to, here and in the tree.
+        rounding = 1.0e-5 * (1.0 + wp.length(p))
+        limit = wp.min(limit, 1.0001 * distance_to_face(p, near[i], points, faces) + rounding)
     if by_winding:
-        hit = wp.mesh_query_point_sign_winding_number(mesh, p, max_distance)
+        hit = wp.mesh_query_point_sign_winding_number(mesh, p, limit)
     else:
-        hit = wp.mesh_query_point_no_sign(mesh, p, max_distance)
+        hit = wp.mesh_query_point_no_sign(mesh, p, limit)
     if not hit.result:
         out_face[i] = -1
         out_feature[i] = FACE

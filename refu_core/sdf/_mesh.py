@@ -42,10 +42,9 @@ class Found(NamedTuple):
         distance = torch.empty(n, device=device)
         return Found(ints[0], ints[1], vectors[0], vectors[1], distance, vectors[2])
 
-    def replace(self, rows: Tensor, by: Found) -> None:
-        """Overwrites the answers for some of the points, integers of shape (R,), by those for R points."""
-        for column, values in zip(self, by, strict=True):
-            column[rows] = values
+    def sample(self) -> SdfSample:
+        """Distances, gradients and faces, copied."""
+        return SdfSample(self.distance.clone(), self.gradient.clone(), self.face.clone())
 
     def as_warp(self) -> list[Any]:
         """The fields as a kernel's outputs."""
@@ -53,39 +52,50 @@ class Found(NamedTuple):
         return [as_warp(tensor, kind) for tensor, kind in zip(self, kinds, strict=True)]
 
 
-class FewPoints:
-    """A launch for few points on a CPU, recorded once, with memory of its own for what is asked and answered.
+class Recorded:
+    """A launch on a CPU, recorded once, with memory of its own for what is asked and answered.
 
-    What Python makes of a launch's arguments, time and again the same ones, takes three times as long as 50 points do.
+    What Python makes of a launch's arguments, time and again the same ones, takes three times as long as 50 points do;
+    and memory that is new for every frame must be cleared by the system first.
     """
-
-    MOST = 256
-    """More points than this are worth a launch of their own."""
 
     def __init__(self, kernel: Any, inputs: Callable[[Any, Any], list[Any]]) -> None:
         """`inputs` makes a list of the kernel's inputs from the points and their near faces; outputs are `Found`'s."""
-        cpu = torch.device("cpu")
-        self._points = torch.zeros(self.MOST, 3)
-        self._near = torch.zeros(self.MOST, dtype=torch.int32)
-        self._found = Found.empty(self.MOST, cpu)
+        self._kernel, self._inputs = kernel, inputs
+        self._room = 0
+        self._make_room(256)
+
+    def ask(self, points: Tensor, near: Tensor | None = None) -> Found:
+        """What the kernel says of checked points, shape (N, 3); the answers are overwritten by the next call's.
+
+        Faces that aren't given are -1.
+        """
+        n = len(points)
+        if n > self._room:
+            self._make_room(max(n, 2 * self._room))
+        self._points[:n] = points
+        if near is None:
+            self._near[:n] = -1
+        else:
+            self._near[:n] = near
+        if n:
+            self._command.set_dim(n)
+            self._command.launch()
+        return Found(*(field[:n] for field in self._found))
+
+    def _make_room(self, n: int) -> None:
+        self._room = n
+        self._points = torch.zeros(n, 3)
+        self._near = torch.zeros(n, dtype=torch.int32)
+        self._found = Found.empty(n, self._points.device)
         self._command = wp.launch(
-            kernel,
-            dim=self.MOST,
-            inputs=inputs(as_warp(self._points, wp.vec3), as_warp(self._near, wp.int32)),
+            self._kernel,
+            dim=n,
+            inputs=self._inputs(as_warp(self._points, wp.vec3), as_warp(self._near, wp.int32)),
             outputs=self._found.as_warp(),
             device="cpu",
             record_cmd=True,
         )
-
-    def ask(self, points: Tensor, near: Tensor | None = None) -> Found:
-        """What the kernel says of checked points, shape (N, 3), N from 1 to `MOST`; the answers are copies."""
-        n = len(points)
-        self._points[:n] = points
-        if near is not None:
-            self._near[:n] = near
-        self._command.set_dim(n)
-        self._command.launch()
-        return Found(*(field[:n].clone() for field in self._found))
 
 
 class MeshSdf(ABC):
@@ -138,12 +148,15 @@ class MeshSdf(ABC):
         assert self._vertices is not None  # _require_update has seen to it
         tracked = torch.is_grad_enabled() and (points.requires_grad or self._vertices.requires_grad)
         if not tracked and points.dtype == torch.float32:
-            return SdfSample(found.distance, found.gradient, found.face)
+            return found.sample()
         corners = self._vertices.to(points)[self.faces.long()[found.face.long()]]
         feature = Feature(
-            found.feature, found.normal.to(points), found.distance.sign().to(points), found.barycentrics.to(points)
+            found.feature.clone(),
+            found.normal.to(points, copy=True),
+            found.distance.sign().to(points),
+            found.barycentrics.to(points, copy=True),
         )
-        return signed_distance(points, corners, feature)._replace(face=found.face)
+        return signed_distance(points, corners, feature)._replace(face=found.face.clone())
 
     @abstractmethod
     def _take_pose(self, *, is_new: bool) -> None:
@@ -151,7 +164,10 @@ class MeshSdf(ABC):
 
     @abstractmethod
     def _find(self, points: Tensor, near: Tensor | None) -> Found:
-        """The closest face to each of the checked `points`, shape (N, 3), whose `near` faces may be known, (N,)."""
+        """The closest face to each of the checked `points`, shape (N, 3), whose `near` faces may be known, (N,).
+
+        The answers may lie in memory that the next call overwrites.
+        """
 
     def _checked(self, points: Tensor) -> Tensor:
         if points.ndim != 2 or points.shape[1] != 3:

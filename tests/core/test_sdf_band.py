@@ -144,9 +144,9 @@ def test_query_is_the_exact_one(seed: int, n: int, spread: float) -> None:
 
 
 def test_places_that_share_a_cell() -> None:
-    """Cells repeat after 64 of 16 mm along x and z and 128 along y; a ball there isn't a ball here."""
+    """Cells repeat after 128 of 16 mm along x and 64 along y and z; a ball there isn't a ball here."""
     band, exact = posed_ball()
-    period = torch.tensor([64, 128, 64]) * 2 * BAND
+    period = torch.tensor([128, 64, 64]) * 2 * BAND
     points = torch.cat([shell(0.303) + period * torch.tensor(k) for k in ([0, 0, 0], [1, 0, 0], [0, -1, 0], [1, 2, 3])])
     got, wanted = band.query(points).distance, exact.query(points).distance
     torch.testing.assert_close(got, wanted, atol=1e-6, rtol=1e-6)
