@@ -9,7 +9,7 @@ from tqdm import tqdm
 
 from refu_core.benchmark import load_average, machine_facts, measure_rates, one_core
 from refu_ros.benchmark import _sections as sections
-from refu_ros.benchmark._accuracy import accuracy, truth_bag
+from refu_ros.benchmark._accuracy import accuracies, truth_bag
 from refu_ros.benchmark._frames import load_pipelines
 from refu_ros.benchmark._inputs import Window, moments, read_stretches
 from refu_ros.benchmark._options import BenchmarkOptions
@@ -86,7 +86,7 @@ def _figures(
         result.missing[f"{garment}: errors"] = f"the repository's evaluation bags in {options.bags.name}/"
         return {}
     count = options.sizes.test_frames
-    return {key: accuracy(one, garment, bag, frames=count, progress=advance) for key, one in pipelines.items()}
+    return accuracies(pipelines, garment, bag, frames=count, progress=advance)
 
 
 def _start_processes(
