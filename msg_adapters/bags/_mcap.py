@@ -33,6 +33,11 @@ MAX_CHUNK_BYTES = 256 << 20
 """A chunk that claims to unpack to more is left out: a few kilobytes could otherwise claim all memory."""
 
 
+_MAX_RATIO, _SMALL_CHUNK = 1000, 8 << 20
+"""A chunk above that size [bytes] that claims to be so much larger than it is packed is a bomb: recorders fill theirs
+to less than a megabyte, and the few messages that are larger aren't all one byte."""
+
+
 class DamageError(Exception):
     """A record whose content can't be read; never leaves this package."""
 
@@ -154,6 +159,9 @@ def unpack_chunk(content: memoryview) -> memoryview:
     if size > MAX_CHUNK_BYTES:
         msg = f"a chunk that unpacks to {size >> 20} MiB, at most {MAX_CHUNK_BYTES >> 20} are read"
         raise DamageError(msg)
+    if size > max(_SMALL_CHUNK, _MAX_RATIO * len(packed)):
+        msg = f"a chunk of {len(packed)} bytes that unpacks to {size >> 20} MiB"
+        raise DamageError(msg)
     records = packed if not compression else memoryview(_decompress(compression, packed, size))
     if len(records) != size:
         msg = f"a chunk that unpacks to {len(records)} bytes where {size} were announced"
@@ -198,6 +206,9 @@ def split_records(content: memoryview) -> Iterator[tuple[int, memoryview]]:
             msg = f"{len(content) - at} bytes where a record should start"
             raise DamageError(msg)
         opcode, length = _RECORD_HEADER.unpack_from(content, at)
+        if opcode == 0:
+            msg = "a record without an opcode"  # the format has none; nothing but zeros would be millions of them
+            raise DamageError(msg)
         at += _RECORD_HEADER.size
         if length > len(content) - at:
             msg = f"a record of {length} bytes where {len(content) - at} are left"

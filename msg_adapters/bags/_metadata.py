@@ -18,7 +18,7 @@ VERSION = 9
 MAX_TIME_NS = 2**63 - 1
 """rosbag2 keeps times in signed 64 bits."""
 _KEY = "rosbag2_bagfile_information"
-_MAX_BYTES = 16 << 20
+_MAX_BYTES = 1 << 20
 _FOREVER = {"sec": 9223372036, "nsec": 854775807}  # rmw's infinite duration: 2^63 - 1 nanoseconds
 
 
@@ -67,6 +67,16 @@ class _Dumper(yaml.SafeDumper):
 
     def ignore_aliases(self, data: Any) -> bool:  # noqa: ARG002
         return True
+
+
+class _Loader(yaml.SafeLoader):
+    """Refuses aliases, which rosbag2 doesn't write: a few lines of them stand for more text than fits any memory."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):
+            msg = "aliases aren't read"
+            raise yaml.YAMLError(msg)
+        return super().compose_node(parent, index)
 
 
 def _dump(value: Any) -> str:
@@ -120,8 +130,8 @@ def read_file_paths(directory: Path) -> list[Path]:
         if len(text) > _MAX_BYTES:
             msg = f"{path}: larger than {_MAX_BYTES >> 20} MiB"
             raise BagError(msg)
-        information = yaml.safe_load(text)[_KEY]
-        storage = information["storage_identifier"]
+        information = yaml.load(text, Loader=_Loader)[_KEY]
+        storage = str(information["storage_identifier"])
         compression = str(information.get("compression_mode") or "none").lower()
         names = [str(name) for name in information["relative_file_paths"]]
     except OSError as error:

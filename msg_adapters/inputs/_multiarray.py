@@ -93,7 +93,7 @@ def from_message(message: Any) -> SmplFrame:
             layout = message.layout
             dimensions = [_Dimension(str(d.label), int(d.size), int(d.stride)) for d in layout.dim]
             offset = int(layout.data_offset)
-            values = np.asarray(message.data, dtype=np.float32)
+            values = np.asarray(message.data, dtype=np.float32).reshape(-1)
         return _frame(dimensions, offset, values)
 
 

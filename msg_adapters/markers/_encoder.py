@@ -15,7 +15,7 @@ import numpy as np
 from msg_adapters.axes import SMPL_COLUMNS
 from msg_adapters.cdr import HEADER_BYTES, CdrWriter, split_stamp
 from msg_adapters.errors import EncodeError
-from msg_adapters.markers._mesh import CLOTH, Rgba
+from msg_adapters.markers._mesh import CLOTH, Rgba, numbers
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -176,12 +176,12 @@ class MarkerArrayEncoder:
         offsets = self._offsets(transl)
         for i, slot in enumerate(self._slots):
             struct.pack_into("<iI", self._payload, slot.stamp_at, *stamps[i])
-            self._write_points(slot, np.asarray(vertices[i]), offsets[i])
+            self._write_points(slot, numbers(slot.mesh.ns, vertices[i]), offsets[i])
             self._write_colors(slot, None if colors is None else colors[i])
         return self._message.tobytes()
 
     def _offsets(self, transl: ArrayLike | None) -> NDArray[np.float64]:
-        offsets = np.zeros(3) if transl is None else np.asarray(transl, dtype=np.float64)
+        offsets = np.zeros(3) if transl is None else numbers("transl", transl).astype(np.float64)
         if offsets.shape not in ((3,), (len(self._slots), 3)):
             msg = f"wanted a translation of shape (3,) or ({len(self._slots)}, 3), got {offsets.shape}"
             raise EncodeError(msg)
@@ -214,7 +214,7 @@ class MarkerArrayEncoder:
             raise EncodeError(msg)
         if slot.colors is None:
             return
-        rgba = np.asarray(colors, dtype=np.float32)
+        rgba = numbers(mesh.ns, colors).astype(np.float32)
         if rgba.shape != (mesh.n_vertices, 4) or not np.isfinite(rgba).all():
             msg = f"{mesh.ns}: wanted finite vertex colours ({mesh.n_vertices}, 4), got {rgba.shape}"
             raise EncodeError(msg)
@@ -243,7 +243,7 @@ def encode_points(
     Raises:
         EncodeError: points of another shape, not finite, none at all, or a stamp that doesn't fit a ROS time.
     """
-    array = np.asarray(points, dtype=np.float64)
+    array = numbers(ns, points).astype(np.float64)
     if array.ndim != 2 or array.shape[1] != 3 or not len(array) or not np.isfinite(array).all():
         msg = f"{ns}: wanted finite points of shape (V, 3), V > 0, got {array.shape}"
         raise EncodeError(msg)

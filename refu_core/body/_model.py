@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
 N_POSE_FEATURES = 9 * (N_JOINTS - 1)
+_LARGEST = 1e6
+"""No model has larger numbers, and in float32 products of much larger ones are infinite."""
 
 
 class BodyOutput(NamedTuple):
@@ -63,11 +65,12 @@ class BodyArrays:
         def numbers(key: str) -> NDArray[np.float64]:
             try:
                 array = np.asarray(data[key], dtype=np.float64)
-            except (TypeError, ValueError) as error:
+            except (TypeError, ValueError, OverflowError) as error:
                 msg = f"{source}: {key} is not an array of numbers: {error}"
                 raise BodyError(msg) from error
-            if not np.isfinite(array).all():
-                msg = f"{source}: {key} has values that are NaN or infinite"
+            # The parent of the root is 2**32 - 1 in official files; all else is metres, shares and indices.
+            if not np.isfinite(array).all() or (key != "kintree_table" and np.abs(array).max(initial=0) > _LARGEST):
+                msg = f"{source}: {key} has values that are NaN or infinite, or beyond {_LARGEST:g}"
                 raise BodyError(msg)
             return array
 
@@ -75,7 +78,7 @@ class BodyArrays:
         n = len(v_template) if v_template.ndim == 2 else 0
         parents = numbers("kintree_table")
         # The root's parent is stored as 2**32 - 1 or -1.
-        if parents.shape != (2, N_JOINTS) or tuple(parents[0, 1:].astype(int)) != PARENTS[1:]:
+        if parents.shape != (2, N_JOINTS) or tuple(parents[0, 1:].tolist()) != PARENTS[1:]:
             msg = f"{source}: kintree_table must be the tree of SMPL's {N_JOINTS} joints, got the shape {parents.shape}"
             raise BodyError(msg)
         posedirs = numbers("posedirs") if "posedirs" in data else None

@@ -7,7 +7,9 @@ arguments, everything else is refused, and arrays are rebuilt from the records a
 
 from __future__ import annotations
 
+import mmap
 import pickle
+import pickletools
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,15 +22,26 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _MAX_BYTES = 1 << 30
+_MAX_MEMO = 1 << 20
+_MAX_OPCODES = 5_000_000
 _NUMERIC_KINDS = "biuf"
+_OPCODES = {ord(opcode.code): opcode for opcode in pickletools.opcodes}
+_LENGTH_BYTES = {
+    pickletools.TAKEN_FROM_ARGUMENT1: 1,
+    pickletools.TAKEN_FROM_ARGUMENT4: 4,
+    pickletools.TAKEN_FROM_ARGUMENT4U: 4,
+    pickletools.TAKEN_FROM_ARGUMENT8U: 8,
+}
 
 
 class _Record:
     """Stands for an object of a pickle: keeps what it was built from, does nothing."""
 
+    args: tuple[Any, ...] = ()
+    state: Any = None
+
     def __init__(self, *args: Any, **_kwargs: Any) -> None:
         self.args = args
-        self.state: Any = None
 
     def __setstate__(self, state: Any) -> None:
         self.state = state
@@ -74,8 +87,12 @@ class _Sparse(_Record):
         if rows * columns > _MAX_BYTES // 8 or len(pointers) != columns + 1 or len(indices) != len(data):
             msg = f"a sparse matrix of {rows} x {columns} with {len(data)} entries"
             raise ValueError(msg)
+        counts = np.diff(pointers)
+        if counts.min(initial=0) < 0 or counts.sum() != len(indices):
+            msg = f"a sparse matrix whose columns have {counts.sum()} entries, and {len(indices)} are given"
+            raise ValueError(msg)
         dense = np.zeros((rows, columns))
-        column = np.repeat(np.arange(columns), np.diff(pointers))
+        column = np.repeat(np.arange(columns), counts)
         np.add.at(dense, (indices, column), data)
         return dense
 
@@ -94,31 +111,45 @@ class _Object(_Record):
     """The name `object`, which Python 2's reconstructor is called with."""
 
 
-def _reconstructor(cls: Any, *_args: Any) -> _Record:
-    if not (isinstance(cls, type) and issubclass(cls, _Record)):
-        msg = "a reconstructor of something that isn't a class"
-        raise pickle.UnpicklingError(msg)
-    return cls()
+# What a pickle may call are classes, too: it could set attributes of a function, and they would stay.
 
 
-def _reconstruct_array(*_args: Any) -> _Array:
-    return _Array()
+class _Reconstructor(_Record):
+    """Python 2's way to make an object of a class."""
+
+    def __new__(cls, made: Any = None, *_args: Any) -> Any:
+        """An empty record of the class `made`."""
+        if not (isinstance(made, type) and issubclass(made, _Record)):
+            msg = "a reconstructor of something that isn't a class"
+            raise pickle.UnpicklingError(msg)
+        return object.__new__(made)
 
 
-def _encode_latin1(text: Any, *_encoding: Any) -> bytes:
+class _ArrayReconstructor(_Record):
+    """Numpy's way to make an array."""
+
+    def __new__(cls, *_args: Any) -> Any:
+        """An array without content."""
+        return _Array()
+
+
+class _Latin1(_Record):
     """How Python 3 writes bytes into protocol 2."""
-    if not isinstance(text, str):
-        msg = "bytes that aren't given as text"
-        raise pickle.UnpicklingError(msg)
-    return text.encode("latin1")
+
+    def __new__(cls, text: Any = None, *_encoding: Any) -> Any:
+        """The bytes."""
+        if not isinstance(text, str):
+            msg = "bytes that aren't given as text"
+            raise pickle.UnpicklingError(msg)
+        return text.encode("latin1")
 
 
 _ALLOWED: dict[tuple[str, str], Any] = {
     ("numpy", "dtype"): _Dtype,
     ("numpy", "ndarray"): _Array,
-    ("_codecs", "encode"): _encode_latin1,
-    **{(module, "_reconstruct"): _reconstruct_array for module in ("numpy.core.multiarray", "numpy._core.multiarray")},
-    **{(module, "_reconstructor"): _reconstructor for module in ("copy_reg", "copyreg")},
+    ("_codecs", "encode"): _Latin1,
+    **{(module, "_reconstruct"): _ArrayReconstructor for module in ("numpy.core.multiarray", "numpy._core.multiarray")},
+    **{(module, "_reconstructor"): _Reconstructor for module in ("copy_reg", "copyreg")},
     **{(module, "object"): _Object for module in ("__builtin__", "builtins")},
     **{(module, "csc_matrix"): _Sparse for module in ("scipy.sparse.csc", "scipy.sparse._csc", "scipy.sparse")},
     ("chumpy.ch", "Ch"): _Chumpy,
@@ -138,6 +169,51 @@ class _InertUnpickler(pickle.Unpickler):
     def persistent_load(self, _pid: Any) -> Any:
         msg = "it refers to objects outside the file: refused"
         raise pickle.UnpicklingError(msg)
+
+
+def _check_opcodes(data: mmap.mmap) -> None:
+    """Checks that a pickle holds what its lengths announce: an unpickler makes room for it before it looks.
+
+    Raises `UnpicklingError` where it doesn't, and for more entries of the memo, or more opcodes, than any model has.
+    """
+    at = 0
+    for _ in range(_MAX_OPCODES):
+        opcode = _OPCODES.get(data[at]) if at < len(data) else None
+        if opcode is None:
+            msg = f"no opcode at byte {at}"
+            raise pickle.UnpicklingError(msg)
+        if opcode.name == "STOP":
+            return
+        at += 1
+        size = _argument_size(opcode.arg, data, at)
+        if size > len(data) - at:
+            msg = f"{opcode.name} at byte {at - 1} wants {size} bytes, the file has {len(data) - at} left"
+            raise pickle.UnpicklingError(msg)
+        if opcode.name in ("PUT", "BINPUT", "LONG_BINPUT"):
+            raw = data[at : at + size]
+            index = int(raw) if opcode.name == "PUT" else int.from_bytes(raw, "little")
+            if not 0 <= index < _MAX_MEMO:
+                msg = f"an entry {index} of the memo, at most {_MAX_MEMO} are made"
+                raise pickle.UnpicklingError(msg)
+        at += size
+    msg = f"more than {_MAX_OPCODES} opcodes"
+    raise pickle.UnpicklingError(msg)
+
+
+def _argument_size(argument: Any, data: mmap.mmap, at: int) -> int:
+    """Bytes that an opcode's argument takes, from `at` on."""
+    if argument is None or argument.n >= 0:
+        return 0 if argument is None else int(argument.n)
+    if argument.n == pickletools.UP_TO_NEWLINE:
+        end = at - 1
+        for _ in range(2 if argument.name == "stringnl_noescape_pair" else 1):
+            end = data.find(b"\n", end + 1)
+            if end < 0:
+                return len(data) + 1
+        return end + 1 - at
+    size = _LENGTH_BYTES[argument.n]
+    # The lengths that have a sign: as a number without one, a negative one is longer than any file.
+    return size + int.from_bytes(data[at : at + size], "little")
 
 
 def _resolve(value: Any) -> NDArray[Any]:
@@ -160,8 +236,9 @@ def read_smpl_pickle(path: Path, *, keys: tuple[str, ...]) -> dict[str, NDArray[
         if size > _MAX_BYTES:
             msg = f"{path}: {size >> 20} MiB, at most {_MAX_BYTES >> 20} MiB are read"
             raise BodyError(msg)
-        with path.open("rb") as file:
-            content = _InertUnpickler(file, encoding="latin1").load()
+        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            _check_opcodes(data)
+            content = _InertUnpickler(data, encoding="latin1").load()
     except BodyError:
         raise
     except RecursionError as error:
@@ -178,7 +255,7 @@ def read_smpl_pickle(path: Path, *, keys: tuple[str, ...]) -> dict[str, NDArray[
         if key in content:
             try:
                 arrays[key] = _resolve(content[key])
-            except (ValueError, TypeError, KeyError, IndexError, OverflowError, UnicodeError) as error:
+            except (ValueError, TypeError, LookupError, OverflowError, RecursionError, MemoryError) as error:
                 msg = f"{path}: {key} can't be read: {error}"
                 raise BodyError(msg) from error
     return arrays

@@ -109,17 +109,18 @@ def _load_clip(path: Path) -> Clip:
         got = "no poses" if poses is None else f"poses of {poses.dtype} and shape {poses.shape}"
         msg = f"{path}: wanted poses (T, 72) of rotation vectors (or SMPL-H's 156, SMPL-X's 165 columns), got {got}"
         raise SimulationError(msg)
-    if fps is None or fps.size != 1 or not 0 < float(fps) <= 10_000:
+    if fps is None or fps.size != 1 or fps.dtype.kind not in "iuf" or not 0 < float(fps.reshape(-1)[0]) <= 10_000:
         msg = f"{path}: wanted mocap_framerate in (0, 10000], got {fps}"
         raise SimulationError(msg)
     transl = data.get("trans", np.zeros((len(poses), 3)))
-    if transl.shape != (len(poses), 3) or not (np.isfinite(poses).all() and np.isfinite(transl).all()):
-        msg = f"{path}: wanted finite poses and trans of the shape ({len(poses)}, 3), got {transl.shape}"
+    is_right = transl.shape == (len(poses), 3) and transl.dtype.kind in "iuf"
+    if not is_right or not (np.isfinite(poses).all() and np.isfinite(transl).all()):
+        msg = f"{path}: wanted finite poses and trans of the shape ({len(poses)}, 3), got {transl.dtype} {transl.shape}"
         raise SimulationError(msg)
     joints = np.zeros((len(poses), N_JOINTS, 3), np.float32)
     n = N_JOINTS if poses.shape[1] == 72 else _BODY_JOINTS
     joints[:, :n] = poses[:, : 3 * n].reshape(-1, n, 3)
-    return Clip(path.stem, joints, transl.astype(np.float64), float(fps))
+    return Clip(path.stem, joints, transl.astype(np.float64), float(fps.reshape(-1)[0]))
 
 
 def split_clips(clips: Sequence[Clip], *, test_every: int = 5) -> tuple[list[Clip], list[Clip]]:

@@ -100,7 +100,7 @@ class Bag:
             self.seeds.append(self._path.read_bytes())
         # Bombs: much of nothing, of records that are too small to be any, and of empty messages; and a claim.
         first = split_mcap(self.seeds[0])[:1]
-        for records in (bytes(128 << 20), b"\x7f" + bytes(8), struct.pack("<BQ", 5, 22) + bytes(22)):
+        for records in (bytes(48 << 20), b"\x7f" + bytes(8), struct.pack("<BQ", 5, 22) + bytes(22)):
             many = records * max(1, (48 << 20) // len(records))
             self.seeds += [
                 join_mcap([*first, (6, mcap_chunk(many))]),
@@ -420,7 +420,7 @@ def small_weights(folder: Path, kind: type[TailorNetConfig] | type[MlpConfig]) -
 
 def _npz(arrays: dict[str, NDArray[Any]]) -> bytes:
     buffer = io.BytesIO()
-    np.savez(buffer, **arrays)
+    np.savez(buffer, **arrays)  # type: ignore[arg-type]
     return buffer.getvalue()
 
 

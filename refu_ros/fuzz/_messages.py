@@ -28,13 +28,14 @@ _WORDS = [
 ]
 
 
+_INTEGERS = (0, 1, 10**9, 2**31 - 1, -(2**31), *INTEGERS, *(-number for number in INTEGERS))
+
+
 def some_frame(seed: int = 0, *, with_style: bool = False) -> SmplFrame:
     """A frame with all its fields set."""
     rng = np.random.default_rng(seed)
-    style = rng.normal(size=4) if with_style else None
-    return SmplFrame(
-        rng.normal(size=(24, 3)), betas=rng.normal(size=10), transl=rng.normal(size=3), style=style, stamp_ns=7
-    )
+    pose, betas, style = (rng.normal(size=n).astype(np.float32) for n in (72, 10, 4))
+    return SmplFrame(pose, betas=betas, transl=rng.normal(size=3), style=style if with_style else None, stamp_ns=7)
 
 
 def check_frame(frame: SmplFrame) -> None:
@@ -139,21 +140,25 @@ class MarkerEncoding(_FromSeed):
     def execute(self, data: bytes) -> None:
         """Encodes what the number stands for."""
         rng = random.Random(data)
-        n, f = rng.choice((0, 1, 4, 300)), rng.choice((0, 1, 7))
         numbers = np.random.default_rng(int.from_bytes(data, "little"))
-        faces = _odd_array(rng, numbers.integers(rng.choice((-1, 0)), max(n, 1) + rng.randrange(2), (f, 3)))
-        name = rng.choice(("a", "", "a/b", "\0", "é", "\ud800", "x" * 3000))
-        color = tuple(rng.choice((0.0, 0.5, 1.0, *FLOATS)) for _ in range(rng.choice((4, 4, 4, 3))))
+
+        def pick(usual: Any, *odd: Any) -> Any:
+            return usual if rng.random() < 0.9 else rng.choice(odd)
+
+        n, f = pick(4, 0, 1, 300), pick(7, 0, 1)
+        faces = _odd_array(rng, numbers.integers(pick(0, -1), max(n, 1) + pick(0, 1), (f, 3)))
+        name = pick("a/b", "", "\0", "é", "\ud800", "x" * 3000)
+        color = tuple(pick(0.5, *FLOATS) for _ in range(pick(4, 3)))
         with_colors = rng.random() < 0.3
-        mesh: Any = adapters.MarkerMesh(name, faces, n, color=color, id=_odd_integer(rng), vertex_colors=with_colors)  # type: ignore[arg-type]
+        mesh = adapters.MarkerMesh(name, faces, n, color=color, id=pick(0, *_INTEGERS), vertex_colors=with_colors)
         vertices = _odd_array(rng, numbers.normal(size=(n, 3)).astype(rng.choice((np.float32, np.float64))))
-        colors = [_odd_array(rng, np.ones((n, 4)))] if with_colors or rng.random() < 0.1 else None
-        stamp = _odd_integer(rng)
+        colors = [_odd_array(rng, np.ones((n, 4)))] if with_colors != pick(False, True) else None
+        stamp = pick(5, *_INTEGERS)
         transl = _odd_array(rng, numbers.normal(size=rng.choice((3, (1, 3)))))
-        axes: Any = rng.choice(("smpl", "frame"))
-        message = adapters.MarkerArrayEncoder([mesh], frame_id=rng.choice(("map", "", "\ud800")), axes=axes).encode(
-            [vertices], stamp_ns=stamp, transl=rng.choice((transl, None)), colors=colors
+        encoder = adapters.MarkerArrayEncoder(
+            [mesh], frame_id=pick("map", "", "\ud800"), axes=rng.choice(("smpl", "frame"))
         )
+        message = encoder.encode([vertices], stamp_ns=stamp, transl=pick(transl, None), colors=colors)
         (marker,) = adapters.decode_marker_array(message)
         assert (marker.ns, marker.stamp_ns, marker.points.shape) == (name, stamp, (3 * len(faces), 3)), "another marker"
         assert np.isfinite(marker.points).all(), "points that aren't finite"
@@ -179,8 +184,9 @@ class MessageObjects(_FromSeed):
         }
         kind = rng.choice(list(message))
         fields: dict[str, Any] = message[kind]
+        holders = (fields, vars(header), vars(header.stamp), vars(point), vars(dimensions[0]))
         for _ in range(rng.randrange(3)):
-            holder = rng.choice((fields, vars(header), vars(header.stamp), vars(point), vars(dimensions[0])))
+            holder = rng.choice(holders)
             holder[rng.choice(list(holder))] = rng.choice(odd)
         if rng.random() < 0.1:
             del fields[rng.choice(list(fields))]
@@ -217,13 +223,9 @@ class Parameters:
             assert settings.changed({}) == settings, "settings that aren't valid themselves"
 
 
-def _odd_integer(rng: random.Random) -> int:
-    return rng.choice((0, 1, 5, 10**9, 2**31 - 1, -(2**31), rng.choice(INTEGERS), -rng.choice(INTEGERS)))
-
-
 def _odd_array(rng: random.Random, array: Any) -> Any:
     """The array, mostly as it is; otherwise of another shape or type, or with an odd number in it."""
-    action = rng.randrange(24)
+    action = rng.randrange(60)
     if action == 0:
         return array.reshape(-1)
     if action == 1:

@@ -35,8 +35,8 @@ _MAX_CORPUS = 2000
 _MAX_KEPT = 64 << 10
 """Larger inputs aren't built upon: they are slow, and small ones reach the same lines."""
 _BEAT_S = 0.5
-_SILENT_S = 120.0
-"""A process that says nothing for so long hangs where Python can't interrupt it."""
+_BUSY_S, _SILENT_S = 15.0, 300.0
+"""Processor time and time that a process may take without a word: longer, and it hangs where Python can't interrupt."""
 _ADDRESS_SPACE = 8 << 30
 """Of memory that is asked for beyond what there is after the start, used or not [bytes]."""
 
@@ -140,6 +140,7 @@ class _Search:
         self._reader = target.open(folder)
         self._rng = random.Random(f"{target.name} {seed}")
         self._corpus = list(self._reader.seeds)
+        self._n_seeds = len(self._corpus)
         self._ways: set[str] = set()
         self._guard = guard or Guard(seconds=target.seconds, memory_mb=target.memory_mb)
         self.current: Callable[[bytes], None] = lambda _: None
@@ -168,8 +169,9 @@ class _Search:
 
     def _next(self) -> bytes:
         # The newest entries are the ones whose surroundings are least known.
-        recent = self._rng.random() < 0.5
-        parent = self._rng.choice(self._corpus[-20:] if recent else self._corpus)
+        # Descendants of damaged input are refused early, so that every third begins with the seeds.
+        places = (self._corpus[: self._n_seeds], self._corpus, self._corpus[-20:])
+        parent = self._rng.choice(self._rng.choice(places))
         if len(parent) > _MAX_KEPT:
             parent = self._corpus[0]
         data = self._reader.mutate(self._rng, parent, self._rng.choice(self._corpus))
@@ -184,7 +186,7 @@ class _Search:
             if len(self._corpus) < _MAX_CORPUS:
                 self._corpus.append(data)
             else:
-                self._corpus[self._rng.randrange(len(self._corpus))] = data
+                self._corpus[self._rng.randrange(self._n_seeds, _MAX_CORPUS)] = data
         is_known = outcome.signature in self._ways
         self._ways.add(outcome.signature)
         if outcome.is_finding:
@@ -222,7 +224,9 @@ def _run_process(
     report: Callable[[FuzzRow], None] | None,
 ) -> bool:
     """Fuzzes in a process of its own and brings `row` up to date; False if the process died, which is a finding."""
-    context = multiprocessing.get_context("spawn")
+    # The libraries are loaded once, in the server that all processes are forked from.
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["refu_ros.fuzz"])
     with tempfile.TemporaryDirectory(dir=working_folder()) as folder:
         current = Path(folder) / "current"
         current.write_bytes(bytes(8 + _LARGEST_INPUT))
@@ -234,7 +238,7 @@ def _run_process(
         before, latest, done = FuzzRow(**{**vars(row), "findings": list(row.findings)}), None, False
         try:
             with contextlib.suppress(EOFError):
-                while receiver.poll(_SILENT_S):
+                while _wait(receiver, process.pid or 0, limit=_BUSY_S + 10 * target.seconds):
                     latest, done = receiver.recv()
                     _add(row, before, latest)
                     if report is not None:
@@ -255,6 +259,23 @@ def _run_process(
         row.failures += 1
         row.findings.append(keep(target.name, "died", f"died: {what}", what, data[8 : 8 + size], output))
         return False
+
+
+def _wait(receiver: Connection, pid: int, *, limit: float) -> bool:
+    """Whether the process has said something, before it took `limit` seconds of processor time or five minutes."""
+    started, used = time.monotonic(), _processor_seconds(pid)
+    while not receiver.poll(1.0):
+        if time.monotonic() - started > _SILENT_S or _processor_seconds(pid) - used > limit:
+            return False
+    return True
+
+
+def _processor_seconds(pid: int) -> float:
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", maxsplit=1)[1].split()
+    except OSError:
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _add(row: FuzzRow, before: FuzzRow, latest: FuzzRow) -> None:
