@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from functools import partial
 
 from tqdm import tqdm
 
@@ -24,105 +24,125 @@ def benchmark(options: BenchmarkOptions, *, progress: bool = False) -> Benchmark
     Raises:
         RefuError: no motion, a bag or weights that can't be read, or a process that couldn't be started.
     """
-    sizes = options.sizes
     result = BenchmarkResult(options.command, options.quick, skips=SKIPS)
-    stretches = read_stretches(options.motions, options.bags, count=sizes.windows, length=sizes.frames)
-    with one_core() as core, _bar(progress) as advance:
+    with one_core() as core, _Bar(shown=progress) as bar:
         result.machine = {**machine_facts(options.devices[-1]), "core": core, "load_before": load_average()}
-        result.rates = measure_rates(quick=options.quick)
-        backbone = ""
-        for garment in options.worn:
-            pipelines, missing = load_pipelines(garment, options, modes=sizes.modes)
-            result.missing.update(missing)
-            first = next(iter(pipelines))
-            backbone = backbone or first[0]
-            windows = moments(stretches, pipelines[first])
-            figures = _figures(options, garment, pipelines, result, advance)
-            _measure(result, options, garment, pipelines, windows, figures, advance)
-        _start_processes(options, result, backbone, advance)
+        _Run(options, result, bar).everything()
         result.machine["load_after"] = load_average()
     return result
 
 
-def _measure(
-    result: BenchmarkResult,
-    options: BenchmarkOptions,
-    garment: str,
-    pipelines: sections.Pipelines,
-    windows: list[Window],
-    figures: dict[tuple[str, str], dict[str, float]],
-    advance: Callable[[], None],
-) -> None:
-    for device in options.devices:
-        if device != "cpu":
-            pipelines, _ = load_pipelines(garment, options, modes=options.sizes.modes, device=device)
-        section = sections.Section(
-            garment=garment, windows=windows, options=options, result=result, progress=advance, device=device
+class _Run:
+    """One run's parts, in their order."""
+
+    def __init__(self, options: BenchmarkOptions, result: BenchmarkResult, bar: _Bar) -> None:
+        self._options, self._sizes = options, options.sizes
+        self._result = result
+        self._bar = bar
+
+    def everything(self) -> None:
+        stretches = read_stretches(
+            self._options.motions, self._options.bags, count=self._sizes.windows, length=self._sizes.frames
         )
-        is_main = garment == options.worn[0]
-        sections.measure_frames(section, pipelines, figures)
-        sections.measure_sdfs(section, network=is_main and options.sizes.has_network)
-        if is_main:
-            sections.measure_persons(section, pipelines)
-            sections.measure_still(section, pipelines)
-            if result.skips:
-                sections.measure_skips(section, pipelines)
-            sections.measure_paper(section, pipelines)
-        if is_main and device == "cpu":
-            sections.measure_growth(section)
-            sections.count_work(section, pipelines)
+        self._result.rates = measure_rates(quick=self._options.quick)
+        for garment in self._options.worn:
+            self._bar.announce(f"{garment}: errors")
+            pipelines, missing = load_pipelines(garment, self._options, modes=self._sizes.modes)
+            self._result.missing.update(missing)
+            windows = moments(stretches, next(iter(pipelines.values())))
+            self._times(garment, pipelines, windows, self._errors(garment, pipelines))
+        self._bar.announce("starts")
+        self._starts()
 
-
-def _figures(
-    options: BenchmarkOptions,
-    garment: str,
-    pipelines: sections.Pipelines,
-    result: BenchmarkResult,
-    advance: Callable[[], None],
-) -> dict[tuple[str, str], dict[str, float]]:
-    """How right each pipeline is, by (backbone, mode)."""
-    bag = truth_bag(garment, options.bags)
-    if bag is None:
-        result.missing[f"{garment}: errors"] = f"the repository's evaluation bags in {options.bags.name}/"
-        return {}
-    count = options.sizes.test_frames
-    return accuracies(pipelines, garment, bag, frames=count, progress=advance)
-
-
-def _start_processes(
-    options: BenchmarkOptions, result: BenchmarkResult, backbone: str, advance: Callable[[], None]
-) -> None:
-    """Processes with two garments, one after the other."""
-    unit = result.of("sdf", mode="plain", device="cpu")[0].ms_median
-    sizes = weights_mb(options, TWO, backbone, options.sizes.starts[0])
-    if len(sizes) < len(TWO):
-        backbone = "skinned"
-    cases = [(mode, False) for mode in options.sizes.starts]
-    cases += [] if options.quick else [(options.sizes.starts[0], True)]
-    for mode, first_ever in cases:
-        found = start(options, mode=mode, backbone=backbone, first_ever=first_ever)
-        ms = 1e3 * found.pop("first_mesh_s")
-        figures = {**found, **{f"weights_mb_{name}": size for name, size in sizes.items()}}
-        result.rows.append(
-            Row(
-                stage="start",
-                mode=mode,
-                garment=",".join(TWO),
-                ms_median=ms,
-                ratio=ms / unit,
-                method="first start ever" if first_ever else "again",
-                backbone=backbone,
-                figures=figures,
+    def _errors(self, garment: str, pipelines: sections.Pipelines) -> dict[tuple[str, str], dict[str, float]]:
+        """How right each pipeline is, by (backbone, mode)."""
+        bag = truth_bag(garment, self._options.bags)
+        if bag is None:
+            self._result.missing[f"{garment}: errors"] = (
+                f"the repository's evaluation bags in {self._options.bags.name}/"
             )
-        )
-        advance()
+            return {}
+        return accuracies(pipelines, garment, bag, frames=self._sizes.test_frames, progress=self._bar.step)
+
+    def _times(
+        self,
+        garment: str,
+        pipelines: sections.Pipelines,
+        windows: list[Window],
+        figures: dict[tuple[str, str], dict[str, float]],
+    ) -> None:
+        is_main = garment == self._options.worn[0]
+        for device in self._options.devices:
+            if device != "cpu":
+                pipelines, _ = load_pipelines(garment, self._options, modes=self._sizes.modes, device=device)
+            section = sections.Section(
+                garment=garment,
+                windows=windows,
+                options=self._options,
+                result=self._result,
+                progress=self._bar.step,
+                device=device,
+            )
+            network = is_main and self._sizes.has_network
+            parts: dict[str, Callable[[], None]] = {
+                "frames": partial(sections.measure_frames, section, pipelines, figures),
+                "distances": partial(sections.measure_sdfs, section, network=network),
+            }
+            if is_main:
+                of_main = sections.OF_MAIN_GARMENT.items()
+                parts |= {name: partial(measure, section, pipelines) for name, measure in of_main}
+            if is_main and device == "cpu":
+                parts["growth"] = partial(sections.measure_growth, section)
+                parts["limits"] = partial(sections.count_work, section, pipelines)
+            for name, part in parts.items():
+                self._bar.announce(f"{garment}, {device}: {name}")
+                part()
+
+    def _starts(self) -> None:
+        """Processes with two garments, one after the other."""
+        unit = self._result.of("sdf", mode="plain", device="cpu")[0].ms_median
+        modes = self._sizes.starts
+        backbone = self._result.of("frame")[0].backbone or "skinned"
+        sizes = weights_mb(self._options, TWO, backbone, modes[0])
+        if len(sizes) < len(TWO):
+            backbone = "skinned"
+        for mode, first_ever in [
+            *((mode, False) for mode in modes),
+            *([] if self._options.quick else [(modes[0], True)]),
+        ]:
+            found = start(self._options, mode=mode, backbone=backbone, first_ever=first_ever)
+            ms = 1e3 * found.pop("first_mesh_s")
+            self._result.rows.append(
+                Row(
+                    stage="start",
+                    mode=mode,
+                    garment=",".join(TWO),
+                    ms_median=ms,
+                    ratio=ms / unit,
+                    method="first start ever" if first_ever else "again",
+                    backbone=backbone,
+                    figures={**found, **{f"weights_mb_{name}": size for name, size in sizes.items()}},
+                )
+            )
+            self._bar.step()
 
 
-@contextmanager
-def _bar(progress: bool) -> Iterator[Callable[[], None]]:
-    with tqdm(desc="benchmark", unit="step", disable=None if progress else True) as bar:
+class _Bar:
+    """How far it is, and with what."""
 
-        def advance() -> None:
-            bar.update()
+    def __init__(self, *, shown: bool) -> None:
+        self._bar = tqdm(desc="benchmark", unit="step", disable=None if shown else True)
 
-        yield advance
+    def announce(self, part: str) -> None:
+        """Names what comes next."""
+        self._bar.set_description(part)
+
+    def step(self) -> None:
+        """One step more is done."""
+        self._bar.update()
+
+    def __enter__(self) -> _Bar:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()

@@ -183,7 +183,7 @@ def measure_skips(section: Section, pipelines: Pipelines) -> None:
     """The pipeline without each of the things that it skips, of bodies that move and of one that doesn't."""
     backbone = _backbone(pipelines)
     held = section.windows[0][1]
-    for _, mode in _main(pipelines):
+    for _, mode in _main(pipelines) if section.result.skips else ():
         contenders: dict[str, Callable[[Moment], object]] = {PLAIN_QUERY: section.plain()}
         for skip in ("", *section.result.skips):
             off = [skip] if skip else []
@@ -263,6 +263,15 @@ def _dressing(paper: PaperStructure, name: str) -> Callable[[Sequence[SmplFrame]
         return outputs
 
     return dress
+
+
+OF_MAIN_GARMENT: Mapping[str, Callable[[Section, Pipelines], None]] = {
+    "persons": measure_persons,
+    "unchanged": measure_still,
+    "skips": measure_skips,
+    "paper": measure_paper,
+}
+"""What is measured of the first garment alone, on every device."""
 
 
 def count_work(section: Section, pipelines: Pipelines) -> None:
