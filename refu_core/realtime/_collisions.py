@@ -8,7 +8,7 @@ from torch import Tensor
 
 from refu_core.body import SmplBody
 from refu_core.garments import GarmentTemplate
-from refu_core.repulsion import Blend, Limbs, Resolution, VertexScale, resolve
+from refu_core.repulsion import Limbs, Resolution, Resolver, VertexScale
 from refu_core.sdf import ApproxSdf, BandSdf, ExactSdf, Links, RestFaces
 
 
@@ -18,11 +18,8 @@ class Fabric:
 
     shapedirs: Tensor
     """The garment's displacement a unit of each beta [m], shape (V * 3, 10)."""
-    edges: Tensor
-    """Shape (E, 2)."""
     links: Links
-    blend: Blend
-    limbs: Limbs
+    resolver: Resolver
 
     @classmethod
     def of(cls, garment: GarmentTemplate, body: SmplBody, rest: ExactSdf) -> Fabric:
@@ -30,10 +27,8 @@ class Fabric:
         clearance = rest.query(garment.v_template).distance
         return cls(
             garment.shapedirs,
-            garment.edges,
             Links.of(garment.edges, garment.n_vertices),
-            Blend.of_faces(garment.faces, garment.n_vertices),
-            Limbs.of(body.weights, body.faces, garment.weights, garment.faces, clearance=clearance),
+            Resolver(Limbs.of(body.weights, body.faces, garment.weights, garment.faces, clearance=clearance)),
         )
 
 
@@ -66,18 +61,9 @@ class Collisions:
     def resolve(
         self, fabric: Fabric, points: Tensor, *, margin: float, scale: float | VertexScale, near: Tensor | None
     ) -> Resolution:
-        """The garment with vertices [m], shape (N, 3), off the body (`refu_core.repulsion.resolve`)."""
-        start = None
+        """The garment with vertices [m], shape (N, 3), off the body (`refu_core.repulsion.Resolver`)."""
         if self._band is not None and margin + 2e-3 <= self._band.band:
             start = self._band.clipped(points, fabric.links)
-        return resolve(
-            points,
-            self._sdf,
-            margin=margin,
-            scale=scale,
-            start=start,
-            near=near,
-            blend=fabric.blend,
-            edges=fabric.edges,
-            limbs=fabric.limbs,
-        )
+        else:
+            start = self._sdf.query(points, near=near)
+        return fabric.resolver(points, self._sdf, start, margin=margin, scale=scale)

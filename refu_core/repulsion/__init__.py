@@ -10,6 +10,7 @@ from refu_core.repulsion._postprocess import push_naively as push_naively
 from refu_core.repulsion._refu import Refu as Refu
 from refu_core.repulsion._resolve import Resolution as Resolution
 from refu_core.repulsion._resolve import resolve as resolve
+from refu_core.repulsion._resolver import Resolver as Resolver
 from refu_core.repulsion._scale import PAPER as PAPER
 from refu_core.repulsion._scale import REALTIME as REALTIME
 from refu_core.repulsion._scale import SCALE_PRESETS as SCALE_PRESETS

@@ -22,9 +22,9 @@ _LIMBS: tuple[tuple[int, ...], ...] = (
 """SMPL joints of each limb."""
 _OWN = 0.02
 """A vertex lies on every limb that has more than this of its skinning weight: around the armpit, on trunk and arm."""
-_INWARD = 0.15
+INWARD = 0.15
 """Share of vertices that a limb has to push inwards not to count as under the cloth."""
-_SIDEWAYS = -0.3
+SIDEWAYS = -0.3
 """Cosine between push and outward normal above which a push leads around a limb, and no longer back from it."""
 
 
@@ -114,5 +114,5 @@ class Limbs:
         inward = torch.zeros(len(_LIMBS), device=rows.device)
         touched = inward.index_add(0, limb[foreign], torch.ones_like(along[foreign]))
         inward.index_add_(0, limb[foreign], (along[foreign] < 0).float())
-        under_cloth = inward < _INWARD * touched
-        return foreign & (along > _SIDEWAYS) & ~under_cloth[limb]
+        under_cloth = inward < INWARD * touched
+        return foreign & (along > SIDEWAYS) & ~under_cloth[limb]

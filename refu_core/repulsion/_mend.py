@@ -14,14 +14,14 @@ _LOOKS = 3
 """How far into a patch of wrong closest faces is looked from its rim [edges]."""
 _ROUNDS = 8
 """How far into a patch of wrong sides is looked from its rim [edges]."""
-_TOLERANCE = 1e-3
+TOLERANCE = 1e-3
 """Disagreement that is let pass [m]: an approximate distance is never quite consistent."""
 DEEP = 0.008
 """How deep a vertex is whose way out may be through the other side of its limb [m]."""
-_STEPS = 8
-_STEP_ON = 1e-3
+STEPS = 8
+STEP_ON = 1e-3
 """What is added to each step [m], so that the steps end."""
-_FARTHEST = 0.08
+FARTHEST = 0.08
 """A way out of its own that is longer is none [m]."""
 
 
@@ -73,7 +73,7 @@ def mend(
             break
         to_plane = within.distance + ((points[high] - points[low]) * within.gradient).sum(-1)
         is_wrong = (
-            limbs.is_sole(high, within.face) & (within.distance < 0) & (to_plane < sample.distance[high] - _TOLERANCE)
+            limbs.is_sole(high, within.face) & (within.distance < 0) & (to_plane < sample.distance[high] - TOLERANCE)
         )
         sample, changed = _replaced(sample, high, within._replace(distance=to_plane), is_wrong)
         if not changed:
@@ -97,14 +97,14 @@ def turn_outward(
     rows = torch.nonzero(against & (sample.distance < -DEEP))[:, 0]
     way, going = -sample.distance[rows], torch.arange(len(rows), device=rows.device)
     looks = 0
-    while len(going) and looks < _STEPS:
+    while len(going) and looks < STEPS:
         at = rows[going]
         # No skin is nearer than |f|.
         height = query(points[at] + way[going, None] * outward[at], at).distance
-        way[going] = way[going] - height + (height < 0) * _STEP_ON
-        going = going[(height < 0) & (way[going] < _FARTHEST)]
+        way[going] = way[going] - height + (height < 0) * STEP_ON
+        going = going[(height < 0) & (way[going] < FARTHEST)]
         looks += 1
-    found = torch.ones_like(way, dtype=torch.bool).index_fill(0, going, False) & (way < _FARTHEST)
+    found = torch.ones_like(way, dtype=torch.bool).index_fill(0, going, False) & (way > 0) & (way < FARTHEST)
     rows, way = rows[found], way[found]
     turned = sample._replace(
         distance=sample.distance.index_copy(0, rows, -way), gradient=sample.gradient.index_copy(0, rows, outward[rows])
@@ -115,11 +115,11 @@ def turn_outward(
 def _contradictions(points: Tensor, distance: Tensor, edges: Tensor, margin: float) -> tuple[Tensor, Tensor]:
     """Ends of the edges whose distances differ by more than their length, and of which one is below `margin`."""
     ends = distance[edges]
-    differs = (ends[:, 0] - ends[:, 1]).abs() > _TOLERANCE
+    differs = (ends[:, 0] - ends[:, 1]).abs() > TOLERANCE
     suspects = edges[torch.nonzero(differs & (ends.amin(1) < margin))[:, 0]]
     first, second = suspects.unbind(1)
     length = torch.linalg.vector_norm(points[first] - points[second], dim=-1)
-    first, second = suspects[(distance[first] - distance[second]).abs() > length + _TOLERANCE].unbind(1)
+    first, second = suspects[(distance[first] - distance[second]).abs() > length + TOLERANCE].unbind(1)
     return first, second
 
 

@@ -14,13 +14,13 @@ from refu_core.repulsion._scale import VertexScale
 from refu_core.repulsion._unit import DEFAULT_MARGIN, MAX_DISPLACEMENT, repulse
 from refu_core.sdf import BodySdf, SdfSample
 
-_RETREAT_STEPS = 8
-_BENT = 0.9
+RETREAT_STEPS = 8
+BENT = 0.9
 """Cosine between the skin's normals below its ends under which an edge may cut a corner."""
-_SURE = 4e-3
+SURE = 4e-3
 """How far beyond the margin a distance is trusted to be one from the body [m]. Where a body runs into itself it jumps:
 a vertex within an arm may be said to be 2 cm outside of the flank that the arm is in."""
-_STEP_ON = 1e-3
+STEP_ON = 1e-3
 """What is added to each step of a retreat [m], so that it ends."""
 
 
@@ -223,7 +223,7 @@ def _push_blended(
     moved = state.bounded(state.origin[everyone] + field[everyone], everyone)
     # No vertex gets nearer by more than it moves: those that stay beyond the margin needn't be asked.
     way = torch.linalg.vector_norm(moved - state.origin[everyone], dim=-1)
-    floor = state.distance[everyone].clamp_max(state.margin + _SURE) - way
+    floor = state.distance[everyone].clamp_max(state.margin + SURE) - way
     is_near = is_pushed[everyone] | (floor < state.margin + state.tolerance)
     far = everyone[~is_near]
     state.vertices[far], state.distance[far] = moved[~is_near], floor[~is_near]
@@ -271,11 +271,11 @@ def _retreat(state: _State, rows: Tensor, outward: Tensor, limbs: Limbs, max_pus
     walker, here = rows, state.vertices[rows]
     distance, way = state.distance[rows], torch.zeros_like(state.distance[rows])
     rounds = 0
-    while len(walker) and rounds < _RETREAT_STEPS:
+    while len(walker) and rounds < RETREAT_STEPS:
         rounds += 1
         # No surface is nearer than |f|: a step of |f| can't jump over the room that is sought, however narrow it is.
         # Farther in than the garment is cut off the skin there is only flesh.
-        step = torch.minimum(-distance + _STEP_ON, limbs.clearance[walker] + _STEP_ON - way)
+        step = torch.minimum(-distance + STEP_ON, limbs.clearance[walker] + STEP_ON - way)
         here = here - step[:, None] * outward[walker]
         way = way + step
         sample = state.query(here, walker)
@@ -306,7 +306,7 @@ def _raise_edges(state: _State, edges: Tensor, max_rounds: int) -> int:
     low = torch.nonzero((closer < state.margin + state.tolerance) & (closer >= 0))[:, 0]
     first, second = edges[low].unbind(1)
     length = torch.linalg.vector_norm(state.vertices[first] - state.vertices[second], dim=-1)
-    is_bent = (state.gradient[first] * state.gradient[second]).sum(-1) < _BENT
+    is_bent = (state.gradient[first] * state.gradient[second]).sum(-1) < BENT
     low = edges[low[is_bent & (farther[low] < wanted + 0.5 * length)]]
     for round_ in range(max_rounds):
         middle = state.query(state.vertices[low].mean(dim=1), low[:, 0])

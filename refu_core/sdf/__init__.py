@@ -18,4 +18,6 @@ from refu_core.sdf._protocol import BodySdf as BodySdf
 from refu_core.sdf._protocol import SdfSample as SdfSample
 from refu_core.sdf._protocol import query_batch as query_batch
 from refu_core.sdf._rest import RestFaces as RestFaces
+from refu_core.sdf._skin import Skin as Skin
+from refu_core.sdf._skin import ask as ask
 from refu_core.sdf._topology import check_faces as check_faces

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -77,6 +77,12 @@ class ApproxSdf(MeshSdf):
         self._table_wp = as_warp(self._table, wp.int32)
         self._exact = ExactSdf(body.faces, device=self.device)
         self._exact_is_late = True
+
+    def skin(self) -> Any:
+        """As `MeshSdf.skin`."""
+        skin = super().skin()
+        skin.links, skin.table, skin.cell = self._links_wp, self._table_wp, _CELL
+        return skin
 
     def _take_pose(self, *, is_new: bool) -> None:
         del is_new

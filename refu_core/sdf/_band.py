@@ -130,6 +130,12 @@ class BandSdf(MeshSdf):
             found.distance.clamp_(max=self.band)
         return found.sample()
 
+    def skin(self) -> Any:
+        """As `MeshSdf.skin`."""
+        self._require_update()
+        self._pose_tree()
+        return self._tree.skin()
+
     def _take_pose(self, *, is_new: bool) -> None:
         if is_new:
             self._scan = None

@@ -105,6 +105,12 @@ class ExactSdf(MeshSdf):
         self._require_update()
         return int(self._mesh.id)
 
+    def skin(self) -> Any:
+        """As `MeshSdf.skin`."""
+        skin = super().skin()
+        skin.tree = self._mesh.id
+        return skin
+
     def closest(self, points: Tensor, *, max_distance: float = math.inf) -> ClosestPoints:
         """The closest point of the body to each of `points` [m], shape (N, 3), where one is within `max_distance` [m].
 

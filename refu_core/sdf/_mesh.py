@@ -15,6 +15,7 @@ from refu_core._warp import as_warp
 from refu_core.errors import MeshError
 from refu_core.sdf._analytic import Feature, signed_distance
 from refu_core.sdf._protocol import SdfSample
+from refu_core.sdf._skin import Skin
 from refu_core.sdf._topology import Topology
 
 
@@ -157,6 +158,14 @@ class MeshSdf(ABC):
             found.barycentrics.to(points, copy=True),
         )
         return signed_distance(points, corners, feature)._replace(face=found.face.clone())
+
+    def skin(self) -> Any:
+        """The posed body for kernels of one's own, as `refu_core.sdf.Skin`. Raises `MeshError` before `update`."""
+        self._require_update()
+        skin = Skin()
+        skin.points, skin.faces = self._points_wp, self._faces
+        skin.across, skin.fan_start, skin.fan_face = self._topology
+        return skin
 
     @abstractmethod
     def _take_pose(self, *, is_new: bool) -> None:

@@ -190,8 +190,10 @@ def descend(
     return face, w, feature, squared
 
 
-@wp.kernel(enable_backward=False)
-def walk_kernel(
+@wp.func
+def walk_from(
+    p: wp.vec3,
+    near: int,
     points: wp.array(dtype=wp.vec3),
     faces: wp.array2d(dtype=int),
     across: wp.array2d(dtype=int),
@@ -200,19 +202,11 @@ def walk_kernel(
     links: wp.array2d(dtype=int),
     table: wp.array2d(dtype=int),
     cell: float,
-    queries: wp.array(dtype=wp.vec3),
-    near: wp.array(dtype=int),
-    # outputs
-    out_face: wp.array(dtype=int),
-    out_feature: wp.array(dtype=int),
-    out_barycentrics: wp.array(dtype=wp.vec3),
-    out_normal: wp.array(dtype=wp.vec3),
-    out_distance: wp.array(dtype=float),
-    out_gradient: wp.array(dtype=wp.vec3),
 ):
-    """The closest of the points that walks from `near` and from other parts' guides end at, as `closest_kernel`'s."""
-    i = wp.tid()
-    p = queries[i]
+    """The closest of the faces that walks from `near` and from other parts' guides end at.
+
+    Also the closest feature on it, the barycentrics there, and the face's normal, of any length.
+    """
     home = cell_of(p, cell)
     row = row_of(home[0], home[1], home[2])
     absent = int(table[row, ABSENT])
@@ -225,7 +219,7 @@ def walk_kernel(
     above = wp.vec3()
     # -1 is the walk from `near`. One loop with one call of each function: so a compiler puts them in place.
     for part in range(-1, MAX_PARTS):
-        start = int(near[i])
+        start = int(near)
         walks = bool(part < 0)
         if part >= 0 and (absent >> part) & 1 == 0 and part != own:
             start = table[row, part] & ((1 << FACE_BITS) - 1)
@@ -259,7 +253,33 @@ def walk_kernel(
             own = links[face, 6]
             if (absent | (1 << own)) == EMPTY:
                 break
+    return face, feature, w, above
 
+
+@wp.kernel(enable_backward=False)
+def walk_kernel(
+    points: wp.array(dtype=wp.vec3),
+    faces: wp.array2d(dtype=int),
+    across: wp.array2d(dtype=int),
+    fan_start: wp.array(dtype=int),
+    fan_face: wp.array(dtype=int),
+    links: wp.array2d(dtype=int),
+    table: wp.array2d(dtype=int),
+    cell: float,
+    queries: wp.array(dtype=wp.vec3),
+    near: wp.array(dtype=int),
+    # outputs
+    out_face: wp.array(dtype=int),
+    out_feature: wp.array(dtype=int),
+    out_barycentrics: wp.array(dtype=wp.vec3),
+    out_normal: wp.array(dtype=wp.vec3),
+    out_distance: wp.array(dtype=float),
+    out_gradient: wp.array(dtype=wp.vec3),
+):
+    """What `walk_from` finds for each query, as `closest_kernel`'s."""
+    i = wp.tid()
+    p = queries[i]
+    face, feature, w, above = walk_from(p, near[i], points, faces, across, fan_start, fan_face, links, table, cell)
     offset = p - points[links[face, 0]]
     if feature == FACE:
         above = wp.normalize(above)

@@ -1,0 +1,257 @@
+"""`resolve` in real time: the same steps, each one launch over the vertices that it concerns."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+from numpy.typing import NDArray
+from torch import Tensor
+
+from refu_core._warp import as_warp, torch_stream
+from refu_core.repulsion import _resolver_kernels as kernels
+from refu_core.repulsion._blend import BLEND_ROUNDS
+from refu_core.repulsion._limbs import INWARD, SIDEWAYS, Limbs
+from refu_core.repulsion._mend import DEEP, FARTHEST, STEP_ON, STEPS, TOLERANCE, mend
+from refu_core.repulsion._resolve import BENT, RETREAT_STEPS, SURE, Resolution
+from refu_core.repulsion._scale import VertexScale
+from refu_core.repulsion._unit import DEFAULT_MARGIN, MAX_DISPLACEMENT
+from refu_core.sdf import ApproxSdf, BandSdf, ExactSdf, SdfSample
+
+_MAX_PUSHES = 4
+_TOLERANCE = 2e-4
+
+
+class Resolver:
+    """Brings one garment off bodies: what `resolve` does with its neighbourhood, limbs and edges, several times faster.
+
+    The memory that it takes and the launches that are made in every frame are prepared once. Vertices are listed by the
+    step before, so that a step costs what the vertices at the skin do; a vertex's pushes, and the looks in between, are
+    one loop in one kernel, since they don't depend on those of others. What does (limbs, neighbourhood, edges) is
+    finished for all vertices by one launch before the next one begins; so the order of vertices plays no role, and the
+    answers are those of `resolve` but for rounding.
+    """
+
+    def __init__(self, limbs: Limbs) -> None:
+        """For the garment that `limbs` is of, on its device."""
+        self._limbs = limbs
+        self.device = limbs.faces.device
+        n, e = len(limbs.own), len(limbs.edges)
+        self._n_vertices = n
+        self._cloth = _cloth(limbs)
+        self._vectors = {name: torch.zeros(n, 3, device=self.device) for name in _VECTORS}
+        self._floats = {name: torch.zeros(n, device=self.device) for name in _FLOATS}
+        self._ints = {name: torch.zeros(n, dtype=torch.int32, device=self.device) for name in _INTS}
+        self._by_edge = torch.zeros(3, e, dtype=torch.int32, device=self.device)
+        self._deficit = torch.zeros(e, device=self.device)
+        self._rise = torch.zeros(e, 3, device=self.device)
+        self._counts = torch.zeros(kernels.N_COUNTS + 2 * _N_LIMBS, dtype=torch.int32, device=self.device)
+        self._sheet = self._bind_sheet()
+        self._commands: dict[str, Any] = {}
+        self._margin = -1.0
+        self._recorded_for: tuple[Any, ...] = ()
+
+    @torch.no_grad()
+    def __call__(
+        self,
+        points: Tensor,
+        sdf: ExactSdf | BandSdf | ApproxSdf,
+        start: SdfSample,
+        *,
+        margin: float = DEFAULT_MARGIN,
+        scale: float | VertexScale = 1.0,
+    ) -> Resolution:
+        """The garment with vertices [m], shape (N, 3), off the body last given to `sdf`; not differentiable.
+
+        Args:
+            points: Garment vertices [m], shape (N, 3).
+            sdf: The body's signed distance.
+            start: What it says of the points; what is beyond `margin` + 2 mm may be clipped from above.
+            margin: ε ≥ 0 [m].
+            scale: α of the first push, as `resolve` takes it.
+        """
+        assert start.face is not None  # these distances are to faces
+        with torch_stream(self.device):
+            if not self._begin(points, start, margin):
+                return self._resolution(points, start, rounds=0)
+            self._record(sdf)
+            if self._count(kernels.CONTRADICTIONS):
+                look = (lambda here, faces: sdf.query(here, near=faces)) if isinstance(sdf, ApproxSdf) else None
+                start = mend(points, start, self._limbs, margin=margin, look=look)
+                self._begin(points, start, margin)
+            self._push(scale)
+            rounds = 1 + self._raise_edges()
+            self._run("tally", self._count(kernels.NEAR))
+            return self._resolution(points, start, rounds=rounds)
+
+    def _begin(self, points: Tensor, start: SdfSample, margin: float) -> bool:
+        """Takes over a frame; whether any vertex is nearer than the margin."""
+        assert start.face is not None  # the caller has seen to it
+        self._counts.zero_()
+        self._vectors["origin"].copy_(points)
+        self._floats["first"].copy_(start.distance)
+        self._vectors["first_gradient"].copy_(start.gradient)
+        self._ints["first_face"].copy_(start.face)
+        if margin != self._margin:
+            self._margin, self._recorded_for = margin, ()
+            inputs = [self._sheet, self._cloth, _rules(margin), self._list("near")]
+            self._command("begin", kernels.begin_kernel, inputs)
+        self._run("begin", self._n_vertices)
+        return self._count(kernels.NEAR) > 0
+
+    def _push(self, scale: float | VertexScale) -> None:
+        """Out of other limbs on the near side, and out of the body along the gradient, with the neighbourhood."""
+        n = self._count(kernels.NEAR)
+        self._run("look", n)
+        if self._counts[kernels.N_COUNTS : kernels.N_COUNTS + _N_LIMBS].any():
+            self._run("retreat", n)
+            self._run("fill", n)
+        self._run("aim", n)
+        n_pushed = self._count(kernels.PUSHED)
+        if n_pushed:
+            rows = self._ints["pushed"][:n_pushed].long()
+            alpha = scale(rows, self._floats["depth"][rows]) if callable(scale) else scale
+            self._floats["alpha"][:n_pushed] = alpha
+            self._run("scale", n_pushed)
+        reached = [0, self._count(kernels.REACHED)]
+        for _ in range(BLEND_ROUNDS):
+            first, last = reached[-2:]
+            self._run("reach", last - first, (2, first))
+            reached.append(self._count(kernels.REACHED))
+        for round_, size in enumerate(reached[2:]):
+            self._run(f"spread{round_ % 2}", size)
+        self._run("settle", reached[-1])
+
+    def _raise_edges(self) -> int:
+        """Raises both ends of the edges that run too low; returns the rounds it took."""
+        self._run("suspect", len(self._limbs.edges))
+        n = self._count(kernels.CUTTING)
+        for round_ in range(_MAX_PUSHES):
+            name = "middle" if round_ == 0 else f"again{round_ % 2}"
+            self._run(name, n, (4, round_))
+            n = self._count(kernels.CUTTING + 1 + round_)
+            if not n:
+                return round_
+            self._counts[kernels.RAISED] = 0
+            self._run(f"choose{round_ % 2}", n)
+            self._run("raise", self._count(kernels.RAISED))
+        return _MAX_PUSHES
+
+    def _resolution(self, points: Tensor, start: SdfSample, *, rounds: int) -> Resolution:
+        return Resolution(
+            self._vectors["place"].clone(),
+            self._floats["distance"].clone(),
+            n_inside=self._count(kernels.INSIDE),
+            n_pushed=self._count(kernels.MOVED),
+            rounds=rounds,
+            max_depth=max(0.0, -float(start.distance.min())) if len(points) else 0.0,
+            n_unresolved=self._count(kernels.STUCK),
+        )
+
+    def _count(self, which: int) -> int:
+        return int(self._counts[which])
+
+    def _run(self, name: str, n: int, parameter: tuple[int, int] | None = None) -> None:
+        """Launches a step for `n` of its list, with one of its parameters, by position, set anew."""
+        if not n:
+            return
+        command = self._commands[name]
+        if parameter is not None:
+            command.set_param_at_index(*parameter)
+        command.set_dim(n)
+        command.launch()
+
+    def _command(self, name: str, kernel: Any, inputs: list[Any]) -> None:
+        self._commands[name] = wp.launch(kernel, dim=1, inputs=inputs, device=str(self.device), record_cmd=True)
+
+    def _list(self, name: str) -> Any:
+        return as_warp(self._ints[name], wp.int32)
+
+    def _record(self, sdf: ExactSdf | BandSdf | ApproxSdf) -> None:
+        """Records the launches of a frame, unless they are the last frame's."""
+        skin = sdf.skin()
+        key = (id(sdf), int(skin.tree), int(skin.points.ptr))
+        if key == self._recorded_for:
+            return
+        self._recorded_for = key
+        sheet, cloth, rules = self._sheet, self._cloth, _rules(self._margin)
+        near, pushed, reached, moved = (self._list(name) for name in ("near", "pushed", "reached", "moved"))
+        field, smoother = (as_warp(self._vectors[name], wp.vec3) for name in ("field", "smoother"))
+        alpha, largest = (as_warp(self._floats[name], wp.float32) for name in ("alpha", "largest"))
+        suspects, low, lower = (as_warp(row, wp.int32) for row in self._by_edge)
+        lack = [as_warp(self._deficit, wp.float32), as_warp(self._rise, wp.vec3), largest]
+        self._command("look", kernels.look_kernel, [sheet, cloth, rules, near])
+        self._command("retreat", kernels.retreat_kernel, [sheet, cloth, skin, rules, near])
+        self._command("fill", kernels.fill_kernel, [sheet, cloth, skin, near])
+        self._command("aim", kernels.aim_kernel, [sheet, cloth, skin, rules, near, pushed, reached, field])
+        self._command("scale", kernels.scale_kernel, [sheet, rules, pushed, alpha, reached, field])
+        self._command("reach", kernels.reach_kernel, [sheet, cloth, 0, reached])
+        self._command("spread0", kernels.spread_kernel, [sheet, cloth, reached, field, smoother])
+        self._command("spread1", kernels.spread_kernel, [sheet, cloth, reached, smoother, field])
+        self._command("settle", kernels.settle_kernel, [sheet, skin, rules, reached, field, smoother])
+        self._command("suspect", kernels.suspect_kernel, [sheet, cloth, rules, suspects])
+        for name, source, target in (("middle", suspects, low), ("again1", low, lower), ("again0", lower, low)):
+            inputs = [sheet, cloth, skin, rules, 0, source, moved, target, *lack]
+            self._command(name, kernels.middle_kernel, inputs)
+        for name, source in (("choose0", low), ("choose1", lower)):
+            self._command(name, kernels.choose_kernel, [sheet, cloth, source, *lack, field, reached])
+        self._command("raise", kernels.raise_kernel, [sheet, skin, rules, reached, field, largest, moved])
+        self._command("tally", kernels.tally_kernel, [sheet, near])
+
+    def _bind_sheet(self) -> Any:
+        sheet = kernels.Sheet()
+        for name in _VECTORS[: -len(("field", "smoother"))]:
+            setattr(sheet, name, as_warp(self._vectors[name], wp.vec3))
+        for name in ("first", "distance", "along", "way", "depth", "goal"):
+            setattr(sheet, name, as_warp(self._floats[name], wp.float32))
+        for name in ("first_face", "face", "role", "mark"):
+            setattr(sheet, name, self._list(name))
+        sheet.counts = as_warp(self._counts, wp.int32)
+        sheet.touched = as_warp(self._counts[kernels.N_COUNTS :], wp.int32)
+        sheet.inward = as_warp(self._counts[kernels.N_COUNTS + _N_LIMBS :], wp.int32)
+        return sheet
+
+
+_VECTORS = ("origin", "first_gradient", "place", "gradient", "outward", "heading", "field", "smoother")
+_FLOATS = ("first", "distance", "along", "way", "depth", "goal", "alpha", "largest")
+_INTS = ("first_face", "face", "role", "mark", "near", "pushed", "reached", "moved")
+_N_LIMBS = 4
+
+
+def _rules(margin: float) -> Any:
+    rules = kernels.Rules()
+    rules.margin, rules.tolerance, rules.max_displacement, rules.max_pushes = (
+        margin,
+        _TOLERANCE,
+        MAX_DISPLACEMENT,
+        _MAX_PUSHES,
+    )
+    rules.contradiction, rules.step_on, rules.deep, rules.sure = TOLERANCE, STEP_ON, DEEP, SURE
+    rules.sideways, rules.inward, rules.farthest, rules.bent = SIDEWAYS, INWARD, FARTHEST, BENT
+    rules.retreats, rules.turns = RETREAT_STEPS, STEPS
+    return rules
+
+
+def _cloth(limbs: Limbs) -> Any:
+    """The garment as the kernels read it."""
+    n = len(limbs.own)
+    edges, faces = limbs.edges.cpu().numpy(), limbs.faces.cpu().numpy()
+    ring_start, ring = _grouped(np.concatenate((edges, edges[:, ::-1])), n)
+    corner = np.stack((faces.ravel(), np.repeat(np.arange(len(faces)), 3)), axis=1)
+    fan_start, fan = _grouped(corner, n)
+    bits = (limbs.own.cpu().numpy() << np.arange(limbs.own.shape[1])).sum(axis=1)
+    cloth = kernels.Cloth()
+    arrays = {"ring_start": ring_start, "ring": ring, "fan_start": fan_start, "fan": fan, "faces": faces}
+    arrays |= {"edges": edges, "own": bits, "limb": limbs.of_face.cpu().numpy()}
+    for name, array in arrays.items():
+        setattr(cloth, name, wp.array(array.astype(np.int32), dtype=wp.int32, device=str(limbs.faces.device)))
+    cloth.clearance = as_warp(limbs.clearance.float().contiguous(), wp.float32)
+    return cloth
+
+
+def _grouped(pairs: NDArray[np.int64], n: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The second numbers of pairs (K, 2) grouped by the first ones, which are below n: starts (n + 1,) and values."""
+    order = np.argsort(pairs[:, 0], kind="stable")
+    return np.searchsorted(pairs[order, 0], np.arange(n + 1)), pairs[order, 1]

@@ -1,0 +1,71 @@
+# mypy: ignore-errors
+# (Warp reads a kernel's annotations as array types of its own; a type checker can't.)
+"""A posed body as kernels of one's own ask it for distances: whichever way a `MeshSdf` finds the closest face."""
+
+import warp as wp
+
+from refu_core.sdf._kernels import closest_on_triangle, distance_and_gradient, offset_from, pseudo_normal
+from refu_core.sdf._walk import walk_from
+
+_UNLIMITED = wp.constant(1e18)
+# A known face's distance is a limit to the closest one's; rounding must not cut that one off.
+_SLACK = wp.constant(1e-6)
+
+
+@wp.struct
+class Skin:
+    """One posed body: `MeshSdf.skin` gives it."""
+
+    tree: wp.uint64
+    """Warp's mesh where the closest face is looked for in a tree; 0 where it is walked to."""
+    points: wp.array(dtype=wp.vec3)
+    """Vertices [m]."""
+    faces: wp.array2d(dtype=wp.int32)
+    across: wp.array2d(dtype=wp.int32)
+    fan_start: wp.array(dtype=wp.int32)
+    fan_face: wp.array(dtype=wp.int32)
+    """Those of `Topology`."""
+    links: wp.array2d(dtype=wp.int32)
+    table: wp.array2d(dtype=wp.int32)
+    cell: wp.float32
+    """What `walk_from` reads, where it is walked."""
+
+
+@wp.func
+def ask(skin: Skin, p: wp.vec3, near: int):
+    """Signed distance at p [m], its unit gradient, and the closest face; `near` is a face near by, or -1."""
+    face = int(near)
+    if skin.tree != wp.uint64(0):
+        limit = float(_UNLIMITED)
+        if near >= 0:
+            known, _ = closest_on_triangle(
+                p,
+                skin.points[skin.faces[near, 0]],
+                skin.points[skin.faces[near, 1]],
+                skin.points[skin.faces[near, 2]],
+            )
+            limit = wp.length(offset_from(p, near, known, skin.points, skin.faces)) * (1.0 + _SLACK) + _SLACK
+        hit = wp.mesh_query_point_no_sign(skin.tree, p, limit)
+        if hit.result:
+            face = hit.face
+    else:
+        face, _feature, _w, _above = walk_from(
+            p,
+            near,
+            skin.points,
+            skin.faces,
+            skin.across,
+            skin.fan_start,
+            skin.fan_face,
+            skin.links,
+            skin.table,
+            skin.cell,
+        )
+    w, feature = closest_on_triangle(
+        p, skin.points[skin.faces[face, 0]], skin.points[skin.faces[face, 1]], skin.points[skin.faces[face, 2]]
+    )
+    normal = pseudo_normal(face, feature, skin.points, skin.faces, skin.across, skin.fan_start, skin.fan_face)
+    offset = offset_from(p, face, w, skin.points, skin.faces)
+    outside = wp.where(wp.dot(offset, normal) < 0.0, -1.0, 1.0)
+    distance, gradient = distance_and_gradient(offset, feature, normal, outside)
+    return distance, gradient, face
