@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import time
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -56,18 +57,25 @@ def run_checks(plan: Plan, *, tick: Callable[[str], object] = str) -> list[Tally
     """
     subjects = {wardrobe: Subject(wardrobe, weights=plan.weights) for wardrobe in plan.wardrobes}
     tallies: dict[tuple[str, str], Tally] = {}
-    start, round_ = time.monotonic(), 0
-    while round_ < plan.rounds or time.monotonic() - start < plan.seconds:
-        for check, wardrobe in plan.pairs():
-            tally = tallies.setdefault((check.name, wardrobe.mode), Tally(check.name, wardrobe.mode))
-            key = zlib.crc32(f"{check.name} {wardrobe.garments}".encode())
-            rng = np.random.default_rng((plan.seed, key, round_))
-            for _ in range(check.trials):
-                trial = check.draw(rng)
-                tally.add(wardrobe, trial, check.run(subjects[wardrobe], trial))
-            tick(check.name)
-        round_ += 1
+    for round_, (check, wardrobe) in _turns(plan):
+        tally = tallies.setdefault((check.name, wardrobe.mode), Tally(check.name, wardrobe.mode))
+        key = zlib.crc32(f"{check.name} {wardrobe.garments}".encode())
+        rng = np.random.default_rng((plan.seed, key, round_))
+        for _ in range(check.trials):
+            trial = check.draw(rng)
+            tally.add(wardrobe, trial, check.run(subjects[wardrobe], trial))
+        tick(check.name)
     return list(tallies.values())
+
+
+def _turns(plan: Plan) -> Iterator[tuple[int, tuple[Check, Wardrobe]]]:
+    """Whose turn it is, with the number of the round; whole rounds first, then until the time is over."""
+    start = time.monotonic()
+    for round_ in count():
+        for pair in plan.pairs():
+            if round_ >= plan.rounds and time.monotonic() - start >= plan.seconds:
+                return
+            yield round_, pair
 
 
 def save_worst(tallies: Sequence[Tally], folder: Path) -> list[Path]:

@@ -1,0 +1,108 @@
+"""Numbers, guarantees and invariances that hold for hostile frames in either mode, and the worst cases so far."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from refu_core import FrameError, SmplFrame
+from refu_core.frames import MAX_ANGLE, MAX_COEFFICIENT
+from refu_core.stress import FRAMES, Check, Subject, Trial, Wardrobe, all_checks, distance_to_mesh, mirror_image
+
+CHECKS = all_checks()
+WARDROBES = {
+    "skinned/accurate": Wardrobe(garments=("skirt-female",)),
+    "tailornet/hybrid": Wardrobe(garments=("tshirt-male",), backbone="tailornet", sdf="hybrid"),
+}
+_subjects: dict[str, Subject] = {}
+
+
+@pytest.fixture(params=WARDROBES)
+def subject(request: pytest.FixtureRequest) -> Subject:
+    mode = request.param
+    if mode not in _subjects:
+        _subjects[mode] = Subject(WARDROBES[mode])
+    return _subjects[mode]
+
+
+@pytest.mark.parametrize("check", CHECKS, ids=[check.name.replace(" ", "-") for check in CHECKS])
+def test_what_refu_stress_checks(check: Check, subject: Subject) -> None:
+    if not check.holds_for(subject.wardrobe):
+        pytest.skip("not promised in this mode")
+    rng = np.random.default_rng(2)
+    measured = check.run(subject, check.draw(rng))
+    assert not measured.is_failure, measured
+
+
+@given(
+    name=st.sampled_from(["pose", "betas", "style", "transl"]),
+    size=st.sampled_from([1e5, 1e10, 1e19, 1e30, 3e38]),
+    at=st.integers(0, 1000),
+)
+def test_numbers_that_no_body_has_are_refused(name: str, size: float, at: int) -> None:
+    """Betas of 10,000 kept the pipeline busy for minutes; angles of 1e20 rad came out as NaN where no SDF looked."""
+    values = {"pose": np.zeros(72), "betas": np.zeros(10), "style": np.zeros(4), "transl": np.zeros(3)}
+    values[name][at % values[name].size] = -size
+    if name == "transl":
+        assert SmplFrame(**values).transl.min() == -size  # added in float64, whatever it is
+        return
+    limit = MAX_ANGLE if name == "pose" else MAX_COEFFICIENT
+    with pytest.raises(FrameError, match=f"{name} has magnitudes up to .*, wanted {limit:g} at most"):
+        SmplFrame(**values)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_largest_numbers_that_are_not_refused_end_in_finite_time(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    frame = SmplFrame(
+        pose=MAX_ANGLE * rng.choice((-1, 1), (24, 3)),
+        betas=MAX_COEFFICIENT * rng.choice((-1, 0, 1), 10, p=(0.05, 0.9, 0.05)),
+        style=MAX_COEFFICIENT * rng.choice((-1, 1), 4),
+    )
+    for mode, wardrobe in WARDROBES.items():
+        out = _subjects.setdefault(mode, Subject(wardrobe)).pipeline(frame)
+        assert all(np.isfinite(mesh.vertices).all() for mesh in out.values())
+
+
+def test_classes_of_frames_are_what_they_say() -> None:
+    rng = np.random.default_rng(0)
+    angles = {name: np.linalg.norm(draw(rng).pose, axis=1) for name, draw in FRAMES.items() if name != "absurd"}
+    assert angles["angles of 1e3"].max() > 900
+    assert angles["denormals"].max() < 1e-38
+    assert 0 < np.abs(FRAMES["denormals"](rng).betas).max() < 1e-38
+    assert angles["half a turn, give or take 1e-6"].min() > 3.14
+    assert np.abs(FRAMES["betas of 50"](rng).betas).max() > 40
+    assert np.abs(FRAMES["translations up to 1e7 m"](rng).transl).max() > 1
+
+
+def test_a_mirror_image_of_a_mirror_image_is_the_frame() -> None:
+    frame = FRAMES["everyday"](np.random.default_rng(3))
+    twice = mirror_image(mirror_image(frame))
+    for key in ("pose", "betas", "transl"):
+        np.testing.assert_array_equal(getattr(twice, key), getattr(frame, key))
+
+
+def test_the_reference_distance_agrees_with_libigl() -> None:
+    igl = pytest.importorskip("igl")
+    rng = np.random.default_rng(4)
+    vertices, faces = rng.normal(size=(40, 3)), rng.integers(0, 40, (60, 3))
+    faces = faces[(np.diff(np.sort(faces, 1), axis=1) > 0).all(1)]
+    points = 2 * rng.normal(size=(50, 3))
+    squared = igl.point_mesh_squared_distance(points, vertices, faces.astype(np.int64))[0]
+    np.testing.assert_allclose(distance_to_mesh(points, vertices, faces), np.sqrt(squared), atol=1e-12)
+
+
+def test_the_reference_distance_to_faces_without_area() -> None:
+    vertices = np.array([(0.0, 0, 0), (2, 0, 0), (1, 0, 0)])
+    points = np.array([(0.5, 3.0, 4.0), (-3.0, 4.0, 0.0)])
+    np.testing.assert_allclose(distance_to_mesh(points, vertices, np.array([[0, 1, 2]])), 5.0)
+    np.testing.assert_allclose(distance_to_mesh(points[1:], vertices, np.array([[0, 0, 0]])), 5.0)
+    assert distance_to_mesh(np.zeros((0, 3)), vertices, np.array([[0, 1, 2]])).shape == (0,)
+
+
+def test_an_empty_trial_is_a_refusal(subject: Subject) -> None:
+    (check,) = (check for check in CHECKS if check.name == "numbers: absurd")
+    measured = check.run(subject, Trial(()))
+    assert (measured.refused, measured.is_failure) == (1, False)

@@ -1,0 +1,282 @@
+"""`refu stress`: that its checks notice what they are for, that worst cases can be tried again, and the command."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from refu_core import GarmentPipeline, SmplFrame
+from refu_core.realtime import GarmentMesh, PipelineOutput
+from refu_core.stress import (
+    Check,
+    Measurement,
+    SoakResult,
+    StressError,
+    Subject,
+    Tally,
+    Trial,
+    Wardrobe,
+    all_checks,
+    load_trial,
+    resident_mb,
+    save_trial,
+    soak,
+)
+from refu_ros.cli import main
+from refu_ros.stress import length
+
+CHECKS = {check.name: check for check in all_checks()}
+TSHIRT = Wardrobe(garments=("tshirt-male",))
+Spoil = Callable[[GarmentMesh, SmplFrame, int], GarmentMesh]
+
+
+@dataclass(eq=False)
+class Spoiled:
+    """A pipeline that does something wrong with every garment."""
+
+    pipeline: GarmentPipeline
+    spoil: Spoil
+    calls: int = 0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.pipeline, name)
+
+    def __call__(self, frames: SmplFrame | Sequence[SmplFrame]) -> Any:
+        if isinstance(frames, SmplFrame):
+            return self._wrong(self.pipeline(frames), frames)
+        return [self._wrong(out, frame) for out, frame in zip(self.pipeline(frames), frames, strict=True)]
+
+    def _wrong(self, out: PipelineOutput, frame: SmplFrame) -> PipelineOutput:
+        self.calls += 1
+        meshes = {name: self.spoil(mesh, frame, self.calls) for name, mesh in out.items()}
+        return replace(out, garments=meshes)
+
+
+def moved(mesh: GarmentMesh, by: Any, rows: Any = slice(None)) -> GarmentMesh:
+    local = mesh.local.copy()
+    local[rows] += by
+    return replace(mesh, local=local)
+
+
+def not_a_number(mesh: GarmentMesh, _frame: SmplFrame, _call: int) -> GarmentMesh:
+    return moved(mesh, np.nan, 7)
+
+
+def imprecise(mesh: GarmentMesh, _frame: SmplFrame, _call: int) -> GarmentMesh:
+    return replace(mesh, raw=mesh.raw.astype(np.float16).astype(np.float32))
+
+
+def shrunk(mesh: GarmentMesh, _frame: SmplFrame, _call: int) -> GarmentMesh:
+    return moved(mesh, 0.3 * (mesh.local.mean(0) - mesh.local))
+
+
+def thrown(mesh: GarmentMesh, _frame: SmplFrame, _call: int) -> GarmentMesh:
+    return moved(mesh, (0, 0, 0.11), 7)
+
+
+def jumping(mesh: GarmentMesh, _frame: SmplFrame, call: int) -> GarmentMesh:
+    return moved(mesh, (0, 0.5 * (call % 2), 0))
+
+
+def stiff(mesh: GarmentMesh, _frame: SmplFrame, _call: int) -> GarmentMesh:
+    return moved(mesh, (1e-3, 0, 0))
+
+
+def far_off(mesh: GarmentMesh, frame: SmplFrame, _call: int) -> GarmentMesh:
+    """As if the translation were added in float32."""
+    shift = (mesh.local + frame.transl.astype(np.float32)) - frame.transl
+    return replace(mesh, local=shift.astype(np.float32))
+
+
+def remembering(mesh: GarmentMesh, _frame: SmplFrame, call: int) -> GarmentMesh:
+    return moved(mesh, 1e-5 * call)
+
+
+WRONG: list[tuple[str, Spoil]] = [
+    ("numbers: everyday", not_a_number),
+    ("numbers: everyday", imprecise),
+    ("numbers: denormals", imprecise),
+    ("guarantees: nothing inside", shrunk),
+    ("guarantees: no vertex thrown out", thrown),
+    ("guarantees: no vertex thrown out", not_a_number),
+    ("guarantees: displacement bounded in any pose", thrown),
+    ("guarantees: no jumps in smooth motion", jumping),
+    ("guarantees: bounded jumps through self-contact", jumping),
+    ("invariance: the person turned", stiff),
+    ("invariance: the person 100 km away", far_off),
+    ("invariance: left and right exchanged", lambda mesh, *_: moved(mesh, (0.03, 0, 0))),
+    ("invariance: what came before", remembering),
+    ("invariance: a batch of 64", remembering),
+]
+
+
+@pytest.fixture(scope="module")
+def subject() -> Subject:
+    return Subject(TSHIRT)
+
+
+def trial_of(check: Check, seed: int = 0) -> Trial:
+    return check.draw(np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize(
+    ("name", "spoil"), WRONG, ids=[f"{name.split(': ')[1]}-{i}" for i, (name, _) in enumerate(WRONG)]
+)
+def test_checks_notice(name: str, spoil: Spoil, subject: Subject, monkeypatch: pytest.MonkeyPatch) -> None:
+    check = CHECKS[name]
+    trial = trial_of(check)
+    sound = check.run(subject, trial)
+    assert not sound.is_failure, sound
+    monkeypatch.setattr(subject, "pipeline", Spoiled(subject.pipeline, spoil))
+    assert check.run(subject, trial).is_failure
+
+
+@pytest.mark.parametrize("kind", [name for name in CHECKS if name.startswith("numbers: distance")])
+def test_wrong_distances_are_noticed(kind: str, subject: Subject, monkeypatch: pytest.MonkeyPatch) -> None:
+    check, trial = CHECKS[kind], trial_of(CHECKS[kind])
+    sound = check.run(subject, trial)
+    assert not sound.is_failure, sound
+    exact = subject.distances["exact"]
+    query = exact.query
+    monkeypatch.setattr(
+        exact, "query", lambda *a, **k: (s := query(*a, **k))._replace(distance=s.distance * 1.001 + 1e-5)
+    )
+    assert check.run(subject, trial).is_failure
+    monkeypatch.setattr(exact, "query", lambda *a, **k: (s := query(*a, **k))._replace(gradient=s.gradient * 0.5))
+    assert "gradient" in check.run(subject, trial).faults[0]
+
+
+def test_errors_of_other_kinds_are_failures_and_refusals_are_not(subject: Subject) -> None:
+    def refuse(_subject: Subject, _trial: Trial) -> Measurement:
+        raise StressError("too far")  # noqa: EM101
+
+    def break_down(_subject: Subject, _trial: Trial) -> Measurement:
+        raise ZeroDivisionError
+
+    check, trial = CHECKS["numbers: everyday"], trial_of(CHECKS["numbers: everyday"])
+    refused, broken = (replace(check, measure=measure).run(subject, trial) for measure in (refuse, break_down))
+    assert (refused.refused, refused.is_failure) == (1, False)
+    assert broken.is_failure
+    assert "ZeroDivisionError" in broken.faults[0]
+
+
+def test_tallies_keep_the_worst() -> None:
+    check = CHECKS["numbers: everyday"]
+    trials = [trial_of(check, seed) for seed in range(3)]
+    tally = Tally("x", "y")
+    for trial, deviation, limit in zip(trials, (1.0, 2.0, 3.0), (2.0, 1.0, 9.0), strict=True):
+        tally.add(TSHIRT, trial, Measurement(deviation=deviation, limit=limit))
+    row = tally.as_dict()
+    assert (row["runs"], row["failures"], row["max_deviation_m"], row["limit_m"]) == (3, 1, 3.0, 1.0)
+    assert tally.worst is not None
+    assert tally.worst[1] is trials[1]
+
+
+def test_a_saved_trial_is_the_same_trial(tmp_path: Path) -> None:
+    check = CHECKS["invariance: what came before"]
+    trial = trial_of(check)
+    path = save_trial(tmp_path / "worst.npz", check.name, TSHIRT, trial)
+    name, wardrobe, again = load_trial(path)
+    assert (name, wardrobe, again.seed, len(again.frames)) == (check.name, TSHIRT, trial.seed, len(trial.frames))
+    for one, two in zip(trial.frames, again.frames, strict=True):
+        for key in ("pose", "betas", "transl"):
+            np.testing.assert_array_equal(getattr(one, key), getattr(two, key))
+        assert (one.style is None) == (two.style is None)
+
+
+@pytest.mark.parametrize(
+    ("content", "wanted"), [(None, "No such file"), (b"PK\3\4 no zip", "trial.npz"), ("lacks", "lacks check, garments")]
+)
+def test_files_that_are_no_trials_are_refused(content: Any, wanted: str, tmp_path: Path) -> None:
+    path = tmp_path / "trial.npz"
+    if content == "lacks":
+        np.savez(path, pose=np.zeros((1, 24, 3)))
+    elif content is not None:
+        path.write_bytes(content)
+    with pytest.raises((StressError, FileNotFoundError), match=wanted):
+        load_trial(path)
+
+
+def test_soaks_judge_memory_at_once_and_latency_of_many_frames(subject: Subject) -> None:
+    done = soak(subject.pipeline, mode="here", frames=20)
+    assert (done.frames, done.nan) == (20, 0)
+    assert 0 < done.memory_mb[0] <= done.memory_mb[1] * 1.01
+    steady: dict[str, Any] = {"mode": "x", "nan": 0, "seconds": 1.0, "wall_p99_ms": (1.0, 9.0)}
+    few = SoakResult(frames=100, memory_mb=(100, 104), p99_ms=(1.0, 2.0), **steady)
+    many = replace(few, frames=100_000)
+    grown = replace(few, memory_mb=(100, 106))
+    assert (few.failures, many.failures, grown.failures) == (0, 1, 1)
+    with pytest.raises(StressError, match="10 frames or more"):
+        soak(subject.pipeline, mode="here", frames=9)
+
+
+def test_resident_memory_is_this_process() -> None:
+    before = resident_mb()
+    held = np.ones(25_000_000)
+    assert 190 < resident_mb() - before < 220
+    assert len(held)
+
+
+@pytest.mark.parametrize(
+    ("metres", "text"),
+    [(0, "0"), (3.2e-10, "320 pm"), (5e-7, "500 nm"), (0.0123, "12.3 mm"), (4, "4 m"), (np.inf, "-")],
+)
+def test_lengths_are_readable(metres: float, text: str) -> None:
+    assert length(metres) == text
+
+
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    worst = tmp_path / "worst"
+    common = ["stress", "--garments", "tshirt-male", "--backbone", "skinned", "--quiet"]
+    json_file = tmp_path / "stress.json"
+    made = ["--quick", "--frames", "20", "--parts", "invariance,soak"]
+    assert main([*common, *made, "--json", str(json_file), "--output", str(worst)]) == 0
+    printed = capsys.readouterr().out
+    assert "nothing failed" in printed
+    rows = json.loads(json_file.read_text())["rows"]
+    assert {"case", "runs", "failures", "nan", "max_deviation_m"} <= set.intersection(*(set(row) for row in rows))
+    wanted = {name for name in CHECKS if name.startswith("invariance")} | {"soak: pipeline"}
+    assert {row["case"] for row in rows} == wanted
+    (row,) = (row for row in rows if row["case"] == "invariance: the person turned")
+    (file,) = worst.glob("invariance-the-person-turned-*.npz")
+    assert main([*common, "--replay", str(file), "--json", str(json_file)]) == 0
+    (again,) = json.loads(json_file.read_text())["rows"]
+    assert again["max_deviation_m"] == pytest.approx(row["worst_share_of_limit"] * row["limit_m"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "wanted"),
+    [
+        (["--parts", "luck"], "no part 'luck': wanted numbers, guarantees, invariance, soak"),
+        (["--hours", "-1"], "hours must be above zero, got -1"),
+        (["--garments", "kilt"], "no garment 'kilt'"),
+        (["--backbone", "tailornet", "--weights", "/nowhere"], "no weights of tailornet hybrid"),
+        (["--replay", "/nowhere/trial.npz"], "/nowhere/trial.npz"),
+    ],
+)
+def test_bad_input_is_one_line(arguments: list[str], wanted: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["stress", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert wanted in error
+    assert error.count("\n") == 1
+
+
+def test_the_live_node(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("rclpy", reason="rclpy isn't installed (extra ros): the node isn't tested")
+    common = ["stress", "--node", "--quick", "--garments", "tshirt-male", "--backbone", "skinned", "--quiet"]
+    file = tmp_path / "node.json"
+    main([*common, "--output", str(tmp_path), "--json", str(file)])
+    (row,) = json.loads(file.read_text())["rows"]
+    # Ten seconds on a busy machine: a frame may be late and be superseded, but nothing may come twice.
+    assert row["sent"] == 300
+    assert row["received"] > 150
+    assert (row["doubled"], row["recorded_twice"], row["nan"], row["exit_code"]) == (0, 0, 0, 0)
+    assert row["recorded_garments"] >= row["received"]
+    assert main([*common, "--output", str(tmp_path)]) == 2
+    assert "is there already" in capsys.readouterr().err
