@@ -23,7 +23,7 @@ MAX_BYTES = 1 << 30
 """An archive that unpacks to more is refused before anything is unpacked."""
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """What numpy writes; other methods ask for gigabytes of their own."""
-_DAMAGE = (
+DAMAGE = (
     *(OSError, ValueError, TypeError, KeyError, RecursionError, MemoryError, OverflowError, EOFError, struct.error),
     *(TokenError, SyntaxError, zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError),
 )
@@ -45,7 +45,7 @@ def read_npz(path: Path, *, keys: Iterable[str], error: type[RefuError]) -> dict
                 raise error(msg)
             entries = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
             return {key: _read_entry(archive, entries[key]) for key in keys if key in entries}
-    except _DAMAGE as cause:
+    except DAMAGE as cause:
         if isinstance(cause, error):  # ours is a ValueError too
             raise
         msg = f"{path}: can't be read as .npz: {cause}"

@@ -14,7 +14,7 @@ from refu_core.backbones._presets import backbone_name, build_backbone, config_f
 from refu_core.backbones._protocol import Backbone, Skinned
 from refu_core.errors import WeightsError
 from refu_core.garments import GarmentTemplate, load_garment
-from refu_core.weights import Weights, load_weights, save_weights, shipped_weights
+from refu_core.weights import Weights, build_for, load_weights, save_weights, shipped_weights
 
 BACKBONES: tuple[str, ...] = ("skinned", "tailornet", "mlp", "gcnn")
 MODES: tuple[str, ...] = ("none", "approx", "accurate", "hybrid")
@@ -95,15 +95,14 @@ def read_backbone(
             msg = f"{weights.path}: made for another basis than the one beside it; get both files again"
             raise WeightsError(msg)
     tensors = {k[len(_PREFIX) :]: v for k, v in weights.tensors.items() if k.startswith(_PREFIX)}
-    module = build_backbone(config, garment, basis=basis, pivots=tensors.get("pivots"))
-    own = {k for k in module.state_dict() if not k.startswith("decoder.")}
     try:
-        if own != set(tensors):
-            msg = f"wanted {len(own)} tensors, got {len(tensors)}, {len(own ^ set(tensors))} of other names"
-            raise RuntimeError(msg)
-        module.load_state_dict(tensors, strict=False)
-    except RuntimeError as error:
-        msg = f"{weights.path}: doesn't fit {garment.name}: {error}; train it again"
+        module = build_for(
+            tensors,
+            lambda: build_backbone(config, garment, basis=basis, pivots=tensors.get("pivots")),
+            shared="decoder.",
+        )
+    except WeightsError as error:
+        msg = f"{weights.path}: doesn't fit {garment.name}: {error}"
         raise WeightsError(msg) from error
     return module.float().to(device).eval()
 

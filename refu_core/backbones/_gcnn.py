@@ -13,7 +13,10 @@ from refu_core.backbones._features import N_STYLE_SHAPE, PoseFeatures, style_sha
 from refu_core.backbones._graph import MeshGraph, Neighbours
 from refu_core.backbones._perceptron import Perceptron
 from refu_core.backbones._protocol import Prediction
+from refu_core.errors import WeightsError
 from refu_core.garments import GarmentTemplate
+
+_MOST_STRIDE, _MOST_LEVELS = 8, 8
 
 
 @dataclass(frozen=True)
@@ -33,6 +36,12 @@ class GcnnConfig:
     stride: int = 2
     activation: str = "silu"
     dropout: float = 0.1
+
+    def __post_init__(self) -> None:
+        """Raises `WeightsError` for graphs that would take for ever to make."""
+        if not 1 <= self.stride <= _MOST_STRIDE or not 1 <= len(self.channels) <= _MOST_LEVELS:
+            msg = f"wanted strides to {_MOST_STRIDE}, {_MOST_LEVELS} channels at most, got {self.stride}, {self.channels}"
+            raise WeightsError(msg)
 
     @classmethod
     def paper(cls, joints: tuple[int, ...]) -> GcnnConfig:

@@ -15,6 +15,7 @@ from refu_core.backbones._mlp import Mlp, MlpConfig
 from refu_core.backbones._tailornet import TailorNet, TailorNetConfig
 from refu_core.errors import WeightsError
 from refu_core.garments import GarmentTemplate
+from refu_core.weights import config_of_card
 
 PRESETS: tuple[str, ...] = ("realtime", "paper")
 """`realtime` has low-rank heads and sizes for a CPU, `paper` the sizes of the paper."""
@@ -100,9 +101,7 @@ def config_from_card(name: str, values: Mapping[str, Any]) -> BackboneConfig:
     Raises:
         WeightsError: the card doesn't describe such a backbone.
     """
-    lists: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
-    try:
-        return _CONFIGS[name](**lists)
-    except (KeyError, TypeError) as error:
-        msg = f"a card of a backbone {name!r} that this version doesn't know: {error}; train it again"
-        raise WeightsError(msg) from error
+    if name not in _CONFIGS:
+        msg = f"a card of a backbone {name[:80]!r} that this version doesn't know; train it again"
+        raise WeightsError(msg)
+    return config_of_card(_CONFIGS[name], values)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from refu_core.errors import WeightsError
 from refu_core.repulsion._refu import Refu
-from refu_core.weights import load_weights
+from refu_core.weights import build_for, load_weights
 
 _PREFIX = "refu."
 
@@ -33,11 +33,10 @@ def read_refu(
     config = weights.card.get("refu")
     if config is None:
         return None
-    refu = Refu.from_config(config)
     tensors = {k[len(_PREFIX) :]: v.float() for k, v in weights.tensors.items() if k.startswith(_PREFIX)}
     try:
-        refu.load_state_dict(tensors)
-    except RuntimeError as error:
-        msg = f"{weights.path}: its ReFU layer doesn't fit its card: {error}; train it again"
+        refu = build_for(tensors, lambda: Refu.from_config(config))
+    except WeightsError as error:
+        msg = f"{weights.path}: its ReFU layer doesn't fit its card: {error}"
         raise WeightsError(msg) from error
     return refu.to(device).eval().requires_grad_(False)

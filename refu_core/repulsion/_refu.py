@@ -15,6 +15,7 @@ from refu_core.repulsion._blend import Blend
 from refu_core.repulsion._scale import REALTIME, ScaleNet, ScaleSettings, VertexScale
 from refu_core.repulsion._unit import DEFAULT_MARGIN, MAX_DISPLACEMENT, pushed_rows, repulse
 from refu_core.sdf import SdfSample
+from refu_core.weights import config_of_card
 
 
 class Refu(nn.Module):
@@ -80,12 +81,12 @@ class Refu(nn.Module):
             return cls(
                 int(config["n_vertices"]),
                 least=float(config["least"]),
-                scale=None if scale is None else ScaleSettings(**scale),
+                scale=None if scale is None else config_of_card(ScaleSettings, scale),
                 margin=float(config["margin"]),
                 learn_margin=bool(config["learn_margin"]),
                 feature_size=config["feature_size"],
             )
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError, RuntimeError) as error:
             msg = f"not the description of a ReFU layer ({error!r}): train it anew with this version"
             raise WeightsError(msg) from error
 

@@ -14,7 +14,7 @@ from refu_core.errors import MeshError, WeightsError
 from refu_core.frames import N_BETAS, N_JOINTS
 from refu_core.sdf._mesh import require_finite
 from refu_core.sdf._protocol import SdfSample
-from refu_core.weights import Weights, load_weights, save_weights
+from refu_core.weights import Weights, build_for, config_of_card, load_weights, save_weights
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from typing import Any
 
 _CONDITION = N_BETAS + 3 * (N_JOINTS - 1)
+_MOST_LAYERS = 64
 _CHUNK = 4096  # points whose activations are held at a time where none are kept: 150 MB of the paper's
 
 
@@ -186,9 +187,12 @@ def load_sdf_network(stem: Path, body: SmplBody) -> SdfNetwork:
         msg = f"{stem}: trained on the body {trained_on}, this one is {body.fingerprint}: train one for it"
         raise WeightsError(msg)
     try:
-        network = SdfNetwork(SdfNetworkConfig(**weights.card["network"]))
-        network.load_state_dict(dict(weights.tensors))
-    except (KeyError, TypeError, RuntimeError) as error:
+        config = config_of_card(SdfNetworkConfig, weights.card.get("network"))
+        if config.hidden > _MOST_LAYERS:
+            msg = f"wanted at most {_MOST_LAYERS} hidden layers, got {config.hidden}"
+            raise WeightsError(msg)
+        network = build_for(weights.tensors, lambda: SdfNetwork(config))
+    except WeightsError as error:
         msg = f"{stem}: not the weights of a distance network: {error}"
         raise WeightsError(msg) from error
     return network.to(device=body.device, dtype=body.dtype)

@@ -12,7 +12,17 @@ from numpy.typing import NDArray
 from refu_core.frames import N_JOINTS
 from refu_core.simulation._errors import SimulationError
 from refu_core.simulation._plan import TEST
-from refu_core.simulation._store import DONE, dequantise, gather, read_by_slot, read_card, rows_of, shards_of
+from refu_core.simulation._store import (
+    DONE,
+    check_rows,
+    clip_names,
+    dequantise,
+    gather,
+    read_by_slot,
+    read_card,
+    rows_of,
+    shards_of,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,15 +77,23 @@ class GarmentDataset:
             msg = f"{path}: wanted shards of one garment, got {sorted(shapes)} vertices a sample"
             raise SimulationError(msg)
         self._where, self._rows = rows_of(self._shards, (DONE,))
-        count = int(self.card["plan"]["count"])
+        plan = self.card.get("plan")
+        count = plan.get("count") if isinstance(plan, dict) else None
+        if not isinstance(count, int) or not 0 <= count < 2**31:
+            msg = f"{path}: wanted a card with the number of samples in plan.count, got {str(count)[:80]}"
+            raise SimulationError(msg)
+        self._clips = clip_names(self.card)
+        check_rows(self._shards, self._where, self._rows, {"slot": (0, count), "split": (0, 2)})
+        is_test = gather(self._shards, self._where, self._rows, "split") == TEST
+        n_clips = np.where(is_test, len(self._clips["test"]), len(self._clips["train"]))
+        check_rows(self._shards, self._where, self._rows, {"clip": (-1, n_clips)})
         self._by_slot = {
             "unseen": read_by_slot(path, "unseen", (count,)),
             "asked": read_by_slot(path, "asked", (count, N_JOINTS, 3)),
         }
-        split = self.column("split")
-        self.train: NDArray[np.bool_] = split != TEST
+        self.train: NDArray[np.bool_] = ~is_test
         """Which samples are for training, shape (M,)."""
-        self.test: NDArray[np.bool_] = split == TEST
+        self.test: NDArray[np.bool_] = is_test
         """Which samples are kept for the test, shape (M,)."""
 
     def __len__(self) -> int:
@@ -117,7 +135,7 @@ class GarmentDataset:
             slot=int(array["slot"]),
             pair=int(array["pair"]),
             split=split,
-            clip=None if clip < 0 else str(self.card["clips"][split][clip]),
+            clip=None if clip < 0 else self._clips[split][clip],
             frame=None if clip < 0 else int(array["frame"]),
             asked=np.array(self._by_slot["asked"][array["slot"]]),
             unseen=float(self._by_slot["unseen"][array["slot"]]),

@@ -17,6 +17,8 @@ from refu_core.simulation._store import (
     DONE,
     SEQUENCES,
     SequenceShard,
+    check_rows,
+    clip_names,
     dequantise,
     gather,
     read_card,
@@ -87,7 +89,12 @@ class GarmentSequences:
             msg = f"{path}: a card and no shard; wanted shard-I-of-N directories beside it"
             raise SimulationError(msg)
         self._where, self._rows = rows_of(self._shards, (DONE,))
+        self._clips = clip_names(self.card)
+        bounds = {"cause": (0, len(CAUSES) + 1), "split": (0, 2)}
+        check_rows(self._shards, self._where, self._rows, bounds)
         split = self.column("split")
+        n_clips = np.where(split == TEST, len(self._clips["test"]), len(self._clips["train"]))
+        check_rows(self._shards, self._where, self._rows, {"clip": (0, n_clips)})
         self.train: NDArray[np.bool_] = split != TEST
         """Which sequences are for training, shape (S,)."""
         self.test: NDArray[np.bool_] = split == TEST
@@ -131,7 +138,7 @@ class GarmentSequences:
             number=int(array["slot"]),
             shape=int(array["shape"]),
             split=split,
-            clip=str(self.card["clips"][split][int(array["clip"])]),
+            clip=self._clips[split][int(array["clip"])],
             start=float(array["start"]),
             mirrored=bool(array["mirrored"]),
             _units=array["vertices"],

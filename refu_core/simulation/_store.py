@@ -32,6 +32,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from refu_core._npz import DAMAGE, check_npy
 from refu_core.simulation._errors import SimulationError
 from refu_core.simulation._selection import CAUSES
 
@@ -40,6 +41,7 @@ SEQUENCES = "refu-sequences-1"
 QUANTUM = 2.0**-14
 """Unit of stored positions [m]: 0.06 mm, so ±2 m fit and rounding moves a vertex by at most 0.03 mm an axis."""
 TO_DO, DONE, GIVEN_UP = 0, 1, 2
+_MAX_CARD_BYTES = 16 << 20
 
 
 Columns = dict[str, tuple[tuple[int, ...], str]]
@@ -126,12 +128,15 @@ class Shard:
         self.arrays: dict[str, Any] = {}
         try:
             for name in self.columns(()):
-                self.arrays[name] = np.load(directory / f"{name}.npy", mmap_mode=mode)  # type: ignore[arg-type]
-        except (OSError, ValueError) as error:
+                path = directory / f"{name}.npy"
+                with path.open("rb") as file:
+                    check_npy(file, path.stat().st_size)  # numpy would lengthen a file that was cut short
+                self.arrays[name] = np.load(path, mmap_mode=mode)  # type: ignore[arg-type]
+        except DAMAGE as error:
             msg = f"{directory}: not a shard of a data set, or a damaged one: {error}"
             raise SimulationError(msg) from error
         wanted = self.columns(self.arrays["vertices"].shape[1:])
-        n = len(self.arrays["slot"])
+        n = self.arrays["slot"].size
         for name, (shape, kind) in wanted.items():
             array = self.arrays[name]
             if array.shape != (n, *shape) or array.dtype != np.dtype(kind):
@@ -208,6 +213,33 @@ def rows_of(shards: Sequence[Shard], states: tuple[int, ...]) -> tuple[NDArray[n
     return where[order], row[order]
 
 
+def check_rows(
+    shards: Sequence[Shard], where: NDArray[np.intp], row: NDArray[np.intp], bounds: dict[str, tuple[int, Any]]
+) -> None:
+    """Checks that columns of whole numbers, at these rows, are within bounds: the lower one in, the upper one out.
+
+    Raises `SimulationError` where one isn't: the set is damaged.
+    """
+    for name, (low, high) in bounds.items():
+        values = gather(shards, where, row, name)
+        high = np.broadcast_to(high, values.shape)
+        bad = np.flatnonzero((values < low) | (values >= high))
+        if bad.size:
+            set_, value, limit = shards[0].directory.parent, values.flat[bad[0]], high.flat[bad[0]]
+            msg = f"{set_}: damaged: {name} is {value}, wanted {low} to {limit - 1}; simulate it again"
+            raise SimulationError(msg)
+
+
+def clip_names(card: dict[str, Any]) -> dict[str, list[str]]:
+    """Names of the motions, by split. Raises `SimulationError` for a card that doesn't have them."""
+    clips = card.get("clips")
+    names = {split: clips.get(split) for split in ("train", "test")} if isinstance(clips, dict) else {}
+    if not names or not all(isinstance(value, list) for value in names.values()):
+        msg = f"wanted a card with the names of the motions in clips.train and clips.test, got {str(clips)[:80]}"
+        raise SimulationError(msg)
+    return {split: [str(name) for name in value or ()] for split, value in names.items()}
+
+
 def gather(shards: Sequence[Shard], where: NDArray[np.intp], row: NDArray[np.intp], name: str) -> NDArray[Any]:
     """A column at these rows of these shards, as `rows_of` names them, shape (M, ...)."""
     column = shards[0].arrays[name]
@@ -239,8 +271,13 @@ def read_card(directory: Path, kind: str = FORMAT) -> dict[str, Any]:
     """The card of a data set of the format `kind`. Raises `SimulationError` when there is none, or it can't be read."""
     path = directory / "card.json"
     try:
-        card = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
+        with path.open("rb") as file:
+            text = file.read(_MAX_CARD_BYTES + 1)
+        if len(text) > _MAX_CARD_BYTES:
+            msg = f"larger than {_MAX_CARD_BYTES >> 20} MiB"
+            raise ValueError(msg)
+        card = json.loads(text)
+    except (OSError, ValueError, RecursionError) as error:
         msg = f"{path}: wanted the card of a simulated data set: {error}"
         raise SimulationError(msg) from error
     if not isinstance(card, dict) or card.get("format") != kind:
@@ -272,10 +309,12 @@ def read_by_slot(directory: Path, name: str, shape: tuple[int, ...]) -> NDArray[
     """
     path = directory / f"{name}.npy"
     if not path.exists():
-        return np.full(shape, np.nan, np.float32)
+        return np.broadcast_to(np.float32(np.nan), shape)
     try:
+        with path.open("rb") as file:
+            check_npy(file, path.stat().st_size)
         values = np.load(path)
-    except (OSError, ValueError) as error:
+    except DAMAGE as error:
         msg = f"{path}: can't be read: {error}"
         raise SimulationError(msg) from error
     if values.shape != shape or values.dtype != np.float32:

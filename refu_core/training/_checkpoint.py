@@ -45,4 +45,7 @@ def load_checkpoint(path: Path) -> dict[str, Any] | None:
     except Exception as error:  # torch raises whatever its readers do
         msg = f"{path}: a damaged checkpoint; delete it to start anew: {error}"
         raise WeightsError(msg) from error
-    return dict(state)
+    if not isinstance(state, dict):
+        msg = f"{path}: a checkpoint holds a dictionary, this one a {type(state).__name__}; delete it to start anew"
+        raise WeightsError(msg)
+    return state

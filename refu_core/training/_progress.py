@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+import os
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
@@ -24,7 +26,7 @@ class TrainingLog:
         self._entries: list[dict[str, Any]] = []
         folder.mkdir(parents=True, exist_ok=True)
         if self._lines.exists():
-            self._entries = [json.loads(line) for line in self._lines.read_text().splitlines() if line]
+            self._entries = _entries(self._lines)
 
     def begin(self, stage: str, *, step: int, steps: int) -> None:
         """A stage of `steps` steps goes on at `step`; entries after it are of an interrupted run and dropped."""
@@ -42,7 +44,10 @@ class TrainingLog:
     def check(self, stage: str, step: int, **values: float) -> None:
         """Losses at a step, by name [mm]."""
         self._entries.append({"stage": stage, "step": step, **{k: round(v, 5) for k, v in values.items()}})
-        self._lines.write_text("".join(json.dumps(entry) + "\n" for entry in self._entries))
+        # Under another name first: a training that is killed leaves the curves of the check before, and no half line.
+        part = self._lines.with_name(f".{self._lines.name}.{os.getpid()}")
+        part.write_text("".join(json.dumps(entry) + "\n" for entry in self._entries))
+        part.replace(self._lines)
         if self._bar is not None:
             self._bar.set_postfix({k: f"{v:.2f}" for k, v in values.items()})
 
@@ -75,3 +80,20 @@ class TrainingLog:
             axes.grid(visible=True, which="both", alpha=0.25)
             axes.legend(frameon=False)
         figure.savefig(self.picture, dpi=120)
+
+
+def _entries(path: Path) -> list[dict[str, Any]]:
+    """The entries of an earlier run; a log is no reason not to go on, so what isn't one is left out."""
+    entries = []
+    for line in path.read_bytes().splitlines():
+        try:
+            entry = json.loads(line)
+        except (ValueError, RecursionError):
+            continue
+        if isinstance(entry, dict) and isinstance(entry.get("stage"), str) and _is_number(entry.get("step")):
+            entries.append({key: value for key, value in entry.items() if key == "stage" or _is_number(value)})
+    return entries
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and abs(value) < math.inf

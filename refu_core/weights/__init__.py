@@ -1,5 +1,7 @@
 """Trained weights: safetensors beside a JSON card; and those that ship, a folder a garment."""
 
+from refu_core.weights._config import build_for as build_for
+from refu_core.weights._config import config_of_card as config_of_card
 from refu_core.weights._files import FORMAT as FORMAT
 from refu_core.weights._files import Weights as Weights
 from refu_core.weights._files import load_weights as load_weights

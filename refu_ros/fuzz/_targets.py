@@ -29,9 +29,9 @@ _ALL = (
     Target("markers", "visualization_msgs/MarkerArray in CDR", 150_000, lambda _: messages.MarkerDecoding()),
     Target("encoder", "odd meshes to a MarkerArray", 50_000, lambda _: messages.MarkerEncoding()),
     Target("parameters", "parameters of the node", 50_000, lambda _: messages.Parameters()),
-    # A chunk may take what the reader allows one to (256 MiB), and its bytes once more while they are checked.
-    Target("mcap", "MCAP files", 40_000, files.Bag, memory_mb=600, seconds=10.0),
-    Target("metadata", "metadata.yaml of a bag", 20_000, files.BagMetadata, seconds=5.0),
+    # A chunk may take what the reader allows one to, and its bytes once more while they are checked.
+    Target("mcap", "MCAP files", 20_000, files.Bag, memory_mb=600, seconds=10.0),
+    Target("metadata", "metadata.yaml of a bag", 6_000, files.BagMetadata, seconds=10.0),
     Target("motion", "AMASS-style .npz", 30_000, files.MotionFile),
     Target("body_npz", "bodies as .npz", 30_000, files.BodyArchive),
     Target("body_pkl", "bodies as official .pkl", 40_000, files.BodyPickle),
