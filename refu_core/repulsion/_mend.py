@@ -10,9 +10,9 @@ from torch import Tensor
 from refu_core.repulsion._limbs import Limbs
 from refu_core.sdf import SdfSample
 
-_LOOKS = 3
+LOOKS = 3
 """How far into a patch of wrong closest faces is looked from its rim [edges]."""
-_ROUNDS = 8
+ROUNDS = 8
 """How far into a patch of wrong sides is looked from its rim [edges]."""
 TOLERANCE = 1e-3
 """Disagreement that is let pass [m]: an approximate distance is never quite consistent."""
@@ -54,7 +54,7 @@ def mend(
     """
     if sample.face is None:
         return sample
-    for _ in range(_LOOKS if look is not None else 0):
+    for _ in range(LOOKS if look is not None else 0):
         first, second = _contradictions(points, sample.distance, limbs.edges, margin)
         is_nearer = sample.distance[first].abs() < sample.distance[second].abs()
         trusted, other = torch.where(is_nearer, first, second), torch.where(is_nearer, second, first)
@@ -64,7 +64,7 @@ def mend(
         sample, changed = _replaced(sample, other, again, again.distance.abs() < sample.distance[other].abs())
         if not changed:
             break
-    for _ in range(_ROUNDS):
+    for _ in range(ROUNDS):
         first, second = _contradictions(points, sample.distance, limbs.edges, margin)
         is_lower = sample.distance[first] < sample.distance[second]
         low, high = torch.where(is_lower, first, second), torch.where(is_lower, second, first)

@@ -14,7 +14,7 @@ from refu_core._warp import as_warp, torch_stream
 from refu_core.repulsion import _resolver_kernels as kernels
 from refu_core.repulsion._blend import BLEND_ROUNDS
 from refu_core.repulsion._limbs import INWARD, SIDEWAYS, Limbs
-from refu_core.repulsion._mend import DEEP, FARTHEST, STEP_ON, STEPS, TOLERANCE, mend
+from refu_core.repulsion._mend import DEEP, FARTHEST, LOOKS, ROUNDS, STEP_ON, STEPS, TOLERANCE
 from refu_core.repulsion._resolve import BENT, RETREAT_STEPS, SURE, Resolution
 from refu_core.repulsion._scale import VertexScale
 from refu_core.repulsion._unit import DEFAULT_MARGIN, MAX_DISPLACEMENT
@@ -50,7 +50,6 @@ class Resolver:
         self._counts = torch.zeros(kernels.N_COUNTS + 2 * _N_LIMBS, dtype=torch.int32, device=self.device)
         self._sheet = self._bind_sheet()
         self._commands: dict[str, Any] = {}
-        self._margin = -1.0
         self._recorded_for: tuple[Any, ...] = ()
 
     @torch.no_grad()
@@ -72,38 +71,50 @@ class Resolver:
             margin: ε ≥ 0 [m].
             scale: α of the first push, as `resolve` takes it.
         """
-        assert start.face is not None  # these distances are to faces
         with torch_stream(self.device):
-            if not self._begin(points, start, margin):
-                return self._resolution(points, start, rounds=0)
-            self._record(sdf)
-            if self._count(kernels.CONTRADICTIONS):
-                look = (lambda here, faces: sdf.query(here, near=faces)) if isinstance(sdf, ApproxSdf) else None
-                start = mend(points, start, self._limbs, margin=margin, look=look)
-                self._begin(points, start, margin)
-            self._push(scale)
-            rounds = 1 + self._raise_edges()
-            self._run("tally", self._count(kernels.NEAR))
-            return self._resolution(points, start, rounds=rounds)
+            self._take(points, start)
+            self._record(sdf, margin)
+            self._mend(can_miss=isinstance(sdf, ApproxSdf))
+            self._run("list", self._n_vertices)
+            n = self._count(kernels.NEAR)
+            if n:
+                self._push(n, scale)
+                rounds = 1 + self._raise_edges()
+                self._run("tally", n)
+            return Resolution(
+                self._vectors["place"].clone(),
+                self._floats["distance"].clone(),
+                n_inside=self._count(kernels.INSIDE),
+                n_pushed=self._count(kernels.MOVED),
+                rounds=rounds if n else 0,
+                max_depth=max(0.0, -float(self._floats["first"].min())) if len(points) else 0.0,
+                n_unresolved=self._count(kernels.STUCK),
+            )
 
-    def _begin(self, points: Tensor, start: SdfSample, margin: float) -> bool:
-        """Takes over a frame; whether any vertex is nearer than the margin."""
-        assert start.face is not None  # the caller has seen to it
+    def _take(self, points: Tensor, start: SdfSample) -> None:
+        """Takes over a frame."""
+        assert start.face is not None  # these distances are to faces
         self._counts.zero_()
         self._vectors["origin"].copy_(points)
         self._floats["first"].copy_(start.distance)
         self._vectors["first_gradient"].copy_(start.gradient)
         self._ints["first_face"].copy_(start.face)
-        if margin != self._margin:
-            self._margin, self._recorded_for = margin, ()
-            inputs = [self._sheet, self._cloth, _rules(margin), self._list("near")]
-            self._command("begin", kernels.begin_kernel, inputs)
-        self._run("begin", self._n_vertices)
-        return self._count(kernels.NEAR) > 0
 
-    def _push(self, scale: float | VertexScale) -> None:
-        """Out of other limbs on the near side, and out of the body along the gradient, with the neighbourhood."""
-        n = self._count(kernels.NEAR)
+    def _mend(self, *, can_miss: bool) -> None:
+        """Makes the distances consistent along edges, as `mend` does; some closest faces may have been missed."""
+        self._run("begin", self._n_vertices)
+        self._run("compare", self._n_vertices)
+        for remedy, rounds in (("look again", LOOKS if can_miss else 0), ("cut off", ROUNDS)):
+            for _ in range(rounds):
+                n = self._count(kernels.SUSPECTS)
+                self._counts[kernels.CHANGED] = 0
+                self._run(remedy, n)
+                self._run("adopt", n)
+                if not self._count(kernels.CHANGED):
+                    break
+
+    def _push(self, n: int, scale: float | VertexScale) -> None:
+        """The `n` near out of other limbs on the near side, and out of the body, with the neighbourhood."""
         self._run("look", n)
         if self._counts[kernels.N_COUNTS : kernels.N_COUNTS + _N_LIMBS].any():
             self._run("retreat", n)
@@ -139,17 +150,6 @@ class Resolver:
             self._run("raise", self._count(kernels.RAISED))
         return _MAX_PUSHES
 
-    def _resolution(self, points: Tensor, start: SdfSample, *, rounds: int) -> Resolution:
-        return Resolution(
-            self._vectors["place"].clone(),
-            self._floats["distance"].clone(),
-            n_inside=self._count(kernels.INSIDE),
-            n_pushed=self._count(kernels.MOVED),
-            rounds=rounds,
-            max_depth=max(0.0, -float(start.distance.min())) if len(points) else 0.0,
-            n_unresolved=self._count(kernels.STUCK),
-        )
-
     def _count(self, which: int) -> int:
         return int(self._counts[which])
 
@@ -169,19 +169,25 @@ class Resolver:
     def _list(self, name: str) -> Any:
         return as_warp(self._ints[name], wp.int32)
 
-    def _record(self, sdf: ExactSdf | BandSdf | ApproxSdf) -> None:
+    def _record(self, sdf: ExactSdf | BandSdf | ApproxSdf, margin: float) -> None:
         """Records the launches of a frame, unless they are the last frame's."""
         skin = sdf.skin()
-        key = (id(sdf), int(skin.tree), int(skin.points.ptr))
+        key = (id(sdf), int(skin.tree), int(skin.points.ptr), margin)
         if key == self._recorded_for:
             return
         self._recorded_for = key
-        sheet, cloth, rules = self._sheet, self._cloth, _rules(self._margin)
+        sheet, cloth, rules = self._sheet, self._cloth, _rules(margin)
         near, pushed, reached, moved = (self._list(name) for name in ("near", "pushed", "reached", "moved"))
         field, smoother = (as_warp(self._vectors[name], wp.vec3) for name in ("field", "smoother"))
         alpha, largest = (as_warp(self._floats[name], wp.float32) for name in ("alpha", "largest"))
         suspects, low, lower = (as_warp(row, wp.int32) for row in self._by_edge)
         lack = [as_warp(self._deficit, wp.float32), as_warp(self._rise, wp.vec3), largest]
+        self._command("begin", kernels.begin_kernel, [sheet])
+        self._command("compare", kernels.compare_kernel, [sheet, cloth, rules, reached])
+        self._command("look again", kernels.look_again_kernel, [sheet, cloth, skin, rules, reached])
+        self._command("cut off", kernels.cut_off_kernel, [sheet, cloth, rules, reached])
+        self._command("adopt", kernels.adopt_kernel, [sheet, cloth, reached])
+        self._command("list", kernels.list_kernel, [sheet, rules, near])
         self._command("look", kernels.look_kernel, [sheet, cloth, rules, near])
         self._command("retreat", kernels.retreat_kernel, [sheet, cloth, skin, rules, near])
         self._command("fill", kernels.fill_kernel, [sheet, cloth, skin, near])
@@ -206,7 +212,7 @@ class Resolver:
             setattr(sheet, name, as_warp(self._vectors[name], wp.vec3))
         for name in ("first", "distance", "along", "way", "depth", "goal"):
             setattr(sheet, name, as_warp(self._floats[name], wp.float32))
-        for name in ("first_face", "face", "role", "mark"):
+        for name in ("first_face", "face", "guess", "role", "mark"):
             setattr(sheet, name, self._list(name))
         sheet.counts = as_warp(self._counts, wp.int32)
         sheet.touched = as_warp(self._counts[kernels.N_COUNTS :], wp.int32)
@@ -216,7 +222,7 @@ class Resolver:
 
 _VECTORS = ("origin", "first_gradient", "place", "gradient", "outward", "heading", "field", "smoother")
 _FLOATS = ("first", "distance", "along", "way", "depth", "goal", "alpha", "largest")
-_INTS = ("first_face", "face", "role", "mark", "near", "pushed", "reached", "moved")
+_INTS = ("first_face", "face", "guess", "role", "mark", "near", "pushed", "reached", "moved")
 _N_LIMBS = 4
 
 

@@ -16,12 +16,13 @@ from refu_core.sdf import Skin, ask
 NEAR = wp.constant(0)  # vertices nearer than the margin
 PUSHED = wp.constant(1)  # those of them that are pushed along the gradient
 REACHED = wp.constant(2)  # vertices that a push reaches by way of its neighbours
-CONTRADICTIONS = wp.constant(3)
+SUSPECTS = wp.constant(3)  # vertices at the ends of edges along which distances contradict each other
 INSIDE = wp.constant(4)
 MOVED = wp.constant(5)  # of those nearer than the margin
 STUCK = wp.constant(6)  # inside after all
 RAISED = wp.constant(7)  # ends of edges that cut the skin
-CUTTING = wp.constant(8)  # such edges; a number for each round follows
+CHANGED = wp.constant(8)  # distances that were mended
+CUTTING = wp.constant(9)  # such edges; a number for each round follows
 N_COUNTS = 16
 
 # A vertex's role: pushed along the gradient, or out of another limb on the near side.
@@ -104,6 +105,8 @@ class Sheet:
     """Distance that the push starts from."""
     goal: wp.array(dtype=wp.float32)
     """Distance that it leads to."""
+    guess: wp.array(dtype=wp.int32)
+    """A face that may be closer."""
     role: wp.array(dtype=wp.int32)
     mark: wp.array(dtype=wp.int32)
     counts: wp.array(dtype=wp.int32)
@@ -160,24 +163,105 @@ def push_on(
         scale = wp.where(wp.dot(last, gradient) < 0.0, 0.5, 1.0)
 
 
+@wp.func
+def contradict(i: int, j: int, sheet: Sheet, rules: Rules):
+    """Whether the distances of two neighbours, one of them at the skin, differ by more than they are apart."""
+    first = sheet.distance[i]
+    second = sheet.distance[j]
+    excess = wp.abs(first - second) - rules.contradiction
+    if excess <= 0.0 or wp.min(first, second) >= rules.margin:
+        return False
+    return excess > wp.length(sheet.origin[i] - sheet.origin[j])
+
+
+@wp.func
+def suspect(i: int, sheet: Sheet, suspects: wp.array(dtype=int)):
+    if wp.atomic_max(sheet.mark, i, BESIDE) == 0:
+        suspects[wp.atomic_add(sheet.counts, SUSPECTS, 1)] = i
+
+
 @wp.kernel(enable_backward=False)
-def begin_kernel(sheet: Sheet, cloth: Cloth, rules: Rules, near: wp.array(dtype=int)):
-    """Everybody where it is; lists who is near, and counts edges along which distances contradict each other."""
+def begin_kernel(sheet: Sheet):
+    """Everybody where it is."""
     i = wp.tid()
-    here = sheet.origin[i]
-    distance = sheet.first[i]
-    keep(i, here, distance, sheet.first_gradient[i], sheet.first_face[i], sheet)
+    keep(i, sheet.origin[i], sheet.first[i], sheet.first_gradient[i], sheet.first_face[i], sheet)
     sheet.role[i] = FREE
-    if distance >= rules.margin:
+
+
+@wp.kernel(enable_backward=False)
+def compare_kernel(sheet: Sheet, cloth: Cloth, rules: Rules, suspects: wp.array(dtype=int)):
+    """Lists the ends of edges at the skin along which distances contradict each other."""
+    i = wp.tid()
+    if sheet.distance[i] >= rules.margin:
         return
-    near[wp.atomic_add(sheet.counts, NEAR, 1)] = i
-    if distance < 0.0:
-        wp.atomic_add(sheet.counts, INSIDE, 1)
     for k in range(cloth.ring_start[i], cloth.ring_start[i + 1]):
         j = cloth.ring[k]
-        apart = wp.abs(sheet.first[j] - distance) - rules.contradiction
-        if apart > 0.0 and apart > wp.length(sheet.origin[j] - here):
-            wp.atomic_add(sheet.counts, CONTRADICTIONS, 1)
+        if contradict(i, j, sheet, rules):
+            suspect(i, sheet, suspects)
+            suspect(j, sheet, suspects)
+
+
+@wp.kernel(enable_backward=False)
+def look_again_kernel(sheet: Sheet, cloth: Cloth, skin: Skin, rules: Rules, suspects: wp.array(dtype=int)):
+    """`mend`'s first remedy: from the faces of neighbours that are nearer to theirs a nearer one may be found."""
+    i = suspects[wp.tid()]
+    sheet.guess[i] = -1
+    nearest = wp.abs(sheet.distance[i])
+    for k in range(cloth.ring_start[i], cloth.ring_start[i + 1]):
+        j = cloth.ring[k]
+        if wp.abs(sheet.distance[j]) < wp.abs(sheet.distance[i]) and contradict(i, j, sheet, rules):
+            distance, gradient, face = ask(skin, sheet.origin[i], sheet.face[j])
+            if wp.abs(distance) < nearest:
+                nearest = wp.abs(distance)
+                sheet.depth[i] = distance
+                sheet.heading[i] = gradient
+                sheet.guess[i] = face
+
+
+@wp.kernel(enable_backward=False)
+def cut_off_kernel(sheet: Sheet, cloth: Cloth, rules: Rules, suspects: wp.array(dtype=int)):
+    """`mend`'s second: what is said to be outside of flesh that a neighbour is in goes with the neighbour."""
+    i = suspects[wp.tid()]
+    sheet.guess[i] = -1
+    nearest = float(1.0e12)
+    for k in range(cloth.ring_start[i], cloth.ring_start[i + 1]):
+        j = cloth.ring[k]
+        within = sheet.distance[j]
+        if within < 0.0 and within < sheet.distance[i] and cloth.own[i] == 1 << cloth.limb[sheet.face[j]]:
+            to_plane = within + wp.dot(sheet.origin[i] - sheet.origin[j], sheet.gradient[j])
+            if (
+                to_plane < sheet.distance[i] - rules.contradiction
+                and wp.abs(to_plane) < nearest
+                and contradict(i, j, sheet, rules)
+            ):
+                nearest = wp.abs(to_plane)
+                sheet.depth[i] = to_plane
+                sheet.heading[i] = sheet.gradient[j]
+                sheet.guess[i] = sheet.face[j]
+
+
+@wp.kernel(enable_backward=False)
+def adopt_kernel(sheet: Sheet, cloth: Cloth, suspects: wp.array(dtype=int)):
+    """Takes over what was found, and suspects the neighbours of what changed."""
+    i = suspects[wp.tid()]
+    if sheet.guess[i] < 0:
+        return
+    wp.atomic_add(sheet.counts, CHANGED, 1)
+    sheet.first[i] = sheet.depth[i]
+    sheet.first_gradient[i] = sheet.heading[i]
+    sheet.first_face[i] = sheet.guess[i]
+    keep(i, sheet.origin[i], sheet.depth[i], sheet.heading[i], sheet.guess[i], sheet)
+    for k in range(cloth.ring_start[i], cloth.ring_start[i + 1]):
+        suspect(cloth.ring[k], sheet, suspects)
+
+
+@wp.kernel(enable_backward=False)
+def list_kernel(sheet: Sheet, rules: Rules, near: wp.array(dtype=int)):
+    """Lists who is nearer than the margin."""
+    i = wp.tid()
+    sheet.mark[i] = 0
+    if sheet.distance[i] < rules.margin:
+        near[wp.atomic_add(sheet.counts, NEAR, 1)] = i
 
 
 @wp.kernel(enable_backward=False)
@@ -520,10 +604,12 @@ def raise_kernel(
 
 @wp.kernel(enable_backward=False)
 def tally_kernel(sheet: Sheet, near: wp.array(dtype=int)):
-    """Counts who was moved, and who is inside."""
+    """Counts who was inside, who was moved, and who is inside."""
     i = near[wp.tid()]
     way = sheet.place[i] - sheet.origin[i]
     if way[0] != 0.0 or way[1] != 0.0 or way[2] != 0.0:
         wp.atomic_add(sheet.counts, MOVED, 1)
+    if sheet.first[i] < 0.0:
+        wp.atomic_add(sheet.counts, INSIDE, 1)
     if sheet.distance[i] < 0.0:
         wp.atomic_add(sheet.counts, STUCK, 1)
