@@ -1,0 +1,325 @@
+"""Kills recordings, simulations and trainings at random moments: what is on disk is readable, and the work goes on.
+
+    python scripts/kill_test.py --what recording|simulation|training --times 100 [--seed S] [--json FILE]
+
+Each kind of work is done once without interruption. Then it is begun in a process that is killed (SIGKILL) after a
+random time, looked at, and begun again in the same place, until it is finished; then all over. Looked at means: the
+project's own readers read what is there, and every finished part has the bytes of the uninterrupted work.
+
+Exit status 1 where anything couldn't be read, differs, or was lost beyond what the documentation says.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import mmap
+import os
+import random
+import shutil
+import signal
+import struct
+import sys
+import tempfile
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+
+ROOT = Path(__file__).resolve().parents[1]
+GARMENT = "short-pant-male"
+CHUNK_BYTES = 1 << 20
+
+
+class Work(Protocol):
+    """Something that takes a while and leaves files."""
+
+    longest_s: float
+    """Kills come after a random time up to this."""
+
+    def begin(self, folder: Path) -> None:
+        """Does the work, or goes on with it. Called in a process of its own."""
+
+    def check(self, folder: Path) -> str:
+        """Reads what a kill has left; returns in a word how far it was. Raises where anything is wrong."""
+
+    def check_finished(self, folder: Path) -> None:
+        """Raises where finished work isn't that of an uninterrupted run."""
+
+
+class Recording:
+    """The node's recorder under full load; a recording can't be gone on with, so the next one must find a place."""
+
+    topic, message_type = "/garments", "visualization_msgs/msg/MarkerArray"
+    longest_s = 0.6
+
+    def __init__(self, folder: Path) -> None:
+        self._progress = folder / "progress"
+        self._progress.write_bytes(bytes(8))
+
+    @staticmethod
+    def payload(i: int) -> bytes:
+        """Message number `i`: of a size and a content that follow from its number, and that hardly compress."""
+        rng = random.Random(i)
+        return struct.pack("<4sQ", b"\0\1\0\0", i) + rng.randbytes(rng.choice((100, 2_000, 60_000, 300_000)))
+
+    def begin(self, folder: Path) -> None:
+        """Records until it is killed."""
+        from msg_adapters import QosProfile
+        from refu_ros._recorder import Recorder
+
+        recorder = Recorder(folder / "bag")
+        with self._progress.open("r+b") as file, mmap.mmap(file.fileno(), 8) as progress:
+            struct.pack_into("<Q", progress, 0, 0)
+            for i in range(1 << 30):
+                while recorder.state().queued > 20:
+                    time.sleep(0.001)
+                recorder.put(self.topic, self.message_type, self.payload(i), time_ns=i, qos=QosProfile())
+                struct.pack_into("<Q", progress, 0, recorder.state().written)
+
+    def check(self, folder: Path) -> str:
+        """All messages but those of the last chunk are there, once each and unharmed; they can be saved."""
+        from msg_adapters import BagReader, BagWriter
+
+        (written,) = struct.unpack("<Q", self._progress.read_bytes())
+        newest = max(folder.glob("bag*/*.mcap"), key=lambda path: path.stat().st_mtime_ns, default=None)
+        if newest is None or newest.stat().st_size == 0:
+            require(written == 0, "messages were written, and there is no file")
+            return "not begun"
+        with BagReader(newest) as reader:
+            messages = list(reader.messages())
+        for i, message in enumerate(messages):
+            require(message.data == self.payload(i), f"message {i} of {len(messages)} is another")
+        lost = sum(len(self.payload(i)) for i in range(len(messages), written - 1))
+        require(lost <= CHUNK_BYTES, f"{lost} bytes of written messages are lost, a chunk has {CHUNK_BYTES}")
+        saved = folder / "saved.mcap"
+        with BagWriter(saved, overwrite=True) as writer:
+            writer.add_topic(self.topic, self.message_type)
+            for message in messages:
+                writer.write(self.topic, message.data, log_time_ns=message.log_time_ns)
+        with BagReader(saved) as reader:
+            require(
+                sum(1 for _ in reader.messages()) == len(messages) and not reader.truncated, "a saved bag is damaged"
+            )
+        return "recording" if messages else "first chunk"
+
+    def check_finished(self, folder: Path) -> None:
+        """Recordings don't end by themselves."""
+
+
+class Simulation:
+    """`refu simulate`: a small set of shorts."""
+
+    count = 3
+
+    def __init__(self, folder: Path) -> None:
+        started = time.monotonic()
+        self.begin(folder / "reference")
+        self._wanted = self._columns(folder / "reference")
+        started, _ = time.monotonic(), started
+        shutil.rmtree(folder / "again", ignore_errors=True)
+        self.begin(folder / "again")  # all kernels are compiled by now
+        self.check_finished(folder / "again")
+        self.longest_s = 1.2 * (time.monotonic() - started)
+
+    def begin(self, folder: Path) -> None:
+        """Simulates what is left."""
+        from refu_core.simulation import simulate_dataset
+
+        simulate_dataset(GARMENT, self.count, folder)
+
+    @staticmethod
+    def _columns(folder: Path) -> dict[str, Any]:
+        files = [*folder.glob("*.npy"), *folder.glob("shard-*-of-1/*.npy")]
+        return {path.name: np.load(path) for path in files if path.name != "seconds.npy"}
+
+    def check(self, folder: Path) -> str:
+        """Each sample that is said to be finished is the one that it has to be."""
+        from refu_core.simulation import GarmentDataset, SimulationError
+
+        if not (folder / "card.json").exists():
+            return "no card"
+        try:
+            dataset = GarmentDataset(folder)
+        except SimulationError as error:
+            require("no shard" in str(error), str(error))
+            return "no shard"
+        for i in range(len(dataset)):
+            dataset.sample(i)
+        slots = dataset.column("slot")
+        for name in ("vertices", "pose", "betas", "style", "split"):
+            wanted = self._wanted[f"{name}.npy"][slots]
+            require(np.array_equal(dataset.column(name), wanted), f"{name} of a finished sample is another")
+        return f"{len(dataset)} samples"
+
+    def check_finished(self, folder: Path) -> None:
+        """All files have the bytes of the reference."""
+        for name, wanted in self._wanted.items():
+            got = self._columns(folder)[name]
+            require(np.array_equal(got, wanted, equal_nan=wanted.dtype.kind == "f"), f"{name} differs")
+
+
+class Training:
+    """`refu train`: a small network on a small set."""
+
+    def __init__(self, folder: Path) -> None:
+        from refu_core import load_body, load_garment
+        from refu_core.backbones import TailorNetConfig
+        from refu_core.training import LoopSettings, PretrainSettings
+
+        sys.path.insert(0, str(ROOT / "tests"))
+        from small_set import write_set
+
+        garment = load_garment(GARMENT)
+        self._set = write_set(folder / "set", garment, load_body(garment.body), pairs=8, poses=4, test_pairs=2)
+        self._config = TailorNetConfig((0, 1, 2, 4, 5), low=(16,), high=(8,), style_shape=(8,), dropout=0.05)
+        loop = LoopSettings(batch_size=8, learning_rate=1e-2, weight_decay=0.01, check_every=4)
+        steps = {"style_shape_steps": 16, "low_steps": 16, "steps": 16}
+        self._settings = PretrainSettings(loop, rank=4, validation_share=0.2, **steps)
+        self.begin(folder / "reference")
+        self._wanted = {path.name: path.read_bytes() for path in (folder / "reference").glob("*.safetensors")}
+        started = time.monotonic()
+        self.begin(folder / "again")
+        self.check_finished(folder / "again")
+        self.longest_s = 1.2 * (time.monotonic() - started)
+
+    def begin(self, folder: Path) -> None:
+        """Trains what is left."""
+        from refu_core.training import pretrain
+
+        torch.manual_seed(os.getpid())  # must not matter
+        pretrain(GARMENT, self._set, folder, settings=self._settings, config=self._config, quiet=True)
+
+    def check(self, folder: Path) -> str:
+        """Checkpoint, weights and curves are there whole, or not at all."""
+        from refu_core.training import load_checkpoint
+        from refu_core.weights import load_weights
+
+        for path in folder.glob("*.safetensors"):
+            if path.with_suffix(".json").exists():
+                load_weights(path.with_suffix(""))
+        for path in folder.glob("*.jsonl"):
+            for line in path.read_text().splitlines():
+                json.loads(line)
+        states = [state for path in folder.glob("*.pt") if (state := load_checkpoint(path)) is not None]
+        if not states:
+            return "no checkpoint"
+        done = ", ".join(states[0]["done"]) or "nothing"
+        return f"done: {done}"
+
+    def check_finished(self, folder: Path) -> None:
+        """The weights have the bytes of the reference."""
+        for name, wanted in self._wanted.items():
+            require((folder / name).read_bytes() == wanted, f"{name} differs")
+
+
+WORKS: dict[str, type[Any]] = {"recording": Recording, "simulation": Simulation, "training": Training}
+
+
+def require(condition: object, what: str) -> None:
+    """Raises `AssertionError`, also where Python doesn't look at `assert`."""
+    if not condition:
+        raise AssertionError(what)
+
+
+@dataclass
+class Result:
+    """What the kills came to."""
+
+    what: str
+    kills: int = 0
+    finished: int = 0
+    """Works that were finished, interrupted or not, and compared with the uninterrupted one."""
+    failures: list[str] = field(default_factory=list)
+    moments: Counter[str] = field(default_factory=Counter)
+    """How far the work was when it was killed."""
+
+
+def kill_often(what: str, times: int, *, seed: int, folder: Path) -> Result:
+    """Begins and kills the work until it has been killed so often."""
+    work: Work = WORKS[what](folder)
+    rng, result = random.Random(seed), Result(what)
+    place = folder / "work"
+    while result.kills < times:
+        seconds = rng.uniform(0, work.longest_s)
+        child = os.fork()
+        if child == 0:
+            _work_and_exit(work, place)
+        status = _wait(child, seconds)
+        try:
+            if status is None:
+                result.kills += 1
+                result.moments[work.check(place)] += 1
+            else:
+                require(status == 0, f"the work failed with status {status} after {result.kills} kills")
+                work.check_finished(place)
+                result.finished += 1
+                shutil.rmtree(place)
+        except Exception as error:
+            result.failures.append(f"{type(error).__name__}: {error}")
+            shutil.rmtree(place, ignore_errors=True)
+    child = os.fork()
+    if child == 0:
+        _work_and_exit(work, place)
+    if _wait(child, 1.0 if what == "recording" else 600.0) == 0:
+        work.check_finished(place)
+        result.finished += 1
+    return result
+
+
+def _work_and_exit(work: Work, place: Path) -> None:
+    """What the process does that may be killed."""
+    status = 1
+    try:
+        place.mkdir(exist_ok=True)
+        work.begin(place)
+        status = 0
+    except Exception as error:
+        sys.stderr.write(f"{type(error).__name__}: {error}\n")
+    finally:
+        os._exit(status)
+
+
+def _wait(child: int, seconds: float) -> int | None:
+    """The exit status of a process, or None where it didn't end in time and was killed."""
+    end = time.monotonic() + seconds
+    while True:
+        pid, status = os.waitpid(child, os.WNOHANG)
+        if pid:
+            return os.waitstatus_to_exitcode(status)
+        if time.monotonic() > end:
+            os.kill(child, signal.SIGKILL)
+            os.waitpid(child, 0)
+            return None
+        time.sleep(0.002)
+
+
+def main() -> int:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--what", choices=[*WORKS, "all"], default="all", help="what is killed")
+    parser.add_argument("--times", type=int, default=100, help="kills of each (100)")
+    parser.add_argument("--seed", type=int, default=0, help="of the moments (0)")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the results as JSON")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    results = []
+    for what in WORKS if args.what == "all" else (args.what,):
+        with tempfile.TemporaryDirectory() as folder:
+            result = kill_often(what, args.times, seed=args.seed, folder=Path(folder))
+        results.append(result)
+        where = ", ".join(f"{moment} {count}" for moment, count in sorted(result.moments.items()))
+        print(f"{what}: {result.kills} kills, {result.finished} finished, {len(result.failures)} failures ({where})")
+        for failure in dict.fromkeys(result.failures):
+            print(f"  {failure}")
+    if args.json is not None:
+        args.json.write_text(json.dumps({"rows": [vars(result) for result in results]}, indent=1) + "\n")
+    return int(any(result.failures for result in results))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
