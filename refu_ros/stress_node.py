@@ -31,7 +31,7 @@ TOLERANCE = 0.05
 """By how much the last tenth may exceed the first one."""
 _DEFAULT_S = 60.0
 _QUICK_S = 10.0
-_START_S = 60.0
+_START_S = 180.0
 _LAST_S = 5.0
 """How long the last messages may take."""
 _SETTLE = 60
@@ -48,8 +48,12 @@ class NodeSoak:
     """Different stamps that came back as garments."""
     doubled: int
     """Garments that came more than once."""
-    recorded_inputs: int
-    recorded_garments: int
+    superseded: int
+    """Frames that the node dropped for a newer one, by its own count: it was busy."""
+    recorded: int
+    """Garments in the bag."""
+    not_recorded: int
+    """Garments that were received and aren't in the bag, or whose input isn't."""
     recorded_twice: int
     """Messages of the bag whose stamp was there already."""
     nan: int
@@ -63,13 +67,8 @@ class NodeSoak:
 
     @property
     def lost(self) -> int:
-        """Frames that no garment came back for."""
-        return self.sent - self.received
-
-    @property
-    def not_recorded(self) -> int:
-        """Frames, and garments, that the bag lacks."""
-        return max(0, self.sent - self.recorded_inputs) + max(0, self.sent - self.recorded_garments)
+        """Frames that no garment came back for, and that the node doesn't say it has dropped."""
+        return max(0, self.sent - self.received - self.superseded)
 
     @property
     def failures(self) -> int:
@@ -83,7 +82,7 @@ class NodeSoak:
         """Ready for JSON."""
         row = {name: getattr(self, name) for name in self.__dataclass_fields__}
         row |= {"case": "soak: node", "runs": self.sent, "failures": self.failures, "max_deviation_m": 0.0}
-        return {"rows": [row | {"lost": self.lost, "not_recorded": self.not_recorded}], "failures": self.failures}
+        return {"rows": [row | {"lost": self.lost}], "failures": self.failures}
 
 
 def node_options(options: StressOptions) -> dict[str, Any]:
@@ -150,6 +149,7 @@ class _Peer:
 
     def __init__(self, process: subprocess.Popen[bytes], log: Path) -> None:
         import rclpy
+        from diagnostic_msgs.msg import DiagnosticArray
         from rclpy.qos import QoSProfile
         from sensor_msgs.msg import JointState
         from visualization_msgs.msg import MarkerArray
@@ -158,6 +158,7 @@ class _Peer:
         self._spin = rclpy.spin_once
         self._node = rclpy.create_node("refu_stress")
         self._publisher = self._node.create_publisher(JointState, "smpl_params", QoSProfile(depth=1))
+        self._node.create_subscription(DiagnosticArray, "/diagnostics", self._note, QoSProfile(depth=10))
         self._node.create_subscription(MarkerArray, "garments", self._take, QoSProfile(depth=100), raw=True)
         self._encode = encoder_for("joint_state")
         self._frames = soak_frames(np.random.default_rng(0))
@@ -166,6 +167,7 @@ class _Peer:
         self._sent: list[int] = []
         self._memory: list[float] = []
         self._nan = 0
+        self._stale, self._stale_before, self._noted = 0, 0, 0
 
     def _take(self, data: bytes) -> None:
         now = time.time_ns()
@@ -175,6 +177,19 @@ class _Peer:
             self._came[stamp] += 1
             self._latency.setdefault(stamp, 1e-6 * (now - stamp))
             self._nan += not all(np.isfinite(marker.points).all() for marker in markers)
+
+    def _note(self, diagnostics: Any) -> None:
+        for status in diagnostics.status:
+            if status.name == "garment_node: input":
+                values = {item.key: item.value for item in status.values}
+                self._stale = int(values.get("dropped: stale", "0"))
+                self._noted += 1
+
+    def _hear(self, times: int) -> None:
+        """Waits until the node has told of itself so often."""
+        wanted, end = self._noted + times, time.monotonic() + _LAST_S
+        while self._noted < wanted and time.monotonic() < end:
+            self._spin(self._node, timeout_sec=0.1)
 
     def _until(self, end: float) -> None:
         while (left := end - time.monotonic()) > 0:
@@ -195,7 +210,8 @@ class _Peer:
                 raise RefuError(msg)
             self._send(len(self._came))
             self._until(time.monotonic() + 1 / RATE)
-        self._until(time.monotonic() + 1.0)
+        self._hear(2)
+        self._stale_before = self._stale
 
     def send_all(self, seconds: float, tick: Callable[[int], object]) -> None:
         """A frame every 1/30 s."""
@@ -210,19 +226,21 @@ class _Peer:
         end = time.monotonic() + _LAST_S
         while time.monotonic() < end and self._sent[-1] not in self._came:
             self._spin(self._node, timeout_sec=0.1)
-        self._until(time.monotonic() + 0.5)
+        self._hear(2)
 
     def summary(self, bag: Path, exit_code: int) -> NodeSoak:
         """All counts, of what was sent by `send_all` alone."""
         sent = set(self._sent)
         inputs, garments = (Counter({s: n for s, n in counts.items() if s in sent}) for counts in _recorded(bag))
+        received = sent & set(self._came)
         latency = [self._latency[stamp] for stamp in self._sent if stamp in self._latency]
         return NodeSoak(
             sent=len(sent),
-            received=len(sent & set(self._came)),
-            doubled=sum(self._came[stamp] - 1 for stamp in sent & set(self._came)),
-            recorded_inputs=len(inputs),
-            recorded_garments=len(garments),
+            received=len(received),
+            doubled=sum(self._came[stamp] - 1 for stamp in received),
+            superseded=self._stale - self._stale_before,
+            recorded=len(garments),
+            not_recorded=len(received - set(garments)) + len(set(garments) - set(inputs)),
             recorded_twice=sum(inputs.values()) - len(inputs) + sum(garments.values()) - len(garments),
             nan=self._nan,
             memory_mb=_tenths(self._memory, max),
@@ -262,8 +280,10 @@ def node_table(result: NodeSoak) -> str:
     rows = [
         ("sent in", f"{result.seconds:.0f} s", str(result.sent)),
         ("came back as garments", "", str(result.received)),
+        ("superseded by a newer one", "", str(result.superseded)),
         ("lost", "", str(result.lost)),
         ("doubled", "", str(result.doubled)),
+        ("recorded garments", "", str(result.recorded)),
         ("not recorded", "", str(result.not_recorded)),
         ("recorded twice", "", str(result.recorded_twice)),
         ("messages with NaN", "", str(result.nan)),

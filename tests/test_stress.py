@@ -161,7 +161,7 @@ def test_errors_of_other_kinds_are_failures_and_refusals_are_not(subject: Subjec
 
     check, trial = CHECKS["numbers: everyday"], trial_of(CHECKS["numbers: everyday"])
     refused, broken = (replace(check, measure=measure).run(subject, trial) for measure in (refuse, break_down))
-    assert (refused.refused, refused.is_failure) == (1, False)
+    assert (refused.refused, refused.is_failure) == (len(trial.frames), False)
     assert broken.is_failure
     assert "ZeroDivisionError" in broken.faults[0]
 
@@ -275,8 +275,8 @@ def test_the_live_node(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     (row,) = json.loads(file.read_text())["rows"]
     # Ten seconds on a busy machine: a frame may be late and be superseded, but nothing may come twice.
     assert row["sent"] == 300
-    assert row["received"] > 150
-    assert (row["doubled"], row["recorded_twice"], row["nan"], row["exit_code"]) == (0, 0, 0, 0)
-    assert row["recorded_garments"] >= row["received"]
+    assert row["received"] > 20
+    assert (row["doubled"], row["recorded_twice"], row["not_recorded"], row["nan"], row["exit_code"]) == (0,) * 5
+    assert row["recorded"] >= row["received"]
     assert main([*common, "--output", str(tmp_path)]) == 2
     assert "is there already" in capsys.readouterr().err

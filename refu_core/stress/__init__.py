@@ -16,7 +16,7 @@ from refu_core.stress._soak import SoakResult as SoakResult
 from refu_core.stress._soak import resident_mb as resident_mb
 from refu_core.stress._soak import soak as soak
 from refu_core.stress._soak import soak_frames as soak_frames
-from refu_core.stress._subject import Reference as Reference
+from refu_core.stress._subject import Prediction as Prediction
 from refu_core.stress._subject import Subject as Subject
 from refu_core.stress._subject import Wardrobe as Wardrobe
 from refu_core.stress._subject import distance_to_mesh as distance_to_mesh

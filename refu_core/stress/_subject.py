@@ -112,45 +112,53 @@ class Subject:
         }
 
     @cached_property
-    def reference(self) -> Reference:
-        """The same in float64."""
-        return Reference(self.pipeline, self.wardrobe, weights=self._weights)
+    def in_float32(self) -> Prediction:
+        """Bodies and garments as the pipeline computes them, without collision handling."""
+        return Prediction(self.pipeline, self.wardrobe, dtype=torch.float32, weights=self._weights)
+
+    @cached_property
+    def in_float64(self) -> Prediction:
+        """The same in float64: what float32 is held against."""
+        return Prediction(self.pipeline, self.wardrobe, dtype=torch.float64, weights=self._weights)
 
 
-class Reference:
-    """Body, backbone and posed garment in float64, from the same parameters: what float32 is held against."""
+class Prediction:
+    """Body, backbone and posed garment in one precision."""
 
-    def __init__(self, pipeline: GarmentPipeline, wardrobe: Wardrobe, *, weights: Path | None = None) -> None:
+    def __init__(
+        self, pipeline: GarmentPipeline, wardrobe: Wardrobe, *, dtype: torch.dtype, weights: Path | None = None
+    ) -> None:
         """Of the bodies and garments of `pipeline`, with networks of its own."""
-        self._body = pipeline.body.to(dtype=torch.float64)
-        self._garments = {name: garment.to(dtype=torch.float64) for name, garment in pipeline.garments.items()}
+        self._dtype = dtype
+        self._body = pipeline.body.to(dtype=dtype)
+        self._garments = {name: garment.to(dtype=dtype) for name, garment in pipeline.garments.items()}
         self._backbones = {}
         for name, garment in pipeline.garments.items():
             network = load_backbone(
                 wardrobe.backbone, garment, mode=wardrobe.sdf, folder=_folder(name, weights), device="cpu"
             )
-            self._backbones[name] = network.double() if isinstance(network, torch.nn.Module) else network
+            self._backbones[name] = network.to(dtype) if isinstance(network, torch.nn.Module) else network
 
     @torch.no_grad()
-    def __call__(self, frames: Sequence[SmplFrame]) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]]]:
-        """Bodies [m], shape (B, V, 3), and garments before collision handling by name, (B, N, 3), of B frames."""
+    def __call__(self, frames: Sequence[SmplFrame]) -> list[NDArray[np.floating]]:
+        """Bodies, and each garment before collision handling [m], shapes (B, V, 3), of B frames."""
         pose, betas = (
-            torch.as_tensor(np.stack([getattr(frame, key) for frame in frames]).astype(np.float64))
+            torch.as_tensor(np.stack([getattr(frame, key) for frame in frames])).to(self._dtype)
             for key in ("pose", "betas")
         )
         style = None
         if any(frame.style is not None for frame in frames):
-            own = [np.zeros(N_STYLES) if frame.style is None else frame.style for frame in frames]
-            style = torch.as_tensor(np.stack(own).astype(np.float64))
+            own = [np.zeros(N_STYLES, np.float32) if frame.style is None else frame.style for frame in frames]
+            style = torch.as_tensor(np.stack(own)).to(self._dtype)
         posed = self._body(pose, betas)
-        garments = {}
+        vertices = [posed.vertices.numpy()]
         for name, garment in self._garments.items():
             unposed = garment.rest(betas, style)
             displacement = self._backbones[name](betas, pose, style).displacement
             if displacement is not None:
                 unposed = unposed + displacement
-            garments[name] = garment.pose(unposed, posed.transforms).numpy()
-        return posed.vertices.numpy(), garments
+            vertices.append(garment.pose(unposed, posed.transforms).numpy())
+        return vertices
 
 
 def distance_to_mesh(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +31,8 @@ class Trial:
     frames: tuple[SmplFrame, ...]
     seed: int = 0
     """Of whatever else the check draws."""
+    refused: int = 0
+    """Frames that were drawn, and that `SmplFrame` itself refused."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,6 +51,8 @@ class Measurement:
     """The largest deviation that is right [m]."""
     faults: tuple[str, ...] = ()
     """What else went wrong."""
+    culprit: int | None = None
+    """The frame that all this is of, where one alone would show it."""
 
     @property
     def badness(self) -> float:
@@ -87,7 +91,9 @@ class Check:
 
     def run(self, subject: Subject, trial: Trial) -> Measurement:
         """Measures; a refusal is counted, any other error is a failure."""
-        n = len(trial.frames)
+        n = len(trial.frames) + trial.refused
+        if not trial.frames:
+            return Measurement(runs=n, refused=n)
         try:
             return self.measure(subject, trial)
         except RefuError as error:
@@ -126,6 +132,8 @@ class Tally:
         if len(self.faults) < 3:
             self.faults += [fault for fault in measured.faults if fault not in self.faults]
         if measured.badness > self.badness:
+            if measured.culprit is not None:
+                trial = replace(trial, frames=(trial.frames[measured.culprit],))
             self.badness, self.limit, self.worst = measured.badness, measured.limit, (wardrobe, trial)
 
     def as_dict(self) -> dict[str, Any]:
