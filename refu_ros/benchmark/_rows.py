@@ -19,7 +19,7 @@ class Row:
     """The pipeline's, or `plain`, `paper` or `other`."""
     garment: str
     ms_median: float
-    """The processor's time; on a GPU, and of starts, wall time [ms]."""
+    """The processor's time; on a GPU, wall time [ms]."""
     ratio: float
     """To refitting a BVH and asking it for all vertices of the garment, measured in turn with it."""
     ms_q1: float | None = None
