@@ -6,6 +6,9 @@ import torch
 
 from refu_core.errors import RefuError
 
+_LOSSES = ("CUDA error", "Warp CUDA error", "HIP error", "cudaError")
+"""What torch and warp begin with when they report the driver's errors, which have no common class in all versions."""
+
 
 def checked_device(name: str) -> torch.device:
     """The torch device of a name. Raises `RefuError` for one that there isn't."""
@@ -18,3 +21,13 @@ def checked_device(name: str) -> torch.device:
         msg = f"no device {name!r}: this torch build or machine has no CUDA; use cpu"
         raise RefuError(msg)
     return device
+
+
+def is_device_loss(error: BaseException) -> bool:
+    """Whether an error of torch or warp says that the device itself has failed: nothing more can be computed on it.
+
+    That it has no memory left isn't such an error; the next frame may find some.
+    """
+    if isinstance(error, torch.OutOfMemoryError):
+        return False
+    return isinstance(error, RuntimeError) and any(sign in str(error) for sign in _LOSSES)

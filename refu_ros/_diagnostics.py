@@ -28,12 +28,17 @@ def statuses(
     persons: Sequence[str],
     recording: RecorderState | None,
     recording_error: str,
+    device: str = "",
+    n_namesakes: int = 0,
 ) -> list[DiagnosticStatus]:
-    """Input, output and recording; `state` is the lifecycle's, `persons` are those in the scene."""
+    """Input, output and recording; `state` is the lifecycle's, `persons` are those in the scene.
+
+    `device` is the one that is computed on, where it isn't the settings'; `n_namesakes` are other nodes of this name.
+    """
     active = state == "active"
     return [
         _input(report, settings, f"{node}: input", persons=persons, active=active),
-        _output(report, settings, f"{node}: garments", state=state),
+        _output(report, settings, f"{node}: garments", state=state, device=device, n_namesakes=n_namesakes),
         _recording(recording, f"{node}: recording", error=recording_error),
     ]
 
@@ -52,6 +57,11 @@ def _input(
         level, message = WARN, f"{invalid} of {received} messages are invalid: {report.reasons.get('invalid', '')}"
     elif report.silent_for is None:
         level, message = WARN, "no input yet"
+    elif report.recent["back_in_time"]:
+        level = WARN
+        message = (
+            f"{report.recent['back_in_time']} stamps went back: was a clock set back, or do two send on one topic?"
+        )
     elif missing:
         who = ", ".join(filter(None, missing))
         level = WARN
@@ -61,14 +71,18 @@ def _input(
         "received": str(report.total["received"]),
         "persons": ", ".join(filter(None, persons)) or str(len(persons)),
         "input type": settings.input_type,
+        "stamps that went back": str(report.total["back_in_time"]),
     }
     values |= {f"dropped: {cause}": str(n) for cause, n in sorted(report.group("drop").items())}
     return DiagnosticStatus(level, name, message, values=values)
 
 
-def _output(report: Report, settings: NodeSettings, name: str, *, state: str) -> DiagnosticStatus:
+def _output(
+    report: Report, settings: NodeSettings, name: str, *, state: str, device: str, n_namesakes: int
+) -> DiagnosticStatus:
     stale, received = report.recent["drop.stale"], report.recent["received"]
-    failed = report.recent["drop.failed"] + report.recent["drop.not_finite"]
+    causes = ("device", "failed", "not_finite")
+    failed = sum(report.recent[f"drop.{cause}"] for cause in causes)
     p50, p95, p99 = report.latency_ms
     level, message = OK, f"{report.rate('ticks'):.1f} Hz, latency p95 {p95:.1f} ms"
     if report.last_error:
@@ -76,8 +90,10 @@ def _output(report: Report, settings: NodeSettings, name: str, *, state: str) ->
     elif state != "active":
         message = f"not active but {state}"
     elif failed:
-        reason = report.reasons.get("failed") or report.reasons.get("not_finite", "")
+        reason = next((report.reasons[cause] for cause in causes if report.recent[f"drop.{cause}"]), "")
         level, message = ERROR, f"{failed} frames failed: {reason}"
+    elif n_namesakes:
+        level, message = WARN, f"{n_namesakes + 1} nodes have this name: start others with -r __node:=another_name"
     elif stale > _OVER_BUDGET * received:
         level = WARN
         message = f"over budget: {stale} of {received} frames were superseded; latency p95 {p95:.1f} ms"
@@ -95,7 +111,7 @@ def _output(report: Report, settings: NodeSettings, name: str, *, state: str) ->
         "garments": ", ".join(settings.garments),
         "backbone": settings.backbone,
         "sdf": settings.sdf,
-        "device": settings.device,
+        "device": device or settings.device,
     }
     values |= {f"skipped: {kind}": str(n) for kind, n in sorted(report.group("skip").items())}
     return DiagnosticStatus(level, name, message, values=values)

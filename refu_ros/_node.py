@@ -45,6 +45,8 @@ class GarmentNode(LifecycleNode):  # type: ignore[misc]
     def __init__(self, **options: Any) -> None:
         super().__init__(NODE_NAME, **options)
         self.finalized = False
+        self.failed = False
+        """Whether it ended because its device did."""
         self.settings = declare_settings(self)
         self._statistics = Statistics()
         self._state = "unconfigured"
@@ -55,6 +57,7 @@ class GarmentNode(LifecycleNode):  # type: ignore[misc]
         self._recorder: Recorder | None = None
         self._recording_error = ""
         self._closing: list[Recorder] = []
+        self._lost = ""
         self._inputs: dict[str, Any] = {}
         self._garments: Any = None
         self._body: Any = None
@@ -216,6 +219,23 @@ class GarmentNode(LifecycleNode):  # type: ignore[misc]
         """Publishes; bodies follow from the recorded inputs."""
         self._body.publish(data)
 
+    def device_lost(self, reason: str) -> None:
+        """Goes on on the CPU, or ends, as `on_device_loss` says."""
+        self._lost = f"{self.settings.device} has failed ({reason})"
+        stops = self.settings.on_device_loss == "stop"
+        self._statistics.set_error(f"{self._lost}: {'the node ends' if stops else 'loading for the cpu'}")
+        self.get_logger().error(f"{self._lost}: {'the node ends' if stops else 'the cpu takes over'}")
+        if stops:
+            self.failed = self.finalized = True
+        elif self._loader is not None:
+            self._loader.request(self._pipeline_key)
+
+    @property
+    def _pipeline_key(self) -> PipelineKey:
+        """What is to be loaded: for the CPU once the device has failed."""
+        key = self.settings.pipeline
+        return replace(key, device="cpu") if self._lost else key
+
     # Parameters -----------------------------------------------------------------------------------
 
     def _on_parameters(self, parameters: list[Any]) -> SetParametersResult:
@@ -228,18 +248,20 @@ class GarmentNode(LifecycleNode):  # type: ignore[misc]
         except RefuError as error:
             return SetParametersResult(successful=False, reason=str(error))
         reload = settings.pipeline != self.settings.pipeline
+        if settings.device != self.settings.device:
+            self._lost = ""  # the operator knows better
         self.settings = settings
         if self._worker is not None:
             self._worker.settings = settings
         if reload and self._loader is not None:
-            self._loader.request(settings.pipeline)
+            self._loader.request(self._pipeline_key)
         return SetParametersResult(successful=True)
 
     def _on_loaded(self, pipeline: GarmentPipeline, key: PipelineKey) -> None:
         self._pipeline = pipeline
         if self._worker is not None:
             self._worker.use(pipeline)
-        self._statistics.set_error("")
+        self._statistics.set_error(f"{self._lost}: on the cpu now; set device to try it again" if self._lost else "")
         self.get_logger().info(f"now with {', '.join(key.garments)} ({key.backbone}, {key.sdf}, {key.device})")
 
     def _on_not_loaded(self, error: Exception, key: PipelineKey) -> None:
@@ -315,11 +337,21 @@ class GarmentNode(LifecycleNode):  # type: ignore[misc]
                 persons=() if self._scene is None else self._scene.persons,
                 recording=recording,
                 recording_error=error,
+                device="cpu" if self._lost else "",
+                n_namesakes=self._count_namesakes(),
             ),
             stamp_ns=self.now_ns(),
         )
         self._diagnostics.publish(data)
         self._record(DIAGNOSTICS_TOPIC, adapters.DIAGNOSTIC_ARRAY, data, _OUTPUT_QOS)
+
+    def _count_namesakes(self) -> int:
+        """Other nodes of this name: they answer each other's parameters and services, and mix on their topics."""
+        own = (self.get_name(), self.get_namespace())
+        count = max(0, list(self.get_node_names_and_namespaces()).count(own) - 1)
+        if count:
+            self.get_logger().warning(f"{count + 1} nodes are called {own[0]}", throttle_duration_sec=60.0)
+        return count
 
 
 def _ros_qos(profile: adapters.QosProfile) -> QoSProfile:

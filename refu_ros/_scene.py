@@ -64,6 +64,7 @@ class Scene:
         self._changed = threading.Condition()
         self._pending: dict[str, Arrival] = {}
         self._seen: dict[str, float] = {}
+        self._stamps: dict[str, int] = {}
         self._held = False
         self._closed = False
 
@@ -76,6 +77,9 @@ class Scene:
                     self._statistics.skip("max_rate")
                 else:
                     self._statistics.drop("stale")
+            if frame.stamp_ns < self._stamps.get(person, 0):
+                self._statistics.back_in_time()
+            self._stamps[person] = frame.stamp_ns
             self._pending[person] = Arrival(frame, now)
             self._seen[person] = now
             self._changed.notify()
@@ -102,7 +106,7 @@ class Scene:
             horizon = self._clock() - timeout
             gone = [person for person, seen in self._seen.items() if seen < horizon and person not in self._pending]
             for person in gone:
-                del self._seen[person]
+                del self._seen[person], self._stamps[person]
             return gone
 
     @property

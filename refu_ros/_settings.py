@@ -90,6 +90,9 @@ class NodeSettings:
     sdf: str = _parameter("hybrid", "How collisions are found.", choices=SDF_MODES)
     margin: float = _parameter(DEFAULT_MARGIN, "Clearance that is kept from the skin [m].", low=0.0, high=0.05)
     device: str = _parameter("cpu", "Torch device: cpu or cuda.")
+    on_device_loss: str = _parameter(
+        "cpu", "When the device fails: go on on the cpu, with an ERROR, or stop the node.", choices=("cpu", "stop")
+    )
     style: tuple[float, ...] = _parameter(
         (0.0,) * 4, "Garment style γ in standard deviations; zeros are the mean style.", low=-10.0, high=10.0
     )

@@ -51,7 +51,7 @@ class Report:
 class Statistics:
     """Counters that any thread may raise.
 
-    Keys: received, ticks, frames, drop.<cause>, skip.<kind>, penetration.<found|unresolved>.
+    Keys: received, ticks, frames, drop.<cause>, skip.<kind>, penetration.<found|unresolved>, back_in_time.
     """
 
     def __init__(self, *, clock: Callable[[], float] = time.monotonic) -> None:
@@ -77,6 +77,11 @@ class Statistics:
             self._total[f"drop.{cause}"] += 1
             if reason:
                 self._reasons[cause] = printable(reason)
+
+    def back_in_time(self) -> None:
+        """A frame is older by its stamp than its person's frame before."""
+        with self._lock:
+            self._total["back_in_time"] += 1
 
     def skip(self, kind: str) -> None:
         """Work was left out that nobody needed."""

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from msg_adapters import EncodeError, MarkerArrayEncoder, MarkerMesh, encode_delete, garment_namespace
+from refu_core._device import is_device_loss
 from refu_core.evaluation.render import GARMENT_COLOURS
 
 if TYPE_CHECKING:
@@ -47,6 +48,9 @@ class Outlet(Protocol):
     def send_body(self, data: bytes) -> None:
         """A MarkerArray for `body`."""
 
+    def device_lost(self, reason: str) -> None:
+        """The pipeline's device has failed: nothing comes before there is another pipeline."""
+
 
 @dataclass(frozen=True, eq=False)
 class _Dressed:
@@ -75,6 +79,7 @@ class Worker:
         self._encoders: dict[tuple[object, ...], MarkerArrayEncoder] = {}
         self._shown: dict[str, tuple[str, ...]] = {}
         self._bodies_shown: set[str] = set()
+        self._is_lost = False
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="inference")
 
@@ -106,13 +111,14 @@ class Worker:
             try:
                 self.tick(arrivals)
             except Exception as error:  # whatever one frame brings up, the next may be good
-                self._statistics.drop("failed", f"{type(error).__name__}: {error}")
+                self._fail(error, "")
 
     def tick(self, arrivals: Mapping[str, Arrival]) -> None:
         """Works on one frame each of some persons."""
         settings = self.settings
         if self._next_pipeline is not self._pipeline:
             self._pipeline = self._next_pipeline
+            self._is_lost = False
             self._dressed.clear()
             self._encoders.clear()
         if settings.margin != self._pipeline.margin:
@@ -173,12 +179,22 @@ class Worker:
         except Exception as error:
             if len(frames) == 1:
                 (person,) = frames
-                self._statistics.drop("failed", f"{person or 'the person'}: {type(error).__name__}: {error}")
+                self._fail(error, f"{person or 'the person'}: ")
                 return {}
         outputs: dict[str, PipelineOutput] = {}
         for person, frame in frames.items():
             outputs |= self._infer({person: frame})
         return outputs
+
+    def _fail(self, error: Exception, who: str) -> None:
+        """Counts what a frame was lost to; a device that has failed is reported once."""
+        if not is_device_loss(error):
+            self._statistics.drop("failed", f"{who}{type(error).__name__}: {error}")
+            return
+        self._statistics.drop("device", f"{who}the device has failed: {error}")
+        if not self._is_lost:
+            self._is_lost = True
+            self._outlet.device_lost(str(error))
 
     def _send(self, frames: Mapping[str, SmplFrame], settings: NodeSettings) -> None:
         """One message with these persons, each marker with the stamp of its person's frame."""

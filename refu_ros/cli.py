@@ -534,6 +534,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ModuleNotFoundError as error:  # an extra's package; those of the core are imported by every command
         print(f'refu: error: {error.name} is not installed: pip install "refu-ros[train]"', file=sys.stderr)
         return EXIT_BAD_INPUT
+    except RuntimeError as error:
+        from refu_core._device import is_device_loss
+
+        if not is_device_loss(error):
+            raise
+        reason = str(error).splitlines()[0]
+        print(f"refu: error: the device has failed: {reason}; run it again, or on the cpu", file=sys.stderr)
+        return EXIT_CHECK_FAILED
     except KeyboardInterrupt:
         print("refu: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED

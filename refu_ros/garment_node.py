@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-EXIT_BAD_PARAMETERS = 2
+EXIT_BAD_PARAMETERS, EXIT_DEVICE_LOST = 2, 3
 _LAST_WORDS_S = 0.2
 """Time for the answer to a shutdown request to leave."""
 
@@ -48,12 +48,12 @@ def main(args: Sequence[str] | None = None) -> int:
             end = time.monotonic() + _LAST_WORDS_S
             while node.finalized and time.monotonic() < end:
                 executor.spin_once(timeout_sec=0.05)
+            return EXIT_DEVICE_LOST if node.failed else 0
         finally:
             node.close()
             node.destroy_node()
     finally:
         rclpy.try_shutdown()
-    return 0
 
 
 def _started(node: object) -> bool:

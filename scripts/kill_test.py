@@ -205,7 +205,7 @@ class Training:
         for path in folder.glob("*.jsonl"):
             for line in path.read_text().splitlines():
                 json.loads(line)
-        states = [state for path in folder.glob("*.pt") if (state := load_checkpoint(path)) is not None]
+        states = [state for path in folder.glob("*.checkpoint") if (state := load_checkpoint(path)) is not None]
         if not states:
             return "no checkpoint"
         done = ", ".join(states[0]["done"]) or "nothing"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,7 +23,13 @@ def save_checkpoint(path: Path, state: Mapping[str, Any]) -> None:
     part = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        torch.save(dict(state), part)
+        # Through memory: on a full disk torch's own writer raises errors of its own, and no system's.
+        buffer = io.BytesIO()
+        torch.save(dict(state), buffer)
+        with part.open("wb") as file:
+            file.write(buffer.getbuffer())
+            file.flush()
+            os.fsync(file.fileno())
         part.replace(path)
     except OSError as error:
         msg = f"{path}: the checkpoint can't be written: {error}"
