@@ -72,6 +72,8 @@ class TailorNet(nn.Module):
         self.pivots: Tensor
         self._directions: Tensor
         self._cache: _Mixture | None = None
+        self.skips_pivots = True
+        """Whether pivots of negligible weight are left out (`TailorNetConfig.skipped`); the next mixture obeys."""
 
     def forward(self, betas: Tensor, pose: Tensor, style: Tensor | None) -> Prediction:
         """Predicts for betas (B, 10), pose (B, 24, 3) [rad] and style (B, 4)."""
@@ -99,6 +101,11 @@ class TailorNet(nn.Module):
         sparse: Tensor = self.high(x, self._cache.weights, self._cache.selected)
         return sparse
 
+    @property
+    def n_skipped(self) -> int:
+        """How many pivots were left out of the last prediction."""
+        return 0 if self._cache is None else len(self.pivots) - self._cache.weights.shape[1]
+
     def drapes(self, s: Tensor) -> Tensor:
         """Mean drapes G, shape (B, C'), of (β, γ) (B, 14), in coordinates isometric to the vertices [m]."""
         code = self.style_shape(s)
@@ -121,7 +128,7 @@ class TailorNet(nn.Module):
 
     def _mix(self, s: Tensor, state: tuple[object, ...]) -> _Mixture:
         mixture = self.mixture(s)
-        active = non_negligible(mixture, self.config.skipped)
+        active = non_negligible(mixture, self.config.skipped if self.skips_pivots else 0.0)
         return _Mixture(s.clone(), state, mixture[:, active].contiguous(), self.high.select(active))
 
     def _state(self) -> tuple[object, ...]:

@@ -2,8 +2,8 @@
 
 from refu_core.body._io import BUILTIN_BODIES, load_body
 from refu_core.body._kinematics import JOINT_NAMES, PARENTS, RigidTransforms, forward_kinematics, rotvec_to_rotmat
-from refu_core.body._model import BodyOutput, SmplBody
-from refu_core.body._skinning import apply_transforms, blend_transforms, unapply_transforms
+from refu_core.body._model import BodyOutput, Shape, SmplBody
+from refu_core.body._skinning import Skinning, apply_transforms, blend_transforms, unapply_transforms
 
 __all__ = [
     "BUILTIN_BODIES",
@@ -11,6 +11,8 @@ __all__ = [
     "PARENTS",
     "BodyOutput",
     "RigidTransforms",
+    "Shape",
+    "Skinning",
     "SmplBody",
     "apply_transforms",
     "blend_transforms",

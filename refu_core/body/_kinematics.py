@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
+import warp as wp
 from torch import Tensor
+
+from refu_core._warp import argument, is_plain, torch_stream
+from refu_core.body._kernels import chain_kernel, rotation_kernel
 
 JOINT_NAMES: tuple[str, ...] = (
     "pelvis",
@@ -46,6 +50,18 @@ def rotvec_to_rotmat(rotvec: Tensor) -> Tensor:
     Smooth with finite derivatives at the zero rotation, where sin θ / θ and (1 - cos θ) / θ² are taken from
     their series.
     """
+    if is_plain(rotvec):
+        flat = rotvec.reshape(-1, 3).contiguous()
+        matrices = torch.empty(*rotvec.shape, 3, device=rotvec.device)
+        if len(flat):
+            with torch_stream(rotvec.device):
+                wp.launch(
+                    rotation_kernel,
+                    len(flat),
+                    [argument(flat, wp.vec3), argument(matrices.view(-1, 3, 3), wp.mat33)],
+                    device=str(rotvec.device),
+                )
+        return matrices
     angle2 = (rotvec * rotvec).sum(-1)
     small = angle2 < 1e-4 if rotvec.dtype == torch.float32 else angle2 < 1e-8
     safe2 = torch.where(small, torch.ones_like(angle2), angle2)  # keeps the unused branch's gradient finite
@@ -77,13 +93,15 @@ def forward_kinematics(rotations: Tensor, joints: Tensor) -> tuple[Tensor, Rigid
 
     Args:
         rotations: rotation of each joint relative to its parent, shape (B, 24, 3, 3).
-        joints: rest positions of the joints [m], shape (B, 24, 3).
+        joints: rest positions of the joints [m], shape (B, 24, 3), or (1, 24, 3) for bodies of one shape.
 
     Returns:
         Posed joints [m], shape (B, 24, 3), and the transforms that take a rest-pose point of each joint's bone to its
         posed place.
     """
-    batch, n = joints.shape[:2]
+    if is_plain(rotations, joints):
+        return _chained(rotations.contiguous(), joints.contiguous())
+    batch, n = rotations.shape[:2]
     chains = _chains(joints.device)
     # Homogeneous, with a joint that stays where it is as the root's parent.
     pose = torch.eye(4, dtype=joints.dtype, device=joints.device).repeat(batch, n + 1, 1, 1)
@@ -96,6 +114,27 @@ def forward_kinematics(rotations: Tensor, joints: Tensor) -> tuple[Tensor, Rigid
         pose = pose[:, above] @ pose
     rotation, posed = pose[:, :n, :3, :3], pose[:, :n, :3, 3]
     return posed, RigidTransforms(rotation, posed - (rotation @ joints.unsqueeze(-1)).squeeze(-1))
+
+
+def _chained(rotations: Tensor, joints: Tensor) -> tuple[Tensor, RigidTransforms]:
+    turned = torch.empty_like(rotations)
+    translation, posed = torch.empty(2, *rotations.shape[:3], device=rotations.device).unbind(0)
+    outputs = [argument(turned, wp.mat33), argument(translation, wp.vec3), argument(posed, wp.vec3)]
+    if len(rotations):
+        with torch_stream(rotations.device):
+            wp.launch(
+                chain_kernel,
+                len(rotations),
+                [argument(rotations, wp.mat33), argument(joints, wp.vec3), _parents(str(rotations.device))],
+                outputs,
+                device=str(rotations.device),
+            )
+    return posed, RigidTransforms(turned, translation)
+
+
+@cache
+def _parents(device: str) -> Any:
+    return wp.array(PARENTS, dtype=wp.int32, device=device)
 
 
 @cache

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from refu_core.body._kinematics import PARENTS, RigidTransforms, forward_kinematics, rotvec_to_rotmat
-from refu_core.body._skinning import apply_transforms, blend_transforms
+from refu_core.body._skinning import Skinning
 from refu_core.errors import BodyError, FrameError
 from refu_core.frames import N_BETAS, N_JOINTS
 
@@ -35,6 +35,15 @@ class BodyOutput(NamedTuple):
     """[m], shape (B, 24, 3)."""
     transforms: RigidTransforms
     """Rest pose to posed, per joint and without `transl`; what garments are posed with."""
+
+
+class Shape(NamedTuple):
+    """Bodies of some β before they are posed, in SMPL axes."""
+
+    vertices: Tensor
+    """Without pose blend shapes [m], shape (B, V, 3)."""
+    joints: Tensor
+    """[m], shape (B, 24, 3)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,6 +147,7 @@ class SmplBody:
         """Shape (F, 3), int64."""
         self.v_template = tensor(arrays.v_template)
         self.weights = tensor(arrays.weights)
+        self._skinning = Skinning(self.weights)
         n = len(arrays.v_template)
         # Rows are summed faster than columns.
         self._shapedirs = tensor(arrays.shapedirs.reshape(n * 3, N_BETAS).T.copy())
@@ -206,21 +216,29 @@ class SmplBody:
         if len(beta) not in (1, batch):
             msg = f"betas must have the shape ({batch}, {N_BETAS}) or (1, {N_BETAS}), got {tuple(beta.shape)}"
             raise FrameError(msg)
-        rotations = rotvec_to_rotmat(theta)
-        joints, transforms = forward_kinematics(rotations, self.rest_joints(beta).expand(batch, -1, -1))
-        shaped = self.rest_vertices(beta).expand(batch, -1, -1)
+        posed = self.posed(theta, self.shape(beta))
+        if transl is None:
+            return posed
+        shift = _tensor(transl, self.device)
+        if shift.ndim != 2 or shift.shape[1] != 3 or len(shift) not in (1, batch):
+            msg = f"transl must have the shape ({batch}, 3), got {tuple(shift.shape)}"
+            raise FrameError(msg)
+        return posed._replace(vertices=posed.vertices + shift[:, None], joints=posed.joints + shift[:, None])
+
+    def shape(self, betas: Tensor) -> Shape:
+        """Bodies of betas (B, 10) as `posed` takes them."""
+        return Shape(self.rest_vertices(betas), self.rest_joints(betas))
+
+    def posed(self, pose: Tensor, shape: Shape) -> BodyOutput:
+        """Poses bodies: rotation vectors (B, 24, 3) [rad] of as many shapes, or of one."""
+        rotations = rotvec_to_rotmat(pose)
+        joints, transforms = forward_kinematics(rotations, shape.joints)
+        vertices = shape.vertices
         if self._posedirs is not None:
             eye = torch.eye(3, dtype=self.dtype, device=self.device)
             feature = (rotations[:, 1:] - eye).flatten(1)
-            shaped = shaped + (feature @ self._posedirs.T).view(batch, -1, 3)
-        vertices = apply_transforms(shaped, blend_transforms(self.weights, transforms))
-        if transl is not None:
-            shift = _tensor(transl, self.device)
-            if shift.ndim != 2 or shift.shape[1] != 3 or len(shift) not in (1, batch):
-                msg = f"transl must have the shape ({batch}, 3), got {tuple(shift.shape)}"
-                raise FrameError(msg)
-            vertices, joints = vertices + shift[:, None], joints + shift[:, None]
-        return BodyOutput(vertices, joints, transforms)
+            vertices = vertices + (feature @ self._posedirs.T).view(len(pose), -1, 3)
+        return BodyOutput(self._skinning(vertices, transforms), joints, transforms)
 
 
 def _tensor(value: ArrayLike | Tensor, device: torch.device) -> Tensor:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import torch
+import warp as wp
 from torch import Tensor
 
+from refu_core._warp import argument, is_plain, torch_stream
+from refu_core.body._kernels import skin_kernel, vec12
 from refu_core.body._kinematics import RigidTransforms
 
 _MIN_DETERMINANT = 1e-4
@@ -22,9 +25,52 @@ def blend_transforms(weights: Tensor, transforms: RigidTransforms) -> RigidTrans
         Transforms of the vertices, leading shape (B, V); the "rotation" of a blend isn't orthonormal.
     """
     batch = transforms.rotation.shape[0]
-    stacked = torch.cat((transforms.rotation.flatten(2), transforms.translation), -1)  # (B, 24, 12): one product
-    blended = weights @ stacked
+    blended = weights @ _stacked(transforms)
     return RigidTransforms(blended[..., :9].view(batch, -1, 3, 3), blended[..., 9:])
+
+
+def _stacked(transforms: RigidTransforms) -> Tensor:
+    """Rotations and translations side by side, shape (B, 24, 12)."""
+    return torch.cat((transforms.rotation.flatten(2), transforms.translation), -1)
+
+
+class Skinning:
+    """Linear blend skinning of one mesh, by those joints only that have a weight at a vertex."""
+
+    def __init__(self, weights: Tensor) -> None:
+        """For skinning weights whose rows sum to one, shape (V, 24)."""
+        self._weights = weights
+        has_weight = weights != 0
+        vertex, joint = torch.nonzero(has_weight, as_tuple=True)
+        self._start = torch.nn.functional.pad(has_weight.sum(1).cumsum(0), (1, 0)).int()
+        self._joint, self._weight = joint.int(), weights[vertex, joint].float()
+
+    def __call__(self, points: Tensor, transforms: RigidTransforms) -> Tensor:
+        """Posed points [m], shape (B, V, 3), of rest-pose points (B, V, 3), or (1, V, 3) for bodies of one shape.
+
+        `transforms` are the joints', leading shape (B, 24). Differentiable.
+        """
+        rotation, translation = transforms
+        if not is_plain(points, rotation, translation, self._weights):
+            return apply_transforms(points, blend_transforms(self._weights, transforms))
+        points, stacked = points.contiguous(), _stacked(transforms)
+        posed = torch.empty(len(rotation), *points.shape[1:], device=points.device)
+        if len(rotation):
+            with torch_stream(points.device):
+                wp.launch(
+                    skin_kernel,
+                    posed.shape[:2],
+                    [
+                        argument(points, wp.vec3),
+                        argument(self._start, wp.int32),
+                        argument(self._joint, wp.int32),
+                        argument(self._weight, wp.float32),
+                        argument(stacked, vec12),
+                    ],
+                    [argument(posed, wp.vec3)],
+                    device=str(points.device),
+                )
+        return posed
 
 
 def apply_transforms(points: Tensor, transforms: RigidTransforms) -> Tensor:

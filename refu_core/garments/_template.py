@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from refu_core._npz import read_npz
-from refu_core.body import RigidTransforms, apply_transforms, blend_transforms, unapply_transforms
+from refu_core.body import RigidTransforms, Skinning, blend_transforms, unapply_transforms
 from refu_core.errors import GarmentError
 from refu_core.frames import N_STYLES as N_STYLES
 
@@ -93,7 +93,11 @@ class GarmentTemplate:
 
     def pose(self, unposed: Tensor, transforms: RigidTransforms) -> Tensor:
         """Posed garment [m], shape (B, V, 3), of an unposed one of the same shape, by the body's transforms (B, 24)."""
-        return apply_transforms(unposed, self.vertex_transforms(transforms))
+        return self._skinning(unposed, transforms)
+
+    @cached_property
+    def _skinning(self) -> Skinning:
+        return Skinning(self.weights)
 
     def unpose(self, posed: Tensor, transforms: RigidTransforms) -> Tensor:
         """The inverse of `pose`, exact to rounding (see `refu_core.body.unapply_transforms`)."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from refu_core.body import SmplBody
@@ -16,18 +17,16 @@ from refu_core.sdf import ApproxSdf, BandSdf, ExactSdf, Links, RestFaces
 class Fabric:
     """What collision handling must know of a garment, once and for all poses."""
 
-    shapedirs: Tensor
-    """The garment's displacement a unit of each beta [m], shape (V * 3, 10)."""
-    links: Links
+    links: Links | None
+    """Where the band is asked by them."""
     resolver: Resolver
 
     @classmethod
-    def of(cls, garment: GarmentTemplate, body: SmplBody, rest: ExactSdf) -> Fabric:
+    def of(cls, garment: GarmentTemplate, body: SmplBody, rest: ExactSdf, *, has_links: bool) -> Fabric:
         """Of a garment on a body, whose rest pose `rest` was updated with."""
         clearance = rest.query(garment.v_template).distance
         return cls(
-            garment.shapedirs,
-            Links.of(garment.edges, garment.n_vertices),
+            Links.of(garment.edges, garment.n_vertices) if has_links else None,
             Resolver(Limbs.of(body.weights, body.faces, garment.weights, garment.faces, clearance=clearance)),
         )
 
@@ -35,24 +34,27 @@ class Fabric:
 class Collisions:
     """Brings garments off one posed body at a time."""
 
-    def __init__(self, body: SmplBody, *, is_accurate: bool) -> None:
-        """With the exact signed distance to `body`, or the approximate one."""
+    def __init__(self, body: SmplBody, *, is_accurate: bool, uses_band: bool = True) -> None:
+        """With the exact signed distance to `body`, within a band of its skin or everywhere, or the approximate one."""
         self._band: BandSdf | None = None
         self._rest_faces: RestFaces | None = None
         self._sdf: BandSdf | ExactSdf | ApproxSdf
         if not is_accurate:
             self._sdf = ApproxSdf(body)
             self._rest_faces = RestFaces(body)
-        elif body.device.type == "cpu":
+        elif body.device.type == "cpu" and uses_band:
             self._sdf = self._band = BandSdf(body.faces, rest=body.v_template)
         else:  # thousands of threads walk the tree faster than one sorts what needn't
             self._sdf = ExactSdf(body.faces, device=body.device)
 
-    def near(self, fabric: Fabric, unposed: Tensor, betas: Tensor) -> Tensor | None:
-        """A face of the body near each vertex of unposed garments (B, V, 3) on shapes (B, 10), where that is of use."""
-        if self._rest_faces is None:
-            return None
-        return self._rest_faces.under(unposed, betas, fabric.shapedirs)
+    @property
+    def uses_band(self) -> bool:
+        """Whether distances are asked within a band of the skin, by a garment's links."""
+        return self._band is not None
+
+    def near(self, unposed: Tensor) -> Tensor | None:
+        """A face of the body near each vertex of unposed garments of the mean shape (B, V, 3), where that is of use."""
+        return None if self._rest_faces is None else self._rest_faces(unposed)
 
     def update(self, vertices: Tensor) -> None:
         """Takes over the body's new pose, shape (V, 3) [m]. Raises `MeshError` for one that isn't finite."""
@@ -60,10 +62,15 @@ class Collisions:
 
     def resolve(
         self, fabric: Fabric, points: Tensor, *, margin: float, scale: float | VertexScale, near: Tensor | None
-    ) -> Resolution:
-        """The garment with vertices [m], shape (N, 3), off the body (`refu_core.repulsion.Resolver`)."""
-        if self._band is not None and margin + 2e-3 <= self._band.band:
+    ) -> tuple[Resolution, int]:
+        """The garment with vertices [m], shape (N, 3), off the body (`refu_core.repulsion.Resolver`).
+
+        Also how many vertices weren't asked for their distance.
+        """
+        if self._band is not None and fabric.links is not None and margin + 2e-3 <= self._band.band:
             start = self._band.clipped(points, fabric.links)
+            n_skipped = int(torch.count_nonzero(start.distance == self._band.band))
         else:
             start = self._sdf.query(points, near=near)
-        return fabric.resolver(points, self._sdf, start, margin=margin, scale=scale)
+            n_skipped = 0
+        return fabric.resolver(points, self._sdf, start, margin=margin, scale=scale), n_skipped

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, overload
 
@@ -13,12 +13,13 @@ import torch
 from torch import Tensor
 
 from refu_core._device import checked_device
-from refu_core.backbones import Backbone, load_backbone
-from refu_core.body import RigidTransforms, SmplBody, load_body
+from refu_core.backbones import Backbone, TailorNet, load_backbone
+from refu_core.body import RigidTransforms, Shape, SmplBody, load_body
 from refu_core.errors import GarmentError, RefuError
 from refu_core.frames import SmplFrame
 from refu_core.garments import N_STYLES, GarmentTemplate, load_garment
 from refu_core.realtime._collisions import Collisions, Fabric
+from refu_core.realtime._outputs import SDF_MODES, SKIPS, FrameStats, GarmentMesh, GarmentStats, PipelineOutput
 from refu_core.repulsion import DEFAULT_MARGIN, Refu, VertexScale, read_refu
 from refu_core.sdf import ExactSdf
 from refu_core.weights import shipped_weights
@@ -27,73 +28,6 @@ if TYPE_CHECKING:
     from os import PathLike
 
     from numpy.typing import ArrayLike, NDArray
-
-SDF_MODES: tuple[str, ...] = ("hybrid", "approx", "accurate", "none")
-"""How collisions are found (paper, Sec. 4.1): with the approximate signed distance, by weights that were trained with
-the accurate one in the loss or without it; with the accurate one; or not at all (the raw backbone)."""
-
-
-@dataclass(frozen=True)
-class GarmentStats:
-    """What collision handling found and did for one garment in one frame."""
-
-    n_inside: int = 0
-    """Vertices inside the body before."""
-    n_pushed: int = 0
-    """Vertices that were moved: inside, or nearer to the skin than the margin."""
-    n_unresolved: int = 0
-    """Vertices still inside afterwards; only where the body touches itself."""
-    max_depth: float = 0.0
-    """Deepest penetration before [m]."""
-    ms: float = 0.0
-    """Wall time of the stages that were run for this garment alone: backbone and refu [ms]."""
-
-
-@dataclass(frozen=True)
-class FrameStats:
-    """How long the stages of one frame took, and what they did."""
-
-    stage_ms: Mapping[str, float]
-    """Wall time of each stage, all garments together [ms]: body, backbone, sdf (new pose), refu (distances, pushes)."""
-    garments: Mapping[str, GarmentStats] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, eq=False)
-class GarmentMesh:
-    """A garment on a body, in SMPL axes."""
-
-    local: NDArray[np.float32]
-    """Vertices relative to the body's own origin, that is without the translation [m], shape (V, 3)."""
-    raw: NDArray[np.float32]
-    """The same before collision handling [m], shape (V, 3)."""
-    faces: NDArray[np.int64]
-    """Counter-clockwise from outside, shape (F, 3)."""
-    transl: NDArray[np.float64]
-    """Translation of the person [m], shape (3,)."""
-
-    @property
-    def vertices(self) -> NDArray[np.float64]:
-        """Vertices with the translation [m], shape (V, 3); added in float64, so that distant bodies stay precise."""
-        return self.local + self.transl
-
-
-@dataclass(frozen=True, eq=False)
-class PipelineOutput(Mapping[str, GarmentMesh]):
-    """The garments of one person in one frame, by name."""
-
-    garments: Mapping[str, GarmentMesh]
-    body: NDArray[np.float32]
-    """Vertices of the posed body without the translation, SMPL axes [m], shape (V, 3)."""
-    stats: FrameStats
-
-    def __getitem__(self, name: str) -> GarmentMesh:
-        return self.garments[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.garments)
-
-    def __len__(self) -> int:
-        return len(self.garments)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +40,22 @@ class _Wearable:
     fabric: Fabric
     faces: NDArray[np.int64]
     margin: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Figures:
+    """What depends on (β, γ) only, of a batch of bodies."""
+
+    key: bytes
+    betas: Tensor
+    """Shape (B, 10)."""
+    style: Tensor | None
+    """Shape (B, 4); None where nobody gave any."""
+    body: Shape
+    rest: Mapping[str, Tensor]
+    """Garments before anything is predicted [m], shape (B, V, 3)."""
+    mean_rest: Mapping[str, Tensor]
+    """The same on the mean shape, of β = 0 [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,6 +90,7 @@ class GarmentPipeline:
         collisions: Collisions | None,
         margin: float | None,
         style: Tensor | None,
+        no_skip: Collection[str] = (),
     ) -> None:
         self.body = body
         self.margin = margin
@@ -147,6 +98,9 @@ class GarmentPipeline:
         self._wearables = wearables
         self._style = style
         self._collisions = collisions
+        self._skips = frozenset(SKIPS) - frozenset(no_skip)
+        self._figures: _Figures | None = None
+        self._last: dict[bytes, PipelineOutput] = {}
 
     @classmethod
     def load(
@@ -159,6 +113,7 @@ class GarmentPipeline:
         margin: float | None = None,
         weights: str | PathLike[str] | None = None,
         device: str = "cpu",
+        no_skip: Collection[str] = (),
     ) -> GarmentPipeline:
         """Loads garments and what they need.
 
@@ -170,11 +125,12 @@ class GarmentPipeline:
             margin: clearance ε that is kept from the skin [m]; by default what the weights were trained with.
             weights: folder with a folder a garment of weights of one's own (`refu train`); those that ship by default.
             device: torch device, `cpu` or `cuda`.
+            no_skip: names of `SKIPS` that are computed nevertheless, to see what skipping them is worth.
 
         Raises:
             GarmentError: no garment, an unknown one, garments of two bodies, or a bad style.
             WeightsError: no such backbone, or no weights of it for a garment, a mode, and the garment's body.
-            RefuError: an unknown mode, margin or device.
+            RefuError: an unknown mode, margin, device or skip.
         """
         if isinstance(garments, str):
             garments = [garments]
@@ -187,6 +143,10 @@ class GarmentPipeline:
         if margin is not None and not 0 <= margin <= 0.05:
             msg = f"the margin must be between 0 and 0.05 m, got {margin}"
             raise RefuError(msg)
+        unknown = sorted({no_skip} if isinstance(no_skip, str) else set(no_skip) - set(SKIPS))
+        if unknown:
+            msg = f"nothing is skipped by the name {', '.join(unknown)}: wanted a collection of {', '.join(SKIPS)}"
+            raise RefuError(msg)
         torch_device = checked_device(device)
         templates = {name: load_garment(name, device=torch_device) for name in dict.fromkeys(garments)}
         worn_by = {template.body for template in templates.values()}
@@ -197,12 +157,18 @@ class GarmentPipeline:
         body = load_body(worn_by.pop(), device=torch_device)
         rest = ExactSdf(body.faces, device=body.device)
         rest.update(body.v_template)
+        collisions = None
+        if sdf != "none":
+            collisions = Collisions(body, is_accurate=sdf == "accurate", uses_band="band" not in no_skip)
+        has_links = collisions is not None and collisions.uses_band
         wearables: dict[str, _Wearable] = {}
         for name, template in templates.items():
             folder = shipped_weights(name) if weights is None else Path(weights) / name
             network = load_backbone(
                 backbone, template, mode=sdf, body_fingerprint=body.fingerprint, folder=folder, device=torch_device
             )
+            if "pivots" in no_skip and isinstance(network, TailorNet):
+                network.skips_pivots = False
             refu = None
             if backbone != "skinned" and sdf != "none":
                 refu = read_refu(folder / f"{backbone}-{sdf}", device=torch_device)
@@ -210,7 +176,7 @@ class GarmentPipeline:
                 template,
                 network,
                 refu,
-                Fabric.of(template, body, rest),
+                Fabric.of(template, body, rest, has_links=has_links),
                 template.faces.cpu().numpy(),
                 DEFAULT_MARGIN if refu is None else float(refu.margin),
             )
@@ -218,8 +184,7 @@ class GarmentPipeline:
         if gamma is not None:
             for template in templates.values():
                 template.rest(gamma.new_zeros(1, 10), gamma)  # says now, not in the first frame, if it has no styles
-        collisions = None if sdf == "none" else Collisions(body, is_accurate=sdf == "accurate")
-        return cls(body, wearables, collisions=collisions, margin=margin, style=gamma)
+        return cls(body, wearables, collisions=collisions, margin=margin, style=gamma, no_skip=no_skip)
 
     @property
     def garments(self) -> dict[str, GarmentTemplate]:
@@ -234,45 +199,84 @@ class GarmentPipeline:
 
     @torch.no_grad()
     def __call__(self, frames: SmplFrame | Sequence[SmplFrame]) -> PipelineOutput | list[PipelineOutput]:
-        """Dresses one person, or a batch of persons (one frame each)."""
+        """Dresses one person, or a batch of persons (one frame each).
+
+        A person whose (β, θ, γ) are among those of the last call gets the arrays of that call: copy them to write in.
+        """
         if isinstance(frames, SmplFrame):
-            return self._run([frames])[0]
-        return self._run(frames) if len(frames) else []
+            return self._dress_all([frames])[0]
+        return self._dress_all(frames)
+
+    def _dress_all(self, frames: Sequence[SmplFrame]) -> list[PipelineOutput]:
+        keys = [_key(frame) for frame in frames]
+        known = self._last if "unchanged" in self._skips else {}
+        new = {key: frame for key, frame in zip(keys, frames, strict=True) if key not in known}
+        outputs = {key: known[key] for key in keys if key in known}
+        if new:
+            outputs |= zip(new, self._run(list(new.values())), strict=True)
+        self._last = outputs
+        return [
+            outputs[key] if new.get(key) is frame else _moved(outputs[key], frame)
+            for key, frame in zip(keys, frames, strict=True)
+        ]
 
     def _run(self, frames: Sequence[SmplFrame]) -> list[PipelineOutput]:
         clock = _StageClock()
-        device = self.body.device
-        pose = torch.as_tensor(np.stack([f.pose for f in frames]), device=device)
-        betas = torch.as_tensor(np.stack([f.betas for f in frames]), device=device)
-        posed = self.body(pose, betas)
+        figures, skipped = self._figures_of(frames)
+        pose = torch.as_tensor(np.stack([f.pose for f in frames]), device=self.body.device)
+        posed = self.body.posed(pose, figures.body)
         stages = {"body": clock.lap() / len(frames)}
-        style = self._styles(frames)
         dressed: dict[str, _Dressed] = {}
         for name, wearable in self._wearables.items():
-            dressed[name] = self._dress(wearable, pose, betas, style, posed.transforms, clock)
+            dressed[name] = self._dress(name, wearable, pose, figures, posed.transforms, clock)
+            if isinstance(wearable.backbone, TailorNet):
+                skipped["pivots"] = skipped.get("pivots", 0) + wearable.backbone.n_skipped
         stages["backbone"] = sum(one.ms for one in dressed.values())
-        return [self._handle_collisions(i, frame, posed.vertices[i], dressed, stages) for i, frame in enumerate(frames)]
+        return [
+            self._handle_collisions(i, frame, posed.vertices[i], dressed, stages, skipped)
+            for i, frame in enumerate(frames)
+        ]
+
+    def _figures_of(self, frames: Sequence[SmplFrame]) -> tuple[_Figures, dict[str, int]]:
+        """The bodies and garments of the persons' (β, γ), and what of that was known from the last frame."""
+        key = b"".join(_key(frame, of_pose=False) for frame in frames)
+        if self._figures is not None and self._figures.key == key and "rest" in self._skips:
+            return self._figures, {"rest": 1 + len(self._wearables)}
+        betas = torch.as_tensor(np.stack([f.betas for f in frames]), device=self.body.device)
+        style = self._styles(frames)
+        mean = betas.new_zeros(1, betas.shape[1])
+        templates = self.garments.items()
+        self._figures = _Figures(
+            key,
+            betas,
+            style,
+            self.body.shape(betas),
+            {name: template.rest(betas, style) for name, template in templates},
+            {name: template.rest(mean, style) for name, template in templates},
+        )
+        return self._figures, {}
 
     def _dress(
         self,
+        name: str,
         wearable: _Wearable,
         pose: Tensor,
-        betas: Tensor,
-        style: Tensor | None,
+        figures: _Figures,
         transforms: RigidTransforms,
         clock: _StageClock,
     ) -> _Dressed:
-        template, refu, n = wearable.template, wearable.refu, len(pose)
-        unposed = template.rest(betas, style)
-        predicted = wearable.backbone(betas, pose, style)
+        refu, n = wearable.refu, len(pose)
+        predicted = wearable.backbone(figures.betas, pose, figures.style)
+        unposed, on_mean = figures.rest[name], figures.mean_rest[name]
         if predicted.displacement is not None:
             unposed = unposed + predicted.displacement
-        near = None if self._collisions is None else self._collisions.near(wearable.fabric, unposed, betas)
+            on_mean = on_mean + predicted.displacement
+        near = None if self._collisions is None else self._collisions.near(on_mean.expand_as(unposed))
         scale: list[float | VertexScale] = [1.0] * n
         if refu is not None:
-            z = refu.feature(betas, pose, style, predicted.feature)
+            z = refu.feature(figures.betas, pose, figures.style, predicted.feature)
             scale = [refu.of_body(None if z is None else z[i]) for i in range(n)]
-        return _Dressed(template.pose(unposed, transforms), near, scale, clock.lap() / n)
+        return _Dressed(wearable.template.pose(unposed, transforms), near, scale, clock.lap() / n)
 
     def _styles(self, frames: Sequence[SmplFrame]) -> Tensor | None:
         """γ of each frame, shape (B, 4): its own, else the pipeline's; None where nobody gave any."""
@@ -289,6 +293,7 @@ class GarmentPipeline:
         body: Tensor,
         dressed: Mapping[str, _Dressed],
         stages: Mapping[str, float],
+        skipped: Mapping[str, int],
     ) -> PipelineOutput:
         clock = _StageClock()
         if self._collisions is not None:
@@ -297,24 +302,41 @@ class GarmentPipeline:
         meshes: dict[str, GarmentMesh] = {}
         stats: dict[str, GarmentStats] = {}
         refu_ms = 0.0
+        n_clipped = 0
         for name, wearable in self._wearables.items():
             one, counts = dressed[name], GarmentStats()
             raw = vertices = one.posed[person]
             if self._collisions is not None:
-                done = self._collisions.resolve(
+                done, n_unasked = self._collisions.resolve(
                     wearable.fabric,
                     raw,
                     margin=wearable.margin if self.margin is None else self.margin,
                     scale=one.scale[person],
                     near=None if one.near is None else one.near[person],
                 )
+                n_clipped += n_unasked
                 vertices = done.vertices
                 counts = GarmentStats(done.n_inside, done.n_pushed, done.n_unresolved, done.max_depth)
             meshes[name] = GarmentMesh(vertices.cpu().numpy(), raw.cpu().numpy(), wearable.faces, frame.transl)
             own_ms = clock.lap()
             refu_ms += own_ms
             stats[name] = replace(counts, ms=one.ms + own_ms)
-        return PipelineOutput(meshes, body.cpu().numpy(), FrameStats({**stages, "sdf": sdf_ms, "refu": refu_ms}, stats))
+        took = FrameStats({**stages, "sdf": sdf_ms, "refu": refu_ms}, stats, {**skipped, "band": n_clipped})
+        return PipelineOutput(meshes, body.cpu().numpy(), took)
+
+
+def _key(frame: SmplFrame, *, of_pose: bool = True) -> bytes:
+    """Tells apart what is different of two persons but where they are."""
+    style = b"" if frame.style is None else b"s" + frame.style.tobytes()
+    return frame.betas.tobytes() + (frame.pose.tobytes() if of_pose else b"") + style
+
+
+def _moved(output: PipelineOutput, frame: SmplFrame) -> PipelineOutput:
+    """What a person wore in the last frame, where it is now: the same arrays."""
+    garments = {name: replace(mesh, transl=frame.transl) for name, mesh in output.items()}
+    counts = {name: replace(one, ms=0.0) for name, one in output.stats.garments.items()}
+    took = FrameStats(dict.fromkeys(output.stats.stage_ms, 0.0), counts, {"unchanged": 1})
+    return PipelineOutput(garments, output.body, took)
 
 
 def _style(value: ArrayLike, device: torch.device) -> Tensor:

@@ -19,6 +19,7 @@ from refu_core import (
     load_body,
     load_garment,
 )
+from refu_core.realtime import SKIPS
 from refu_core.sdf import ExactSdf
 
 
@@ -112,13 +113,62 @@ def test_far_from_the_origin_nothing_changes(pipeline: GarmentPipeline) -> None:
         np.testing.assert_allclose(far[name].vertices - [1e5, -2e5, 3e5], mesh.vertices, atol=1e-9)
 
 
-def test_the_same_frame_gives_the_same_bits(pipeline: GarmentPipeline) -> None:
+@pytest.mark.parametrize("sdf", ["accurate", "hybrid"])
+def test_the_same_frame_gives_the_same_bits(sdf: str) -> None:
+    pipeline = GarmentPipeline.load(["short-pant-male"], sdf=sdf, backbone="skinned", no_skip=["unchanged"])
     one, two = pipeline(frame(8)), pipeline(frame(8))
     pipeline(frame(9))  # what came between leaves no trace
     three = pipeline(frame(8))
     for name, mesh in one.items():
+        assert mesh.local is not two[name].local
         np.testing.assert_array_equal(mesh.local, two[name].local)
         np.testing.assert_array_equal(mesh.local, three[name].local)
+
+
+def test_an_unchanged_pose_keeps_its_garments_wherever_it_is(pipeline: GarmentPipeline) -> None:
+    first, other = pipeline([frame(20), frame(21)])
+    moved, still, new = pipeline([frame(21, transl=(1, 2, 3)), frame(20), frame(22)])
+    assert moved.stats.skipped == still.stats.skipped == {"unchanged": 1}
+    assert "unchanged" not in new.stats.skipped
+    assert set(moved.stats.stage_ms) == set(new.stats.stage_ms)
+    for name in first:
+        assert still[name].local is first[name].local
+        assert moved[name].local is other[name].local
+        np.testing.assert_array_equal(moved[name].vertices, other[name].local + np.array([1.0, 2, 3]))
+    assert "unchanged" in pipeline(frame(22)).stats.skipped
+    assert "unchanged" not in pipeline(frame(21)).stats.skipped, "only the last frame is kept"
+    styled = SmplFrame(pose=frame(21).pose, betas=frame(21).betas, style=np.zeros(4, np.float32))
+    assert "unchanged" not in pipeline(styled).stats.skipped
+
+
+def test_two_persons_of_one_pose_in_one_frame(pipeline: GarmentPipeline) -> None:
+    here, there = pipeline([frame(23), frame(23, transl=(0, 0, 4))])
+    for name in here:
+        np.testing.assert_array_equal(there[name].local, here[name].local)
+        np.testing.assert_array_equal(there[name].transl - here[name].transl, [0, 0, 4])
+
+
+@pytest.mark.parametrize(("sdf", "skips"), [("accurate", ["band", "rest"]), ("hybrid", ["rest"])])
+def test_what_is_skipped_changes_nothing(sdf: str, skips: list[str]) -> None:
+    """Within 0.1 mm: the same distances, but for rounding, and the resolution goes on from there."""
+    names = ["tshirt-male", "short-pant-male"]
+    fast, slow = (GarmentPipeline.load(names, sdf=sdf, backbone="skinned", no_skip=no) for no in ([], skips))
+    for k in range(6):
+        posed = SmplFrame(pose=frame(30 + k, spread=0.15).pose, betas=frame(30 + k // 3).betas)
+        one, other = fast(posed), slow(posed)
+        for skip in skips:
+            assert (one.stats.skipped.get(skip, 0) > 0) == (skip == "band" or k % 3 > 0)
+            assert not other.stats.skipped.get(skip)
+        for name, mesh in one.items():
+            np.testing.assert_array_equal(mesh.raw, other[name].raw)
+            np.testing.assert_allclose(mesh.local, other[name].local, atol=1e-4)
+
+
+def test_skips_are_named() -> None:
+    for unknown in (["bands"], "band"):
+        with pytest.raises(RefuError, match=f"wanted a collection of {', '.join(SKIPS)}"):
+            GarmentPipeline.load(["tshirt-male"], backbone="skinned", no_skip=unknown)
+    assert all(SKIPS.values())
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,88 @@
+"""What the pipeline hands out: garments, and what handling them took."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+SDF_MODES: tuple[str, ...] = ("hybrid", "approx", "accurate", "none")
+"""How collisions are found (paper, Sec. 4.1): with the approximate signed distance, by weights that were trained with
+the accurate one in the loss or without it; with the accurate one; or not at all (the raw backbone)."""
+
+SKIPS: Mapping[str, str] = {
+    "band": "distances of vertices that are farther off the skin than they matter (accurate)",
+    "pivots": "networks of TailorNet's mixture whose weights together are at most a thousandth",
+    "rest": "bodies and garments of some (β, γ) before they are posed, while these are those of the last frame",
+    "unchanged": "persons whose (β, θ, γ) are those of the last frame: they keep their garments",
+}
+"""What isn't computed where it would change nothing, or next to nothing, by name."""
+
+
+@dataclass(frozen=True)
+class GarmentStats:
+    """What collision handling found and did for one garment in one frame."""
+
+    n_inside: int = 0
+    """Vertices inside the body before."""
+    n_pushed: int = 0
+    """Vertices that were moved: inside, or nearer to the skin than the margin."""
+    n_unresolved: int = 0
+    """Vertices still inside afterwards; only where the body touches itself."""
+    max_depth: float = 0.0
+    """Deepest penetration before [m]."""
+    ms: float = 0.0
+    """Wall time of the stages that were run for this garment alone: backbone and refu [ms]."""
+
+
+@dataclass(frozen=True)
+class FrameStats:
+    """How long the stages of one frame took, and what they did."""
+
+    stage_ms: Mapping[str, float]
+    """Wall time of each stage, all garments together [ms]: body, backbone, sdf (new pose), refu (distances, pushes)."""
+    garments: Mapping[str, GarmentStats] = field(default_factory=dict)
+    skipped: Mapping[str, int] = field(default_factory=dict)
+    """How much of what `SKIPS` names was left out: vertices, networks, meshes and persons."""
+
+
+@dataclass(frozen=True, eq=False)
+class GarmentMesh:
+    """A garment on a body, in SMPL axes."""
+
+    local: NDArray[np.float32]
+    """Vertices relative to the body's own origin, that is without the translation [m], shape (V, 3)."""
+    raw: NDArray[np.float32]
+    """The same before collision handling [m], shape (V, 3)."""
+    faces: NDArray[np.int64]
+    """Counter-clockwise from outside, shape (F, 3)."""
+    transl: NDArray[np.float64]
+    """Translation of the person [m], shape (3,)."""
+
+    @property
+    def vertices(self) -> NDArray[np.float64]:
+        """Vertices with the translation [m], shape (V, 3); added in float64, so that distant bodies stay precise."""
+        return self.local + self.transl
+
+
+@dataclass(frozen=True, eq=False)
+class PipelineOutput(Mapping[str, GarmentMesh]):
+    """The garments of one person in one frame, by name."""
+
+    garments: Mapping[str, GarmentMesh]
+    body: NDArray[np.float32]
+    """Vertices of the posed body without the translation, SMPL axes [m], shape (V, 3)."""
+    stats: FrameStats
+
+    def __getitem__(self, name: str) -> GarmentMesh:
+        return self.garments[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.garments)
+
+    def __len__(self) -> int:
+        return len(self.garments)
