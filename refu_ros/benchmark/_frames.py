@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from itertools import product
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +16,6 @@ from refu_core.garments import GarmentTemplate
 from refu_core.realtime import PipelineOutput
 from refu_ros.benchmark._inputs import Moment
 from refu_ros.benchmark._options import BenchmarkOptions
-from refu_ros.benchmark._skips import SKIPS
 
 BACKBONES = ("tailornet", "skinned")
 """The default one, and the one that needs no weights."""
@@ -98,9 +96,13 @@ def load_pipeline(
     Raises:
         WeightsError: there are no weights of the backbone for a garment and mode.
     """
-    unskipped: dict[str, Any] = {"no_skip": {*options.no_skip, *no_skip}} if SKIPS else {}
     return GarmentPipeline.load(
-        garments, sdf=mode, backbone=backbone, weights=options.weights, device=device, **unskipped
+        garments,
+        sdf=mode,
+        backbone=backbone,
+        weights=options.weights,
+        device=device,
+        no_skip={*options.no_skip, *no_skip},
     )
 
 

@@ -9,7 +9,7 @@ import torch
 
 from refu_core import RefuError
 from refu_core.garments import BUILTIN_GARMENTS
-from refu_ros.benchmark._skips import SKIPS
+from refu_core.realtime import SKIPS
 
 OUTPUT = Path("docs/results")
 BAGS = Path("bags")

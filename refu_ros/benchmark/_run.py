@@ -8,13 +8,13 @@ from functools import partial
 from tqdm import tqdm
 
 from refu_core.benchmark import load_average, machine_facts, measure_rates, one_core
+from refu_core.realtime import SKIPS
 from refu_ros.benchmark import _sections as sections
 from refu_ros.benchmark._accuracy import accuracies, truth_bag
 from refu_ros.benchmark._frames import load_pipelines
 from refu_ros.benchmark._inputs import Window, moments, read_stretches
 from refu_ros.benchmark._options import BenchmarkOptions
 from refu_ros.benchmark._rows import BenchmarkResult, Row
-from refu_ros.benchmark._skips import SKIPS
 from refu_ros.benchmark._starts import TWO, start, weights_mb
 
 

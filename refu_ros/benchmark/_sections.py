@@ -183,7 +183,7 @@ def measure_skips(section: Section, pipelines: Pipelines) -> None:
     """The pipeline without each of the things that it skips, of bodies that move and of one that doesn't."""
     backbone = _backbone(pipelines)
     held = section.windows[0][1]
-    for _, mode in _main(pipelines) if section.result.skips else ():
+    for _, mode in _main(pipelines):
         contenders: dict[str, Callable[[Moment], object]] = {PLAIN_QUERY: section.plain()}
         for skip in ("", *section.result.skips):
             off = [skip] if skip else []

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
+from refu_ros.benchmark._goals import goals
 from refu_ros.benchmark._published import published
 from refu_ros.benchmark._rows import BenchmarkResult, Row
 
@@ -24,8 +25,17 @@ class Table(NamedTuple):
 
 def tables(result: BenchmarkResult) -> list[Table]:
     """All tables there are rows for."""
-    made = (frames, stages, sdfs, persons, growth, unchanged, skips, paper, starts)
+    made = (aims, frames, stages, sdfs, persons, growth, unchanged, skips, paper, starts)
     return [table for table in (make(result) for make in made) if table.rows]
+
+
+def aims(result: BenchmarkResult) -> Table:
+    """What is to be reached, and what was."""
+    rows: list[tuple[str, ...]] = [
+        (g.name, f"{g.value:.3g}", f"{'≥' if g.is_least else '≤'} {g.bound:g}", "yes" if g.is_reached else "no")
+        for g in goals(result)
+    ]
+    return Table("goals", "Goals", "", ("goal", "measured", "bound", "reached"), rows)
 
 
 def frames(result: BenchmarkResult) -> Table:
