@@ -1,0 +1,371 @@
+"""Things that break: weights, devices, disks, clocks, processes. Each is a clear word and bounded harm."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import resource
+import runpy
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from msg_adapters import BagError, BagReader, BagWriter, QosProfile
+from refu_core import GarmentPipeline, SmplFrame, WeightsError, load_body
+from refu_core._device import is_device_loss
+from refu_core.backbones import TailorNetConfig
+from refu_core.training import load_checkpoint, save_checkpoint
+from refu_core.weights import save_weights
+from refu_ros._diagnostics import statuses
+from refu_ros._recorder import Recorder
+from refu_ros._scene import Scene
+from refu_ros._settings import NodeSettings
+from refu_ros._statistics import Statistics
+from refu_ros._worker import Worker
+from refu_ros.cli import main
+from refu_ros.fuzz._files import small_weights
+
+GARMENT = "short-pant-male"
+KILL_TEST = Path(__file__).parents[1] / "scripts" / "kill_test.py"
+LOST = (
+    "CUDA error: unspecified launch failure\nCUDA kernel errors might be asynchronously reported at some other API call"
+)
+
+
+# Weights ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Weights of one's own for the shorts: untrained, and small."""
+    folder = tmp_path_factory.mktemp("weights")
+    small_weights(folder / GARMENT, TailorNetConfig)
+    return folder
+
+
+def load(weights: Path) -> GarmentPipeline:
+    return GarmentPipeline.load([GARMENT], backbone="tailornet", sdf="hybrid", weights=weights)
+
+
+def copy_of(weights: Path, folder: Path) -> Path:
+    for path in (weights / GARMENT).iterdir():
+        (folder / GARMENT).mkdir(exist_ok=True)
+        (folder / GARMENT / path.name).write_bytes(path.read_bytes())
+    return folder
+
+
+def edit_card(path: Path, **changes: Any) -> None:
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+def test_whole_weights_dress_somebody(weights: Path) -> None:
+    mesh = load(weights)(SmplFrame(np.zeros((24, 3), np.float32)))[GARMENT]
+    assert np.isfinite(mesh.vertices).all()
+
+
+@pytest.mark.parametrize(
+    "name", ["tailornet-hybrid.safetensors", "tailornet-hybrid.json", "basis.safetensors", "basis.json"]
+)
+def test_missing_weights_say_what_to_do(weights: Path, tmp_path: Path, name: str) -> None:
+    (copy_of(weights, tmp_path) / GARMENT / name).unlink()
+    with pytest.raises(WeightsError, match=f"{name}: no such weights; train some with `refu train`"):
+        load(tmp_path)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.999])
+@pytest.mark.parametrize("name", ["tailornet-hybrid.safetensors", "basis.safetensors"])
+def test_truncated_weights_are_refused(weights: Path, tmp_path: Path, name: str, share: float) -> None:
+    path = copy_of(weights, tmp_path) / GARMENT / name
+    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+    with pytest.raises(WeightsError, match=f"{name}: damaged, or not the file that its card describes"):
+        load(tmp_path)
+
+
+def test_weights_of_another_body_are_refused(weights: Path, tmp_path: Path) -> None:
+    card = copy_of(weights, tmp_path) / GARMENT / "tailornet-hybrid.json"
+    edit_card(card, body_fingerprint=load_body("female").fingerprint)
+    with pytest.raises(WeightsError, match="wanted weights whose body_fingerprint is"):
+        load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"format": "refu-weights-2"}, "wanted a card of the format refu-weights-1, got refu-weights-2"),
+        ({"backbone": "transformer"}, "a backbone 'transformer' that this version doesn't know"),
+        ({"config": {"joints": [0], "heads": 8}}, "a card that this version doesn't know"),
+        ({"config": {"joints": [0], "low": [2**40]}}, "low of TailorNetConfig can't be"),
+        ({"config": {"joints": [0, 1, 2], "low": [1 << 19], "high": [1 << 19]}}, "of another shape"),
+    ],
+)
+def test_weights_of_another_version_are_refused(
+    weights: Path, tmp_path: Path, changes: dict[str, Any], reason: str
+) -> None:
+    edit_card(copy_of(weights, tmp_path) / GARMENT / "tailornet-hybrid.json", **changes)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(WeightsError, match=reason):
+        load(tmp_path)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # [KiB]; the last one asks for 1 TB
+
+
+# Devices ------------------------------------------------------------------------------------------
+
+
+def test_what_a_lost_device_is() -> None:
+    assert is_device_loss(RuntimeError(LOST))
+    assert is_device_loss(RuntimeError("Warp CUDA error 719: unspecified launch failure"))
+    assert not is_device_loss(ValueError(LOST))
+    assert not is_device_loss(RuntimeError("mat1 and mat2 shapes cannot be multiplied"))
+    assert not is_device_loss(torch.OutOfMemoryError("CUDA out of memory. CUDA error"))
+
+
+class Failing:
+    """A pipeline whose device fails with the third frame."""
+
+    def __init__(self, pipeline: GarmentPipeline) -> None:
+        self._pipeline = pipeline
+        self.body, self.garments, self.margin = pipeline.body, pipeline.garments, pipeline.margin
+        self.frames = 0
+
+    def __call__(self, frames: list[SmplFrame]) -> list[Any]:
+        self.frames += 1
+        if self.frames > 2:
+            raise RuntimeError(LOST)
+        return self._pipeline(frames)
+
+
+class Outlet:
+    """Counts what comes out, and does what the node does."""
+
+    def __init__(self, replacement: GarmentPipeline) -> None:
+        self.replacement = replacement
+        self.worker: Worker | None = None
+        self.sent, self.losses = 0, []  # type: ignore[var-annotated]
+
+    def watched(self) -> bool:
+        return True
+
+    def body_watched(self) -> bool:
+        return False
+
+    def now_ns(self) -> int:
+        return 0
+
+    def send_garments(self, data: bytes) -> None:  # noqa: ARG002
+        self.sent += 1
+
+    def send_body(self, data: bytes) -> None:
+        raise NotImplementedError
+
+    def device_lost(self, reason: str) -> None:
+        self.losses.append(reason)
+
+
+def turned(i: int) -> SmplFrame:
+    pose = np.zeros((24, 3), np.float32)
+    pose[16, 2] = -0.1 * i
+    return SmplFrame(pose, stamp_ns=i)
+
+
+def test_a_lost_device_is_reported_once_and_another_pipeline_takes_over() -> None:
+    pipeline = GarmentPipeline.load([GARMENT], backbone="skinned", sdf="none")
+    statistics, outlet = Statistics(), Outlet(pipeline)
+    scene = Scene(statistics)
+    settings = NodeSettings(garments=(GARMENT,), backbone="skinned", sdf="none")
+    worker = Worker(scene, statistics, outlet, settings=settings, pipeline=Failing(pipeline))  # type: ignore[arg-type]
+
+    def tick(i: int) -> None:
+        scene.put("", turned(i))
+        worker.tick(scene.take(timeout=0.0))
+
+    for i in range(1, 6):
+        tick(i)
+    assert (outlet.sent, outlet.losses) == (2, [LOST])
+    report = statistics.report()
+    assert report.total["drop.device"] == 3
+    parts = {"node": "n", "state": "active", "persons": ("",), "recording": None, "recording_error": ""}
+    output = statuses(report, settings, **parts)[1]  # type: ignore[arg-type]
+    assert (output.level, "the device has failed" in output.message) == (2, True)
+    worker.use(pipeline)
+    tick(6)
+    assert outlet.sent == 3
+    assert statuses(statistics.report(), settings, **parts, device="cpu")[1].values["device"] == "cpu"  # type: ignore[arg-type]
+
+
+def test_a_command_whose_device_fails_says_so_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def lost() -> None:
+        raise RuntimeError(LOST)
+
+    monkeypatch.setattr("refu_ros.info.collect", lost)
+    assert main(["info"]) == 1
+    assert capsys.readouterr().err == (
+        "refu: error: the device has failed: CUDA error: unspecified launch failure; run it again, or on the cpu\n"
+    )
+
+
+# Clocks and names ---------------------------------------------------------------------------------
+
+
+def test_a_clock_set_back_loses_nothing_and_is_reported(tmp_path: Path) -> None:
+    statistics = Statistics()
+    scene = Scene(statistics)
+    for stamp in (10, 20, 5, 6, 30):
+        scene.put("ann", SmplFrame(np.zeros((24, 3), np.float32), stamp_ns=stamp))
+        assert scene.take(timeout=0.0)["ann"].frame.stamp_ns == stamp
+    statistics.receive()
+    parts = {"node": "n", "state": "active", "recording": None, "recording_error": ""}
+    first = statuses(statistics.report(), NodeSettings(), persons=("",), **parts)[0]  # type: ignore[arg-type]
+    assert (first.level, first.values["stamps that went back"]) == (1, "1")
+    assert "was a clock set back" in first.message
+    times = [100, 200, 50, 60, 300]
+    with BagWriter(tmp_path / "bag") as writer:
+        writer.add_topic("/a", "std_msgs/msg/Float32MultiArray")
+        for time_ns in times:
+            writer.write("/a", b"\0\1\0\0", log_time_ns=time_ns)
+    with BagReader(tmp_path / "bag") as reader:
+        assert [message.log_time_ns for message in reader.messages()] == times
+    text = (tmp_path / "bag" / "metadata.yaml").read_text()
+    assert "nanoseconds_since_epoch: 50" in text
+    assert "nanoseconds: 250" in text
+
+
+def test_nodes_of_one_name_are_reported() -> None:
+    parts: dict[str, Any] = {"state": "active", "persons": ("",), "recording": None, "recording_error": ""}
+    status = statuses(Statistics().report(), NodeSettings(), node="n", n_namesakes=1, **parts)[1]
+    assert (status.level, status.message) == (1, "2 nodes have this name: start others with -r __node:=another_name")
+
+
+# Disks --------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def small_disk(size: int) -> Iterator[None]:
+    """No file gets larger than that [bytes]."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_a_full_disk_keeps_the_checkpoint_before(tmp_path: Path) -> None:
+    path = tmp_path / "training.checkpoint"
+    save_checkpoint(path, {"step": 1, "w": torch.zeros(4)})
+    with small_disk(50_000), pytest.raises(WeightsError, match="the checkpoint can't be written"):
+        save_checkpoint(path, {"step": 2, "w": torch.randn(100_000)})
+    state = load_checkpoint(path)
+    assert state is not None
+    assert state["step"] == 1
+    assert [file.name for file in tmp_path.iterdir()] == [path.name]
+
+
+def test_a_full_disk_keeps_the_weights_before(tmp_path: Path) -> None:
+    path = save_weights(tmp_path / "w", {"a": torch.zeros(4)}, {"garment": GARMENT})
+    before = path.read_bytes()
+    with small_disk(50_000), pytest.raises(WeightsError, match="can't be written"):
+        save_weights(tmp_path / "w", {"a": torch.randn(100_000)}, {"garment": GARMENT})
+    assert path.read_bytes() == before
+
+
+def test_a_read_only_disk_is_said_before_any_frame(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    opened = Path.open
+
+    def read_only(self: Path, mode: str = "r", *args: Any, **kwargs: Any) -> Any:
+        if set(mode) & set("wxa+") and tmp_path in self.parents:
+            raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(self))
+        return opened(self, mode, *args, **kwargs)
+
+    monkeypatch.setattr(Path, "open", read_only)  # root may write wherever permissions say no
+    with pytest.raises(BagError, match="Read-only file system"):
+        Recorder(tmp_path / "bag")
+    with pytest.raises(WeightsError, match="Read-only file system"):
+        save_checkpoint(tmp_path / "x.checkpoint", {"step": 1})
+
+
+def test_a_disk_that_stalls_costs_messages_and_no_time(tmp_path: Path) -> None:
+    class Stalling(BagWriter):
+        def write(self, *args: Any, **kwargs: Any) -> None:
+            time.sleep(0.02)
+            super().write(*args, **kwargs)
+
+    recorder = Recorder(tmp_path / "bag", max_queued_bytes=4_000, open_bag=Stalling)
+    started = time.thread_time()
+    for i in range(500):
+        recorder.put("/a", "std_msgs/msg/Float32MultiArray", bytes(1000), time_ns=i, qos=QosProfile())
+    assert time.thread_time() - started < 1.0  # twenty seconds, if it waited
+    recorder.close()
+    state = recorder.state()
+    assert (state.written + state.dropped, state.error) == (500, "")
+    with BagReader(tmp_path / "bag") as reader:
+        assert sum(1 for _ in reader.messages()) == state.written
+
+
+# Processes ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("what", "times"), [("recording", 4), ("training", 3)])
+def test_kills_leave_what_can_be_read_and_gone_on_with(what: str, times: int) -> None:
+    done = subprocess.run(
+        [sys.executable, str(KILL_TEST), "--what", what, "--times", str(times)],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert f"{what}: {times} kills" in done.stdout
+
+
+def test_the_kill_test_notices_damage(tmp_path: Path) -> None:
+    recording = runpy.run_path(str(KILL_TEST))["Recording"](tmp_path)
+    with BagWriter(tmp_path / "bag") as writer:
+        writer.add_topic(recording.topic, recording.message_type)
+        for i in (0, 2):
+            writer.write(recording.topic, recording.payload(i), log_time_ns=i)
+    with pytest.raises(AssertionError, match="message 1 of 2 is another"):
+        recording.check(tmp_path)
+
+
+# Networks -----------------------------------------------------------------------------------------
+
+OFFLINE = """
+import sys
+def refuse(event, arguments):
+    if event in ("socket.connect", "socket.getaddrinfo", "socket.bind", "socket.sendto", "socket.gethostbyname"):
+        sys.stderr.write(f"network: {event} {arguments}\\n")
+        raise OSError("there is no network")
+sys.addaudithook(refuse)
+from refu_ros.cli import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_a_replay_asks_no_network_for_anything(tmp_path: Path) -> None:
+    bag = Path(__file__).parents[1] / "bags" / "walk"
+    arguments = ["replay", str(bag), "--output", str(tmp_path / "out.mcap"), "--garments", GARMENT, "--max-frames", "2"]
+    arguments += ["--backbone", "skinned", "--sdf", "accurate", "--quiet"]
+    proxies = dict.fromkeys(("HTTP_PROXY", "HTTPS_PROXY", "http_proxy", "https_proxy"), "http://127.0.0.1:9")
+    done = subprocess.run(
+        [sys.executable, "-c", OFFLINE, *arguments],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+        env={**os.environ, **proxies, "HF_HUB_OFFLINE": "1"},
+    )
+    assert done.returncode == 0, done.stderr
+    assert "network:" not in done.stderr
+    with BagReader(tmp_path / "out.mcap") as reader:
+        assert {topic.message_count for topic in reader.topics} == {2}
