@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import resources
@@ -20,6 +21,15 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 BUILTIN_GARMENTS: tuple[str, ...] = ("shirt-male", "tshirt-male", "short-pant-male", "skirt-female")
+
+LAYERS: Mapping[str, int] = {"short-pant-male": 0, "skirt-female": 0, "tshirt-male": 1, "shirt-male": 2}
+"""Which garments are worn over which: those of a higher number over those of a lower one. Tops hang over bottoms, and
+a shirt over a T-shirt. A garment that isn't listed is an outermost one; of one layer, the later named is the outer."""
+
+
+def inner_first(names: Iterable[str]) -> list[str]:
+    """Names of garments worn together, from the skin outwards (`LAYERS`)."""
+    return sorted(names, key=lambda name: LAYERS.get(name, max(LAYERS.values())))
 
 
 def unique_edges(faces: Tensor) -> Tensor:

@@ -28,15 +28,17 @@ class GarmentStats:
     """What collision handling found and did for one garment in one frame."""
 
     n_inside: int = 0
-    """Vertices inside the body before."""
+    """Vertices inside the body before; of an outer garment, once it is off the inner ones."""
     n_pushed: int = 0
     """Vertices that were moved: inside, or nearer to the skin than the margin."""
     n_unresolved: int = 0
     """Vertices still inside afterwards; only where the body touches itself."""
     max_depth: float = 0.0
-    """Deepest penetration before [m]."""
+    """Deepest penetration before, likewise [m]."""
+    n_layered: int = 0
+    """Vertices that were moved since they were under another garment, or nearer to it than the gap between garments."""
     ms: float = 0.0
-    """Wall time of the stages that were run for this garment alone: backbone and refu [ms]."""
+    """Wall time of the stages that were run for this garment alone: backbone, layers and refu [ms]."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,8 @@ class FrameStats:
     """How long the stages of one frame took, and what they did."""
 
     stage_ms: Mapping[str, float]
-    """Wall time of each stage, all garments together [ms]: body, backbone, sdf (new pose), refu (distances, pushes)."""
+    """Wall time of each stage, all garments together [ms]: body, backbone, sdf (new pose), refu (distances, pushes),
+    and layers where garments are worn over each other."""
     garments: Mapping[str, GarmentStats] = field(default_factory=dict)
     skipped: Mapping[str, int] = field(default_factory=dict)
     """How much of what `SKIPS` names was left out: vertices, networks, meshes and persons."""

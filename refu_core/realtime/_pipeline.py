@@ -19,6 +19,7 @@ from refu_core.errors import GarmentError, RefuError
 from refu_core.frames import SmplFrame
 from refu_core.garments import N_STYLES, GarmentTemplate, load_garment
 from refu_core.realtime._collisions import Collisions, Fabric
+from refu_core.realtime._outfit import Outfit
 from refu_core.realtime._outputs import SDF_MODES, SKIPS, FrameStats, GarmentMesh, GarmentStats, PipelineOutput
 from refu_core.repulsion import DEFAULT_MARGIN, Refu, VertexScale, read_refu
 from refu_core.sdf import ExactSdf
@@ -88,6 +89,7 @@ class GarmentPipeline:
         wearables: Mapping[str, _Wearable],
         *,
         collisions: Collisions | None,
+        outfit: Outfit | None,
         margin: float | None,
         style: Tensor | None,
         no_skip: Collection[str] = (),
@@ -98,6 +100,7 @@ class GarmentPipeline:
         self._wearables = wearables
         self._style = style
         self._collisions = collisions
+        self._outfit = outfit
         self._skips = frozenset(SKIPS) - frozenset(no_skip)
         self._figures: _Figures | None = None
         self._last: dict[bytes, PipelineOutput] = {}
@@ -184,7 +187,8 @@ class GarmentPipeline:
         if gamma is not None:
             for template in templates.values():
                 template.rest(gamma.new_zeros(1, 10), gamma)  # says now, not in the first frame, if it has no styles
-        return cls(body, wearables, collisions=collisions, margin=margin, style=gamma, no_skip=no_skip)
+        outfit = Outfit(templates) if collisions is not None and len(templates) > 1 else None
+        return cls(body, wearables, collisions=collisions, outfit=outfit, margin=margin, style=gamma, no_skip=no_skip)
 
     @property
     def garments(self) -> dict[str, GarmentTemplate]:
@@ -301,28 +305,37 @@ class GarmentPipeline:
         sdf_ms = clock.lap()
         meshes: dict[str, GarmentMesh] = {}
         stats: dict[str, GarmentStats] = {}
-        refu_ms = 0.0
+        worn: dict[str, Tensor] = {}
+        layers_ms = refu_ms = 0.0
         n_clipped = 0
-        for name, wearable in self._wearables.items():
-            one, counts = dressed[name], GarmentStats()
+        # From the skin outwards. A garment is brought off those below it first: the body has the last word.
+        for name in self._wearables if self._outfit is None else self._outfit.order:
+            wearable, one, counts, n_layered = self._wearables[name], dressed[name], GarmentStats(), 0
             raw = vertices = one.posed[person]
+            if self._outfit is not None:
+                vertices, n_layered = self._outfit.lift(name, vertices, worn)
+            own_layers_ms = clock.lap()
             if self._collisions is not None:
                 done, n_unasked = self._collisions.resolve(
                     wearable.fabric,
-                    raw,
+                    vertices,
                     margin=wearable.margin if self.margin is None else self.margin,
                     scale=one.scale[person],
                     near=None if one.near is None else one.near[person],
                 )
                 n_clipped += n_unasked
                 vertices = done.vertices
-                counts = GarmentStats(done.n_inside, done.n_pushed, done.n_unresolved, done.max_depth)
+                counts = GarmentStats(done.n_inside, done.n_pushed, done.n_unresolved, done.max_depth, n_layered)
+            worn[name] = vertices
             meshes[name] = GarmentMesh(vertices.cpu().numpy(), raw.cpu().numpy(), wearable.faces, frame.transl)
             own_ms = clock.lap()
-            refu_ms += own_ms
-            stats[name] = replace(counts, ms=one.ms + own_ms)
-        took = FrameStats({**stages, "sdf": sdf_ms, "refu": refu_ms}, stats, {**skipped, "band": n_clipped})
-        return PipelineOutput(meshes, body.cpu().numpy(), took)
+            layers_ms, refu_ms = layers_ms + own_layers_ms, refu_ms + own_ms
+            stats[name] = replace(counts, ms=one.ms + own_layers_ms + own_ms)
+        stage_ms = {**stages, "sdf": sdf_ms, **({} if self._outfit is None else {"layers": layers_ms}), "refu": refu_ms}
+        in_order = {name: meshes[name] for name in self._wearables}
+        counts_in_order = {name: stats[name] for name in in_order}
+        took = FrameStats(stage_ms, counts_in_order, {**skipped, "band": n_clipped})
+        return PipelineOutput(in_order, body.cpu().numpy(), took)
 
 
 def _key(frame: SmplFrame, *, of_pose: bool = True) -> bytes:

@@ -4,6 +4,9 @@ from refu_core.repulsion._blend import BLEND_ROUNDS as BLEND_ROUNDS
 from refu_core.repulsion._blend import Blend as Blend
 from refu_core.repulsion._files import read_refu as read_refu
 from refu_core.repulsion._files import refu_tensors as refu_tensors
+from refu_core.repulsion._layers import LAYER_GAP as LAYER_GAP
+from refu_core.repulsion._layers import LAYER_REACH as LAYER_REACH
+from refu_core.repulsion._layers import Layer as Layer
 from refu_core.repulsion._limbs import Limbs as Limbs
 from refu_core.repulsion._postprocess import PostProcess as PostProcess
 from refu_core.repulsion._postprocess import push_naively as push_naively

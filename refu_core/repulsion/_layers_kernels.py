@@ -1,0 +1,200 @@
+# mypy: ignore-errors
+# ruff: noqa: UP018, RUF046
+# (Warp reads a kernel's annotations as array types of its own; a type checker can't. A variable that changes in a
+# branch has to be called int or float there.)
+"""How far one garment's vertices are from the outer side of another one's sheet: one code for CPU and CUDA."""
+
+import warp as wp
+
+from refu_core.sdf._kernels import closest_on_triangle, offset_from
+
+# Nothing is so far from where it was at rest; it is a limit to what a sheet crumpled into itself may take.
+MOST_STEPS = wp.constant(64)
+
+
+@wp.struct
+class Cut:
+    """A garment's mesh, which doesn't change."""
+
+    faces: wp.array2d(dtype=wp.int32)
+    fan_start: wp.array(dtype=wp.int32)
+    fan_face: wp.array(dtype=wp.int32)
+    """The faces around vertex v are `fan_face[fan_start[v]:fan_start[v + 1]]`."""
+    ring_start: wp.array(dtype=wp.int32)
+    ring: wp.array(dtype=wp.int32)
+    """Its neighbours, likewise."""
+    rim: wp.array(dtype=wp.int32)
+    """Bit k of a face's number is set where its feature k is on an open rim."""
+
+
+@wp.struct
+class LayerRules:
+    """Lengths in metres."""
+
+    gap: wp.float32
+    reach: wp.float32
+    longest: wp.float32
+    fade: wp.float32
+    agreement: wp.float32
+
+
+@wp.func
+def normal_at(v: int, points: wp.array(dtype=wp.vec3), cut: Cut):
+    """Unit normal of a garment's vertex, its faces weighted by area."""
+    total = wp.vec3(0.0, 0.0, 0.0)
+    for i in range(cut.fan_start[v], cut.fan_start[v + 1]):
+        face = cut.fan_face[i]
+        a = points[cut.faces[face, 0]]
+        total += wp.cross(points[cut.faces[face, 1]] - a, points[cut.faces[face, 2]] - a)
+    return wp.normalize(total)
+
+
+@wp.func
+def nearest_vertex(p: wp.vec3, start: int, points: wp.array(dtype=wp.vec3), cut: Cut):
+    """The vertex that is downhill from `start`: none of its neighbours is nearer to p."""
+    v = int(start)
+    squared = wp.length_sq(points[v] - p)
+    for _step in range(MOST_STEPS):
+        best = int(v)
+        for r in range(cut.ring_start[v], cut.ring_start[v + 1]):
+            u = cut.ring[r]
+            other = wp.length_sq(points[u] - p)
+            if other < squared:
+                squared = other
+                best = u
+        if best == v:
+            break
+        v = best
+    return v
+
+
+@wp.func
+def nearest_face(p: wp.vec3, start: int, points: wp.array(dtype=wp.vec3), cut: Cut):
+    """The face closest to p downhill from the fan of vertex `start`: feature, barycentrics, and p's offset from it."""
+    v = int(start)
+    squared = float(wp.inf)
+    face = int(-1)
+    feature = int(0)
+    w = wp.vec3(1.0, 0.0, 0.0)
+    offset = wp.vec3(0.0, 0.0, 0.0)
+    for _step in range(MOST_STEPS):
+        last = face
+        for k in range(cut.fan_start[v], cut.fan_start[v + 1]):
+            f = cut.fan_face[k]
+            f_w, f_feature = closest_on_triangle(
+                p, points[cut.faces[f, 0]], points[cut.faces[f, 1]], points[cut.faces[f, 2]]
+            )
+            f_offset = offset_from(p, f, f_w, points, cut.faces)
+            other = wp.length_sq(f_offset)
+            if other < squared:
+                squared = other
+                face = f
+                feature = f_feature
+                w = f_w
+                offset = f_offset
+        # The closest vertex isn't always a corner of the closest face: on, at the corner that weighs most.
+        corner = wp.where(w[0] >= w[1] and w[0] >= w[2], 0, wp.where(w[1] >= w[2], 1, 2))
+        if face == last or cut.faces[face, corner] == v:
+            break
+        v = cut.faces[face, corner]
+    return face, feature, w, offset
+
+
+@wp.kernel(enable_backward=False)
+def normals_kernel(
+    points: wp.array(dtype=wp.vec3),
+    cut: Cut,
+    # output
+    normals: wp.array(dtype=wp.vec3),
+):
+    """Unit normals of a garment's vertices."""
+    v = wp.tid()
+    normals[v] = normal_at(v, points, cut)
+
+
+@wp.kernel(enable_backward=False)
+def lift_kernel(
+    # the garment below
+    below: wp.array(dtype=wp.vec3),
+    below_normals: wp.array(dtype=wp.vec3),
+    below_cut: Cut,
+    # the garment above
+    above: wp.array(dtype=wp.vec3),
+    above_cut: Cut,
+    candidates: wp.array(dtype=int),
+    near: wp.array(dtype=int),
+    rules: LayerRules,
+    # outputs, by candidate
+    found: wp.array(dtype=int),
+    push: wp.array(dtype=wp.vec3),
+    count: wp.array(dtype=int),
+):
+    """What brings each candidate to the gap above the sheet, and how many they are that lack something.
+
+    `near` is a vertex of the sheet to look from, `found` the one that was come to.
+    """
+    k = wp.tid()
+    i = candidates[k]
+    p = above[i]
+    push[k] = wp.vec3(0.0, 0.0, 0.0)
+
+    v = nearest_vertex(p, near[k], below, below_cut)
+    found[k] = v
+    # No point of a face is farther than its longest edge from its closest corner.
+    if wp.length(below[v] - p) > rules.reach + rules.longest:
+        return
+    face, feature, w, offset = nearest_face(p, v, below, below_cut)
+    if wp.length(offset) > rules.reach:
+        return
+    a = below_cut.faces[face, 0]
+    b = below_cut.faces[face, 1]
+    c = below_cut.faces[face, 2]
+    normal = wp.normalize(w[0] * below_normals[a] + w[1] * below_normals[b] + w[2] * below_normals[c])
+    height = wp.dot(offset, normal)
+    if height >= rules.gap:
+        return
+    own = normal_at(i, above, above_cut)
+    share = wp.clamp(wp.dot(own, normal) / rules.agreement, 0.0, 1.0)
+    if (below_cut.rim[face] >> feature) & 1 != 0:
+        share *= wp.max(0.0, 1.0 - wp.length(offset - height * normal) / rules.fade)
+    if share > 0.0:
+        push[k] = share * (rules.gap - height) * normal
+        wp.atomic_add(count, 0, 1)
+
+
+@wp.kernel(enable_backward=False)
+def spread_kernel(
+    push: wp.array(dtype=wp.vec3),
+    n_pushed: int,
+    ring_start: wp.array(dtype=int),
+    ring: wp.array(dtype=int),
+    field: wp.array(dtype=wp.vec3),
+    # output
+    smoother: wp.array(dtype=wp.vec3),
+):
+    """One round of `Blend.spread`."""
+    k = wp.tid()
+    start = ring_start[k]
+    end = ring_start[k + 1]
+    total = wp.vec3(0.0, 0.0, 0.0)
+    for r in range(start, end):
+        total += field[ring[r]]
+    mean = total / float(wp.max(end - start, 1))
+    if k < n_pushed:
+        length = wp.length(push[k])
+        if length > 0.0:
+            way = push[k] / length
+            mean += wp.max(0.0, length - wp.dot(mean, way)) * way
+    smoother[k] = mean
+
+
+@wp.kernel(enable_backward=False)
+def move_kernel(
+    rows: wp.array(dtype=int),
+    field: wp.array(dtype=wp.vec3),
+    # output
+    points: wp.array(dtype=wp.vec3),
+):
+    """Moves the vertices of the region."""
+    k = wp.tid()
+    points[rows[k]] += field[k]
