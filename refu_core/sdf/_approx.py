@@ -12,7 +12,7 @@ from torch import Tensor
 from refu_core._warp import as_warp, torch_stream
 from refu_core.errors import MeshError
 from refu_core.sdf._exact import ExactSdf
-from refu_core.sdf._mesh import Found, MeshSdf
+from refu_core.sdf._mesh import Found, MeshSdf, Recorded
 from refu_core.sdf._walk import COLUMNS, EMPTY, MAX_FACES, ROWS, enter_kernel, walk_kernel
 
 if TYPE_CHECKING:
@@ -77,6 +77,8 @@ class ApproxSdf(MeshSdf):
         self._table_wp = as_warp(self._table, wp.int32)
         self._exact = ExactSdf(body.faces, device=self.device)
         self._exact_is_late = True
+        self._enter: Any = None  # both recorded for the tensors that hold the pose
+        self._walk: Recorded | None = None
 
     def skin(self) -> Any:
         """As `MeshSdf.skin`."""
@@ -85,40 +87,40 @@ class ApproxSdf(MeshSdf):
         return skin
 
     def _take_pose(self, *, is_new: bool) -> None:
-        del is_new
         self._exact_is_late = True
         self._table.fill_(EMPTY)
-        with torch_stream(self.device):
-            wp.launch(
+        if is_new:
+            self._enter = wp.launch(
                 enter_kernel,
                 dim=len(self._guides),
                 inputs=[self._points_wp, self._links_wp, self._guides, _CELL, _DEPTH],
                 outputs=[self._table_wp],
                 device=str(self.device),
+                record_cmd=True,
             )
+            self._walk = Recorded(walk_kernel, self._inputs) if self.device.type == "cpu" else None
+        with torch_stream(self.device):
+            self._enter.launch()
 
     def _find(self, points: Tensor, near: Tensor | None) -> Found:
         near = self._seek(points) if near is None else near
+        if self._walk is not None:
+            return self._walk.ask(points, near)
         found = Found.empty(len(points), self.device)
         if len(points):
             with torch_stream(self.device):
                 wp.launch(
                     walk_kernel,
                     dim=len(points),
-                    inputs=[
-                        self._points_wp,
-                        self._faces,
-                        *self._topology,
-                        self._links_wp,
-                        self._table_wp,
-                        _CELL,
-                        as_warp(points, wp.vec3),
-                        as_warp(near, wp.int32),
-                    ],
+                    inputs=self._inputs(as_warp(points, wp.vec3), as_warp(near, wp.int32)),
                     outputs=found.as_warp(),
                     device=str(self.device),
                 )
         return found
+
+    def _inputs(self, points: Any, near: Any) -> list[Any]:
+        """What `walk_kernel` reads."""
+        return [self._points_wp, self._faces, *self._topology, self._links_wp, self._table_wp, _CELL, points, near]
 
     def _seek(self, points: Tensor) -> Tensor:
         """Where nothing is known to be near a point the exact query finds it: right, and as slow."""
