@@ -21,6 +21,7 @@ from refu_core.garments import N_STYLES, GarmentTemplate, load_garment
 from refu_core.realtime._collisions import Collisions, Fabric
 from refu_core.realtime._outfit import Outfit
 from refu_core.realtime._outputs import SDF_MODES, SKIPS, FrameStats, GarmentMesh, GarmentStats, PipelineOutput
+from refu_core.realtime._turn import RootTurn
 from refu_core.repulsion import DEFAULT_MARGIN, Refu, VertexScale, read_refu
 from refu_core.sdf import ExactSdf
 from refu_core.weights import shipped_weights
@@ -228,7 +229,8 @@ class GarmentPipeline:
         clock = _StageClock()
         figures, skipped = self._figures_of(frames)
         pose = torch.as_tensor(np.stack([f.pose for f in frames]), device=self.body.device)
-        posed = self.body.posed(pose, figures.body)
+        turns, at_root = RootTurn.taken_off(pose, figures.body.joints)
+        posed = self.body.posed(at_root, figures.body)
         stages = {"body": clock.lap() / len(frames)}
         dressed: dict[str, _Dressed] = {}
         for name, wearable in self._wearables.items():
@@ -237,7 +239,7 @@ class GarmentPipeline:
                 skipped["pivots"] = skipped.get("pivots", 0) + wearable.backbone.n_skipped
         stages["backbone"] = sum(one.ms for one in dressed.values())
         return [
-            self._handle_collisions(i, frame, posed.vertices[i], dressed, stages, skipped)
+            self._handle_collisions(i, frame, posed.vertices[i], turns[i], dressed, stages, skipped)
             for i, frame in enumerate(frames)
         ]
 
@@ -295,6 +297,7 @@ class GarmentPipeline:
         person: int,
         frame: SmplFrame,
         body: Tensor,
+        turn: RootTurn,
         dressed: Mapping[str, _Dressed],
         stages: Mapping[str, float],
         skipped: Mapping[str, int],
@@ -327,7 +330,8 @@ class GarmentPipeline:
                 vertices = done.vertices
                 counts = GarmentStats(done.n_inside, done.n_pushed, done.n_unresolved, done.max_depth, n_layered)
             worn[name] = vertices
-            meshes[name] = GarmentMesh(vertices.cpu().numpy(), raw.cpu().numpy(), wearable.faces, frame.transl)
+            local, before = (turn(points).cpu().numpy() for points in (vertices, raw))
+            meshes[name] = GarmentMesh(local, before, wearable.faces, frame.transl)
             own_ms = clock.lap()
             layers_ms, refu_ms = layers_ms + own_layers_ms, refu_ms + own_ms
             stats[name] = replace(counts, ms=one.ms + own_layers_ms + own_ms)
@@ -335,7 +339,7 @@ class GarmentPipeline:
         in_order = {name: meshes[name] for name in self._wearables}
         counts_in_order = {name: stats[name] for name in in_order}
         took = FrameStats(stage_ms, counts_in_order, {**skipped, "band": n_clipped})
-        return PipelineOutput(in_order, body.cpu().numpy(), took)
+        return PipelineOutput(in_order, turn(body).cpu().numpy(), took)
 
 
 def _key(frame: SmplFrame, *, of_pose: bool = True) -> bytes:

@@ -1,0 +1,42 @@
+"""The root's rotation, taken off a frame before it is dressed and put back at the end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from refu_core.body import rotvec_to_rotmat
+
+
+@dataclass(frozen=True, eq=False)
+class RootTurn:
+    """Turns one person about their root.
+
+    A person is dressed as the root sees them: grids, tables and thresholds are then the same whichever way the person
+    faces or lies. In world axes the approximate distance looks up other guides after a turn, and rounding decides anew
+    on which side of a threshold a vertex is: millimetres at a fold, and centimetres where limbs run into each other.
+    """
+
+    rotation: Tensor
+    """Shape (3, 3)."""
+    shift: Tensor
+    """Keeps the root in its place [m], shape (3,)."""
+
+    @staticmethod
+    def taken_off(pose: Tensor, joints: Tensor) -> tuple[list[RootTurn], Tensor]:
+        """The turns of persons, and their poses without them, (B, 24, 3) [rad].
+
+        Args:
+            pose: Rotation vectors [rad], shape (B, 24, 3).
+            joints: Of their rest poses [m], shape (B, 24, 3) or (1, 24, 3).
+        """
+        rotations, roots = rotvec_to_rotmat(pose[:, 0]), joints[:, 0]
+        shifts = roots - (rotations @ roots.unsqueeze(-1)).squeeze(-1)
+        at_root = torch.cat((torch.zeros_like(pose[:, :1]), pose[:, 1:]), 1)
+        return [RootTurn(*turn) for turn in zip(rotations, shifts, strict=True)], at_root
+
+    def __call__(self, points: Tensor) -> Tensor:
+        """Points [m], shape (N, 3), as the world sees them, of those that the root sees."""
+        return torch.addmm(self.shift, points, self.rotation.T)
