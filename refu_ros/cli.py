@@ -448,7 +448,7 @@ def _benchmark(args: argparse.Namespace) -> int:
     print(benchmark_text(result))
     print(f"\nwrote {', '.join(map(str, write_results(result, options.output)))}")
     _write_json(args.json, result.as_dict())
-    return 0
+    return EXIT_INTERRUPTED if result.interrupted else 0
 
 
 def _info(args: argparse.Namespace) -> int:

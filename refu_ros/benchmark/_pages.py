@@ -44,6 +44,8 @@ def conditions(result: BenchmarkResult) -> str:
     load = [machine.get("load_before"), machine.get("load_after")]
     if None not in load:
         text += f"; load average {load[0]:.1f} before, {load[1]:.1f} after"
+    if result.interrupted:
+        text += "; interrupted before everything was measured"
     return (
         f"{text}. Times are the processor's, medians and quartiles of contenders taken in turn; ratios are to "
         "refitting a BVH and asking it for every vertex (the plain query), taken in turn with them."

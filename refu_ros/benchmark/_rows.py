@@ -62,6 +62,8 @@ class BenchmarkResult:
 
     command: str
     quick: bool
+    interrupted: bool = False
+    """Whether it was ended before everything was measured."""
     machine: dict[str, Any] = field(default_factory=dict)
     rates: Rates | None = None
     rows: list[Row] = field(default_factory=list)
@@ -86,6 +88,7 @@ class BenchmarkResult:
         return {
             "command": self.command,
             "quick": self.quick,
+            "interrupted": self.interrupted,
             "machine": {**self.machine, **rates},
             "rows": [row.as_dict() for row in self.rows],
             "limits": [

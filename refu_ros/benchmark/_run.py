@@ -19,7 +19,7 @@ from refu_ros.benchmark._starts import TWO, start, weights_mb
 
 
 def benchmark(options: BenchmarkOptions, *, progress: bool = False) -> BenchmarkResult:
-    """Measures everything, pinned to one core.
+    """Measures everything, pinned to one core; an interrupt (Ctrl-C) ends it early with what there is.
 
     Raises:
         RefuError: no motion, a bag or weights that can't be read, or a process that couldn't be started.
@@ -27,7 +27,12 @@ def benchmark(options: BenchmarkOptions, *, progress: bool = False) -> Benchmark
     result = BenchmarkResult(options.command, options.quick, skips=SKIPS)
     with one_core() as core, _Bar(shown=progress) as bar:
         result.machine = {**machine_facts(options.devices[-1]), "core": core, "load_before": load_average()}
-        _Run(options, result, bar).everything()
+        try:
+            _Run(options, result, bar).everything()
+        except KeyboardInterrupt:
+            if not result.rows:
+                raise
+            result.interrupted = True
         result.machine["load_after"] = load_average()
     return result
 
