@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -58,17 +59,20 @@ class PoseFeatures(nn.Module):
         self.encoding = encoding
         self.joints = tuple(j for j in joints if j != 0)
         self.size = 3 + 9 * len(self.joints) if encoding == "matrix" else 72
-        per_joint = torch.arange(24).repeat_interleave(3)
+        # In numpy: on the meta device, where a card's sizes are tried out, sums make torch import all of its compiler.
+        per_joint = np.repeat(np.arange(24), 3)
         if encoding == "matrix":
-            per_joint = torch.cat((torch.zeros(3), 1 + torch.arange(len(self.joints)).repeat_interleave(9))).long()
-        self.groups = torch.cat((per_joint, per_joint[-1] + 1 + torch.arange(N_STYLE_SHAPE)))
+            per_joint = np.concatenate((np.zeros(3, np.int64), 1 + np.repeat(np.arange(len(self.joints)), 9)))
+        self.groups = torch.from_numpy(np.concatenate((per_joint, per_joint[-1] + 1 + np.arange(N_STYLE_SHAPE))))
         """Which numbers of (features, β, γ) belong together, shape (size + 14,): those of one joint."""
         keep = torch.zeros(24, 1)
         keep[list(joints)] = 1.0
         self.register_buffer("_index", torch.tensor((0, *self.joints)), persistent=False)
         self.register_buffer("_keep", keep, persistent=False)
+        self.register_buffer("_eye", torch.from_numpy(np.eye(3, dtype=np.float32)), persistent=False)
         self._index: Tensor
         self._keep: Tensor
+        self._eye: Tensor
 
     def forward(self, pose: Tensor) -> Tensor:
         """Features, shape (B, size), of poses (B, 24, 3) [rad]."""
@@ -76,8 +80,7 @@ class PoseFeatures(nn.Module):
             whole = torch.cat((tilt_rotvec(up_in_root(pose))[:, None], pose[:, 1:]), 1)
             return (whole * self._keep).flatten(1)
         rotations = rotvec_to_rotmat(pose[:, self._index])  # the root's first
-        eye = torch.eye(3, dtype=pose.dtype, device=pose.device)
-        return torch.cat((rotations[:, 0, 1], (rotations[:, 1:] - eye).flatten(1)), 1)
+        return torch.cat((rotations[:, 0, 1], (rotations[:, 1:] - self._eye).flatten(1)), 1)
 
 
 def style_shape(betas: Tensor, style: Tensor | None) -> Tensor:

@@ -35,9 +35,11 @@ class Perceptron(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Shape (B, I) -> (B, O)."""
         x = (x - self.shift) * self.scale
-        for layer in self.layers[:-1]:
-            x = functional.dropout(self.activation(layer(x)), self.dropout, self.training)
-        out: Tensor = self.layers[-1](x)
+        *hidden, last = self.layers
+        for layer in hidden:
+            x = self.activation(layer(x))
+            x = functional.dropout(x, self.dropout) if self.training else x
+        out: Tensor = last(x)
         return out
 
 
@@ -85,9 +87,8 @@ class StackedPerceptrons(nn.Module):
         layers = selected or list(zip(self.weights, self.biases, strict=True))
         h = ((x - self.shift) * self.scale).expand(mixture.shape[1], -1, -1)  # (K, B, I)
         for weight, bias in layers[:-1]:
-            h = functional.dropout(
-                self.activation(torch.baddbmm(bias[:, None], h, weight)), self.dropout, self.training
-            )
+            h = self.activation(torch.baddbmm(bias[:, None], h, weight))
+            h = functional.dropout(h, self.dropout) if self.training else h
         weight, bias = layers[-1]
         # Mixing before the last layer makes one product of it, and no (K, B, O) array, large with dense heads.
         mixed = (h * mixture.T[..., None]).transpose(0, 1).flatten(1)  # (B, K * H)

@@ -185,8 +185,11 @@ class _CompactLatent(nn.Module):
 
     def __init__(self, m: int, n: int, d: int) -> None:
         super().__init__()
-        self.embedding = nn.Parameter(torch.randn(n, d))
+        self.embedding = nn.Parameter(torch.empty(n, d))
         self.projection = nn.Linear(m, d)
+        if self.embedding.is_meta:  # where only sizes are tried out, `normal_` makes torch import all of its compiler
+            return
+        nn.init.normal_(self.embedding)
         # Starts at what all poses have in common.
         nn.init.normal_(self.projection.weight, std=0.1 / math.sqrt(m))
         nn.init.ones_(self.projection.bias)
