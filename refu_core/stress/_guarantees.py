@@ -123,33 +123,37 @@ def buried(subject: Subject, trial: Trial) -> Measurement:
 
 
 def not_thrown(subject: Subject, trial: Trial) -> Measurement:
-    """How far vertices are moved, against how far the deepest one near each is from the margin.
+    """How far vertices are moved off the body, against how far the deepest one near each is from the margin.
 
     Where the body touches itself the way out of it may be longer: there it is bounded by `MAX_DISPLACEMENT` alone.
     """
-    (out,) = subject.pipeline(trial.frames)
-    sdf = subject.distances["exact"]
-    sdf.update(torch.from_numpy(out.body))
-    is_free = subject.contacts.detect(out.body).is_free
-    worst = Measurement(nan=_not_finite(out))
-    for name, mesh in out.items():
+    worst = Measurement()
+    for name, pipeline in subject.one_by_one.items():
+        (out,) = pipeline(trial.frames)
+        mesh = out[name]
+        sdf = subject.distances["exact"]
+        sdf.update(torch.from_numpy(out.body))
         moved = np.linalg.norm(mesh.local - mesh.raw, axis=1)
-        lack = np.maximum(DEFAULT_MARGIN - sdf.query(torch.from_numpy(mesh.raw)).distance.numpy(), 0)
-        edges = subject.pipeline.garments[name].edges.numpy()
-        limit = MULTIPLE * (_largest_near(lack, edges) + DEFAULT_MARGIN)
-        limit = np.minimum(limit, MAX_DISPLACEMENT) if is_free else np.full_like(moved, MAX_DISPLACEMENT)
+        limit = np.full_like(moved, MAX_DISPLACEMENT)
+        if subject.contacts.detect(out.body).is_free:
+            lack = np.maximum(DEFAULT_MARGIN - sdf.query(torch.from_numpy(mesh.raw)).distance.numpy(), 0)
+            near = _largest_near(lack, pipeline.garments[name].edges.numpy())
+            limit = np.minimum(limit, MULTIPLE * (near + DEFAULT_MARGIN))
         limit = limit + _BOUND_SLACK
         i = int(np.argmax(moved / limit))
-        found = Measurement(nan=worst.nan, deviation=float(moved[i]), limit=float(limit[i]))
-        worst = max(worst, found, key=lambda measured: measured.badness)
+        found = Measurement(nan=worst.nan + _not_finite(out), deviation=float(moved[i]), limit=float(limit[i]))
+        worst = max(replace(worst, nan=found.nan), found, key=lambda measured: measured.badness)
     return worst
 
 
 def bounded(subject: Subject, trial: Trial) -> Measurement:
     """The largest displacement against `MAX_DISPLACEMENT`, whatever the frame."""
-    (out,) = subject.pipeline(trial.frames)
-    moved = max(float(np.linalg.norm(mesh.local - mesh.raw, axis=1).max()) for mesh in out.values())
-    return Measurement(nan=_not_finite(out), deviation=moved, limit=MAX_DISPLACEMENT + _BOUND_SLACK)
+    moved, nan = 0.0, 0
+    for name, pipeline in subject.one_by_one.items():
+        (out,) = pipeline(trial.frames)
+        moved = max(moved, float(np.linalg.norm(out[name].local - out[name].raw, axis=1).max()))
+        nan += _not_finite(out)
+    return Measurement(nan=nan, deviation=moved, limit=MAX_DISPLACEMENT + _BOUND_SLACK)
 
 
 def no_jumps(subject: Subject, trial: Trial) -> Measurement:

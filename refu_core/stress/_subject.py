@@ -72,11 +72,23 @@ class Subject:
         self._weights = weights
         self.pipeline = self.load()
 
-    def load(self) -> GarmentPipeline:
-        """A pipeline that has never seen a frame."""
+    def load(self, *garments: str) -> GarmentPipeline:
+        """A pipeline that has never seen a frame, of these garments or all."""
         return GarmentPipeline.load(
-            self.wardrobe.garments, backbone=self.wardrobe.backbone, sdf=self.wardrobe.sdf, weights=self._weights
+            garments or self.wardrobe.garments,
+            backbone=self.wardrobe.backbone,
+            sdf=self.wardrobe.sdf,
+            weights=self._weights,
         )
+
+    @property
+    def one_by_one(self) -> dict[str, GarmentPipeline]:
+        """A pipeline for each garment: worn together, they are lifted off each other, too."""
+        return self._alone if len(self.wardrobe.garments) > 1 else {self.wardrobe.garments[0]: self.pipeline}
+
+    @cached_property
+    def _alone(self) -> dict[str, GarmentPipeline]:
+        return {name: self.load(name) for name in self.wardrobe.garments}
 
     @cached_property
     def checker(self) -> CollisionChecker:
