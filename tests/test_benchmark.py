@@ -27,6 +27,8 @@ from refu_core.benchmark import (
     processor_clock,
     sdf_methods,
 )
+from refu_ros.benchmark import BenchmarkResult, Row
+from refu_ros.benchmark._goals import goals
 from refu_ros.benchmark._inputs import read_stretches, sdf_frame
 from refu_ros.benchmark._meshes import resized
 from refu_ros.benchmark._published import published
@@ -243,5 +245,41 @@ def test_stretches_follow_each_other_at_thirty_hertz(tmp_path: Path) -> None:
         read_stretches(tmp_path, BAGS, count=3, length=5)
 
 
+def test_goals_are_about_the_main_garment_and_both_directions() -> None:
+    result = BenchmarkResult("refu benchmark", quick=False)
+
+    def add(stage: str, mode: str, ratio: float, garment: str = SHORTS, **facts: Any) -> None:
+        result.rows.append(Row(stage=stage, mode=mode, garment=garment, ms_median=1.0, ratio=ratio, **facts))
+
+    add("frame", "accurate", 0.9)
+    add("frame", "accurate", 9.0, garment="tshirt-male")
+    add("frame", "hybrid", 0.8)
+    add("frame", "paper", 99.0, figures={"times_accurate": 150.0, "times_hybrid": 50.0})
+    found = {goal.name: goal.is_reached for goal in goals(result)}
+    assert found == {
+        "accurate: whole frame, ratio to the plain query alone": True,
+        "accurate: times as fast as the paper's structure": True,
+        "hybrid: whole frame, ratio to the plain query alone": False,
+        "hybrid: times as fast as the paper's structure": False,
+    }
+    result.quick = True
+    assert not goals(result)
+
+
 def test_published_times_are_those_of_the_abstract() -> None:
     assert {one.mode: round(one.ms, 1) for one in published()} == {"approx": 22.6, "hybrid": 22.6, "accurate": 126.3}
+
+
+def test_an_interrupted_run_keeps_what_it_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    weights = tmp_path / "no weights"
+    weights.mkdir()
+
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("refu_ros.benchmark._sections.measure_sdfs", interrupt)
+    options = ("--quick", "--device", "cpu", "--garments", SHORTS, "--bags", BAGS, "--weights", weights)
+    assert run(*options, "--output", tmp_path) == 130
+    result = json.loads((tmp_path / "performance.json").read_text())
+    assert result["interrupted"]
+    assert {row["stage"].partition(".")[0] for row in result["rows"]} == {"frame"}
