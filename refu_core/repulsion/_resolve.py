@@ -15,8 +15,9 @@ from refu_core.repulsion._unit import DEFAULT_MARGIN, MAX_DISPLACEMENT, repulse
 from refu_core.sdf import BodySdf, SdfSample
 
 RETREAT_STEPS = 8
-BENT = 0.9
-"""Cosine between the skin's normals below its ends under which an edge may cut a corner."""
+BULGE = 0.375
+"""How far skin is expected to bulge to the middle of an edge, a length of the edge and a radian between the normals
+below its ends: three times as far as a circle does."""
 SURE = 4e-3
 """How far beyond the margin a distance is trusted to be one from the body [m]. Where a body runs into itself it jumps:
 a vertex within an arm may be said to be 2 cm outside of the flank that the arm is in."""
@@ -95,7 +96,8 @@ def resolve(
     state = _State(
         vertices=points.clone(),
         distance=start.distance.clone(),
-        gradient=start.gradient.clone(),
+        # Beyond a band nothing is known.
+        gradient=start.gradient.clone() if start.face is None else start.gradient * (start.face >= 0)[:, None],
         near=None if near is None else start.face.clone() if start.face is not None else near,
         origin=points,
         sdf=sdf,
@@ -136,7 +138,7 @@ class _State:
     vertices: Tensor
     distance: Tensor
     gradient: Tensor
-    """Of the distance; beyond the margin it may be that of an earlier place."""
+    """Of the distance; beyond the margin it may be that of an earlier place, or zero where it isn't known."""
     near: Tensor | None
     """Closest face of each vertex as last known, where the distance asks for such hints."""
     origin: Tensor
@@ -296,20 +298,21 @@ def _retreat(state: _State, rows: Tensor, outward: Tensor, limbs: Limbs, max_pus
 def _raise_edges(state: _State, edges: Tensor, max_rounds: int) -> int:
     """Raises both ends of the edges whose middle is closer to the body than half the margin; returns the rounds.
 
-    Only edges with an end at the margin are looked at: skin would have to bulge by more than the margin between two
-    vertices further off, as only a finger does. And of these the ones whose ends are above different sides of the body,
-    and so short of it that the middle may be too low.
+    The middle is no lower than either end by more than half the edge's length, whatever the skin is like. Most edges at
+    the margin are longer than that can clear; of these the ones are asked for that skin may reach which bulges between
+    their ends as the normals there say, or more: around an elbow, a shoulder, a hand, and between two limbs.
     """
     wanted = 0.5 * state.margin
     ends = state.distance[edges]
-    closer, farther = ends.amin(dim=1), ends.amax(dim=1)
-    low = torch.nonzero((closer < state.margin + state.tolerance) & (closer >= 0))[:, 0]
-    first, second = edges[low].unbind(1)
+    first, second = edges.unbind(1)
     length = torch.linalg.vector_norm(state.vertices[first] - state.vertices[second], dim=-1)
-    is_bent = (state.gradient[first] * state.gradient[second]).sum(-1) < BENT
-    low = edges[low[is_bent & (farther[low] < wanted + 0.5 * length)]]
+    bulge = BULGE * length * torch.linalg.vector_norm(state.gradient[first] - state.gradient[second], dim=-1)
+    bulge *= state.gradient.any(dim=-1)[edges].all(dim=1)
+    may_be_low = (ends.amax(dim=1) < wanted + 0.5 * length) & (ends.mean(dim=1) < wanted + bulge)
+    low = edges[may_be_low & (ends.amin(dim=1) >= 0)]
     for round_ in range(max_rounds):
-        middle = state.query(state.vertices[low].mean(dim=1), low[:, 0])
+        closer = low.gather(1, state.distance[low].argmin(dim=1, keepdim=True))[:, 0]
+        middle = state.query(state.vertices[low].mean(dim=1), closer)
         is_low = middle.distance < wanted
         if not bool(is_low.any()):
             return round_

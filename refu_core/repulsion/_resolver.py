@@ -15,7 +15,7 @@ from refu_core.repulsion import _resolver_kernels as kernels
 from refu_core.repulsion._blend import BLEND_ROUNDS
 from refu_core.repulsion._limbs import INWARD, SIDEWAYS, Limbs
 from refu_core.repulsion._mend import DEEP, FARTHEST, LOOKS, ROUNDS, STEP_ON, STEPS, TOLERANCE
-from refu_core.repulsion._resolve import BENT, RETREAT_STEPS, SURE, Resolution
+from refu_core.repulsion._resolve import BULGE, RETREAT_STEPS, SURE, Resolution
 from refu_core.repulsion._scale import VertexScale
 from refu_core.repulsion._unit import DEFAULT_MARGIN, MAX_DISPLACEMENT
 from refu_core.sdf import ApproxSdf, BandSdf, ExactSdf, SdfSample
@@ -48,6 +48,8 @@ class Resolver:
         self._deficit = torch.zeros(e, device=self.device)
         self._rise = torch.zeros(e, 3, device=self.device)
         self._counts = torch.zeros(kernels.N_COUNTS + 2 * _N_LIMBS, dtype=torch.int32, device=self.device)
+        # On a CPU the same memory; reading a number from it costs nothing.
+        self._read_counts = self._counts.numpy() if self.device.type == "cpu" else None
         self._sheet = self._bind_sheet()
         self._commands: dict[str, Any] = {}
         self._recorded_for: tuple[Any, ...] = ()
@@ -151,7 +153,7 @@ class Resolver:
         return _MAX_PUSHES
 
     def _count(self, which: int) -> int:
-        return int(self._counts[which])
+        return int(self._read_counts[which] if self._read_counts is not None else self._counts[which])
 
     def _run(self, name: str, n: int, parameter: tuple[int, int] | None = None) -> None:
         """Launches a step for `n` of its list, with one of its parameters, by position, set anew."""
@@ -235,7 +237,7 @@ def _rules(margin: float) -> Any:
         _MAX_PUSHES,
     )
     rules.contradiction, rules.step_on, rules.deep, rules.sure = TOLERANCE, STEP_ON, DEEP, SURE
-    rules.sideways, rules.inward, rules.farthest, rules.bent = SIDEWAYS, INWARD, FARTHEST, BENT
+    rules.sideways, rules.inward, rules.farthest, rules.bulge = SIDEWAYS, INWARD, FARTHEST, BULGE
     rules.retreats, rules.turns = RETREAT_STEPS, STEPS
     return rules
 

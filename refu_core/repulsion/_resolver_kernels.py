@@ -72,7 +72,7 @@ class Rules:
     inward: wp.float32
     farthest: wp.float32
     sure: wp.float32
-    bent: wp.float32
+    bulge: wp.float32
     retreats: wp.int32
     turns: wp.int32
 
@@ -185,6 +185,8 @@ def begin_kernel(sheet: Sheet):
     """Everybody where it is."""
     i = wp.tid()
     keep(i, sheet.origin[i], sheet.first[i], sheet.first_gradient[i], sheet.first_face[i], sheet)
+    if sheet.first_face[i] < 0:
+        sheet.gradient[i] = wp.vec3()  # beyond a band nothing is known
     sheet.role[i] = FREE
 
 
@@ -505,23 +507,27 @@ def look_between(edge: int, sheet: Sheet, cloth: Cloth, skin: Skin, rules: Rules
     """How much the middle of an edge lacks of half the margin [m], and the way up there."""
     a = cloth.edges[edge, 0]
     b = cloth.edges[edge, 1]
-    distance, gradient, _face = ask(skin, 0.5 * (sheet.place[a] + sheet.place[b]), sheet.face[a])
+    # Beyond a band no face is known; a known one makes the answer cheap.
+    near = wp.where(sheet.distance[a] <= sheet.distance[b], sheet.face[a], sheet.face[b])
+    distance, gradient, _face = ask(skin, 0.5 * (sheet.place[a] + sheet.place[b]), near)
     return 0.5 * rules.margin - distance, gradient
 
 
 @wp.kernel(enable_backward=False)
 def suspect_kernel(sheet: Sheet, cloth: Cloth, rules: Rules, suspects: wp.array(dtype=int)):
-    """Lists the edges whose middle may be closer to the skin than half the margin (`resolve`'s argument)."""
+    """Lists the edges whose middle may be closer to the skin than half the margin (`_raise_edges`)."""
     edge = wp.tid()
     a = cloth.edges[edge, 0]
     b = cloth.edges[edge, 1]
-    closer = wp.min(sheet.distance[a], sheet.distance[b])
-    if closer >= rules.margin + rules.tolerance or closer < 0.0:
-        return
+    first = sheet.distance[a]
+    second = sheet.distance[b]
     length = wp.length(sheet.place[a] - sheet.place[b])
-    if wp.max(sheet.distance[a], sheet.distance[b]) >= 0.5 * (rules.margin + length):
+    if wp.min(first, second) < 0.0 or wp.max(first, second) >= 0.5 * (rules.margin + length):
         return
-    if wp.dot(sheet.gradient[a], sheet.gradient[b]) < rules.bent:
+    bulge = float(0.0)
+    if sheet.face[a] >= 0 and sheet.face[b] >= 0:
+        bulge = rules.bulge * length * wp.length(sheet.gradient[a] - sheet.gradient[b])
+    if 0.5 * (first + second) < 0.5 * rules.margin + bulge:
         suspects[wp.atomic_add(sheet.counts, CUTTING, 1)] = edge
 
 

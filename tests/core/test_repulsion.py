@@ -178,6 +178,20 @@ def test_edges_are_raised_over_a_ridge() -> None:
     assert float(sdf.query(with_edges.vertices.mean(0, keepdim=True)).distance) >= 0.0024
 
 
+def test_edges_across_something_round_are_raised_whose_ends_are_beyond_the_margin() -> None:
+    """As over a finger: 1 cm thick on either side, the ends 6 mm off it, the middle 1 mm."""
+    import trimesh
+
+    mesh = trimesh.creation.icosphere(subdivisions=4, radius=0.01)
+    sdf = ExactSdf(mesh.faces)
+    sdf.update(torch.tensor(mesh.vertices, dtype=torch.float32))
+    ends = torch.tensor([[-0.012, 0.011, 0.0], [0.012, 0.011, 0.0]])
+    assert float(sdf.query(ends).distance.min()) > 0.006
+    done = resolve(ends, sdf, margin=0.004, edges=torch.tensor([[0, 1]]))
+    assert float(sdf.query(done.vertices.mean(0, keepdim=True)).distance) == pytest.approx(0.002, abs=1e-4)
+    torch.testing.assert_close(done.vertices, ends + torch.tensor([0.0, 0.001, 0.0]), atol=2e-4, rtol=0)
+
+
 GARMENTS = ("shirt-male", "tshirt-male", "short-pant-male", "skirt-female")
 
 
