@@ -70,6 +70,19 @@ def test_the_largest_numbers_that_are_not_refused_end_in_finite_time(seed: int) 
         assert all(np.isfinite(mesh.vertices).all() for mesh in out.values())
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_turned_persons_wear_the_same_where_limbs_run_into_each_other(seed: int, subject: Subject) -> None:
+    """In world axes a turn made 11 cm of difference to a vertex of the mode hybrid, and 3 mm to one of accurate.
+
+    What is left with a network is the rounding of gravity's direction, which may decide anew at a threshold.
+    """
+    (check,) = (check for check in CHECKS if check.name == "invariance: the person turned")
+    frame = FRAMES["limbs through the trunk"](np.random.default_rng(seed))
+    measured = check.run(subject, Trial((frame,), seed))
+    limit = measured.limit if subject.wardrobe.backbone == "skinned" else DEFAULT_MARGIN
+    assert measured.deviation < limit, measured
+
+
 def test_classes_of_frames_are_what_they_say() -> None:
     rng = np.random.default_rng(0)
     angles = {name: np.linalg.norm(draw(rng).pose, axis=1) for name, draw in FRAMES.items() if name != "absurd"}
