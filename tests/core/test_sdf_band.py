@@ -143,6 +143,23 @@ def test_query_is_the_exact_one(seed: int, n: int, spread: float) -> None:
     torch.testing.assert_close(got.distance, wanted.distance, atol=1e-6, rtol=1e-6)
 
 
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 2**31), n=st.integers(1, 3000), spread=st.sampled_from([0.2, 0.5, 5.0, 1e4]))
+def test_a_face_said_to_be_near_is_a_hint_only(seed: int, n: int, spread: float) -> None:
+    """Any face, near or not: nothing closer is missed, by a tree built for whatever pose."""
+    _, exact = posed_ball()
+    body = torch.tensor(BALL.vertices, dtype=torch.float32)
+    band = BandSdf(BALL.faces, rest=body * torch.tensor([0.2, 3.0, 1.0]))
+    band.update(body)
+    generator = torch.Generator().manual_seed(seed)
+    points = torch.randn(n, 3, generator=generator) * spread
+    wanted = exact.query(points)
+    for near in (torch.randint(len(BALL.faces), (n,), generator=generator), wanted.face):
+        for sdf in (band, exact):
+            got = sdf.query(points, near=near)
+            torch.testing.assert_close(got.distance, wanted.distance, atol=1e-6, rtol=1e-6)
+
+
 def test_places_that_share_a_cell() -> None:
     """Cells repeat after 128 of 16 mm along x and 64 along y and z; a ball there isn't a ball here."""
     band, exact = posed_ball()
