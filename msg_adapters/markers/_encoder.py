@@ -210,7 +210,7 @@ class MarkerArrayEncoder:
         mesh = slot.mesh
         if (slot.colors is None) != (colors is None):
             wanted = "no vertex colours" if slot.colors is None else f"vertex colours ({mesh.n_vertices}, 4)"
-            msg = f"{mesh.ns}: wanted {wanted}, got {'none' if colors is None else np.shape(colors)}"
+            msg = f"{mesh.ns}: wanted {wanted}, got {'none' if colors is None else 'some'}"
             raise EncodeError(msg)
         if slot.colors is None:
             return

@@ -87,13 +87,22 @@ def test_bad_input_is_counted_and_harms_nobody(scene: Peer) -> None:
     assert all(np.isfinite(marker.points).all() for markers in scene.garments for marker in markers)
 
 
-def test_a_burst_leaves_no_backlog(scene: Peer) -> None:
-    for i in range(2000):
-        scene.send(frame(i, stamp_ns=50 * 10**9 + i), "ann")
+def test_ten_thousand_messages_at_once_leave_no_backlog(scene: Peer) -> None:
+    """Half of them hostile: nothing is queued, what is bad is counted, and the next good frame is dressed."""
+    received, invalid = scene.count("input", "received"), scene.count("input", "dropped: invalid")
+    bad = hostile()
+    encode = encoder_for("joint_state")
+    burst = [encode(frame(i, stamp_ns=50 * 10**9 + i)) for i in range(50)]
+    for i in range(10_000):
+        scene.send_raw(bad[i // 2 % len(bad)] if i % 2 else burst[i // 2 % len(burst)], "ann")
     scene.garments.clear()
     marker = scene.dress(frame(3), "ann")
     assert marker.stamp_ns == frame(3).stamp_ns
     assert len(scene.garments) < 100
+    assert all(np.isfinite(marker.points).all() for markers in scene.garments for marker in markers)
+    scene.spin_until(lambda: scene.count("input", "received") > received + 10, "what arrived is counted")
+    scene.spin_until(lambda: scene.count("input", "dropped: invalid") > invalid, "what was bad is counted")
+    scene.spin_until(lambda: scene.status("input")[0] < 2, "the burst is forgotten", timeout=30.0)
 
 
 def test_parameters_change_while_frames_flow(scene: Peer) -> None:

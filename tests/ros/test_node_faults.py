@@ -1,0 +1,98 @@
+"""Faults around a running node: a clock that is set back, a subscriber that doesn't read, a second node of one name."""
+
+from __future__ import annotations
+
+import select
+import signal
+import subprocess
+import sys
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="rclpy isn't installed (extra ros): the node isn't tested")
+
+from harness import GARMENTS, NodeProcess, Peer, frame
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")
+
+STALLED = """
+import signal, sys
+import rclpy
+from rclpy.signals import SignalHandlerOptions
+from visualization_msgs.msg import MarkerArray
+rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+node = rclpy.create_node("stalled")
+node.create_subscription(MarkerArray, "garments", lambda data: print("got one", flush=True), 10, raw=True)
+rclpy.spin(node)
+"""
+
+
+@pytest.fixture(scope="module")
+def scene(ros: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Peer]:  # noqa: ARG001
+    """A node for one person in one garment, and its peer."""
+    log = tmp_path_factory.mktemp("node") / "log.txt"
+    parameters = {"input_type": "joint_state", "garments": [GARMENTS[0]], "backbone": "skinned", "sdf": "accurate"}
+    with NodeProcess(log, **parameters) as node:
+        peer = Peer()
+        peer.wait_for_node()
+        yield peer
+        peer.close()
+        assert node.process.poll() is None, node.log
+        assert "Traceback" not in node.log
+
+
+def test_a_clock_set_back_is_reported_and_everybody_stays_dressed(scene: Peer) -> None:
+    ahead, back = frame(1, stamp_ns=10_000 * 10**9), frame(2, stamp_ns=5 * 10**9)
+    scene.dress(ahead)
+    assert scene.dress(back).stamp_ns == back.stamp_ns
+    scene.spin_until(lambda: scene.count("input", "stamps that went back") > 0, "the step back is counted")
+
+
+def test_a_subscriber_that_does_not_read_holds_nobody_up(scene: Peer) -> None:
+    stalled = subprocess.Popen([sys.executable, "-c", STALLED], stdout=subprocess.PIPE, text=True)
+    try:
+        assert stalled.stdout is not None
+        line: list[str] = []
+
+        def reads() -> bool:
+            scene.send(frame(len(scene.garments)))
+            return scene.node.count_subscribers("garments") >= 2
+
+        scene.spin_until(reads, "the second subscriber is there", timeout=40.0)
+        while not line:
+            scene.send(frame(len(scene.garments)))
+            scene.spin(0.1)
+            if select.select([stalled.stdout], [], [], 0)[0]:
+                line.append(stalled.stdout.readline())
+        stalled.send_signal(signal.SIGSTOP)
+        scene.garments.clear()
+        for i in range(40):  # eight times what the publisher keeps for who is slow
+            marker = scene.dress(frame(i, stamp_ns=20_000 * 10**9 + i))
+            assert np.isfinite(marker.points).all()
+        assert scene.status("garments")[0] < 2
+    finally:
+        stalled.kill()
+        stalled.wait()
+        if stalled.stdout is not None:
+            stalled.stdout.close()
+
+
+def test_a_second_node_of_the_name_is_reported_by_both(scene: Peer, tmp_path: Path) -> None:
+    with NodeProcess(tmp_path / "log.txt", input_type="joint_state", garments=[GARMENTS[0]], sdf="accurate") as second:
+        scene.spin_until(
+            lambda: "2 nodes have this name" in scene.status("garments")[1], "the twin is seen", timeout=60.0
+        )
+        scene.dress(frame(50))
+        scene.spin_until(lambda: "2 nodes are called" in second.log, "the second one says so, too")
+        assert second.stop(signal.SIGINT) == 0, second.log
+    scene.diagnostics.clear()
+    scene.spin_until(
+        lambda: scene.diagnostics and "2 nodes" not in scene.status("garments")[1], "the twin is gone", timeout=60.0
+    )
+    scene.dress(frame(51))
