@@ -17,6 +17,8 @@ from refu_core.stress._trial import Check, Measurement, Trial
 
 ROUNDING = 5e-6
 """What float32 may cost a body of a metre or two [m]: fifty times its resolution there."""
+PIVOTS = 2e-3
+"""Share of the largest displacement that pivots which weigh 0.1 % may make: they may point the other way."""
 _DISTANCE_ROUNDING = 2e-6
 _FRAMES = 32
 _POINTS = 24
@@ -57,18 +59,20 @@ def _standing(rng: np.random.Generator) -> Trial:
 def against_float64(subject: Subject, trial: Trial) -> Measurement:
     """Bodies and garments before collision handling, in float32 and in float64; and the whole pipeline for the first.
 
-    The limit grows with the size of what is computed, and with the angles: float32 holds 1,000 rad to 6e-5.
+    The limit grows with the size of what is computed, and with the angles: float32 holds 1,000 rad to 6e-5. What
+    TailorNet leaves out of its mixture in a pipeline, a thousandth of a displacement, is no matter of precision.
     """
     out = subject.pipeline(trial.frames[0])
     first = [out.body, *(mesh.raw for mesh in out.values())]
     ours, wanted = subject.in_float32(trial.frames), subject.in_float64(trial.frames)
     finite = [n_not_finite(*first, *(mesh.vertices for mesh in out.values())), n_not_finite(*ours)]
+    left_out = PIVOTS * subject.in_float64.largest_displacement
     turn = 1 + np.array([np.linalg.norm(frame.pose, axis=1).max() for frame in trial.frames]) / np.pi
     deviation = np.zeros(len(trial.frames))
     limit = np.zeros_like(deviation)
     for got, whole, right in zip(ours, first, wanted, strict=True):
         error = np.abs(got - right).max((1, 2))
-        error[0] = max(error[0], np.abs(whole - right[0]).max())
+        error[0] = max(error[0], np.abs(whole - right[0]).max() - left_out)
         limit = np.maximum(limit, ROUNDING * turn * np.abs(right).max((1, 2), initial=1.0))
         deviation = np.maximum(deviation, error)
     culprit = int(np.argmax(deviation / limit))

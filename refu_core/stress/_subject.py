@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from refu_core.backbones import load_backbone
+from refu_core.backbones import TailorNet, load_backbone
 from refu_core.errors import RefuError
 from refu_core.evaluation import CollisionChecker, SelfContactDetector
 from refu_core.frames import N_STYLES, SmplFrame
@@ -149,7 +149,11 @@ class Prediction:
             network = load_backbone(
                 wardrobe.backbone, garment, mode=wardrobe.sdf, folder=_folder(name, weights), device="cpu"
             )
+            if isinstance(network, TailorNet):
+                network.skips_pivots = False  # a pivot at the threshold would be left out in one precision only
             self._backbones[name] = network.to(dtype) if isinstance(network, torch.nn.Module) else network
+        self.largest_displacement = 0.0
+        """Largest coordinate of a backbone's displacement in the last call [m]."""
 
     @torch.no_grad()
     def __call__(self, frames: Sequence[SmplFrame]) -> list[NDArray[np.floating]]:
@@ -164,11 +168,13 @@ class Prediction:
             style = torch.as_tensor(np.stack(own)).to(self._dtype)
         posed = self._body(pose, betas)
         vertices = [posed.vertices.numpy()]
+        self.largest_displacement = 0.0
         for name, garment in self._garments.items():
             unposed = garment.rest(betas, style)
             displacement = self._backbones[name](betas, pose, style).displacement
             if displacement is not None:
                 unposed = unposed + displacement
+                self.largest_displacement = max(self.largest_displacement, float(displacement.abs().max()))
             vertices.append(garment.pose(unposed, posed.transforms).numpy())
         return vertices
 
