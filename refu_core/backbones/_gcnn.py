@@ -40,7 +40,9 @@ class GcnnConfig:
     def __post_init__(self) -> None:
         """Raises `WeightsError` for graphs that would take for ever to make."""
         if not 1 <= self.stride <= _MOST_STRIDE or not 1 <= len(self.channels) <= _MOST_LEVELS:
-            msg = f"wanted strides to {_MOST_STRIDE}, {_MOST_LEVELS} channels at most, got {self.stride}, {self.channels}"
+            msg = (
+                f"wanted strides to {_MOST_STRIDE}, {_MOST_LEVELS} channels at most, got {self.stride}, {self.channels}"
+            )
             raise WeightsError(msg)
 
     @classmethod
