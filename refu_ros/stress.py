@@ -18,7 +18,7 @@ from refu_ros.tables import format_table
 
 MODES: tuple[tuple[str, str], ...] = (("skinned", "accurate"), ("tailornet", "hybrid"))
 """Backbone and signed distance of the modes that are tried if none is named."""
-_ROUNDS = 6
+_ROUNDS = 3
 _QUICK_ROUNDS = 1
 _FRAMES = 3_000
 _QUICK_FRAMES = 200
