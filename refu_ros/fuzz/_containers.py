@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     import random
 
 _CHUNK = 0x06
+_MOST_UNPACKED = 1 << 15
+_COMPRESSOR = zstandard.ZstdCompressor(level=1)
 _MAGIC = b"\x89MCAP0\r\n"
 _HEADERS = [b"(1000000000000,)", b"(100000, 100000)", b"(-1, 72)", b"(2, 72, 0)", b"()", b"(True, 72)", b"(" * 500]
 _DTYPES = [
@@ -176,16 +178,20 @@ def join_mcap(records: list[tuple[int, bytes]]) -> bytes:
 
 def mcap_chunk(records: bytes, *, claimed: int | None = None) -> bytes:
     """The content of a chunk of these records, which claims to unpack to `claimed` bytes."""
-    packed = zstandard.ZstdCompressor().compress(records)
+    packed = _COMPRESSOR.compress(records)
     head = struct.pack("<QQQI", 0, 1, len(records) if claimed is None else claimed, zlib.crc32(records))
     return head + struct.pack("<I", 4) + b"zstd" + struct.pack("<Q", len(packed)) + packed
 
 
 def _mutate_chunk(rng: random.Random, content: bytes) -> bytes:
     try:
-        (name,) = struct.unpack_from("<I", content, 28)
+        size, _, name = struct.unpack_from("<QII", content, 16)
+        if size > _MOST_UNPACKED:
+            return mutate_bytes(rng, content)
         packed = content[32 + name + 8 :]
-        records = packed if not name else zstandard.ZstdDecompressor().decompress(packed, max_output_size=1 << 20)
+        records = (
+            packed if not name else zstandard.ZstdDecompressor().decompress(packed, max_output_size=_MOST_UNPACKED)
+        )
     except (struct.error, zstandard.ZstdError):
         return mutate_bytes(rng, content)
     claimed = rng.choice(INTEGERS) if rng.random() < 0.1 else None

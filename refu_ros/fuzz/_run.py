@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import itertools
 import mmap
 import multiprocessing
 import os
@@ -97,6 +98,8 @@ class FuzzRow:
 def fuzz(options: FuzzOptions, *, report: Callable[[FuzzRow], None] | None = None) -> list[FuzzRow]:
     """Fuzzes targets, one after another; `report` gets each one's figures every half second.
 
+    An interrupt (Ctrl-C) ends it early, with the figures so far.
+
     Raises `RefuError` for a target that doesn't exist.
     """
     unknown = [name for name in options.targets if name not in TARGETS]
@@ -106,20 +109,25 @@ def fuzz(options: FuzzOptions, *, report: Callable[[FuzzRow], None] | None = Non
     targets = [TARGETS[name] for name in options.targets or TARGETS]
     rows = {target.name: FuzzRow(target.name, target.what) for target in targets}
     end = None if options.hours is None else time.monotonic() + 3600 * options.hours
-    for round_number in range(1_000_000):
-        for target in targets:
-            row = rows[target.name]
-            wanted = row.executions + (options.executions or target.executions)
-            seed = options.seed + 1_000_003 * round_number
-            while row.executions < wanted:
-                if _run_process(target, row, wanted - row.executions, seed, options.output, report):
-                    break
-                seed += 1  # the process has died: on with other input
-            if end is not None and time.monotonic() > end:
-                return list(rows.values())
-        if end is None:
-            break
+    with contextlib.suppress(KeyboardInterrupt):
+        for round_number in itertools.count():
+            for target in targets:
+                _run_target(target, rows[target.name], options, options.seed + 1_000_003 * round_number, report)
+                if end is not None and time.monotonic() > end:
+                    return list(rows.values())
+            if end is None:
+                break
     return list(rows.values())
+
+
+def _run_target(
+    target: Target, row: FuzzRow, options: FuzzOptions, seed: int, report: Callable[[FuzzRow], None] | None
+) -> None:
+    wanted = row.executions + (options.executions or target.executions)
+    while row.executions < wanted:
+        if _run_process(target, row, wanted - row.executions, seed, options.output, report):
+            return
+        seed += 1  # the process has died: on with other input
 
 
 def fuzz_target(target: Target, executions: int, *, seed: int = 0, guard: Guard | None = None) -> FuzzRow:
