@@ -174,6 +174,9 @@ class GarmentNode(LifecycleNode):  # type: ignore[misc]
             return
         self._statistics.receive()
         self._record(topic, self._input_type, data, _INPUT_QOS)
+        if not (self.watched() or self.body_watched()):
+            self._statistics.skip("unwatched")
+            return
         try:
             frame = self._decoder.from_bytes(data)
             if frame.stamp_ns == 0:  # the message has no header, or an empty one: when it came is the best there is

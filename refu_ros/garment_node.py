@@ -6,7 +6,7 @@ import signal
 import sys
 import threading
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -25,7 +25,6 @@ def main(args: Sequence[str] | None = None) -> int:
 
     import rclpy
     from rclpy.exceptions import ParameterException
-    from rclpy.executors import SingleThreadedExecutor
     from rclpy.signals import SignalHandlerOptions
 
     from refu_core import RefuError
@@ -41,7 +40,7 @@ def main(args: Sequence[str] | None = None) -> int:
         try:
             if node.settings.autostart and not _started(node):
                 return EXIT_BAD_PARAMETERS
-            executor = SingleThreadedExecutor()
+            executor = _executor()
             executor.add_node(node)
             while not (stop.is_set() or node.finalized):
                 executor.spin_once(timeout_sec=0.1)
@@ -54,6 +53,18 @@ def main(args: Sequence[str] | None = None) -> int:
             node.destroy_node()
     finally:
         rclpy.try_shutdown()
+
+
+def _executor() -> Any:
+    """What waits for messages, requests and timers."""
+    try:
+        # Waits in C++ for events: the other one tells the middleware anew, in Python, what it waits for after each.
+        from rclpy.experimental import EventsExecutor
+    except ImportError:  # an older rclpy
+        from rclpy.executors import SingleThreadedExecutor
+
+        return SingleThreadedExecutor()
+    return EventsExecutor()
 
 
 def _started(node: object) -> bool:
