@@ -51,7 +51,7 @@ def normal_at(v: int, points: wp.array(dtype=wp.vec3), cut: Cut):
 
 @wp.func
 def nearest_vertex(p: wp.vec3, start: int, points: wp.array(dtype=wp.vec3), cut: Cut):
-    """The vertex that is downhill from `start`: none of its neighbours is nearer to p."""
+    """The vertex downhill from `start`: none of its neighbours is nearer to p."""
     v = int(start)
     squared = wp.length_sq(points[v] - p)
     for _step in range(MOST_STEPS):
@@ -122,6 +122,7 @@ def lift_kernel(
     above: wp.array(dtype=wp.vec3),
     above_cut: Cut,
     candidates: wp.array(dtype=int),
+    near_start: wp.array(dtype=int),
     near: wp.array(dtype=int),
     rules: LayerRules,
     # outputs, by candidate
@@ -131,17 +132,27 @@ def lift_kernel(
 ):
     """What brings each candidate to the gap above the sheet, and how many they are that lack something.
 
-    `near` is a vertex of the sheet to look from, `found` the one that was come to.
+    The vertices of the sheet to look from are `near[near_start[k]:near_start[k + 1]]`; `found` is the one come to.
     """
     k = wp.tid()
     i = candidates[k]
     p = above[i]
     push[k] = wp.vec3(0.0, 0.0, 0.0)
 
-    v = nearest_vertex(p, near[k], below, below_cut)
+    v = int(near[near_start[k]])
+    if v < 0:  # too far away the last time
+        return
+    squared = float(wp.inf)
+    for n in range(near_start[k], near_start[k + 1]):
+        other = wp.length_sq(below[near[n]] - p)
+        if other < squared:
+            squared = other
+            v = near[n]
+    v = nearest_vertex(p, v, below, below_cut)
     found[k] = v
     # No point of a face is farther than its longest edge from its closest corner.
     if wp.length(below[v] - p) > rules.reach + rules.longest:
+        found[k] = -1
         return
     face, feature, w, offset = nearest_face(p, v, below, below_cut)
     if wp.length(offset) > rules.reach:
@@ -155,6 +166,8 @@ def lift_kernel(
         return
     own = normal_at(i, above, above_cut)
     share = wp.clamp(wp.dot(own, normal) / rules.agreement, 0.0, 1.0)
+    # Whatever ends does so gradually, or cloth would jump from frame to frame.
+    share *= wp.min(1.0, 4.0 * (1.0 - wp.length(offset) / rules.reach))
     if (below_cut.rim[face] >> feature) & 1 != 0:
         share *= wp.max(0.0, 1.0 - wp.length(offset - height * normal) / rules.fade)
     if share > 0.0:
