@@ -22,7 +22,10 @@ STEPS = 8
 STEP_ON = 1e-3
 """What is added to each step [m], so that the steps end."""
 FARTHEST = 0.08
-"""A way out of its own that is longer is none [m]."""
+"""A way out of its own that is longer is none [m];"""
+DETOUR = 2.0
+"""nor is one that is longer than this multiple of the depth: there the cloth isn't in the middle of a limb but has been
+folded, and its normal leads a single vertex through a whole thigh, centimetres past all others."""
 
 
 def mend(
@@ -96,15 +99,16 @@ def turn_outward(
     against = (sample.gradient * outward).sum(-1) < 0
     rows = torch.nonzero(against & (sample.distance < -DEEP))[:, 0]
     way, going = -sample.distance[rows], torch.arange(len(rows), device=rows.device)
+    farthest = (DETOUR * way).clamp_max(FARTHEST)
     looks = 0
     while len(going) and looks < STEPS:
         at = rows[going]
         # No skin is nearer than |f|.
         height = query(points[at] + way[going, None] * outward[at], at).distance
         way[going] = way[going] - height + (height < 0) * STEP_ON
-        going = going[(height < 0) & (way[going] < FARTHEST)]
+        going = going[(height < 0) & (way[going] < farthest[going])]
         looks += 1
-    found = torch.ones_like(way, dtype=torch.bool).index_fill(0, going, False) & (way > 0) & (way < FARTHEST)
+    found = torch.ones_like(way, dtype=torch.bool).index_fill(0, going, False) & (way > 0) & (way < farthest)
     rows, way = rows[found], way[found]
     turned = sample._replace(
         distance=sample.distance.index_copy(0, rows, -way), gradient=sample.gradient.index_copy(0, rows, outward[rows])

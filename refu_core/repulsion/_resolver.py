@@ -14,7 +14,7 @@ from refu_core._warp import as_warp, torch_stream
 from refu_core.repulsion import _resolver_kernels as kernels
 from refu_core.repulsion._blend import BLEND_ROUNDS
 from refu_core.repulsion._limbs import INWARD, SIDEWAYS, Limbs
-from refu_core.repulsion._mend import DEEP, FARTHEST, LOOKS, ROUNDS, STEP_ON, STEPS, TOLERANCE
+from refu_core.repulsion._mend import DEEP, DETOUR, FARTHEST, LOOKS, ROUNDS, STEP_ON, STEPS, TOLERANCE
 from refu_core.repulsion._resolve import BULGE, RETREAT_STEPS, SURE, Resolution
 from refu_core.repulsion._scale import VertexScale
 from refu_core.repulsion._unit import DEFAULT_MARGIN, MAX_DISPLACEMENT
@@ -237,7 +237,8 @@ def _rules(margin: float) -> Any:
         _MAX_PUSHES,
     )
     rules.contradiction, rules.step_on, rules.deep, rules.sure = TOLERANCE, STEP_ON, DEEP, SURE
-    rules.sideways, rules.inward, rules.farthest, rules.bulge = SIDEWAYS, INWARD, FARTHEST, BULGE
+    rules.sideways, rules.inward, rules.bulge = SIDEWAYS, INWARD, BULGE
+    rules.farthest, rules.detour = FARTHEST, DETOUR
     rules.retreats, rules.turns = RETREAT_STEPS, STEPS
     return rules
 

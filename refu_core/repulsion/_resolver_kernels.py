@@ -71,6 +71,7 @@ class Rules:
     sideways: wp.float32
     inward: wp.float32
     farthest: wp.float32
+    detour: wp.float32
     sure: wp.float32
     bulge: wp.float32
     retreats: wp.int32
@@ -375,15 +376,16 @@ def aim_kernel(
         # all go along the cloth's normal, as far as that is.
         outward = sheet.outward[i]
         way = -depth
+        farthest = wp.min(rules.farthest, rules.detour * way)
         turned = bool(False)
         for _look in range(rules.turns):
             height, _gradient, _face = ask(skin, sheet.origin[i] + way * outward, sheet.face[i])
             way = way - height
             if height >= 0.0:
-                turned = way > 0.0 and way < rules.farthest
+                turned = way > 0.0 and way < farthest
                 break
             way += rules.step_on
-            if way >= rules.farthest:
+            if way >= farthest:
                 break
         if turned:
             depth = -way
