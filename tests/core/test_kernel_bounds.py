@@ -21,7 +21,7 @@ torch.set_num_threads(1)
 rng = np.random.default_rng(0)
 frames = [SmplFrame(pose=rng.normal(0, 0.4, (24, 3)), betas=rng.normal(size=10)) for _ in range(40)]
 for sdf in ("accurate", "hybrid"):
-    pipeline = GarmentPipeline.load(["tshirt-male"], sdf=sdf, backbone="skinned")
+    pipeline = GarmentPipeline.load(["tshirt-male", "short-pant-male"], sdf=sdf, backbone="tailornet")
     for frame in frames:
         pipeline(frame)
 print("in bounds")
