@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,9 +12,20 @@ from hypothesis import strategies as st
 from refu_core import FrameError, SmplFrame
 from refu_core.frames import MAX_ANGLE, MAX_COEFFICIENT
 from refu_core.repulsion import DEFAULT_MARGIN
-from refu_core.stress import FRAMES, Check, Subject, Trial, Wardrobe, all_checks, distance_to_mesh, mirror_image
+from refu_core.stress import (
+    FRAMES,
+    Check,
+    Subject,
+    Trial,
+    Wardrobe,
+    all_checks,
+    distance_to_mesh,
+    mirror_image,
+    replay_trial,
+)
 
 CHECKS = all_checks()
+WORST = sorted((Path(__file__).parents[1] / "data" / "stress").glob("*.npz"))
 WARDROBES = {
     "skinned/accurate": Wardrobe(garments=("skirt-female",)),
     "tailornet/hybrid": Wardrobe(garments=("tshirt-male",), backbone="tailornet", sdf="hybrid"),
@@ -81,6 +94,13 @@ def test_turned_persons_wear_the_same_where_limbs_run_into_each_other(seed: int,
     measured = check.run(subject, Trial((frame,), seed))
     limit = measured.limit if subject.wardrobe.backbone == "skinned" else DEFAULT_MARGIN
     assert measured.deviation < limit, measured
+
+
+@pytest.mark.parametrize("path", WORST, ids=[path.stem for path in WORST])
+def test_worst_cases_of_refu_stress_that_are_no_more(path: Path) -> None:
+    """Shorts whose fold sent a vertex through the thigh; a turn that the approximate distance felt."""
+    tally = replay_trial(path)
+    assert not tally.failures, tally.as_dict()
 
 
 def test_classes_of_frames_are_what_they_say() -> None:
