@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from refu_core._warp import as_warp, torch_stream
-from refu_core.repulsion import _resolver_kernels as kernels
+from refu_core.repulsion import _edge_kernels, _resolver_kernels, _sheet, _spread_kernels
 from refu_core.repulsion._blend import BLEND_ROUNDS
 from refu_core.repulsion._limbs import INWARD, SIDEWAYS, Limbs
 from refu_core.repulsion._mend import DEEP, DETOUR, FARTHEST, LOOKS, ROUNDS, STEP_ON, STEPS, TOLERANCE
@@ -47,9 +47,10 @@ class Resolver:
         self._by_edge = torch.zeros(3, e, dtype=torch.int32, device=self.device)
         self._deficit = torch.zeros(e, device=self.device)
         self._rise = torch.zeros(e, 3, device=self.device)
-        self._counts = torch.zeros(kernels.N_COUNTS + 2 * _N_LIMBS, dtype=torch.int32, device=self.device)
-        # On a CPU the same memory; reading a number from it costs nothing.
-        self._read_counts = self._counts.numpy() if self.device.type == "cpu" else None
+        self._counts = torch.zeros(_sheet.N_COUNTS + 2 * _N_LIMBS, dtype=torch.int32, device=self.device)
+        # On a CPU a kernel is one thread, and may as well do several short steps; and reading a number costs nothing.
+        self._is_serial = self.device.type == "cpu"
+        self._read_counts = self._counts.numpy() if self._is_serial else None
         self._sheet = self._bind_sheet()
         self._commands: dict[str, Any] = {}
         self._recorded_for: tuple[Any, ...] = ()
@@ -78,7 +79,7 @@ class Resolver:
             self._record(sdf, margin)
             self._mend(can_miss=isinstance(sdf, ApproxSdf))
             self._run("list", self._n_vertices)
-            n = self._count(kernels.NEAR)
+            n = self._count(_sheet.NEAR)
             if n:
                 self._push(n, scale)
                 rounds = 1 + self._raise_edges()
@@ -86,11 +87,11 @@ class Resolver:
             return Resolution(
                 self._vectors["place"].clone(),
                 self._floats["distance"].clone(),
-                n_inside=self._count(kernels.INSIDE),
-                n_pushed=self._count(kernels.MOVED),
+                n_inside=self._count(_sheet.INSIDE),
+                n_pushed=self._count(_sheet.MOVED),
                 rounds=rounds if n else 0,
                 max_depth=max(0.0, -float(self._floats["first"].min())) if len(points) else 0.0,
-                n_unresolved=self._count(kernels.STUCK),
+                n_unresolved=self._count(_sheet.STUCK),
             )
 
     def _take(self, points: Tensor, start: SdfSample) -> None:
@@ -108,48 +109,57 @@ class Resolver:
         self._run("compare", self._n_vertices)
         for remedy, rounds in (("look again", LOOKS if can_miss else 0), ("cut off", ROUNDS)):
             for _ in range(rounds):
-                n = self._count(kernels.SUSPECTS)
-                self._counts[kernels.CHANGED] = 0
+                n = self._count(_sheet.SUSPECTS)
+                self._counts[_sheet.CHANGED] = 0
                 self._run(remedy, n)
                 self._run("adopt", n)
-                if not self._count(kernels.CHANGED):
+                if not self._count(_sheet.CHANGED):
                     break
 
     def _push(self, n: int, scale: float | VertexScale) -> None:
         """The `n` near out of other limbs on the near side, and out of the body, with the neighbourhood."""
         self._run("look", n)
-        if self._counts[kernels.N_COUNTS : kernels.N_COUNTS + _N_LIMBS].any():
+        if self._counts[_sheet.N_COUNTS : _sheet.N_COUNTS + _N_LIMBS].any():
             self._run("retreat", n)
             self._run("fill", n)
         self._run("aim", n)
-        n_pushed = self._count(kernels.PUSHED)
+        n_pushed = self._count(_sheet.PUSHED)
         if n_pushed:
             rows = self._ints["pushed"][:n_pushed].long()
             alpha = scale(rows, self._floats["depth"][rows]) if callable(scale) else scale
             self._floats["alpha"][:n_pushed] = alpha
             self._run("scale", n_pushed)
-        reached = [0, self._count(kernels.REACHED)]
-        for _ in range(BLEND_ROUNDS):
+        self._blend()
+        self._run("settle", self._count(_sheet.REACHED))
+
+    def _blend(self) -> None:
+        """The neighbourhood of those pushed gives way with them."""
+        if self._is_serial:
+            self._run("blend", 1)
+            return
+        reached = [0, self._count(_sheet.REACHED)]
+        for round_ in range(BLEND_ROUNDS):
             first, last = reached[-2:]
             self._run("reach", last - first, (2, first))
-            reached.append(self._count(kernels.REACHED))
-        for round_, size in enumerate(reached[2:]):
-            self._run(f"spread{round_ % 2}", size)
-        self._run("settle", reached[-1])
+            reached.append(self._count(_sheet.REACHED))
+            self._run(f"spread{round_ % 2}", reached[-1])
 
     def _raise_edges(self) -> int:
         """Raises both ends of the edges that run too low; returns the rounds it took."""
         self._run("suspect", len(self._limbs.edges))
-        n = self._count(kernels.CUTTING)
+        n = self._count(_sheet.CUTTING)
+        if self._is_serial:
+            self._run("raise edges", int(n > 0))
+            return sum(self._count(_sheet.CUTTING + 1 + round_) > 0 for round_ in range(_MAX_PUSHES))
         for round_ in range(_MAX_PUSHES):
-            name = "middle" if round_ == 0 else f"again{round_ % 2}"
+            name = "measure" if round_ == 0 else f"again{round_ % 2}"
             self._run(name, n, (4, round_))
-            n = self._count(kernels.CUTTING + 1 + round_)
+            n = self._count(_sheet.CUTTING + 1 + round_)
             if not n:
                 return round_
-            self._counts[kernels.RAISED] = 0
+            self._counts[_sheet.RAISED] = 0
             self._run(f"choose{round_ % 2}", n)
-            self._run("raise", self._count(kernels.RAISED))
+            self._run("lift", self._count(_sheet.RAISED))
         return _MAX_PUSHES
 
     def _count(self, which: int) -> int:
@@ -174,7 +184,7 @@ class Resolver:
     def _record(self, sdf: ExactSdf | BandSdf | ApproxSdf, margin: float) -> None:
         """Records the launches of a frame, unless they are the last frame's."""
         skin = sdf.skin()
-        key = (id(sdf), int(skin.tree), int(skin.points.ptr), margin)
+        key = (skin, margin)
         if key == self._recorded_for:
             return
         self._recorded_for = key
@@ -184,32 +194,38 @@ class Resolver:
         alpha, largest = (as_warp(self._floats[name], wp.float32) for name in ("alpha", "largest"))
         suspects, low, lower = (as_warp(row, wp.int32) for row in self._by_edge)
         lack = [as_warp(self._deficit, wp.float32), as_warp(self._rise, wp.vec3), largest]
-        self._command("begin", kernels.begin_kernel, [sheet])
-        self._command("compare", kernels.compare_kernel, [sheet, cloth, rules, reached])
-        self._command("look again", kernels.look_again_kernel, [sheet, cloth, skin, rules, reached])
-        self._command("cut off", kernels.cut_off_kernel, [sheet, cloth, rules, reached])
-        self._command("adopt", kernels.adopt_kernel, [sheet, cloth, reached])
-        self._command("list", kernels.list_kernel, [sheet, rules, near])
-        self._command("look", kernels.look_kernel, [sheet, cloth, rules, near])
-        self._command("retreat", kernels.retreat_kernel, [sheet, cloth, skin, rules, near])
-        self._command("fill", kernels.fill_kernel, [sheet, cloth, skin, near])
-        self._command("aim", kernels.aim_kernel, [sheet, cloth, skin, rules, near, pushed, reached, field])
-        self._command("scale", kernels.scale_kernel, [sheet, rules, pushed, alpha, reached, field])
-        self._command("reach", kernels.reach_kernel, [sheet, cloth, 0, reached])
-        self._command("spread0", kernels.spread_kernel, [sheet, cloth, reached, field, smoother])
-        self._command("spread1", kernels.spread_kernel, [sheet, cloth, reached, smoother, field])
-        self._command("settle", kernels.settle_kernel, [sheet, skin, rules, reached, field, smoother])
-        self._command("suspect", kernels.suspect_kernel, [sheet, cloth, rules, suspects])
-        for name, source, target in (("middle", suspects, low), ("again1", low, lower), ("again0", lower, low)):
+        self._command("begin", _resolver_kernels.begin_kernel, [sheet])
+        self._command("compare", _resolver_kernels.compare_kernel, [sheet, cloth, rules, reached])
+        self._command("look again", _resolver_kernels.look_again_kernel, [sheet, cloth, skin, rules, reached])
+        self._command("cut off", _resolver_kernels.cut_off_kernel, [sheet, cloth, rules, reached])
+        self._command("adopt", _resolver_kernels.adopt_kernel, [sheet, cloth, reached])
+        self._command("list", _resolver_kernels.list_kernel, [sheet, rules, near])
+        self._command("look", _resolver_kernels.look_kernel, [sheet, cloth, rules, near])
+        self._command("retreat", _resolver_kernels.retreat_kernel, [sheet, cloth, skin, rules, near])
+        self._command("fill", _resolver_kernels.fill_kernel, [sheet, cloth, skin, near])
+        self._command("aim", _resolver_kernels.aim_kernel, [sheet, cloth, skin, rules, near, pushed, reached, field])
+        self._command("scale", _resolver_kernels.scale_kernel, [sheet, rules, pushed, alpha, reached, field])
+        self._command("settle", _resolver_kernels.settle_kernel, [sheet, skin, rules, reached, field, smoother])
+        self._command("suspect", _edge_kernels.suspect_kernel, [sheet, cloth, rules, suspects])
+        self._command("tally", _resolver_kernels.tally_kernel, [sheet, near])
+        if self._is_serial:
+            inputs = [sheet, cloth, BLEND_ROUNDS, reached, field, smoother]
+            self._command("blend", _spread_kernels.blend_kernel, inputs)
+            inputs = [sheet, cloth, skin, rules, suspects, moved, *lack, field, reached]
+            self._command("raise edges", _edge_kernels.raise_edges_kernel, inputs)
+            return
+        self._command("reach", _spread_kernels.reach_kernel, [sheet, cloth, 0, reached])
+        self._command("spread0", _spread_kernels.spread_kernel, [sheet, cloth, reached, field, smoother])
+        self._command("spread1", _spread_kernels.spread_kernel, [sheet, cloth, reached, smoother, field])
+        for name, source, target in (("measure", suspects, low), ("again1", low, lower), ("again0", lower, low)):
             inputs = [sheet, cloth, skin, rules, 0, source, moved, target, *lack]
-            self._command(name, kernels.middle_kernel, inputs)
+            self._command(name, _edge_kernels.measure_kernel, inputs)
         for name, source in (("choose0", low), ("choose1", lower)):
-            self._command(name, kernels.choose_kernel, [sheet, cloth, source, *lack, field, reached])
-        self._command("raise", kernels.raise_kernel, [sheet, skin, rules, reached, field, largest, moved])
-        self._command("tally", kernels.tally_kernel, [sheet, near])
+            self._command(name, _edge_kernels.choose_kernel, [sheet, cloth, source, *lack, field, reached])
+        self._command("lift", _edge_kernels.lift_kernel, [sheet, skin, rules, reached, field, largest, moved])
 
     def _bind_sheet(self) -> Any:
-        sheet = kernels.Sheet()
+        sheet = _sheet.Sheet()
         for name in _VECTORS[: -len(("field", "smoother"))]:
             setattr(sheet, name, as_warp(self._vectors[name], wp.vec3))
         for name in ("first", "distance", "along", "way", "depth", "goal"):
@@ -217,8 +233,8 @@ class Resolver:
         for name in ("first_face", "face", "guess", "role", "mark"):
             setattr(sheet, name, self._list(name))
         sheet.counts = as_warp(self._counts, wp.int32)
-        sheet.touched = as_warp(self._counts[kernels.N_COUNTS :], wp.int32)
-        sheet.inward = as_warp(self._counts[kernels.N_COUNTS + _N_LIMBS :], wp.int32)
+        sheet.touched = as_warp(self._counts[_sheet.N_COUNTS :], wp.int32)
+        sheet.inward = as_warp(self._counts[_sheet.N_COUNTS + _N_LIMBS :], wp.int32)
         return sheet
 
 
@@ -229,7 +245,7 @@ _N_LIMBS = 4
 
 
 def _rules(margin: float) -> Any:
-    rules = kernels.Rules()
+    rules = _sheet.Rules()
     rules.margin, rules.tolerance, rules.max_displacement, rules.max_pushes = (
         margin,
         _TOLERANCE,
@@ -251,7 +267,7 @@ def _cloth(limbs: Limbs) -> Any:
     corner = np.stack((faces.ravel(), np.repeat(np.arange(len(faces)), 3)), axis=1)
     fan_start, fan = _grouped(corner, n)
     bits = (limbs.own.cpu().numpy() << np.arange(limbs.own.shape[1])).sum(axis=1)
-    cloth = kernels.Cloth()
+    cloth = _sheet.Cloth()
     arrays = {"ring_start": ring_start, "ring": ring, "fan_start": fan_start, "fan": fan, "faces": faces}
     arrays |= {"edges": edges, "own": bits, "limb": limbs.of_face.cpu().numpy()}
     for name, array in arrays.items():

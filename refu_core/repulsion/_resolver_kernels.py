@@ -2,126 +2,33 @@
 # ruff: noqa: UP018
 # (Warp reads a kernel's annotations as array types of its own; a type checker can't. A variable that changes in a loop
 # has to be called int or float there.)
-"""The steps of `resolve`, each over the vertices that it concerns: one code for CPU and CUDA.
-
-Lists of vertices are filled by kernels: `counts[NAME]` says how many they are. On a CPU they are in order, on a GPU in
-any; nothing depends on it.
-"""
+"""Most steps of `resolve`, each over the vertices that it concerns: one code for CPU and CUDA."""
 
 import warp as wp
 
+from refu_core.repulsion._sheet import (
+    BACK,
+    BESIDE,
+    CHANGED,
+    FILLED,
+    FREE,
+    INSIDE,
+    LEFT,
+    MISSED,
+    MOVED,
+    NEAR,
+    PUSHED,
+    REACHED,
+    SOURCE,
+    STUCK,
+    SUSPECTS,
+    Cloth,
+    Rules,
+    Sheet,
+    bounded,
+    keep,
+)
 from refu_core.sdf import Skin, ask
-
-# What a kernel counts.
-NEAR = wp.constant(0)  # vertices nearer than the margin
-PUSHED = wp.constant(1)  # those of them that are pushed along the gradient
-REACHED = wp.constant(2)  # vertices that a push reaches by way of its neighbours
-SUSPECTS = wp.constant(3)  # vertices at the ends of edges along which distances contradict each other
-INSIDE = wp.constant(4)
-MOVED = wp.constant(5)  # of those nearer than the margin
-STUCK = wp.constant(6)  # inside after all
-RAISED = wp.constant(7)  # ends of edges that cut the skin
-CHANGED = wp.constant(8)  # distances that were mended
-CUTTING = wp.constant(9)  # such edges; a number for each round follows
-N_COUNTS = 16
-
-# A vertex's role: pushed along the gradient, or out of another limb on the near side.
-FREE = wp.constant(0)
-LEFT = wp.constant(1)
-MISSED = wp.constant(2)  # found no room on its own
-FILLED = wp.constant(3)  # found it where its neighbours are
-BACK = wp.constant(4)  # found none, so is pushed
-
-# A vertex reached by pushes, or pushed itself.
-BESIDE = wp.constant(1)
-SOURCE = wp.constant(2)
-
-
-@wp.struct
-class Cloth:
-    """What doesn't change of a garment and the body's limbs."""
-
-    ring_start: wp.array(dtype=wp.int32)
-    ring: wp.array(dtype=wp.int32)
-    """The neighbours of vertex i are `ring[ring_start[i]:ring_start[i + 1]]`."""
-    fan_start: wp.array(dtype=wp.int32)
-    fan: wp.array(dtype=wp.int32)
-    """The faces around it, likewise."""
-    faces: wp.array2d(dtype=wp.int32)
-    edges: wp.array2d(dtype=wp.int32)
-    own: wp.array(dtype=wp.int32)
-    """A bit for each limb that a vertex lies on."""
-    clearance: wp.array(dtype=wp.float32)
-    """How far off the skin it is cut [m]."""
-    limb: wp.array(dtype=wp.int32)
-    """Limb of each body face."""
-
-
-@wp.struct
-class Rules:
-    """Numbers that are the same for all vertices; lengths in metres."""
-
-    margin: wp.float32
-    tolerance: wp.float32
-    max_displacement: wp.float32
-    max_pushes: wp.int32
-    contradiction: wp.float32
-    step_on: wp.float32
-    deep: wp.float32
-    sideways: wp.float32
-    inward: wp.float32
-    farthest: wp.float32
-    detour: wp.float32
-    sure: wp.float32
-    bulge: wp.float32
-    retreats: wp.int32
-    turns: wp.int32
-
-
-@wp.struct
-class Sheet:
-    """A garment in one frame, by vertex; lengths in metres."""
-
-    origin: wp.array(dtype=wp.vec3)
-    """Before."""
-    first: wp.array(dtype=wp.float32)
-    first_gradient: wp.array(dtype=wp.vec3)
-    first_face: wp.array(dtype=wp.int32)
-    """Distance there."""
-    place: wp.array(dtype=wp.vec3)
-    """The best place so far."""
-    distance: wp.array(dtype=wp.float32)
-    gradient: wp.array(dtype=wp.vec3)
-    face: wp.array(dtype=wp.int32)
-    """Distance there."""
-    outward: wp.array(dtype=wp.vec3)
-    """Unit normal, where a limb is near that may not pull the cloth through itself."""
-    along: wp.array(dtype=wp.float32)
-    """Cosine of gradient and normal."""
-    way: wp.array(dtype=wp.float32)
-    """How far a push is to go."""
-    heading: wp.array(dtype=wp.vec3)
-    """Unit direction of it."""
-    depth: wp.array(dtype=wp.float32)
-    """Distance that the push starts from."""
-    goal: wp.array(dtype=wp.float32)
-    """Distance that it leads to."""
-    guess: wp.array(dtype=wp.int32)
-    """A face that may be closer."""
-    role: wp.array(dtype=wp.int32)
-    mark: wp.array(dtype=wp.int32)
-    counts: wp.array(dtype=wp.int32)
-    touched: wp.array(dtype=wp.int32)
-    """Vertices at each limb that they don't lie on."""
-    inward: wp.array(dtype=wp.int32)
-    """Those of them that it pushes inwards."""
-
-
-@wp.func
-def bounded(moved: wp.vec3, origin: wp.vec3, most: float):
-    """`moved`, drawn back to within `most` of where the vertex began."""
-    way = moved - origin
-    return origin + way * wp.min(1.0, most / wp.max(wp.length(way), 1.0e-12))
 
 
 @wp.func
@@ -133,14 +40,6 @@ def normal_of(i: int, cloth: Cloth, points: wp.array(dtype=wp.vec3)):
         a = points[cloth.faces[face, 0]]
         total += wp.cross(points[cloth.faces[face, 1]] - a, points[cloth.faces[face, 2]] - a)
     return wp.normalize(total)
-
-
-@wp.func
-def keep(i: int, place: wp.vec3, distance: float, gradient: wp.vec3, face: int, sheet: Sheet):
-    sheet.place[i] = place
-    sheet.distance[i] = distance
-    sheet.gradient[i] = gradient
-    sheet.face[i] = face
 
 
 @wp.func
@@ -420,40 +319,6 @@ def scale_kernel(
 
 
 @wp.kernel(enable_backward=False)
-def reach_kernel(sheet: Sheet, cloth: Cloth, first: int, reached: wp.array(dtype=int)):
-    """Lists the neighbours of those listed from `first` on."""
-    i = reached[first + wp.tid()]
-    for k in range(cloth.ring_start[i], cloth.ring_start[i + 1]):
-        j = cloth.ring[k]
-        if wp.atomic_max(sheet.mark, j, BESIDE) == 0:
-            reached[wp.atomic_add(sheet.counts, REACHED, 1)] = j
-
-
-@wp.kernel(enable_backward=False)
-def spread_kernel(
-    sheet: Sheet,
-    cloth: Cloth,
-    reached: wp.array(dtype=int),
-    field: wp.array(dtype=wp.vec3),
-    # output
-    smoother: wp.array(dtype=wp.vec3),
-):
-    """One Jacobi sweep of `Blend.spread`: the mean of the neighbours, but no less than a vertex has to go."""
-    i = reached[wp.tid()]
-    first = cloth.ring_start[i]
-    last = cloth.ring_start[i + 1]
-    total = wp.vec3()
-    for k in range(first, last):
-        total += field[cloth.ring[k]]
-    if last > first:
-        total = total / float(last - first)
-    if sheet.mark[i] == SOURCE:
-        lack = sheet.way[i] - wp.dot(total, sheet.heading[i])
-        total += wp.max(lack, 0.0) * sheet.heading[i]
-    smoother[i] = total
-
-
-@wp.kernel(enable_backward=False)
 def settle_kernel(
     sheet: Sheet,
     skin: Skin,
@@ -502,112 +367,6 @@ def settle_kernel(
     if sheet.distance[i] < 0.0:
         sheet.place[i] = origin
         sheet.distance[i] = sheet.first[i]
-
-
-@wp.func
-def look_between(edge: int, sheet: Sheet, cloth: Cloth, skin: Skin, rules: Rules):
-    """How much the middle of an edge lacks of half the margin [m], and the way up there."""
-    a = cloth.edges[edge, 0]
-    b = cloth.edges[edge, 1]
-    # Beyond a band no face is known; a known one makes the answer cheap.
-    near = wp.where(sheet.distance[a] <= sheet.distance[b], sheet.face[a], sheet.face[b])
-    distance, gradient, _face = ask(skin, 0.5 * (sheet.place[a] + sheet.place[b]), near)
-    return 0.5 * rules.margin - distance, gradient
-
-
-@wp.kernel(enable_backward=False)
-def suspect_kernel(sheet: Sheet, cloth: Cloth, rules: Rules, suspects: wp.array(dtype=int)):
-    """Lists the edges whose middle may be closer to the skin than half the margin (`_raise_edges`)."""
-    edge = wp.tid()
-    a = cloth.edges[edge, 0]
-    b = cloth.edges[edge, 1]
-    first = sheet.distance[a]
-    second = sheet.distance[b]
-    length = wp.length(sheet.place[a] - sheet.place[b])
-    if wp.min(first, second) < 0.0 or wp.max(first, second) >= 0.5 * (rules.margin + length):
-        return
-    bulge = float(0.0)
-    if sheet.face[a] >= 0 and sheet.face[b] >= 0:
-        bulge = rules.bulge * length * wp.length(sheet.gradient[a] - sheet.gradient[b])
-    if 0.5 * (first + second) < 0.5 * rules.margin + bulge:
-        suspects[wp.atomic_add(sheet.counts, CUTTING, 1)] = edge
-
-
-@wp.kernel(enable_backward=False)
-def middle_kernel(
-    sheet: Sheet,
-    cloth: Cloth,
-    skin: Skin,
-    rules: Rules,
-    rounds: int,
-    suspects: wp.array(dtype=int),
-    moved: wp.array(dtype=int),
-    # outputs
-    low: wp.array(dtype=int),
-    deficit: wp.array(dtype=float),
-    rise: wp.array(dtype=wp.vec3),
-    largest: wp.array(dtype=float),
-):
-    """Which of the suspected edges are too low, and by how much; after the first of the `rounds`, of those moved."""
-    edge = suspects[wp.tid()]
-    a = cloth.edges[edge, 0]
-    b = cloth.edges[edge, 1]
-    if rounds > 0 and moved[a] == 0 and moved[b] == 0:
-        return  # between two limbs, and stays there
-    lack, up = look_between(edge, sheet, cloth, skin, rules)
-    if lack > 0.0:
-        k = wp.atomic_add(sheet.counts, CUTTING + 1 + rounds, 1)
-        low[k] = edge
-        deficit[k] = lack
-        rise[k] = lack * up
-        wp.atomic_max(largest, a, lack)
-        wp.atomic_max(largest, b, lack)
-
-
-@wp.kernel(enable_backward=False)
-def choose_kernel(
-    sheet: Sheet,
-    cloth: Cloth,
-    low: wp.array(dtype=int),
-    deficit: wp.array(dtype=float),
-    rise: wp.array(dtype=wp.vec3),
-    largest: wp.array(dtype=float),
-    # outputs
-    field: wp.array(dtype=wp.vec3),
-    raised: wp.array(dtype=int),
-):
-    """A vertex of several low edges follows the lowest of them."""
-    k = wp.tid()
-    for end in range(2):
-        i = cloth.edges[low[k], end]
-        if deficit[k] == largest[i]:
-            field[i] = rise[k]
-            if wp.atomic_max(sheet.mark, i, BESIDE) == 0:
-                raised[wp.atomic_add(sheet.counts, RAISED, 1)] = i
-
-
-@wp.kernel(enable_backward=False)
-def raise_kernel(
-    sheet: Sheet,
-    skin: Skin,
-    rules: Rules,
-    raised: wp.array(dtype=int),
-    # outputs
-    field: wp.array(dtype=wp.vec3),
-    largest: wp.array(dtype=float),
-    moved: wp.array(dtype=int),
-):
-    """Raises the ends of low edges that don't come nearer to the skin by it."""
-    i = raised[wp.tid()]
-    here = bounded(sheet.place[i] + field[i], sheet.origin[i], rules.max_displacement)
-    field[i] = wp.vec3()
-    largest[i] = 0.0
-    sheet.mark[i] = 0
-    moved[i] = 0
-    distance, gradient, face = ask(skin, here, sheet.face[i])
-    if distance >= wp.min(sheet.distance[i], rules.margin - rules.tolerance):
-        keep(i, here, distance, gradient, face, sheet)
-        moved[i] = 1
 
 
 @wp.kernel(enable_backward=False)

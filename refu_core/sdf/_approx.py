@@ -80,9 +80,8 @@ class ApproxSdf(MeshSdf):
         self._enter: Any = None  # both recorded for the tensors that hold the pose
         self._walk: Recorded | None = None
 
-    def skin(self) -> Any:
-        """As `MeshSdf.skin`."""
-        skin = super().skin()
+    def _bind_skin(self) -> Any:
+        skin = super()._bind_skin()
         skin.links, skin.table, skin.cell = self._links_wp, self._table_wp, _CELL
         return skin
 

@@ -87,7 +87,7 @@ class ExactSdf(MeshSdf):
     def rebuild(self) -> None:
         """Builds the BVH anew for the present pose; answers don't depend on it. Raises `MeshError` before `update`."""
         self._built_at = self._require_update().clone()
-        self._few = None
+        self._few = self._skin = None
         with torch_stream(self.device):
             self._mesh = wp.Mesh(
                 self._points_wp, as_warp(self.faces.view(-1), wp.int32), support_winding_number=self._by_winding
@@ -105,9 +105,8 @@ class ExactSdf(MeshSdf):
         self._require_update()
         return int(self._mesh.id)
 
-    def skin(self) -> Any:
-        """As `MeshSdf.skin`."""
-        skin = super().skin()
+    def _bind_skin(self) -> Any:
+        skin = super()._bind_skin()
         skin.tree = self._mesh.id
         return skin
 

@@ -115,6 +115,7 @@ class MeshSdf(ABC):
         self._vertices: Tensor | None = None  # as given, with its graph
         self._points: Tensor | None = None  # float32 copy that the kernels read
         self._points_wp: Any = None
+        self._skin: Any = None
 
     def update(self, vertices: Tensor, *, pose: Tensor | None = None, betas: Tensor | None = None) -> None:
         """Takes over a new pose: `vertices` [m], shape (V, 3). What it was posed by isn't needed here.
@@ -131,6 +132,7 @@ class MeshSdf(ABC):
             self._require_outward(vertices.detach())
             self._points = torch.empty(len(vertices), 3, device=self.device)
             self._points_wp = as_warp(self._points, wp.vec3)
+            self._skin = None
         self._vertices = vertices
         self._points.copy_(vertices.detach())
         self._take_pose(is_new=is_new)
@@ -160,8 +162,16 @@ class MeshSdf(ABC):
         return signed_distance(points, corners, feature)._replace(face=found.face.clone())
 
     def skin(self) -> Any:
-        """The posed body for kernels of one's own, as `refu_core.sdf.Skin`. Raises `MeshError` before `update`."""
+        """The posed body for kernels of one's own, as `refu_core.sdf.Skin`. Raises `MeshError` before `update`.
+
+        The same one for all poses, until the memory that it names is another.
+        """
         self._require_update()
+        if self._skin is None:
+            self._skin = self._bind_skin()
+        return self._skin
+
+    def _bind_skin(self) -> Any:
         skin = Skin()
         skin.points, skin.faces = self._points_wp, self._faces
         skin.across, skin.fan_start, skin.fan_face = self._topology

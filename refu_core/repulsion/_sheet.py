@@ -1,0 +1,128 @@
+# mypy: ignore-errors
+# (Warp reads a kernel's annotations as array types of its own; a type checker can't.)
+"""What the steps of `resolve` read and write: a garment, a frame of it, and numbers.
+
+Lists of vertices are filled by kernels: `counts[NAME]` says how many they are. On a CPU they are in order, on a GPU in
+any; nothing depends on it.
+"""
+
+import warp as wp
+
+# What a kernel counts.
+NEAR = wp.constant(0)  # vertices nearer than the margin
+PUSHED = wp.constant(1)  # those of them that are pushed along the gradient
+REACHED = wp.constant(2)  # vertices that a push reaches by way of its neighbours
+SUSPECTS = wp.constant(3)  # vertices at the ends of edges along which distances contradict each other
+INSIDE = wp.constant(4)
+MOVED = wp.constant(5)  # of those nearer than the margin
+STUCK = wp.constant(6)  # inside after all
+RAISED = wp.constant(7)  # ends of edges that cut the skin
+CHANGED = wp.constant(8)  # distances that were mended
+CUTTING = wp.constant(9)  # such edges; a number for each round follows
+N_COUNTS = 16
+
+# A vertex's role: pushed along the gradient, or out of another limb on the near side.
+FREE = wp.constant(0)
+LEFT = wp.constant(1)
+MISSED = wp.constant(2)  # found no room on its own
+FILLED = wp.constant(3)  # found it where its neighbours are
+BACK = wp.constant(4)  # found none, so is pushed
+
+# A vertex reached by pushes, or pushed itself.
+BESIDE = wp.constant(1)
+SOURCE = wp.constant(2)
+
+
+@wp.struct
+class Cloth:
+    """What doesn't change of a garment and the body's limbs."""
+
+    ring_start: wp.array(dtype=wp.int32)
+    ring: wp.array(dtype=wp.int32)
+    """The neighbours of vertex i are `ring[ring_start[i]:ring_start[i + 1]]`."""
+    fan_start: wp.array(dtype=wp.int32)
+    fan: wp.array(dtype=wp.int32)
+    """The faces around it, likewise."""
+    faces: wp.array2d(dtype=wp.int32)
+    edges: wp.array2d(dtype=wp.int32)
+    own: wp.array(dtype=wp.int32)
+    """A bit for each limb that a vertex lies on."""
+    clearance: wp.array(dtype=wp.float32)
+    """How far off the skin it is cut [m]."""
+    limb: wp.array(dtype=wp.int32)
+    """Limb of each body face."""
+
+
+@wp.struct
+class Rules:
+    """Numbers that are the same for all vertices; lengths in metres."""
+
+    margin: wp.float32
+    tolerance: wp.float32
+    max_displacement: wp.float32
+    max_pushes: wp.int32
+    contradiction: wp.float32
+    step_on: wp.float32
+    deep: wp.float32
+    sideways: wp.float32
+    inward: wp.float32
+    farthest: wp.float32
+    detour: wp.float32
+    sure: wp.float32
+    bulge: wp.float32
+    retreats: wp.int32
+    turns: wp.int32
+
+
+@wp.struct
+class Sheet:
+    """A garment in one frame, by vertex; lengths in metres."""
+
+    origin: wp.array(dtype=wp.vec3)
+    """Before."""
+    first: wp.array(dtype=wp.float32)
+    first_gradient: wp.array(dtype=wp.vec3)
+    first_face: wp.array(dtype=wp.int32)
+    """Distance there."""
+    place: wp.array(dtype=wp.vec3)
+    """The best place so far."""
+    distance: wp.array(dtype=wp.float32)
+    gradient: wp.array(dtype=wp.vec3)
+    face: wp.array(dtype=wp.int32)
+    """Distance there."""
+    outward: wp.array(dtype=wp.vec3)
+    """Unit normal, where a limb is near that may not pull the cloth through itself."""
+    along: wp.array(dtype=wp.float32)
+    """Cosine of gradient and normal."""
+    way: wp.array(dtype=wp.float32)
+    """How far a push is to go."""
+    heading: wp.array(dtype=wp.vec3)
+    """Unit direction of it."""
+    depth: wp.array(dtype=wp.float32)
+    """Distance that the push starts from."""
+    goal: wp.array(dtype=wp.float32)
+    """Distance that it leads to."""
+    guess: wp.array(dtype=wp.int32)
+    """A face that may be closer."""
+    role: wp.array(dtype=wp.int32)
+    mark: wp.array(dtype=wp.int32)
+    counts: wp.array(dtype=wp.int32)
+    touched: wp.array(dtype=wp.int32)
+    """Vertices at each limb that they don't lie on."""
+    inward: wp.array(dtype=wp.int32)
+    """Those of them that it pushes inwards."""
+
+
+@wp.func
+def bounded(moved: wp.vec3, origin: wp.vec3, most: float):
+    """`moved`, drawn back to within `most` of where the vertex began."""
+    way = moved - origin
+    return origin + way * wp.min(1.0, most / wp.max(wp.length(way), 1.0e-12))
+
+
+@wp.func
+def keep(i: int, place: wp.vec3, distance: float, gradient: wp.vec3, face: int, sheet: Sheet):
+    sheet.place[i] = place
+    sheet.distance[i] = distance
+    sheet.gradient[i] = gradient
+    sheet.face[i] = face

@@ -1,0 +1,89 @@
+# mypy: ignore-errors
+# ruff: noqa: RUF046, UP018
+# (Warp reads a kernel's annotations as array types of its own; a type checker can't. A variable that changes in a loop
+# has to be called int or float there.)
+"""How pushes spread over the neighbourhood: all rounds in one launch on a CPU, a round a launch on a GPU."""
+
+import warp as wp
+
+from refu_core.repulsion._sheet import BESIDE, REACHED, SOURCE, Cloth, Sheet
+
+
+@wp.func
+def reach(i: int, sheet: Sheet, cloth: Cloth, reached: wp.array(dtype=int)):
+    """Lists the neighbours of a vertex, unless they are."""
+    for k in range(cloth.ring_start[i], cloth.ring_start[i + 1]):
+        j = cloth.ring[k]
+        if wp.atomic_max(sheet.mark, j, BESIDE) == 0:
+            reached[wp.atomic_add(sheet.counts, REACHED, 1)] = j
+
+
+@wp.func
+def spread(i: int, sheet: Sheet, cloth: Cloth, field: wp.array(dtype=wp.vec3), smoother: wp.array(dtype=wp.vec3)):
+    """The mean of the neighbours, but no less than a vertex has to go."""
+    first = cloth.ring_start[i]
+    last = cloth.ring_start[i + 1]
+    total = wp.vec3()
+    for k in range(first, last):
+        total += field[cloth.ring[k]]
+    if last > first:
+        total = total / float(last - first)
+    if sheet.mark[i] == SOURCE:
+        lack = sheet.way[i] - wp.dot(total, sheet.heading[i])
+        total += wp.max(lack, 0.0) * sheet.heading[i]
+    smoother[i] = total
+
+
+@wp.kernel(enable_backward=False)
+def reach_kernel(sheet: Sheet, cloth: Cloth, first: int, reached: wp.array(dtype=int)):
+    """Lists the neighbours of those listed from `first` on."""
+    reach(reached[first + wp.tid()], sheet, cloth, reached)
+
+
+@wp.kernel(enable_backward=False)
+def spread_kernel(
+    sheet: Sheet,
+    cloth: Cloth,
+    reached: wp.array(dtype=int),
+    field: wp.array(dtype=wp.vec3),
+    # output
+    smoother: wp.array(dtype=wp.vec3),
+):
+    """One Jacobi sweep of `Blend.spread`."""
+    spread(reached[wp.tid()], sheet, cloth, field, smoother)
+
+
+@wp.func
+def sweep(
+    first: int,
+    sheet: Sheet,
+    cloth: Cloth,
+    reached: wp.array(dtype=int),
+    field: wp.array(dtype=wp.vec3),
+    smoother: wp.array(dtype=wp.vec3),
+):
+    """Reaches the neighbours of those listed from `first` on, and sweeps over all; where the new ones begin."""
+    last = int(sheet.counts[REACHED])
+    for k in range(first, last):
+        reach(reached[k], sheet, cloth, reached)
+    n = int(sheet.counts[REACHED])
+    for k in range(n):
+        spread(reached[k], sheet, cloth, field, smoother)
+    return last
+
+
+@wp.kernel(enable_backward=False)
+def blend_kernel(
+    sheet: Sheet,
+    cloth: Cloth,
+    rounds: int,
+    reached: wp.array(dtype=int),
+    # kept up to date
+    field: wp.array(dtype=wp.vec3),
+    smoother: wp.array(dtype=wp.vec3),
+):
+    """All sweeps, an even number, by one thread: the lists are short, and a launch costs what hundreds of steps do."""
+    first = int(0)
+    for _pair in range(rounds / 2):
+        first = sweep(first, sheet, cloth, reached, field, smoother)
+        first = sweep(first, sheet, cloth, reached, smoother, field)
