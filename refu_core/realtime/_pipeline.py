@@ -96,8 +96,7 @@ class GarmentPipeline:
         no_skip: Collection[str] = (),
     ) -> None:
         self.body = body
-        self.margin = margin
-        """Clearance that is kept from the skin [m]; None for what each garment's weights were trained with."""
+        self._margin = margin
         self._wearables = wearables
         self._style = style
         self._collisions = collisions
@@ -105,6 +104,16 @@ class GarmentPipeline:
         self._skips = frozenset(SKIPS) - frozenset(no_skip)
         self._figures: _Figures | None = None
         self._last: dict[bytes, PipelineOutput] = {}
+
+    @property
+    def margin(self) -> float | None:
+        """Clearance that is kept from the skin [m]; None for what each garment's weights were trained with."""
+        return self._margin
+
+    @margin.setter
+    def margin(self, margin: float | None) -> None:
+        self._margin = margin
+        self._last = {}  # what nobody moved for is not what it would be now
 
     @classmethod
     def load(
