@@ -93,16 +93,19 @@ def enter_kernel(
     c = points[links[face, 2]]
     middle = (a + b + c) / 3.0
     home = cell_of(middle - depth * wp.normalize(wp.cross(b - a, c - a)), cell)
-    for i in range(27):
-        x = home[0] + i % 3 - 1
-        y = home[1] + (i // 3) % 3 - 1
-        z = home[2] + i // 9 - 1
-        away = middle - cell * wp.vec3(float(x) + 0.5, float(y) + 0.5, float(z) + 0.5)
-        squared = wp.dot(away, away)
-        if squared < ENTER * cell * cell:
-            row = row_of(x, y, z)
-            wp.atomic_min(table, row, part, (int(UNITS * squared) << FACE_BITS) | face)
-            wp.atomic_and(table, row, ABSENT, ~(1 << part))
+    most = ENTER * cell * cell
+    for x in range(home[0] - 1, home[0] + 2):
+        away_x = middle[0] - cell * (float(x) + 0.5)
+        for y in range(home[1] - 1, home[1] + 2):
+            away_y = middle[1] - cell * (float(y) + 0.5)
+            beside = away_x * away_x + away_y * away_y
+            for z in range(home[2] - 1, home[2] + 2):
+                away_z = middle[2] - cell * (float(z) + 0.5)
+                squared = beside + away_z * away_z
+                if squared < most:
+                    row = row_of(x, y, z)
+                    wp.atomic_min(table, row, part, (int(UNITS * squared) << FACE_BITS) | face)
+                    wp.atomic_and(table, row, ABSENT, ~(1 << part))
 
 
 @wp.func
