@@ -87,6 +87,23 @@ def test_frames_leave_nothing_behind() -> None:
     assert torch.equal(alone, again)
 
 
+@pytest.mark.parametrize("kind", ["exact", "approx"])
+def test_one_thread_does_what_a_launch_a_round_does(kind: str) -> None:
+    """On a CPU some steps are a loop within one launch; on a GPU each of their rounds is a launch."""
+    body, unposed, points = dressed("shirt-male", 1.2, 0.02)
+    person, _, limbs, resolver = worn("shirt-male")
+    sdf = distance("shirt-male", kind)
+    sdf.update(body)
+    start = sdf.query(points, near=RestFaces(person)(unposed[0]) if kind == "approx" else None)
+    by_rounds = Resolver(limbs)
+    by_rounds._is_serial = False
+    one, other = resolver(points, sdf, start), by_rounds(points, sdf, start)
+    assert one.rounds > 1
+    assert torch.equal(one.vertices, other.vertices)
+    assert torch.equal(one.distance, other.distance)
+    assert (one.n_pushed, one.rounds, one.n_unresolved) == (other.n_pushed, other.rounds, other.n_unresolved)
+
+
 def test_another_margin_is_another_launch() -> None:
     body, _, points = dressed("tshirt-male", 0.2, 0.02)
     sdf = distance("tshirt-male", "exact")
