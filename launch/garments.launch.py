@@ -15,7 +15,18 @@ from launch_ros.actions import Node
 
 from launch import LaunchContext, LaunchDescription
 
-TEXTS = ("backbone", "betas_source", "device", "frame_id", "input_axes", "input_type", "record", "sdf", "weights")
+TEXTS = (
+    "backbone",
+    "betas_source",
+    "device",
+    "frame_id",
+    "input_axes",
+    "input_type",
+    "on_device_loss",
+    "record",
+    "sdf",
+    "weights",
+)
 NUMBERS = ("margin", "max_distance", "max_rate", "person_timeout")
 YAML = ("betas", "follow_humans", "garments", "persons", "style")
 PARAMETERS = TEXTS + NUMBERS + YAML

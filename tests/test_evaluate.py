@@ -78,7 +78,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "body_fingerprint": body.fingerprint,
         "quantum_m": QUANTUM,
         "plan": {"count": n},
-        "clips": [[], []],
+        "clips": {"train": [], "test": []},
     }
     (path / "card.json").write_text(json.dumps(card), encoding="utf-8")
     return path

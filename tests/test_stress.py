@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -267,16 +269,23 @@ def test_bad_input_is_one_line(arguments: list[str], wanted: str, capsys: pytest
     assert error.count("\n") == 1
 
 
-def test_the_live_node(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_live_node(tmp_path: Path) -> None:
     pytest.importorskip("rclpy", reason="rclpy isn't installed (extra ros): the node isn't tested")
     common = ["stress", "--node", "--quick", "--garments", "tshirt-male", "--backbone", "skinned", "--quiet"]
     file = tmp_path / "node.json"
-    main([*common, "--output", str(tmp_path), "--json", str(file)])
+
+    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+        # A process of its own: rclpy starts once in one.
+        command = [sys.executable, "-m", "refu_ros.cli", *common, "--output", str(tmp_path), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, timeout=200, check=False)
+
+    run("--json", str(file))
     (row,) = json.loads(file.read_text())["rows"]
     # Ten seconds on a busy machine: a frame may be late and be superseded, but nothing may come twice.
     assert row["sent"] == 300
     assert row["received"] > 20
     assert (row["doubled"], row["recorded_twice"], row["not_recorded"], row["nan"], row["exit_code"]) == (0,) * 5
     assert row["recorded"] >= row["received"]
-    assert main([*common, "--output", str(tmp_path)]) == 2
-    assert "is there already" in capsys.readouterr().err
+    again = run()
+    assert again.returncode == 2
+    assert "is there already" in again.stderr

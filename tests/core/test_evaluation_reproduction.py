@@ -370,7 +370,7 @@ def test_motion_table(clip: Callable[[int], rp.Clip]) -> None:
             assert table.value(groups[0], method, metric) == pytest.approx(of(parts, weights=[3, 1]))
     # The clip swings evenly, and the template is skinned to it.
     assert 0 < table.value(groups[1], "skinned", "jitter_mm") < 5
-    assert {m.method for m in table.missing} == {"tailornet", "node-approx", "node-accurate", "node-hybrid"}
+    assert not table.missing  # the weights of what it shows ship
 
 
 @pytest.fixture
