@@ -128,8 +128,8 @@ def soak_node(folder: Path, *, seconds: float, parameters: dict[str, str], progr
     command = [sys.executable, "-m", "refu_ros.garment_node", "--ros-args", *arguments]
     with (folder / "log.txt").open("wb") as log:
         process = subprocess.Popen(command, stdout=log, stderr=log, env={**os.environ, "OMP_NUM_THREADS": "1"})
-    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     try:
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         peer = _Peer(process, folder / "log.txt")
         peer.wait()
         with tqdm(total=round(seconds * RATE), unit="frame", disable=not progress, leave=False) as bar:
