@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from msg_adapters import BagReader, decode_marker_array, decoder_for, encoder_for
 from refu_core import RefuError
-from refu_core.stress import StressError, resident_mb, soak_frames, wardrobes
+from refu_core.stress import TOLERANCE, StressError, resident_mb, soak_frames, wardrobes
 from refu_ros.tables import format_table
 
 if TYPE_CHECKING:
@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
 RATE = 30.0
 """Frames a second."""
-TOLERANCE = 0.05
-"""By how much the last tenth may exceed the first one."""
 _DEFAULT_S = 60.0
 _QUICK_S = 10.0
 _START_S = 180.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -14,7 +15,7 @@ from refu_core.sdf import ApproxSdf, BandSdf, ExactSdf, Links, RestFaces
 
 
 @dataclass(frozen=True, eq=False)
-class Fabric:
+class _Fabric:
     """What collision handling must know of a garment, once and for all poses."""
 
     links: Links | None
@@ -22,7 +23,7 @@ class Fabric:
     resolver: Resolver
 
     @classmethod
-    def of(cls, garment: GarmentTemplate, body: SmplBody, rest: ExactSdf, *, has_links: bool) -> Fabric:
+    def of(cls, garment: GarmentTemplate, body: SmplBody, rest: ExactSdf, *, has_links: bool) -> _Fabric:
         """Of a garment on a body, whose rest pose `rest` was updated with."""
         clearance = rest.query(garment.v_template).distance
         return cls(
@@ -34,7 +35,9 @@ class Fabric:
 class Collisions:
     """Brings garments off one posed body at a time."""
 
-    def __init__(self, body: SmplBody, *, is_accurate: bool, uses_band: bool = True) -> None:
+    def __init__(
+        self, body: SmplBody, garments: Mapping[str, GarmentTemplate], *, is_accurate: bool, uses_band: bool = True
+    ) -> None:
         """With the exact signed distance to `body`, within a band of its skin or everywhere, or the approximate one."""
         self._band: BandSdf | None = None
         self._rest_faces: RestFaces | None = None
@@ -46,11 +49,10 @@ class Collisions:
             self._sdf = self._band = BandSdf(body.faces, rest=body.v_template)
         else:  # thousands of threads walk the tree faster than one sorts what needn't
             self._sdf = ExactSdf(body.faces, device=body.device)
-
-    @property
-    def uses_band(self) -> bool:
-        """Whether distances are asked within a band of the skin, by a garment's links."""
-        return self._band is not None
+        rest = ExactSdf(body.faces, device=body.device)
+        rest.update(body.v_template)
+        has_links = self._band is not None
+        self._fabrics = {name: _Fabric.of(one, body, rest, has_links=has_links) for name, one in garments.items()}
 
     def near(self, unposed: Tensor) -> Tensor | None:
         """A face of the body near each vertex of unposed garments of the mean shape (B, V, 3), where that is of use."""
@@ -61,12 +63,13 @@ class Collisions:
         self._sdf.update(vertices)
 
     def resolve(
-        self, fabric: Fabric, points: Tensor, *, margin: float, scale: float | VertexScale, near: Tensor | None
+        self, name: str, points: Tensor, *, margin: float, scale: float | VertexScale, near: Tensor | None
     ) -> tuple[Resolution, int]:
-        """The garment with vertices [m], shape (N, 3), off the body (`refu_core.repulsion.Resolver`).
+        """The garment of that name, with vertices [m], shape (N, 3), off the body (`refu_core.repulsion.Resolver`).
 
         Also how many vertices weren't asked for their distance.
         """
+        fabric = self._fabrics[name]
         if self._band is not None and fabric.links is not None and margin + 2e-3 <= self._band.band:
             start = self._band.clipped(points, fabric.links)
             n_skipped = int(torch.count_nonzero(start.distance == self._band.band))

@@ -18,12 +18,11 @@ from refu_core.body import RigidTransforms, Shape, SmplBody, load_body
 from refu_core.errors import GarmentError, RefuError
 from refu_core.frames import SmplFrame
 from refu_core.garments import N_STYLES, GarmentTemplate, load_garment
-from refu_core.realtime._collisions import Collisions, Fabric
+from refu_core.realtime._collisions import Collisions
 from refu_core.realtime._outfit import Outfit
 from refu_core.realtime._outputs import SDF_MODES, SKIPS, FrameStats, GarmentMesh, GarmentStats, PipelineOutput
 from refu_core.realtime._turn import RootTurn
 from refu_core.repulsion import DEFAULT_MARGIN, Refu, VertexScale, read_refu
-from refu_core.sdf import ExactSdf
 from refu_core.weights import shipped_weights
 
 if TYPE_CHECKING:
@@ -39,7 +38,6 @@ class _Wearable:
     template: GarmentTemplate
     backbone: Backbone
     refu: Refu | None
-    fabric: Fabric
     faces: NDArray[np.int64]
     margin: float
 
@@ -168,12 +166,10 @@ class GarmentPipeline:
             msg = f"one person wears garments of one body: got {cut_for}"
             raise GarmentError(msg)
         body = load_body(worn_by.pop(), device=torch_device)
-        rest = ExactSdf(body.faces, device=body.device)
-        rest.update(body.v_template)
         collisions = None
         if sdf != "none":
-            collisions = Collisions(body, is_accurate=sdf == "accurate", uses_band="band" not in no_skip)
-        has_links = collisions is not None and collisions.uses_band
+            is_accurate, uses_band = sdf == "accurate", "band" not in no_skip
+            collisions = Collisions(body, templates, is_accurate=is_accurate, uses_band=uses_band)
         wearables: dict[str, _Wearable] = {}
         for name, template in templates.items():
             folder = shipped_weights(name) if weights is None else Path(weights) / name
@@ -189,7 +185,6 @@ class GarmentPipeline:
                 template,
                 network,
                 refu,
-                Fabric.of(template, body, rest, has_links=has_links),
                 template.faces.cpu().numpy(),
                 DEFAULT_MARGIN if refu is None else float(refu.margin),
             )
@@ -329,7 +324,7 @@ class GarmentPipeline:
             own_layers_ms = clock.lap()
             if self._collisions is not None:
                 done, n_unasked = self._collisions.resolve(
-                    wearable.fabric,
+                    name,
                     vertices,
                     margin=wearable.margin if self.margin is None else self.margin,
                     scale=one.scale[person],
