@@ -317,6 +317,9 @@ def _add_stress(commands: Any) -> None:
     length.add_argument("--quick", action="store_true", help="each check once: for CI")
     length.add_argument("--hours", type=float, metavar="H", help="go on for so long (default: some minutes)")
     parser.add_argument("--frames", type=_positive, metavar="N", help="frames of each soak (3000)")
+    parser.add_argument(
+        "--persons", type=_positive, default=1, metavar="P", help="persons of a soak, each one's frame counting (1)"
+    )
     parser.add_argument("--seed", type=int, default=0, metavar="S", help="of everything that is drawn (0)")
     parser.add_argument(
         "--output", type=Path, default=Path("stress"), metavar="DIR", help="where the worst trials go (stress)"
@@ -476,7 +479,12 @@ def _stress(args: argparse.Namespace) -> int:
         print(node_table(soak))
         _write_json(args.json, soak.as_dict())
         return EXIT_CHECK_FAILED if soak.failures else 0
-    result = run_stress(options, progress=not args.quiet) if args.replay is None else replay_worst(args.replay, options)
+    if args.replay is not None:
+        result = replay_worst(args.replay, options)
+    else:
+        result = run_stress(
+            options, progress=not args.quiet, report=lambda so_far: _write_json(args.json, so_far.as_dict())
+        )
     print(stress_table(result))
     _write_json(args.json, result.as_dict())
     return EXIT_CHECK_FAILED if result.failures else 0

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,7 @@ class StressOptions:
     sdf: str | None = None
     weights: Path | None = None
     frames: int | None = None
+    persons: int = 1
     hours: float | None = None
     quick: bool = False
     seed: int = 0
@@ -91,8 +92,10 @@ class StressResult:
         }
 
 
-def run_stress(options: StressOptions, *, progress: bool) -> StressResult:
-    """Tries all that was asked for.
+def run_stress(
+    options: StressOptions, *, progress: bool, report: Callable[[StressResult], object] = id
+) -> StressResult:
+    """Tries all that was asked for; `report` gets what there is so far, every minute of a soak.
 
     Raises:
         StressError: there is nothing to try: no such part, or no weights of any garment.
@@ -120,20 +123,26 @@ def run_stress(options: StressOptions, *, progress: bool) -> StressResult:
             share = _SOAK_SHARE if checks else 1.0
             limit = share * seconds / len(wardrobes) if options.hours is not None else math.inf
             subject = stress.Subject(wardrobe, weights=options.weights)
-            with tqdm(total=options.n_frames, unit="frame", disable=not progress, leave=False) as bar:
-                result.soaks.append(
-                    stress.soak(
-                        subject.pipeline,
-                        mode=f"{wardrobe.mode} {', '.join(wardrobe.garments)}",
-                        frames=options.n_frames,
-                        seconds=limit,
-                        seed=options.seed,
-                        tick=bar.update,
-                    )
+            with tqdm(total=options.n_frames, unit="frame", disable=not progress, leave=False, mininterval=1) as bar:
+                done = stress.soak(
+                    subject.pipeline,
+                    mode=f"{wardrobe.mode} {', '.join(wardrobe.garments)}",
+                    frames=options.n_frames,
+                    persons=options.persons,
+                    seconds=limit,
+                    seed=options.seed,
+                    tick=bar.update,
+                    report=_after(result, report),
                 )
+            result.soaks.append(done)
     if options.output is not None:
         result.files.extend(stress.save_worst(result.tallies, options.output))
     return result
+
+
+def _after(done: StressResult, report: Callable[[StressResult], object]) -> Callable[[stress.SoakResult], object]:
+    """Reports a soak together with what was done before it."""
+    return lambda soak: report(replace(done, soaks=[*done.soaks, soak]))
 
 
 def _wardrobes(options: StressOptions) -> tuple[list[stress.Wardrobe], list[str]]:
@@ -180,21 +189,26 @@ def stress_table(result: StressResult) -> str:
         ]
         lines += [format_table(header, rows), "(the limit is that of the worst trial; a few depend on the frame)", ""]
     if result.soaks:
-        header = ("soak", "frames", "NaN", "memory MB", "", "p99 ms", "", "wall p99 ms")
-        rows = [
+        soak_header = ("soak", "frames", "NaN", "memory MB", "", "p99 ms", "", "wall p99 ms", "machine")
+        soak_rows = [
             (
                 soak.mode,
-                str(soak.frames),
+                f"{soak.frames} by {soak.persons}",
                 str(soak.nan),
-                "{:.0f} → {:.0f}".format(*soak.memory_mb),
+                _first_last("{:.0f}", soak.tenths_mb),
                 f"{100 * soak.growth:+.1f} %",
-                "{:.1f} → {:.1f}".format(*soak.p99_ms),
+                _first_last("{:.1f}", soak.tenths_ms),
                 f"{100 * soak.slowdown:+.1f} %",
-                "{:.1f} → {:.1f}".format(*soak.wall_p99_ms),
+                _first_last("{:.1f}", soak.tenths_wall_ms),
+                f"{100 * soak.machine_slowdown:+.1f} %",
             )
             for soak in result.soaks
         ]
-        lines += [format_table(header, rows), "(first tenth → last tenth)", ""]
+        lines += [
+            format_table(soak_header, soak_rows),
+            "(first tenth → last tenth; machine: of the processor time of a fixed piece of work)",
+            "",
+        ]
     for tally in result.tallies:
         lines += [f"{tally.case} ({tally.mode}): {fault}" for fault in tally.faults]
     lines += [f"left out: {text}" for text in result.left_out]
@@ -202,6 +216,10 @@ def stress_table(result: StressResult) -> str:
         lines.append(f"worst cases: {result.files[0].parent}/*.npz, to be tried again with refu stress --replay FILE")
     lines.append("nothing failed" if not result.failures else f"{result.failures} FAILED")
     return "\n".join(lines)
+
+
+def _first_last(form: str, tenths: tuple[float, ...]) -> str:
+    return f"{form.format(tenths[0])} → {form.format(tenths[-1])}"
 
 
 def length(metres: float) -> str:

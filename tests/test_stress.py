@@ -206,16 +206,56 @@ def test_files_that_are_no_trials_are_refused(content: Any, wanted: str, tmp_pat
 
 
 def test_soaks_judge_memory_at_once_and_latency_of_many_frames(subject: Subject) -> None:
-    done = soak(subject.pipeline, mode="here", frames=20)
-    assert (done.frames, done.nan) == (20, 0)
-    assert 0 < done.memory_mb[0] <= done.memory_mb[1] * 1.01
-    steady: dict[str, Any] = {"mode": "x", "nan": 0, "seconds": 1.0, "wall_p99_ms": (1.0, 9.0)}
-    few = SoakResult(frames=100, memory_mb=(100, 104), p99_ms=(1.0, 2.0), **steady)
-    many = replace(few, frames=100_000)
-    grown = replace(few, memory_mb=(100, 106))
-    assert (few.failures, many.failures, grown.failures) == (0, 1, 1)
-    with pytest.raises(StressError, match="10 frames or more"):
-        soak(subject.pipeline, mode="here", frames=9)
+    ticked: list[int] = []
+    done = soak(subject.pipeline, mode="here", frames=40, persons=2, tick=ticked.append)
+    assert (done.frames, done.nan, sum(ticked)) == (40, 0, 40)
+    assert all(len(tenths) == 10 for tenths in (done.tenths_mb, done.tenths_ms, done.tenths_yardstick_ms))
+    assert 0 < done.tenths_mb[0] <= done.tenths_mb[-1] * 1.01
+    with pytest.raises(StressError, match="10 frames or more of each person, got 9"):
+        soak(subject.pipeline, mode="here", frames=18, persons=2)
+
+
+@pytest.mark.parametrize(
+    ("memory", "ours", "yardstick", "frames", "failures"),
+    [
+        (104, 2.0, 1.0, 39_000, 0),  # latencies of few calls are luck
+        (104, 2.0, 1.0, 40_000, 1),
+        (104, 2.0, 2.0, 40_000, 0),  # everything takes longer: that's the machine
+        (104, 1.04, 0.5, 40_000, 0),
+        (106, 1.0, 1.0, 39_000, 1),
+        (106, 2.0, 1.5, 40_000, 2),
+    ],
+)
+def test_a_soak_fails_by_memory_or_by_latency(
+    memory: float, ours: float, yardstick: float, frames: int, failures: int
+) -> None:
+    others = (1.0,) * 8
+    result = SoakResult(
+        mode="x",
+        frames=frames,
+        persons=2,
+        nan=0,
+        seconds=1.0,
+        tenths_mb=(100, *others, memory),
+        tenths_ms=(1.0, *others, ours),
+        tenths_wall_ms=(1.0, *others, 9.0),
+        tenths_yardstick_ms=(1.0, *others, yardstick),
+    )
+    assert result.failures == failures
+
+
+def test_an_interrupted_soak_has_its_row(subject: Subject, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("refu_core.stress._soak._REPORT_S", 0.0)
+    so_far: list[SoakResult] = []
+
+    def report(result: SoakResult) -> None:
+        so_far.append(result)
+        if len(so_far) == 3:
+            raise KeyboardInterrupt
+
+    result = soak(subject.pipeline, mode="here", frames=100, report=report)
+    assert [part.frames for part in so_far] == [10, 11, 12]
+    assert result.frames == 12
 
 
 def test_resident_memory_is_this_process() -> None:
@@ -237,7 +277,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     worst = tmp_path / "worst"
     common = ["stress", "--garments", "tshirt-male", "--backbone", "skinned", "--quiet"]
     json_file = tmp_path / "stress.json"
-    made = ["--quick", "--frames", "20", "--parts", "invariance,soak"]
+    made = ["--quick", "--frames", "20", "--persons", "2", "--parts", "invariance,soak"]
     assert main([*common, *made, "--json", str(json_file), "--output", str(worst)]) == 0
     printed = capsys.readouterr().out
     assert "nothing failed" in printed

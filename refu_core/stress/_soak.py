@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,10 +22,13 @@ from refu_core.stress._trial import StressError
 TOLERANCE = 0.05
 """By how much the last tenth may exceed the first one."""
 JUDGED_FROM = 20_000
-"""Frames from which the 99th percentiles of a tenth are judged: of less they are the luck of a few frames."""
+"""Calls from which the 99th percentiles of a tenth are judged: of less they are the luck of a few frames."""
 _POSES = 8
 _STEPS = 25
 _FEWEST = 10
+_REPORT_S = 60.0
+_YARDSTICK = 192
+"""Size of the matrix that the yardstick multiplies: a fifth of a millisecond."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,48 +37,56 @@ class SoakResult:
 
     mode: str
     frames: int
+    """Persons dressed."""
+    persons: int
+    """In one call."""
     nan: int
     """Numbers that came out and aren't finite."""
     seconds: float
-    memory_mb: tuple[float, float]
-    """Largest resident memory of the first and the last tenth."""
-    p99_ms: tuple[float, float]
-    """99th percentile of a frame's processor time in the first and the last tenth [ms]."""
-    wall_p99_ms: tuple[float, float]
+    tenths_mb: tuple[float, ...]
+    """Largest resident memory of each tenth."""
+    tenths_ms: tuple[float, ...]
+    """99th percentile of a call's processor time in each tenth [ms]."""
+    tenths_wall_ms: tuple[float, ...]
     """The same of its wall time, which other processes lengthen [ms]."""
+    tenths_yardstick_ms: tuple[float, ...]
+    """The same of the processor time of work that is always the same [ms]."""
 
     @property
     def growth(self) -> float:
         """Of the memory, as a share of the first tenth's."""
-        return self.memory_mb[1] / self.memory_mb[0] - 1
+        return _growth(self.tenths_mb)
 
     @property
     def slowdown(self) -> float:
         """Of the processor time's 99th percentile, as a share of the first tenth's."""
-        return self.p99_ms[1] / self.p99_ms[0] - 1
+        return _growth(self.tenths_ms)
+
+    @property
+    def machine_slowdown(self) -> float:
+        """Of the yardstick: how much slower the machine itself has become."""
+        return _growth(self.tenths_yardstick_ms)
+
+    @property
+    def is_slower(self) -> bool:
+        """Whether calls take longer, by the clock and by the yardstick, too; few calls aren't judged."""
+        by_yardstick = (1 + self.slowdown) / (1 + self.machine_slowdown) - 1
+        return min(self.slowdown, by_yardstick) > TOLERANCE and self.frames >= JUDGED_FROM * self.persons
 
     @property
     def failures(self) -> int:
-        """How many of memory and latency have grown too much; latencies of few frames aren't judged."""
-        is_slow = self.slowdown > TOLERANCE and self.frames >= JUDGED_FROM
-        return (self.growth > TOLERANCE) + is_slow + (self.nan > 0)
+        """How many of these have failed: memory, latency, finite numbers."""
+        return (self.growth > TOLERANCE) + self.is_slower + (self.nan > 0)
 
     def as_dict(self) -> dict[str, Any]:
         """A row of the results, ready for JSON."""
-        return {
-            "case": "soak: pipeline",
-            "mode": self.mode,
-            "runs": self.frames,
-            "failures": self.failures,
-            "nan": self.nan,
-            "max_deviation_m": 0.0,
-            "seconds": self.seconds,
-            "memory_mb": self.memory_mb,
-            "p99_ms": self.p99_ms,
-            "wall_p99_ms": self.wall_p99_ms,
-            "growth": self.growth,
-            "slowdown": self.slowdown,
-        }
+        row = {name: getattr(self, name) for name in self.__dataclass_fields__ if name != "frames"}
+        judged = ("growth", "slowdown", "machine_slowdown", "failures")
+        return (
+            {"case": "soak: pipeline", "runs": self.frames, "max_deviation_m": 0.0}
+            | row
+            | {name: getattr(self, name) for name in judged}
+        )
 
 
 def soak_frames(rng: np.random.Generator) -> list[SmplFrame]:
@@ -89,45 +101,94 @@ def soak(
     *,
     mode: str,
     frames: int,
+    persons: int = 1,
     seconds: float = math.inf,
     seed: int = 0,
     tick: Callable[[int], object] = int,
+    report: Callable[[SoakResult], object] = id,
 ) -> SoakResult:
-    """Runs the same motion over and over, until `frames` or `seconds` are over, and compares the tenths.
+    """Runs the same motions over and over, until `frames` or `seconds` are over, and compares the tenths.
 
-    `tick` is called with a number of frames that are done.
+    Args:
+        pipeline: What is to endure.
+        mode: Its name.
+        frames: How many to run, at most; each person of a call is one.
+        persons: In one call, each with a motion of their own.
+        seconds: For how long, at most.
+        seed: Of the motions.
+        tick: Called with a number of frames that are done.
+        report: Called every minute with what has come of it so far.
+
+    Returns:
+        The tenths; those so far after an interrupt (Ctrl-C).
 
     Raises:
-        StressError: fewer than ten frames, which have no tenths.
+        StressError: fewer than ten calls, which have no tenths.
     """
-    if frames < _FEWEST:
-        msg = f"a soak needs {_FEWEST} frames or more, got {frames}"
+    calls = -(-frames // persons)
+    if calls < _FEWEST:
+        msg = f"a soak needs {_FEWEST} frames or more of each person, got {calls}"
         raise StressError(msg)
-    motion = soak_frames(np.random.default_rng(seed))
-    for frame in motion:  # what is made in the first frames of all is no growth
-        pipeline(frame)
-    # Room for all figures, touched now: it mustn't look like the pipeline's growth.
-    cpu, wall, memory = np.zeros((3, frames), np.float32) + 1
-    start, n, nan = time.perf_counter(), 0, 0
-    while n < frames and (n < _FEWEST or time.perf_counter() - start < seconds):
-        cpu_before, before = time.thread_time(), time.perf_counter()
-        out = pipeline(motion[n % len(motion)])
-        wall[n] = 1e3 * (time.perf_counter() - before)
-        cpu[n] = 1e3 * (time.thread_time() - cpu_before)
-        nan += n_not_finite(*(mesh.local for mesh in out.values()))
-        memory[n] = resident_mb()
-        n += 1
-        tick(1)
-    first, last = slice(0, n // 10), slice(n - n // 10, n)
-    return SoakResult(
-        mode=mode,
-        frames=n,
-        nan=nan,
-        seconds=time.perf_counter() - start,
-        memory_mb=(float(memory[first].max()), float(memory[last].max())),
-        p99_ms=(_p99(cpu[first]), _p99(cpu[last])),
-        wall_p99_ms=(_p99(wall[first]), _p99(wall[last])),
-    )
+    motions = [soak_frames(np.random.default_rng(seed + i)) for i in range(persons)]
+    steps = list(zip(*motions, strict=True))
+    for step in steps:  # what is made in the first frames of all is no growth
+        pipeline(step)
+    log = _Log(calls)
+    start = last = time.perf_counter()
+
+    def result() -> SoakResult:
+        return log.result(mode=mode, persons=persons, seconds=time.perf_counter() - start)
+
+    with contextlib.suppress(KeyboardInterrupt):
+        while log.n < calls and (log.n < _FEWEST or time.perf_counter() - start < seconds):
+            log.take(pipeline, steps[log.n % len(steps)])
+            tick(persons)
+            if time.perf_counter() - last > _REPORT_S and log.n >= _FEWEST:
+                last = time.perf_counter()
+                report(result())
+    return result()
+
+
+class _Log:
+    """The figures of all calls so far."""
+
+    def __init__(self, calls: int) -> None:
+        # Room for all of them, touched now: it mustn't look like the pipeline's growth.
+        self._cpu, self._wall, self._memory, self._same = np.zeros((4, calls), np.float32) + 1
+        self._work = np.random.default_rng(0).normal(size=(_YARDSTICK, _YARDSTICK)).astype(np.float32)
+        self._rows = np.random.default_rng(0).integers(_YARDSTICK, size=8 * _YARDSTICK)
+        self._nan = 0
+        self.n = 0
+
+    def take(self, pipeline: GarmentPipeline, step: Sequence[SmplFrame]) -> None:
+        """One call, and the yardstick."""
+        cpu, wall = time.thread_time(), time.perf_counter()
+        outs = pipeline(step)
+        self._wall[self.n] = 1e3 * (time.perf_counter() - wall)
+        self._cpu[self.n] = 1e3 * (time.thread_time() - cpu)
+        cpu = time.thread_time()
+        (self._work @ self._work)[self._rows].sum()
+        self._same[self.n] = 1e3 * (time.thread_time() - cpu)
+        self._nan += n_not_finite(*(mesh.local for out in outs for mesh in out.values()))
+        self._memory[self.n] = resident_mb()
+        self.n += 1
+
+    def result(self, *, mode: str, persons: int, seconds: float) -> SoakResult:
+        """What has come of it so far."""
+        cpu, wall, memory, same = (
+            np.array_split(log[: self.n], 10) for log in (self._cpu, self._wall, self._memory, self._same)
+        )
+        return SoakResult(
+            mode=mode,
+            frames=self.n * persons,
+            persons=persons,
+            nan=self._nan,
+            seconds=seconds,
+            tenths_mb=tuple(float(tenth.max()) for tenth in memory),
+            tenths_ms=_p99(cpu),
+            tenths_wall_ms=_p99(wall),
+            tenths_yardstick_ms=_p99(same),
+        )
 
 
 def resident_mb(process: int | str = "self") -> float:
@@ -145,5 +206,9 @@ def _page_mb() -> float:
 _PAGE_MB = _page_mb()
 
 
-def _p99(values: NDArray[np.float32]) -> float:
-    return float(np.percentile(values, 99))
+def _p99(tenths: Sequence[NDArray[np.float32]]) -> tuple[float, ...]:
+    return tuple(float(np.percentile(tenth, 99)) for tenth in tenths)
+
+
+def _growth(tenths: Sequence[float]) -> float:
+    return tenths[-1] / tenths[0] - 1
