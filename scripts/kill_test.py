@@ -29,6 +29,7 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
+from tqdm import tqdm
 
 ROOT = Path(__file__).resolve().parents[1]
 GARMENT = "short-pant-male"
@@ -117,10 +118,13 @@ class Simulation:
     count = 3
 
     def __init__(self, folder: Path) -> None:
-        started = time.monotonic()
+        from refu_core.simulation import GarmentDataset
+
         self.begin(folder / "reference")
         self._wanted = self._columns(folder / "reference")
-        started, _ = time.monotonic(), started
+        self._by_slot = GarmentDataset(folder / "reference")
+        require(len(self._by_slot) == self.count, "not every slot has got a sample, so that rows can't be compared")
+        started = time.monotonic()
         shutil.rmtree(folder / "again", ignore_errors=True)
         self.begin(folder / "again")  # all kernels are compiled by now
         self.check_finished(folder / "again")
@@ -152,7 +156,7 @@ class Simulation:
             dataset.sample(i)
         slots = dataset.column("slot")
         for name in ("vertices", "pose", "betas", "style", "split"):
-            wanted = self._wanted[f"{name}.npy"][slots]
+            wanted = self._by_slot.column(name)[slots]
             require(np.array_equal(dataset.column(name), wanted), f"{name} of a finished sample is another")
         return f"{len(dataset)} samples"
 
@@ -244,7 +248,9 @@ def kill_often(what: str, times: int, *, seed: int, folder: Path) -> Result:
     work: Work = WORKS[what](folder)
     rng, result = random.Random(seed), Result(what)
     place = folder / "work"
+    progress = tqdm(total=times, desc=what, unit="kill", leave=False)
     while result.kills < times:
+        progress.update(result.kills - progress.n)
         seconds = rng.uniform(0, work.longest_s)
         child = os.fork()
         if child == 0:
@@ -262,6 +268,7 @@ def kill_often(what: str, times: int, *, seed: int, folder: Path) -> Result:
         except Exception as error:
             result.failures.append(f"{type(error).__name__}: {error}")
             shutil.rmtree(place, ignore_errors=True)
+    progress.close()
     child = os.fork()
     if child == 0:
         _work_and_exit(work, place)
