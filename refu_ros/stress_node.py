@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -17,7 +18,7 @@ from tqdm import tqdm
 
 from msg_adapters import BagReader, decode_marker_array, decoder_for, encoder_for
 from refu_core import RefuError
-from refu_core.stress import TOLERANCE, StressError, resident_mb, soak_frames, wardrobes
+from refu_core.stress import TOLERANCE, StressError, Yardstick, resident_mb, soak_frames, wardrobes
 from refu_ros.tables import format_table
 
 if TYPE_CHECKING:
@@ -60,6 +61,10 @@ class NodeSoak:
     """Largest resident memory of the node in the first and the last tenth."""
     p99_ms: tuple[float, float]
     """99th percentile of the time from sending to receiving, in the first and the last tenth [ms]."""
+    cpu_ms: tuple[float, float]
+    """99th percentile of the node's processor time a frame, of the seconds of the first and the last tenth [ms]."""
+    yardstick_ms: tuple[float, float]
+    """99th percentile of the processor time of work that is always the same, in the sender's process [ms]."""
     seconds: float
     exit_code: int
 
@@ -69,12 +74,20 @@ class NodeSoak:
         return max(0, self.sent - self.received - self.superseded)
 
     @property
+    def is_slower(self) -> bool:
+        """Whether messages come later, and the node computes longer than the machine's own slowing explains.
+
+        The first alone is what any other process does that wants the processor.
+        """
+        later, longer, machine = (last / first for first, last in (self.p99_ms, self.cpu_ms, self.yardstick_ms))
+        return min(later, longer / machine) > 1 + TOLERANCE
+
+    @property
     def failures(self) -> int:
         """Of: lost, doubled, not recorded, recorded twice, not finite, grown, slower, not ended well."""
         grown = self.memory_mb[1] > (1 + TOLERANCE) * self.memory_mb[0]
-        slower = self.p99_ms[1] > (1 + TOLERANCE) * self.p99_ms[0]
         counts = (self.lost, self.doubled, self.not_recorded, self.recorded_twice, self.nan, self.exit_code)
-        return sum(count != 0 for count in counts) + grown + slower
+        return sum(count != 0 for count in counts) + grown + self.is_slower
 
     def as_dict(self) -> dict[str, Any]:
         """Ready for JSON."""
@@ -164,6 +177,9 @@ class _Peer:
         self._latency: dict[int, float] = {}
         self._sent: list[int] = []
         self._memory: list[float] = []
+        self._cpu: list[float] = []
+        self._same: list[float] = []
+        self._yardstick = Yardstick()
         self._nan = 0
         self._stale, self._stale_before, self._noted = 0, 0, 0
 
@@ -214,12 +230,17 @@ class _Peer:
     def send_all(self, seconds: float, tick: Callable[[int], object]) -> None:
         """A frame every 1/30 s."""
         start = last = time.monotonic()
+        came, used = len(self._came), _processor_ms(self._process.pid)
         for i in range(round(seconds * RATE)):
             self._until(start + i / RATE)
             self._sent.append(self._send(i))
-            if time.monotonic() - last >= _SAMPLE_S or not self._memory:
+            self._same.append(self._yardstick.measure())
+            if time.monotonic() - last >= _SAMPLE_S:
                 last = time.monotonic()
                 self._memory.append(resident_mb(self._process.pid))
+                came_before, came = came, len(self._came)
+                used_before, used = used, _processor_ms(self._process.pid)
+                self._cpu.append((used - used_before) / max(1, came - came_before))
             tick(1)
         end = time.monotonic() + _LAST_S
         while time.monotonic() < end and self._sent[-1] not in self._came:
@@ -242,7 +263,9 @@ class _Peer:
             recorded_twice=sum(inputs.values()) - len(inputs) + sum(garments.values()) - len(garments),
             nan=self._nan,
             memory_mb=_tenths(self._memory, max),
-            p99_ms=_tenths(latency, lambda values: float(np.percentile(values, 99))),
+            p99_ms=_tenths(latency, _p99),
+            cpu_ms=_tenths(self._cpu, _p99),
+            yardstick_ms=_tenths(self._same, _p99),
             seconds=len(self._sent) / RATE,
             exit_code=exit_code,
         )
@@ -250,7 +273,20 @@ class _Peer:
 
 def _tenths(values: list[float], of: Callable[[list[float]], float]) -> tuple[float, float]:
     n = max(1, len(values) // 10)
-    return (of(values[:n]), of(values[-n:])) if values else (0.0, 0.0)
+    return (of(values[:n]), of(values[-n:])) if values else (1.0, 1.0)
+
+
+def _p99(values: list[float]) -> float:
+    return float(np.percentile(values, 99))
+
+
+def _processor_ms(process: int) -> float:
+    """Processor time that all threads of a process have taken [ms]."""
+    total = 0
+    for task in Path(f"/proc/{process}/task").iterdir():
+        with contextlib.suppress(FileNotFoundError):  # a thread that has just ended
+            total += int((task / "schedstat").read_text(encoding="ascii").split()[0])
+    return 1e-6 * total
 
 
 def _recorded(bag: Path) -> tuple[Counter[int], Counter[int]]:
@@ -287,6 +323,8 @@ def node_table(result: NodeSoak) -> str:
         ("messages with NaN", "", str(result.nan)),
         ("memory, first → last tenth", "", "{:.0f} → {:.0f} MB".format(*result.memory_mb)),
         ("latency p99, first → last tenth", "", "{:.1f} → {:.1f} ms".format(*result.p99_ms)),
+        ("processor time a frame p99, first → last tenth", "", "{:.1f} → {:.1f} ms".format(*result.cpu_ms)),
+        ("the same of a fixed piece of work", "", "{:.2f} → {:.2f} ms".format(*result.yardstick_ms)),
         ("exit code", "", str(result.exit_code)),
     ]
     verdict = "nothing failed" if not result.failures else f"{result.failures} FAILED"

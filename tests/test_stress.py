@@ -32,6 +32,7 @@ from refu_core.stress import (
 )
 from refu_ros.cli import main
 from refu_ros.stress import length
+from refu_ros.stress_node import NodeSoak
 
 CHECKS = {check.name: check for check in all_checks()}
 TSHIRT = Wardrobe(garments=("tshirt-male",))
@@ -307,6 +308,26 @@ def test_bad_input_is_one_line(arguments: list[str], wanted: str, capsys: pytest
     error = capsys.readouterr().err
     assert wanted in error
     assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("later", "longer", "machine", "is_slower"),
+    [
+        (2.0, 2.0, 1.0, True),
+        (2.0, 1.0, 1.0, False),  # others want the processor
+        (2.0, 2.0, 2.0, False),  # everything takes longer
+        (1.04, 2.0, 1.0, False),
+        (1.06, 1.06, 1.0, True),
+    ],
+)
+def test_a_node_is_slower_by_the_clock_and_by_its_own_work(
+    later: float, longer: float, machine: float, is_slower: bool
+) -> None:
+    figures = dict.fromkeys(("sent", "received", "doubled", "superseded", "recorded", "not_recorded"), 0)
+    figures |= dict.fromkeys(("recorded_twice", "nan", "exit_code", "seconds"), 0)
+    ratios = {"memory_mb": 1.0, "p99_ms": later, "cpu_ms": longer, "yardstick_ms": machine}
+    result = NodeSoak(**figures, **{name: (1.0, last) for name, last in ratios.items()})  # type: ignore[arg-type]
+    assert (result.is_slower, result.failures) == (is_slower, int(is_slower))
 
 
 def test_the_live_node(tmp_path: Path) -> None:

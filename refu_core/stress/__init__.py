@@ -14,6 +14,7 @@ from refu_core.stress._run import run_checks as run_checks
 from refu_core.stress._run import save_worst as save_worst
 from refu_core.stress._soak import TOLERANCE as TOLERANCE
 from refu_core.stress._soak import SoakResult as SoakResult
+from refu_core.stress._soak import Yardstick as Yardstick
 from refu_core.stress._soak import resident_mb as resident_mb
 from refu_core.stress._soak import soak as soak
 from refu_core.stress._soak import soak_frames as soak_frames
