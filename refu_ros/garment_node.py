@@ -29,7 +29,9 @@ def main(args: Sequence[str] | None = None) -> int:
 
     from refu_core import RefuError
     from refu_ros._node import GarmentNode
+    from refu_ros._transport import make_room
 
+    make_room()
     rclpy.init(args=None if args is None else list(args), signal_handler_options=SignalHandlerOptions.NO)
     try:
         try:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import resource
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
@@ -21,6 +24,7 @@ from refu_ros._recorder import Recorder, RecorderState, free_path
 from refu_ros._scene import Scene, check_plausible
 from refu_ros._settings import NodeSettings, SettingsError, defaults, specs
 from refu_ros._statistics import Statistics
+from refu_ros._transport import PROFILES, SEGMENT_BYTES, make_room
 from refu_ros._worker import Worker
 
 TOPIC, TYPE = "/garments", "visualization_msgs/msg/MarkerArray"
@@ -454,3 +458,56 @@ def test_levels_mean_something(tmp_path: Path) -> None:
         (2, RecorderState(tmp_path, 1, 0, 0, 10, 10**12, "no space left")),
     ):
         assert report_of(statistics, recording=state)["recording"].level == level
+
+
+# Transport ----------------------------------------------------------------------------------------
+
+_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE", "FASTDDS_BUILTIN_TRANSPORTS")
+
+
+@pytest.fixture
+def unconfigured(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """Fast DDS as installed, and room in shared memory; returns the working folder."""
+    for name in _VARIABLES:
+        monkeypatch.setenv(name, "")  # what `make_room` sets goes with the test
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=SEGMENT_BYTES + 1))  # noqa: ARG005
+    return tmp_path
+
+
+def test_fast_dds_gets_room_for_meshes(unconfigured: Path) -> None:  # noqa: ARG001
+    assert make_room()
+    assert Path(os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"]) == PROFILES
+    name = "{http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles}segment_size"
+    assert [int(size.text or 0) for size in ET.parse(PROFILES).iter(name)] == [SEGMENT_BYTES]
+
+
+@pytest.mark.parametrize("variable", _VARIABLES)
+def test_who_configured_fast_dds_keeps_that(
+    unconfigured: Path,  # noqa: ARG001
+    monkeypatch: pytest.MonkeyPatch,
+    variable: str,
+) -> None:
+    monkeypatch.setenv(variable, "mine")
+    assert not make_room()
+    assert os.environ[variable] == "mine"
+
+
+def test_a_profile_in_the_folder_counts_too(unconfigured: Path) -> None:
+    (unconfigured / "DEFAULT_FASTRTPS_PROFILES.xml").write_text("<profiles/>")
+    assert not make_room()
+
+
+@pytest.mark.parametrize("free", [0, SEGMENT_BYTES, None])
+def test_without_room_everything_stays_as_it_is(
+    unconfigured: Path,  # noqa: ARG001
+    monkeypatch: pytest.MonkeyPatch,
+    free: int | None,
+) -> None:
+    def usage(path: str) -> SimpleNamespace:
+        if free is None:
+            raise FileNotFoundError(path)
+        return SimpleNamespace(free=free)
+
+    monkeypatch.setattr("shutil.disk_usage", usage)
+    assert not make_room()

@@ -57,7 +57,7 @@ class NodeProcess:
         for number in signals:
             self.process.send_signal(number)
             time.sleep(0.05)
-        return self.process.wait(timeout=20)
+        return self.process.wait(timeout=60)
 
 
 def _yaml(value: Any) -> str:
@@ -94,7 +94,7 @@ class Peer:
         """Listens no longer."""
         self.node.destroy_subscription(self._subscription)
 
-    def spin_until(self, condition: Callable[[], Any], what: str, *, timeout: float = 20.0) -> None:
+    def spin_until(self, condition: Callable[[], Any], what: str, *, timeout: float = 60.0) -> None:
         """Fails with `what` when it doesn't come true."""
         end = time.monotonic() + timeout
         while not condition():
@@ -115,7 +115,7 @@ class Peer:
                 and self.node.count_publishers("garments")
             ),
             "the node listens",
-            timeout=40.0,
+            timeout=120.0,
         )
 
     def fall_silent(self, person: str) -> None:
@@ -141,11 +141,13 @@ class Peer:
     def dress(self, frame: SmplFrame, person: str = "") -> Marker:
         """Sends a frame (again and again: input is best effort) until its T-shirt comes back."""
         ns = f"{person}/{GARMENTS[0]}" if person else GARMENTS[0]
-        end = time.monotonic() + 20
+        end = time.monotonic() + 60
         while (marker := self.seen(frame.stamp_ns, ns)) is None:
             assert time.monotonic() < end, f"no garment for {person or 'the frame'}"
             self.send(frame, person)
-            self.spin(0.1)
+            again = time.monotonic() + 0.1
+            while time.monotonic() < again and self.seen(frame.stamp_ns, ns) is None:
+                rclpy.spin_once(self.node, timeout_sec=0.02)
         return marker
 
     def status(self, part: str) -> tuple[int, str, dict[str, str]]:
@@ -164,7 +166,7 @@ class Peer:
         """A service's answer."""
         client = self.node.create_client(service_type, name)
         try:
-            assert client.wait_for_service(timeout_sec=20.0), name
+            assert client.wait_for_service(timeout_sec=60.0), name
             future = client.call_async(request)
             self.spin_until(future.done, f"{name} answers")
             return future.result()
