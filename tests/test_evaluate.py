@@ -14,7 +14,8 @@ import msg_adapters as adapters
 from refu_core import SmplFrame, load_body, load_garment
 from refu_core.evaluation.reproduction import _pictures
 from refu_ros import quick
-from refu_ros.cli import EVALUATION_TABLES, main
+from refu_ros._commands.evaluate import EVALUATION_TABLES
+from refu_ros.cli import main
 from refu_ros.truth import TOPIC
 
 BAGS = Path(__file__).parents[1] / "bags"

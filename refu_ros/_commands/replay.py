@@ -1,0 +1,88 @@
+"""`refu replay`: recorded motion through the pipeline, measured."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from refu_ros._commands._common import (
+    EXIT_INTERRUPTED,
+    add_common,
+    check_writable,
+    names,
+    numbers,
+    positive,
+    write_json,
+)
+
+if TYPE_CHECKING:
+    import argparse
+
+
+def add(commands: Any) -> None:
+    """The command's parser."""
+    parser = commands.add_parser(
+        "replay",
+        help="run recorded motion through the pipeline and measure it",
+        description="Run every frame of a bag or motion file through the pipeline, write the garments as a bag, and "
+        "evaluate them with exact collision checks.",
+    )
+    parser.add_argument(
+        "input", type=Path, metavar="INPUT", help="an .mcap, a rosbag2 directory, or an AMASS-style .npz"
+    )
+    parser.add_argument("--output", type=Path, metavar="OUT", help="bag to write: OUT.mcap, or a directory for rosbag2")
+    parser.add_argument("--report", type=Path, metavar="DIR", help="write DIR/index.html with plots and pictures")
+    parser.add_argument(
+        "--garments",
+        type=names,
+        default=("tshirt-male", "short-pant-male"),
+        metavar="A,B",
+        help="garments of one body (default: tshirt-male,short-pant-male)",
+    )
+    parser.add_argument(
+        "--backbone", default="tailornet", metavar="NAME", help="tailornet (default), mlp, gcnn, or skinned: no network"
+    )
+    parser.add_argument(
+        "--sdf", default="hybrid", metavar="MODE", help="hybrid (default), approx, accurate, or none for no ReFU"
+    )
+    parser.add_argument(
+        "--weights", type=Path, metavar="DIR", help="folder with a folder a garment of weights of one's own"
+    )
+    parser.add_argument("--margin", type=float, default=0.004, metavar="M", help="clearance from the skin [m] (0.004)")
+    parser.add_argument("--betas", type=numbers(10), metavar="B0,…", help="shape to use instead of the recorded one")
+    parser.add_argument("--style", type=numbers(4), metavar="G0,…", help="garment style γ")
+    parser.add_argument(
+        "--speed", choices=("max", "real"), default="max", help="as fast as possible (default), or paced"
+    )
+    parser.add_argument("--topic", metavar="NAME", help="input topic, where a bag has several of SMPL parameters")
+    parser.add_argument("--input-type", metavar="TYPE", help="multiarray, joint_state, pose_array or smpl_msgs")
+    parser.add_argument(
+        "--input-axes",
+        choices=("smpl", "frame"),
+        default="smpl",
+        help="axes of the recorded root: SMPL's world, y up (default), or those of the frame itself",
+    )
+    parser.add_argument("--frame-id", default="map", metavar="ID", help="frame_id of the markers (map)")
+    parser.add_argument("--device", default="cpu", metavar="DEVICE", help="cpu (default) or cuda")
+    parser.add_argument("--max-frames", type=positive, metavar="N", help="stop after N frames")
+    parser.add_argument("--overwrite", action="store_true", help="replace an output that is there already")
+    add_common(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Does what was asked; returns the exit code."""
+    from refu_ros.replay import ReplayOptions, replay
+    from refu_ros.tables import replay_table
+
+    for path in (args.json, args.report):
+        check_writable(path)
+    given = {key: value for key, value in vars(args).items() if key in ReplayOptions.__dataclass_fields__}
+    result = replay(ReplayOptions(**given), progress=not args.quiet)
+    print(replay_table(result))
+    write_json(args.json, result.as_dict())
+    if args.report is not None and result.frames:
+        from refu_ros.report import write_report
+
+        print(f"report: {write_report(result, args.report, progress=not args.quiet)}")
+    return EXIT_INTERRUPTED if result.interrupted else 0
