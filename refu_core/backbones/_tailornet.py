@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
+from torch.func import functional_call
 
 from refu_core.backbones._decoder import Decoder
 from refu_core.backbones._features import N_STYLE_SHAPE, PoseFeatures, style_shape
@@ -107,15 +108,22 @@ class TailorNet(nn.Module):
         return 0 if self._cache is None else len(self.pivots) - self._cache.weights.shape[1]
 
     def drapes(self, s: Tensor) -> Tensor:
-        """Mean drapes G, shape (B, C'), of (β, γ) (B, 14), in coordinates isometric to the vertices [m]."""
-        code = self.style_shape(s)
-        drape = s @ self._directions
+        """Mean drapes G, shape (B, C'), of (β, γ) (B, 14), in coordinates isometric to the vertices [m].
+
+        Computed in the type of `s`.
+        """
+        if s.dtype == self._directions.dtype:
+            code = self.style_shape(s)
+        else:
+            tensors = {name: tensor.to(s.dtype) for name, tensor in self.style_shape.state_dict().items()}
+            code = functional_call(self.style_shape, tensors, s)
+        drape = s @ self._directions.to(s.dtype)
         drape[:, : code.shape[1]] += code
         return drape
 
     def distances(self, s: Tensor) -> Tensor:
         """dist_k to the pivots, shape (B, K), of (β, γ) (B, 14)."""
-        gap = (self.drapes(s)[:, None] - self.drapes(self.pivots)).square().sum(-1)
+        gap = (self.drapes(s)[:, None] - self.drapes(self.pivots.to(s.dtype))).square().sum(-1)
         return 1000.0 / self.decoder.n_vertices * gap
 
     @torch.no_grad()
@@ -127,7 +135,9 @@ class TailorNet(nn.Module):
         return kernel_weights(self.distances(s), self.config.sigma)
 
     def _mix(self, s: Tensor, state: tuple[object, ...]) -> _Mixture:
-        mixture = self.mixture(s)
+        # Far from all pivots, which of two is nearer hangs on the last digits of distances of 1e5: float32 hasn't got
+        # them, and a pivot's weight would be rounding.
+        mixture = self.mixture(s.double()).to(s.dtype)
         active = non_negligible(mixture, self.config.skipped if self.skips_pivots else 0.0)
         return _Mixture(s.clone(), state, mixture[:, active].contiguous(), self.high.select(active))
 
