@@ -24,7 +24,13 @@ from refu_core.backbones._gcnn import Gcnn, GcnnConfig
 from refu_core.backbones._mlp import Mlp, MlpConfig
 from refu_core.backbones._presets import PRESETS, TRAINABLE, BackboneConfig, backbone_config, build_backbone, uses_basis
 from refu_core.backbones._protocol import Backbone, Prediction, Skinned
-from refu_core.backbones._tailornet import TailorNet, TailorNetConfig, kernel_weights, non_negligible
+from refu_core.backbones._tailornet import (
+    TailorNet,
+    TailorNetConfig,
+    kernel_weights,
+    non_negligible,
+    without_negligible,
+)
 
 __all__ = [
     "BACKBONES",
@@ -62,4 +68,5 @@ __all__ = [
     "tilt_rotvec",
     "up_in_root",
     "uses_basis",
+    "without_negligible",
 ]

@@ -138,7 +138,8 @@ class TailorNet(nn.Module):
         # Far from all pivots, which of two is nearer hangs on the last digits of distances of 1e5: float32 hasn't got
         # them, and a pivot's weight would be rounding.
         mixture = self.mixture(s.double()).to(s.dtype)
-        active = non_negligible(mixture, self.config.skipped if self.skips_pivots else 0.0)
+        mixture = without_negligible(mixture, self.config.skipped if self.skips_pivots else 0.0)
+        active = mixture.amax(0).nonzero()[:, 0]
         return _Mixture(s.clone(), state, mixture[:, active].contiguous(), self.high.select(active))
 
     def _state(self) -> tuple[object, ...]:
@@ -168,12 +169,17 @@ def kernel_weights(distances: Tensor, sigma: float) -> Tensor:
     return kernel / kernel.sum(-1, keepdim=True)
 
 
-def non_negligible(mixture: Tensor, skipped: float) -> Tensor:
-    """Indices of the pivots that count, shape (A,), for a mixture (B, K).
+def without_negligible(mixture: Tensor, skipped: float) -> Tensor:
+    """The mixture (B, K) with a weight of zero for the pivots that a row leaves out.
 
-    Those left out are the lightest ones that weigh at most `skipped` together in every row.
+    These are the lightest ones that weigh at most `skipped` together. A row leaves out the same, whoever else is in the
+    batch: a person alone and in a crowd wear the same.
     """
-    heaviest = mixture.amax(0)
-    order = heaviest.argsort()
-    left_out = heaviest[order].cumsum(0) <= skipped
-    return order[~left_out].sort().values
+    order = mixture.argsort(-1)
+    is_light = mixture.gather(-1, order).cumsum(-1) <= skipped
+    return mixture.masked_fill(torch.zeros_like(is_light).scatter(-1, order, is_light), 0.0)
+
+
+def non_negligible(mixture: Tensor, skipped: float) -> Tensor:
+    """Indices of the pivots that count in any row, shape (A,), for a mixture (B, K): see `without_negligible`."""
+    return without_negligible(mixture, skipped).amax(0).nonzero()[:, 0]

@@ -42,6 +42,7 @@ from refu_core.backbones import (
     style_shape,
     tilt_rotvec,
     up_in_root,
+    without_negligible,
 )
 from refu_core.backbones._gcnn import UpConv
 from refu_core.backbones._graph import MeshGraph
@@ -152,7 +153,33 @@ def test_what_is_left_out_weighs_no_more_than_was_allowed(seed: int, skipped: fl
     mixture = torch.as_tensor(rng.dirichlet(np.full(20, 0.1), size=rng.integers(1, 4)))
     active = non_negligible(mixture, skipped)
     assert len(active) > 0
-    assert bool((1 - mixture[:, active].sum(1) <= skipped + 1e-12).all())
+    left = without_negligible(mixture, skipped)
+    assert bool((1 - left.sum(1) <= skipped + 1e-12).all())
+    assert bool((left[:, active].amax(0) > 0).all())
+    assert torch.count_nonzero(left) == torch.count_nonzero(left[:, active])
+    for row, alone in zip(mixture, left, strict=True):
+        assert torch.equal(without_negligible(row[None], skipped)[0], alone)
+
+
+def test_a_person_wears_the_same_alone_and_in_a_crowd(garment: GarmentTemplate, basis: BasisDecoder) -> None:
+    net = tailornet(garment, basis, sigma=0.5, skipped=0.2)
+    betas, pose, style = bodies(6)
+    with torch.no_grad():
+        together = net(betas, pose, style).displacement
+        for i in range(6):
+            alone = net(betas[i : i + 1], pose[i : i + 1], style[i : i + 1]).displacement
+            torch.testing.assert_close(alone[0], together[i], atol=1e-6, rtol=0)
+
+
+def test_of_pivots_far_away_the_nearest_ones_are_known(garment: GarmentTemplate, basis: BasisDecoder) -> None:
+    net = tailornet(garment, basis, sigma=1.0, skipped=0.0)
+    exact = copy.deepcopy(net).double()
+    betas, pose, style = bodies(16)
+    style = 50 * style
+    with torch.no_grad():
+        got = net(betas, pose, style).displacement
+        wanted = exact(betas.double(), pose.double(), style.double()).displacement
+    torch.testing.assert_close(got, wanted.float(), atol=1e-6, rtol=0)
 
 
 def test_leaving_pivots_out_moves_vertices_within_the_bound(garment: GarmentTemplate, basis: BasisDecoder) -> None:
