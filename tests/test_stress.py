@@ -115,7 +115,8 @@ WRONG: list[tuple[str, Spoil]] = [
     ("invariance: the person 100 km away", far_off),
     ("invariance: left and right exchanged", lambda mesh, *_: moved(mesh, (0.03, 0, 0))),
     ("invariance: what came before", remembering),
-    ("invariance: a batch of 64", remembering),
+    ("invariance: a batch of 64, predicted", lambda mesh, _, call: replace(mesh, raw=mesh.raw + 1e-5 * call)),
+    ("invariance: a batch of 64, resolved", remembering),
 ]
 
 

@@ -12,16 +12,24 @@ from scipy.spatial.transform import Rotation
 from refu_core.body import JOINT_NAMES
 from refu_core.frames import N_BETAS, SmplFrame
 from refu_core.stress._frames import FRAMES, everyday, everyday_pose, frame_of
+from refu_core.stress._numbers import ROUNDING
 from refu_core.stress._subject import distance_to_mesh
 from refu_core.stress._trial import Check, Measurement, Trial
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from refu_core.realtime import PipelineOutput
     from refu_core.stress._subject import Subject
 
 RIGID = 1e-4
 """How closely a garment follows the person [m]."""
 _FAR = 1e5  # [m]
 _BATCH = 64
+_ALONE = 16
+"""Persons of a batch that are dressed alone, too."""
+_UNDECIDED = 0.01
+"""Share of a garment's vertices whose way out may hang on a rounding."""
 _MIRROR_POINTS = 32
 ASYMMETRY = 4e-3
 """What collision handling may add to the asymmetry of body, garment and backbone [m]: as much as the margin."""
@@ -35,7 +43,8 @@ def invariance_checks() -> list[Check]:
         Check(name="invariance: the person 100 km away", draw=_calm, measure=moved, trials=2),
         Check(name="invariance: left and right exchanged", draw=_calm, measure=mirrored),
         Check(name="invariance: what came before", draw=_teleport, measure=history),
-        Check(name="invariance: a batch of 64", draw=_crowd, measure=batch),
+        Check(name="invariance: a batch of 64, predicted", draw=_crowd, measure=batch),
+        Check(name="invariance: a batch of 64, resolved", draw=_crowd, measure=batch_resolved),
     ]
 
 
@@ -127,14 +136,31 @@ def history(subject: Subject, trial: Trial) -> Measurement:
 
 
 def batch(subject: Subject, trial: Trial) -> Measurement:
-    """Persons dressed together against the same persons one by one."""
-    together = subject.pipeline(trial.frames)
-    some = np.random.default_rng(0).choice(len(trial.frames), 8, replace=False)
+    """Persons dressed together against the same persons one by one, before collision handling."""
     deviation = 0.0
-    for i in some:
-        alone = subject.pipeline(trial.frames[i])
-        deviation = max(deviation, *(_farthest(mesh.local, alone[name].local) for name, mesh in together[i].items()))
-    return Measurement(runs=len(trial.frames) + len(some), deviation=deviation, limit=RIGID)
+    for alone, together in _alone_and_together(subject, trial):
+        deviation = max(deviation, *(_farthest(mesh.raw, together[name].raw) for name, mesh in alone.items()))
+    return Measurement(runs=len(trial.frames) + _ALONE, deviation=deviation, limit=ROUNDING)
+
+
+def batch_resolved(subject: Subject, trial: Trial) -> Measurement:
+    """The same after collision handling, which has two ways out for some vertices: all but one in a hundred.
+
+    A product of matrices of 64 rows is rounded otherwise than one of a single row, and which way is shorter may hang on
+    that; a bound for every single vertex is that of displacements, which is a check of its own.
+    """
+    deviation = 0.0
+    for alone, together in _alone_and_together(subject, trial):
+        for name, mesh in alone.items():
+            way = np.linalg.norm(mesh.local - together[name].local, axis=1)
+            deviation = max(deviation, float(np.quantile(way, 1 - _UNDECIDED)))
+    return Measurement(runs=len(trial.frames) + _ALONE, deviation=deviation, limit=RIGID)
+
+
+def _alone_and_together(subject: Subject, trial: Trial) -> Iterator[tuple[PipelineOutput, PipelineOutput]]:
+    outs = subject.pipeline(trial.frames)
+    for i in np.random.default_rng(0).choice(len(trial.frames), _ALONE, replace=False):
+        yield subject.pipeline(trial.frames[i]), outs[i]
 
 
 def _farthest(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:

@@ -20,7 +20,7 @@ ROUNDING = 5e-6
 PIVOTS = 2e-3
 """Share of the largest displacement that pivots which weigh 0.1 % may make: they may point the other way."""
 _DISTANCE_ROUNDING = 2e-6
-_FRAMES = 32
+_FRAMES = 64
 _POINTS = 24
 _UNIT = 1e-3
 """How far from one the length of a gradient may be."""
