@@ -11,7 +11,7 @@ at a time, and the points lie sorted by row and cell, so that what a face sees o
 
 import warp as wp
 
-from refu_core.sdf._kernels import closest_on_triangle, distance_and_gradient, offset_from, pseudo_normal
+from refu_core.sdf._kernels import closest_on_triangle, measured_to
 
 wp.set_module_options({"enable_backward": False})
 
@@ -200,7 +200,6 @@ def finish_kernel(
     out_face: wp.array(dtype=int),
     out_feature: wp.array(dtype=int),
     out_barycentrics: wp.array(dtype=wp.vec3),
-    out_normal: wp.array(dtype=wp.vec3),
     out_distance: wp.array(dtype=float),
     out_gradient: wp.array(dtype=wp.vec3),
 ):
@@ -212,15 +211,9 @@ def finish_kernel(
         out_distance[q] = beyond[0]
         out_gradient[q] = wp.vec3(0.0, 1.0, 0.0)
         return
-    p = points[q]
-    w, feature = closest_on_triangle(p, body[faces[f, 0]], body[faces[f, 1]], body[faces[f, 2]])
-    normal = pseudo_normal(f, feature, body, faces, across, fan_start, fan_face)
-    offset = offset_from(p, f, w, body, faces)
-    outside = wp.where(wp.dot(offset, normal) < 0.0, -1.0, 1.0)
-    distance, gradient = distance_and_gradient(offset, feature, normal, outside)
+    distance, gradient, w, feature = measured_to(points[q], f, body, faces, across, fan_start, fan_face)
     out_feature[q] = feature
     out_barycentrics[q] = w
-    out_normal[q] = normal
     out_distance[q] = distance
     out_gradient[q] = gradient
 

@@ -117,16 +117,72 @@ def offset_from(p: wp.vec3, face: int, w: wp.vec3, points: wp.array(dtype=wp.vec
 
 
 @wp.func
-def distance_and_gradient(offset: wp.vec3, feature: int, normal: wp.vec3, outside: float):
-    """Signed distance and its unit gradient from the closest point's offset, feature and normal, and the side it is."""
-    height = wp.dot(offset, normal)
-    distance = wp.length(offset)
+def is_below(
+    offset: wp.vec3,
+    face: int,
+    feature: int,
+    points: wp.array(dtype=wp.vec3),
+    faces: wp.array2d(dtype=int),
+    across: wp.array2d(dtype=int),
+    fan_start: wp.array(dtype=int),
+    fan_face: wp.array(dtype=int),
+):
+    """Whether an offset from a feature of a face leads inside, by the pseudo-normal there."""
+    below = bool(True)
+    above = bool(True)
+    if feature >= VERTEX and feature < EDGE:
+        # Mostly all faces around a vertex say the same, and their angles there needn't be known.
+        vertex = faces[face, feature - VERTEX]
+        for i in range(fan_start[vertex], fan_start[vertex + 1]):
+            a = points[faces[fan_face[i], 0]]
+            normal = wp.cross(points[faces[fan_face[i], 1]] - a, points[faces[fan_face[i], 2]] - a)
+            if wp.dot(offset, normal) < 0.0:
+                above = False
+            else:
+                below = False
+    if above == below:
+        below = wp.dot(offset, pseudo_normal(face, feature, points, faces, across, fan_start, fan_face)) < 0.0
+    return below
+
+
+@wp.func
+def distance_and_gradient(
+    offset: wp.vec3,
+    face: int,
+    feature: int,
+    points: wp.array(dtype=wp.vec3),
+    faces: wp.array2d(dtype=int),
+    across: wp.array2d(dtype=int),
+    fan_start: wp.array(dtype=int),
+    fan_face: wp.array(dtype=int),
+):
+    """Signed distance and its unit gradient from the offset of the closest point, which is on a feature of a face."""
     if feature == FACE:
-        distance = wp.abs(height)
-    if feature == FACE or distance < ON_SURFACE:
-        # On the surface the two signs may differ by rounding alone, and the way out is the normal.
-        return outside * distance, wp.where(distance > ON_SURFACE and height * outside < 0.0, -normal, normal)
+        normal = face_normal(face, points, faces)
+        return wp.dot(offset, normal), normal
+    distance = wp.length(offset)
+    if distance < ON_SURFACE:
+        normal = pseudo_normal(face, feature, points, faces, across, fan_start, fan_face)
+        return wp.where(wp.dot(offset, normal) < 0.0, -distance, distance), normal
+    outside = wp.where(is_below(offset, face, feature, points, faces, across, fan_start, fan_face), -1.0, 1.0)
     return outside * distance, offset * (outside / distance)
+
+
+@wp.func
+def measured_to(
+    p: wp.vec3,
+    face: int,
+    points: wp.array(dtype=wp.vec3),
+    faces: wp.array2d(dtype=int),
+    across: wp.array2d(dtype=int),
+    fan_start: wp.array(dtype=int),
+    fan_face: wp.array(dtype=int),
+):
+    """Signed distance at p and its unit gradient, if `face` is the closest; p's place on it, and the feature there."""
+    w, feature = closest_on_triangle(p, points[faces[face, 0]], points[faces[face, 1]], points[faces[face, 2]])
+    offset = offset_from(p, face, w, points, faces)
+    distance, gradient = distance_and_gradient(offset, face, feature, points, faces, across, fan_start, fan_face)
+    return distance, gradient, w, feature
 
 
 @wp.func
@@ -152,11 +208,10 @@ def closest_kernel(
     out_face: wp.array(dtype=int),
     out_feature: wp.array(dtype=int),
     out_barycentrics: wp.array(dtype=wp.vec3),
-    out_normal: wp.array(dtype=wp.vec3),
     out_distance: wp.array(dtype=float),
     out_gradient: wp.array(dtype=wp.vec3),
 ):
-    """Closest point, pseudo-normal there, signed distance and its gradient; face -1 where nothing is close enough.
+    """Closest point, signed distance there and its gradient; face -1 where nothing is close enough.
 
     Of the queries numbered `rows`, or of all where there are no rows. Where a face `near` is known (not -1), nothing
     farther away than that is looked at.
@@ -178,23 +233,36 @@ def closest_kernel(
         out_face[i] = -1
         out_feature[i] = FACE
         out_barycentrics[i] = wp.vec3(1.0, 0.0, 0.0)
-        out_normal[i] = wp.vec3(0.0, 1.0, 0.0)
         out_distance[i] = wp.inf
         out_gradient[i] = wp.vec3(0.0, 1.0, 0.0)
         return
 
     face = hit.face
-    w, feature = closest_on_triangle(p, points[faces[face, 0]], points[faces[face, 1]], points[faces[face, 2]])
-    normal = pseudo_normal(face, feature, points, faces, across, fan_start, fan_face)
-    offset = offset_from(p, face, w, points, faces)
-    outside = wp.where(wp.dot(offset, normal) < 0.0, -1.0, 1.0)
-    if by_winding:
-        outside = hit.sign
-    distance, gradient = distance_and_gradient(offset, feature, normal, outside)
+    distance, gradient, w, feature = measured_to(p, face, points, faces, across, fan_start, fan_face)
+    if by_winding and hit.sign * distance < 0.0:
+        distance = -distance
+        if wp.abs(distance) > ON_SURFACE:  # nearer, the two signs may differ by rounding alone
+            gradient = -gradient
 
     out_face[i] = face
     out_feature[i] = feature
     out_barycentrics[i] = w
-    out_normal[i] = normal
     out_distance[i] = distance
     out_gradient[i] = gradient
+
+
+@wp.kernel(enable_backward=False)
+def normal_kernel(
+    points: wp.array(dtype=wp.vec3),
+    faces: wp.array2d(dtype=int),
+    across: wp.array2d(dtype=int),
+    fan_start: wp.array(dtype=int),
+    fan_face: wp.array(dtype=int),
+    face: wp.array(dtype=int),
+    feature: wp.array(dtype=int),
+    # outputs
+    normal: wp.array(dtype=wp.vec3),
+):
+    """The pseudo-normal of each feature."""
+    i = wp.tid()
+    normal[i] = pseudo_normal(face[i], feature[i], points, faces, across, fan_start, fan_face)

@@ -11,9 +11,10 @@ import warp as wp
 from numpy.typing import NDArray
 from torch import Tensor
 
-from refu_core._warp import as_warp
+from refu_core._warp import as_warp, torch_stream
 from refu_core.errors import MeshError
 from refu_core.sdf._analytic import Feature, signed_distance
+from refu_core.sdf._kernels import normal_kernel
 from refu_core.sdf._protocol import SdfSample
 from refu_core.sdf._skin import Skin
 from refu_core.sdf._topology import Topology
@@ -28,8 +29,6 @@ class Found(NamedTuple):
     """Its closest part, as `Feature.kind` numbers them, int32, shape (N,)."""
     barycentrics: Tensor
     """Weights of the face's vertices at the closest point, shape (N, 3)."""
-    normal: Tensor
-    """Unit pseudo-normal at the closest point, shape (N, 3)."""
     distance: Tensor
     """Signed distance [m], shape (N,); infinite for no face."""
     gradient: Tensor
@@ -39,9 +38,9 @@ class Found(NamedTuple):
     def empty(n: int, device: torch.device) -> Found:
         """Room for n points."""
         ints = torch.empty(2, n, dtype=torch.int32, device=device)
-        vectors = torch.empty(3, n, 3, device=device)
+        vectors = torch.empty(2, n, 3, device=device)
         distance = torch.empty(n, device=device)
-        return Found(ints[0], ints[1], vectors[0], vectors[1], distance, vectors[2])
+        return Found(ints[0], ints[1], vectors[0], distance, vectors[1])
 
     def sample(self) -> SdfSample:
         """Distances, gradients and faces, copied."""
@@ -49,7 +48,7 @@ class Found(NamedTuple):
 
     def as_warp(self) -> list[Any]:
         """The fields as a kernel's outputs."""
-        kinds = (wp.int32, wp.int32, wp.vec3, wp.vec3, wp.float32, wp.vec3)
+        kinds = (wp.int32, wp.int32, wp.vec3, wp.float32, wp.vec3)
         return [as_warp(tensor, kind) for tensor, kind in zip(self, kinds, strict=True)]
 
 
@@ -155,11 +154,26 @@ class MeshSdf(ABC):
         corners = self._vertices.to(points)[self.faces.long()[found.face.long()]]
         feature = Feature(
             found.feature.clone(),
-            found.normal.to(points, copy=True),
+            self._normals(found).to(points),
             found.distance.sign().to(points),
             found.barycentrics.to(points, copy=True),
         )
         return signed_distance(points, corners, feature)._replace(face=found.face.clone())
+
+    def _normals(self, found: Found) -> Tensor:
+        """Unit pseudo-normals at the closest points, shape (N, 3)."""
+        normals = torch.empty_like(found.barycentrics)
+        if len(normals):
+            kinds = [as_warp(found.face, wp.int32), as_warp(found.feature, wp.int32)]
+            with torch_stream(self.device):
+                wp.launch(
+                    normal_kernel,
+                    dim=len(normals),
+                    inputs=[self._points_wp, self._faces, *self._topology, *kinds],
+                    outputs=[as_warp(normals, wp.vec3)],
+                    device=str(self.device),
+                )
+        return normals
 
     def skin(self) -> Any:
         """The posed body for kernels of one's own, as `refu_core.sdf.Skin`. Raises `MeshError` before `update`.

@@ -112,7 +112,7 @@ class Scan:
         self._spread = _record(
             spread_kernel,
             1,
-            [points, sizes, *none, parents, answers[4], self._band],
+            [points, sizes, *none, parents, answers[3], self._band],
             [answers[0], state, queue, asked],
         )
         self._ask = self._record_ask(points, asked, self._found)

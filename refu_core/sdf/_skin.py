@@ -4,7 +4,7 @@
 
 import warp as wp
 
-from refu_core.sdf._kernels import closest_on_triangle, distance_and_gradient, offset_from, pseudo_normal
+from refu_core.sdf._kernels import distance_to_face, measured_to
 from refu_core.sdf._walk import walk_from
 
 _UNLIMITED = wp.constant(1e18)
@@ -38,18 +38,13 @@ def ask(skin: Skin, p: wp.vec3, near: int):
     if skin.tree != wp.uint64(0):
         limit = float(_UNLIMITED)
         if near >= 0:
-            known, _ = closest_on_triangle(
-                p,
-                skin.points[skin.faces[near, 0]],
-                skin.points[skin.faces[near, 1]],
-                skin.points[skin.faces[near, 2]],
-            )
-            limit = wp.length(offset_from(p, near, known, skin.points, skin.faces)) * (1.0 + _SLACK) + _SLACK
+            known = distance_to_face(p, near, skin.points, skin.faces)
+            limit = known * (1.0 + _SLACK) + _SLACK
         hit = wp.mesh_query_point_no_sign(skin.tree, p, limit)
         if hit.result:
             face = hit.face
     else:
-        face, _feature, _w, _above = walk_from(
+        face, _feature, _w = walk_from(
             p,
             near,
             skin.points,
@@ -61,11 +56,7 @@ def ask(skin: Skin, p: wp.vec3, near: int):
             skin.table,
             skin.cell,
         )
-    w, feature = closest_on_triangle(
-        p, skin.points[skin.faces[face, 0]], skin.points[skin.faces[face, 1]], skin.points[skin.faces[face, 2]]
+    distance, gradient, _w, _feature = measured_to(
+        p, face, skin.points, skin.faces, skin.across, skin.fan_start, skin.fan_face
     )
-    normal = pseudo_normal(face, feature, skin.points, skin.faces, skin.across, skin.fan_start, skin.fan_face)
-    offset = offset_from(p, face, w, skin.points, skin.faces)
-    outside = wp.where(wp.dot(offset, normal) < 0.0, -1.0, 1.0)
-    distance, gradient = distance_and_gradient(offset, feature, normal, outside)
     return distance, gradient, face

@@ -18,7 +18,6 @@ from refu_core.sdf._kernels import (
     closest_on_triangle,
     distance_and_gradient,
     offset_from,
-    pseudo_normal,
 )
 
 ROWS = 1 << 13
@@ -38,6 +37,8 @@ ENTER = wp.constant(2.6)
 MAX_STEPS = wp.constant(64)
 # A guide is of use if it is no farther than the best distance so far and the way to the part's closest face [m].
 REACH = wp.constant(0.06)
+# Of other parts than a point's own one, nothing farther than this need be found [m].
+FAR = wp.constant(0.02)
 # Whoever is deeper than this below a face [m] may be below others, too, as the centre of a sphere is below all of its:
 # the face's neighbours are looked at as well; unless it is by more than CLOSER [m] farther than the best so far.
 DEEP = wp.constant(0.008)
@@ -110,37 +111,48 @@ def enter_kernel(
 
 @wp.func
 def walk_under(p: wp.vec3, start: int, points: wp.array(dtype=wp.vec3), links: wp.array2d(dtype=int)):
-    """The face that p is above or below, each step over the edge that p is most beyond.
+    """The face that p is above or below, each step over the edge that p is most beyond; or a face of an edge or vertex
+    that p is above or below in their place.
 
-    Also the weights of its vertices 1 and 2 where p is, and its normal, of twice its area; negative weights say that p
-    is above or below none of the faces where the walk ended.
+    Also the feature of the face that is closest as far as this walk can tell, -1 where it can't, the barycentrics
+    there, and the face's normal, of twice its area.
     """
     face = start
     last = int(-1)
+    feature = int(-1)
+    w = wp.vec3()
     normal = wp.vec3()
-    weight_b = float(0.0)
-    weight_c = float(0.0)
     for _step in range(MAX_STEPS):
         a = points[links[face, 0]]
         ab = points[links[face, 1]] - a
         ac = points[links[face, 2]] - a
+        ap = p - a
         normal = wp.cross(ab, ac)
-        around = wp.cross(p - a, normal)
+        around = wp.cross(ap, normal)
         area = wp.dot(normal, normal)
         weight_b = -wp.dot(around, ac)
         weight_c = wp.dot(around, ab)
         weight_a = area - weight_b - weight_c
         lowest = wp.min(weight_a, wp.min(weight_b, weight_c))
         if lowest >= 0.0 and area > 0.0:
+            feature = FACE
+            w = wp.vec3(weight_a, weight_b, weight_c) / area
             break
         edge = wp.where(lowest == weight_a, 1, wp.where(lowest == weight_b, 2, 0))
         ahead = links[face, 3 + edge]
-        weight_b = -1.0
         if ahead == last:
+            # Beyond the edge as seen from either face: closest to it, or else to something at one of its ends.
+            along = wp.where(edge == 0, ab, wp.where(edge == 1, ac - ab, -ac))
+            begun = wp.where(edge == 0, ap, wp.where(edge == 1, ap - ab, ap - ac))
+            t = wp.dot(begun, along) / wp.dot(along, along)
+            if t > 0.0 and t < 1.0:
+                feature = EDGE + edge
+                w[edge] = 1.0 - t
+                w[wp.where(edge == 2, 0, edge + 1)] = t
             break
         last = face
         face = ahead
-    return face, weight_b, weight_c, normal
+    return face, feature, w, normal
 
 
 @wp.func
@@ -208,7 +220,7 @@ def walk_from(
 ):
     """The closest of the faces that walks from `near` and from other parts' guides end at.
 
-    Also the closest feature on it, the barycentrics there, and the face's normal, of any length.
+    Also the closest feature on it, and the barycentrics there.
     """
     home = cell_of(p, cell)
     row = row_of(home[0], home[1], home[2])
@@ -219,44 +231,33 @@ def walk_from(
     squared = float(1.0e12)
     distance = float(1.0e6)
     own = int(-1)
-    above = wp.vec3()
     # -1 is the walk from `near`. One loop with one call of each function: so a compiler puts them in place.
     for part in range(-1, MAX_PARTS):
         start = int(near)
         walks = bool(part < 0)
         if part >= 0 and (absent >> part) & 1 == 0 and part != own:
             start = table[row, part] & ((1 << FACE_BITS) - 1)
-            walks = wp.length(points[links[start, 0]] - p) < distance + REACH
+            walks = wp.length(points[links[start, 0]] - p) < wp.min(distance, FAR) + REACH
         if walks:
-            start, weight_b, weight_c, normal = walk_under(p, start, points, links)
-            if start != face:
-                face_ = start
-                feature_ = int(FACE)
-                w_ = wp.vec3()
-                squared_ = float(0.0)
-                area = wp.dot(normal, normal)
-                depth = wp.dot(points[links[start, 0]] - p, normal) / wp.sqrt(area)
-                if weight_b >= 0.0 and (depth < DEEP or depth > distance + CLOSER):
-                    squared_ = depth * depth
-                    weight_b = weight_b / area
-                    weight_c = weight_c / area
-                    w_ = wp.vec3(1.0 - weight_b - weight_c, weight_b, weight_c)
-                else:
-                    face_, w_, feature_, squared_ = descend(p, start, points, faces, across, fan_start, fan_face)
-                    a = points[links[face_, 0]]
-                    normal = wp.cross(points[links[face_, 1]] - a, points[links[face_, 2]] - a)
+            face_, feature_, w_, normal = walk_under(p, start, points, links)
+            if face_ != face:
+                a = points[links[face_, 0]]
+                offset = (p - a) - (w_[1] * (points[links[face_, 1]] - a) + w_[2] * (points[links[face_, 2]] - a))
+                squared_ = wp.dot(offset, offset)
+                depth = -wp.dot(p - a, normal) / wp.length(normal)
+                if feature_ < 0 or (depth >= DEEP and depth <= distance + CLOSER):
+                    face_, w_, feature_, squared_ = descend(p, face_, points, faces, across, fan_start, fan_face)
                 if squared_ < squared:
                     face = face_
                     w = w_
                     feature = feature_
                     squared = squared_
                     distance = wp.sqrt(squared)
-                    above = normal
         if part < 0:
             own = links[face, 6]
             if (absent | (1 << own)) == EMPTY:
                 break
-    return face, feature, w, above
+    return face, feature, w
 
 
 @wp.kernel(enable_backward=False)
@@ -275,25 +276,17 @@ def walk_kernel(
     out_face: wp.array(dtype=int),
     out_feature: wp.array(dtype=int),
     out_barycentrics: wp.array(dtype=wp.vec3),
-    out_normal: wp.array(dtype=wp.vec3),
     out_distance: wp.array(dtype=float),
     out_gradient: wp.array(dtype=wp.vec3),
 ):
     """What `walk_from` finds for each query, as `closest_kernel`'s."""
     i = wp.tid()
     p = queries[i]
-    face, feature, w, above = walk_from(p, near[i], points, faces, across, fan_start, fan_face, links, table, cell)
-    offset = p - points[links[face, 0]]
-    if feature == FACE:
-        above = wp.normalize(above)
-    else:
-        above = pseudo_normal(face, feature, points, faces, across, fan_start, fan_face)
-        offset = offset_from(p, face, w, points, faces)
-    outside = wp.where(wp.dot(offset, above) < 0.0, -1.0, 1.0)
-    distance_, gradient = distance_and_gradient(offset, feature, above, outside)
+    face, feature, w = walk_from(p, near[i], points, faces, across, fan_start, fan_face, links, table, cell)
+    offset = offset_from(p, face, w, points, faces)
+    distance, gradient = distance_and_gradient(offset, face, feature, points, faces, across, fan_start, fan_face)
     out_face[i] = face
     out_feature[i] = feature
     out_barycentrics[i] = w
-    out_normal[i] = above
-    out_distance[i] = distance_
+    out_distance[i] = distance
     out_gradient[i] = gradient
