@@ -14,7 +14,7 @@ from torch import Tensor
 from refu_core._warp import as_warp, torch_stream
 from refu_core.errors import MeshError
 from refu_core.repulsion import _layers_kernels as kernels
-from refu_core.repulsion._blend import BLEND_ROUNDS, Blend
+from refu_core.repulsion._blend import Blend
 from refu_core.sdf import check_faces
 
 LAYER_GAP = 0.003
@@ -36,9 +36,11 @@ _SPACING = 0.05
 """How far the places on a sheet are apart from which the closest one is looked for [m]."""
 _SLIDES = 0.14
 """Places this far away at rest are among them [m]: so far one garment slides over the other, or folds come together."""
+_ROUNDS = 6
+"""How far the neighbourhood of a first push reaches [edges], and how often it is swept: even, so that the field ends
+where it began."""
 _LATER_ROUNDS = 2
-"""How far the neighbourhood of a second push reaches, which is a correction [edges]; even, as that of the first is, so
-that the field ends where it began."""
+"""Those of a second push, which is a correction."""
 
 
 class Layer:
@@ -104,7 +106,7 @@ class Layer:
             self._above.copy_(above)
             self._below.copy_(below)
             self._commands["normals"].launch()
-            n_low = self._lift("lift", BLEND_ROUNDS)
+            n_low = self._lift("lift", _ROUNDS)
             if n_low:
                 # What has left the sheet at one place may have come to another, and be too low there.
                 self._lift("lift again", _LATER_ROUNDS)
@@ -219,7 +221,7 @@ def _region(
     reached = np.zeros(len(blend.start), np.bool_)
     reached[candidates] = True
     is_beside = ~reached
-    for _ in range(BLEND_ROUNDS):
+    for _ in range(_ROUNDS):
         reached[neighbour[reached[vertex]]] = True
     rows = np.concatenate((candidates, np.flatnonzero(reached & is_beside)))
     place = np.full(len(reached), len(rows))

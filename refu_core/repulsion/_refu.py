@@ -141,7 +141,8 @@ class Refu(nn.Module):
         moved = moved.view_as(points)
         if blend is None or moved is points:
             return moved
-        field = blend.spread((moved - points).transpose(0, 1)).transpose(0, 1)
+        least = (self.margin - sample.distance).clamp_min(0)
+        field = blend.spread((moved - points).transpose(0, 1), least=least.T).transpose(0, 1)
         length = torch.linalg.vector_norm(field.detach(), dim=-1, keepdim=True)
         blended: Tensor = points + field * (max_displacement / length.clamp_min(max_displacement))
         return blended

@@ -220,7 +220,9 @@ def _push_blended(
         state.vertices[rows], sample, scale=scale, margin=state.margin, max_displacement=state.max_displacement
     )
     push[rows] = moved - state.vertices[rows]
-    field = blend.spread(push[:, None])[:, 0]
+    least = torch.full_like(goal, torch.inf)
+    least[rows] = state.margin - sample.distance
+    field = blend.spread(push[:, None], least=least[:, None])[:, 0]
     everyone = torch.nonzero((field != 0).any(dim=-1) & ~has_left)[:, 0]
     moved = state.bounded(state.origin[everyone] + field[everyone], everyone)
     # No vertex gets nearer by more than it moves: those that stay beyond the margin needn't be asked.

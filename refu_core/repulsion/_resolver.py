@@ -12,7 +12,7 @@ from torch import Tensor
 
 from refu_core._warp import as_warp, torch_stream
 from refu_core.repulsion import _edge_kernels, _resolver_kernels, _sheet, _spread_kernels
-from refu_core.repulsion._blend import BLEND_ROUNDS
+from refu_core.repulsion._blend import BLEND_REACH, BLEND_ROUNDS
 from refu_core.repulsion._limbs import INWARD, SIDEWAYS, Limbs
 from refu_core.repulsion._mend import DEEP, DETOUR, FARTHEST, LOOKS, ROUNDS, STEP_ON, STEPS, TOLERANCE
 from refu_core.repulsion._resolve import BULGE, RETREAT_STEPS, SURE, Resolution
@@ -137,12 +137,12 @@ class Resolver:
         if self._is_serial:
             self._run("blend", 1)
             return
-        reached = [0, self._count(_sheet.REACHED)]
-        for round_ in range(BLEND_ROUNDS):
-            first, last = reached[-2:]
+        first, last = 0, self._count(_sheet.REACHED)
+        for _ in range(BLEND_REACH):
             self._run("reach", last - first, (2, first))
-            reached.append(self._count(_sheet.REACHED))
-            self._run(f"spread{round_ % 2}", reached[-1])
+            first, last = last, self._count(_sheet.REACHED)
+        for round_ in range(BLEND_ROUNDS):
+            self._run(f"spread{round_ % 2}", last)
 
     def _raise_edges(self) -> int:
         """Raises both ends of the edges that run too low; returns the rounds it took."""
@@ -209,7 +209,7 @@ class Resolver:
         self._command("suspect", _edge_kernels.suspect_kernel, [sheet, cloth, rules, suspects])
         self._command("tally", _resolver_kernels.tally_kernel, [sheet, near])
         if self._is_serial:
-            inputs = [sheet, cloth, BLEND_ROUNDS, reached, field, smoother]
+            inputs = [sheet, cloth, BLEND_REACH, BLEND_ROUNDS, reached, field, smoother]
             self._command("blend", _spread_kernels.blend_kernel, inputs)
             inputs = [sheet, cloth, skin, rules, suspects, moved, *lack, field, reached]
             self._command("raise edges", _edge_kernels.raise_edges_kernel, inputs)

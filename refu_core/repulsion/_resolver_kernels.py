@@ -312,7 +312,7 @@ def scale_kernel(
     scale = wp.max(alpha[k], (wp.min(rules.tolerance, rules.margin) - sheet.depth[i]) / deficit)
     way = wp.min(scale * deficit, rules.max_displacement)
     sheet.goal[i] = wp.min(sheet.depth[i] + scale * deficit, rules.margin)
-    sheet.way[i] = way
+    sheet.way[i] = wp.min(way, deficit)
     field[i] = way * sheet.heading[i]
     sheet.mark[i] = SOURCE
     reached[wp.atomic_add(sheet.counts, REACHED, 1)] = i

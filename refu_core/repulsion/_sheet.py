@@ -95,7 +95,7 @@ class Sheet:
     along: wp.array(dtype=wp.float32)
     """Cosine of gradient and normal."""
     way: wp.array(dtype=wp.float32)
-    """How far a push is to go."""
+    """How far a vertex has to go."""
     heading: wp.array(dtype=wp.vec3)
     """Unit direction of it."""
     depth: wp.array(dtype=wp.float32)

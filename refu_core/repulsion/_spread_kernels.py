@@ -53,29 +53,11 @@ def spread_kernel(
     spread(reached[wp.tid()], sheet, cloth, field, smoother)
 
 
-@wp.func
-def sweep(
-    first: int,
-    sheet: Sheet,
-    cloth: Cloth,
-    reached: wp.array(dtype=int),
-    field: wp.array(dtype=wp.vec3),
-    smoother: wp.array(dtype=wp.vec3),
-):
-    """Reaches the neighbours of those listed from `first` on, and sweeps over all; where the new ones begin."""
-    last = int(sheet.counts[REACHED])
-    for k in range(first, last):
-        reach(reached[k], sheet, cloth, reached)
-    n = int(sheet.counts[REACHED])
-    for k in range(n):
-        spread(reached[k], sheet, cloth, field, smoother)
-    return last
-
-
 @wp.kernel(enable_backward=False)
 def blend_kernel(
     sheet: Sheet,
     cloth: Cloth,
+    reach_of: int,
     rounds: int,
     reached: wp.array(dtype=int),
     # kept up to date
@@ -84,6 +66,14 @@ def blend_kernel(
 ):
     """All sweeps, an even number, by one thread: the lists are short, and a launch costs what hundreds of steps do."""
     first = int(0)
+    for _ring in range(reach_of):
+        last = int(sheet.counts[REACHED])
+        for k in range(first, last):
+            reach(reached[k], sheet, cloth, reached)
+        first = last
+    n = int(sheet.counts[REACHED])
     for _pair in range(rounds / 2):
-        first = sweep(first, sheet, cloth, reached, field, smoother)
-        first = sweep(first, sheet, cloth, reached, smoother, field)
+        for k in range(n):
+            spread(reached[k], sheet, cloth, field, smoother)
+        for k in range(n):
+            spread(reached[k], sheet, cloth, smoother, field)
