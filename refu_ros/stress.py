@@ -38,6 +38,7 @@ class StressOptions:
     weights: Path | None = None
     frames: int | None = None
     persons: int = 1
+    rounds: int | None = None
     hours: float | None = None
     quick: bool = False
     seed: int = 0
@@ -59,6 +60,11 @@ class StressOptions:
             return list(MODES)
         backbone = self.backbone or "skinned"
         return [(backbone, self.sdf or ("accurate" if backbone == "skinned" else "hybrid"))]
+
+    @property
+    def n_rounds(self) -> int:
+        """How often each check has its turn, at least."""
+        return self.rounds or (_QUICK_ROUNDS if self.quick or self.hours is not None else _ROUNDS)
 
     @property
     def n_frames(self) -> int:
@@ -112,7 +118,7 @@ def run_stress(
                 checks=checks,
                 wardrobes=tuple(wardrobes),
                 weights=options.weights,
-                rounds=_QUICK_ROUNDS if options.quick or options.hours is not None else _ROUNDS,
+                rounds=options.n_rounds,
                 seconds=seconds * (1 - _SOAK_SHARE * soaks),
                 seed=options.seed,
             )

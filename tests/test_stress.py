@@ -279,7 +279,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     worst = tmp_path / "worst"
     common = ["stress", "--garments", "tshirt-male", "--backbone", "skinned", "--quiet"]
     json_file = tmp_path / "stress.json"
-    made = ["--quick", "--frames", "20", "--persons", "2", "--parts", "invariance,soak"]
+    made = ["--rounds", "1", "--frames", "20", "--persons", "2", "--parts", "invariance,soak"]
     assert main([*common, *made, "--json", str(json_file), "--output", str(worst)]) == 0
     printed = capsys.readouterr().out
     assert "nothing failed" in printed

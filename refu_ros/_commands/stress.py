@@ -48,6 +48,7 @@ def add(commands: Any) -> None:
     length = parser.add_mutually_exclusive_group()
     length.add_argument("--quick", action="store_true", help="each check once: for CI")
     length.add_argument("--hours", type=float, metavar="H", help="go on for so long (default: some minutes)")
+    parser.add_argument("--rounds", type=positive, metavar="N", help="turns of each check (3)")
     parser.add_argument("--frames", type=positive, metavar="N", help="frames of each soak (3000)")
     parser.add_argument(
         "--persons", type=positive, default=1, metavar="P", help="persons of a soak, each one's frame counting (1)"
