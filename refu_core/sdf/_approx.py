@@ -41,6 +41,11 @@ _CELL = 0.045
 _DEPTH = 0.01
 """How far below its face a guide is entered [m]: what is inside may be deeper than what matters outside is far."""
 
+_MANY = 1000
+"""From this number of points on their order matters."""
+_MAX_ORDERS = 16
+"""Orders that are kept, one a number of points."""
+
 
 class ApproxSdf(MeshSdf):
     """Signed distance to the closest face that is found by walking downhill (takes the place of the paper's network).
@@ -79,6 +84,8 @@ class ApproxSdf(MeshSdf):
         self._exact_is_late = True
         self._enter: Any = None  # both recorded for the tensors that hold the pose
         self._walk: Recorded | None = None
+        self._none = wp.empty(0, dtype=wp.int32, device=str(self.device))
+        self._orders: dict[int, Any] = {}
 
     def _bind_skin(self) -> Any:
         skin = super()._bind_skin()
@@ -104,7 +111,7 @@ class ApproxSdf(MeshSdf):
     def _find(self, points: Tensor, near: Tensor | None) -> Found:
         near = self._seek(points) if near is None else near
         if self._walk is not None:
-            return self._walk.ask(points, near)
+            return self._walk.ask(points, near, last=self._order(near))
         found = Found.empty(len(points), self.device)
         if len(points):
             with torch_stream(self.device):
@@ -119,7 +126,31 @@ class ApproxSdf(MeshSdf):
 
     def _inputs(self, points: Any, near: Any) -> list[Any]:
         """What `walk_kernel` reads."""
-        return [self._points_wp, self._faces, *self._topology, self._links_wp, self._table_wp, _CELL, points, near]
+        return [
+            self._points_wp,
+            self._faces,
+            *self._topology,
+            self._links_wp,
+            self._table_wp,
+            _CELL,
+            points,
+            near,
+            self._none,
+        ]
+
+    def _order(self, near: Tensor) -> Any:
+        """Points over neighbouring faces one after another: one finds in the cache what the last one has read there.
+
+        Any order gives the same answers, so that of the first points of their number, a garment's vertices, will do.
+        """
+        n = len(near)
+        if n < _MANY:
+            return self._none
+        if n not in self._orders:
+            if len(self._orders) >= _MAX_ORDERS:
+                self._orders.clear()
+            self._orders[n] = wp.array(near.argsort().int().numpy(), dtype=wp.int32, device="cpu")
+        return self._orders[n]
 
     def _seek(self, points: Tensor) -> Tensor:
         """Where nothing is known to be near a point the exact query finds it: right, and as slow."""

@@ -1,5 +1,7 @@
 # mypy: ignore-errors
-# (Warp reads a kernel's annotations as array types of its own; a type checker can't.)
+# ruff: noqa: UP018
+# (Warp reads a kernel's annotations as array types of its own; a type checker can't. A variable that changes in a loop
+# has to be called int, float or bool there.)
 """Closest point on a triangle mesh, with the sign of the angle-weighted pseudo-normal: one code for CPU and CUDA.
 
 Barycentrics here weigh a face's vertices 0, 1, 2 in that order. The part of a face that holds the closest point is its
@@ -150,20 +152,23 @@ def distance_and_gradient(
     offset: wp.vec3,
     face: int,
     feature: int,
+    normal: wp.vec3,
     points: wp.array(dtype=wp.vec3),
     faces: wp.array2d(dtype=int),
     across: wp.array2d(dtype=int),
     fan_start: wp.array(dtype=int),
     fan_face: wp.array(dtype=int),
 ):
-    """Signed distance and its unit gradient from the offset of the closest point, which is on a feature of a face."""
+    """Signed distance and its unit gradient from the offset of the closest point, which is on a feature of a face.
+
+    In a face's interior any point's offset will do. `normal` is the face's, of unit length.
+    """
     if feature == FACE:
-        normal = face_normal(face, points, faces)
         return wp.dot(offset, normal), normal
     distance = wp.length(offset)
     if distance < ON_SURFACE:
-        normal = pseudo_normal(face, feature, points, faces, across, fan_start, fan_face)
-        return wp.where(wp.dot(offset, normal) < 0.0, -distance, distance), normal
+        pseudo = pseudo_normal(face, feature, points, faces, across, fan_start, fan_face)
+        return wp.where(wp.dot(offset, pseudo) < 0.0, -distance, distance), pseudo
     outside = wp.where(is_below(offset, face, feature, points, faces, across, fan_start, fan_face), -1.0, 1.0)
     return outside * distance, offset * (outside / distance)
 
@@ -181,7 +186,10 @@ def measured_to(
     """Signed distance at p and its unit gradient, if `face` is the closest; p's place on it, and the feature there."""
     w, feature = closest_on_triangle(p, points[faces[face, 0]], points[faces[face, 1]], points[faces[face, 2]])
     offset = offset_from(p, face, w, points, faces)
-    distance, gradient = distance_and_gradient(offset, face, feature, points, faces, across, fan_start, fan_face)
+    normal = face_normal(face, points, faces)
+    distance, gradient = distance_and_gradient(
+        offset, face, feature, normal, points, faces, across, fan_start, fan_face
+    )
     return distance, gradient, w, feature
 
 

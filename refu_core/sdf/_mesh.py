@@ -65,10 +65,10 @@ class Recorded:
         self._room = 0
         self._make_room(256)
 
-    def ask(self, points: Tensor, near: Tensor | None = None) -> Found:
+    def ask(self, points: Tensor, near: Tensor | None = None, *, last: Any = None) -> Found:
         """What the kernel says of checked points, shape (N, 3); the answers are overwritten by the next call's.
 
-        Faces that aren't given are -1.
+        Faces that aren't given are -1. `last` takes the place of the kernel's last input, if it is given.
         """
         n = len(points)
         if n > self._room:
@@ -79,6 +79,8 @@ class Recorded:
         else:
             self._near[:n] = near
         if n:
+            if last is not None:
+                self._command.set_param_at_index(self._n_inputs - 1, last)
             self._command.set_dim(n)
             self._command.launch()
         return Found(*(field[:n] for field in self._found))
@@ -88,10 +90,12 @@ class Recorded:
         self._points = torch.zeros(n, 3)
         self._near = torch.zeros(n, dtype=torch.int32)
         self._found = Found.empty(n, self._points.device)
+        inputs = self._inputs(as_warp(self._points, wp.vec3), as_warp(self._near, wp.int32))
+        self._n_inputs = len(inputs)
         self._command = wp.launch(
             self._kernel,
             dim=n,
-            inputs=self._inputs(as_warp(self._points, wp.vec3), as_warp(self._near, wp.int32)),
+            inputs=inputs,
             outputs=self._found.as_warp(),
             device="cpu",
             record_cmd=True,

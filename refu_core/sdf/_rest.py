@@ -53,6 +53,7 @@ class RestFaces:
         self._device = torch.device(body.device)
         self._low = wp.vec3(*low.tolist())
         self._grid = wp.array(face[tuple(nearest)], dtype=wp.int32, device=str(self._device))
+        self._make_room(1024)
 
     def under(self, unposed: Tensor, betas: Tensor, shapedirs: Tensor) -> Tensor:
         """Near body faces, int32 of shape (B, V), of unposed garments [m], shape (B, V, 3), on shapes (B, 10).
@@ -63,15 +64,26 @@ class RestFaces:
 
     def __call__(self, unposed: Tensor) -> Tensor:
         """Near body faces, int32 of shape (...,), of places on the mean shape in the rest pose [m], shape (..., 3)."""
-        places = unposed.detach().to(device=self._device, dtype=torch.float32).reshape(-1, 3).contiguous()
-        near = torch.empty(len(places), dtype=torch.int32, device=self._device)
-        if len(places):
+        places = unposed.detach().to(device=self._device, dtype=torch.float32).reshape(-1, 3)
+        n = len(places)
+        if n > len(self._places):
+            self._make_room(n)
+        self._places[:n] = places
+        if n:
+            self._look_up.set_dim(n)
             with torch_stream(self._device):
-                wp.launch(
-                    look_up_kernel,
-                    dim=len(places),
-                    inputs=[as_warp(places, wp.vec3), self._low, _CELL, self._grid],
-                    outputs=[as_warp(near, wp.int32)],
-                    device=str(self._device),
-                )
-        return near.view(unposed.shape[:-1])
+                self._look_up.launch()
+        return self._near[:n].clone().view(unposed.shape[:-1])
+
+    def _make_room(self, n: int) -> None:
+        """For n places. The launch is recorded: what Python makes of it takes longer than the look-ups do."""
+        self._places = torch.empty(n, 3, device=self._device)
+        self._near = torch.empty(n, dtype=torch.int32, device=self._device)
+        self._look_up = wp.launch(
+            look_up_kernel,
+            dim=n,
+            inputs=[as_warp(self._places, wp.vec3), self._low, _CELL, self._grid],
+            outputs=[as_warp(self._near, wp.int32)],
+            device=str(self._device),
+            record_cmd=True,
+        )

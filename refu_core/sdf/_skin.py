@@ -44,7 +44,7 @@ def ask(skin: Skin, p: wp.vec3, near: int):
         if hit.result:
             face = hit.face
     else:
-        face, _feature, _w = walk_from(
+        face, _feature, _w, _above = walk_from(
             p,
             near,
             skin.points,

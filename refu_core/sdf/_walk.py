@@ -100,13 +100,14 @@ def enter_kernel(
         for y in range(home[1] - 1, home[1] + 2):
             away_y = middle[1] - cell * (float(y) + 0.5)
             beside = away_x * away_x + away_y * away_y
-            for z in range(home[2] - 1, home[2] + 2):
-                away_z = middle[2] - cell * (float(z) + 0.5)
-                squared = beside + away_z * away_z
-                if squared < most:
-                    row = row_of(x, y, z)
-                    wp.atomic_min(table, row, part, (int(UNITS * squared) << FACE_BITS) | face)
-                    wp.atomic_and(table, row, ABSENT, ~(1 << part))
+            if beside < most:
+                for z in range(home[2] - 1, home[2] + 2):
+                    away_z = middle[2] - cell * (float(z) + 0.5)
+                    squared = beside + away_z * away_z
+                    if squared < most:
+                        row = row_of(x, y, z)
+                        wp.atomic_min(table, row, part, (int(UNITS * squared) << FACE_BITS) | face)
+                        wp.atomic_and(table, row, ABSENT, ~(1 << part))
 
 
 @wp.func
@@ -142,13 +143,17 @@ def walk_under(p: wp.vec3, start: int, points: wp.array(dtype=wp.vec3), links: w
         ahead = links[face, 3 + edge]
         if ahead == last:
             # Beyond the edge as seen from either face: closest to it, or else to something at one of its ends.
-            along = wp.where(edge == 0, ab, wp.where(edge == 1, ac - ab, -ac))
-            begun = wp.where(edge == 0, ap, wp.where(edge == 1, ap - ab, ap - ac))
-            t = wp.dot(begun, along) / wp.dot(along, along)
+            if edge == 0:
+                t = wp.dot(ap, ab) / wp.dot(ab, ab)
+                w = wp.vec3(1.0 - t, t, 0.0)
+            elif edge == 2:
+                t = wp.dot(ap, ac) / wp.dot(ac, ac)
+                w = wp.vec3(1.0 - t, 0.0, t)
+            else:
+                t = wp.dot(ap - ab, ac - ab) / wp.dot(ac - ab, ac - ab)
+                w = wp.vec3(0.0, 1.0 - t, t)
             if t > 0.0 and t < 1.0:
                 feature = EDGE + edge
-                w[edge] = 1.0 - t
-                w[wp.where(edge == 2, 0, edge + 1)] = t
             break
         last = face
         face = ahead
@@ -220,7 +225,7 @@ def walk_from(
 ):
     """The closest of the faces that walks from `near` and from other parts' guides end at.
 
-    Also the closest feature on it, and the barycentrics there.
+    Also the closest feature on it, the barycentrics there, and the face's normal, of any length.
     """
     home = cell_of(p, cell)
     row = row_of(home[0], home[1], home[2])
@@ -231,6 +236,7 @@ def walk_from(
     squared = float(1.0e12)
     distance = float(1.0e6)
     own = int(-1)
+    above = wp.vec3()
     # -1 is the walk from `near`. One loop with one call of each function: so a compiler puts them in place.
     for part in range(-1, MAX_PARTS):
         start = int(near)
@@ -241,23 +247,27 @@ def walk_from(
         if walks:
             face_, feature_, w_, normal = walk_under(p, start, points, links)
             if face_ != face:
-                a = points[links[face_, 0]]
-                offset = (p - a) - (w_[1] * (points[links[face_, 1]] - a) + w_[2] * (points[links[face_, 2]] - a))
-                squared_ = wp.dot(offset, offset)
-                depth = -wp.dot(p - a, normal) / wp.length(normal)
+                depth = wp.dot(points[links[face_, 0]] - p, normal) / wp.length(normal)
+                squared_ = depth * depth
+                if feature_ >= EDGE:
+                    offset = offset_from(p, face_, w_, points, faces)
+                    squared_ = wp.dot(offset, offset)
                 if feature_ < 0 or (depth >= DEEP and depth <= distance + CLOSER):
                     face_, w_, feature_, squared_ = descend(p, face_, points, faces, across, fan_start, fan_face)
+                    a = points[links[face_, 0]]
+                    normal = wp.cross(points[links[face_, 1]] - a, points[links[face_, 2]] - a)
                 if squared_ < squared:
                     face = face_
                     w = w_
                     feature = feature_
                     squared = squared_
                     distance = wp.sqrt(squared)
+                    above = normal
         if part < 0:
             own = links[face, 6]
             if (absent | (1 << own)) == EMPTY:
                 break
-    return face, feature, w
+    return face, feature, w, above
 
 
 @wp.kernel(enable_backward=False)
@@ -272,6 +282,7 @@ def walk_kernel(
     cell: float,
     queries: wp.array(dtype=wp.vec3),
     near: wp.array(dtype=int),
+    order: wp.array(dtype=int),
     # outputs
     out_face: wp.array(dtype=int),
     out_feature: wp.array(dtype=int),
@@ -279,12 +290,18 @@ def walk_kernel(
     out_distance: wp.array(dtype=float),
     out_gradient: wp.array(dtype=wp.vec3),
 ):
-    """What `walk_from` finds for each query, as `closest_kernel`'s."""
+    """What `walk_from` finds for each query, in that order where there is one; as `closest_kernel`'s."""
     i = wp.tid()
+    if order.shape[0] > 0:
+        i = order[i]
     p = queries[i]
-    face, feature, w = walk_from(p, near[i], points, faces, across, fan_start, fan_face, links, table, cell)
-    offset = offset_from(p, face, w, points, faces)
-    distance, gradient = distance_and_gradient(offset, face, feature, points, faces, across, fan_start, fan_face)
+    face, feature, w, above = walk_from(p, near[i], points, faces, across, fan_start, fan_face, links, table, cell)
+    offset = p - points[links[face, 0]]
+    if feature != FACE:
+        offset = offset_from(p, face, w, points, faces)
+    distance, gradient = distance_and_gradient(
+        offset, face, feature, wp.normalize(above), points, faces, across, fan_start, fan_face
+    )
     out_face[i] = face
     out_feature[i] = feature
     out_barycentrics[i] = w
