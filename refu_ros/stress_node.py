@@ -49,6 +49,8 @@ class NodeSoak:
     """Garments that came more than once."""
     superseded: int
     """Frames that the node dropped for a newer one, by its own count: it was busy."""
+    replaced: int
+    """Frames that the node never got, going by its recording: the topic's queue holds one, and a newer one came."""
     recorded: int
     """Garments in the bag."""
     not_recorded: int
@@ -70,8 +72,8 @@ class NodeSoak:
 
     @property
     def lost(self) -> int:
-        """Frames that no garment came back for, and that the node doesn't say it has dropped."""
-        return max(0, self.sent - self.received - self.superseded)
+        """Frames that the node got, that no garment came back for, and that it doesn't say it has dropped."""
+        return max(0, self.sent - self.received - self.superseded - self.replaced)
 
     @property
     def is_slower(self) -> bool:
@@ -258,6 +260,7 @@ class _Peer:
             received=len(received),
             doubled=sum(self._came[stamp] - 1 for stamp in received),
             superseded=self._stale - self._stale_before,
+            replaced=len(sent - set(inputs)),
             recorded=len(garments),
             not_recorded=len(received - set(garments)) + len(set(garments) - set(inputs)),
             recorded_twice=sum(inputs.values()) - len(inputs) + sum(garments.values()) - len(garments),
@@ -315,6 +318,7 @@ def node_table(result: NodeSoak) -> str:
         ("sent in", f"{result.seconds:.0f} s", str(result.sent)),
         ("came back as garments", "", str(result.received)),
         ("superseded by a newer one", "", str(result.superseded)),
+        ("replaced in the topic's queue, which holds one", "", str(result.replaced)),
         ("lost", "", str(result.lost)),
         ("doubled", "", str(result.doubled)),
         ("recorded garments", "", str(result.recorded)),
