@@ -324,11 +324,14 @@ def test_bad_input_is_one_line(arguments: list[str], wanted: str, capsys: pytest
 def test_a_node_is_slower_by_the_clock_and_by_its_own_work(
     later: float, longer: float, machine: float, is_slower: bool
 ) -> None:
-    figures = dict.fromkeys(("sent", "received", "doubled", "superseded", "replaced"), 0)
-    figures |= dict.fromkeys(("recorded", "not_recorded", "recorded_twice", "nan", "exit_code", "seconds"), 0)
+    figures = dict.fromkeys(("sent", "received", "recorded", "seconds"), 20_000)
+    figures |= dict.fromkeys(
+        ("doubled", "superseded", "replaced", "not_recorded", "recorded_twice", "nan", "exit_code"), 0
+    )
     ratios = {"memory_mb": 1.0, "p99_ms": later, "cpu_ms": longer, "yardstick_ms": machine}
     result = NodeSoak(**figures, **{name: (1.0, last) for name, last in ratios.items()})  # type: ignore[arg-type]
     assert (result.is_slower, result.failures) == (is_slower, int(is_slower))
+    assert not replace(result, sent=19_999).is_slower
 
 
 def test_the_live_node(tmp_path: Path) -> None:

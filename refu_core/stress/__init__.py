@@ -12,6 +12,7 @@ from refu_core.stress._run import all_checks as all_checks
 from refu_core.stress._run import replay_trial as replay_trial
 from refu_core.stress._run import run_checks as run_checks
 from refu_core.stress._run import save_worst as save_worst
+from refu_core.stress._soak import JUDGED_FROM as JUDGED_FROM
 from refu_core.stress._soak import TOLERANCE as TOLERANCE
 from refu_core.stress._soak import SoakResult as SoakResult
 from refu_core.stress._soak import Yardstick as Yardstick
