@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 _SKIN = (0.80, 0.67, 0.58, 1.0)
 _IDLE_S = 0.1
 """How often the thread looks for persons who have left when nobody sends [s]."""
+_EMPTY_S = 2.0
+"""The same when nobody is there [s]; a new person wakes the thread at once."""
 _MAX_ENCODERS = 16
 """Sets of persons whose message layout is kept; making one takes a millisecond."""
 
@@ -104,7 +106,8 @@ class Worker:
         last = -1e9
         while not self._stopping.is_set():
             period = 1.0 / self.settings.max_rate if self.settings.max_rate else 0.0
-            arrivals = self._scene.take(not_before=last + period, timeout=_IDLE_S)
+            idle = _IDLE_S if self._shown or self._scene.persons else _EMPTY_S
+            arrivals = self._scene.take(not_before=last + period, timeout=idle)
             now = time.monotonic()
             if arrivals:  # on the grid of the rate as long as the frames keep up with it
                 last = last + period if now < last + 2 * period else now

@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 EXIT_BAD_PARAMETERS, EXIT_DEVICE_LOST = 2, 3
+_LOOK_UP_S = 0.25
+"""How often the main thread looks for a signal when nothing happens."""
 _LAST_WORDS_S = 0.2
 """Time for the answer to a shutdown request to leave."""
 
@@ -45,7 +47,7 @@ def main(args: Sequence[str] | None = None) -> int:
             executor = _executor()
             executor.add_node(node)
             while not (stop.is_set() or node.finalized):
-                executor.spin_once(timeout_sec=0.1)
+                executor.spin_once(timeout_sec=_LOOK_UP_S)
             end = time.monotonic() + _LAST_WORDS_S
             while node.finalized and time.monotonic() < end:
                 executor.spin_once(timeout_sec=0.05)
