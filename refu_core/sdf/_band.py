@@ -11,8 +11,6 @@ import numpy as np
 import torch
 import warp as wp
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import breadth_first_order, connected_components
 from torch import Tensor
 
 from refu_core._warp import as_warp
@@ -31,14 +29,12 @@ _FEW = 200
 
 @dataclass(frozen=True, eq=False)
 class Links:
-    """The edges of a garment, by vertex; and one tree of them, by which most vertices hear from most others."""
+    """The edges of a garment, by vertex."""
 
     start: Tensor
     """The neighbours of vertex v are `linked[start[v]:start[v + 1]]`; int32, shape (N + 1,)."""
     linked: Tensor
     """Int32, shape (2 E,)."""
-    parents: Tensor
-    """Each vertex and its parent, parents first, -1 for none; int32, shape (N, 2)."""
 
     @staticmethod
     def of(edges: Tensor, n_vertices: int) -> Links:
@@ -47,17 +43,12 @@ class Links:
         order = np.argsort(both[:, 0], kind="stable")
         linked = both[order, 1].astype(np.int32)
         start = np.searchsorted(both[order, 0], np.arange(n_vertices + 1)).astype(np.int32)
-        graph = csr_matrix((np.ones(len(linked)), linked, start), shape=(n_vertices, n_vertices))
-        pieces, label = connected_components(graph, directed=False)
-        trees = [breadth_first_order(graph, int(np.argmax(label == k)), directed=False) for k in range(pieces)]
-        pairs = [np.stack((nodes, np.maximum(predecessor[nodes], -1)), 1) for nodes, predecessor in trees]
-        parents = np.concatenate([np.zeros((0, 2)), *pairs]).astype(np.int32)
-        return Links(*map(torch.from_numpy, (start, linked, parents)))
+        return Links(torch.from_numpy(start), torch.from_numpy(linked))
 
     @cached_property
     def arrays(self) -> list[Any]:
         """The same as kernels take them."""
-        return [as_warp(tensor, wp.int32) for tensor in (self.start, self.linked, self.parents)]
+        return [as_warp(tensor, wp.int32) for tensor in (self.start, self.linked)]
 
 
 class BandSdf(MeshSdf):
@@ -73,8 +64,10 @@ class BandSdf(MeshSdf):
     that is reached from nowhere, is asked in the tree like any other point. So no vertex inside is ever taken for one
     outside, in whatever pose and after whatever jump: nothing is carried over from the last frame.
 
-    (Where the body runs into itself "inside" is the pseudo-normal's word, as for `ExactSdf`, and not continuous: a
-    vertex deep in a flank may be next to an arm's skin, outside of that. What is reached from both sides is asked.)
+    Where the body runs into itself "inside" is the pseudo-normal's word, as for `ExactSdf`, and not continuous: a
+    vertex deep in one thigh may be reached from the skin of the other, which is buried there, and outside of that. What
+    is reached from both sides is asked; and so are pieces of fewer than some hundred vertices, since what the skin of a
+    limb shuts in is one, while what a worn garment has outside hangs together.
     """
 
     def __init__(self, faces: Tensor | NDArray[Any], *, band: float = BAND, rest: Tensor | None = None) -> None:

@@ -23,9 +23,12 @@ _LAST_Z = wp.constant(63)
 _LAST = wp.constant(63)
 
 NEAR = wp.constant(0)  # closest face within the band: distance and side are known
-INSIDE_MAYBE = wp.constant(1)  # reached from a vertex inside: must be asked
-OUTSIDE = wp.constant(2)  # reached from a vertex outside, and from none inside
-UNREACHED = wp.constant(3)  # 3 + number of its patch
+JOINED = wp.constant(1)  # the same, and its piece has been seen
+ASKED = wp.constant(2)  # may be inside: must be asked
+OUTSIDE = wp.constant(3)  # of a large piece with vertices of the band, which are outside
+UNREACHED = wp.constant(4)  # 4 + number of its patch
+_SMALL = wp.constant(256)
+"""Vertices of a piece that isn't taken at its word. What a worn garment has outside hangs together, or nearly."""
 
 _MOST_CELLS = wp.constant(1.0e9)  # farther from the origin a cell's number would overflow; far means far there
 
@@ -226,48 +229,13 @@ def is_free(p: wp.vec3, q: wp.vec3, distances: float):
     return wp.dot(way, way) < distances * distances * 0.9999
 
 
-@wp.func
-def spread(
-    points: wp.array(dtype=wp.vec3),
-    link_start: wp.array(dtype=int),
-    linked: wp.array(dtype=int),
-    distance: wp.array(dtype=float),
-    face: wp.array(dtype=int),
-    state: wp.array(dtype=int),
-    queue: wp.array(dtype=int),
-    end: int,
-    band: float,
-    given: int,
-):
-    """Gives the state `given` to all that the queue's vertices reach along free edges; the queue's new end.
-
-    What will be asked in the tree is told the face of whom it was reached from: it is not far from there.
-    """
-    here = int(0)
-    tail = int(end)
-    while here < tail:
-        q = queue[here]
-        here += 1
-        for n in range(link_start[q], link_start[q + 1]):
-            other = linked[n]
-            if state[other] < 0 and is_free(points[q], points[other], wp.abs(distance[q]) + band):
-                state[other] = given
-                if given == INSIDE_MAYBE:
-                    face[other] = face[q]
-                queue[tail] = other
-                tail += 1
-    return tail
-
-
 @wp.kernel
 def spread_kernel(
     points: wp.array(dtype=wp.vec3),
     sizes: wp.array(dtype=int),
     link_start: wp.array(dtype=int),
     linked: wp.array(dtype=int),
-    parents: wp.array2d(dtype=int),
     distance: wp.array(dtype=float),
-    band: float,
     # kept up to date
     face: wp.array(dtype=int),
     # outputs
@@ -277,8 +245,8 @@ def spread_kernel(
 ):
     """On which side of the skin the vertices beyond the band are, by way of the garment's edges.
 
-    `asked` lists those that may be inside, and one of each patch that no vertex of the band reaches; `sizes[2]` and
-    `sizes[3]` say how many of either kind there are.
+    `asked` lists those that may be inside, and one of each large patch that no vertex of the band reaches; `sizes[2]`
+    and `sizes[3]` say how many of either kind there are. The distance of what is beyond the band is the band.
     """
     n = sizes[0]
     tail = int(0)
@@ -287,42 +255,64 @@ def spread_kernel(
         if face[q] >= 0:
             state[q] = NEAR
             if distance[q] < 0.0:
+                state[q] = JOINED
                 queue[tail] = q
                 tail += 1
     # From the inside first: what both sides reach lies where the body runs into itself, and is asked.
-    first = tail
-    tail = spread(points, link_start, linked, distance, face, state, queue, tail, band, INSIDE_MAYBE)
-    inside = tail - first
-    for k in range(inside):
-        asked[k] = queue[first + k]
-    # Most of a garment is reached from the outside along one tree of its edges, at one look a vertex.
-    for k in range(n):
-        q = parents[k, 0]
-        parent = parents[k, 1]
-        if state[q] < 0 and parent >= 0:
-            is_outside = state[parent] == OUTSIDE or (state[parent] == NEAR and distance[parent] >= 0.0)
-            if is_outside and is_free(points[q], points[parent], wp.abs(distance[parent]) + band):
-                state[q] = OUTSIDE
-    # The rest asks all of its neighbours, and spreads what they say.
-    for q in range(n):
-        if state[q] < 0:
-            reached = int(0)
-            for m in range(link_start[q], link_start[q + 1]):
-                other = linked[m]
-                is_outside = state[other] == OUTSIDE or (state[other] == NEAR and distance[other] >= 0.0)
-                if is_outside and is_free(points[q], points[other], wp.abs(distance[other]) + band):
-                    reached = 1
-            if reached == 1:
-                state[q] = OUTSIDE
-                queue[0] = q
-                spread(points, link_start, linked, distance, face, state, queue, 1, band, OUTSIDE)
+    here = int(0)
+    inside = int(0)
+    while here < tail:
+        q = queue[here]
+        here += 1
+        for m in range(link_start[q], link_start[q + 1]):
+            other = linked[m]
+            if state[other] < 0 and is_free(points[q], points[other], wp.abs(distance[q]) + distance[other]):
+                state[other] = ASKED
+                face[other] = face[q]  # where to begin: it is not far from there
+                queue[tail] = other
+                tail += 1
+                asked[inside] = other
+                inside += 1
+    # The rest hangs together in pieces; those of the patches are kept from the end of the list until all are known.
     patches = int(0)
-    for q in range(n):
-        if state[q] < 0:
-            state[q] = UNREACHED + patches
-            queue[0] = q
-            spread(points, link_start, linked, distance, face, state, queue, 1, band, UNREACHED + patches)
-            asked[inside + patches] = q
-            patches += 1
+    for seed in range(n):
+        if state[seed] < 0:
+            state[seed] = UNREACHED + patches
+            queue[0] = seed
+            here = int(0)
+            tail = int(1)
+            in_band = int(0)
+            while here < tail:
+                q = queue[here]
+                here += 1
+                for m in range(link_start[q], link_start[q + 1]):
+                    other = linked[m]
+                    if state[other] <= 0 and is_free(points[q], points[other], distance[q] + distance[other]):
+                        if state[other] == NEAR:
+                            state[other] = JOINED
+                            in_band += 1
+                        else:
+                            state[other] = UNREACHED + patches
+                        queue[tail] = other
+                        tail += 1
+            if tail <= _SMALL:
+                for k in range(tail):
+                    q = queue[k]
+                    if state[q] != JOINED:
+                        state[q] = ASKED
+                        asked[inside] = q
+                        inside += 1
+            elif in_band > 0:
+                for k in range(tail):
+                    q = queue[k]
+                    if state[q] != JOINED:
+                        state[q] = OUTSIDE
+            else:
+                patches += 1
+                asked[n - patches] = seed
+    for k in range(patches):
+        queue[k] = asked[n - 1 - k]
+    for k in range(patches):
+        asked[inside + k] = queue[k]
     sizes[2] = inside
     sizes[3] = patches

@@ -108,11 +108,10 @@ class Scan:
         answers = self._found.as_warp()
         self._finish = _record(finish_kernel, n, [*self._body, points, slot, face, beyond], answers)
         none = [wp.empty(0, dtype=wp.int32, device="cpu")] * 2
-        parents = wp.empty((0, 2), dtype=wp.int32, device="cpu")
         self._spread = _record(
             spread_kernel,
             1,
-            [points, sizes, *none, parents, answers[3], self._band],
+            [points, sizes, *none, answers[3]],
             [answers[0], state, queue, asked],
         )
         self._ask = self._record_ask(points, asked, self._found)

@@ -134,6 +134,31 @@ def test_loose_pieces_are_judged_by_themselves() -> None:
     torch.testing.assert_close(got, exact.query(points).distance.clamp(max=BAND), atol=1e-6, rtol=0)
 
 
+@pytest.mark.parametrize("reach", [0.15, 0.2])
+def test_what_a_limb_shuts_in_beside_the_skin_of_another_is_asked(reach: float) -> None:
+    """A sheet of cloth off the skin of a thin limb, where that is buried in a thick one.
+
+    Near the buried skin the pseudo-normal says "outside", farther off "inside", and no skin lies between.
+    """
+    thin = trimesh.creation.cylinder(radius=0.05, height=0.4, sections=48)
+    body = trimesh.util.concatenate([BALL, thin.subdivide().subdivide()])
+    band, exact = BandSdf(body.faces), ExactSdf(body.faces)
+    for sdf in (band, exact):
+        sdf.update(torch.tensor(body.vertices, dtype=torch.float32))
+    # From 4 mm off the thin limb, within the band, to where the thick one's skin is the closer one.
+    rows, columns = 25, 4
+    across, along = np.meshgrid(np.linspace(0.054, 0.054 + reach, rows), 0.006 * np.arange(columns), indexing="ij")
+    points = np.stack((across, along, 0 * along), -1).reshape(-1, 3)
+    corners = [columns * i + j for i in range(rows - 1) for j in range(columns - 1)]
+    sheet = trimesh.Trimesh(points, [(k, k + 1, k + columns) for k in corners])
+    where = torch.tensor(points, dtype=torch.float32)
+    wanted = exact.query(where).distance
+    assert ((wanted > 0) & (wanted < BAND)).any()
+    assert (wanted < -BAND).any()
+    got = band.clipped(where, Links.of(torch.tensor(sheet.edges_unique), len(points))).distance
+    torch.testing.assert_close(got, wanted.clamp(max=BAND), atol=1e-6, rtol=0)
+
+
 @settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 2**31), n=st.integers(1, 700), spread=st.sampled_from([0.2, 0.5, 5.0, 1e4, 1e7]))
 def test_query_is_the_exact_one(seed: int, n: int, spread: float) -> None:
