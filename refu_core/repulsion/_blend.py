@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,8 +15,10 @@ from refu_core.errors import MeshError
 BLEND_REACH = 2
 """How far the neighbourhood reaches that gives way with a pushed vertex [edges]. What is farther off has no share in
 the collision, and moving it makes it no truer."""
-BLEND_ROUNDS = 12
-"""Sweeps over pushed vertices and neighbourhood, an even number. Each makes them smoother, by less and less."""
+BLEND_STEPS = (3.0, 0.75) * 3
+"""How far each sweep goes towards the mean of the neighbours: pairs of a long step, which levels what is wide, and a
+short one, which levels the ripples that the long one overdoes (Richardson's method). Six of them do what twelve plain
+means do. On a mesh of triangles a pair leaves no more than 0.6 of any ripple."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,8 +27,8 @@ class Blend:
 
     Vertices pushed one by one to the margin lie flat on it, and are torn from neighbours that were just outside: folds
     are lost, and the edges between cut through the skin. So the displacement is made smooth, under the condition that
-    every vertex goes at least as far along its gradient as it has to: a few Jacobi sweeps for the smoothest field with
-    nᵢᵀdᵢ ≥ pᵢ. It is the smoothness term of DRAPE's optimisation (Guan et al. 2012) at the price of a few averages.
+    every vertex goes at least as far along its gradient as it has to: a few sweeps of averaging for the smoothest field
+    with nᵢᵀdᵢ ≥ pᵢ. It is the smoothness term of DRAPE's optimisation (Guan et al. 2012) at a few averages' price.
 
     A predicted scale says how far to go, and may say farther than to the margin. From there the field begins; but pᵢ is
     no more than the way to the margin. What α exceeds 1 by differs from neighbour to neighbour (by a twentieth): held
@@ -66,7 +69,12 @@ class Blend:
         return total * self.share.to(field)
 
     def spread(
-        self, push: Tensor, *, least: Tensor | None = None, rounds: int = BLEND_ROUNDS, reach: int = BLEND_REACH
+        self,
+        push: Tensor,
+        *,
+        least: Tensor | None = None,
+        steps: Sequence[float] = BLEND_STEPS,
+        reach: int = BLEND_REACH,
     ) -> Tensor:
         """Displacements [m], shape (N, B, 3), smooth and nowhere less along the pushes of the same shape than wanted.
 
@@ -76,7 +84,7 @@ class Blend:
             push: Where to begin [m]; zero is no push.
             least: How far each vertex has to go along its push, if that goes so far [m], shape (N, B); by default as
                 far as it goes.
-            rounds: Sweeps.
+            steps: How far each sweep goes towards the mean of the neighbours; 1 is all the way.
             reach: How many edges from a pushed vertex others give way.
         """
         is_pushed = (push.detach() != 0).any(dim=-1)
@@ -91,8 +99,9 @@ class Blend:
         if least is not None:
             length = torch.minimum(length, least[rows].unsqueeze(-1))
         field = push
-        for _ in range(rounds):
-            field = self.mean(field.flatten(1)).view_as(push) * gives_way.unsqueeze(-1)
+        for step in steps:
+            mean = self.mean(field.flatten(1)).view_as(push) * gives_way.unsqueeze(-1)
+            field = field + step * (mean - field)
             lack = (length - (field[rows] * direction).sum(-1, keepdim=True)).clamp_min(0)
             field = field.index_add(0, rows, lack * direction)
         return field

@@ -16,7 +16,7 @@ def look_between(edge: int, sheet: Sheet, cloth: Cloth, skin: Skin, rules: Rules
     a = cloth.edges[edge, 0]
     b = cloth.edges[edge, 1]
     # Beyond a band no face is known; a known one makes the answer cheap.
-    near = wp.where(sheet.distance[a] <= sheet.distance[b], sheet.face[a], sheet.face[b])
+    near = wp.where(sheet.distance[a] <= sheet.distance[b] + rules.tolerance, sheet.face[a], sheet.face[b])
     distance, gradient, _face = ask(skin, 0.5 * (sheet.place[a] + sheet.place[b]), near)
     return 0.5 * rules.margin - distance, gradient
 

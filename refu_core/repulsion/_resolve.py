@@ -313,7 +313,9 @@ def _raise_edges(state: _State, edges: Tensor, max_rounds: int) -> int:
     may_be_low = (ends.amax(dim=1) < wanted + 0.5 * length) & (ends.mean(dim=1) < wanted + bulge)
     low = edges[may_be_low & (ends.amin(dim=1) >= 0)]
     for round_ in range(max_rounds):
-        closer = low.gather(1, state.distance[low].argmin(dim=1, keepdim=True))[:, 0]
+        # Both ends are often at the margin: rounding mustn't choose.
+        of_first, of_second = state.distance[low].unbind(1)
+        closer = torch.where(of_first <= of_second + state.tolerance, low[:, 0], low[:, 1])
         middle = state.query(state.vertices[low].mean(dim=1), closer)
         is_low = middle.distance < wanted
         if not bool(is_low.any()):

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from refu_core._warp import as_warp, torch_stream
 from refu_core.repulsion import _edge_kernels, _resolver_kernels, _sheet, _spread_kernels
-from refu_core.repulsion._blend import BLEND_REACH, BLEND_ROUNDS
+from refu_core.repulsion._blend import BLEND_REACH, BLEND_STEPS
 from refu_core.repulsion._limbs import INWARD, SIDEWAYS, Limbs
 from refu_core.repulsion._mend import DEEP, DETOUR, FARTHEST, LOOKS, ROUNDS, STEP_ON, STEPS, TOLERANCE
 from refu_core.repulsion._resolve import BULGE, RETREAT_STEPS, SURE, Resolution
@@ -141,8 +141,8 @@ class Resolver:
         for _ in range(BLEND_REACH):
             self._run("reach", last - first, (2, first))
             first, last = last, self._count(_sheet.REACHED)
-        for round_ in range(BLEND_ROUNDS):
-            self._run(f"spread{round_ % 2}", last)
+        for sweep in range(len(BLEND_STEPS)):
+            self._run(f"spread{sweep % 2}", last)
 
     def _raise_edges(self) -> int:
         """Raises both ends of the edges that run too low; returns the rounds it took."""
@@ -208,15 +208,19 @@ class Resolver:
         self._command("settle", _resolver_kernels.settle_kernel, [sheet, skin, rules, reached, field, smoother])
         self._command("suspect", _edge_kernels.suspect_kernel, [sheet, cloth, rules, suspects])
         self._command("tally", _resolver_kernels.tally_kernel, [sheet, near])
+        long_step, short_step = BLEND_STEPS[:2]
         if self._is_serial:
-            inputs = [sheet, cloth, BLEND_REACH, BLEND_ROUNDS, reached, field, smoother]
+            inputs = [sheet, cloth, BLEND_REACH, len(BLEND_STEPS) // 2, long_step, short_step, reached, field, smoother]
             self._command("blend", _spread_kernels.blend_kernel, inputs)
             inputs = [sheet, cloth, skin, rules, suspects, moved, *lack, field, reached]
             self._command("raise edges", _edge_kernels.raise_edges_kernel, inputs)
             return
         self._command("reach", _spread_kernels.reach_kernel, [sheet, cloth, 0, reached])
-        self._command("spread0", _spread_kernels.spread_kernel, [sheet, cloth, reached, field, smoother])
-        self._command("spread1", _spread_kernels.spread_kernel, [sheet, cloth, reached, smoother, field])
+        for name, step, fields in (
+            ("spread0", long_step, (field, smoother)),
+            ("spread1", short_step, (smoother, field)),
+        ):
+            self._command(name, _spread_kernels.spread_kernel, [sheet, cloth, step, reached, *fields])
         for name, source, target in (("measure", suspects, low), ("again1", low, lower), ("again0", lower, low)):
             inputs = [sheet, cloth, skin, rules, 0, source, moved, target, *lack]
             self._command(name, _edge_kernels.measure_kernel, inputs)

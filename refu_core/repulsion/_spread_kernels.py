@@ -14,24 +14,28 @@ def reach(i: int, sheet: Sheet, cloth: Cloth, reached: wp.array(dtype=int)):
     """Lists the neighbours of a vertex, unless they are."""
     for k in range(cloth.ring_start[i], cloth.ring_start[i + 1]):
         j = cloth.ring[k]
-        if wp.atomic_max(sheet.mark, j, BESIDE) == 0:
+        if sheet.mark[j] == 0 and wp.atomic_max(sheet.mark, j, BESIDE) == 0:
             reached[wp.atomic_add(sheet.counts, REACHED, 1)] = j
 
 
 @wp.func
-def spread(i: int, sheet: Sheet, cloth: Cloth, field: wp.array(dtype=wp.vec3), smoother: wp.array(dtype=wp.vec3)):
-    """The mean of the neighbours, but no less than a vertex has to go."""
+def spread(
+    i: int, sheet: Sheet, cloth: Cloth, step: float, field: wp.array(dtype=wp.vec3), smoother: wp.array(dtype=wp.vec3)
+):
+    """A step towards the mean of the neighbours, but no less than a vertex has to go."""
     first = cloth.ring_start[i]
     last = cloth.ring_start[i + 1]
-    total = wp.vec3()
+    mean = wp.vec3()
     for k in range(first, last):
-        total += field[cloth.ring[k]]
+        mean += field[cloth.ring[k]]
     if last > first:
-        total = total / float(last - first)
+        mean = mean * (1.0 / float(last - first))
+    here = field[i]
+    here += step * (mean - here)
     if sheet.mark[i] == SOURCE:
-        lack = sheet.way[i] - wp.dot(total, sheet.heading[i])
-        total += wp.max(lack, 0.0) * sheet.heading[i]
-    smoother[i] = total
+        lack = sheet.way[i] - wp.dot(here, sheet.heading[i])
+        here += wp.max(lack, 0.0) * sheet.heading[i]
+    smoother[i] = here
 
 
 @wp.kernel(enable_backward=False)
@@ -44,36 +48,39 @@ def reach_kernel(sheet: Sheet, cloth: Cloth, first: int, reached: wp.array(dtype
 def spread_kernel(
     sheet: Sheet,
     cloth: Cloth,
+    step: float,
     reached: wp.array(dtype=int),
     field: wp.array(dtype=wp.vec3),
     # output
     smoother: wp.array(dtype=wp.vec3),
 ):
-    """One Jacobi sweep of `Blend.spread`."""
-    spread(reached[wp.tid()], sheet, cloth, field, smoother)
+    """One sweep of `Blend.spread`."""
+    spread(reached[wp.tid()], sheet, cloth, step, field, smoother)
 
 
 @wp.kernel(enable_backward=False)
 def blend_kernel(
     sheet: Sheet,
     cloth: Cloth,
-    reach_of: int,
-    rounds: int,
+    rings: int,
+    pairs: int,
+    long_step: float,
+    short_step: float,
     reached: wp.array(dtype=int),
     # kept up to date
     field: wp.array(dtype=wp.vec3),
     smoother: wp.array(dtype=wp.vec3),
 ):
-    """All sweeps, an even number, by one thread: the lists are short, and a launch costs what hundreds of steps do."""
+    """All sweeps, in pairs, by one thread: the lists are short, and a launch costs what hundreds of steps do."""
     first = int(0)
-    for _ring in range(reach_of):
+    for _ring in range(rings):
         last = int(sheet.counts[REACHED])
         for k in range(first, last):
             reach(reached[k], sheet, cloth, reached)
         first = last
     n = int(sheet.counts[REACHED])
-    for _pair in range(rounds / 2):
+    for _pair in range(pairs):
         for k in range(n):
-            spread(reached[k], sheet, cloth, field, smoother)
+            spread(reached[k], sheet, cloth, long_step, field, smoother)
         for k in range(n):
-            spread(reached[k], sheet, cloth, smoother, field)
+            spread(reached[k], sheet, cloth, short_step, smoother, field)

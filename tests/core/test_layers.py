@@ -94,7 +94,7 @@ def test_equals_the_search_over_all_triangles(seed: int, height: float, shift: f
     for rounds in (6, 2):
         push = wanted_pushes(wanted.numpy(), above_faces.numpy(), low.double().numpy(), below_faces.numpy())
         counts.append(int((push != 0).any(axis=1).sum()))
-        field = blend.spread(torch.from_numpy(push).float()[:, None], rounds=rounds, reach=rounds)
+        field = blend.spread(torch.from_numpy(push).float()[:, None], steps=rounds * (1.0,), reach=rounds)
         wanted = wanted + field[:, 0].double()
     assert abs(n_low - counts[0]) <= 1  # but for rounding
     np.testing.assert_allclose(found.numpy(), wanted.numpy(), atol=2e-5)
