@@ -23,6 +23,7 @@ from refu_core.realtime._outfit import Outfit
 from refu_core.realtime._outputs import SDF_MODES, SKIPS, FrameStats, GarmentMesh, GarmentStats, PipelineOutput
 from refu_core.realtime._turn import RootTurn
 from refu_core.repulsion import DEFAULT_MARGIN, Refu, VertexScale, read_refu
+from refu_core.sdf import require_outward
 from refu_core.weights import shipped_weights
 
 if TYPE_CHECKING:
@@ -256,11 +257,14 @@ class GarmentPipeline:
         style = self._styles(frames)
         mean = betas.new_zeros(1, betas.shape[1])
         templates = self.garments.items()
+        shape = self.body.shape(betas)
+        if self._collisions is not None:  # of a body that its β turn inside out, every vertex would be inside
+            require_outward(shape.vertices, self.body.faces)
         self._figures = _Figures(
             key,
             betas,
             style,
-            self.body.shape(betas),
+            shape,
             {name: template.rest(betas, style) for name, template in templates},
             {name: template.rest(mean, style) for name, template in templates},
         )

@@ -280,7 +280,7 @@ def _retreat(state: _State, rows: Tensor, outward: Tensor, limbs: Limbs, max_pus
         # No surface is nearer than |f|: a step of |f| can't jump over the room that is sought, however narrow it is.
         # Farther in than the garment is cut off the skin there is only flesh.
         step = torch.minimum(-distance + STEP_ON, limbs.clearance[walker] + STEP_ON - way)
-        here = here - step[:, None] * outward[walker]
+        here = state.bounded(here - step[:, None] * outward[walker], walker)
         way = way + step
         sample = state.query(here, walker)
         state.keep_better(walker, here, sample)
@@ -289,7 +289,7 @@ def _retreat(state: _State, rows: Tensor, outward: Tensor, limbs: Limbs, max_pus
         walker, here, distance, way = walker[going], here[going], distance[going], way[going]
     # The few that missed it go where their neighbours went.
     missed = rows[state.distance[rows] < 0]
-    filled = limbs.mean_of_neighbours(state.vertices, missed)
+    filled = state.bounded(limbs.mean_of_neighbours(state.vertices, missed), missed)
     state.keep_better(missed, filled, state.query(filled, missed))
     # In the room between limb and skin the gradient keeps to the middle, or at the margin where that is wide enough.
     found = rows[state.distance[rows] > 0]

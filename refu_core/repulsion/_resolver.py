@@ -202,7 +202,7 @@ class Resolver:
         self._command("list", _resolver_kernels.list_kernel, [sheet, rules, near])
         self._command("look", _resolver_kernels.look_kernel, [sheet, cloth, rules, near])
         self._command("retreat", _resolver_kernels.retreat_kernel, [sheet, cloth, skin, rules, near])
-        self._command("fill", _resolver_kernels.fill_kernel, [sheet, cloth, skin, near])
+        self._command("fill", _resolver_kernels.fill_kernel, [sheet, cloth, skin, rules, near])
         self._command("aim", _resolver_kernels.aim_kernel, [sheet, cloth, skin, rules, near, pushed, reached, field])
         self._command("scale", _resolver_kernels.scale_kernel, [sheet, rules, pushed, alpha, reached, field])
         self._command("settle", _resolver_kernels.settle_kernel, [sheet, skin, rules, reached, field, smoother])

@@ -200,7 +200,7 @@ def retreat_kernel(sheet: Sheet, cloth: Cloth, skin: Skin, rules: Rules, near: w
     for _step in range(rules.retreats):
         # No surface is nearer than |f|: a step of |f| can't jump over the room that is sought, however narrow it is.
         step = wp.min(-distance, room - way) + rules.step_on
-        here = here - step * sheet.outward[i]
+        here = bounded(here - step * sheet.outward[i], sheet.origin[i], rules.max_displacement)
         way += step
         distance, gradient, face = ask(skin, here, sheet.face[i])
         if distance > sheet.distance[i]:
@@ -211,7 +211,7 @@ def retreat_kernel(sheet: Sheet, cloth: Cloth, skin: Skin, rules: Rules, near: w
 
 
 @wp.kernel(enable_backward=False)
-def fill_kernel(sheet: Sheet, cloth: Cloth, skin: Skin, near: wp.array(dtype=int)):
+def fill_kernel(sheet: Sheet, cloth: Cloth, skin: Skin, rules: Rules, near: wp.array(dtype=int)):
     """The few that found no room go where their neighbours went."""
     i = near[wp.tid()]
     if sheet.role[i] != MISSED:
@@ -227,7 +227,7 @@ def fill_kernel(sheet: Sheet, cloth: Cloth, skin: Skin, near: wp.array(dtype=int
                 number += 1.0
     here = sheet.place[i]
     if number > 0.0:
-        here = total / number
+        here = bounded(total / number, sheet.origin[i], rules.max_displacement)
     distance, gradient, face = ask(skin, here, sheet.face[i])
     if distance > 0.0:
         keep(i, here, distance, gradient, face, sheet)

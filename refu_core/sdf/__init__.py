@@ -6,6 +6,7 @@ from refu_core.sdf._band import BandSdf as BandSdf
 from refu_core.sdf._band import Links as Links
 from refu_core.sdf._exact import ClosestPoints as ClosestPoints
 from refu_core.sdf._exact import ExactSdf as ExactSdf
+from refu_core.sdf._mesh import require_outward as require_outward
 from refu_core.sdf._neural import SDF_PRESETS as SDF_PRESETS
 from refu_core.sdf._neural import NeuralSdf as NeuralSdf
 from refu_core.sdf._neural import SdfNetwork as SdfNetwork

@@ -132,7 +132,7 @@ class MeshSdf(ABC):
         require_finite("the body's vertices", vertices)
         is_new = self._points is None or len(vertices) != len(self._points)
         if self._points is None or is_new:
-            self._require_outward(vertices.detach())
+            require_outward(vertices.detach().to(self.device).double()[None], self.faces)
             self._points = torch.empty(len(vertices), 3, device=self.device)
             self._points_wp = as_warp(self._points, wp.vec3)
             self._skin = None
@@ -229,11 +229,13 @@ class MeshSdf(ABC):
             raise MeshError(msg)
         return self._points
 
-    def _require_outward(self, vertices: Tensor) -> None:
-        a, b, c = vertices.to(self.device).double()[self.faces.long()].unbind(1)
-        if (a * torch.linalg.cross(b, c)).sum() <= 0:
-            msg = "the body's faces must be counter-clockwise seen from outside: this body has a negative volume"
-            raise MeshError(msg)
+
+def require_outward(vertices: Tensor, faces: Tensor) -> None:
+    """Raises `MeshError` where one of B bodies (B, V, 3) [m] with these `faces`, shape (F, 3), is turned inside out."""
+    a, b, c = vertices[:, faces.long()].unbind(2)
+    if not bool(((a * torch.linalg.cross(b, c)).sum((1, 2)) > 0).all()):
+        msg = "the body's faces must be counter-clockwise seen from outside: this body has a negative volume"
+        raise MeshError(msg)
 
 
 def require_finite(name: str, values: Tensor) -> None:

@@ -19,6 +19,7 @@ from refu_core import (
     load_body,
     load_garment,
 )
+from refu_core.errors import MeshError
 from refu_core.realtime import SKIPS
 from refu_core.sdf import ExactSdf
 
@@ -208,6 +209,14 @@ def test_bad_options_are_named(garments: list[str], options: dict[str, object], 
 def test_bad_frames_are_named(values: dict[str, object], wanted: str) -> None:
     with pytest.raises(FrameError, match=wanted):
         SmplFrame(**values)  # type: ignore[arg-type]
+
+
+def test_a_body_that_its_shape_turns_inside_out_is_refused_whatever_came_before(pipeline: GarmentPipeline) -> None:
+    pipeline(frame())
+    inside_out = SmplFrame(pose=np.zeros((24, 3)), betas=np.full(10, -50.0))
+    with pytest.raises(MeshError, match="negative volume"):
+        pipeline(inside_out)
+    assert np.isfinite(pipeline(frame())["tshirt-male"].vertices).all()
 
 
 def test_frames_own_their_data() -> None:
