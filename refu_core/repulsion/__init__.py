@@ -1,7 +1,5 @@
 """The Repulsive Force Unit: penetrating garment vertices leave the body along the gradient of its signed distance."""
 
-from refu_core.repulsion._blend import BLEND_REACH as BLEND_REACH
-from refu_core.repulsion._blend import BLEND_STEPS as BLEND_STEPS
 from refu_core.repulsion._blend import Blend as Blend
 from refu_core.repulsion._files import read_refu as read_refu
 from refu_core.repulsion._files import refu_tensors as refu_tensors

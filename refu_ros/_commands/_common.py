@@ -6,6 +6,7 @@ import argparse
 import json
 import math
 import os
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -77,6 +78,12 @@ def add_common(parser: argparse.ArgumentParser) -> None:
     """What every command has."""
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the results as JSON")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def given(args: argparse.Namespace, options: type) -> dict[str, Any]:
+    """The arguments that are fields of a dataclass of options, by name."""
+    names_of_fields = {field.name for field in fields(options)}
+    return {name: value for name, value in vars(args).items() if name in names_of_fields}
 
 
 def check_writable(path: Path | None) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from refu_ros._commands._common import EXIT_INTERRUPTED, add_common, check_writable, names, positive, write_json
+from refu_ros._commands._common import EXIT_INTERRUPTED, add_common, check_writable, given, names, positive, write_json
 
 if TYPE_CHECKING:
     import argparse
@@ -42,8 +42,8 @@ def run(args: argparse.Namespace) -> int:
     """Does what was asked; returns the exit code."""
     from refu_ros.benchmark import OUTPUT, BenchmarkOptions, benchmark, benchmark_text, write_results
 
-    given = {key: value for key, value in vars(args).items() if key in BenchmarkOptions.__dataclass_fields__}
-    options = BenchmarkOptions(**{**given, "no_skip": tuple(args.no_skip), "output": args.output or OUTPUT})
+    chosen = given(args, BenchmarkOptions) | {"no_skip": tuple(args.no_skip), "output": args.output or OUTPUT}
+    options = BenchmarkOptions(**chosen)
     for path in (args.json, options.output):
         check_writable(path)
     result = benchmark(options, progress=not args.quiet)

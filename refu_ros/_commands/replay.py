@@ -9,6 +9,7 @@ from refu_ros._commands._common import (
     EXIT_INTERRUPTED,
     add_common,
     check_writable,
+    given,
     names,
     numbers,
     positive,
@@ -77,8 +78,7 @@ def run(args: argparse.Namespace) -> int:
 
     for path in (args.json, args.report):
         check_writable(path)
-    given = {key: value for key, value in vars(args).items() if key in ReplayOptions.__dataclass_fields__}
-    result = replay(ReplayOptions(**given), progress=not args.quiet)
+    result = replay(ReplayOptions(**given(args, ReplayOptions)), progress=not args.quiet)
     print(replay_table(result))
     write_json(args.json, result.as_dict())
     if args.report is not None and result.frames:

@@ -9,6 +9,7 @@ from refu_ros._commands._common import (
     EXIT_CHECK_FAILED,
     add_common,
     check_writable,
+    given,
     names,
     positive,
     write_json,
@@ -71,9 +72,7 @@ def run(args: argparse.Namespace) -> int:
 
     for path in (args.json, args.output):
         check_writable(path)
-    options = StressOptions(
-        **{key: value for key, value in vars(args).items() if key in StressOptions.__dataclass_fields__}
-    )
+    options = StressOptions(**given(args, StressOptions))
     if args.node:
         from refu_ros.stress_node import node_options, node_table, soak_node
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from refu_ros._commands._common import add_common, check_writable, positive, write_json
+from refu_ros._commands._common import add_common, check_writable, given, positive, write_json
 
 if TYPE_CHECKING:
     import argparse
@@ -62,9 +62,7 @@ def run(args: argparse.Namespace) -> int:
 
     for path in (args.json, args.output):
         check_writable(path)
-    options = TrainOptions(
-        **{key: value for key, value in vars(args).items() if key in TrainOptions.__dataclass_fields__}
-    )
+    options = TrainOptions(**given(args, TrainOptions))
     card = train(options, progress=not args.quiet)
     print(training_table(card, options))
     write_json(args.json, card)
