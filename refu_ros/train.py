@@ -112,7 +112,7 @@ def _sdf_training(options: TrainOptions) -> SdfSettings:
 
 
 def _pretraining(options: TrainOptions) -> PretrainSettings:
-    settings = PretrainSettings.paper() if options.preset == "paper" else PretrainSettings()
+    settings = PretrainSettings.of(options.backbone, options.preset)
     settings = replace(settings, loop=replace(settings.loop, seed=options.seed))
     if options.steps is None:
         return settings
@@ -120,7 +120,7 @@ def _pretraining(options: TrainOptions) -> PretrainSettings:
 
 
 def _finetuning(options: TrainOptions) -> FinetuneSettings:
-    settings = FinetuneSettings.paper() if options.preset == "paper" else FinetuneSettings()
+    settings = FinetuneSettings.of(options.backbone, options.preset)
     settings = replace(settings, loop=replace(settings.loop, seed=options.seed))
     if options.scale == "fixed":
         settings = replace(settings, scale=None)

@@ -73,18 +73,20 @@ class UpConv(nn.Module):
         self.across = nn.Linear(inputs, outputs, bias=False) if inputs != outputs else nn.Identity()
 
     def forward(self, x: Tensor) -> Tensor:
-        """Shape (B, V_coarse, I) -> (B, V_fine, O)."""
-        alpha = self.coefficients * self.valid[..., None]
+        """Shape (V_coarse, B, I) -> (V_fine, B, O): what a neighbour hands over lies in one piece."""
+        n_out, n = self.index.shape
         bases, inputs, outputs = self.basis.shape
-        if outputs < inputs:  # the smaller array is the one that is gathered over the neighbours
-            mixed = torch.einsum("bvi,mio->bvmo", x, self.basis)[:, self.index]  # (B, V_fine, n, M, O)
-            conv = torch.einsum("bvnmo,vnm->bvo", mixed, alpha)
+        batch = x.shape[1]
+        alpha = self.coefficients * self.valid[..., None]  # (V_fine, n, M)
+        if outputs < inputs:  # the smaller array is the one that is gathered
+            mixed = torch.einsum("vbi,mio->vmbo", x, self.basis).flatten(2)[self.index]  # (V_fine, n, M, B O)
+            conv = torch.bmm(alpha.view(n_out, 1, -1), mixed.view(n_out, n * bases, -1)).view(n_out, batch, outputs)
         else:
-            gathered = torch.einsum("bvni,vnm->bvmi", x[:, self.index], alpha)
-            conv = gathered.flatten(2) @ self.basis.reshape(bases * inputs, outputs)
+            gathered = torch.bmm(alpha.transpose(1, 2), x.flatten(1)[self.index])  # (V_fine, M, B I)
+            conv = torch.einsum("vmbi,mio->vbo", gathered.view(n_out, bases, batch, inputs), self.basis)
         rho = self.density.abs() * self.valid
         rho = rho / rho.sum(1, keepdim=True).clamp_min(1e-6)
-        passed = torch.einsum("bvno,vn->bvo", self.across(x)[:, self.index], rho)
+        passed = torch.bmm(rho[:, None], self.across(x).flatten(1)[self.index]).view(n_out, batch, outputs)
         return math.sqrt(1 - self.residual) * (conv + self.bias) + math.sqrt(self.residual) * passed
 
 
@@ -124,7 +126,7 @@ class Gcnn(nn.Module):
     def forward(self, betas: Tensor, pose: Tensor, style: Tensor | None) -> Prediction:
         """Predicts for betas (B, 10), pose (B, 24, 3) [rad] and style (B, 4)."""
         z = self.head(torch.cat((self.features(pose), style_shape(betas, style)), 1))
-        x = z.view(len(z), -1, self.config.channels[0])
+        x = z.view(len(z), -1, self.config.channels[0]).transpose(0, 1)
         for layer in self.layers[:-1]:
             x = functional.elu(layer(x))
-        return Prediction(self.mean + self.scale * self.layers[-1](x), z)
+        return Prediction(self.mean + self.scale * self.layers[-1](x).transpose(0, 1), z)

@@ -78,6 +78,14 @@ class FinetuneSettings:
         loop = LoopSettings(batch_size=32, learning_rate=1e-5, weight_decay=0.0, check_every=1000)
         return cls(loop, steps=100_000, scale="paper", margin=0.0, is_blended=False, is_mirrored=False)
 
+    @classmethod
+    def of(cls, backbone: str, preset: str = "realtime") -> FinetuneSettings:
+        """A backbone's own in a preset. The gcnn is trained from scratch, so as long and as fast as it is alone."""
+        if preset == "paper":
+            return cls.paper()
+        alone = PretrainSettings.of(backbone)
+        return cls(alone.loop, steps=alone.steps) if backbone == "gcnn" else cls()
+
 
 def finetune(
     garment: str | GarmentTemplate,
@@ -106,7 +114,7 @@ def finetune(
         mode: one of `FINETUNE_MODES`.
         backbone: `tailornet`, `mlp` or `gcnn`.
         preset: `realtime` or `paper`, of ReFU and of a backbone from scratch.
-        settings: the preset's own if not given.
+        settings: the backbone's own in the preset if not given.
         body: the body that the set was simulated on; the garment's built-in one if not given.
         device: `cpu` or `cuda`.
         quiet: show no progress.
@@ -123,7 +131,7 @@ def finetune(
         msg = f"no mode {mode!r} of training: wanted {', '.join(FINETUNE_MODES)}"
         raise RefuError(msg)
     if settings is None:
-        settings = FinetuneSettings.paper() if preset == "paper" else FinetuneSettings()
+        settings = FinetuneSettings.of(backbone, preset)
     template = load_garment(garment) if isinstance(garment, str) else garment
     body = load_body(template.body) if body is None else body
     is_writer, torch_device = start_parallel(torch.device(device))

@@ -72,6 +72,14 @@ class PretrainSettings:
         loop = LoopSettings(batch_size=32, learning_rate=1e-4, weight_decay=1e-6, check_every=1000)
         return cls(loop, style_shape_steps=100_000, low_steps=300_000, steps=300_000, pivots="separate")
 
+    @classmethod
+    def of(cls, backbone: str, preset: str = "realtime") -> PretrainSettings:
+        """A backbone's own in a preset."""
+        if preset == "paper":
+            return cls.paper()
+        # A gcnn's step costs many times one of a network with an output basis, and hardly gains from larger batches.
+        return cls(LoopSettings(batch_size=32, learning_rate=5e-3, weight_decay=0.1)) if backbone == "gcnn" else cls()
+
 
 def pretrain(
     garment: str | GarmentTemplate,
@@ -97,7 +105,7 @@ def pretrain(
         output: folder of the weights, of the checkpoint while it is needed, and of the loss curves.
         backbone: `tailornet`, `mlp` or `gcnn`.
         preset: `realtime` or `paper`.
-        settings: the preset's own if not given.
+        settings: the backbone's own in the preset if not given.
         config: sizes of the network; the preset's if not given.
         body: the body that the set was simulated on; the garment's built-in one if not given.
         device: `cpu` or `cuda`.
@@ -112,7 +120,7 @@ def pretrain(
     """
     template = load_garment(garment) if isinstance(garment, str) else garment
     body = load_body(template.body) if body is None else body
-    settings = _settings(settings, preset)
+    settings = _checked(PretrainSettings.of(backbone, preset) if settings is None else settings)
     config = backbone_config(backbone, template.name, preset=preset) if config is None else config
     is_writer, torch_device = start_parallel(torch.device(device))
     output = Path(output)
@@ -166,9 +174,7 @@ def pretrain(
     return card
 
 
-def _settings(settings: PretrainSettings | None, preset: str) -> PretrainSettings:
-    if settings is None:
-        settings = PretrainSettings.paper() if preset == "paper" else PretrainSettings()
+def _checked(settings: PretrainSettings) -> PretrainSettings:
     if settings.pivots not in PIVOT_TRAINING:
         msg = f"pivots are trained {' or '.join(PIVOT_TRAINING)}, got {settings.pivots!r}"
         raise RefuError(msg)

@@ -391,18 +391,18 @@ def test_up_convolution_is_what_the_formula_says(garment: GarmentTemplate) -> No
         layer = UpConv(up, inputs, outputs, bases=4, residual=0.3)
         torch.nn.init.normal_(layer.density)
         torch.nn.init.normal_(layer.bias)
-        x = torch.randn(2, graph.sizes[3], inputs)
+        x = torch.randn(graph.sizes[3], 2, inputs)
         got = layer(x)
         for i in range(0, graph.sizes[2], 7):
             conv, passed, total = layer.bias.clone(), torch.zeros(outputs), torch.zeros(())
             for n in np.flatnonzero(up.valid[i]):
                 j = int(up.index[i, n])
                 weight = sum(layer.coefficients[i, n, m] * layer.basis[m] for m in range(4))
-                conv = conv + x[1, j] @ weight
+                conv = conv + x[j, 1] @ weight
                 rho = layer.density[i, n].abs()
-                passed, total = passed + rho * layer.across(x[1, j]), total + rho
+                passed, total = passed + rho * layer.across(x[j, 1]), total + rho
             wanted = 0.7**0.5 * conv + 0.3**0.5 * passed / total
-            torch.testing.assert_close(got[1, i], wanted, atol=1e-4, rtol=1e-4)
+            torch.testing.assert_close(got[i, 1], wanted, atol=1e-4, rtol=1e-4)
 
 
 @pytest.mark.parametrize("name", ["tshirt-male", "skirt-female"])
