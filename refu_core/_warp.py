@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 from collections.abc import Iterator
 from typing import Any
@@ -58,7 +59,22 @@ def is_plain(*tensors: Tensor) -> bool:
 def torch_stream(device: torch.device) -> Iterator[None]:
     """Queues Warp's work on torch's current CUDA stream, so that the two keep their order; nothing to do on a CPU."""
     if device.type == "cuda":
-        with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device))):
+        stream = _same_stream(torch.cuda.current_stream(device))
+        # While torch captures a graph, work on another stream can't be waited for.
+        with wp.ScopedStream(stream, sync_enter=not torch.cuda.is_current_stream_capturing()):
             yield
     else:
         yield
+
+
+@functools.cache
+def _same_stream(stream: torch.cuda.Stream) -> Any:
+    """Warp's object of one of torch's few streams, kept: with the first one to go Warp would forget the stream."""
+    return wp.stream_from_torch(stream)
+
+
+@contextlib.contextmanager
+def joined_capture(device: torch.device) -> Iterator[Any]:
+    """Tells Warp that torch is capturing a CUDA graph; what this gives must live as long as the graph does."""
+    with torch_stream(device), wp.ScopedCapture(external=True, force_module_load=False) as capture:
+        yield capture

@@ -76,10 +76,17 @@ class TailorNet(nn.Module):
         self.skips_pivots = True
         """Whether pivots of negligible weight are left out (`TailorNetConfig.skipped`); the next mixture obeys."""
 
-    def forward(self, betas: Tensor, pose: Tensor, style: Tensor | None) -> Prediction:
-        """Predicts for betas (B, 10), pose (B, 24, 3) [rad] and style (B, 4)."""
+    def forward(
+        self, betas: Tensor, pose: Tensor, style: Tensor | None, *, mixture: Tensor | None = None
+    ) -> Prediction:
+        """Predicts for betas (B, 10), pose (B, 24, 3) [rad] and style (B, 4).
+
+        Given the `mixture` as `run_time_mixture` says it, shape (B, K), all pivots are computed, and nothing is
+        remembered or looked up: the same work for any input.
+        """
         x, s = self.features(pose), style_shape(betas, style)
-        return Prediction(self.decoder(self.low_code(x, s) + self.high_code(x, s)), None)
+        high = self.high_code(x, s) if mixture is None else self.high(x, mixture)
+        return Prediction(self.decoder(self.low_code(x, s) + high), None)
 
     def low_code(self, x: Tensor, s: Tensor) -> Tensor:
         """Code of D_LF, shape (B, C), of pose features (B, I) and (β, γ) (B, 14)."""
@@ -134,11 +141,15 @@ class TailorNet(nn.Module):
         """
         return kernel_weights(self.distances(s), self.config.sigma)
 
-    def _mix(self, s: Tensor, state: tuple[object, ...]) -> _Mixture:
+    def run_time_mixture(self, s: Tensor) -> Tensor:
+        """Ψ, shape (B, K), of (β, γ) (B, 14), with a weight of zero for pivots that are left out."""
         # Far from all pivots, which of two is nearer hangs on the last digits of distances of 1e5: float32 hasn't got
         # them, and a pivot's weight would be rounding.
         mixture = self.mixture(s.double()).to(s.dtype)
-        mixture = without_negligible(mixture, self.config.skipped if self.skips_pivots else 0.0)
+        return without_negligible(mixture, self.config.skipped if self.skips_pivots else 0.0)
+
+    def _mix(self, s: Tensor, state: tuple[object, ...]) -> _Mixture:
+        mixture = self.run_time_mixture(s)
         active = mixture.amax(0).nonzero()[:, 0]
         return _Mixture(s.clone(), state, mixture[:, active].contiguous(), self.high.select(active))
 

@@ -77,3 +77,11 @@ class Collisions:
             start = self._sdf.query(points, near=near)
             n_skipped = 0
         return fabric.resolver(points, self._sdf, start, margin=margin, scale=scale), n_skipped
+
+    def queued(
+        self, name: str, points: Tensor, *, margin: float, scale: float | VertexScale, near: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """The same of a GPU that isn't waited for (`refu_core.repulsion.Resolver.queued`)."""
+        assert not isinstance(self._sdf, BandSdf)  # which is for a CPU
+        start = self._sdf.query(points, near=near)
+        return self._fabrics[name].resolver.queued(points, self._sdf, start, margin=margin, scale=scale)

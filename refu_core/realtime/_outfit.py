@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import torch
 from torch import Tensor
 
 from refu_core.garments import GarmentTemplate, inner_first
@@ -34,4 +35,12 @@ class Outfit:
         for inner, layer in self._below[name].items():
             vertices, n_low = layer(vertices, worn[inner])
             n_layered += n_low
+        return vertices, n_layered
+
+    def queued(self, name: str, vertices: Tensor, worn: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """The same of a GPU that isn't waited for, the number of shape (1,)."""
+        n_layered = torch.zeros(1, dtype=torch.int32, device=vertices.device)
+        for inner, layer in self._below[name].items():
+            vertices, n_low = layer.queued(vertices, worn[inner])
+            n_layered = n_layered + n_low
         return vertices, n_layered

@@ -6,7 +6,7 @@
 
 import warp as wp
 
-from refu_core.repulsion._sheet import BESIDE, CUTTING, RAISED, Cloth, Rules, Sheet, bounded, keep
+from refu_core.repulsion._sheet import BESIDE, CUTTING, NEAR, RAISED, Cloth, Rules, Sheet, bounded, keep, listed
 from refu_core.sdf import Skin, ask
 
 
@@ -24,6 +24,8 @@ def look_between(edge: int, sheet: Sheet, cloth: Cloth, skin: Skin, rules: Rules
 @wp.kernel(enable_backward=False)
 def suspect_kernel(sheet: Sheet, cloth: Cloth, rules: Rules, suspects: wp.array(dtype=int)):
     """Lists the edges whose middle may be closer to the skin than half the margin (`_raise_edges`)."""
+    if sheet.counts[NEAR] == 0:
+        return  # nothing is moved then
     edge = wp.tid()
     a = cloth.edges[edge, 0]
     b = cloth.edges[edge, 1]
@@ -129,13 +131,16 @@ def measure_kernel(
     rise: wp.array(dtype=wp.vec3),
     largest: wp.array(dtype=float),
 ):
-    measure(suspects[wp.tid()], rounds, sheet, cloth, skin, rules, moved, low, deficit, rise, largest)
+    edge = listed(wp.tid(), CUTTING + rounds, suspects, sheet)
+    if edge >= 0:
+        measure(edge, rounds, sheet, cloth, skin, rules, moved, low, deficit, rise, largest)
 
 
 @wp.kernel(enable_backward=False)
 def choose_kernel(
     sheet: Sheet,
     cloth: Cloth,
+    rounds: int,
     low: wp.array(dtype=int),
     deficit: wp.array(dtype=float),
     rise: wp.array(dtype=wp.vec3),
@@ -144,7 +149,9 @@ def choose_kernel(
     field: wp.array(dtype=wp.vec3),
     raised: wp.array(dtype=int),
 ):
-    choose(wp.tid(), sheet, cloth, low, deficit, rise, largest, field, raised)
+    k = wp.tid()
+    if listed(k, CUTTING + 1 + rounds, low, sheet) >= 0:
+        choose(k, sheet, cloth, low, deficit, rise, largest, field, raised)
 
 
 @wp.kernel(enable_backward=False)
@@ -158,7 +165,9 @@ def lift_kernel(
     largest: wp.array(dtype=float),
     moved: wp.array(dtype=int),
 ):
-    lift(raised[wp.tid()], sheet, skin, rules, field, largest, moved)
+    i = listed(wp.tid(), RAISED, raised, sheet)
+    if i >= 0:
+        lift(i, sheet, skin, rules, field, largest, moved)
 
 
 @wp.kernel(enable_backward=False)

@@ -94,36 +94,62 @@ class Layer:
 
         Not differentiable. Raises `MeshError` for garments of other sizes than these were made for.
         """
+        self._check(above, below)
+        if not self._n_candidates:
+            return above, 0
+        with torch_stream(self.device):
+            self._take(above, below)
+            self._look("lift")
+            n_low = int(self._count)
+            if n_low:
+                self._move(_ROUNDS)
+                # What has left the sheet at one place may have come to another, and be too low there.
+                self._look("lift again")
+                if int(self._count):
+                    self._move(_LATER_ROUNDS)
+        return (self._above.clone(), n_low) if n_low else (above, 0)
+
+    @torch.no_grad()
+    def queued(self, above: Tensor, below: Tensor) -> tuple[Tensor, Tensor]:
+        """The same of a GPU that isn't waited for, the number of shape (1,): where none is low, none moves."""
+        self._check(above, below)
+        if not self._n_candidates:
+            return above, torch.zeros_like(self._count)
+        with torch_stream(self.device):
+            self._take(above, below)
+            self._look("lift")
+            n_low = self._count.clone()
+            self._move(_ROUNDS)
+            self._look("lift again")
+            self._move(_LATER_ROUNDS)
+        return self._above.clone(), n_low
+
+    def _check(self, above: Tensor, below: Tensor) -> None:
         if above.shape != self._above.shape or below.shape != self._below.shape:
             msg = (
                 f"wanted garments of {len(self._above)} and {len(self._below)} vertices, "
                 f"got the shapes {tuple(above.shape)} and {tuple(below.shape)}"
             )
             raise MeshError(msg)
-        if not self._n_candidates:
-            return above, 0
-        with torch_stream(self.device):
-            self._above.copy_(above)
-            self._below.copy_(below)
-            self._commands["normals"].launch()
-            n_low = self._lift("lift", _ROUNDS)
-            if n_low:
-                # What has left the sheet at one place may have come to another, and be too low there.
-                self._lift("lift again", _LATER_ROUNDS)
-        return (self._above.clone(), n_low) if n_low else (above, 0)
 
-    def _lift(self, name: str, blend_rounds: int) -> int:
-        """One push with its neighbourhood; how many vertices it was that had to be pushed."""
+    def _take(self, above: Tensor, below: Tensor) -> None:
+        """Takes over a frame."""
+        self._above.copy_(above)
+        self._below.copy_(below)
+        self._commands["normals"].launch()
+
+    def _look(self, name: str) -> None:
+        """What has to be pushed, and how many vertices that are."""
         self._count.zero_()
         self._commands[name].launch()
-        n_low = int(self._count)
-        if n_low:
-            self._fields[0].zero_()
-            self._fields[0, : self._n_candidates] = self._push
-            for round_ in range(blend_rounds):
-                self._commands[f"spread{round_ % 2}"].launch()
-            self._commands["move"].launch()
-        return n_low
+
+    def _move(self, blend_rounds: int) -> None:
+        """Pushes those with their neighbourhood."""
+        self._fields[0].zero_()
+        self._fields[0, : self._n_candidates] = self._push
+        for round_ in range(blend_rounds):
+            self._commands[f"spread{round_ % 2}"].launch()
+        self._commands["move"].launch()
 
     def _record(
         self, rules: Any, above_cut: Any, below_cut: Any, near_start: Any, near: Any, rows: Any, start: Any, ring: Any

@@ -32,6 +32,9 @@ class Resolver:
     one loop in one kernel, since they don't depend on those of others. What does (limbs, neighbourhood, edges) is
     finished for all vertices by one launch before the next one begins; so the order of vertices plays no role, and the
     answers are those of `resolve` but for rounding.
+
+    On a CPU steps that concern nobody are left out. A GPU isn't waited for to know: it gets the same launches in every
+    frame, as a CUDA graph wants them. Rounds that would have been left out change nothing.
     """
 
     def __init__(self, limbs: Limbs) -> None:
@@ -48,6 +51,7 @@ class Resolver:
         self._deficit = torch.zeros(e, device=self.device)
         self._rise = torch.zeros(e, 3, device=self.device)
         self._counts = torch.zeros(_sheet.N_COUNTS + 2 * _N_LIMBS, dtype=torch.int32, device=self.device)
+        self._bounds = torch.full((2, _sheet.N_COUNTS), 2**31 - 1, dtype=torch.int32, device=self.device)
         # On a CPU a kernel is one thread, and may as well do several short steps; and reading a number costs nothing.
         self._is_serial = self.device.type == "cpu"
         self._read_counts = self._counts.numpy() if self._is_serial else None
@@ -74,30 +78,63 @@ class Resolver:
             margin: ε ≥ 0 [m].
             scale: α of the first push, as `resolve` takes it.
         """
+        self._bring(points, sdf, start, margin, scale)
+        counts = self._counts.cpu().numpy()
+        low = counts[_sheet.CUTTING + 1 : _sheet.CUTTING + 1 + _MAX_PUSHES]
+        return Resolution(
+            self._vectors["place"].clone(),
+            self._floats["distance"].clone(),
+            n_inside=int(counts[_sheet.INSIDE]),
+            n_pushed=int(counts[_sheet.MOVED]),
+            rounds=1 + int(np.count_nonzero(low)) if counts[_sheet.NEAR] else 0,
+            max_depth=max(0.0, -float(self._floats["first"].min())) if len(points) else 0.0,
+            n_unresolved=int(counts[_sheet.STUCK]),
+        )
+
+    @torch.no_grad()
+    def queued(
+        self,
+        points: Tensor,
+        sdf: ExactSdf | ApproxSdf,
+        start: SdfSample,
+        *,
+        margin: float = DEFAULT_MARGIN,
+        scale: float | VertexScale = 1.0,
+    ) -> tuple[Tensor, Tensor]:
+        """The same of a GPU that isn't waited for: vertices (N, 3), and a resolution's numbers, float32, shape (4,).
+
+        These are `n_inside`, `n_pushed`, `n_unresolved` and `max_depth`.
+        """
+        self._bring(points, sdf, start, margin, scale)
+        depth = -self._floats["first"].amin(0, keepdim=True)
+        counts = self._counts[_sheet.INSIDE : _sheet.STUCK + 1].float()
+        return self._vectors["place"].clone(), torch.cat((counts, depth.clamp_min(0)))
+
+    def _bring(
+        self,
+        points: Tensor,
+        sdf: ExactSdf | BandSdf | ApproxSdf,
+        start: SdfSample,
+        margin: float,
+        scale: float | VertexScale,
+    ) -> None:
         with torch_stream(self.device):
             self._take(points, start)
             self._record(sdf, margin)
             self._mend(can_miss=isinstance(sdf, ApproxSdf))
             self._run("list", self._n_vertices)
-            n = self._count(_sheet.NEAR)
+            n = self._length(_sheet.NEAR)
             if n:
                 self._push(n, scale)
-                rounds = 1 + self._raise_edges()
+                self._raise_edges()
                 self._run("tally", n)
-            return Resolution(
-                self._vectors["place"].clone(),
-                self._floats["distance"].clone(),
-                n_inside=self._count(_sheet.INSIDE),
-                n_pushed=self._count(_sheet.MOVED),
-                rounds=rounds if n else 0,
-                max_depth=max(0.0, -float(self._floats["first"].min())) if len(points) else 0.0,
-                n_unresolved=self._count(_sheet.STUCK),
-            )
 
     def _take(self, points: Tensor, start: SdfSample) -> None:
         """Takes over a frame."""
         assert start.face is not None  # these distances are to faces
         self._counts.zero_()
+        if not self._is_serial:
+            self._bounds.zero_()
         self._vectors["origin"].copy_(points)
         self._floats["first"].copy_(start.distance)
         self._vectors["first_gradient"].copy_(start.gradient)
@@ -109,61 +146,68 @@ class Resolver:
         self._run("compare", self._n_vertices)
         for remedy, rounds in (("look again", LOOKS if can_miss else 0), ("cut off", ROUNDS)):
             for _ in range(rounds):
-                n = self._count(_sheet.SUSPECTS)
+                n = self._length(_sheet.SUSPECTS)
                 self._counts[_sheet.CHANGED] = 0
                 self._run(remedy, n)
                 self._run("adopt", n)
-                if not self._count(_sheet.CHANGED):
+                if self._is_serial and not self._count(_sheet.CHANGED):
                     break
 
     def _push(self, n: int, scale: float | VertexScale) -> None:
         """The `n` near out of other limbs on the near side, and out of the body, with the neighbourhood."""
         self._run("look", n)
-        if self._counts[_sheet.N_COUNTS : _sheet.N_COUNTS + _N_LIMBS].any():
+        if not self._is_serial or self._counts[_sheet.N_COUNTS : _sheet.N_COUNTS + _N_LIMBS].any():
             self._run("retreat", n)
             self._run("fill", n)
         self._run("aim", n)
-        n_pushed = self._count(_sheet.PUSHED)
+        n_pushed = self._length(_sheet.PUSHED)
         if n_pushed:
             rows = self._ints["pushed"][:n_pushed].long()
             alpha = scale(rows, self._floats["depth"][rows]) if callable(scale) else scale
             self._floats["alpha"][:n_pushed] = alpha
             self._run("scale", n_pushed)
         self._blend()
-        self._run("settle", self._count(_sheet.REACHED))
+        self._run("settle", self._length(_sheet.REACHED))
 
     def _blend(self) -> None:
         """The neighbourhood of those pushed gives way with them."""
         if self._is_serial:
             self._run("blend", 1)
             return
-        first, last = 0, self._count(_sheet.REACHED)
         for _ in range(BLEND_REACH):
-            self._run("reach", last - first, (2, first))
-            first, last = last, self._count(_sheet.REACHED)
+            self._run("reach", self._length(_sheet.REACHED))
+        n = self._length(_sheet.REACHED)
         for sweep in range(len(BLEND_STEPS)):
-            self._run(f"spread{sweep % 2}", last)
+            self._run(f"spread{sweep % 2}", n)
 
-    def _raise_edges(self) -> int:
-        """Raises both ends of the edges that run too low; returns the rounds it took."""
-        self._run("suspect", len(self._limbs.edges))
-        n = self._count(_sheet.CUTTING)
+    def _raise_edges(self) -> None:
+        """Raises both ends of the edges that run too low."""
+        n = len(self._limbs.edges)
+        self._run("suspect", n)
         if self._is_serial:
-            self._run("raise edges", int(n > 0))
-            return sum(self._count(_sheet.CUTTING + 1 + round_) > 0 for round_ in range(_MAX_PUSHES))
+            self._run("raise edges", int(self._count(_sheet.CUTTING) > 0))
+            return
+        self._close(_sheet.CUTTING)
         for round_ in range(_MAX_PUSHES):
-            name = "measure" if round_ == 0 else f"again{round_ % 2}"
-            self._run(name, n, (4, round_))
-            n = self._count(_sheet.CUTTING + 1 + round_)
-            if not n:
-                return round_
+            self._run("measure" if round_ == 0 else f"again{round_ % 2}", n, (4, round_))
+            self._close(_sheet.CUTTING + 1 + round_)
             self._counts[_sheet.RAISED] = 0
-            self._run(f"choose{round_ % 2}", n)
-            self._run("lift", self._count(_sheet.RAISED))
-        return _MAX_PUSHES
+            self._run(f"choose{round_ % 2}", n, (2, round_))
+            self._run("lift", self._length(_sheet.RAISED))
+
+    def _length(self, which: int) -> int:
+        """How long a launch through a list of vertices is: as long as the list, or as it may be."""
+        if self._is_serial:
+            return self._count(which)
+        self._close(which)
+        return self._n_vertices
+
+    def _close(self, which: int) -> None:
+        self._run("close", 1, (1, which))
 
     def _count(self, which: int) -> int:
-        return int(self._read_counts[which] if self._read_counts is not None else self._counts[which])
+        assert self._read_counts is not None  # of a CPU
+        return int(self._read_counts[which])
 
     def _run(self, name: str, n: int, parameter: tuple[int, int] | None = None) -> None:
         """Launches a step for `n` of its list, with one of its parameters, by position, set anew."""
@@ -215,7 +259,8 @@ class Resolver:
             inputs = [sheet, cloth, skin, rules, suspects, moved, *lack, field, reached]
             self._command("raise edges", _edge_kernels.raise_edges_kernel, inputs)
             return
-        self._command("reach", _spread_kernels.reach_kernel, [sheet, cloth, 0, reached])
+        self._command("close", _sheet.close_kernel, [sheet, 0])
+        self._command("reach", _spread_kernels.reach_kernel, [sheet, cloth, reached])
         for name, step, fields in (
             ("spread0", long_step, (field, smoother)),
             ("spread1", short_step, (smoother, field)),
@@ -225,7 +270,7 @@ class Resolver:
             inputs = [sheet, cloth, skin, rules, 0, source, moved, target, *lack]
             self._command(name, _edge_kernels.measure_kernel, inputs)
         for name, source in (("choose0", low), ("choose1", lower)):
-            self._command(name, _edge_kernels.choose_kernel, [sheet, cloth, source, *lack, field, reached])
+            self._command(name, _edge_kernels.choose_kernel, [sheet, cloth, 0, source, *lack, field, reached])
         self._command("lift", _edge_kernels.lift_kernel, [sheet, skin, rules, reached, field, largest, moved])
 
     def _bind_sheet(self) -> Any:
@@ -239,6 +284,7 @@ class Resolver:
         sheet.counts = as_warp(self._counts, wp.int32)
         sheet.touched = as_warp(self._counts[_sheet.N_COUNTS :], wp.int32)
         sheet.inward = as_warp(self._counts[_sheet.N_COUNTS + _N_LIMBS :], wp.int32)
+        sheet.begins, sheet.ends = (as_warp(bounds, wp.int32) for bounds in self._bounds)
         return sheet
 
 

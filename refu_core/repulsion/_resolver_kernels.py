@@ -27,6 +27,7 @@ from refu_core.repulsion._sheet import (
     Sheet,
     bounded,
     keep,
+    listed,
 )
 from refu_core.sdf import Skin, ask
 
@@ -106,7 +107,9 @@ def compare_kernel(sheet: Sheet, cloth: Cloth, rules: Rules, suspects: wp.array(
 @wp.kernel(enable_backward=False)
 def look_again_kernel(sheet: Sheet, cloth: Cloth, skin: Skin, rules: Rules, suspects: wp.array(dtype=int)):
     """`mend`'s first remedy: from the faces of neighbours that are nearer to theirs a nearer one may be found."""
-    i = suspects[wp.tid()]
+    i = listed(wp.tid(), SUSPECTS, suspects, sheet)
+    if i < 0:
+        return
     sheet.guess[i] = -1
     nearest = wp.abs(sheet.distance[i])
     for k in range(cloth.ring_start[i], cloth.ring_start[i + 1]):
@@ -123,7 +126,9 @@ def look_again_kernel(sheet: Sheet, cloth: Cloth, skin: Skin, rules: Rules, susp
 @wp.kernel(enable_backward=False)
 def cut_off_kernel(sheet: Sheet, cloth: Cloth, rules: Rules, suspects: wp.array(dtype=int)):
     """`mend`'s second: what is said to be outside of flesh that a neighbour is in goes with the neighbour."""
-    i = suspects[wp.tid()]
+    i = listed(wp.tid(), SUSPECTS, suspects, sheet)
+    if i < 0:
+        return
     sheet.guess[i] = -1
     nearest = float(1.0e12)
     for k in range(cloth.ring_start[i], cloth.ring_start[i + 1]):
@@ -145,7 +150,9 @@ def cut_off_kernel(sheet: Sheet, cloth: Cloth, rules: Rules, suspects: wp.array(
 @wp.kernel(enable_backward=False)
 def adopt_kernel(sheet: Sheet, cloth: Cloth, suspects: wp.array(dtype=int)):
     """Takes over what was found, and suspects the neighbours of what changed."""
-    i = suspects[wp.tid()]
+    i = listed(wp.tid(), SUSPECTS, suspects, sheet)
+    if i < 0:
+        return
     if sheet.guess[i] < 0:
         return
     wp.atomic_add(sheet.counts, CHANGED, 1)
@@ -169,7 +176,9 @@ def list_kernel(sheet: Sheet, rules: Rules, near: wp.array(dtype=int)):
 @wp.kernel(enable_backward=False)
 def look_kernel(sheet: Sheet, cloth: Cloth, rules: Rules, near: wp.array(dtype=int)):
     """Which way the cloth faces where that matters, and who is pushed inwards by a limb it doesn't lie on."""
-    i = near[wp.tid()]
+    i = listed(wp.tid(), NEAR, near, sheet)
+    if i < 0:
+        return
     limb = cloth.limb[sheet.face[i]]
     foreign = (cloth.own[i] >> limb) & 1 == 0
     if foreign or sheet.distance[i] < -rules.deep:
@@ -186,7 +195,9 @@ def look_kernel(sheet: Sheet, cloth: Cloth, rules: Rules, near: wp.array(dtype=i
 @wp.kernel(enable_backward=False)
 def retreat_kernel(sheet: Sheet, cloth: Cloth, skin: Skin, rules: Rules, near: wp.array(dtype=int)):
     """What the gradient would take out on the far side of another limb goes back against its normal instead."""
-    i = near[wp.tid()]
+    i = listed(wp.tid(), NEAR, near, sheet)
+    if i < 0:
+        return
     limb = cloth.limb[sheet.face[i]]
     if (cloth.own[i] >> limb) & 1 == 1 or sheet.along[i] <= rules.sideways:
         return
@@ -213,7 +224,9 @@ def retreat_kernel(sheet: Sheet, cloth: Cloth, skin: Skin, rules: Rules, near: w
 @wp.kernel(enable_backward=False)
 def fill_kernel(sheet: Sheet, cloth: Cloth, skin: Skin, rules: Rules, near: wp.array(dtype=int)):
     """The few that found no room go where their neighbours went."""
-    i = near[wp.tid()]
+    i = listed(wp.tid(), NEAR, near, sheet)
+    if i < 0:
+        return
     if sheet.role[i] != MISSED:
         return
     total = wp.vec3()
@@ -251,7 +264,9 @@ def aim_kernel(
     field: wp.array(dtype=wp.vec3),
 ):
     """Which way each vertex goes: those that left a limb as far as they are; the others are listed, to be pushed."""
-    i = near[wp.tid()]
+    i = listed(wp.tid(), NEAR, near, sheet)
+    if i < 0:
+        return
     role = sheet.role[i]
     if role == LEFT or role == FILLED:  # noqa: SIM109
         # In the room between limb and skin the gradient keeps to the middle, or at the margin where it is wide enough.
@@ -306,7 +321,9 @@ def scale_kernel(
 ):
     """How far each pushed vertex goes, for predicted scales: at least until it is outside."""
     k = wp.tid()
-    i = pushed[k]
+    i = listed(k, PUSHED, pushed, sheet)
+    if i < 0:
+        return
     deficit = rules.margin - sheet.depth[i]
     # Where α is below 1, the distance was predicted to exaggerate; its sign is trusted all the same.
     scale = wp.max(alpha[k], (wp.min(rules.tolerance, rules.margin) - sheet.depth[i]) / deficit)
@@ -329,7 +346,9 @@ def settle_kernel(
     smoother: wp.array(dtype=wp.vec3),
 ):
     """Takes vertices along, and pushes on those that aren't clear yet. Leaves fields and marks empty."""
-    i = reached[wp.tid()]
+    i = listed(wp.tid(), REACHED, reached, sheet)
+    if i < 0:
+        return
     shift = field[i]
     mark = sheet.mark[i]
     field[i] = wp.vec3()
@@ -372,7 +391,9 @@ def settle_kernel(
 @wp.kernel(enable_backward=False)
 def tally_kernel(sheet: Sheet, near: wp.array(dtype=int)):
     """Counts who was inside, who was moved, and who is inside."""
-    i = near[wp.tid()]
+    i = listed(wp.tid(), NEAR, near, sheet)
+    if i < 0:
+        return
     way = sheet.place[i] - sheet.origin[i]
     if way[0] != 0.0 or way[1] != 0.0 or way[2] != 0.0:
         wp.atomic_add(sheet.counts, MOVED, 1)

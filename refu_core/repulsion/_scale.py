@@ -194,6 +194,8 @@ class _DenseLatent(nn.Module):
         self.bias = nn.Parameter(torch.empty(n, d).uniform_(-bound, bound))
 
     def forward(self, z: Tensor, body: Tensor, vertex: Tensor) -> Tensor:
+        if len(z) == 1:
+            return functional.relu(self.weight[vertex] @ z[0] + self.bias[vertex])
         # Of a batch, the vertices that any of the bodies asks for: one product, and each row is read once.
         asked, where = torch.unique(vertex, return_inverse=True)
         latent = torch.einsum("bm,udm->bud", z, self.weight[asked]) + self.bias[asked]

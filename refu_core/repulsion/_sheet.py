@@ -3,7 +3,8 @@
 """What the steps of `resolve` read and write: a garment, a frame of it, and numbers.
 
 Lists of vertices are filled by kernels: `counts[NAME]` says how many they are. On a CPU they are in order, on a GPU in
-any; nothing depends on it.
+any; nothing depends on it. On a CPU a launch is as long as its list. To know how long that is a GPU would have to be
+waited for: there a launch is as long as any list can be, and what is beyond its list's end does nothing.
 """
 
 import warp as wp
@@ -111,6 +112,24 @@ class Sheet:
     """Vertices at each limb that they don't lie on."""
     inward: wp.array(dtype=wp.int32)
     """Those of them that it pushes inwards."""
+    begins: wp.array(dtype=wp.int32)
+    ends: wp.array(dtype=wp.int32)
+    """Where launches begin and end to go through each list, on a GPU; `close_kernel` says so."""
+
+
+@wp.func
+def listed(k: int, which: int, rows: wp.array(dtype=int), sheet: Sheet):
+    """Number k of a list; -1 beyond its end."""
+    if k < sheet.ends[which]:
+        return rows[k]
+    return -1
+
+
+@wp.kernel(enable_backward=False)
+def close_kernel(sheet: Sheet, which: int):
+    """From now on launches go through a list as long as it is now, whatever is added to it meanwhile."""
+    sheet.begins[which] = sheet.ends[which]
+    sheet.ends[which] = sheet.counts[which]
 
 
 @wp.func

@@ -6,7 +6,7 @@
 
 import warp as wp
 
-from refu_core.repulsion._sheet import BESIDE, REACHED, SOURCE, Cloth, Sheet
+from refu_core.repulsion._sheet import BESIDE, REACHED, SOURCE, Cloth, Sheet, listed
 
 
 @wp.func
@@ -39,9 +39,11 @@ def spread(
 
 
 @wp.kernel(enable_backward=False)
-def reach_kernel(sheet: Sheet, cloth: Cloth, first: int, reached: wp.array(dtype=int)):
-    """Lists the neighbours of those listed from `first` on."""
-    reach(reached[first + wp.tid()], sheet, cloth, reached)
+def reach_kernel(sheet: Sheet, cloth: Cloth, reached: wp.array(dtype=int)):
+    """Lists the neighbours of those that came to the list last."""
+    i = listed(sheet.begins[REACHED] + wp.tid(), REACHED, reached, sheet)
+    if i >= 0:
+        reach(i, sheet, cloth, reached)
 
 
 @wp.kernel(enable_backward=False)
@@ -55,7 +57,9 @@ def spread_kernel(
     smoother: wp.array(dtype=wp.vec3),
 ):
     """One sweep of `Blend.spread`."""
-    spread(reached[wp.tid()], sheet, cloth, step, field, smoother)
+    i = listed(wp.tid(), REACHED, reached, sheet)
+    if i >= 0:
+        spread(i, sheet, cloth, step, field, smoother)
 
 
 @wp.kernel(enable_backward=False)

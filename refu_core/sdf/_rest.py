@@ -66,7 +66,8 @@ class RestFaces:
         """Near body faces, int32 of shape (...,), of places on the mean shape in the rest pose [m], shape (..., 3)."""
         places = unposed.detach().to(device=self._device, dtype=torch.float32).reshape(-1, 3)
         n = len(places)
-        if n > len(self._places):
+        # On a GPU always anew: a CUDA graph may go on using the last room.
+        if n > len(self._places) or self._device.type != "cpu":
             self._make_room(n)
         self._places[:n] = places
         if n:

@@ -144,6 +144,21 @@ def test_what_does_not_meet_is_left_alone() -> None:
         assert found is moved
 
 
+@pytest.mark.parametrize("height", [-0.004, 0.002, 0.5])
+def test_unasked_it_does_the_same(height: float) -> None:
+    """As on a GPU, which isn't waited for to know whether anything is too low."""
+    below, faces = sheet(12)
+    above = below + torch.tensor([0.003, height, 0.002])
+    layer = Layer(faces, below + torch.tensor([0.0, 0.01, 0.0]), faces, below)
+    lifted, n_low = layer(above, below)
+    assert (n_low > 0) == (height < LAYER_GAP)
+    unasked, number = layer.queued(above, below)
+    assert torch.equal(lifted, unasked)
+    assert number.tolist() == [n_low]
+    apart = Layer(faces, below + 1.0, faces, below)
+    assert torch.equal(apart.queued(above, below)[0], above)
+
+
 def test_refuses_what_it_was_not_made_for() -> None:
     points, faces = sheet(4)
     with pytest.raises(MeshError, match="gap between garments must be at least 0"):
