@@ -28,7 +28,7 @@ TEXTS = (
     "weights",
 )
 NUMBERS = ("margin", "max_distance", "max_rate", "person_timeout")
-YAML = ("betas", "follow_humans", "garments", "persons", "style")
+YAML = ("betas", "follow_humans", "garments", "lazy", "persons", "style")
 PARAMETERS = TEXTS + NUMBERS + YAML
 
 

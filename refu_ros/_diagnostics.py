@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 from msg_adapters import DiagnosticStatus
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
 _OVER_BUDGET = 0.1
 """Share of the frames that may be superseded before they are worked on."""
 _LOW_DISK_BYTES = 1 << 30
+_FIRST_INPUT_S = 2.0
+"""How long after the node has begun to listen nobody is missed yet [s]."""
 
 
 def statuses(
@@ -28,45 +31,64 @@ def statuses(
     persons: Sequence[str],
     recording: RecorderState | None,
     recording_error: str,
+    listening_for: float | None = math.inf,
     device: str = "",
     n_namesakes: int = 0,
 ) -> list[DiagnosticStatus]:
     """Input, output and recording; `state` is the lifecycle's, `persons` are those in the scene.
 
-    `device` is the one that is computed on, where it isn't the settings'; `n_namesakes` are other nodes of this name.
+    `listening_for` is the time since the inputs were subscribed to [s], None where they aren't; `device` is the one
+    that is computed on, where it isn't the settings'; `n_namesakes` are other nodes of this name.
     """
     active = state == "active"
     return [
-        _input(report, settings, f"{node}: input", persons=persons, active=active),
-        _output(report, settings, f"{node}: garments", state=state, device=device, n_namesakes=n_namesakes),
+        _input(report, settings, f"{node}: input", persons=persons, active=active, listening_for=listening_for),
+        _output(
+            report,
+            settings,
+            f"{node}: garments",
+            state=state,
+            resting=listening_for is None,
+            device=device,
+            n_namesakes=n_namesakes,
+        ),
         _recording(recording, f"{node}: recording", error=recording_error),
     ]
 
 
 def _input(
-    report: Report, settings: NodeSettings, name: str, *, persons: Sequence[str], active: bool
+    report: Report,
+    settings: NodeSettings,
+    name: str,
+    *,
+    persons: Sequence[str],
+    active: bool,
+    listening_for: float | None,
 ) -> DiagnosticStatus:
     invalid, received = report.recent["drop.invalid"], report.recent["received"]
     missing = [] if settings.follow_humans else [person for person in settings.persons if person not in persons]
     level, message = OK, f"{report.rate('received'):.1f} Hz"
     if not active:
         message = "not active"
+    elif listening_for is None:
+        message = "not subscribed to: nobody listens to garments or body, and nothing is recorded"
     elif invalid and invalid == received:
         level, message = ERROR, f"every message is invalid: {report.reasons.get('invalid', '')}"
     elif invalid:
         level, message = WARN, f"{invalid} of {received} messages are invalid: {report.reasons.get('invalid', '')}"
-    elif report.silent_for is None:
+    elif report.silent_for is None and listening_for > _FIRST_INPUT_S:
         level, message = WARN, "no input yet"
     elif report.recent["back_in_time"]:
         level = WARN
         message = (
             f"{report.recent['back_in_time']} stamps went back: was a clock set back, or do two send on one topic?"
         )
-    elif missing:
+    elif missing and report.silent_for is not None and listening_for > _FIRST_INPUT_S:
         who = ", ".join(filter(None, missing))
         level = WARN
-        message = f"no input from {who}" if who else f"no input for {report.silent_for:.1f} s"
+        message = f"no input from {who}" if who else f"no input for {min(report.silent_for, listening_for):.1f} s"
     values = {
+        "subscribed": "no" if listening_for is None else "yes",
         "rate [Hz]": f"{report.rate('received'):.1f}",
         "received": str(report.total["received"]),
         "persons": ", ".join(filter(None, persons)) or str(len(persons)),
@@ -78,7 +100,7 @@ def _input(
 
 
 def _output(
-    report: Report, settings: NodeSettings, name: str, *, state: str, device: str, n_namesakes: int
+    report: Report, settings: NodeSettings, name: str, *, state: str, resting: bool, device: str, n_namesakes: int
 ) -> DiagnosticStatus:
     stale, received = report.recent["drop.stale"], report.recent["received"]
     causes = ("device", "failed", "not_finite")
@@ -97,6 +119,8 @@ def _output(
     elif stale > _OVER_BUDGET * received:
         level = WARN
         message = f"over budget: {stale} of {received} frames were superseded; latency p95 {p95:.1f} ms"
+    elif resting:
+        message = "nobody listens"
     found, unresolved = report.total["penetration.found"], report.total["penetration.unresolved"]
     values = {
         "rate [Hz]": f"{report.rate('ticks'):.1f}",

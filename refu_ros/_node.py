@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import SetParametersResult
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -32,6 +33,8 @@ NODE_NAME = "garment_node"
 DIAGNOSTICS_TOPIC = "/diagnostics"
 _HUMANS = re.compile(r"/humans/bodies/([A-Za-z0-9_]+)/joint_states")
 _LOG_PERIOD_S = 5.0
+_GRACE_S = 5.0
+"""How long the inputs stay subscribed to when nobody is left: many a viewer is only restarted [s]."""
 _INPUT_QOS = adapters.QosProfile(reliability="best_effort", depth=1)
 _OUTPUT_QOS = adapters.QosProfile(reliability="reliable", depth=5)
 
@@ -59,6 +62,8 @@ class GarmentNode(LifecycleNode):  # type: ignore[misc]
         self._closing: list[Recorder] = []
         self._lost = ""
         self._inputs: dict[str, Any] = {}
+        self._listening_since: float | None = None
+        self._wanted_at = 0.0
         self._garments: Any = None
         self._body: Any = None
         self._decoder = adapters.decoder_for(self.settings.layout)
@@ -82,6 +87,7 @@ class GarmentNode(LifecycleNode):  # type: ignore[misc]
                     topic,
                     _ros_qos(_OUTPUT_QOS),
                     qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+                    event_callbacks=PublisherEventCallbacks(matched=lambda _: self._attend()),
                 )
                 for topic in ("garments", "body")
             )
@@ -94,7 +100,7 @@ class GarmentNode(LifecycleNode):  # type: ignore[misc]
         return super().on_configure(state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Listens, and dresses who sends."""
+        """Dresses who sends, as soon as somebody wants that."""
         result = super().on_activate(state)
         assert self._pipeline is not None
         if self.settings.record and not self._recording:
@@ -105,9 +111,7 @@ class GarmentNode(LifecycleNode):  # type: ignore[misc]
         self._scene = Scene(self._statistics)
         self._worker = Worker(self._scene, self._statistics, self, settings=self.settings, pipeline=self._pipeline)
         self._worker.start()
-        if not self.settings.follow_humans:
-            for person in self.settings.persons:
-                self._listen(person, f"{person}/smpl_params" if person else "smpl_params")
+        self._subscribe()  # in any case: what is wrong with the inputs has to show at the start
         self._state = "active"
         return result
 
@@ -134,9 +138,7 @@ class GarmentNode(LifecycleNode):  # type: ignore[misc]
         self._cleanup()
 
     def _deactivate(self) -> None:
-        for subscription in self._inputs.values():
-            self.destroy_subscription(subscription)
-        self._inputs.clear()
+        self._unsubscribe()
         if self._worker is not None:
             self._worker.stop()
         self._worker = self._scene = None
@@ -157,6 +159,35 @@ class GarmentNode(LifecycleNode):  # type: ignore[misc]
         self._state = "unconfigured"
 
     # Input ----------------------------------------------------------------------------------------
+
+    def _attend(self) -> None:
+        """Listens while somebody wants what comes of it, and some seconds longer.
+
+        Called on the executor's thread whenever that may have changed, and once a second in case an event was missed.
+        """
+        if self._state != "active":
+            return
+        now = time.monotonic()
+        if not self.settings.lazy or self.watched() or self.body_watched():
+            self._wanted_at = now
+            if self._listening_since is None:
+                self._subscribe()
+        elif self._listening_since is not None and now > self._wanted_at + _GRACE_S:
+            self._unsubscribe()
+
+    def _subscribe(self) -> None:
+        self._listening_since = self._wanted_at = time.monotonic()
+        if self.settings.follow_humans:
+            self._follow_humans()
+        else:
+            for person in self.settings.persons:
+                self._listen(person, f"{person}/smpl_params" if person else "smpl_params")
+
+    def _unsubscribe(self) -> None:
+        for subscription in self._inputs.values():
+            self.destroy_subscription(subscription)
+        self._inputs.clear()
+        self._listening_since = None
 
     def _listen(self, person: str, topic: str) -> None:
         full_name = self.resolve_topic_name(topic)
@@ -254,6 +285,7 @@ class GarmentNode(LifecycleNode):  # type: ignore[misc]
         if settings.device != self.settings.device:
             self._lost = ""  # the operator knows better
         self.settings = settings
+        self._attend()  # a recording may have begun
         if self._worker is not None:
             self._worker.settings = settings
         if reload and self._loader is not None:
@@ -316,12 +348,14 @@ class GarmentNode(LifecycleNode):  # type: ignore[misc]
         except RefuError as error:
             return False, str(error)
         assert self._recorder is not None
+        self._attend()
         return True, f"recording to {self._recorder.path}"
 
     # Once a second --------------------------------------------------------------------------------
 
     def _on_second(self) -> None:
-        if self._state == "active" and self.settings.follow_humans:
+        self._attend()
+        if self._listening_since is not None and self.settings.follow_humans:
             self._follow_humans()
         self._closing = [recorder for recorder in self._closing if not recorder.finished]
         report = self._statistics.report()
@@ -340,6 +374,7 @@ class GarmentNode(LifecycleNode):  # type: ignore[misc]
                 persons=() if self._scene is None else self._scene.persons,
                 recording=recording,
                 recording_error=error,
+                listening_for=None if self._listening_since is None else time.monotonic() - self._listening_since,
                 device="cpu" if self._lost else "",
                 n_namesakes=self._count_namesakes(),
             ),

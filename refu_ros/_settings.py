@@ -125,6 +125,11 @@ class NodeSettings:
         0.0, "A person farther from the origin of frame_id isn't dressed; 0 for no limit [m].", low=0.0, high=1e6
     )
     record: str = _parameter("", "Directory that inputs and outputs are recorded to as a bag; empty for none.")
+    lazy: bool = _parameter(
+        True,
+        "Whether the inputs are subscribed to only while somebody wants the output, or it is recorded.",
+        live=False,
+    )
     autostart: bool = _parameter(True, "Whether the node configures and activates itself.", live=False)
 
     def __post_init__(self) -> None:

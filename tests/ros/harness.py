@@ -34,8 +34,7 @@ class NodeProcess:
 
     def __init__(self, log: Path, prepare: Callable[[], None] | None = None, **parameters: Any) -> None:
         self._log = log
-        arguments = [item for name, value in parameters.items() for item in ("-p", f"{name}:={_yaml(value)}")]
-        command = [sys.executable, "-m", "refu_ros.garment_node", "--ros-args", *arguments]
+        command = [sys.executable, "-m", "refu_ros.garment_node", *ros_arguments(parameters)]
         with log.open("wb") as file:
             self.process = subprocess.Popen(command, cwd=ROOT, stdout=file, stderr=file, preexec_fn=prepare)
 
@@ -58,6 +57,11 @@ class NodeProcess:
             self.process.send_signal(number)
             time.sleep(0.05)
         return self.process.wait(timeout=60)
+
+
+def ros_arguments(parameters: dict[str, Any]) -> list[str]:
+    """Parameters as a command line has them."""
+    return ["--ros-args", *(item for name, value in parameters.items() for item in ("-p", f"{name}:={_yaml(value)}"))]
 
 
 def _yaml(value: Any) -> str:
@@ -117,6 +121,10 @@ class Peer:
             "the node listens",
             timeout=120.0,
         )
+
+    def listeners(self, person: str = "") -> int:
+        """How many subscriptions a person's topic has."""
+        return int(self._publishers[person or next(iter(self._publishers))].get_subscription_count())
 
     def fall_silent(self, person: str) -> None:
         """A person's topic is gone."""
