@@ -1,6 +1,9 @@
-"""Names of devices, checked where they come in."""
+"""Devices: names, checked where they come in; threads; signs that one is lost."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import torch
 
@@ -21,6 +24,17 @@ def checked_device(name: str) -> torch.device:
         msg = f"no device {name!r}: this torch build or machine has no CUDA; use cpu"
         raise RefuError(msg)
     return device
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Torch on one thread, as the node runs: a frame is too little work to share, and others want their cores."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def is_device_loss(error: BaseException) -> bool:

@@ -11,11 +11,11 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-import torch
 from tqdm import tqdm
 
 import msg_adapters as adapters
 from refu_core import RefuError
+from refu_core._device import one_thread
 from refu_core.evaluation import reproduction as rp
 from refu_core.garments import BUILTIN_GARMENTS
 from refu_ros.tables import format_table
@@ -166,7 +166,7 @@ class _Maker:
     def _time(self) -> tuple[rp.Table, dict[str, int]]:
         """Measured now, never taken from a cache, with nothing else in the same run."""
         study = rp.Study()
-        with _one_thread():
+        with one_thread():
             for samples in self._posed:
                 with _bar(f"time, {samples.garment}", self._progress) as advance:
                     few = samples.thinned(_TIMED)
@@ -230,17 +230,6 @@ def read_clips(folder: Path) -> list[rp.Clip]:
         raise RefuError(msg)
     motions = [(path.stem, adapters.read_motion(path)) for path in paths]
     return [rp.Clip(name, [motion.frame(i) for i in range(len(motion))]) for name, motion in motions]
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """As the node runs."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 @contextmanager

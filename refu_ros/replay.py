@@ -17,6 +17,7 @@ from tqdm import tqdm
 
 import msg_adapters as adapters
 from refu_core import FrameError, GarmentPipeline, SmplFrame
+from refu_core._device import one_thread
 from refu_core.evaluation import CollisionChecker, GarmentMetrics, MetricsSummary, SelfContact, SelfContactDetector
 from refu_core.evaluation.render import GARMENT_COLOURS
 from refu_core.repulsion import DEFAULT_MARGIN
@@ -342,6 +343,7 @@ class _Replayer:
         self._result.after = {name: metrics.summary() for name, metrics in self._evaluator.after.items()}
 
 
+@one_thread()
 def replay(options: ReplayOptions, *, progress: bool = False) -> ReplayResult:
     """Runs every frame of the input through the pipeline, writes the output bag, measures.
 

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import torch
 from tqdm import tqdm
 
 from refu_core import stress
+from refu_core._device import one_thread
 from refu_core.garments import BUILTIN_GARMENTS
 from refu_ros.tables import format_table
 
@@ -112,7 +111,7 @@ def run_stress(
     seconds = 0.0 if options.hours is None else 3600 * options.hours
     checks = tuple(check for check in stress.all_checks() if check.part in options.parts)
     soaks = "soak" in options.parts
-    with _one_thread():
+    with one_thread():
         if checks:
             plan = stress.Plan(
                 checks=checks,
@@ -162,17 +161,6 @@ def _wardrobes(options: StressOptions) -> tuple[list[stress.Wardrobe], list[str]
         msg = f"nothing to try: {'; '.join(left_out) or 'no garment was named'}"
         raise stress.StressError(msg)
     return wardrobes, left_out
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """As the node runs."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def stress_table(result: StressResult) -> str:
@@ -240,6 +228,6 @@ def length(metres: float) -> str:
 
 def replay_worst(path: Path, options: StressOptions) -> StressResult:
     """Tries a saved trial again, with the options' weights; raises `StressError` for a file that isn't one."""
-    with _one_thread():
+    with one_thread():
         tally = stress.replay_trial(path, weights=options.weights)
     return StressResult(tallies=[tally])

@@ -107,7 +107,7 @@ def _check(options: TrainOptions) -> None:
 
 
 def _sdf_training(options: TrainOptions) -> SdfSettings:
-    settings = SdfSettings(preset=options.preset, seed=options.seed)
+    settings = replace(SdfSettings.of(options.preset), seed=options.seed)
     return settings if options.steps is None else replace(settings, steps=options.steps)
 
 

@@ -15,6 +15,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from refu_core._device import one_thread
+
 Input = TypeVar("Input")
 
 
@@ -54,18 +56,16 @@ class Timing:
 @contextlib.contextmanager
 def one_core() -> Iterator[int | None]:
     """One thread on one core, where the system lets a process choose; gives its number, None where it doesn't."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
     allowed = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set()
     core = max(allowed, default=None)
-    try:
-        if core is not None:
-            os.sched_setaffinity(0, {core})
-        yield core
-    finally:
-        if core is not None:
-            os.sched_setaffinity(0, allowed)
-        torch.set_num_threads(threads)
+    with one_thread():
+        try:
+            if core is not None:
+                os.sched_setaffinity(0, {core})
+            yield core
+        finally:
+            if core is not None:
+                os.sched_setaffinity(0, allowed)
 
 
 @contextlib.contextmanager

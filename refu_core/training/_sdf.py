@@ -50,6 +50,19 @@ class SdfSettings:
     validation_share: float = 0.05
     """Of the training split's style-shape pairs, held out whole."""
     seed: int = 0
+    is_annealed: bool = False
+    """Whether the learning rate falls to nothing as a cosine; the paper names one rate alone."""
+
+    @classmethod
+    def of(cls, preset: str) -> SdfSettings:
+        """A preset's own: those of the paper, or what a CPU does in half an hour."""
+        if preset == "paper":
+            return cls()
+        return cls(preset, 6000, batch_size=8, points=512, learning_rate=1e-3, check_every=250, is_annealed=True)
+
+    def rate(self, step: int) -> float:
+        """Learning rate of a step."""
+        return self.learning_rate * (0.5 + 0.5 * math.cos(math.pi * step / self.steps) if self.is_annealed else 1.0)
 
     def __post_init__(self) -> None:
         """Raises `RefuError` for numbers that make no training."""
@@ -233,6 +246,8 @@ def train_sdf(
         )
         with torch.autocast(where.type, torch.bfloat16, enabled=where.type == "cuda"):
             loss = module(batch.to(where))
+        for group in optimiser.param_groups:
+            group["lr"] = settings.rate(step)
         optimiser.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         optimiser.step()
