@@ -46,7 +46,8 @@ def mend(
       itself, the upper arm's skin is within the forearm, and a vertex deep in there is said to be outside of it. The
       end inside is right; the other one gets its distance to the tangent plane of the skin that the one inside is at,
       and leaves the body with it. That is so within a limb only: between two limbs cloth may well be outside of one
-      and within the other.
+      and within the other. What is said to be inside has a way out of its own, and keeps it: a plane that is carried on
+      from vertex to vertex leads ever deeper, until no push is long enough.
 
     Args:
         points: Garment vertices [m], shape (N, 3).
@@ -76,7 +77,10 @@ def mend(
             break
         to_plane = within.distance + ((points[high] - points[low]) * within.gradient).sum(-1)
         is_wrong = (
-            limbs.is_sole(high, within.face) & (within.distance < 0) & (to_plane < sample.distance[high] - TOLERANCE)
+            limbs.is_sole(high, within.face)
+            & (within.distance < 0)
+            & (sample.distance[high] >= 0)
+            & (to_plane < sample.distance[high] - TOLERANCE)
         )
         sample, changed = _replaced(sample, high, within._replace(distance=to_plane), is_wrong)
         if not changed:

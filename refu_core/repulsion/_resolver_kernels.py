@@ -130,11 +130,13 @@ def cut_off_kernel(sheet: Sheet, cloth: Cloth, rules: Rules, suspects: wp.array(
     if i < 0:
         return
     sheet.guess[i] = -1
+    if sheet.distance[i] < 0.0:
+        return  # has a way out of its own
     nearest = float(1.0e12)
     for k in range(cloth.ring_start[i], cloth.ring_start[i + 1]):
         j = cloth.ring[k]
         within = sheet.distance[j]
-        if within < 0.0 and within < sheet.distance[i] and cloth.own[i] == 1 << cloth.limb[sheet.face[j]]:
+        if within < 0.0 and cloth.own[i] == 1 << cloth.limb[sheet.face[j]]:
             to_plane = within + wp.dot(sheet.origin[i] - sheet.origin[j], sheet.gradient[j])
             if (
                 to_plane < sheet.distance[i] - rules.contradiction

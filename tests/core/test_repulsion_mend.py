@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 import trimesh
 from torch import Tensor
@@ -55,6 +56,22 @@ def test_a_vertex_within_flesh_that_meets_itself_leaves_with_its_neighbours() ->
     assert not checker.check(resolve(points, sdf, blend=blend).vertices, faces).is_free
     # The same between two limbs is left alone.
     assert mend(points, sample, one_limb(faces, len(points), len(body_faces), foreign=True), margin=0.004) is sample
+
+
+@pytest.mark.parametrize("depth", [0.02, 0.03])
+def test_what_is_inside_keeps_its_own_way_out(depth: float) -> None:
+    """A neighbour's tangent plane is for those who are said to be outside: carried on, it would lead ever deeper."""
+    body, body_faces = boxes()
+    points, faces = sheet(21, 0.01)
+    points[:, 1] = 0.03 - (0.03 + depth) * torch.exp(-((points.norm(dim=1) / 0.08) ** 2))
+    sdf = ExactSdf(body_faces)
+    sdf.update(body)
+    sample = sdf.query(points)
+    mended = mend(points, sample, one_limb(faces, len(points), len(body_faces)), margin=0.004)
+    is_inside = sample.distance < 0
+    assert torch.equal(mended.distance[is_inside], sample.distance[is_inside])
+    assert torch.equal(mended.gradient[is_inside], sample.gradient[is_inside])
+    assert (mended.distance[~is_inside] < 0).any()
 
 
 def test_a_closest_face_that_was_missed_is_found_from_a_neighbours() -> None:
