@@ -38,7 +38,7 @@ class GarmentStats:
     n_layered: int = 0
     """Vertices that were moved since they were under another garment, or nearer to it than the gap between garments."""
     ms: float = 0.0
-    """Wall time of the stages that were run for this garment alone: backbone, layers and refu [ms]."""
+    """Wall time of the stages that were run for this garment alone: backbone, layers and refu [ms]; 0 in a graph."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class FrameStats:
 
     stage_ms: Mapping[str, float]
     """Wall time of each stage, all garments together [ms]: body, backbone, sdf (new pose), refu (distances, pushes),
-    and layers where garments are worn over each other."""
+    and layers where garments are worn over each other; on CUDA, where a graph makes one of them, step."""
     garments: Mapping[str, GarmentStats] = field(default_factory=dict)
     skipped: Mapping[str, int] = field(default_factory=dict)
     """How much of what `SKIPS` names was left out: vertices, networks, meshes and persons."""

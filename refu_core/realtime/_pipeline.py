@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, overload
 
@@ -13,64 +13,26 @@ import torch
 from torch import Tensor
 
 from refu_core._device import checked_device
-from refu_core.backbones import Backbone, TailorNet, load_backbone
-from refu_core.body import RigidTransforms, Shape, SmplBody, load_body
+from refu_core.backbones import TailorNet, load_backbone
+from refu_core.body import SmplBody, load_body
 from refu_core.errors import GarmentError, RefuError
 from refu_core.frames import SmplFrame
 from refu_core.garments import N_STYLES, GarmentTemplate, load_garment
 from refu_core.realtime._collisions import Collisions
+from refu_core.realtime._graph import StepGraphs
 from refu_core.realtime._outfit import Outfit
 from refu_core.realtime._outputs import SDF_MODES, SKIPS, FrameStats, GarmentMesh, GarmentStats, PipelineOutput
+from refu_core.realtime._step import Step
 from refu_core.realtime._turn import RootTurn
-from refu_core.repulsion import DEFAULT_MARGIN, Refu, VertexScale, read_refu
+from refu_core.realtime._wearable import Dressed, Figures, Wearable
+from refu_core.repulsion import DEFAULT_MARGIN, read_refu
 from refu_core.sdf import require_outward
 from refu_core.weights import shipped_weights
 
 if TYPE_CHECKING:
     from os import PathLike
 
-    from numpy.typing import ArrayLike, NDArray
-
-
-@dataclass(frozen=True, eq=False)
-class _Wearable:
-    """A loaded garment, its networks, and what collision handling knows of it."""
-
-    template: GarmentTemplate
-    backbone: Backbone
-    refu: Refu | None
-    faces: NDArray[np.int64]
-    margin: float
-
-
-@dataclass(frozen=True, eq=False)
-class _Figures:
-    """What depends on (β, γ) only, of a batch of bodies."""
-
-    key: bytes
-    betas: Tensor
-    """Shape (B, 10)."""
-    style: Tensor | None
-    """Shape (B, 4); None where nobody gave any."""
-    body: Shape
-    rest: Mapping[str, Tensor]
-    """Garments before anything is predicted [m], shape (B, V, 3)."""
-    mean_rest: Mapping[str, Tensor]
-    """The same on the mean shape, of β = 0 [m]."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Dressed:
-    """One garment on a batch of bodies, before collisions are handled."""
-
-    posed: Tensor
-    """Vertices [m], shape (B, V, 3)."""
-    near: Tensor | None
-    """A body face near each vertex, shape (B, V), where the distance wants to know."""
-    scale: list[float | VertexScale]
-    """α of each body."""
-    ms: float
-    """Wall time of one of the bodies [ms]."""
+    from numpy.typing import ArrayLike
 
 
 class GarmentPipeline:
@@ -86,13 +48,14 @@ class GarmentPipeline:
     def __init__(
         self,
         body: SmplBody,
-        wearables: Mapping[str, _Wearable],
+        wearables: Mapping[str, Wearable],
         *,
         collisions: Collisions | None,
         outfit: Outfit | None,
         margin: float | None,
         style: Tensor | None,
         no_skip: Collection[str] = (),
+        graph: bool = True,
     ) -> None:
         self.body = body
         self._margin = margin
@@ -101,7 +64,9 @@ class GarmentPipeline:
         self._collisions = collisions
         self._outfit = outfit
         self._skips = frozenset(SKIPS) - frozenset(no_skip)
-        self._figures: _Figures | None = None
+        self._step = Step(body, wearables, collisions=collisions, outfit=outfit)
+        self._graphs = StepGraphs(self._step, body.device) if graph and body.device.type == "cuda" else None
+        self._figures: Figures | None = None
         self._last: dict[bytes, PipelineOutput] = {}
 
     @property
@@ -126,6 +91,7 @@ class GarmentPipeline:
         weights: str | PathLike[str] | None = None,
         device: str = "cpu",
         no_skip: Collection[str] = (),
+        graph: bool = True,
     ) -> GarmentPipeline:
         """Loads garments and what they need.
 
@@ -138,6 +104,7 @@ class GarmentPipeline:
             weights: folder with a folder a garment of weights of one's own (`refu train`); those that ship by default.
             device: torch device, `cpu` or `cuda`.
             no_skip: names of `SKIPS` that are computed nevertheless, to see what skipping them is worth.
+            graph: on CUDA, capture the whole of a frame as a CUDA graph; without, it is launched stage by stage.
 
         Raises:
             GarmentError: no garment, an unknown one, garments of two bodies, or a bad style.
@@ -171,7 +138,7 @@ class GarmentPipeline:
         if sdf != "none":
             is_accurate, uses_band = sdf == "accurate", "band" not in no_skip
             collisions = Collisions(body, templates, is_accurate=is_accurate, uses_band=uses_band)
-        wearables: dict[str, _Wearable] = {}
+        wearables: dict[str, Wearable] = {}
         for name, template in templates.items():
             folder = shipped_weights(name) if weights is None else Path(weights) / name
             network = load_backbone(
@@ -182,7 +149,7 @@ class GarmentPipeline:
             refu = None
             if backbone != "skinned" and sdf != "none":
                 refu = read_refu(folder / f"{backbone}-{sdf}", device=torch_device)
-            wearables[name] = _Wearable(
+            wearables[name] = Wearable(
                 template,
                 network,
                 refu,
@@ -194,7 +161,16 @@ class GarmentPipeline:
             for template in templates.values():
                 template.rest(gamma.new_zeros(1, 10), gamma)  # says now, not in the first frame, if it has no styles
         outfit = Outfit(templates) if collisions is not None and len(templates) > 1 else None
-        return cls(body, wearables, collisions=collisions, outfit=outfit, margin=margin, style=gamma, no_skip=no_skip)
+        return cls(
+            body,
+            wearables,
+            collisions=collisions,
+            outfit=outfit,
+            margin=margin,
+            style=gamma,
+            no_skip=no_skip,
+            graph=graph,
+        )
 
     @property
     def garments(self) -> dict[str, GarmentTemplate]:
@@ -231,24 +207,44 @@ class GarmentPipeline:
         ]
 
     def _run(self, frames: Sequence[SmplFrame]) -> list[PipelineOutput]:
+        if self._graphs is not None:
+            return self._replay(frames, self._graphs)
         clock = _StageClock()
         figures, skipped = self._figures_of(frames)
         pose = torch.as_tensor(np.stack([f.pose for f in frames]), device=self.body.device)
         turns, at_root = RootTurn.taken_off(pose, figures.body.joints)
         posed = self.body.posed(at_root, figures.body)
         stages = {"body": clock.lap() / len(frames)}
-        dressed: dict[str, _Dressed] = {}
+        dressed: dict[str, tuple[Dressed, float]] = {}
         for name, wearable in self._wearables.items():
-            dressed[name] = self._dress(name, wearable, pose, figures, posed.transforms, clock)
+            worn = wearable.dress(pose, figures, posed.transforms, self._collisions)
+            dressed[name] = worn, clock.lap() / len(frames)
             if isinstance(wearable.backbone, TailorNet):
                 skipped["pivots"] = skipped.get("pivots", 0) + wearable.backbone.n_skipped
-        stages["backbone"] = sum(one.ms for one in dressed.values())
+        stages["backbone"] = sum(ms for _, ms in dressed.values())
         return [
             self._handle_collisions(i, frame, posed.vertices[i], turns[i], dressed, stages, skipped)
             for i, frame in enumerate(frames)
         ]
 
-    def _figures_of(self, frames: Sequence[SmplFrame]) -> tuple[_Figures, dict[str, int]]:
+    def _replay(self, frames: Sequence[SmplFrame], graphs: StepGraphs) -> list[PipelineOutput]:
+        clock = _StageClock()
+        figures, skipped = self._figures_of(frames)
+        pose = torch.as_tensor(np.stack([f.pose for f in frames]))
+        margins = tuple(one.margin if self.margin is None else self.margin for one in self._wearables.values())
+        packed = graphs(self._step.inputs(pose, figures), margins)
+        outputs = []
+        for frame, (body, worn) in zip(frames, self._step.unpacked(packed), strict=True):
+            meshes = {
+                name: GarmentMesh(one.local, one.raw, self._wearables[name].faces, frame.transl)
+                for name, one in worn.items()
+            }
+            counts = {name: one.counts for name, one in worn.items()}
+            outputs.append(PipelineOutput(meshes, body, FrameStats({}, counts, skipped)))
+        took = {"step": clock.lap() / len(frames)}
+        return [replace(output, stats=replace(output.stats, stage_ms=took)) for output in outputs]
+
+    def _figures_of(self, frames: Sequence[SmplFrame]) -> tuple[Figures, dict[str, int]]:
         """The bodies and garments of the persons' (β, γ), and what of that was known from the last frame."""
         key = b"".join(_key(frame, of_pose=False) for frame in frames)
         if self._figures is not None and self._figures.key == key and "rest" in self._skips:
@@ -260,7 +256,7 @@ class GarmentPipeline:
         shape = self.body.shape(betas)
         if self._collisions is not None:  # of a body that its β turn inside out, every vertex would be inside
             require_outward(shape.vertices, self.body.faces)
-        self._figures = _Figures(
+        self._figures = Figures(
             key,
             betas,
             style,
@@ -269,28 +265,6 @@ class GarmentPipeline:
             {name: template.rest(mean, style) for name, template in templates},
         )
         return self._figures, {}
-
-    def _dress(
-        self,
-        name: str,
-        wearable: _Wearable,
-        pose: Tensor,
-        figures: _Figures,
-        transforms: RigidTransforms,
-        clock: _StageClock,
-    ) -> _Dressed:
-        refu, n = wearable.refu, len(pose)
-        predicted = wearable.backbone(figures.betas, pose, figures.style)
-        unposed, on_mean = figures.rest[name], figures.mean_rest[name]
-        if predicted.displacement is not None:
-            unposed = unposed + predicted.displacement
-            on_mean = on_mean + predicted.displacement
-        near = None if self._collisions is None else self._collisions.near(on_mean.expand_as(unposed))
-        scale: list[float | VertexScale] = [1.0] * n
-        if refu is not None:
-            z = refu.feature(figures.betas, pose, figures.style, predicted.feature)
-            scale = [refu.of_body(None if z is None else z[i]) for i in range(n)]
-        return _Dressed(wearable.template.pose(unposed, transforms), near, scale, clock.lap() / n)
 
     def _styles(self, frames: Sequence[SmplFrame]) -> Tensor | None:
         """γ of each frame, shape (B, 4): its own, else the pipeline's; None where nobody gave any."""
@@ -306,7 +280,7 @@ class GarmentPipeline:
         frame: SmplFrame,
         body: Tensor,
         turn: RootTurn,
-        dressed: Mapping[str, _Dressed],
+        dressed: Mapping[str, tuple[Dressed, float]],
         stages: Mapping[str, float],
         skipped: Mapping[str, int],
     ) -> PipelineOutput:
@@ -321,7 +295,7 @@ class GarmentPipeline:
         n_clipped = 0
         # From the skin outwards. A garment is brought off those below it first: the body has the last word.
         for name in self._wearables if self._outfit is None else self._outfit.order:
-            wearable, one, counts, n_layered = self._wearables[name], dressed[name], GarmentStats(), 0
+            wearable, (one, dress_ms), counts, n_layered = self._wearables[name], dressed[name], GarmentStats(), 0
             raw = vertices = one.posed[person]
             if self._outfit is not None:
                 vertices, n_layered = self._outfit.lift(name, vertices, worn)
@@ -342,7 +316,7 @@ class GarmentPipeline:
             meshes[name] = GarmentMesh(local, before, wearable.faces, frame.transl)
             own_ms = clock.lap()
             layers_ms, refu_ms = layers_ms + own_layers_ms, refu_ms + own_ms
-            stats[name] = replace(counts, ms=one.ms + own_layers_ms + own_ms)
+            stats[name] = replace(counts, ms=dress_ms + own_layers_ms + own_ms)
         stage_ms = {**stages, "sdf": sdf_ms, **({} if self._outfit is None else {"layers": layers_ms}), "refu": refu_ms}
         in_order = {name: meshes[name] for name in self._wearables}
         counts_in_order = {name: stats[name] for name in in_order}

@@ -147,7 +147,7 @@ class Resolver:
         for remedy, rounds in (("look again", LOOKS if can_miss else 0), ("cut off", ROUNDS)):
             for _ in range(rounds):
                 n = self._length(_sheet.SUSPECTS)
-                self._counts[_sheet.CHANGED] = 0
+                self._counts[_sheet.CHANGED].zero_()
                 self._run(remedy, n)
                 self._run("adopt", n)
                 if self._is_serial and not self._count(_sheet.CHANGED):
@@ -162,9 +162,12 @@ class Resolver:
         self._run("aim", n)
         n_pushed = self._length(_sheet.PUSHED)
         if n_pushed:
-            rows = self._ints["pushed"][:n_pushed].long()
-            alpha = scale(rows, self._floats["depth"][rows]) if callable(scale) else scale
-            self._floats["alpha"][:n_pushed] = alpha
+            alpha = self._floats["alpha"][:n_pushed]
+            if callable(scale):
+                rows = self._ints["pushed"][:n_pushed].long()
+                alpha.copy_(scale(rows, self._floats["depth"][rows]))
+            else:
+                alpha.fill_(scale)
             self._run("scale", n_pushed)
         self._blend()
         self._run("settle", self._length(_sheet.REACHED))
@@ -191,7 +194,7 @@ class Resolver:
         for round_ in range(_MAX_PUSHES):
             self._run("measure" if round_ == 0 else f"again{round_ % 2}", n, (4, round_))
             self._close(_sheet.CUTTING + 1 + round_)
-            self._counts[_sheet.RAISED] = 0
+            self._counts[_sheet.RAISED].zero_()
             self._run(f"choose{round_ % 2}", n, (2, round_))
             self._run("lift", self._length(_sheet.RAISED))
 

@@ -1,0 +1,125 @@
+"""A function of tensors on a GPU: captured once as a CUDA graph, then replayed with other contents."""
+
+from __future__ import annotations
+
+import warnings
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Mapping
+from typing import TYPE_CHECKING, Protocol
+
+import torch
+from torch import Tensor
+
+from refu_core._warp import joined_capture
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+MOST_GRAPHS = 8
+"""How many graphs are kept: of so many numbers of persons, most of all."""
+_WARM_UPS = 2
+"""Before a capture: kernels are loaded, and libraries get their memory, which a graph can't do."""
+
+
+class Captured(Protocol):
+    """Work that can be done again, on what its inputs hold by then."""
+
+    output: Tensor
+    """Where it leaves its result."""
+
+    def replay(self) -> None:
+        """Does it."""
+        ...
+
+
+class CudaCapture:
+    """A `torch.cuda.CUDAGraph`, with the launches of Warp's kernels in it."""
+
+    def __init__(self, run: Callable[[], Tensor], device: torch.device) -> None:
+        """Runs it a few times, then captures it. Raises `RuntimeError` where that can't be done."""
+        here, stream = torch.cuda.current_stream(device), torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
+        stream.wait_stream(here)
+        with torch.cuda.stream(stream):
+            for _ in range(_WARM_UPS):
+                run()
+        here.wait_stream(stream)
+        self._graph = torch.cuda.CUDAGraph()
+        # What other threads do with the device meanwhile is theirs.
+        capturing = torch.cuda.graph(self._graph, stream=stream, capture_error_mode="thread_local")
+        with capturing, joined_capture(device) as self._kept:
+            self.output = run()
+
+    def replay(self) -> None:
+        """Does it on the current stream."""
+        self._graph.replay()
+
+
+class StepGraphs:
+    """Replays `step`, a function of tensors and of some numbers, and brings its result to the host in one copy.
+
+    The numbers become part of a graph, the tensors' contents don't: these are copied to where it reads them, unless
+    they are the last call's. So there is a graph for each number of persons, and none for each (β, γ).
+    """
+
+    def __init__(
+        self,
+        step: Callable[[Mapping[str, Tensor], tuple[float, ...]], Tensor],
+        device: torch.device,
+        *,
+        capture: Callable[[Callable[[], Tensor], torch.device], Captured] = CudaCapture,
+        most: int = MOST_GRAPHS,
+    ) -> None:
+        """For a step that never waits for the device, which gives float32; the graphs used last are kept."""
+        self._step, self._device, self._capture, self._most = step, device, capture, most
+        self._graphs: OrderedDict[Hashable, _Graph] = OrderedDict()
+        self._has_failed = False
+
+    @torch.no_grad()
+    def __call__(self, inputs: Mapping[str, Tensor], numbers: tuple[float, ...]) -> NDArray[np.float32]:
+        """What the step gives, in memory of its own. What can't be captured is done launch by launch from then on."""
+        if not self._has_failed:
+            key = (numbers, tuple(tensor.shape for tensor in inputs.values()))
+            try:
+                graph = self._graphs.pop(key, None) or self._captured(inputs, numbers)
+            except RuntimeError as error:
+                self._has_failed = True
+                self._graphs.clear()
+                msg = f"no CUDA graph could be captured, so every frame is launched anew and takes longer: {error}"
+                warnings.warn(msg, RuntimeWarning, stacklevel=2)
+            else:
+                self._graphs[key] = graph  # the last one used
+                return graph(inputs)
+        moved = {name: tensor.to(self._device) for name, tensor in inputs.items()}
+        result: NDArray[np.float32] = self._step(moved, numbers).cpu().numpy()
+        return result
+
+    def _captured(self, inputs: Mapping[str, Tensor], numbers: tuple[float, ...]) -> _Graph:
+        while len(self._graphs) >= self._most:
+            self._graphs.popitem(last=False)
+        held = {name: tensor.to(self._device, copy=True) for name, tensor in inputs.items()}
+        return _Graph(held, self._capture(lambda: self._step(held, numbers), self._device))
+
+
+class _Graph:
+    """A captured step, the tensors that it reads, and the memory on the host that its result goes to."""
+
+    def __init__(self, held: Mapping[str, Tensor], captured: Captured) -> None:
+        self._held, self._captured = held, captured
+        self._given: dict[str, Tensor] = {}
+        output = captured.output
+        self._host = torch.empty(output.shape, dtype=output.dtype, pin_memory=output.is_cuda)
+
+    def __call__(self, inputs: Mapping[str, Tensor]) -> NDArray[np.float32]:
+        for name, tensor in inputs.items():
+            if self._given.get(name) is not tensor:
+                self._held[name].copy_(tensor, non_blocking=True)
+        self._given = dict(inputs)
+        self._captured.replay()
+        self._host.copy_(self._captured.output, non_blocking=True)
+        if self._captured.output.is_cuda:
+            done = torch.cuda.Event()  # type: ignore[no-untyped-call]
+            done.record()
+            done.synchronize()
+        result: NDArray[np.float32] = self._host.numpy().copy()
+        return result
