@@ -60,7 +60,13 @@ class PostProcess:
 
     @torch.no_grad()
     def optimise(
-        self, points: Tensor, sdf: BodySdf, *, clearance: float = _CLEARANCE, near: Tensor | None = None
+        self,
+        points: Tensor,
+        sdf: BodySdf,
+        *,
+        clearance: float = _CLEARANCE,
+        reach: float = 0.0,
+        near: Tensor | None = None,
     ) -> Tensor:
         """The optimisation of DRAPE (Guan et al. 2012), the paper's "Opt. Post-Process": garment vertices [m], (N, 3).
 
@@ -73,11 +79,13 @@ class PostProcess:
             points: Garment vertices [m], shape (N, 3).
             sdf: The body's signed distance.
             clearance: ε, how far outside the vertices are to end [m].
+            reach: Vertices that are nearer to the skin than this are brought to `clearance`, too [m]. DRAPE's is 0:
+                only those inside are, and edges between others may still cut through the body.
             near: As `push_naively`.
         """
         for smoothness, damping in DRAPE_ROUNDS:
             sample = _query(sdf, points, near)
-            inside, normal, deficit = _penetrating(sample, clearance)
+            inside, normal, deficit = _penetrating(sample, clearance, reach)
             if not len(inside):
                 break
             points = points + self._drape_round(inside, normal, deficit, smoothness, damping).to(points)
@@ -133,10 +141,10 @@ def _query(sdf: BodySdf, points: Tensor, near: Tensor | None) -> SdfSample:
 
 
 def _penetrating(
-    sample: SdfSample, clearance: float
+    sample: SdfSample, clearance: float, reach: float = 0.0
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Vertices inside (R,), the way out (R, 3), and how far it is to `clearance` outside [m], shape (R,)."""
-    rows = torch.nonzero(sample.distance < 0)[:, 0]
+    """Vertices inside or nearer than `reach` (R,), the way out (R, 3), and how far it is to `clearance` outside [m]."""
+    rows = torch.nonzero(sample.distance < reach)[:, 0]
     found = sample.rows(rows)
     return (
         rows.cpu().numpy(),

@@ -59,14 +59,15 @@ def test_naive_push_ends_on_the_skin(cloth: tuple[Tensor, Tensor]) -> None:
     assert torch.equal(pushed[~inside], points[~inside])
 
 
-def test_optimisation_solves_drapes_least_squares(cloth: tuple[Tensor, Tensor]) -> None:
+@pytest.mark.parametrize(("clearance", "reach"), [(0.001, 0.0), (0.004, 0.004)])
+def test_optimisation_solves_drapes_least_squares(cloth: tuple[Tensor, Tensor], clearance: float, reach: float) -> None:
     points, faces = cloth
-    n, clearance = len(points), 0.001
+    n = len(points)
     laplacian = np.kron(laplacian_of(faces, n), np.eye(3))
     y = points.double().numpy()
     for smoothness, damping in ((4.0, 0.8), (2.0, 0.6), (1.0, 0.4)):
         length = np.linalg.norm(y, axis=1)
-        inside = np.flatnonzero(length < RADIUS)
+        inside = np.flatnonzero(length < RADIUS + reach)
         normal = y / length[:, None]
         closest = RADIUS * normal
         push, wanted = np.zeros((len(inside), 3 * n)), np.zeros(len(inside))
@@ -76,7 +77,7 @@ def test_optimisation_solves_drapes_least_squares(cloth: tuple[Tensor, Tensor]) 
         rows = np.vstack([push, np.sqrt(smoothness) * laplacian, np.sqrt(damping) * np.eye(3 * n)])
         target = np.concatenate([wanted, np.sqrt(smoothness) * laplacian @ y.ravel(), np.sqrt(damping) * y.ravel()])
         y = np.linalg.lstsq(rows, target, rcond=None)[0].reshape(n, 3)
-    done = PostProcess.of_faces(faces, n).optimise(points, Ball(), clearance=clearance)
+    done = PostProcess.of_faces(faces, n).optimise(points, Ball(), clearance=clearance, reach=reach)
     torch.testing.assert_close(done.double(), torch.tensor(y), atol=1e-5, rtol=0)
     assert (done.norm(dim=1) < RADIUS).sum() < 0.5 * (points.norm(dim=1) < RADIUS).sum()
 

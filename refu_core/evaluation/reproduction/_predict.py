@@ -152,8 +152,9 @@ class Predictor:
         if self._method.handling == "naive":
             done = push_naively(points, sdf, near=near)
         else:
-            clearance = {} if self._method.margin is None else {"clearance": self._method.margin}
-            done = self._wardrobe.post_process.optimise(points, sdf, near=near, **clearance)
+            margin = self._method.margin
+            kept = {} if margin is None else {"clearance": margin, "reach": margin if self._method.is_kept else 0.0}
+            done = self._wardrobe.post_process.optimise(points, sdf, near=near, **kept)
         ms["post-process"] = update_ms + 1e3 * (time.perf_counter() - start)
         return _outcome(done, ms)
 

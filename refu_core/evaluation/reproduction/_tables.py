@@ -38,6 +38,7 @@ METRICS: Mapping[str, Metric] = {
     "missed_percent": Metric("wrong by over 2 mm [%]", 3),
     "hidden_percent": Metric("over 2 mm inside, taken for outside [%]", 4),
     "ms": Metric("median time [ms]", 2),
+    "times": Metric("times what the node does about collisions", 1, higher_is_better=True),
     "jitter_mm": Metric("jitter [mm/frame²]", 3),
     "mpve_mm_trend": Metric("MPVE, change [%]", 1),
     "vfcp_percent_trend": Metric("VFCP, change [%]", 1),
