@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from refu_core import RefuError, SmplFrame, load_body, load_garment
+from refu_core import GarmentPipeline, RefuError, SmplFrame, load_body, load_garment
 from refu_core.backbones import Skinned, TailorNet, backbone_config, build_backbone
 from refu_core.benchmark import (
     PLAIN_QUERY,
@@ -27,11 +27,13 @@ from refu_core.benchmark import (
     processor_clock,
     sdf_methods,
 )
-from refu_ros.benchmark import BenchmarkResult, Row
+from refu_ros.benchmark import BenchmarkOptions, BenchmarkResult, Row
+from refu_ros.benchmark._frames import load_pipeline
 from refu_ros.benchmark._goals import goals
 from refu_ros.benchmark._inputs import read_stretches, sdf_frame
 from refu_ros.benchmark._meshes import resized
 from refu_ros.benchmark._published import published
+from refu_ros.benchmark._sections import GRAPH, LAUNCHES, Section, frame_runners
 from refu_ros.cli import main
 
 BAGS = Path(__file__).parents[1] / "bags"
@@ -107,6 +109,31 @@ def test_page_data_and_plot_say_the_same(tiny: Round) -> None:
     widths = {line.count("|") for line in page.split("## ")[1].splitlines() if line.startswith("|")}
     assert len(widths) == 1
     assert (tiny.folder / "time-against-error.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_on_a_gpu_frames_are_measured_with_graphs_and_without(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With pipelines of a CPU in their place, since there needn't be a GPU."""
+    asked: list[dict[str, Any]] = []
+
+    def load(garments: list[str], options: BenchmarkOptions, *, device: str, **rest: Any) -> GarmentPipeline:
+        asked.append({"device": device, **rest})
+        return load_pipeline(garments, options, **rest)
+
+    monkeypatch.setattr("refu_ros.benchmark._sections.load_pipeline", load)
+    options = BenchmarkOptions(quick=True)
+    modes = ("hybrid", "accurate")
+    pipelines = {("skinned", mode): load_pipeline([SHORTS], options, mode=mode, backbone="skinned") for mode in modes}
+    result = BenchmarkResult("refu benchmark", quick=True)
+    runners = {
+        device: frame_runners(
+            Section(garment=SHORTS, windows=[], options=options, result=result, progress=lambda: None, device=device),
+            pipelines,
+        )
+        for device in ("cpu", "cuda")
+    }
+    assert list(runners["cpu"]) == [("skinned", mode, None) for mode in modes]
+    assert [method for _, _, method in runners["cuda"]] == [GRAPH] * 2 + [LAUNCHES] * 2
+    assert asked == [{"device": "cuda", "mode": mode, "backbone": "skinned", "graph": False} for mode in modes]
 
 
 def test_what_is_not_installed_or_trained_is_named(tiny: Round) -> None:

@@ -90,6 +90,7 @@ def load_pipeline(
     backbone: str,
     device: str = "cpu",
     no_skip: Collection[str] = (),
+    graph: bool = True,
 ) -> GarmentPipeline:
     """A pipeline that doesn't skip what the options and `no_skip` say.
 
@@ -103,6 +104,7 @@ def load_pipeline(
         weights=options.weights,
         device=device,
         no_skip={*options.no_skip, *no_skip},
+        graph=graph,
     )
 
 

@@ -33,6 +33,8 @@ from refu_ros.benchmark._rows import BenchmarkResult, Row
 Pipelines = Mapping[tuple[str, str], GarmentPipeline]
 MAIN_MODES = ("hybrid", "accurate")
 """Of which the stages, persons and skips are measured."""
+GRAPH, LAUNCHES = "CUDA graph", "launch by launch"
+"""How a GPU is told what to do in a frame."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,20 +104,33 @@ def measure_frames(
     section: Section, pipelines: Pipelines, figures: Mapping[tuple[str, str], Mapping[str, float]]
 ) -> None:
     """Whole frames of every pipeline, and the stages of the main ones. `figures` are added to the rows."""
-    runners = {key: FrameRunner.of(pipeline) for key, pipeline in pipelines.items()}
-    names = {", ".join(key): key for key in runners}
+    runners = frame_runners(section, pipelines)
+    names = {", ".join(filter(None, key)): key for key in runners}
     contenders: dict[str, Callable[[Moment], object]] = {PLAIN_QUERY: section.plain()}
     contenders |= {name: runners[key] for name, key in names.items()}
     times = section.measure(contenders, section.windows)
     plain = times[PLAIN_QUERY]
     n = load_garment(section.garment).n_vertices
-    for name, (backbone, mode) in names.items():
-        facts = {"backbone": backbone, "vertices": n, "persons": 1, "figures": figures.get((backbone, mode), {})}
-        section.add("frame", mode, times[name], plain, **facts)
-    main = next(iter(runners))[0]
-    for mode in MAIN_MODES:
-        for stage, ms in runners[main, mode].stage_times().items():
-            section.add(f"frame.{stage}", mode, Timing(ms, ms), plain, backbone=main, vertices=n)
+    for name, (backbone, mode, method) in names.items():
+        facts = {"backbone": backbone, "vertices": n, "persons": 1, "method": method}
+        errors = {} if method == LAUNCHES else figures.get((backbone, mode), {})
+        section.add("frame", mode, times[name], plain, figures=errors, **facts)
+    for (backbone, mode, method), runner in runners.items():
+        if backbone == _backbone(pipelines) and mode in MAIN_MODES:
+            for stage, ms in runner.stage_times().items():
+                section.add(f"frame.{stage}", mode, Timing(ms, ms), plain, backbone=backbone, vertices=n, method=method)
+
+
+def frame_runners(section: Section, pipelines: Pipelines) -> dict[tuple[str, str, str | None], FrameRunner]:
+    """Of every pipeline, by backbone, mode and, of a GPU, method: the main ones are measured without graphs, too."""
+    method = GRAPH if section.device == "cuda" else None
+    runners = {(*key, method): FrameRunner.of(pipeline) for key, pipeline in pipelines.items()}
+    for backbone, mode in _main(pipelines) if section.device == "cuda" else ():
+        pipeline = load_pipeline(
+            [section.garment], section.options, mode=mode, backbone=backbone, device=section.device, graph=False
+        )
+        runners[backbone, mode, LAUNCHES] = FrameRunner.of(pipeline)
+    return runners
 
 
 def measure_persons(section: Section, pipelines: Pipelines) -> None:

@@ -45,9 +45,8 @@ def frames(result: BenchmarkResult) -> Table:
         if row.mode != "paper":
             per_thousand = f"{1e3 * row.ms_median / row.vertices:.2f}" if row.vertices else "-"
             errors = (_figure(row, "mpve_mm", 2), _figure(row, "vfcp_percent", 3), _figure(row, "cfmp_percent", 1))
-            rows.append(
-                (_where(row, f"{row.garment}, {row.backbone}, {row.mode}"), *_times(row), per_thousand, *errors)
-            )
+            name = ", ".join(filter(None, (row.garment, row.backbone, row.mode, row.method)))
+            rows.append((_where(row, name), *_times(row), per_thousand, *errors))
     header = ("frame, bytes to bytes", *_TIMES, "ms / 1,000 vertices", "MPVE mm", "VFCP %", "CFMP %")
     note = (
         "Errors are those of the frames with ground truth in bags/eval_*: bodies and motion that were not trained on."
