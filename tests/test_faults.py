@@ -32,7 +32,7 @@ from refu_ros._settings import NodeSettings
 from refu_ros._statistics import Statistics
 from refu_ros._worker import Worker
 from refu_ros.cli import main
-from refu_ros.fuzz._files import small_weights
+from refu_ros.fuzz._results import small_weights
 
 GARMENT = "short-pant-male"
 KILL_TEST = Path(__file__).parents[1] / "scripts" / "kill_test.py"

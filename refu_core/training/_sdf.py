@@ -58,7 +58,7 @@ class SdfSettings:
         """A preset's own: those of the paper, or what a CPU does in half an hour."""
         if preset == "paper":
             return cls()
-        return cls(preset, 6000, batch_size=8, points=512, learning_rate=1e-3, check_every=250, is_annealed=True)
+        return cls(preset, 4000, batch_size=8, points=512, learning_rate=1e-3, check_every=250, is_annealed=True)
 
     def rate(self, step: int) -> float:
         """Learning rate of a step."""

@@ -10,14 +10,17 @@ import io
 import struct
 import zipfile
 import zlib
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import zstandard
 
 from refu_ros.fuzz._mutate import INTEGERS, mutate_bytes
 
 if TYPE_CHECKING:
     import random
+
+    from numpy.typing import NDArray
 
 _CHUNK = 0x06
 _MOST_UNPACKED = 1 << 15
@@ -207,3 +210,10 @@ def mutate_pickle(rng: random.Random, data: bytes, other: bytes) -> bytes:
         at = len(content) - 1 if rng.random() < 0.4 else rng.randrange(len(content) + 1)
         content = content[:at] + rng.choice(GADGETS) + content[at:]
     return content
+
+
+def npy_bytes(array: NDArray[Any]) -> bytes:
+    """An array as a file."""
+    buffer = io.BytesIO()
+    np.save(buffer, array)
+    return buffer.getvalue()

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from refu_ros.fuzz import _files as files
 from refu_ros.fuzz import _messages as messages
+from refu_ros.fuzz import _results as results
 from refu_ros.fuzz._target import Target
 
 if TYPE_CHECKING:
@@ -35,13 +36,13 @@ _ALL = (
     Target("motion", "AMASS-style .npz", 20_000, files.MotionFile),
     Target("body_npz", "bodies as .npz", 20_000, files.BodyArchive),
     Target("body_pkl", "bodies as official .pkl", 40_000, files.BodyPickle),
-    Target("tensors", "weights as safetensors", 20_000, files.WeightTensors),
-    Target("card", "cards of weights", 20_000, files.WeightCard),
-    Target("distance_card", "cards of distance networks", 20_000, files.DistanceCard),
-    Target("data_set", "data sets of samples", 10_000, files.DataSet),
-    Target("sequences", "data sets of sequences", 10_000, files.SequenceSet),
-    Target("checkpoint", "checkpoints of a training", 20_000, files.Checkpoint),
-    Target("loss_log", "loss curves of a training", 20_000, files.LossLog),
+    Target("tensors", "weights as safetensors", 20_000, results.WeightTensors),
+    Target("card", "cards of weights", 20_000, results.WeightCard),
+    Target("distance_card", "cards of distance networks", 20_000, results.DistanceCard),
+    Target("data_set", "data sets of samples", 10_000, results.DataSet),
+    Target("sequences", "data sets of sequences", 10_000, results.SequenceSet),
+    Target("checkpoint", "checkpoints of a training", 20_000, results.Checkpoint),
+    Target("loss_log", "loss curves of a training", 20_000, results.LossLog),
 )
 TARGETS: dict[str, Target] = {target.name: target for target in _ALL}
 """What is fuzzed, by name."""
