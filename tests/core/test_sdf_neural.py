@@ -194,7 +194,14 @@ def test_training_lowers_the_error_and_resumes_to_the_same_weights(
     body: SmplBody, garment: GarmentTemplate, dataset: GarmentDataset, tmp_path: Path
 ) -> None:
     settings = SdfSettings(
-        preset="tiny", steps=40, batch_size=2, points=160, learning_rate=3e-3, check_every=20, validation_share=0.25
+        preset="tiny",
+        steps=40,
+        batch_size=2,
+        points=160,
+        learning_rate=3e-3,
+        check_every=20,
+        validation_share=0.25,
+        is_annealed=True,
     )
     card = train_sdf(dataset, body, garment, tmp_path / "once", settings=settings, quiet=True)
     checks = [json.loads(line) for line in (tmp_path / "once" / "sdf-tiny.jsonl").read_text().splitlines()]
@@ -218,6 +225,15 @@ def test_training_lowers_the_error_and_resumes_to_the_same_weights(
         assert torch.equal(tensor, resumed.state_dict()[name]), name
     with pytest.raises(RefuError, match=r"other settings or data"):
         train_sdf(dataset, body, garment, tmp_path / "twice", settings=SdfSettings(preset="tiny", seed=1), quiet=True)
+
+
+def test_rates_are_the_papers_or_fall_to_nothing() -> None:
+    paper, small = SdfSettings.of("paper"), SdfSettings.of("small")
+    assert {paper.rate(step) for step in (0, 1000, paper.steps)} == {1e-5}
+    rates = [small.rate(step) for step in range(0, small.steps + 1, 100)]
+    assert rates[0] == small.learning_rate
+    assert rates == sorted(rates, reverse=True)
+    assert rates[-1] == pytest.approx(0.0, abs=1e-12)
 
 
 class _FailsAt:

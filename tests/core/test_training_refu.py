@@ -232,6 +232,14 @@ def test_a_gcnn_is_trained_from_scratch(tmp_path: Path, dataset: Path, garment: 
     assert torch.isfinite(network(*bodies(1)).displacement).all()
 
 
+def test_a_gcnn_has_as_much_training_with_refu_as_alone() -> None:
+    alone, together = PretrainSettings.of("gcnn"), FinetuneSettings.of("gcnn")
+    assert (together.loop, together.steps) == (alone.loop, alone.steps)
+    assert FinetuneSettings.of("gcnn", "paper") == FinetuneSettings.paper()
+    assert FinetuneSettings.of("tailornet") == FinetuneSettings()
+    assert PretrainSettings.of("mlp") == PretrainSettings()
+
+
 def test_says_what_it_knows(tmp_path: Path, dataset: Path, pretrained: Path) -> None:
     with pytest.raises(RefuError, match="no mode 'exact' of training: wanted approx, accurate"):
         finetune(GARMENT, dataset, pretrained, tmp_path, mode="exact")
