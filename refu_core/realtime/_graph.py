@@ -118,8 +118,6 @@ class _Graph:
         self._captured.replay()
         self._host.copy_(self._captured.output, non_blocking=True)
         if self._captured.output.is_cuda:
-            done = torch.cuda.Event()  # type: ignore[no-untyped-call]
-            done.record()
-            done.synchronize()
+            torch.cuda.current_stream(self._captured.output.device).record_event().synchronize()
         result: NDArray[np.float32] = self._host.numpy().copy()
         return result

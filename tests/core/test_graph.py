@@ -9,6 +9,7 @@ right: `CudaCapture` needs a GPU.
 from __future__ import annotations
 
 import copy
+import inspect
 import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -26,7 +27,7 @@ from torch.utils._pytree import tree_flatten
 
 from refu_core import GarmentPipeline, SmplFrame
 from refu_core.errors import MeshError
-from refu_core.realtime._graph import StepGraphs
+from refu_core.realtime._graph import CudaCapture, StepGraphs
 from refu_core.realtime._step import Step
 from refu_core.sdf import ExactSdf, _mesh
 
@@ -312,6 +313,47 @@ def test_packed_and_unpacked() -> None:
 
 def test_a_cpu_has_no_graphs() -> None:
     assert GarmentPipeline.load(["tshirt-male"], graph=True)._graphs is None
+
+
+def test_a_capture_warms_up_on_the_stream_that_it_then_captures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only that: what is noted here is done by nobody, since there needn't be a GPU. `test_on_a_gpu` does it."""
+    noted: list[str] = []
+
+    class Stream:
+        def __init__(self, device: torch.device) -> None:
+            pass
+
+        def wait_stream(self, other: Stream) -> None:
+            noted.append(f"{'side waits' if other is usual else 'usual waits'}")
+
+    @contextmanager
+    def within(name: str, *given: object, **settings: object) -> Iterator[str]:
+        assert all(stream is not usual for stream in (*given, *settings.values()))
+        noted.append(f"{name} begins")
+        yield name
+        noted.append(f"{name} ends")
+
+    class Graph:
+        def replay(self) -> None:
+            noted.append("replays")
+
+    usual = Stream(CPU)
+    inspect.signature(torch.cuda.graph).bind(None, stream=None, capture_error_mode="thread_local")
+    monkeypatch.setattr(torch.cuda, "Stream", Stream)
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda _: usual)
+    monkeypatch.setattr(torch.cuda, "CUDAGraph", Graph)
+    monkeypatch.setattr(torch.cuda, "stream", partial(within, "stream"))
+    monkeypatch.setattr(torch.cuda, "graph", partial(within, "capture"))
+    monkeypatch.setattr("refu_core.realtime._graph.joined_capture", partial(within, "warp"))
+
+    def run() -> Tensor:
+        noted.append("runs")
+        return torch.zeros(1)
+
+    captured = CudaCapture(run, CPU)
+    captured.replay()
+    warm_up = ["side waits", "stream begins", "runs", "runs", "stream ends", "usual waits"]
+    assert noted == [*warm_up, "capture begins", "warp begins", "runs", "warp ends", "capture ends", "replays"]
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
