@@ -20,6 +20,7 @@ from torch import Tensor
 from refu_core.backbones import Prediction
 from refu_core.body import SmplBody, load_body
 from refu_core.errors import RefuError, WeightsError
+from refu_core.evaluation import FrameMetrics
 from refu_core.evaluation import reproduction as rp
 from refu_core.evaluation.reproduction import _build, _claims, _pictures, _runs, _tables
 from refu_core.garments import GarmentTemplate, load_garment
@@ -316,6 +317,63 @@ def test_findings_say_what_holds(better: float, word: str) -> None:
     assert word in text
     assert f"all {better:.2f} against 95.00" in text
     assert _claims.count_held(table, orders) == (better > 95, 1)
+
+
+@pytest.mark.parametrize(("margin", "word"), [(6.0, "**May be chance**"), (4.0, "**Doesn't hold**")])
+def test_findings_say_what_may_be_chance(margin: float, word: str) -> None:
+    rows = [
+        rp.Row.of("comparison", "all", "refu-accurate", "cfmp_percent", 90.0),
+        rp.Row.of("comparison", "all", "refu-hybrid", "cfmp_percent", 95.0),
+    ]
+    order = _claims.Order("cfmp_percent", "refu-accurate", "refu-hybrid")
+    gap = _claims.Gap(-5.0, margin)
+    (text,) = _claims.findings(
+        rp.Table("comparison", "", "", rows), [order], _build.LABELS, gap=lambda _garment, _order: gap
+    )
+    assert word in text
+    assert f"sample by sample -5.000 ± {margin:.3f}" in text
+
+
+def test_differences_are_taken_sample_by_sample(study: rp.Study) -> None:
+    found = study.paired(GARMENT, "refu-accurate", "tailornet", "mpve_mm")
+    runs = [study.runs[GARMENT, name].samples for name in ("refu-accurate", "tailornet")]
+    wanted = [a.mpve_mm - b.mpve_mm for a, b in zip(*runs, strict=True) if a.mpve_mm and b.mpve_mm]
+    assert found == pytest.approx(wanted)
+    assert len(found) == N_SAMPLES
+    assert study.paired(None, "refu-accurate", "tailornet", "mpve_mm") == pytest.approx(wanted)
+    assert len(study.paired(GARMENT, "refu-accurate", "nobody's", "mpve_mm")) == 0
+
+
+def test_intervals_hold_the_true_difference_as_often_as_they_say() -> None:
+    rng = np.random.default_rng(0)
+    order = _claims.Order("mpve_mm", "a", "b")
+    hits = 0
+    for _ in range(200):
+        study = rp.Study(n_samples={"x": 60})
+        shared = 10 + rng.normal(size=60)
+        for name, shift in (("a", 0.3), ("b", 0.0)):
+            samples = [_frame(value) for value in shared + shift + 0.5 * rng.normal(size=60)]
+            study.runs["x", name] = rp.Run("x", name, samples)
+        gap = _build._gap(study, "x", order)
+        assert gap is not None
+        hits += abs(gap.mean - 0.3) <= gap.margin
+    assert 180 <= hits <= 198
+    assert _build._gap(rp.Study(), "x", order) is None
+
+
+def _frame(mpve: float) -> FrameMetrics:
+    return FrameMetrics(
+        n_vertices=1,
+        n_inside=0,
+        is_free=True,
+        n_vf=0,
+        n_ee=0,
+        max_depth_mm=0.0,
+        energy=0.0,
+        collision_error_mm=0.0,
+        mpve_mm=float(mpve),
+        laplacian_mm=None,
+    )
 
 
 # ---- the other tables ------------------------------------------------------------------------------------------------

@@ -7,7 +7,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
-from refu_core.evaluation.reproduction._claims import Order, findings
+from refu_core.evaluation.metrics import Figures
+from refu_core.evaluation.reproduction._claims import Gap, Order, findings
 from refu_core.evaluation.reproduction._methods import METHODS, SAMPLE_TABLES, SEQUENCE_SHAPES
 from refu_core.evaluation.reproduction._paper import OPTIMISATION_MS
 from refu_core.evaluation.reproduction._runs import RATIO_EDGES, Run, Study
@@ -18,6 +19,8 @@ LABELS: Mapping[str, str] = {name: method.label for name, method in METHODS.item
 
 ENERGY_ZOOM = 2.5e-3
 """Upper end of the paper's zoomed histogram [m²]."""
+FEWEST_PAIRED = 10
+"""Samples that say how sure a difference is."""
 UNSEEN_GROUPS = 5
 """Groups of equally many samples, by distance to the training set."""
 
@@ -41,6 +44,11 @@ _COMPARISON_ORDERS: tuple[Order, ...] = (
 _ABLATION_ORDERS: tuple[Order, ...] = (
     *(Order(metric, "refu-approx", "fixed-approx") for metric in (*_MAIN, "avg_vf", "avg_ee")),
     *(Order(metric, "refu-accurate", "fixed-accurate") for metric in ("mpve_mm", "cfmp_percent", "avg_vf", "avg_ee")),
+    *(
+        Order(metric, f"bare-{sdf}", f"fixed-bare-{sdf}")
+        for sdf in ("approx", "accurate")
+        for metric in (*_MAIN, "avg_vf", "avg_ee")
+    ),
     *(Order("cfmp_percent", f"refu-{mode}", f"bare-{mode}") for mode in ("approx", "accurate", "hybrid")),
 )
 ORDERS: Mapping[str, tuple[Order, ...]] = {
@@ -341,8 +349,21 @@ def _finished(study: Study, table: Table) -> Table:
     """The table with what is missing, and what agrees with the paper."""
     methods = {row.method for row in table.rows} | set(SAMPLE_TABLES.get(table.name, ()))
     table.missing = [missing for missing in study.missing.values() if missing.method in methods]
-    table.findings += findings(table, ORDERS.get(table.name, ()), LABELS)
+    table.findings += findings(
+        table, ORDERS.get(table.name, ()), LABELS, gap=lambda garment, order: _gap(study, garment, order)
+    )
     return table
+
+
+def _gap(study: Study, garment: str, order: Order) -> Gap | None:
+    """How sure a difference is, by the samples: they are independent poses. None for too few, or for other figures."""
+    if order.metric not in Figures.__dataclass_fields__:
+        return None
+    differences = study.paired(None if garment == ALL else garment, order.better, order.worse, order.metric)
+    if len(differences) < FEWEST_PAIRED:
+        return None
+    spread = float(differences.std(ddof=1)) / len(differences) ** 0.5
+    return Gap(float(differences.mean()), 1.96 * spread)
 
 
 SAMPLE_BUILDERS: Mapping[str, Callable[[Study], Table]] = {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 from refu_core.evaluation.reproduction._tables import METRICS, Table, format_value, label_of
@@ -16,26 +16,52 @@ class Order(NamedTuple):
     worse: str
 
 
-def findings(table: Table, orders: Sequence[Order], labels: Mapping[str, str]) -> list[str]:
-    """A sentence for each order and garment that the table has both figures for, those that hold first."""
-    holding, failing = [], []
+class Gap(NamedTuple):
+    """Mean difference of two methods over the same samples, and half of its 95 % interval."""
+
+    mean: float
+    margin: float
+
+    @property
+    def is_chance(self) -> bool:
+        """Whether none at all is within the interval."""
+        return abs(self.mean) <= self.margin
+
+
+def findings(
+    table: Table,
+    orders: Sequence[Order],
+    labels: Mapping[str, str],
+    *,
+    gap: Callable[[str, Order], Gap | None] | None = None,
+) -> list[str]:
+    """A sentence for each order and garment that the table has both figures for, those that hold first.
+
+    `gap` of a garment and an order says how sure a difference is; one of which it says so may be chance is told apart.
+    """
+    found: dict[str, list[str]] = {"Holds": [], "May be chance": [], "Doesn't hold": []}
     garments = list(dict.fromkeys(row.garment for row in table.rows))
     for order in orders:
-        agree: list[str] = []
-        disagree: list[str] = []
+        shown: dict[str, list[str]] = {verdict: [] for verdict in found}
         for garment in garments:
             better = table.value(garment, order.better, order.metric)
             worse = table.value(garment, order.worse, order.metric)
             if better is None or worse is None:
                 continue
-            shown = f"{garment} {format_value(order.metric, better)} against {format_value(order.metric, worse)}"
-            (agree if is_as_good(order.metric, better, worse) else disagree).append(shown)
+            figures = f"{garment} {format_value(order.metric, better)} against {format_value(order.metric, worse)}"
+            if is_as_good(order.metric, better, worse):
+                shown["Holds"].append(figures)
+                continue
+            known = None if gap is None else gap(garment, order)
+            if known is not None:
+                digits = METRICS[order.metric].digits + 1
+                figures += f", sample by sample {known.mean:+.{digits}f} ± {known.margin:.{digits}f}"
+            shown["May be chance" if known is not None and known.is_chance else "Doesn't hold"].append(figures)
         claim = f"{label_of(order.metric)}: {labels[order.better]} at least as good as {labels[order.worse]}"
-        if agree:
-            holding.append(f"{claim}. **Holds** ({', '.join(agree)}).")
-        if disagree:
-            failing.append(f"{claim}. **Doesn't hold** ({', '.join(disagree)}).")
-    return holding + failing
+        for verdict, cases in shown.items():
+            if cases:
+                found[verdict].append(f"{claim}. **{verdict}** ({'; '.join(cases)}).")
+    return [sentence for sentences in found.values() for sentence in sentences]
 
 
 def count_held(table: Table, orders: Sequence[Order]) -> tuple[int, int]:

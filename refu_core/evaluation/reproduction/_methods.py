@@ -55,6 +55,7 @@ class Method:
 
 _TRAINING: Mapping[str, str] = {
     "fixed": "--scale fixed",
+    "fixed-bare": "--scale fixed --margin 0 --unblended",
     "alt1": "--scale shared",
     "alt2": "--scale distance",
     "bare": "--margin 0 --unblended",
@@ -113,10 +114,19 @@ def _tailornet() -> list[Method]:
             ),
         ]
     for sdf in _SDFS:
-        label = f"fixed scale, {sdf}"
-        methods += _ablated(
-            Method(name=f"fixed-{sdf}", label=label, mode=sdf, folder="fixed", handling="refu", sdf=sdf)
+        fixed = Method(
+            name=f"fixed-{sdf}", label=f"fixed scale, {sdf}", mode=sdf, folder="fixed", handling="refu", sdf=sdf
         )
+        methods += [
+            *_ablated(fixed),
+            replace(
+                fixed,
+                name=f"fixed-bare-{sdf}",
+                label=f"fixed scale, {sdf}, not blended, ε = 0, trained so (the paper's)",
+                folder="fixed-bare",
+                is_blended=False,
+            ),
+        ]
     methods += [
         Method(
             name=f"alt{number}-approx",
@@ -241,8 +251,9 @@ SAMPLE_TABLES: Mapping[str, tuple[str, ...]] = {
     ),
     "ablation": (
         "tailornet",
-        *(f"fixed-{sdf}{kind}" for kind in ("-bare", "-unblended", "") for sdf in _SDFS),
+        *(f"fixed-bare-{sdf}" for sdf in _SDFS),
         *(f"bare-{mode}" for mode in _RUN_TIME_SDF),
+        *(f"fixed-{sdf}{kind}" for kind in ("-bare", "-unblended", "") for sdf in _SDFS),
         *(f"refu-{mode}{kind}" for kind in ("-bare", "-unblended", "") for mode in _RUN_TIME_SDF),
     ),
     "alpha": ("tailornet", "alt1-approx", "alt2-approx", "refu-approx"),

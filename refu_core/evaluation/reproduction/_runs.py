@@ -107,6 +107,22 @@ class Study:
         run = self.runs.get((garment, method))
         return None if run is None else getattr(run.figures, metric)
 
+    def paired(self, garment: str | None, first: str, second: str, metric: str) -> NDArray[np.float64]:
+        """First method's figure less the second one's, of each sample of a garment (of all for None), shape (N,).
+
+        Samples of which one has no figure are left out, and garments that one wasn't run on.
+        """
+        differences = []
+        for name in self.garments if garment is None else [garment]:
+            runs = self.runs.get((name, first)), self.runs.get((name, second))
+            if runs[0] is None or runs[1] is None:
+                continue
+            for one, other in zip(runs[0].samples, runs[1].samples, strict=True):
+                a, b = (getattr(Figures.over([sample]), metric) for sample in (one, other))
+                if a is not None and b is not None:
+                    differences.append(a - b)
+        return np.array(differences, np.float64)
+
 
 def run_methods(
     study: Study,
