@@ -2,7 +2,9 @@
 
     python benchmarks/node.py                              # one person, T-shirt and short pant at 30 Hz, 60 s
     python benchmarks/node.py --persons 4 --rate 10        # four persons, two garments each
-    python benchmarks/node.py --nobody                     # nobody listens: what the node costs then
+    python benchmarks/node.py --nobody                     # nobody listens: what the node costs then, and how long
+                                                           # viewers wait that come late
+    python benchmarks/node.py --nobody -p lazy:=false      # the same of a node that stays subscribed
 
 Prints how many frames came out, latencies from the sender's stamp to the subscriber, whether they grow, how long the
 node takes to answer parameter changes meanwhile, and its share of a core. Needs rclpy (extra `ros`).
@@ -11,6 +13,7 @@ node takes to answer parameter changes meanwhile, and its share of a core. Needs
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import subprocess
@@ -22,6 +25,10 @@ from typing import Any
 import numpy as np
 
 GARMENTS = ("tshirt-male", "short-pant-male")
+LATE_VIEWERS = 12
+UNTIL_KILLED_S = 3600.0
+REST_S = 8.0
+"""The node stays subscribed for some seconds after the last viewer; in this time it has unsubscribed [s]."""
 
 
 def names(persons: int) -> list[str]:
@@ -31,7 +38,7 @@ def names(persons: int) -> list[str]:
 def start_ros(name: str) -> Any:
     import rclpy
 
-    rclpy.init()
+    rclpy.init(args=[])
     return rclpy.create_node(name)
 
 
@@ -47,7 +54,7 @@ def send(options: argparse.Namespace) -> dict[str, Any]:
     persons = names(options.persons)
     topics = [f"{person}/smpl_params" if person else "smpl_params" for person in persons]
     publishers = [node.create_publisher(JointState, topic, QoSProfile(depth=1)) for topic in topics]
-    while not all(publisher.get_subscription_count() for publisher in publishers):
+    while not (node.count_publishers("garments") and (options.nobody or all(map(node.count_subscribers, topics)))):
         time.sleep(0.05)
     time.sleep(3.0)  # the subscriber may still be looking for the node
     encode = encoder_for("joint_state")
@@ -106,20 +113,51 @@ def receive(options: argparse.Namespace) -> dict[str, Any]:
     return {"got": got, "not_finite": bad}
 
 
-def processor_seconds(process: subprocess.Popen[bytes]) -> float:
-    """What a process has used of a core so far [s] (Linux)."""
-    fields = Path(f"/proc/{process.pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")  # in the kernel and out of it
+def processor_seconds(process: subprocess.Popen[bytes]) -> dict[str, float]:
+    """What the threads of a process have used of a core so far [s], by name (Linux)."""
+    seconds: dict[str, float] = {}
+    for task in Path(f"/proc/{process.pid}/task").iterdir():
+        with contextlib.suppress(FileNotFoundError):  # a thread that has just ended
+            name = "main" if task.name == str(process.pid) else (task / "comm").read_text(encoding="utf-8").strip()
+            used = 1e-9 * int((task / "schedstat").read_text(encoding="ascii").split()[0])
+            seconds[name] = seconds.get(name, 0.0) + used
+    return seconds
 
 
-def wait(options: argparse.Namespace, sender: subprocess.Popen[bytes], node: subprocess.Popen[bytes]) -> dict[str, Any]:
-    """The node's share of a core in a third of the time that frames are sent."""
-    time.sleep(options.seconds / 3 + 10.0)  # until everything has started and found each other
+def share_of_core(before: dict[str, float], after: dict[str, float], seconds: float) -> dict[str, float]:
+    """Of all threads, and of each that has used any [%]."""
+    used = {name: 100 * (value - before.get(name, 0.0)) / seconds for name, value in after.items()}
+    each = {name: round(value, 2) for name, value in sorted(used.items(), key=lambda item: -item[1]) if value > 0.005}
+    return {"all": round(sum(used.values()), 2), **each}
+
+
+def wait(options: argparse.Namespace, node: subprocess.Popen[bytes]) -> dict[str, Any]:
+    """The node's share of a core while frames are sent and nobody listens; then, how long late viewers wait."""
+    time.sleep(25.0)  # until everything has started and found each other, and the node rests
     used, start = processor_seconds(node), time.monotonic()
-    time.sleep(options.seconds / 3)
-    share = 100 * (processor_seconds(node) - used) / (time.monotonic() - start)
-    sender.wait()
-    return {"core_percent": round(share, 2)}
+    time.sleep(options.seconds)
+    share = share_of_core(used, processor_seconds(node), time.monotonic() - start)
+    return {"core_percent": share, "first_garment_ms": late_viewers()}
+
+
+def late_viewers() -> list[int]:
+    """How long somebody whose program runs already waits for a first garment after subscribing, time and again [ms]."""
+    import rclpy
+    from rclpy.qos import QoSProfile
+    from visualization_msgs.msg import MarkerArray
+
+    node = start_ros("viewer")
+    waited = []
+    for _ in range(LATE_VIEWERS):
+        time.sleep(REST_S)
+        came: list[bytes] = []
+        start = time.monotonic()
+        subscription = node.create_subscription(MarkerArray, "garments", came.append, QoSProfile(depth=10), raw=True)
+        while not came and time.monotonic() < start + 60.0:
+            rclpy.spin_once(node, timeout_sec=0.1)
+        waited.append(round(1e3 * (time.monotonic() - start)))
+        node.destroy_subscription(subscription)
+    return waited
 
 
 def operate(
@@ -157,11 +195,11 @@ def operate(
         start = time.perf_counter()
         rclpy.spin_until_future_complete(node, client.call_async(request), timeout_sec=5.0)
         answers.append(1e3 * (time.perf_counter() - start))
-    share = 100 * (processor_seconds(of_node) - used) / (time.monotonic() - began)
+    share = share_of_core(used, processor_seconds(of_node), time.monotonic() - began)
     return {
         "parameter_ms": percentiles(answers),
         "parameter_max_ms": max(answers),
-        "core_percent": round(share, 1),
+        "core_percent": share,
         "diagnostics": statuses,
     }
 
@@ -198,6 +236,7 @@ def main() -> None:
         "--reload", action="store_true", help="change a parameter that loads another pipeline each time"
     )
     parser.add_argument("--nobody", action="store_true", help="leave out the subscriber, and changes of parameters")
+    parser.add_argument("-p", "--parameter", action="append", default=[], help="name:=value of the node, besides those")
     parser.add_argument("--role", choices=("send", "receive"), help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.role:
@@ -210,25 +249,29 @@ def main() -> None:
     parameters = {"input_type": "joint_state", "garments": f"[{options.garments}]"}
     if options.persons > 1:
         parameters["persons"] = f"[{', '.join(names(options.persons))}]"
-    arguments = [item for name, value in parameters.items() for item in ("-p", f"{name}:={value}")]
+    given = [f"{name}:={value}" for name, value in parameters.items()] + options.parameter
+    arguments = [item for parameter in given for item in ("-p", parameter)]
     node = subprocess.Popen([sys.executable, "-m", "refu_ros.garment_node", "--ros-args", *arguments])
     same = [
         sys.executable,
         __file__,
         f"--persons={options.persons}",
         f"--rate={options.rate}",
-        f"--seconds={options.seconds}",
+        f"--seconds={options.seconds if not options.nobody else UNTIL_KILLED_S}",
+        *(["--nobody"] if options.nobody else []),
     ]
+    sender = subprocess.Popen([*same, "--role=send"], stdout=subprocess.PIPE)
     try:
-        receiver = None if options.nobody else subprocess.Popen([*same, "--role=receive"], stdout=subprocess.PIPE)
-        sender = subprocess.Popen([*same, "--role=send"], stdout=subprocess.PIPE)
-        operated = wait(options, sender, node) if options.nobody else operate(options, sender, node)
-        sent = json.loads(sender.communicate()[0])["sent"]
-        if receiver is None:
-            print(json.dumps({"sent": sum(map(len, sent.values())), **operated}, indent=2))
+        if options.nobody:
+            print(json.dumps(wait(options, node), indent=2))
             return
+        receiver = subprocess.Popen([*same, "--role=receive"], stdout=subprocess.PIPE)
+        operated = operate(options, sender, node)
+        sent = json.loads(sender.communicate()[0])["sent"]
         received = json.loads(receiver.communicate()[0])
     finally:
+        sender.kill()
+        sender.wait()
         node.terminate()
         node.wait()
     result = {**summary(sent, received["got"]), "not_finite": received["not_finite"], **operated}
