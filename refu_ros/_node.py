@@ -111,7 +111,12 @@ class GarmentNode(LifecycleNode):  # type: ignore[misc]
         self._scene = Scene(self._statistics)
         self._worker = Worker(self._scene, self._statistics, self, settings=self.settings, pipeline=self._pipeline)
         self._worker.start()
-        self._subscribe()  # in any case: what is wrong with the inputs has to show at the start
+        try:
+            self._subscribe()  # in any case: what is wrong with the inputs has to show at the start
+        except Exception as error:  # rclpy would swallow it
+            self.get_logger().error(f"can't be activated: {error}")
+            self.on_deactivate(state)
+            return TransitionCallbackReturn.FAILURE
         self._state = "active"
         return result
 

@@ -191,6 +191,14 @@ def test_a_bad_start_is_one_line(ros: None, tmp_path: Path) -> None:  # noqa: AR
         assert "Traceback" not in node.log
 
 
+def test_a_quality_that_does_not_exist_is_one_line(ros: None, tmp_path: Path) -> None:  # noqa: ARG001
+    with NodeProcess(tmp_path / "log.txt", **{"qos_overrides./smpl_params.subscription.reliability": "magic"}) as node:
+        assert node.process.wait(timeout=120) == 2
+        assert "can't be activated" in node.log
+        assert "magic" in node.log
+        assert "Traceback" not in node.log
+
+
 def test_humans_come_and_go(ros: None, tmp_path: Path) -> None:  # noqa: ARG001
     peer = Peer("ann", "bob", topic="/humans/bodies/{}/joint_states")
     parameters = {"input_type": "joint_state", "follow_humans": True, "garments": [GARMENTS[0]], "person_timeout": 0.5}
