@@ -176,12 +176,16 @@ def stress_table(result: StressResult) -> str:
                 str(tally.failures),
                 str(tally.nan),
                 str(tally.refused),
-                length(tally.max_deviation),
+                length(tally.deviation),
                 length(tally.limit),
             )
             for tally in result.tallies
         ]
-        lines += [format_table(header, rows), "(the limit is that of the worst trial; a few depend on the frame)", ""]
+        lines += [
+            format_table(header, rows),
+            "(deviation and limit are those of the worst trial; a few limits depend on the frame)",
+            "",
+        ]
     if result.soaks:
         soak_header = ("soak", "frames", "NaN", "memory MB", "", "p99 ms", "", "wall p99 ms", "machine")
         soak_rows = [

@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
 from refu_core.frames import N_BETAS
-from refu_core.repulsion import DEFAULT_MARGIN, MAX_DISPLACEMENT, Blend, resolve
+from refu_core.garments import inner_first
+from refu_core.repulsion import DEFAULT_MARGIN, LAYER_GAP, LAYER_REACH, MAX_DISPLACEMENT, Blend, resolve
 from refu_core.stress._frames import FRAMES, between, everyday, everyday_pose, frame_of
 from refu_core.stress._numbers import n_not_finite
+from refu_core.stress._sheets import closest_on_sheet
 from refu_core.stress._trial import Check, Measurement, Trial
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from refu_core.evaluation import SelfContact
-    from refu_core.realtime import GarmentMesh, PipelineOutput
+    from refu_core.realtime import GarmentMesh, GarmentPipeline, PipelineOutput
     from refu_core.stress._subject import Subject
 
 DEPTH = 1e-4
@@ -49,6 +52,7 @@ def guarantee_checks() -> list[Check]:
         Check(name="guarantees: no vertex thrown out", draw=_any_day, measure=not_thrown, trials=2),
         Check(name="guarantees: displacement bounded in any pose", draw=_any_frame, measure=bounded, trials=4),
         Check(name="guarantees: no jumps in smooth motion", draw=_motion, measure=no_jumps),
+        Check(name="guarantees: no jumps in smooth motion, worn together", draw=_motion, measure=no_jumps_together),
         Check(name="guarantees: bounded jumps through self-contact", draw=_folding, measure=bounded_jumps),
     ]
 
@@ -157,40 +161,105 @@ def bounded(subject: Subject, trial: Trial) -> Measurement:
 
 
 def no_jumps(subject: Subject, trial: Trial) -> Measurement:
-    """How far vertices go from frame to frame, against the body's fastest one.
+    """How far vertices go from frame to frame, each garment worn alone, against the body's fastest vertex.
 
-    Where the body touches itself the way out of it may change sides; cloth around is taken along, and left out here.
+    What is pushed goes to the closest skin. That leaps where another way out becomes the shortest, from one side of a
+    limb's medial axis to the other, and no projection that remembers nothing can follow it smoothly: so vertices may go
+    as far, in addition, as the closest skin does of what is pushed near them. Where the body touches itself, the way
+    out may change sides at any depth; cloth around is taken along, and left out here.
     """
-    return _jumps(subject, trial, allowed=PACE_SLACK, everywhere=False)
+    found = [_jumps(subject, pipeline, trial) for pipeline in subject.one_by_one.values()]
+    return replace(_worst(found), runs=len(trial.frames))
+
+
+def no_jumps_together(subject: Subject, trial: Trial) -> Measurement:
+    """The same of garments worn over each other, where the closest place of the sheet below may leap, too."""
+    return replace(_jumps(subject, subject.pipeline, trial), runs=len(trial.frames))
+
+
+def _jumps(subject: Subject, pipeline: GarmentPipeline, trial: Trial) -> Measurement:
+    found = []
+    last: PipelineOutput | None = None
+    before: dict[str, _Aims] = {}
+    for frame in trial.frames:
+        out = pipeline(frame)
+        found.append(Measurement(nan=_not_finite(out)))
+        aims = _aims(subject, pipeline, out)
+        if last is not None:
+            pace = PACE * float(np.linalg.norm(out.body - last.body, axis=1).max()) + PACE_SLACK
+            for name, mesh in out.items():
+                limit = pace + _leap(before[name], aims[name], pipeline.garments[name].edges.numpy())
+                way = np.linalg.norm(mesh.local - last[name].local, axis=1)
+                way[before[name].is_left_out | aims[name].is_left_out] = 0
+                i = int(np.argmax(way / limit))
+                found.append(Measurement(deviation=float(way[i]), limit=float(limit[i])))
+        last, before = out, aims
+    return _worst(found)
+
+
+@dataclass(frozen=True, eq=False)
+class _Aims:
+    """Where collision handling takes the N vertices of a garment: to the skin, and to the sheets worn below."""
+
+    places: list[NDArray[np.float32]]
+    """The closest point of each surface to each vertex before collision handling [m], (N, 3)."""
+    is_pushed: list[NDArray[np.bool_]]
+    """Whether a vertex is nearer to that surface than it may be, (N,)."""
+    is_left_out: NDArray[np.bool_]
+    """The vertices with a self-contact of the body near, (N,)."""
+
+
+def _aims(subject: Subject, pipeline: GarmentPipeline, out: PipelineOutput) -> dict[str, _Aims]:
+    contact, skin = subject.contacts.detect(out.body), subject.distances["exact"]
+    skin.update(torch.from_numpy(out.body))
+    aims: dict[str, _Aims] = {}
+    worn: list[GarmentMesh] = []
+    for name in inner_first(out):
+        mesh = out[name]
+        sample = skin.query(torch.from_numpy(mesh.raw))
+        places = [mesh.raw - (sample.distance[:, None] * sample.gradient).numpy()]
+        is_pushed = [(sample.distance < DEFAULT_MARGIN).numpy()]
+        for below in worn:
+            closest, height = closest_on_sheet(mesh.raw, below.local, below.faces)
+            places.append(closest)
+            is_pushed.append((height < LAYER_GAP) & (np.linalg.norm(mesh.raw - closest, axis=1) < LAYER_REACH))
+        is_near = np.zeros(len(mesh.raw), np.bool_)
+        if not contact.is_free:
+            is_near = _largest_near(_in_contact(contact, mesh), pipeline.garments[name].edges.numpy())
+        aims[name] = _Aims(places, is_pushed, is_near)
+        worn.append(mesh)
+    return aims
+
+
+def _leap(before: _Aims, now: _Aims, edges: NDArray[np.int64]) -> NDArray[np.floating]:
+    """How far, at most, the places go that vertices near each vertex are pushed to [m], (N,)."""
+    leap = np.zeros(len(now.is_left_out), np.float32)
+    for i, place in enumerate(now.places):
+        way = np.linalg.norm(place - before.places[i], axis=1)
+        leap += _largest_near(np.where(before.is_pushed[i] | now.is_pushed[i], way, 0), edges)
+    return leap
 
 
 def bounded_jumps(subject: Subject, trial: Trial) -> Measurement:
-    """The same with all vertices: from one bound of the displacement to the other, and no farther."""
-    return _jumps(subject, trial, allowed=2 * MAX_DISPLACEMENT, everywhere=True)
-
-
-def _jumps(subject: Subject, trial: Trial, *, allowed: float, everywhere: bool) -> Measurement:
-    worst = Measurement(runs=len(trial.frames))
-    last: tuple[PipelineOutput, dict[str, NDArray[np.bool_]]] | None = None
-    nan = 0
+    """All vertices, through self-contact: from one bound of the displacement to the other, and no farther."""
+    found = []
+    last: PipelineOutput | None = None
     for frame in trial.frames:
         out = subject.pipeline(frame)
-        nan += _not_finite(out)
-        contact = None if everywhere else subject.contacts.detect(out.body)
-        near = {}
-        for name, mesh in out.items():
-            near[name] = np.zeros(len(mesh.local), np.bool_)
-            if contact is not None and not contact.is_free:
-                edges = subject.pipeline.garments[name].edges.numpy()
-                near[name] = _largest_near(_in_contact(contact, mesh), edges)
+        found.append(Measurement(nan=_not_finite(out)))
         if last is not None:
-            limit = PACE * float(np.linalg.norm(out.body - last[0].body, axis=1).max()) + allowed
+            limit = PACE * float(np.linalg.norm(out.body - last.body, axis=1).max()) + 2 * MAX_DISPLACEMENT
             for name, mesh in out.items():
-                way = np.linalg.norm(mesh.local - last[0][name].local, axis=1)[~(near[name] | last[1][name])]
-                found = Measurement(runs=worst.runs, deviation=float(way.max(initial=0.0)), limit=limit)
-                worst = max(worst, found, key=lambda measured: measured.badness)
-        last = out, near
-    return replace(worst, nan=nan)
+                way = float(np.linalg.norm(mesh.local - last[name].local, axis=1).max())
+                found.append(Measurement(deviation=way, limit=limit))
+        last = out
+    return replace(_worst(found), runs=len(trial.frames))
+
+
+def _worst(found: Sequence[Measurement]) -> Measurement:
+    """The worst of these, with all numbers together that aren't finite."""
+    worst = max(found, key=lambda measured: replace(measured, nan=0).badness)
+    return replace(worst, nan=sum(measured.nan for measured in found))
 
 
 def _in_contact(contact: SelfContact, mesh: GarmentMesh) -> NDArray[np.bool_]:

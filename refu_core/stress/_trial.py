@@ -113,8 +113,11 @@ class Tally:
     failures: int = 0
     nan: int = 0
     max_deviation: float = 0.0
+    """Of all trials [m]: where the limit depends on the frame, not always that of the worst one."""
     badness: float = -1.0
     """Of the worst trial."""
+    deviation: float = 0.0
+    """Of the worst trial [m]."""
     limit: float = 0.0
     """Its limit [m]."""
     faults: list[str] = field(default_factory=list)
@@ -134,7 +137,8 @@ class Tally:
         if measured.badness > self.badness:
             if measured.culprit is not None:
                 trial = replace(trial, frames=(trial.frames[measured.culprit],))
-            self.badness, self.limit, self.worst = measured.badness, measured.limit, (wardrobe, trial)
+            self.badness, self.worst = measured.badness, (wardrobe, trial)
+            self.deviation, self.limit = measured.deviation, measured.limit
 
     def as_dict(self) -> dict[str, Any]:
         """A row of the results, ready for JSON; lengths in metres."""
@@ -146,6 +150,7 @@ class Tally:
             "nan": self.nan,
             "refused": self.refused,
             "max_deviation_m": self.max_deviation,
+            "deviation_m": self.deviation if math.isfinite(self.deviation) else None,
             "limit_m": self.limit if math.isfinite(self.limit) else None,
             "worst_share_of_limit": self.badness if 0 <= self.badness < math.inf else None,
             "faults": self.faults,

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -21,6 +22,7 @@ from refu_core.stress import (
     Wardrobe,
     all_checks,
     distance_to_mesh,
+    load_trial,
     mirror_image,
     replay_trial,
 )
@@ -102,9 +104,30 @@ def test_turned_persons_wear_the_same_where_limbs_run_into_each_other(seed: int,
 
 @pytest.mark.parametrize("path", WORST, ids=[path.stem for path in WORST])
 def test_worst_cases_of_refu_stress_that_are_no_more(path: Path) -> None:
-    """A fold of shorts that sent a vertex through the thigh; a turn that made a difference; a skirt of γ = -28."""
+    """Shorts: a fold that sent a vertex through the thigh, and one that was left between crossed thighs. A turn that
+    made a difference; a skirt of γ = -28; and a skirt deep in the thighs, where the closest skin leaps."""
     tally = replay_trial(path)
     assert not tally.failures, tally.as_dict()
+
+
+def test_where_the_closest_skin_leaps_both_ways_out_are_as_long() -> None:
+    """What a vertex may jump for: it has passed the medial axis, and neither way is the wrong one."""
+    _, wardrobe, trial = load_trial(next(path for path in WORST if path.stem == "medial-axis"))
+    subject = Subject(wardrobe)
+    sdf = subject.distances["exact"]
+    points, bodies, found = [], [], []
+    for frame in trial.frames:
+        out = subject.pipeline(frame)
+        points.append(torch.from_numpy(out["skirt-female"].raw))
+        bodies.append(torch.from_numpy(out.body))
+        sdf.update(bodies[-1])
+        found.append(sdf.closest(points[-1]))
+    before, now = ((one.barycentrics[..., None] * bodies[-1][sdf.faces[one.face.long()]]).sum(1) for one in found)
+    leap = (before - now).norm(dim=1)
+    longer = (points[-1] - before).norm(dim=1) - found[-1].distance
+    is_inside = (sdf.query(points[-1]).distance < 0) & (leap > 0.01)
+    assert leap[is_inside].max() > 0.015
+    assert longer[is_inside].max() < 1e-3
 
 
 def test_classes_of_frames_are_what_they_say() -> None:
