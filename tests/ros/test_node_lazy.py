@@ -12,6 +12,7 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy isn't installed (extra ros): the node isn't tested")
 
 from harness import GARMENTS, NodeProcess, Peer, frame, ros_arguments
+from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import ReliabilityPolicy
@@ -125,6 +126,23 @@ def test_viewers_come_and_go_and_leave_nothing_behind(
     assert held() == before
     scene.peer.watch()
     scene.dresses(2000)
+
+
+@pytest.mark.parametrize("missing", ["event", "timer"])
+def test_an_event_or_the_second_is_enough(
+    stage: Callable[..., Stage], monkeypatch: pytest.MonkeyPatch, missing: str
+) -> None:
+    if missing == "event":
+        monkeypatch.setattr("refu_ros._node.PublisherEventCallbacks", lambda **_: PublisherEventCallbacks())
+    scene = stage()
+    scene.rests()
+    if missing == "timer":
+        for timer in scene.node.timers:
+            timer.cancel()
+    scene.peer.watch()
+    scene.dresses()
+    scene.peer.unwatch()
+    scene.rests()
 
 
 def test_rest_is_reported_and_is_no_fault(stage: Callable[..., Stage]) -> None:
