@@ -43,6 +43,26 @@ class CdrReader:
         self._at = HEADER_BYTES
 
     @property
+    def place(self) -> int:
+        """Where the next field begins, in bytes from the start."""
+        return self._at
+
+    def since(self, place: int) -> tuple[str, bytes]:
+        """What was read since then, with the byte order: the same again is the same fields again, see `repeats`."""
+        return self._order, bytes(self._data[place : self._at])
+
+    def repeats(self, known: tuple[str, bytes]) -> bool:
+        """Whether what `since` gave of another message comes next; if so it is skipped.
+
+        Both must begin where the strictest of their alignments is satisfied.
+        """
+        order, raw = known
+        if order != self._order or bytes(self._data[self._at : self._at + len(raw)]) != raw:
+            return False
+        self._at += len(raw)
+        return True
+
+    @property
     def remaining(self) -> int:
         """Bytes not read yet."""
         return len(self._data) - self._at

@@ -174,6 +174,37 @@ def test_joint_states_that_are_refused(entries: Any, extra: int, message: str) -
     assert str(caught.value).startswith(JOINT_STATE)
 
 
+@given(st.lists(st.permutations(list((JOINTS | TRANSL).items())), min_size=1, max_size=2), st.data())
+def test_names_are_remembered_without_mixing_up_senders(senders: list[list[tuple[str, float]]], data: Any) -> None:
+    """Names that are sent again aren't read again; what is decoded must not depend on who sent before."""
+    for _ in range(6):
+        entries = list(data.draw(st.sampled_from(senders)))
+        kind = data.draw(st.sampled_from(["good", "renamed", "too many", "big-endian"]))
+        if kind == "renamed":
+            entries[data.draw(st.integers(0, len(entries) - 1))] = ("jaw_x", 0.0)
+        raw = joint_state(entries, extra_positions=kind == "too many")
+        if kind == "big-endian":
+            raw = big_endian_joint_state(entries)
+        decode = decoder_for("joint_state")
+        if kind in ("good", "big-endian"):
+            frame = decode(raw)
+            np.testing.assert_allclose(frame.pose.ravel(), np.arange(72) * 0.01, rtol=1e-6)
+            np.testing.assert_array_equal(frame.transl, [1, 2, 3])
+            continue
+        with pytest.raises(DecodeError, match=r"are missing|all three or none|75 names but 76 positions"):
+            decode(raw)
+
+
+def big_endian_joint_state(entries: list[tuple[str, float]]) -> bytes:
+    out = bytearray(struct.pack(">iI", 0, 5) + struct.pack(">I", 1) + b"\0")
+    out += bytes(-len(out) % 4) + struct.pack(">I", len(entries))
+    for name, _ in entries:
+        out += bytes(-len(out) % 4) + struct.pack(">I", len(name) + 1) + name.encode() + b"\0"
+    out += bytes(-len(out) % 4) + struct.pack(">I", len(entries))
+    out += bytes(-len(out) % 8) + np.array([value for _, value in entries], ">f8").tobytes()
+    return bytes([0, 0, 0, 0]) + bytes(out) + struct.pack(">II", 0, 0)
+
+
 # ------------------------------------------------------------------------------------------------ PoseArray
 
 
