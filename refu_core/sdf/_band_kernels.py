@@ -201,8 +201,6 @@ def finish_kernel(
     beyond: wp.array(dtype=float),
     # outputs
     out_face: wp.array(dtype=int),
-    out_feature: wp.array(dtype=int),
-    out_barycentrics: wp.array(dtype=wp.vec3),
     out_distance: wp.array(dtype=float),
     out_gradient: wp.array(dtype=wp.vec3),
 ):
@@ -214,9 +212,7 @@ def finish_kernel(
         out_distance[q] = beyond[0]
         out_gradient[q] = wp.vec3(0.0, 1.0, 0.0)
         return
-    distance, gradient, w, feature = measured_to(points[q], f, body, faces, across, fan_start, fan_face)
-    out_feature[q] = feature
-    out_barycentrics[q] = w
+    distance, gradient = measured_to(points[q], f, body, faces, across, fan_start, fan_face)
     out_distance[q] = distance
     out_gradient[q] = gradient
 

@@ -118,13 +118,12 @@ class ExactSdf(MeshSdf):
         if not max_distance > 0:
             msg = f"max_distance must be positive, got {max_distance}"
             raise MeshError(msg)
-        found = self._search(points, max_distance)
-        sign = torch.where(found.distance < 0, -1.0, 1.0)
-        return ClosestPoints(found.face, found.barycentrics, found.distance.abs(), sign)
-
-    def _search(self, points: Tensor, max_distance: float) -> Found:
         self._require_update()
-        return self._launch(self._checked(points), min(max_distance, _UNLIMITED))
+        where = self._checked(points)
+        found = self._launch(where, min(max_distance, _UNLIMITED))
+        _, barycentrics, _ = self._features(where, found.face)
+        sign = torch.where(found.distance < 0, -1.0, 1.0)
+        return ClosestPoints(found.face, barycentrics, found.distance.abs(), sign)
 
     def _find(self, points: Tensor, near: Tensor | None) -> Found:
         if self.device.type == "cpu" and len(points) <= _FEW:

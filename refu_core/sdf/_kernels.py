@@ -183,14 +183,11 @@ def measured_to(
     fan_start: wp.array(dtype=int),
     fan_face: wp.array(dtype=int),
 ):
-    """Signed distance at p and its unit gradient, if `face` is the closest; p's place on it, and the feature there."""
+    """Signed distance at p and its unit gradient, if `face` is the closest."""
     w, feature = closest_on_triangle(p, points[faces[face, 0]], points[faces[face, 1]], points[faces[face, 2]])
     offset = offset_from(p, face, w, points, faces)
     normal = face_normal(face, points, faces)
-    distance, gradient = distance_and_gradient(
-        offset, face, feature, normal, points, faces, across, fan_start, fan_face
-    )
-    return distance, gradient, w, feature
+    return distance_and_gradient(offset, face, feature, normal, points, faces, across, fan_start, fan_face)
 
 
 @wp.func
@@ -214,8 +211,6 @@ def closest_kernel(
     by_winding: bool,
     # outputs
     out_face: wp.array(dtype=int),
-    out_feature: wp.array(dtype=int),
-    out_barycentrics: wp.array(dtype=wp.vec3),
     out_distance: wp.array(dtype=float),
     out_gradient: wp.array(dtype=wp.vec3),
 ):
@@ -239,38 +234,46 @@ def closest_kernel(
         hit = wp.mesh_query_point_no_sign(mesh, p, limit)
     if not hit.result:
         out_face[i] = -1
-        out_feature[i] = FACE
-        out_barycentrics[i] = wp.vec3(1.0, 0.0, 0.0)
         out_distance[i] = wp.inf
         out_gradient[i] = wp.vec3(0.0, 1.0, 0.0)
         return
 
     face = hit.face
-    distance, gradient, w, feature = measured_to(p, face, points, faces, across, fan_start, fan_face)
+    distance, gradient = measured_to(p, face, points, faces, across, fan_start, fan_face)
     if by_winding and hit.sign * distance < 0.0:
         distance = -distance
         if wp.abs(distance) > ON_SURFACE:  # nearer, the two signs may differ by rounding alone
             gradient = -gradient
 
     out_face[i] = face
-    out_feature[i] = feature
-    out_barycentrics[i] = w
     out_distance[i] = distance
     out_gradient[i] = gradient
 
 
 @wp.kernel(enable_backward=False)
-def normal_kernel(
+def feature_kernel(
     points: wp.array(dtype=wp.vec3),
     faces: wp.array2d(dtype=int),
     across: wp.array2d(dtype=int),
     fan_start: wp.array(dtype=int),
     fan_face: wp.array(dtype=int),
-    face: wp.array(dtype=int),
-    feature: wp.array(dtype=int),
+    queries: wp.array(dtype=wp.vec3),
+    closest: wp.array(dtype=int),
     # outputs
-    normal: wp.array(dtype=wp.vec3),
+    out_feature: wp.array(dtype=int),
+    out_barycentrics: wp.array(dtype=wp.vec3),
+    out_normal: wp.array(dtype=wp.vec3),
 ):
-    """The pseudo-normal of each feature."""
+    """The feature of the closest face that is closest to each query, the place there, and the pseudo-normal."""
     i = wp.tid()
-    normal[i] = pseudo_normal(face[i], feature[i], points, faces, across, fan_start, fan_face)
+    face = closest[i]
+    w = wp.vec3(1.0, 0.0, 0.0)
+    feature = int(FACE)
+    normal = wp.vec3(0.0, 1.0, 0.0)
+    if face >= 0:
+        a = points[faces[face, 0]]
+        w, feature = closest_on_triangle(queries[i], a, points[faces[face, 1]], points[faces[face, 2]])
+        normal = pseudo_normal(face, feature, points, faces, across, fan_start, fan_face)
+    out_feature[i] = feature
+    out_barycentrics[i] = w
+    out_normal[i] = normal

@@ -14,7 +14,7 @@ from torch import Tensor
 from refu_core._warp import as_warp, torch_stream
 from refu_core.errors import MeshError
 from refu_core.sdf._analytic import Feature, signed_distance
-from refu_core.sdf._kernels import normal_kernel
+from refu_core.sdf._kernels import feature_kernel
 from refu_core.sdf._protocol import SdfSample
 from refu_core.sdf._skin import Skin
 from refu_core.sdf._topology import Topology
@@ -25,10 +25,6 @@ class Found(NamedTuple):
 
     face: Tensor
     """Closest face, int32, shape (N,); -1 for none."""
-    feature: Tensor
-    """Its closest part, as `Feature.kind` numbers them, int32, shape (N,)."""
-    barycentrics: Tensor
-    """Weights of the face's vertices at the closest point, shape (N, 3)."""
     distance: Tensor
     """Signed distance [m], shape (N,); infinite for no face."""
     gradient: Tensor
@@ -37,10 +33,8 @@ class Found(NamedTuple):
     @staticmethod
     def empty(n: int, device: torch.device) -> Found:
         """Room for n points."""
-        ints = torch.empty(2, n, dtype=torch.int32, device=device)
-        vectors = torch.empty(2, n, 3, device=device)
-        distance = torch.empty(n, device=device)
-        return Found(ints[0], ints[1], vectors[0], distance, vectors[1])
+        face = torch.empty(n, dtype=torch.int32, device=device)
+        return Found(face, torch.empty(n, device=device), torch.empty(n, 3, device=device))
 
     def sample(self) -> SdfSample:
         """Distances, gradients and faces, copied."""
@@ -48,7 +42,7 @@ class Found(NamedTuple):
 
     def as_warp(self) -> list[Any]:
         """The fields as a kernel's outputs."""
-        kinds = (wp.int32, wp.int32, wp.vec3, wp.float32, wp.vec3)
+        kinds = (wp.int32, wp.float32, wp.vec3)
         return [as_warp(tensor, kind) for tensor, kind in zip(self, kinds, strict=True)]
 
 
@@ -156,28 +150,30 @@ class MeshSdf(ABC):
         if not tracked and points.dtype == torch.float32:
             return found.sample()
         corners = self._vertices.to(points)[self.faces.long()[found.face.long()]]
-        feature = Feature(
-            found.feature.clone(),
-            self._normals(found).to(points),
-            found.distance.sign().to(points),
-            found.barycentrics.to(points, copy=True),
-        )
+        kind, barycentrics, normal = self._features(where, found.face)
+        feature = Feature(kind, normal.to(points), found.distance.sign().to(points), barycentrics.to(points))
         return signed_distance(points, corners, feature)._replace(face=found.face.clone())
 
-    def _normals(self, found: Found) -> Tensor:
-        """Unit pseudo-normals at the closest points, shape (N, 3)."""
-        normals = torch.empty_like(found.barycentrics)
-        if len(normals):
-            kinds = [as_warp(found.face, wp.int32), as_warp(found.feature, wp.int32)]
+    def _features(self, points: Tensor, face: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Of each point's closest face: `Feature.kind`, int32 (N,), barycentrics and unit pseudo-normals, (N, 3)."""
+        kind = torch.empty_like(face)
+        barycentrics, normal = torch.empty(2, len(face), 3, device=self.device)
+        if len(face):
             with torch_stream(self.device):
                 wp.launch(
-                    normal_kernel,
-                    dim=len(normals),
-                    inputs=[self._points_wp, self._faces, *self._topology, *kinds],
-                    outputs=[as_warp(normals, wp.vec3)],
+                    feature_kernel,
+                    dim=len(face),
+                    inputs=[
+                        self._points_wp,
+                        self._faces,
+                        *self._topology,
+                        as_warp(points, wp.vec3),
+                        as_warp(face, wp.int32),
+                    ],
+                    outputs=[as_warp(kind, wp.int32), as_warp(barycentrics, wp.vec3), as_warp(normal, wp.vec3)],
                     device=str(self.device),
                 )
-        return normals
+        return kind, barycentrics, normal
 
     def skin(self) -> Any:
         """The posed body for kernels of one's own, as `refu_core.sdf.Skin`. Raises `MeshError` before `update`.

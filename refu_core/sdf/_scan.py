@@ -111,7 +111,7 @@ class Scan:
         self._spread = _record(
             spread_kernel,
             1,
-            [points, sizes, *none, answers[3]],
+            [points, sizes, *none, answers[1]],
             [answers[0], state, queue, asked],
         )
         self._ask = self._record_ask(points, asked, self._found)

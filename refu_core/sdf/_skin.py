@@ -25,7 +25,7 @@ class Skin:
     fan_start: wp.array(dtype=wp.int32)
     fan_face: wp.array(dtype=wp.int32)
     """Those of `Topology`."""
-    links: wp.array2d(dtype=wp.int32)
+    links: wp.array(dtype=wp.vec4i)
     table: wp.array2d(dtype=wp.int32)
     cell: wp.float32
     """What `walk_from` reads, where it is walked."""
@@ -56,7 +56,5 @@ def ask(skin: Skin, p: wp.vec3, near: int):
             skin.table,
             skin.cell,
         )
-    distance, gradient, _w, _feature = measured_to(
-        p, face, skin.points, skin.faces, skin.across, skin.fan_start, skin.fan_face
-    )
+    distance, gradient = measured_to(p, face, skin.points, skin.faces, skin.across, skin.fan_start, skin.fan_face)
     return distance, gradient, face

@@ -4,9 +4,9 @@
 # has to be called int or float there.)
 """Closest point by walking over a posed triangle mesh from faces that are near already: one code for CPU and CUDA.
 
-`links` has a row of eight a face, half a cache line: its vertices, the faces across its edges (0, 1), (1, 2), (2, 0),
-its part, and nothing. `table` has a row of sixteen a cell of space, one cache line: by part the guide closest to the
-cell's centre, and in the last column a bit for each part that has none.
+`links` has two rows a face, half a cache line together: its vertices and its part; the faces across its edges (0, 1),
+(1, 2), (2, 0), and nothing. `table` has a row of sixteen a cell of space, one cache line: by part the guide closest to
+the cell's centre, and in the last column a bit for each part that has none.
 """
 
 import warp as wp
@@ -28,6 +28,7 @@ EMPTY = wp.constant(0x7FFFFFFF)  # also: every part is absent
 
 # An entry is the squared distance of guide and cell's centre in these units a square metre, above the face's bits.
 FACE_BITS = wp.constant(20)
+FACE_MASK = wp.constant((1 << 20) - 1)
 UNITS = wp.constant(65536.0)
 MAX_FACES = 1 << 20
 # How far a guide is entered: up to this squared distance, in edges of a cell, between its middle and a cell's centre.
@@ -35,10 +36,16 @@ ENTER = wp.constant(2.6)
 
 # No walk takes more steps than this; one over half a body's height does.
 MAX_STEPS = wp.constant(64)
-# A guide is of use if it is no farther than the best distance so far and the way to the part's closest face [m].
-REACH = wp.constant(0.06)
 # Of other parts than a point's own one, nothing farther than this need be found [m].
 FAR = wp.constant(0.02)
+# A guide is of use if it is no farther than the best distance so far and the way to the part's closest face [m]; and if
+# its plane is no farther below than that distance and what the part rises above the plane on the way.
+REACH = wp.constant(0.08)
+ROOM = wp.constant(0.01)
+# Of no use is one that only carries on the point's own skin, bent away from the point as a body mostly is: one that
+# looks the same way, by this cosine, and doesn't rise by more than this above the skin below the point [m].
+ALIKE = wp.constant(0.9)
+RISE = wp.constant(0.005)
 # Whoever is deeper than this below a face [m] may be below others, too, as the centre of a sphere is below all of its:
 # the face's neighbours are looked at as well; unless it is by more than CLOSER [m] farther than the best so far.
 DEEP = wp.constant(0.008)
@@ -63,35 +70,43 @@ def look_up_kernel(
     places: wp.array(dtype=wp.vec3),
     low: wp.vec3,
     cell: float,
-    grid: wp.array3d(dtype=int),
+    shape: wp.vec3i,
+    grid: wp.array2d(dtype=int),
     # outputs
     near: wp.array(dtype=int),
 ):
-    """What a grid with the corner `low` says of places; at its border, where they are outside."""
+    """What a grid with the corner `low` says of places; at its border, where they are outside.
+
+    Its cells come in blocks of 4 x 4 x 4, a row each: what is near in space is mostly near in memory, too.
+    """
     i = wp.tid()
-    p = places[i]
-    x = wp.clamp((p[0] - low[0]) / cell, 0.0, float(grid.shape[0] - 1))
-    y = wp.clamp((p[1] - low[1]) / cell, 0.0, float(grid.shape[1] - 1))
-    z = wp.clamp((p[2] - low[2]) / cell, 0.0, float(grid.shape[2] - 1))
-    near[i] = grid[int(x), int(y), int(z)]
+    p = (places[i] - low) / cell
+    x = int(wp.clamp(p[0], 0.0, float(shape[0] - 1)))
+    y = int(wp.clamp(p[1], 0.0, float(shape[1] - 1)))
+    z = int(wp.clamp(p[2], 0.0, float(shape[2] - 1)))
+    block = ((x >> 2) * (shape[1] >> 2) + (y >> 2)) * (shape[2] >> 2) + (z >> 2)
+    near[i] = grid[block, ((x & 3) << 4) | ((y & 3) << 2) | (z & 3)]
 
 
 @wp.kernel(enable_backward=False)
 def enter_kernel(
     points: wp.array(dtype=wp.vec3),
-    links: wp.array2d(dtype=int),
-    guides: wp.array(dtype=int),
+    guides: wp.array(dtype=wp.vec4i),
     cell: float,
     depth: float,
     # outputs
     table: wp.array2d(dtype=int),
 ):
-    """Enters guide faces into the cell of a place below them and into its neighbours."""
-    face = guides[wp.tid()]
-    part = links[face, 6]
-    a = points[links[face, 0]]
-    b = points[links[face, 1]]
-    c = points[links[face, 2]]
+    """Enters guide faces into the cell of a place below them and into its neighbours.
+
+    A guide is its vertices, and its number with the part in the bits above.
+    """
+    guide = guides[wp.tid()]
+    part = guide[3] >> FACE_BITS
+    face = guide[3] & FACE_MASK
+    a = points[guide[0]]
+    b = points[guide[1]]
+    c = points[guide[2]]
     middle = (a + b + c) / 3.0
     home = cell_of(middle - depth * wp.normalize(wp.cross(b - a, c - a)), cell)
     most = ENTER * cell * cell
@@ -111,12 +126,12 @@ def enter_kernel(
 
 
 @wp.func
-def walk_under(p: wp.vec3, start: int, points: wp.array(dtype=wp.vec3), links: wp.array2d(dtype=int)):
+def walk_under(p: wp.vec3, start: int, points: wp.array(dtype=wp.vec3), links: wp.array(dtype=wp.vec4i)):
     """The face that p is above or below, each step over the edge that p is most beyond; or a face of an edge or vertex
     that p is above or below in their place.
 
     Also the feature of the face that is closest as far as this walk can tell, -1 where it can't, the barycentrics
-    there, and the face's normal, of twice its area.
+    on an edge, and the face's normal, of twice its area.
     """
     face = start
     last = int(-1)
@@ -124,9 +139,11 @@ def walk_under(p: wp.vec3, start: int, points: wp.array(dtype=wp.vec3), links: w
     w = wp.vec3()
     normal = wp.vec3()
     for _step in range(MAX_STEPS):
-        a = points[links[face, 0]]
-        ab = points[links[face, 1]] - a
-        ac = points[links[face, 2]] - a
+        corners = links[2 * face]
+        beside = links[2 * face + 1]
+        a = points[corners[0]]
+        ab = points[corners[1]] - a
+        ac = points[corners[2]] - a
         ap = p - a
         normal = wp.cross(ab, ac)
         around = wp.cross(ap, normal)
@@ -134,13 +151,16 @@ def walk_under(p: wp.vec3, start: int, points: wp.array(dtype=wp.vec3), links: w
         weight_b = -wp.dot(around, ac)
         weight_c = wp.dot(around, ab)
         weight_a = area - weight_b - weight_c
-        lowest = wp.min(weight_a, wp.min(weight_b, weight_c))
+        # Selections, which a processor needn't guess as it does branches; and wp.min looks for NaN.
+        lowest = wp.where(weight_b < weight_a, weight_b, weight_a)
+        edge = wp.where(weight_b < weight_a, 2, 1)
+        ahead = wp.where(weight_b < weight_a, beside[2], beside[1])
+        edge = wp.where(weight_c < lowest, 0, edge)
+        ahead = wp.where(weight_c < lowest, beside[0], ahead)
+        lowest = wp.where(weight_c < lowest, weight_c, lowest)
         if lowest >= 0.0 and area > 0.0:
             feature = FACE
-            w = wp.vec3(weight_a, weight_b, weight_c) / area
             break
-        edge = wp.where(lowest == weight_a, 1, wp.where(lowest == weight_b, 2, 0))
-        ahead = links[face, 3 + edge]
         if ahead == last:
             # Beyond the edge as seen from either face: closest to it, or else to something at one of its ends.
             if edge == 0:
@@ -211,6 +231,26 @@ def descend(
 
 
 @wp.func
+def is_of_use(
+    guide: int,
+    p: wp.vec3,
+    distance: float,
+    outward: wp.vec3,
+    points: wp.array(dtype=wp.vec3),
+    links: wp.array(dtype=wp.vec4i),
+):
+    """Whether a walk from another part's guide may end closer to p than p's own skin, whose normal is `outward`, is."""
+    corners = links[2 * guide]
+    a = points[corners[0]]
+    if wp.length(a - p) >= wp.min(distance, FAR) + REACH:
+        return False
+    normal = wp.normalize(wp.cross(points[corners[1]] - a, points[corners[2]] - a))
+    rise = wp.dot(a - p, outward) + distance
+    goes_on = rise < RISE and wp.dot(normal, outward) > ALIKE
+    return wp.dot(p - a, normal) < distance + ROOM and not goes_on
+
+
+@wp.func
 def walk_from(
     p: wp.vec3,
     near: int,
@@ -219,13 +259,14 @@ def walk_from(
     across: wp.array2d(dtype=int),
     fan_start: wp.array(dtype=int),
     fan_face: wp.array(dtype=int),
-    links: wp.array2d(dtype=int),
+    links: wp.array(dtype=wp.vec4i),
     table: wp.array2d(dtype=int),
     cell: float,
 ):
     """The closest of the faces that walks from `near` and from other parts' guides end at.
 
-    Also the closest feature on it, the barycentrics there, and the face's normal, of any length.
+    Also the closest feature on it, the barycentrics there unless it is the interior, and the face's normal, of any
+    length.
     """
     home = cell_of(p, cell)
     row = row_of(home[0], home[1], home[2])
@@ -235,27 +276,32 @@ def walk_from(
     w = wp.vec3()
     squared = float(1.0e12)
     distance = float(1.0e6)
-    own = int(-1)
+    others = int(0)
     above = wp.vec3()
+    outward = wp.vec3()
     # -1 is the walk from `near`. One loop with one call of each function: so a compiler puts them in place.
     for part in range(-1, MAX_PARTS):
         start = int(near)
         walks = bool(part < 0)
-        if part >= 0 and (absent >> part) & 1 == 0 and part != own:
-            start = table[row, part] & ((1 << FACE_BITS) - 1)
-            walks = wp.length(points[links[start, 0]] - p) < wp.min(distance, FAR) + REACH
+        if part >= 0:
+            if others >> part == 0:
+                break
+            if (others >> part) & 1 == 1:
+                start = table[row, part] & FACE_MASK
+                walks = is_of_use(start, p, distance, outward, points, links)
         if walks:
             face_, feature_, w_, normal = walk_under(p, start, points, links)
             if face_ != face:
-                depth = wp.dot(points[links[face_, 0]] - p, normal) / wp.length(normal)
+                depth = wp.dot(points[links[2 * face_][0]] - p, normal) / wp.length(normal)
                 squared_ = depth * depth
                 if feature_ >= EDGE:
                     offset = offset_from(p, face_, w_, points, faces)
                     squared_ = wp.dot(offset, offset)
                 if feature_ < 0 or (depth >= DEEP and depth <= distance + CLOSER):
                     face_, w_, feature_, squared_ = descend(p, face_, points, faces, across, fan_start, fan_face)
-                    a = points[links[face_, 0]]
-                    normal = wp.cross(points[links[face_, 1]] - a, points[links[face_, 2]] - a)
+                    corners = links[2 * face_]
+                    a = points[corners[0]]
+                    normal = wp.cross(points[corners[1]] - a, points[corners[2]] - a)
                 if squared_ < squared:
                     face = face_
                     w = w_
@@ -264,9 +310,8 @@ def walk_from(
                     distance = wp.sqrt(squared)
                     above = normal
         if part < 0:
-            own = links[face, 6]
-            if (absent | (1 << own)) == EMPTY:
-                break
+            outward = wp.normalize(above)
+            others = (EMPTY ^ absent) & ~(1 << links[2 * face][3])
     return face, feature, w, above
 
 
@@ -277,7 +322,7 @@ def walk_kernel(
     across: wp.array2d(dtype=int),
     fan_start: wp.array(dtype=int),
     fan_face: wp.array(dtype=int),
-    links: wp.array2d(dtype=int),
+    links: wp.array(dtype=wp.vec4i),
     table: wp.array2d(dtype=int),
     cell: float,
     queries: wp.array(dtype=wp.vec3),
@@ -285,8 +330,6 @@ def walk_kernel(
     order: wp.array(dtype=int),
     # outputs
     out_face: wp.array(dtype=int),
-    out_feature: wp.array(dtype=int),
-    out_barycentrics: wp.array(dtype=wp.vec3),
     out_distance: wp.array(dtype=float),
     out_gradient: wp.array(dtype=wp.vec3),
 ):
@@ -296,14 +339,12 @@ def walk_kernel(
         i = order[i]
     p = queries[i]
     face, feature, w, above = walk_from(p, near[i], points, faces, across, fan_start, fan_face, links, table, cell)
-    offset = p - points[links[face, 0]]
+    offset = p - points[links[2 * face][0]]
     if feature != FACE:
         offset = offset_from(p, face, w, points, faces)
     distance, gradient = distance_and_gradient(
         offset, face, feature, wp.normalize(above), points, faces, across, fan_start, fan_face
     )
     out_face[i] = face
-    out_feature[i] = feature
-    out_barycentrics[i] = w
     out_distance[i] = distance
     out_gradient[i] = gradient

@@ -194,13 +194,17 @@ def test_gradcheck_of_distance_and_gradient(body: SmplBody, approx: ApproxSdf) -
     skin, worn, unposed = dressed(body, load_garment("tshirt-male"), pose_of("a-pose"))
     near = RestFaces(body)(unposed)
     approx.update(skin)
-    found = approx._find(worn, near)
+    found = approx.query(worn, near=near)
     # A few of each kind of closest feature: faces, edges, vertices; none where a millimetre away it is another one.
-    nudged = [approx._find(worn + step * axis, near) for axis in torch.eye(3) for step in (-1e-3, 1e-3)]
-    steady = torch.stack([(n.face == found.face) & (n.feature == found.feature) for n in nudged]).all(0)
-    kinds = [found.feature == 0, (found.feature >= 1) & (found.feature < 4), found.feature >= 4]
+    aside = [worn + step * axis for axis in torch.eye(3) for step in (-1e-3, 1e-3)]
+    nudged = [(points, approx.query(points, near=near).face) for points in aside]
+    feature, *_ = approx._features(worn, found.face)
+    steady = torch.stack(
+        [(face == found.face) & (approx._features(points, face)[0] == feature) for points, face in nudged]
+    ).all(0)
+    kinds = [feature == 0, (feature >= 1) & (feature < 4), feature >= 4]
     rows = torch.cat([torch.nonzero(steady & kind & (found.distance.abs() > 2e-3))[:6, 0] for kind in kinds])
-    assert {min(int(kind), 4) for kind in found.feature[rows]} >= {0, 4}
+    assert {min(int(kind), 4) for kind in feature[rows]} >= {0, 4}
 
     def f(points: Tensor, scale: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
         approx.update(skin.double() * scale + shift)
