@@ -58,7 +58,7 @@ class ApproxSdf(MeshSdf):
 
     So the distance is always that to a face of the posed body: exact, or too large where none of the walks ended at the
     closest face. Sign, gradient and derivatives are those of `ExactSdf`. Within 2 cm of the skin the mean error is some
-    hundredths of a millimetre; benchmarks/sdf.py measures it, and the cost: an eighth of the exact query's.
+    hundredths of a millimetre; benchmarks/sdf.py measures it, and the cost: less than a fifth of the exact query's.
 
     Needs nothing but the posed vertices, so it works for every β, γ and pose, and builds nothing for them.
     """
