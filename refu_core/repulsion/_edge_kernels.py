@@ -2,11 +2,11 @@
 # ruff: noqa: UP018
 # (Warp reads a kernel's annotations as array types of its own; a type checker can't. A variable that changes in a loop
 # has to be called int or float there.)
-"""Raising edges that run too low between their ends: all rounds in one launch on a CPU, three a round on a GPU."""
+"""Raising edges that run too low between their ends: all rounds in one launch (`_round_kernels` has a GPU's)."""
 
 import warp as wp
 
-from refu_core.repulsion._sheet import BESIDE, CUTTING, NEAR, RAISED, Cloth, Rules, Sheet, bounded, keep, listed
+from refu_core.repulsion._sheet import BESIDE, CUTTING, NEAR, RAISED, Cloth, Rules, Sheet, bounded, keep
 from refu_core.sdf import Skin, ask
 
 
@@ -22,7 +22,7 @@ def look_between(edge: int, sheet: Sheet, cloth: Cloth, skin: Skin, rules: Rules
 
 
 @wp.kernel(enable_backward=False)
-def suspect_kernel(sheet: Sheet, cloth: Cloth, rules: Rules, suspects: wp.array(dtype=int)):
+def suspect_kernel(sheet: Sheet, cloth: Cloth, rules: Rules):
     """Lists the edges whose middle may be closer to the skin than half the margin (`_raise_edges`)."""
     if sheet.counts[NEAR] == 0:
         return  # nothing is moved then
@@ -38,7 +38,7 @@ def suspect_kernel(sheet: Sheet, cloth: Cloth, rules: Rules, suspects: wp.array(
     if sheet.face[a] >= 0 and sheet.face[b] >= 0:
         bulge = rules.bulge * length * wp.length(sheet.gradient[a] - sheet.gradient[b])
     if 0.5 * (first + second) < 0.5 * rules.margin + bulge:
-        suspects[wp.atomic_add(sheet.counts, CUTTING, 1)] = edge
+        sheet.suspects[wp.atomic_add(sheet.counts, CUTTING, 1)] = edge
 
 
 @wp.func
@@ -49,152 +49,62 @@ def measure(
     cloth: Cloth,
     skin: Skin,
     rules: Rules,
-    moved: wp.array(dtype=int),
-    # outputs
+    # output
     low: wp.array(dtype=int),
-    deficit: wp.array(dtype=float),
-    rise: wp.array(dtype=wp.vec3),
-    largest: wp.array(dtype=float),
 ):
     """Whether a suspected edge is too low, and by how much; after the first of the `rounds`, if it was moved."""
     a = cloth.edges[edge, 0]
     b = cloth.edges[edge, 1]
-    if rounds > 0 and moved[a] == 0 and moved[b] == 0:
+    if rounds > 0 and sheet.moved[a] == 0 and sheet.moved[b] == 0:
         return  # between two limbs, and stays there
     lack, up = look_between(edge, sheet, cloth, skin, rules)
     if lack > 0.0:
         k = wp.atomic_add(sheet.counts, CUTTING + 1 + rounds, 1)
         low[k] = edge
-        deficit[k] = lack
-        rise[k] = lack * up
-        wp.atomic_max(largest, a, lack)
-        wp.atomic_max(largest, b, lack)
+        sheet.deficit[k] = lack
+        sheet.rise[k] = lack * up
+        wp.atomic_max(sheet.largest, a, lack)
+        wp.atomic_max(sheet.largest, b, lack)
 
 
 @wp.func
-def choose(
-    k: int,
-    sheet: Sheet,
-    cloth: Cloth,
-    low: wp.array(dtype=int),
-    deficit: wp.array(dtype=float),
-    rise: wp.array(dtype=wp.vec3),
-    largest: wp.array(dtype=float),
-    # outputs
-    field: wp.array(dtype=wp.vec3),
-    raised: wp.array(dtype=int),
-):
+def choose(k: int, sheet: Sheet, cloth: Cloth, low: wp.array(dtype=int)):
     """A vertex of several low edges follows the lowest of them."""
     for end in range(2):
         i = cloth.edges[low[k], end]
-        if deficit[k] == largest[i]:
-            field[i] = rise[k]
+        if sheet.deficit[k] == sheet.largest[i]:
+            sheet.field[i] = sheet.rise[k]
             if wp.atomic_max(sheet.mark, i, BESIDE) == 0:
-                raised[wp.atomic_add(sheet.counts, RAISED, 1)] = i
+                sheet.reached[wp.atomic_add(sheet.counts, RAISED, 1)] = i
 
 
 @wp.func
-def lift(
-    i: int,
-    sheet: Sheet,
-    skin: Skin,
-    rules: Rules,
-    # outputs
-    field: wp.array(dtype=wp.vec3),
-    largest: wp.array(dtype=float),
-    moved: wp.array(dtype=int),
-):
+def lift(i: int, sheet: Sheet, skin: Skin, rules: Rules):
     """Raises an end of a low edge, unless it came nearer to the skin by it."""
-    here = bounded(sheet.place[i] + field[i], sheet.origin[i], rules.max_displacement)
-    field[i] = wp.vec3()
-    largest[i] = 0.0
+    here = bounded(sheet.place[i] + sheet.field[i], sheet.origin[i], rules.max_displacement)
+    sheet.field[i] = wp.vec3()
+    sheet.largest[i] = 0.0
     sheet.mark[i] = 0
-    moved[i] = 0
+    sheet.moved[i] = 0
     distance, gradient, face = ask(skin, here, sheet.face[i])
     if distance >= wp.min(sheet.distance[i], rules.margin - rules.tolerance):
         keep(i, here, distance, gradient, face, sheet)
-        moved[i] = 1
+        sheet.moved[i] = 1
 
 
 @wp.kernel(enable_backward=False)
-def measure_kernel(
-    sheet: Sheet,
-    cloth: Cloth,
-    skin: Skin,
-    rules: Rules,
-    rounds: int,
-    suspects: wp.array(dtype=int),
-    moved: wp.array(dtype=int),
-    # outputs
-    low: wp.array(dtype=int),
-    deficit: wp.array(dtype=float),
-    rise: wp.array(dtype=wp.vec3),
-    largest: wp.array(dtype=float),
-):
-    edge = listed(wp.tid(), CUTTING + rounds, suspects, sheet)
-    if edge >= 0:
-        measure(edge, rounds, sheet, cloth, skin, rules, moved, low, deficit, rise, largest)
-
-
-@wp.kernel(enable_backward=False)
-def choose_kernel(
-    sheet: Sheet,
-    cloth: Cloth,
-    rounds: int,
-    low: wp.array(dtype=int),
-    deficit: wp.array(dtype=float),
-    rise: wp.array(dtype=wp.vec3),
-    largest: wp.array(dtype=float),
-    # outputs
-    field: wp.array(dtype=wp.vec3),
-    raised: wp.array(dtype=int),
-):
-    k = wp.tid()
-    if listed(k, CUTTING + 1 + rounds, low, sheet) >= 0:
-        choose(k, sheet, cloth, low, deficit, rise, largest, field, raised)
-
-
-@wp.kernel(enable_backward=False)
-def lift_kernel(
-    sheet: Sheet,
-    skin: Skin,
-    rules: Rules,
-    raised: wp.array(dtype=int),
-    # outputs
-    field: wp.array(dtype=wp.vec3),
-    largest: wp.array(dtype=float),
-    moved: wp.array(dtype=int),
-):
-    i = listed(wp.tid(), RAISED, raised, sheet)
-    if i >= 0:
-        lift(i, sheet, skin, rules, field, largest, moved)
-
-
-@wp.kernel(enable_backward=False)
-def raise_edges_kernel(
-    sheet: Sheet,
-    cloth: Cloth,
-    skin: Skin,
-    rules: Rules,
-    low: wp.array(dtype=int),
-    moved: wp.array(dtype=int),
-    deficit: wp.array(dtype=float),
-    rise: wp.array(dtype=wp.vec3),
-    largest: wp.array(dtype=float),
-    field: wp.array(dtype=wp.vec3),
-    raised: wp.array(dtype=int),
-):
-    """All rounds by one thread; those that stay low take the places of those before them in `low`, the suspects."""
+def raise_edges_kernel(sheet: Sheet, cloth: Cloth, skin: Skin, rules: Rules):
+    """All rounds by one thread; those that stay low take the places of those before them in the list of suspects."""
     n = int(sheet.counts[CUTTING])
     for rounds in range(rules.max_pushes):
         for k in range(n):
-            measure(low[k], rounds, sheet, cloth, skin, rules, moved, low, deficit, rise, largest)
+            measure(sheet.suspects[k], rounds, sheet, cloth, skin, rules, sheet.suspects)
         n = int(sheet.counts[CUTTING + 1 + rounds])
         if n == 0:
             break
         sheet.counts[RAISED] = 0
         for k in range(n):
-            choose(k, sheet, cloth, low, deficit, rise, largest, field, raised)
+            choose(k, sheet, cloth, sheet.suspects)
         ends = int(sheet.counts[RAISED])
         for k in range(ends):
-            lift(raised[k], sheet, skin, rules, field, largest, moved)
+            lift(sheet.reached[k], sheet, skin, rules)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from refu_core._warp import as_warp, torch_stream
-from refu_core.repulsion import _edge_kernels, _resolver_kernels, _sheet, _spread_kernels
+from refu_core.repulsion import _edge_kernels, _resolver_kernels, _round_kernels, _sheet, _spread_kernels
 from refu_core.repulsion._blend import BLEND_REACH, BLEND_STEPS
 from refu_core.repulsion._limbs import INWARD, SIDEWAYS, Limbs
 from refu_core.repulsion._mend import DEEP, DETOUR, FARTHEST, LOOKS, ROUNDS, STEP_ON, STEPS, TOLERANCE
@@ -225,9 +225,6 @@ class Resolver:
     def _command(self, name: str, kernel: Any, inputs: list[Any]) -> None:
         self._commands[name] = wp.launch(kernel, dim=1, inputs=inputs, device=str(self.device), record_cmd=True)
 
-    def _list(self, name: str) -> Any:
-        return as_warp(self._ints[name], wp.int32)
-
     def _record(self, sdf: ExactSdf | BandSdf | ApproxSdf, margin: float) -> None:
         """Records the launches of a frame, unless they are the last frame's."""
         skin = sdf.skin()
@@ -236,54 +233,47 @@ class Resolver:
             return
         self._recorded_for = key
         sheet, cloth, rules = self._sheet, self._cloth, _rules(margin)
-        near, pushed, reached, moved = (self._list(name) for name in ("near", "pushed", "reached", "moved"))
-        field, smoother = (as_warp(self._vectors[name], wp.vec3) for name in ("field", "smoother"))
-        alpha, largest = (as_warp(self._floats[name], wp.float32) for name in ("alpha", "largest"))
-        suspects, low, lower = (as_warp(row, wp.int32) for row in self._by_edge)
-        lack = [as_warp(self._deficit, wp.float32), as_warp(self._rise, wp.vec3), largest]
         self._command("begin", _resolver_kernels.begin_kernel, [sheet])
-        self._command("compare", _resolver_kernels.compare_kernel, [sheet, cloth, rules, reached])
-        self._command("look again", _resolver_kernels.look_again_kernel, [sheet, cloth, skin, rules, reached])
-        self._command("cut off", _resolver_kernels.cut_off_kernel, [sheet, cloth, rules, reached])
-        self._command("adopt", _resolver_kernels.adopt_kernel, [sheet, cloth, reached])
-        self._command("list", _resolver_kernels.list_kernel, [sheet, rules, near])
-        self._command("look", _resolver_kernels.look_kernel, [sheet, cloth, rules, near])
-        self._command("retreat", _resolver_kernels.retreat_kernel, [sheet, cloth, skin, rules, near])
-        self._command("fill", _resolver_kernels.fill_kernel, [sheet, cloth, skin, rules, near])
-        self._command("aim", _resolver_kernels.aim_kernel, [sheet, cloth, skin, rules, near, pushed, reached, field])
-        self._command("scale", _resolver_kernels.scale_kernel, [sheet, rules, pushed, alpha, reached, field])
-        self._command("settle", _resolver_kernels.settle_kernel, [sheet, skin, rules, reached, field, smoother])
-        self._command("suspect", _edge_kernels.suspect_kernel, [sheet, cloth, rules, suspects])
-        self._command("tally", _resolver_kernels.tally_kernel, [sheet, near])
+        self._command("compare", _resolver_kernels.compare_kernel, [sheet, cloth, rules])
+        self._command("look again", _resolver_kernels.look_again_kernel, [sheet, cloth, skin, rules])
+        self._command("cut off", _resolver_kernels.cut_off_kernel, [sheet, cloth, rules])
+        self._command("adopt", _resolver_kernels.adopt_kernel, [sheet, cloth])
+        self._command("list", _resolver_kernels.list_kernel, [sheet, rules])
+        self._command("look", _resolver_kernels.look_kernel, [sheet, cloth, rules])
+        self._command("retreat", _resolver_kernels.retreat_kernel, [sheet, cloth, skin, rules])
+        self._command("fill", _resolver_kernels.fill_kernel, [sheet, cloth, skin, rules])
+        self._command("aim", _resolver_kernels.aim_kernel, [sheet, cloth, skin, rules])
+        self._command("scale", _resolver_kernels.scale_kernel, [sheet, rules])
+        self._command("settle", _resolver_kernels.settle_kernel, [sheet, skin, rules])
+        self._command("suspect", _edge_kernels.suspect_kernel, [sheet, cloth, rules])
+        self._command("tally", _resolver_kernels.tally_kernel, [sheet])
         long_step, short_step = BLEND_STEPS[:2]
         if self._is_serial:
-            inputs = [sheet, cloth, BLEND_REACH, len(BLEND_STEPS) // 2, long_step, short_step, reached, field, smoother]
+            inputs = [sheet, cloth, BLEND_REACH, len(BLEND_STEPS) // 2, long_step, short_step]
             self._command("blend", _spread_kernels.blend_kernel, inputs)
-            inputs = [sheet, cloth, skin, rules, suspects, moved, *lack, field, reached]
-            self._command("raise edges", _edge_kernels.raise_edges_kernel, inputs)
+            self._command("raise edges", _edge_kernels.raise_edges_kernel, [sheet, cloth, skin, rules])
             return
-        self._command("close", _sheet.close_kernel, [sheet, 0])
-        self._command("reach", _spread_kernels.reach_kernel, [sheet, cloth, reached])
+        suspects, low, lower = (as_warp(row, wp.int32) for row in self._by_edge)
+        self._command("close", _round_kernels.close_kernel, [sheet, 0])
+        self._command("reach", _round_kernels.reach_kernel, [sheet, cloth])
         for name, step, fields in (
-            ("spread0", long_step, (field, smoother)),
-            ("spread1", short_step, (smoother, field)),
+            ("spread0", long_step, (sheet.field, sheet.smoother)),
+            ("spread1", short_step, (sheet.smoother, sheet.field)),
         ):
-            self._command(name, _spread_kernels.spread_kernel, [sheet, cloth, step, reached, *fields])
+            self._command(name, _round_kernels.spread_kernel, [sheet, cloth, step, *fields])
         for name, source, target in (("measure", suspects, low), ("again1", low, lower), ("again0", lower, low)):
-            inputs = [sheet, cloth, skin, rules, 0, source, moved, target, *lack]
-            self._command(name, _edge_kernels.measure_kernel, inputs)
+            self._command(name, _round_kernels.measure_kernel, [sheet, cloth, skin, rules, 0, source, target])
         for name, source in (("choose0", low), ("choose1", lower)):
-            self._command(name, _edge_kernels.choose_kernel, [sheet, cloth, 0, source, *lack, field, reached])
-        self._command("lift", _edge_kernels.lift_kernel, [sheet, skin, rules, reached, field, largest, moved])
+            self._command(name, _round_kernels.choose_kernel, [sheet, cloth, 0, source])
+        self._command("lift", _round_kernels.lift_kernel, [sheet, skin, rules])
 
     def _bind_sheet(self) -> Any:
         sheet = _sheet.Sheet()
-        for name in _VECTORS[: -len(("field", "smoother"))]:
-            setattr(sheet, name, as_warp(self._vectors[name], wp.vec3))
-        for name in ("first", "distance", "along", "way", "depth", "goal"):
-            setattr(sheet, name, as_warp(self._floats[name], wp.float32))
-        for name in ("first_face", "face", "guess", "role", "mark"):
-            setattr(sheet, name, self._list(name))
+        for tensors, kind in ((self._vectors, wp.vec3), (self._floats, wp.float32), (self._ints, wp.int32)):
+            for name, tensor in tensors.items():
+                setattr(sheet, name, as_warp(tensor, kind))
+        sheet.suspects = as_warp(self._by_edge[0], wp.int32)
+        sheet.deficit, sheet.rise = as_warp(self._deficit, wp.float32), as_warp(self._rise, wp.vec3)
         sheet.counts = as_warp(self._counts, wp.int32)
         sheet.touched = as_warp(self._counts[_sheet.N_COUNTS :], wp.int32)
         sheet.inward = as_warp(self._counts[_sheet.N_COUNTS + _N_LIMBS :], wp.int32)

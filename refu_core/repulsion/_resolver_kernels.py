@@ -76,9 +76,9 @@ def contradict(i: int, j: int, sheet: Sheet, rules: Rules):
 
 
 @wp.func
-def suspect(i: int, sheet: Sheet, suspects: wp.array(dtype=int)):
+def suspect(i: int, sheet: Sheet):
     if wp.atomic_max(sheet.mark, i, BESIDE) == 0:
-        suspects[wp.atomic_add(sheet.counts, SUSPECTS, 1)] = i
+        sheet.reached[wp.atomic_add(sheet.counts, SUSPECTS, 1)] = i
 
 
 @wp.kernel(enable_backward=False)
@@ -92,7 +92,7 @@ def begin_kernel(sheet: Sheet):
 
 
 @wp.kernel(enable_backward=False)
-def compare_kernel(sheet: Sheet, cloth: Cloth, rules: Rules, suspects: wp.array(dtype=int)):
+def compare_kernel(sheet: Sheet, cloth: Cloth, rules: Rules):
     """Lists the ends of edges at the skin along which distances contradict each other."""
     i = wp.tid()
     if sheet.distance[i] >= rules.margin:
@@ -100,14 +100,14 @@ def compare_kernel(sheet: Sheet, cloth: Cloth, rules: Rules, suspects: wp.array(
     for k in range(cloth.ring_start[i], cloth.ring_start[i + 1]):
         j = cloth.ring[k]
         if contradict(i, j, sheet, rules):
-            suspect(i, sheet, suspects)
-            suspect(j, sheet, suspects)
+            suspect(i, sheet)
+            suspect(j, sheet)
 
 
 @wp.kernel(enable_backward=False)
-def look_again_kernel(sheet: Sheet, cloth: Cloth, skin: Skin, rules: Rules, suspects: wp.array(dtype=int)):
+def look_again_kernel(sheet: Sheet, cloth: Cloth, skin: Skin, rules: Rules):
     """`mend`'s first remedy: from the faces of neighbours that are nearer to theirs a nearer one may be found."""
-    i = listed(wp.tid(), SUSPECTS, suspects, sheet)
+    i = listed(wp.tid(), SUSPECTS, sheet.reached, sheet)
     if i < 0:
         return
     sheet.guess[i] = -1
@@ -124,9 +124,9 @@ def look_again_kernel(sheet: Sheet, cloth: Cloth, skin: Skin, rules: Rules, susp
 
 
 @wp.kernel(enable_backward=False)
-def cut_off_kernel(sheet: Sheet, cloth: Cloth, rules: Rules, suspects: wp.array(dtype=int)):
+def cut_off_kernel(sheet: Sheet, cloth: Cloth, rules: Rules):
     """`mend`'s second: what is said to be outside of flesh that a neighbour is in goes with the neighbour."""
-    i = listed(wp.tid(), SUSPECTS, suspects, sheet)
+    i = listed(wp.tid(), SUSPECTS, sheet.reached, sheet)
     if i < 0:
         return
     sheet.guess[i] = -1
@@ -150,9 +150,9 @@ def cut_off_kernel(sheet: Sheet, cloth: Cloth, rules: Rules, suspects: wp.array(
 
 
 @wp.kernel(enable_backward=False)
-def adopt_kernel(sheet: Sheet, cloth: Cloth, suspects: wp.array(dtype=int)):
+def adopt_kernel(sheet: Sheet, cloth: Cloth):
     """Takes over what was found, and suspects the neighbours of what changed."""
-    i = listed(wp.tid(), SUSPECTS, suspects, sheet)
+    i = listed(wp.tid(), SUSPECTS, sheet.reached, sheet)
     if i < 0:
         return
     if sheet.guess[i] < 0:
@@ -163,22 +163,22 @@ def adopt_kernel(sheet: Sheet, cloth: Cloth, suspects: wp.array(dtype=int)):
     sheet.first_face[i] = sheet.guess[i]
     keep(i, sheet.origin[i], sheet.depth[i], sheet.heading[i], sheet.guess[i], sheet)
     for k in range(cloth.ring_start[i], cloth.ring_start[i + 1]):
-        suspect(cloth.ring[k], sheet, suspects)
+        suspect(cloth.ring[k], sheet)
 
 
 @wp.kernel(enable_backward=False)
-def list_kernel(sheet: Sheet, rules: Rules, near: wp.array(dtype=int)):
+def list_kernel(sheet: Sheet, rules: Rules):
     """Lists who is nearer than the margin."""
     i = wp.tid()
     sheet.mark[i] = 0
     if sheet.distance[i] < rules.margin:
-        near[wp.atomic_add(sheet.counts, NEAR, 1)] = i
+        sheet.near[wp.atomic_add(sheet.counts, NEAR, 1)] = i
 
 
 @wp.kernel(enable_backward=False)
-def look_kernel(sheet: Sheet, cloth: Cloth, rules: Rules, near: wp.array(dtype=int)):
+def look_kernel(sheet: Sheet, cloth: Cloth, rules: Rules):
     """Which way the cloth faces where that matters, and who is pushed inwards by a limb it doesn't lie on."""
-    i = listed(wp.tid(), NEAR, near, sheet)
+    i = listed(wp.tid(), NEAR, sheet.near, sheet)
     if i < 0:
         return
     limb = cloth.limb[sheet.face[i]]
@@ -195,9 +195,9 @@ def look_kernel(sheet: Sheet, cloth: Cloth, rules: Rules, near: wp.array(dtype=i
 
 
 @wp.kernel(enable_backward=False)
-def retreat_kernel(sheet: Sheet, cloth: Cloth, skin: Skin, rules: Rules, near: wp.array(dtype=int)):
+def retreat_kernel(sheet: Sheet, cloth: Cloth, skin: Skin, rules: Rules):
     """What the gradient would take out on the far side of another limb goes back against its normal instead."""
-    i = listed(wp.tid(), NEAR, near, sheet)
+    i = listed(wp.tid(), NEAR, sheet.near, sheet)
     if i < 0:
         return
     limb = cloth.limb[sheet.face[i]]
@@ -224,9 +224,9 @@ def retreat_kernel(sheet: Sheet, cloth: Cloth, skin: Skin, rules: Rules, near: w
 
 
 @wp.kernel(enable_backward=False)
-def fill_kernel(sheet: Sheet, cloth: Cloth, skin: Skin, rules: Rules, near: wp.array(dtype=int)):
+def fill_kernel(sheet: Sheet, cloth: Cloth, skin: Skin, rules: Rules):
     """The few that found no room go where their neighbours went."""
-    i = listed(wp.tid(), NEAR, near, sheet)
+    i = listed(wp.tid(), NEAR, sheet.near, sheet)
     if i < 0:
         return
     if sheet.role[i] != MISSED:
@@ -259,14 +259,9 @@ def aim_kernel(
     cloth: Cloth,
     skin: Skin,
     rules: Rules,
-    near: wp.array(dtype=int),
-    # outputs
-    pushed: wp.array(dtype=int),
-    reached: wp.array(dtype=int),
-    field: wp.array(dtype=wp.vec3),
 ):
     """Which way each vertex goes: those that left a limb as far as they are; the others are listed, to be pushed."""
-    i = listed(wp.tid(), NEAR, near, sheet)
+    i = listed(wp.tid(), NEAR, sheet.near, sheet)
     if i < 0:
         return
     role = sheet.role[i]
@@ -280,9 +275,9 @@ def aim_kernel(
             return
         sheet.way[i] = way
         sheet.heading[i] = push / way
-        field[i] = push
+        sheet.field[i] = push
         sheet.mark[i] = SOURCE
-        reached[wp.atomic_add(sheet.counts, REACHED, 1)] = i
+        sheet.reached[wp.atomic_add(sheet.counts, REACHED, 1)] = i
         return
     depth = sheet.distance[i]
     heading = sheet.gradient[i]
@@ -308,33 +303,28 @@ def aim_kernel(
             heading = outward
     sheet.depth[i] = depth
     sheet.heading[i] = heading
-    pushed[wp.atomic_add(sheet.counts, PUSHED, 1)] = i
+    sheet.pushed[wp.atomic_add(sheet.counts, PUSHED, 1)] = i
 
 
 @wp.kernel(enable_backward=False)
 def scale_kernel(
     sheet: Sheet,
     rules: Rules,
-    pushed: wp.array(dtype=int),
-    alpha: wp.array(dtype=float),
-    # outputs
-    reached: wp.array(dtype=int),
-    field: wp.array(dtype=wp.vec3),
 ):
     """How far each pushed vertex goes, for predicted scales: at least until it is outside."""
     k = wp.tid()
-    i = listed(k, PUSHED, pushed, sheet)
+    i = listed(k, PUSHED, sheet.pushed, sheet)
     if i < 0:
         return
     deficit = rules.margin - sheet.depth[i]
     # Where α is below 1, the distance was predicted to exaggerate; its sign is trusted all the same.
-    scale = wp.max(alpha[k], (wp.min(rules.tolerance, rules.margin) - sheet.depth[i]) / deficit)
+    scale = wp.max(sheet.alpha[k], (wp.min(rules.tolerance, rules.margin) - sheet.depth[i]) / deficit)
     way = wp.min(scale * deficit, rules.max_displacement)
     sheet.goal[i] = wp.min(sheet.depth[i] + scale * deficit, rules.margin)
     sheet.way[i] = wp.min(way, deficit)
-    field[i] = way * sheet.heading[i]
+    sheet.field[i] = way * sheet.heading[i]
     sheet.mark[i] = SOURCE
-    reached[wp.atomic_add(sheet.counts, REACHED, 1)] = i
+    sheet.reached[wp.atomic_add(sheet.counts, REACHED, 1)] = i
 
 
 @wp.kernel(enable_backward=False)
@@ -342,19 +332,15 @@ def settle_kernel(
     sheet: Sheet,
     skin: Skin,
     rules: Rules,
-    reached: wp.array(dtype=int),
-    # outputs
-    field: wp.array(dtype=wp.vec3),
-    smoother: wp.array(dtype=wp.vec3),
 ):
     """Takes vertices along, and pushes on those that aren't clear yet. Leaves fields and marks empty."""
-    i = listed(wp.tid(), REACHED, reached, sheet)
+    i = listed(wp.tid(), REACHED, sheet.reached, sheet)
     if i < 0:
         return
-    shift = field[i]
+    shift = sheet.field[i]
     mark = sheet.mark[i]
-    field[i] = wp.vec3()
-    smoother[i] = wp.vec3()
+    sheet.field[i] = wp.vec3()
+    sheet.smoother[i] = wp.vec3()
     sheet.mark[i] = 0
     role = sheet.role[i]
     if role == LEFT or role == FILLED:  # noqa: SIM109
@@ -391,9 +377,9 @@ def settle_kernel(
 
 
 @wp.kernel(enable_backward=False)
-def tally_kernel(sheet: Sheet, near: wp.array(dtype=int)):
+def tally_kernel(sheet: Sheet):
     """Counts who was inside, who was moved, and who is inside."""
-    i = listed(wp.tid(), NEAR, near, sheet)
+    i = listed(wp.tid(), NEAR, sheet.near, sheet)
     if i < 0:
         return
     way = sheet.place[i] - sheet.origin[i]

@@ -114,7 +114,24 @@ class Sheet:
     """Those of them that it pushes inwards."""
     begins: wp.array(dtype=wp.int32)
     ends: wp.array(dtype=wp.int32)
-    """Where launches begin and end to go through each list, on a GPU; `close_kernel` says so."""
+    """Where launches begin and end to go through each list, on a GPU; `_round_kernels.close_kernel` says so."""
+    near: wp.array(dtype=wp.int32)
+    pushed: wp.array(dtype=wp.int32)
+    reached: wp.array(dtype=wp.int32)
+    """The lists; `reached` serves as that of suspects before, and of raised ends after."""
+    alpha: wp.array(dtype=wp.float32)
+    """Scale of each of those pushed."""
+    field: wp.array(dtype=wp.vec3)
+    smoother: wp.array(dtype=wp.vec3)
+    """How far vertices are taken along, and the same a sweep later; zero in between frames."""
+    moved: wp.array(dtype=wp.int32)
+    """Whether the end of an edge was raised in the last round."""
+    suspects: wp.array(dtype=wp.int32)
+    deficit: wp.array(dtype=wp.float32)
+    rise: wp.array(dtype=wp.vec3)
+    """Edges that may run too low; how much those lack that do, and the way up."""
+    largest: wp.array(dtype=wp.float32)
+    """The largest of those at each vertex."""
 
 
 @wp.func
@@ -123,13 +140,6 @@ def listed(k: int, which: int, rows: wp.array(dtype=int), sheet: Sheet):
     if k < sheet.ends[which]:
         return rows[k]
     return -1
-
-
-@wp.kernel(enable_backward=False)
-def close_kernel(sheet: Sheet, which: int):
-    """From now on launches go through a list as long as it is now, whatever is added to it meanwhile."""
-    sheet.begins[which] = sheet.ends[which]
-    sheet.ends[which] = sheet.counts[which]
 
 
 @wp.func

@@ -2,20 +2,20 @@
 # ruff: noqa: RUF046, UP018
 # (Warp reads a kernel's annotations as array types of its own; a type checker can't. A variable that changes in a loop
 # has to be called int or float there.)
-"""How pushes spread over the neighbourhood: all rounds in one launch on a CPU, a round a launch on a GPU."""
+"""How pushes spread over the neighbourhood: all rounds in one launch (`_round_kernels` has those of a GPU)."""
 
 import warp as wp
 
-from refu_core.repulsion._sheet import BESIDE, REACHED, SOURCE, Cloth, Sheet, listed
+from refu_core.repulsion._sheet import BESIDE, REACHED, SOURCE, Cloth, Sheet
 
 
 @wp.func
-def reach(i: int, sheet: Sheet, cloth: Cloth, reached: wp.array(dtype=int)):
+def reach(i: int, sheet: Sheet, cloth: Cloth):
     """Lists the neighbours of a vertex, unless they are."""
     for k in range(cloth.ring_start[i], cloth.ring_start[i + 1]):
         j = cloth.ring[k]
         if sheet.mark[j] == 0 and wp.atomic_max(sheet.mark, j, BESIDE) == 0:
-            reached[wp.atomic_add(sheet.counts, REACHED, 1)] = j
+            sheet.reached[wp.atomic_add(sheet.counts, REACHED, 1)] = j
 
 
 @wp.func
@@ -39,30 +39,6 @@ def spread(
 
 
 @wp.kernel(enable_backward=False)
-def reach_kernel(sheet: Sheet, cloth: Cloth, reached: wp.array(dtype=int)):
-    """Lists the neighbours of those that came to the list last."""
-    i = listed(sheet.begins[REACHED] + wp.tid(), REACHED, reached, sheet)
-    if i >= 0:
-        reach(i, sheet, cloth, reached)
-
-
-@wp.kernel(enable_backward=False)
-def spread_kernel(
-    sheet: Sheet,
-    cloth: Cloth,
-    step: float,
-    reached: wp.array(dtype=int),
-    field: wp.array(dtype=wp.vec3),
-    # output
-    smoother: wp.array(dtype=wp.vec3),
-):
-    """One sweep of `Blend.spread`."""
-    i = listed(wp.tid(), REACHED, reached, sheet)
-    if i >= 0:
-        spread(i, sheet, cloth, step, field, smoother)
-
-
-@wp.kernel(enable_backward=False)
 def blend_kernel(
     sheet: Sheet,
     cloth: Cloth,
@@ -70,21 +46,17 @@ def blend_kernel(
     pairs: int,
     long_step: float,
     short_step: float,
-    reached: wp.array(dtype=int),
-    # kept up to date
-    field: wp.array(dtype=wp.vec3),
-    smoother: wp.array(dtype=wp.vec3),
 ):
     """All sweeps, in pairs, by one thread: the lists are short, and a launch costs what hundreds of steps do."""
     first = int(0)
     for _ring in range(rings):
         last = int(sheet.counts[REACHED])
         for k in range(first, last):
-            reach(reached[k], sheet, cloth, reached)
+            reach(sheet.reached[k], sheet, cloth)
         first = last
     n = int(sheet.counts[REACHED])
     for _pair in range(pairs):
         for k in range(n):
-            spread(reached[k], sheet, cloth, long_step, field, smoother)
+            spread(sheet.reached[k], sheet, cloth, long_step, sheet.field, sheet.smoother)
         for k in range(n):
-            spread(reached[k], sheet, cloth, short_step, smoother, field)
+            spread(sheet.reached[k], sheet, cloth, short_step, sheet.smoother, sheet.field)
