@@ -53,7 +53,8 @@ class Layer:
     an open rim, where there are no two sides either, the sheet is felt less and less.
 
     The closest point is looked for downhill from the nearest of a few places around what was closest at rest. As cloth
-    slides by a few edges only, that takes half the time that a tree does.
+    slides by a few edges only, that takes half the time that a tree does. Where the sheet is folded such a search may
+    end in the wrong fold, and in the next frame in another one: so a vertex looks at what its neighbours found, too.
     """
 
     def __init__(
@@ -99,12 +100,12 @@ class Layer:
             return above, 0
         with torch_stream(self.device):
             self._take(above, below)
-            self._look("lift")
+            self._look("search")
             n_low = int(self._count)
             if n_low:
                 self._move(_ROUNDS)
                 # What has left the sheet at one place may have come to another, and be too low there.
-                self._look("lift again")
+                self._look("search again")
                 if int(self._count):
                     self._move(_LATER_ROUNDS)
         return (self._above.clone(), n_low) if n_low else (above, 0)
@@ -117,10 +118,10 @@ class Layer:
             return above, torch.zeros_like(self._count)
         with torch_stream(self.device):
             self._take(above, below)
-            self._look("lift")
+            self._look("search")
             n_low = self._count.clone()
             self._move(_ROUNDS)
-            self._look("lift again")
+            self._look("search again")
             self._move(_LATER_ROUNDS)
         return self._above.clone(), n_low
 
@@ -138,10 +139,11 @@ class Layer:
         self._below.copy_(below)
         self._commands["normals"].launch()
 
-    def _look(self, name: str) -> None:
+    def _look(self, search: str) -> None:
         """What has to be pushed, and how many vertices that are."""
         self._count.zero_()
-        self._commands[name].launch()
+        self._commands[search].launch()
+        self._commands["lift"].launch()
 
     def _move(self, blend_rounds: int) -> None:
         """Pushes those with their neighbourhood."""
@@ -159,15 +161,17 @@ class Layer:
             as_warp(tensor, wp.vec3) for tensor in (self._above, self._below, self._normals, self._push)
         )
         fields = [as_warp(field, wp.vec3) for field in self._fields]
-        found = wp.zeros(self._n_candidates, dtype=wp.int32, device=str(self.device))
+        found, closest = (wp.zeros(self._n_candidates, dtype=wp.int32, device=str(self.device)) for _ in range(2))
         itself = _ints(np.arange(self._n_candidates + 1), self.device)
+        search = [below, below_cut, above, rows]
         garments = [below, normals, below_cut, above, above_cut, rows]
-        pushed = [rules, found, push, as_warp(self._count, wp.int32)]
+        pushed = [start, ring, found, rules, closest, push, as_warp(self._count, wp.int32)]
         blend = [push, self._n_candidates, start, ring]
         for name, kernel, size, arguments in (
             ("normals", kernels.normals_kernel, len(self._below), [below, below_cut, normals]),
-            ("lift", kernels.lift_kernel, self._n_candidates, [*garments, near_start, near, *pushed]),
-            ("lift again", kernels.lift_kernel, self._n_candidates, [*garments, itself, found, *pushed]),
+            ("search", kernels.search_kernel, self._n_candidates, [*search, near_start, near, found]),
+            ("search again", kernels.search_kernel, self._n_candidates, [*search, itself, closest, found]),
+            ("lift", kernels.lift_kernel, self._n_candidates, [*garments, *pushed]),
             ("spread0", kernels.spread_kernel, self._n_region, [*blend, fields[0], fields[1]]),
             ("spread1", kernels.spread_kernel, self._n_region, [*blend, fields[1], fields[0]]),
             ("move", kernels.move_kernel, self._n_region, [rows, fields[0], above]),

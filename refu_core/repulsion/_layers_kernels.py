@@ -113,6 +113,35 @@ def normals_kernel(
 
 
 @wp.kernel(enable_backward=False)
+def search_kernel(
+    below: wp.array(dtype=wp.vec3),
+    below_cut: Cut,
+    above: wp.array(dtype=wp.vec3),
+    candidates: wp.array(dtype=int),
+    near_start: wp.array(dtype=int),
+    near: wp.array(dtype=int),
+    # output, by candidate
+    found: wp.array(dtype=int),
+):
+    """Which vertex of the sheet below each candidate comes to, downhill.
+
+    From the nearest of those to look from, which are `near[near_start[k]:near_start[k + 1]]`; or -1, if they are -1.
+    """
+    k = wp.tid()
+    p = above[candidates[k]]
+    v = int(near[near_start[k]])
+    if v >= 0:  # else too far away the last time
+        squared = float(wp.inf)
+        for n in range(near_start[k], near_start[k + 1]):
+            other = wp.length_sq(below[near[n]] - p)
+            if other < squared:
+                squared = other
+                v = near[n]
+        v = nearest_vertex(p, v, below, below_cut)
+    found[k] = v
+
+
+@wp.kernel(enable_backward=False)
 def lift_kernel(
     # the garment below
     below: wp.array(dtype=wp.vec3),
@@ -122,38 +151,44 @@ def lift_kernel(
     above: wp.array(dtype=wp.vec3),
     above_cut: Cut,
     candidates: wp.array(dtype=int),
-    near_start: wp.array(dtype=int),
-    near: wp.array(dtype=int),
+    ring_start: wp.array(dtype=int),
+    ring: wp.array(dtype=int),
+    found: wp.array(dtype=int),
     rules: LayerRules,
     # outputs, by candidate
-    found: wp.array(dtype=int),
+    closest: wp.array(dtype=int),
     push: wp.array(dtype=wp.vec3),
     count: wp.array(dtype=int),
 ):
     """What brings each candidate to the gap above the sheet, and how many they are that lack something.
 
-    The vertices of the sheet to look from are `near[near_start[k]:near_start[k + 1]]`; `found` is the one come to.
+    A fold that one candidate's search ended in is seldom in the way of its neighbours': what these `found` is looked
+    at, too. `closest` is the vertex of the sheet that each has come to, -1 where that is too far away.
     """
     k = wp.tid()
     i = candidates[k]
     p = above[i]
     push[k] = wp.vec3(0.0, 0.0, 0.0)
-
-    v = int(near[near_start[k]])
-    if v < 0:  # too far away the last time
+    v = int(found[k])
+    closest[k] = -1
+    if v < 0:
         return
-    squared = float(wp.inf)
-    for n in range(near_start[k], near_start[k + 1]):
-        other = wp.length_sq(below[near[n]] - p)
-        if other < squared:
-            squared = other
-            v = near[n]
-    v = nearest_vertex(p, v, below, below_cut)
-    found[k] = v
+    squared = wp.length_sq(below[v] - p)
+    # As near as that, it is the right fold.
+    if 4.0 * squared > rules.longest * rules.longest:
+        for r in range(ring_start[k], ring_start[k + 1]):
+            j = ring[r]
+            if j < found.shape[0] and found[j] >= 0 and found[j] != v:
+                other = wp.length_sq(below[found[j]] - p)
+                if other < squared:
+                    squared = other
+                    v = found[j]
+        if v != found[k]:
+            v = nearest_vertex(p, v, below, below_cut)
     # No point of a face is farther than its longest edge from its closest corner.
     if wp.length(below[v] - p) > rules.reach + rules.longest:
-        found[k] = -1
         return
+    closest[k] = v
     face, feature, w, offset = nearest_face(p, v, below, below_cut)
     if wp.length(offset) > rules.reach:
         return

@@ -105,7 +105,8 @@ def test_turned_persons_wear_the_same_where_limbs_run_into_each_other(seed: int,
 @pytest.mark.parametrize("path", WORST, ids=[path.stem for path in WORST])
 def test_worst_cases_of_refu_stress_that_are_no_more(path: Path) -> None:
     """Shorts: a fold that sent a vertex through the thigh, and one that was left between crossed thighs. A turn that
-    made a difference; a skirt of γ = -28; and a skirt deep in the thighs, where the closest skin leaps."""
+    made a difference; a skirt of γ = -28, and one deep in the thighs, where the closest skin leaps. A shirt that
+    was brought off another fold of the T-shirt in every frame."""
     tally = replay_trial(path)
     assert not tally.failures, tally.as_dict()
 
