@@ -35,7 +35,7 @@ _PARTS: tuple[tuple[int, ...], ...] = (
 """SMPL joints of the parts that a body is cut into where it folds: over one part the distance mostly falls all the way
 to the closest face, from one to another it may first have to rise."""
 _SPACING = 0.05
-"""Edge of the cubes of the rest pose that have one guide each [m]."""
+"""Edge of the cubes of the rest pose that have one guide of each part in them [m]."""
 _CELL = 0.045
 """Edge of the table's cells [m]. A guide is found from its own cell and most of the neighbours: 4 to 6 cm away."""
 _DEPTH = 0.01
@@ -78,7 +78,11 @@ class ApproxSdf(MeshSdf):
         self._links[:, 0, 3] = torch.from_numpy(part)
         self._links[:, 1, :3] = wp.to_torch(self._topology[0])
         self._links_wp = as_warp(self._links.view(-1, 4), wp.vec4i)
-        self._guides = wp.array(_guides(body, part), dtype=wp.vec4i, device=str(self.device))
+        cube = _cube_of_faces(body)
+        rank = np.empty(len(part), np.int64)
+        rank[np.lexsort(cube.T)] = np.arange(len(part))
+        self._rank = torch.from_numpy(rank)
+        self._guides = wp.array(_guides(body, part, cube), dtype=wp.vec4i, device=str(self.device))
         self._table = torch.empty(ROWS, COLUMNS, dtype=torch.int32, device=self.device)
         self._table_wp = as_warp(self._table, wp.int32)
         self._exact = ExactSdf(body.faces, device=self.device)
@@ -140,7 +144,7 @@ class ApproxSdf(MeshSdf):
         ]
 
     def _order(self, near: Tensor) -> Any:
-        """Points over neighbouring faces one after another: one finds in the cache what the last one has read there.
+        """Points over the same cube of the rest pose one after another: one finds in the cache what the last has read.
 
         Any order gives the same answers, so that of the first points of their number, a garment's vertices, will do.
         """
@@ -150,7 +154,7 @@ class ApproxSdf(MeshSdf):
         if n not in self._orders:
             if len(self._orders) >= _MAX_ORDERS:
                 self._orders.clear()
-            self._orders[n] = wp.array(near.argsort().int().numpy(), dtype=wp.int32, device="cpu")
+            self._orders[n] = wp.array(self._rank[near.long()].argsort().int().numpy(), dtype=wp.int32, device="cpu")
         return self._orders[n]
 
     def _seek(self, points: Tensor) -> Tensor:
@@ -170,12 +174,17 @@ def _part_of_faces(body: SmplBody) -> NDArray[np.int32]:
     return largest
 
 
-def _guides(body: SmplBody, part: NDArray[np.int32]) -> NDArray[np.int32]:
+def _cube_of_faces(body: SmplBody) -> NDArray[np.int64]:
+    """Which cube of the rest pose each face is in, shape (F, 3)."""
+    middles = body.v_template.double().cpu().numpy()[body.faces.cpu().numpy()].mean(1)
+    cube: NDArray[np.int64] = np.floor(middles / _SPACING).astype(np.int64)
+    return cube
+
+
+def _guides(body: SmplBody, part: NDArray[np.int32], cube: NDArray[np.int64]) -> NDArray[np.int32]:
     """Faces spread over the body, one of each part in each cube of the rest pose, as `enter_kernel` reads them."""
     faces = body.faces.cpu().numpy()
-    middles = body.v_template.double().cpu().numpy()[faces].mean(1)
-    cubes = np.floor(middles / _SPACING).astype(np.int64)
-    _, first = np.unique(np.column_stack([cubes, part]), axis=0, return_index=True)
+    _, first = np.unique(np.column_stack([cube, part]), axis=0, return_index=True)
     chosen = np.sort(first)
     rows: NDArray[np.int32] = np.column_stack([faces[chosen], (part[chosen] << FACE_BITS) | chosen]).astype(np.int32)
     return rows
