@@ -18,7 +18,16 @@ from tqdm import tqdm
 
 from msg_adapters import BagReader, decode_marker_array, decoder_for, encoder_for
 from refu_core import RefuError
-from refu_core.stress import JUDGED_FROM, TOLERANCE, StressError, Yardstick, resident_mb, soak_frames, wardrobes
+from refu_core.stress import (
+    JUDGED_FROM,
+    TOLERANCE,
+    StressError,
+    Yardstick,
+    is_slower,
+    resident_mb,
+    soak_frames,
+    wardrobes,
+)
 from refu_ros.tables import format_table
 
 if TYPE_CHECKING:
@@ -77,14 +86,10 @@ class NodeSoak:
 
     @property
     def is_slower(self) -> bool:
-        """Whether messages come later, and the node computes longer than the machine's own slowing explains.
-
-        The first alone is what any other process does that wants the processor; a few frames aren't judged.
-        """
+        """Whether messages come later, and the node computes longer; a few frames aren't judged."""
         if self.sent < JUDGED_FROM:
             return False
-        later, longer, machine = (last / first for first, last in (self.p99_ms, self.cpu_ms, self.yardstick_ms))
-        return min(later, longer / machine) > 1 + TOLERANCE
+        return is_slower(*(last / first for first, last in (self.p99_ms, self.cpu_ms, self.yardstick_ms)))
 
     @property
     def failures(self) -> int:

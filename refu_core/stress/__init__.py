@@ -16,6 +16,7 @@ from refu_core.stress._soak import JUDGED_FROM as JUDGED_FROM
 from refu_core.stress._soak import TOLERANCE as TOLERANCE
 from refu_core.stress._soak import SoakResult as SoakResult
 from refu_core.stress._soak import Yardstick as Yardstick
+from refu_core.stress._soak import is_slower as is_slower
 from refu_core.stress._soak import resident_mb as resident_mb
 from refu_core.stress._soak import soak as soak
 from refu_core.stress._soak import soak_frames as soak_frames

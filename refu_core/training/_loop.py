@@ -218,4 +218,9 @@ def _schedule(step: int, steps: int) -> float:
     warm = max(1, steps // 20)
     if step < warm:
         return (step + 1) / warm
-    return 0.5 * (1 + math.cos(math.pi * (step - warm) / max(1, steps - warm)))
+    return cosine(step - warm, steps - warm)
+
+
+def cosine(step: int, steps: int) -> float:
+    """A learning rate that falls to nothing, as a share of the highest one."""
+    return 0.5 * (1 + math.cos(math.pi * step / max(1, steps)))

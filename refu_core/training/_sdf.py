@@ -20,7 +20,7 @@ from refu_core.garments import GarmentTemplate
 from refu_core.sdf import SDF_PRESETS, ExactSdf, SdfNetwork, body_frame, query_batch, save_sdf_network, with_gradient
 from refu_core.simulation import GarmentDataset
 from refu_core.training._checkpoint import load_checkpoint, save_checkpoint
-from refu_core.training._loop import start_parallel
+from refu_core.training._loop import cosine, start_parallel
 from refu_core.training._progress import TrainingLog
 
 VALUE_WEIGHT, NORMAL_WEIGHT, EIKONAL_WEIGHT = 2.0, 1.0, 0.1
@@ -62,7 +62,7 @@ class SdfSettings:
 
     def rate(self, step: int) -> float:
         """Learning rate of a step."""
-        return self.learning_rate * (0.5 + 0.5 * math.cos(math.pi * step / self.steps) if self.is_annealed else 1.0)
+        return self.learning_rate * (cosine(step, self.steps) if self.is_annealed else 1.0)
 
     def __post_init__(self) -> None:
         """Raises `RefuError` for numbers that make no training."""

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 _CHUNK = 0x06
 _MOST_UNPACKED = 1 << 15
+MOST_READ = 200
+"""Messages, frames or rows that are read of each file."""
 _COMPRESSOR = zstandard.ZstdCompressor(level=1)
 _MAGIC = b"\x89MCAP0\r\n"
 _HEADERS = [b"(1000000000000,)", b"(100000, 100000)", b"(-1, 72)", b"(2, 72, 0)", b"()", b"(True, 72)", b"(" * 500]

@@ -19,6 +19,7 @@ from refu_core import FrameError, load_body
 from refu_core.simulation import load_clips
 from refu_ros.fuzz._containers import (
     GADGETS,
+    MOST_READ,
     join_mcap,
     mcap_chunk,
     mutate_mcap,
@@ -36,8 +37,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-_MOST_READ = 200
-"""Messages, frames or rows that are read of each file."""
 _YAML_WORDS = [
     b"\n",
     b":",
@@ -91,16 +90,16 @@ class Bag:
         """Reads all there is."""
         self._path.write_bytes(data)
         with adapters.BagReader(self._path) as reader:
-            for topic in reader.topics[:_MOST_READ]:
+            for topic in reader.topics[:MOST_READ]:
                 assert topic.message_count >= 0, "a negative count"
-            for message in itertools.islice(reader.messages(), _MOST_READ):
+            for message in itertools.islice(reader.messages(), MOST_READ):
                 assert 0 <= message.log_time_ns < 2**63, "a time that ROS can't hold"
         for kind in ("multiarray", "smpl_msgs"):
             try:
                 bag = adapters.open_smpl_bag(self._path, topic=f"/{kind}/smpl_params")
             except adapters.AdapterError:
                 continue
-            for record in itertools.islice(bag, _MOST_READ):
+            for record in itertools.islice(bag, MOST_READ):
                 assert (record.frame is None) != (record.error is None), "a record that is neither frame nor error"
                 if record.frame is not None:
                     check_frame(record.frame)
@@ -164,7 +163,7 @@ class MotionFile(_Archive):
         except adapters.AdapterError:
             load_clips(self._path)
             return
-        for i in range(min(len(motion), _MOST_READ)):
+        for i in range(min(len(motion), MOST_READ)):
             with contextlib.suppress(FrameError):  # a frame that isn't finite is refused by itself
                 check_frame(motion.frame(i))
         if len(motion) / motion.fps < 100:

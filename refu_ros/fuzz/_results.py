@@ -20,15 +20,13 @@ from refu_core.sdf._neural import SDF_PRESETS, SdfNetwork, load_sdf_network, sav
 from refu_core.simulation import GarmentDataset, GarmentSequences
 from refu_core.simulation._store import FORMAT, SEQUENCES, sample_columns, sequence_columns
 from refu_core.training import TrainingLog, load_checkpoint, save_checkpoint
-from refu_ros.fuzz._containers import GADGETS, mutate_npy, mutate_zip, npy_bytes, pack_zip
+from refu_ros.fuzz._containers import GADGETS, MOST_READ, mutate_npy, mutate_zip, npy_bytes, pack_zip
 from refu_ros.fuzz._mutate import ODD_VALUES, mutate_bytes, mutate_json
 
 if TYPE_CHECKING:
     import random
 
 _GARMENT = "short-pant-male"
-_MOST_READ = 200
-"""Rows that are read of each set."""
 _SIZES: list[Any] = [
     *ODD_VALUES,
     10**6,
@@ -151,7 +149,7 @@ class DataSet:
 
     def _read(self) -> None:
         dataset = GarmentDataset(self._folder)
-        for i in range(min(len(dataset), _MOST_READ)):
+        for i in range(min(len(dataset), MOST_READ)):
             assert np.isfinite(dataset.sample(i).vertices).all(), "a garment that isn't finite"
         dataset.column("asked")
 
@@ -163,7 +161,7 @@ class SequenceSet(DataSet):
 
     def _read(self) -> None:
         sequences = GarmentSequences(self._folder)
-        for i in range(min(len(sequences), _MOST_READ)):
+        for i in range(min(len(sequences), MOST_READ)):
             assert np.isfinite(sequences.sequence(i).vertices()).all(), "a garment that isn't finite"
 
 

@@ -105,28 +105,13 @@ def _tailornet() -> list[Method]:
         methods += [
             *_ablated(refu),
             replace(refu, name=f"node-{mode}", label=f"the node, {mode}", handling="node"),
-            replace(
-                refu,
-                name=f"bare-{mode}",
-                label=f"ReFU, {mode}, not blended, ε = 0, trained so (the paper's)",
-                folder="bare",
-                is_blended=False,
-            ),
+            _trained_bare(refu, f"bare-{mode}", folder="bare"),
         ]
     for sdf in _SDFS:
         fixed = Method(
             name=f"fixed-{sdf}", label=f"fixed scale, {sdf}", mode=sdf, folder="fixed", handling="refu", sdf=sdf
         )
-        methods += [
-            *_ablated(fixed),
-            replace(
-                fixed,
-                name=f"fixed-bare-{sdf}",
-                label=f"fixed scale, {sdf}, not blended, ε = 0, trained so (the paper's)",
-                folder="fixed-bare",
-                is_blended=False,
-            ),
-        ]
+        methods += [*_ablated(fixed), _trained_bare(fixed, f"fixed-bare-{sdf}", folder="fixed-bare")]
     methods += [
         Method(
             name=f"alt{number}-approx",
@@ -146,6 +131,12 @@ def _ablated(whole: Method) -> list[Method]:
     unblended = replace(whole, name=f"{whole.name}-unblended", label=f"{whole.label}, not blended", is_blended=False)
     bare = replace(unblended, name=f"{whole.name}-bare", label=f"{whole.label}, not blended, ε = 0", margin=0.0)
     return [whole, unblended, bare]
+
+
+def _trained_bare(whole: Method, name: str, *, folder: str) -> Method:
+    """The paper's layer trained as such, by the weights in `folder`: their ε is 0 already."""
+    label = f"{whole.label}, not blended, ε = 0, trained so (the paper's)"
+    return replace(whole, name=name, label=label, folder=folder, is_blended=False)
 
 
 def _with_refu(backbone: str, label: str, modes: tuple[str, ...]) -> list[Method]:
