@@ -73,9 +73,10 @@ class Recording:
         from msg_adapters import QosProfile
         from refu_ros._recorder import Recorder
 
-        recorder = Recorder(folder / "bag")
         with self._progress.open("r+b") as file, mmap.mmap(file.fileno(), 8) as progress:
+            # Before there is a new bag: the last one's count would be taken for that of its empty file.
             struct.pack_into("<Q", progress, 0, 0)
+            recorder = Recorder(folder / "bag")
             for i in range(1 << 30):
                 while recorder.state().queued > 20:
                     time.sleep(0.001)

@@ -16,11 +16,11 @@ import numpy as np
 import pytest
 
 from msg_adapters import BagError, BagReader, BagWriter, EncodeError, MarkerMesh, decoder_for, read_motion
-from refu_core import BodyError, load_body
+from refu_core import BodyError, WeightsError, load_body
 from refu_core.body import _pickle
 from refu_core.simulation import SimulationError, load_clips
 from refu_core.simulation._store import Shard
-from refu_core.training import TrainingLog
+from refu_core.training import TrainingLog, load_checkpoint, save_checkpoint
 from refu_ros._settings import NodeSettings, SettingsError
 from refu_ros.cli import main
 from refu_ros.fuzz import TARGETS, Guard, Target, fuzz_target
@@ -119,6 +119,27 @@ def test_compression_that_asks_for_gigabytes(tmp_path: Path) -> None:
     path = npz(tmp_path / "a.npz", {"poses": npy(np.zeros((3, 72)))}, zipfile.ZIP_LZMA)
     with pytest.raises(ValueError, match="only deflate is read"):
         read_motion(path)
+
+
+def test_a_checkpoint_unpacks_nothing(tmp_path: Path) -> None:
+    save_checkpoint(tmp_path / "good.checkpoint", {"step": 1})
+    with (
+        zipfile.ZipFile(tmp_path / "good.checkpoint") as good,
+        zipfile.ZipFile(tmp_path / "packed.checkpoint", "w", zipfile.ZIP_DEFLATED) as packed,
+    ):
+        for entry in good.infolist():
+            packed.writestr(entry.filename, good.read(entry))
+    with pytest.raises(WeightsError, match="compressed records"):
+        load_checkpoint(tmp_path / "packed.checkpoint")
+
+
+def test_a_checkpoint_with_records_larger_than_itself(tmp_path: Path) -> None:
+    save_checkpoint(tmp_path / "a.checkpoint", {"step": 1})
+    whole = (tmp_path / "a.checkpoint").read_bytes()
+    at = whole.index(b"PK\x01\x02") + 20  # of the directory: the first record's sizes, packed and not
+    (tmp_path / "a.checkpoint").write_bytes(whole[:at] + struct.pack("<II", 700_000_000, 700_000_000) + whole[at + 8 :])
+    with pytest.raises(WeightsError, match="larger than the file"):
+        load_checkpoint(tmp_path / "a.checkpoint")
 
 
 def test_a_frame_rate_in_a_row_of_one_is_a_frame_rate(tmp_path: Path) -> None:

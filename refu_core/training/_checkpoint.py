@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -48,7 +49,7 @@ def load_checkpoint(path: Path) -> dict[str, Any] | None:
     if not path.exists():
         return None
     try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
+        state = torch.load(_as_saved(path), map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises whatever its readers do
         msg = f"{path}: a damaged checkpoint; delete it to start anew: {error}"
         raise WeightsError(msg) from error
@@ -56,3 +57,23 @@ def load_checkpoint(path: Path) -> dict[str, Any] | None:
         msg = f"{path}: a checkpoint holds a dictionary, this one a {type(state).__name__}; delete it to start anew"
         raise WeightsError(msg)
     return state
+
+
+def _as_saved(path: Path) -> io.BytesIO:
+    """The archive as `torch.save` would have written it: the same records, none of them compressed.
+
+    Torch's own reader takes room for whatever size a damaged record claims. So it gets an archive that was made here.
+    """
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(path) as archive, zipfile.ZipFile(buffer, "w") as copy:
+        entries = archive.infolist()
+        if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
+            msg = "it has compressed records"
+            raise zipfile.BadZipFile(msg)
+        if sum(entry.file_size for entry in entries) > path.stat().st_size:
+            msg = "its records are larger than the file"
+            raise zipfile.BadZipFile(msg)
+        for entry in entries:
+            copy.writestr(entry.filename, archive.read(entry))
+    buffer.seek(0)
+    return buffer
