@@ -15,10 +15,11 @@ from torch import Tensor
 
 from refu_core._warp import as_warp
 from refu_core.errors import MeshError
-from refu_core.sdf._exact import ExactSdf
-from refu_core.sdf._mesh import Found, MeshSdf
+from refu_core.sdf._box_tree import BoxTree
+from refu_core.sdf._mesh import Found, MeshSdf, Recorded
 from refu_core.sdf._protocol import SdfSample
 from refu_core.sdf._scan import Scan
+from refu_core.sdf._skin import ask_kernel
 
 BAND = 0.008
 """Width of the band on either side of the skin [m]. It must hold the margin that is kept; and a garment's edges must be
@@ -83,12 +84,11 @@ class BandSdf(MeshSdf):
             raise MeshError(msg)
         super().__init__(faces)
         self.band = band
-        # Few points are asked in the tree: one that fits its pose loosely costs less than another one does.
-        self._tree = ExactSdf(faces, rebuild_distance=math.inf)
-        if rest is not None:
-            self._tree.update(rest.detach())
+        self._tree = None if rest is None else BoxTree(self.faces, rest)
         self._tree_is_posed = False
         self._scan: Scan | None = None
+        self._few: Recorded | None = None
+        self._none = wp.empty(0, dtype=wp.int32, device="cpu")
 
     def clipped(self, points: Tensor, links: Links) -> SdfSample:
         """The signed distance and gradient of a garment's vertices [m], shape (N, 3), clipped from above.
@@ -125,19 +125,25 @@ class BandSdf(MeshSdf):
 
     def skin(self) -> Any:
         """As `MeshSdf.skin`."""
-        self._require_update()
         self._pose_tree()
-        return self._tree.skin()
+        return super().skin()
+
+    def _bind_skin(self) -> Any:
+        skin = super()._bind_skin()
+        skin.boxes = self._pose_tree().boxes
+        return skin
 
     def _take_pose(self, *, is_new: bool) -> None:
         if is_new:
-            self._scan = None
+            self._scan = self._few = None
         self._tree_is_posed = False
 
     def _find(self, points: Tensor, near: Tensor | None) -> Found:
         if near is not None or len(points) < _FEW:
-            self._pose_tree()
-            return self._tree._find(points, near)
+            skin = self.skin()
+            if self._few is None:
+                self._few = Recorded(ask_kernel, lambda points, near: [skin, points, near, self._none])
+            return self._few.ask(points, near)
         scan = self._scan_of_pose()
         found = scan.near(points, beyond=math.inf)
         far = torch.nonzero(found.face < 0)[:, 0]
@@ -146,15 +152,23 @@ class BandSdf(MeshSdf):
             scan.ask(len(far), far)
         return found
 
-    def _pose_tree(self) -> None:
+    def _pose_tree(self) -> BoxTree:
+        points = self._require_update()
+        if self._tree is None:
+            self._tree = BoxTree(self.faces, points)
         if not self._tree_is_posed:
-            assert self._vertices is not None  # callers have seen to it
-            self._tree.update(self._vertices.detach())
+            self._tree.fit(self._points_wp)
             self._tree_is_posed = True
+        return self._tree
 
     def _scan_of_pose(self) -> Scan:
         if self._scan is None:
-            self._pose_tree()  # the recorded launch knows which it is
             body = [self._points_wp, self._faces, *self._topology]
-            self._scan = Scan(body, len(self.faces), self.band, self._tree.record)
+            self._scan = Scan(body, len(self.faces), self.band, self._record)
         return self._scan
+
+    def _record(self, points: Any, rows: Any, answers: Found) -> Any:
+        """A launch to be repeated, of those of the points that are in rows; the answers' faces before count as near."""
+        outputs = answers.as_warp()
+        inputs = [self.skin(), points, outputs[0], rows]
+        return wp.launch(ask_kernel, len(rows), inputs, outputs, device="cpu", record_cmd=True)

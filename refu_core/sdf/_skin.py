@@ -4,6 +4,7 @@
 
 import warp as wp
 
+from refu_core.sdf._boxes import Boxes, closest_in_boxes, guess, is_beyond
 from refu_core.sdf._kernels import distance_to_face, measured_to
 from refu_core.sdf._walk import walk_from
 
@@ -17,7 +18,9 @@ class Skin:
     """One posed body: `MeshSdf.skin` gives it."""
 
     tree: wp.uint64
-    """Warp's mesh where the closest face is looked for in a tree; 0 where it is walked to."""
+    """Warp's mesh where the closest face is looked for in its tree; 0 where not."""
+    boxes: Boxes
+    """Those where it is looked for; without faces where not."""
     points: wp.array(dtype=wp.vec3)
     """Vertices [m]."""
     faces: wp.array2d(dtype=wp.int32)
@@ -28,14 +31,18 @@ class Skin:
     links: wp.array(dtype=wp.vec4i)
     table: wp.array2d(dtype=wp.int32)
     cell: wp.float32
-    """What `walk_from` reads, where it is walked."""
+    """What `walk_from` reads, where it is walked to."""
 
 
 @wp.func
 def ask(skin: Skin, p: wp.vec3, near: int):
     """Signed distance at p [m], its unit gradient, and the closest face; `near` is a face near by, or -1."""
     face = int(near)
-    if skin.tree != wp.uint64(0):
+    if skin.boxes.order.shape[0] > 0:
+        if near < 0:
+            face = guess(p, skin.boxes)
+        face = closest_in_boxes(p, face, skin.boxes, skin.points, skin.faces)
+    elif skin.tree != wp.uint64(0):
         limit = float(_UNLIMITED)
         if near >= 0:
             known = distance_to_face(p, near, skin.points, skin.faces)
@@ -57,4 +64,29 @@ def ask(skin: Skin, p: wp.vec3, near: int):
             skin.cell,
         )
     distance, gradient = measured_to(p, face, skin.points, skin.faces, skin.across, skin.fan_start, skin.fan_face)
+    if distance < 0.0 and skin.boxes.order.shape[0] > 0 and is_beyond(p, skin.boxes):
+        # A thousand kilometres off all faces are equally far, and rounding may have taken one of the other side.
+        distance = -distance
+        gradient = -gradient
     return distance, gradient, face
+
+
+@wp.kernel(enable_backward=False)
+def ask_kernel(
+    skin: Skin,
+    queries: wp.array(dtype=wp.vec3),
+    near: wp.array(dtype=int),
+    rows: wp.array(dtype=int),
+    # outputs
+    out_face: wp.array(dtype=int),
+    out_distance: wp.array(dtype=float),
+    out_gradient: wp.array(dtype=wp.vec3),
+):
+    """What `ask` says of the queries numbered `rows`, or of all where there are no rows; `near` has a face of each."""
+    i = wp.tid()
+    if rows.shape[0] > 0:
+        i = rows[i]
+    distance, gradient, face = ask(skin, queries[i], near[i])
+    out_face[i] = face
+    out_distance[i] = distance
+    out_gradient[i] = gradient

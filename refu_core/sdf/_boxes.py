@@ -1,0 +1,139 @@
+# mypy: ignore-errors
+# ruff: noqa: RUF046, UP018  (to Warp, int(0) is a variable and 0 a constant)
+# (Warp reads a kernel's annotations as array types of its own; a type checker can't.)
+"""Closest face by boxes of eight: a tree for one CPU core and points that know a face near by.
+
+A node has eight children, and their boxes lie together by coordinate, so that a processor looks at all eight at once.
+Node b has the children 8 b + 1 to 8 b + 8, faces come after the last node: no links are stored, and none followed.
+"""
+
+import warp as wp
+
+from refu_core.sdf._kernels import closest_on_triangle, offset_from
+
+WIDTH = wp.constant(8)
+_FAR = wp.constant(1.0e36)  # [m²]
+Eight = wp.types.vector(length=8, dtype=wp.float32)
+_Stack = wp.types.vector(length=64, dtype=wp.int32)  # seven more a level than are taken off it: nine levels
+MAX_FACES = 8**8
+
+
+@wp.struct
+class Boxes:
+    """A tree of boxes around the faces of a posed body."""
+
+    bounds: wp.array2d(dtype=Eight)
+    """Of each node's children: least x, y, z, greatest x, y, z [m]; where there is no child, nothing is within."""
+    order: wp.array(dtype=wp.int32)
+    """Faces as they come after the last node; empty where there is no tree."""
+    first: wp.int32
+    """Number of the first face."""
+
+
+@wp.kernel(enable_backward=False)
+def fit_kernel(
+    points: wp.array(dtype=wp.vec3),
+    faces: wp.array2d(dtype=int),
+    boxes: Boxes,
+    # output
+    bounds: wp.array3d(dtype=float),
+):
+    """Fits the boxes to a pose, from the faces to the root; `bounds` are those of `boxes`, number by number."""
+    n = boxes.order.shape[0]
+    for k in range(n):
+        face = boxes.order[k]
+        a = points[faces[face, 0]]
+        b = points[faces[face, 1]]
+        c = points[faces[face, 2]]
+        low = wp.min(wp.min(a, b), c)
+        high = wp.max(wp.max(a, b), c)
+        place = boxes.first + k - 1
+        for axis in range(3):
+            bounds[place / WIDTH, axis, place & 7] = low[axis]
+            bounds[place / WIDTH, axis + 3, place & 7] = high[axis]
+    last = (boxes.first + n - 2) / WIDTH
+    for back in range(last):
+        node = last - back
+        place = node - 1
+        for axis in range(3):
+            bounds[place / WIDTH, axis, place & 7] = wp.min(boxes.bounds[node, axis])
+            bounds[place / WIDTH, axis + 3, place & 7] = wp.max(boxes.bounds[node, axis + 3])
+
+
+@wp.func
+def squared_gaps(p: wp.vec3, node: int, boxes: Boxes):
+    """Squared distance from p to the boxes of a node's children."""
+    x = Eight(p[0])
+    y = Eight(p[1])
+    z = Eight(p[2])
+    none = Eight()
+    along_x = wp.max(wp.max(boxes.bounds[node, 0] - x, x - boxes.bounds[node, 3]), none)
+    along_y = wp.max(wp.max(boxes.bounds[node, 1] - y, y - boxes.bounds[node, 4]), none)
+    along_z = wp.max(wp.max(boxes.bounds[node, 2] - z, z - boxes.bounds[node, 5]), none)
+    return wp.cw_mul(along_x, along_x) + wp.cw_mul(along_y, along_y) + wp.cw_mul(along_z, along_z)
+
+
+@wp.func
+def is_beyond(p: wp.vec3, boxes: Boxes):
+    """Whether p is outside of the box around everything."""
+    beyond = bool(False)
+    for axis in range(3):
+        least = wp.min(boxes.bounds[0, axis])
+        greatest = wp.max(boxes.bounds[0, axis + 3])
+        if p[axis] < least or p[axis] > greatest:
+            beyond = True
+    return beyond
+
+
+@wp.func
+def guess(p: wp.vec3, boxes: Boxes):
+    """A face that isn't far: from each node on to the child with the closest box."""
+    place = int(0)
+    while place < boxes.first:
+        gaps = squared_gaps(p, place, boxes)
+        place = WIDTH * place + 1 + int(wp.argmin(gaps))
+    return boxes.order[wp.min(place - boxes.first, boxes.order.shape[0] - 1)]
+
+
+@wp.func
+def closest_in_boxes(
+    p: wp.vec3, near: int, boxes: Boxes, points: wp.array(dtype=wp.vec3), faces: wp.array2d(dtype=int)
+):
+    """The face closest to p, whatever face is `near`; the nearer that is the sooner it is found.
+
+    No box is farther from p than what is in it, and a node or face is left out only when its box isn't closer than the
+    closest face so far, or a face when its plane isn't. So what is found is the closest of all but for rounding: of
+    several equally close, `near` or any.
+    """
+    face = near
+    w, _feature = closest_on_triangle(p, points[faces[face, 0]], points[faces[face, 1]], points[faces[face, 2]])
+    offset = offset_from(p, face, w, points, faces)
+    squared = wp.dot(offset, offset)
+    if not squared < _FAR:  # of a face without area it isn't a number
+        squared = _FAR
+    stack = _Stack()  # begins with the root
+    n = int(1)
+    while n > 0:
+        n -= 1
+        place = stack[n]
+        if place < boxes.first:
+            gaps = squared_gaps(p, place, boxes)
+            for k in range(8):
+                # Written in any case, counted if it is of use: there is nothing to be foreseen.
+                stack[n] = 8 * place + 1 + k
+                n += wp.where(gaps[k] < squared, 1, 0)
+        else:
+            other = boxes.order[place - boxes.first]
+            a = points[faces[other, 0]]
+            ab = points[faces[other, 1]] - a
+            ac = points[faces[other, 2]] - a
+            normal = wp.cross(ab, ac)
+            height = wp.dot(normal, p - a)
+            if height * height < squared * wp.dot(normal, normal):
+                w, _feature = closest_on_triangle(p, a, a + ab, a + ac)
+                offset = (p - a) - (w[1] * ab + w[2] * ac)
+                length = wp.dot(offset, offset)
+                if length < squared:
+                    squared = length
+                    face = other
+    return face
