@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from refu_core._warp import as_warp, torch_stream
 from refu_core.errors import MeshError
 from refu_core.sdf._exact import ExactSdf
 from refu_core.sdf._mesh import Found, MeshSdf, Recorded
-from refu_core.sdf._walk import COLUMNS, EMPTY, FACE_BITS, MAX_FACES, ROWS, enter_kernel, walk_kernel
+from refu_core.sdf._walk import COLUMNS, EMPTY, FACE_BITS, MAX_FACES, ROWS, deep_kernel, enter_kernel, walk_kernel
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -40,6 +41,9 @@ _CELL = 0.045
 """Edge of the table's cells [m]. A guide is found from its own cell and most of the neighbours: 4 to 6 cm away."""
 _DEPTH = 0.01
 """How far below its face a guide is entered [m]: what is inside may be deeper than what matters outside is far."""
+EXACT_FROM = 0.03
+"""How deep a point is, by its walk, that is asked exactly [m]: deeper than cloth is in most frames, and these cost what
+they did. In a frame that has such points the exact query's tree is refitted, for a tenth of what walks take."""
 
 _MANY = 1000
 """From this number of points on their order matters."""
@@ -56,6 +60,9 @@ class ApproxSdf(MeshSdf):
     that a table of space names; the table is filled anew for each pose. A look at the guide's plane tells most of the
     walks that would end no closer. The closest end of these walks counts.
 
+    What is as deep as the middle of a limb has several ways out of nearly one length, and cloth is thrown from side to
+    side by a walk that ends at another one than the last frame's. The few points of this kind are asked exactly.
+
     So the distance is always that to a face of the posed body: exact, or too large where none of the walks ended at the
     closest face. Sign, gradient and derivatives are those of `ExactSdf`. Within 2 cm of the skin the mean error is some
     hundredths of a millimetre; benchmarks/sdf.py measures it, and the cost: less than a fifth of the exact query's.
@@ -63,8 +70,12 @@ class ApproxSdf(MeshSdf):
     Needs nothing but the posed vertices, so it works for every β, γ and pose, and builds nothing for them.
     """
 
-    def __init__(self, body: SmplBody, *, device: str | torch.device | None = None) -> None:
+    def __init__(
+        self, body: SmplBody, *, device: str | torch.device | None = None, exact_from: float = EXACT_FROM
+    ) -> None:
         """Prepares for poses of `body`, on `device` (by default the body's).
+
+        What a walk says is deeper inside than `exact_from` [m] is asked exactly; infinity leaves it at walks.
 
         Raises `MeshError` when its faces aren't a closed, consistently oriented surface, or are more than a million.
         """
@@ -72,6 +83,7 @@ class ApproxSdf(MeshSdf):
         if len(self.faces) > MAX_FACES:
             msg = f"the approximate distance is for bodies of up to {MAX_FACES} faces, got {len(self.faces)}: use exact"
             raise MeshError(msg)
+        self._exact_from = exact_from
         part = _part_of_faces(body)
         self._links = torch.zeros(len(part), 2, 4, dtype=torch.int32, device=self.device)
         self._links[:, 0, :3] = self.faces
@@ -85,7 +97,9 @@ class ApproxSdf(MeshSdf):
         self._guides = wp.array(_guides(body, part, cube), dtype=wp.vec4i, device=str(self.device))
         self._table = torch.empty(ROWS, COLUMNS, dtype=torch.int32, device=self.device)
         self._table_wp = as_warp(self._table, wp.int32)
-        self._exact = ExactSdf(body.faces, device=self.device)
+        # Few points are asked in it: a tree of the rest pose, whose limbs are apart, fits any pose well enough.
+        self._exact = ExactSdf(body.faces, device=self.device, rebuild_distance=math.inf)
+        self._exact.update(body.v_template.float())
         self._exact_is_late = True
         self._enter: Any = None  # both recorded for the tensors that hold the pose
         self._walk: Recorded | None = None
@@ -116,7 +130,10 @@ class ApproxSdf(MeshSdf):
     def _find(self, points: Tensor, near: Tensor | None) -> Found:
         near = self._seek(points) if near is None else near
         if self._walk is not None:
-            return self._walk.ask(points, near, last=self._order(near))
+            found = self._walk.ask(points, near, last=self._order(near))
+            if len(points) and float(found.distance.min()) < -self._exact_from:
+                self._ask_deep(points, found)
+            return found
         found = Found.empty(len(points), self.device)
         if len(points):
             with torch_stream(self.device):
@@ -127,7 +144,27 @@ class ApproxSdf(MeshSdf):
                     outputs=found.as_warp(),
                     device=str(self.device),
                 )
+            self._ask_deep(points, found)
         return found
+
+    def _ask_deep(self, points: Tensor, found: Found) -> None:
+        """Has the exact query's answers take the place of those of walks that ended far above a point."""
+        exact = self._exact_of_pose()
+        with torch_stream(self.device):
+            wp.launch(
+                deep_kernel,
+                dim=len(points),
+                inputs=[
+                    exact.mesh_id,
+                    self._points_wp,
+                    self._faces,
+                    *self._topology,
+                    self._exact_from,
+                    as_warp(points, wp.vec3),
+                ],
+                outputs=found.as_warp(),
+                device=str(self.device),
+            )
 
     def _inputs(self, points: Any, near: Any) -> list[Any]:
         """What `walk_kernel` reads."""
@@ -159,10 +196,13 @@ class ApproxSdf(MeshSdf):
 
     def _seek(self, points: Tensor) -> Tensor:
         """Where nothing is known to be near a point the exact query finds it: right, and as slow."""
+        return self._exact_of_pose().closest(points).face
+
+    def _exact_of_pose(self) -> ExactSdf:
         if self._exact_is_late:
             self._exact.update(self._require_update())
             self._exact_is_late = False
-        return self._exact.closest(points).face
+        return self._exact
 
 
 def _part_of_faces(body: SmplBody) -> NDArray[np.int32]:

@@ -17,6 +17,7 @@ from refu_core.sdf._kernels import (
     VERTEX,
     closest_on_triangle,
     distance_and_gradient,
+    measured_to,
     offset_from,
 )
 
@@ -348,3 +349,33 @@ def walk_kernel(
     out_face[i] = face
     out_distance[i] = distance
     out_gradient[i] = gradient
+
+
+@wp.kernel(enable_backward=False)
+def deep_kernel(
+    mesh: wp.uint64,
+    points: wp.array(dtype=wp.vec3),
+    faces: wp.array2d(dtype=int),
+    across: wp.array2d(dtype=int),
+    fan_start: wp.array(dtype=int),
+    fan_face: wp.array(dtype=int),
+    depth: float,
+    queries: wp.array(dtype=wp.vec3),
+    # what walks found, and what is found now
+    out_face: wp.array(dtype=int),
+    out_distance: wp.array(dtype=float),
+    out_gradient: wp.array(dtype=wp.vec3),
+):
+    """Asks the tree about each query that is deeper than `depth`, by its walk: no farther away than that ended."""
+    i = wp.tid()
+    far = -out_distance[i]
+    if far <= depth:
+        return
+    p = queries[i]
+    found = wp.mesh_query_point_no_sign(mesh, p, far)
+    if found.result and found.face != out_face[i]:
+        distance, gradient = measured_to(p, found.face, points, faces, across, fan_start, fan_face)
+        if wp.abs(distance) < far:
+            out_face[i] = found.face
+            out_distance[i] = distance
+            out_gradient[i] = gradient
