@@ -18,7 +18,9 @@ def look_between(edge: int, sheet: Sheet, cloth: Cloth, skin: Skin, rules: Rules
     # Beyond a band no face is known; a known one makes the answer cheap.
     near = wp.where(sheet.distance[a] <= sheet.distance[b] + rules.tolerance, sheet.face[a], sheet.face[b])
     distance, gradient, _face = ask(skin, 0.5 * (sheet.place[a] + sheet.place[b]), near)
-    return 0.5 * rules.margin - distance, gradient
+    lack = 0.5 * rules.margin - distance
+    # What runs through a limb hasn't cut a corner, and isn't to be raised.
+    return lack * wp.clamp(2.0 - lack / rules.through, 0.0, 1.0), gradient
 
 
 @wp.kernel(enable_backward=False)

@@ -26,6 +26,8 @@ FARTHEST = 0.08
 DETOUR = 2.0
 """nor is one that is longer than this multiple of the depth: there the cloth isn't in the middle of a limb but has been
 folded, and its normal leads a single vertex through a whole thigh, centimetres past all others."""
+TURNING = 0.5
+"""TODO"""
 
 
 def mend(
@@ -95,29 +97,49 @@ def turn_outward(
 
     In the middle of a thin limb the closest skin of one vertex is in front and that of the next one behind: they would
     be torn apart, and the cloth between them end within the limb. So what is deep, and would leave against the outward
-    normal of the cloth (R, 3), goes along that normal instead; its distance is then how far that is.
+    normal of the cloth (R, 3), goes along that normal instead; its distance is then how far that is. Where
+    that is nearly too far it goes between the two, if the body ends there as soon.
 
     `query` gives the distances of points (R', 3), which are those number `at` (R',). Returns how often it was asked,
     too.
     """
     against = (sample.gradient * outward).sum(-1) < 0
     rows = torch.nonzero(against & (sample.distance < -DEEP))[:, 0]
-    way, going = -sample.distance[rows], torch.arange(len(rows), device=rows.device)
-    farthest = (DETOUR * way).clamp_max(FARTHEST)
-    looks = 0
+    depth, here = -sample.distance[rows], points[rows]
+    farthest = (DETOUR * depth).clamp_max(FARTHEST)
+    way, found, looks = _way_out(here, outward[rows], depth, farthest, lambda x, at: query(x, rows[at]))
+    rows, here, depth, farthest, way = rows[found], here[found], depth[found], farthest[found], way[found]
+    heading = outward[rows]
+    share = (DETOUR - way / depth) / TURNING
+    between = torch.nonzero(share < 1)[:, 0]
+    side = share[between, None] * heading[between] + (1 - share[between, None]) * sample.gradient[rows[between]]
+    side = torch.nn.functional.normalize(side, dim=-1)
+    way_between, found, more = _way_out(
+        here[between], side, depth[between], farthest[between], lambda x, at: query(x, rows[between[at]])
+    )
+    way[between[found]], heading[between[found]] = way_between[found], side[found]
+    turned = sample._replace(
+        distance=sample.distance.index_copy(0, rows, -way), gradient=sample.gradient.index_copy(0, rows, heading)
+    )
+    return turned, looks + more
+
+
+def _way_out(
+    points: Tensor, heading: Tensor, depth: Tensor, farthest: Tensor, query: Callable[[Tensor, Tensor], SdfSample]
+) -> tuple[Tensor, Tensor, int]:
+    """How far it is out of the body [m] from points (R, 3) of this `depth` (R,) along `heading` (R, 3).
+
+    Also where a way was found that is shorter than the `farthest` (R,), and how often it was asked.
+    """
+    way, going, looks = depth.clone(), torch.arange(len(points), device=points.device), 0
     while len(going) and looks < STEPS:
-        at = rows[going]
         # No skin is nearer than |f|.
-        height = query(points[at] + way[going, None] * outward[at], at).distance
+        height = query(points[going] + way[going, None] * heading[going], going).distance
         way[going] = way[going] - height + (height < 0) * STEP_ON
         going = going[(height < 0) & (way[going] < farthest[going])]
         looks += 1
     found = torch.ones_like(way, dtype=torch.bool).index_fill(0, going, False) & (way > 0) & (way < farthest)
-    rows, way = rows[found], way[found]
-    turned = sample._replace(
-        distance=sample.distance.index_copy(0, rows, -way), gradient=sample.gradient.index_copy(0, rows, outward[rows])
-    )
-    return turned, looks
+    return way, found, looks
 
 
 def _contradictions(points: Tensor, distance: Tensor, edges: Tensor, margin: float) -> tuple[Tensor, Tensor]:

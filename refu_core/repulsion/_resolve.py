@@ -18,6 +18,10 @@ RETREAT_STEPS = 8
 BULGE = 0.375
 """How far skin is expected to bulge to the middle of an edge, a length of the edge and a radian between the normals
 below its ends: three times as far as a circle does."""
+THROUGH = 0.01
+"""How much a middle may lack for the edge to be raised in full [m]; at twice that it isn't at all. An edge that cuts a
+corner lacks less; one that lacks more runs through a limb, no rise clears it, and its ends would be thrown far off the
+skin, to whichever side is closest to the middle."""
 SURE = 4e-3
 """How far beyond the margin a distance is trusted to be one from the body [m]. Where a body runs into itself it jumps:
 a vertex within an arm may be said to be 2 cm outside of the flank that the arm is in."""
@@ -317,11 +321,13 @@ def _raise_edges(state: _State, edges: Tensor, max_rounds: int) -> int:
         of_first, of_second = state.distance[low].unbind(1)
         closer = torch.where(of_first <= of_second + state.tolerance, low[:, 0], low[:, 1])
         middle = state.query(state.vertices[low].mean(dim=1), closer)
-        is_low = middle.distance < wanted
+        lack = wanted - middle.distance
+        lack = lack * (2 - lack / THROUGH).clamp(0, 1)
+        is_low = lack > 0
         if not bool(is_low.any()):
             return round_
         low = low[is_low]
-        deficit = (wanted - middle.distance[is_low]).repeat_interleave(2)
+        deficit = lack[is_low].repeat_interleave(2)
         rise = deficit[:, None] * middle.gradient[is_low].repeat_interleave(2, dim=0)
         ends = low.reshape(-1)
         # A vertex of several low edges follows the lowest of them.

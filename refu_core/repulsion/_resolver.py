@@ -14,8 +14,8 @@ from refu_core._warp import as_warp, torch_stream
 from refu_core.repulsion import _edge_kernels, _resolver_kernels, _round_kernels, _sheet, _spread_kernels
 from refu_core.repulsion._blend import BLEND_REACH, BLEND_STEPS
 from refu_core.repulsion._limbs import INWARD, SIDEWAYS, Limbs
-from refu_core.repulsion._mend import DEEP, DETOUR, FARTHEST, LOOKS, ROUNDS, STEP_ON, STEPS, TOLERANCE
-from refu_core.repulsion._resolve import BULGE, RETREAT_STEPS, SURE, Resolution
+from refu_core.repulsion._mend import DEEP, DETOUR, FARTHEST, LOOKS, ROUNDS, STEP_ON, STEPS, TOLERANCE, TURNING
+from refu_core.repulsion._resolve import BULGE, RETREAT_STEPS, SURE, THROUGH, Resolution
 from refu_core.repulsion._scale import VertexScale
 from refu_core.repulsion._unit import DEFAULT_MARGIN, MAX_DISPLACEMENT
 from refu_core.sdf import ApproxSdf, BandSdf, ExactSdf, SdfSample
@@ -296,8 +296,9 @@ def _rules(margin: float) -> Any:
         _MAX_PUSHES,
     )
     rules.contradiction, rules.step_on, rules.deep, rules.sure = TOLERANCE, STEP_ON, DEEP, SURE
-    rules.sideways, rules.inward, rules.bulge = SIDEWAYS, INWARD, BULGE
-    rules.farthest, rules.detour = FARTHEST, DETOUR
+    rules.sideways, rules.inward = SIDEWAYS, INWARD
+    rules.bulge, rules.through = BULGE, THROUGH
+    rules.farthest, rules.detour, rules.turning = FARTHEST, DETOUR, TURNING
     rules.retreats, rules.turns = RETREAT_STEPS, STEPS
     return rules
 

@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-# ruff: noqa: UP018
+# ruff: noqa: RUF046, UP018
 # (Warp reads a kernel's annotations as array types of its own; a type checker can't. A variable that changes in a loop
 # has to be called int or float there.)
 """Most steps of `resolve`, each over the vertices that it concerns: one code for CPU and CUDA."""
@@ -284,23 +284,34 @@ def aim_kernel(
     limb = cloth.limb[sheet.face[i]]
     if depth < -rules.deep and cloth.own[i] == 1 << limb and sheet.along[i] < 0.0:
         # In the middle of a thin limb the closest skin of one vertex is in front and that of the next one behind:
-        # all go along the cloth's normal, as far as that is.
-        outward = sheet.outward[i]
+        # all go along the cloth's normal, as far as that is; or between both, where that is nearly too far.
+        shortest = heading
+        side = sheet.outward[i]
+        first = -depth
         way = -depth
-        farthest = wp.min(rules.farthest, rules.detour * way)
-        turned = bool(False)
-        for _look in range(rules.turns):
-            height, _gradient, _face = ask(skin, sheet.origin[i] + way * outward, sheet.face[i])
+        farthest = wp.min(rules.farthest, rules.detour * first)
+        looks = int(0)
+        is_second = bool(False)
+        for _look in range(2 * rules.turns):
+            height, _gradient, _face = ask(skin, sheet.origin[i] + way * side, sheet.face[i])
             way = way - height
+            looks += 1
             if height >= 0.0:
-                turned = way > 0.0 and way < farthest
-                break
-            way += rules.step_on
-            if way >= farthest:
-                break
-        if turned:
-            depth = -way
-            heading = outward
+                if way <= 0.0 or way >= farthest:
+                    break
+                depth = -way
+                heading = side
+                share = (rules.detour - way / first) / rules.turning
+                if is_second or share >= 1.0:
+                    break
+                side = wp.normalize(share * side + (1.0 - share) * shortest)
+                way = first
+                looks = 0
+                is_second = True
+            else:
+                way += rules.step_on
+                if way >= farthest or looks >= rules.turns:
+                    break
     sheet.depth[i] = depth
     sheet.heading[i] = heading
     sheet.pushed[wp.atomic_add(sheet.counts, PUSHED, 1)] = i

@@ -69,8 +69,10 @@ class Rules:
     inward: wp.float32
     farthest: wp.float32
     detour: wp.float32
+    turning: wp.float32
     sure: wp.float32
     bulge: wp.float32
+    through: wp.float32
     retreats: wp.int32
     turns: wp.int32
 

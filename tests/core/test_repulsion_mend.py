@@ -146,3 +146,23 @@ def test_without_a_way_out_on_its_own_side_a_vertex_keeps_the_other() -> None:
     turned, _ = turn_outward(point, sample, torch.tensor([[0.0, 1.0, 0.0]]), lambda here, _: sdf.query(here))
     assert torch.equal(turned.distance, sample.distance)
     assert torch.equal(turned.gradient, sample.gradient)
+
+
+def test_where_the_own_side_becomes_too_far_the_way_out_goes_around() -> None:
+    """A point that nears the skin: out on its own side at first, at twice the depth by the shortest way, no leap."""
+    mesh = trimesh.creation.icosphere(subdivisions=5, radius=0.05)
+    sdf = ExactSdf(mesh.faces)
+    sdf.update(torch.tensor(mesh.vertices, dtype=torch.float32))
+    height = torch.linspace(0.015, 0.03, 200)
+    points = torch.stack((0.1 * height, height, 0.05 * height), dim=1)
+    side = torch.tensor([1.0, -0.15, 0.0]).expand_as(points)
+    side = side / side.norm(dim=1, keepdim=True)
+    sample = sdf.query(points)
+    turned, _ = turn_outward(points, sample, side, lambda here, _: sdf.query(here))
+    along = (turned.gradient * side).sum(1)
+    assert along[0] > 0.99
+    assert torch.equal(turned.gradient[-1], sample.gradient[-1])
+    ends = points - turned.distance[:, None] * turned.gradient
+    assert sdf.query(ends).distance.abs().max() < 2e-3
+    assert (ends[1:] - ends[:-1]).norm(dim=1).max() < 3e-3
+    assert (ends[0] - ends[-1]).norm() > 0.04

@@ -106,7 +106,9 @@ def test_turned_persons_wear_the_same_where_limbs_run_into_each_other(seed: int,
 def test_worst_cases_of_refu_stress_that_are_no_more(path: Path) -> None:
     """Shorts: a fold that sent a vertex through the thigh, and one that was left between crossed thighs. A turn that
     made a difference; a skirt of γ = -28, and one deep in the thighs, where the closest skin leaps. A shirt that
-    was brought off another fold of the T-shirt in every frame."""
+    was brought off another fold of the T-shirt in every frame. Deep in the thighs: an edge from one side of a thigh to
+    the other that was raised in vain, a walk that ended at another way out than the shortest, and a way out on the
+    cloth's own side that became too long."""
     tally = replay_trial(path)
     assert not tally.failures, tally.as_dict()
 
