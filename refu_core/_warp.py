@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import os
+import warnings
 from collections.abc import Iterator
 from typing import Any
 
@@ -32,7 +33,8 @@ def _start_quietly() -> None:
         wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
     else:  # releases before the logger
         wp.config.quiet = True
-    with contextlib.nullcontext() if torch.cuda.is_available() else _no_stderr():
+    with warnings.catch_warnings(), contextlib.nullcontext() if torch.cuda.is_available() else _no_stderr():
+        warnings.filterwarnings("ignore", "Support for Python", FutureWarning)  # by releases to come: pip minds that
         wp.init()
 
 

@@ -35,7 +35,7 @@ ALLOWED = (
         r"mozilla",
     ),
     *(r"\bhpnd\b", r"historical permission", r"unlicense", r"\bcc0\b", r"\b0bsd\b", r"\bzlib\b", r"public domain"),
-    *(r"\blgpl\b", r"lesser general public", r"boost", r"matplotlib", r"nvidia", r"cnri"),
+    *(r"\blgpl\b", r"lesser general public", r"boost", r"matplotlib", r"cnri"),
 )
 """Licences that permit commercial use and ask nothing of the source of what merely uses the package."""
 REFUSED = (
@@ -45,9 +45,11 @@ REFUSED = (
     r"non-?commercial",
     r"research only",
 )
+_CUDA = "NVIDIA's terms for CUDA, which permit commercial use; comes with torch's CUDA build alone"
 _FORTRAN = "BSD-3-Clause; the GPL in its metadata is libgfortran's, which has the runtime library exception"
 EXCEPTIONS = {
     "apsw": "MIT-like (any licence that OSI approves)",
+    "cuda-toolkit": _CUDA,
     "docutils": "public domain, BSD-2-Clause; the GPL in its metadata is of an editor mode that isn't installed",
     "libigl": "MPL-2.0; its wheel leaves out what is under the GPL",
     "numpy": _FORTRAN,
@@ -59,6 +61,8 @@ EXCEPTIONS = {
     "setuptools": "MIT",
 }
 """Looked up by hand, where metadata says nothing or names a part that isn't used."""
+EXCEPTED_FAMILIES = {"nvidia-": _CUDA}
+"""The same, by how names begin."""
 
 
 @dataclass(frozen=True)
@@ -110,9 +114,15 @@ def licence_of(package: Distribution) -> str:
     return expression or (named if named not in ("", "OSI Approved") else " ".join(text.split())[:200]) or "unknown"
 
 
+def exception(name: str) -> str | None:
+    """What was looked up by hand; None where metadata will do."""
+    families = (licence for start, licence in EXCEPTED_FAMILIES.items() if name.startswith(start))
+    return EXCEPTIONS.get(name) or next(families, None)
+
+
 def is_allowed(name: str, licence: str) -> bool:
     """Whether a licence is on the list, and not on the other one."""
-    if name in EXCEPTIONS:
+    if exception(name) is not None:
         return True
     text = licence.lower()
     return any(re.search(pattern, text) for pattern in ALLOWED) and not any(re.search(p, text) for p in REFUSED)
@@ -125,7 +135,7 @@ def dependencies() -> list[Dependency]:
         Dependency(
             name,
             package.version,
-            EXCEPTIONS.get(name) or licence_of(package),
+            exception(name) or licence_of(package),
             name in used,
             is_allowed(name, licence_of(package)),
         )

@@ -16,6 +16,8 @@ ROOT = Path(__file__).parents[1]
 def test_tools_are_silent(command: list[str]) -> None:
     if importlib.util.find_spec(command[0]) is None:
         pytest.skip(f"{command[0]} isn't installed (extra dev)")
+    if command == ["mypy"] and sys.version_info < (3, 11):
+        pytest.skip("numpy's last release for Python 3.10 lacks types that later ones have")
     done = subprocess.run([sys.executable, "-m", *command], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
 

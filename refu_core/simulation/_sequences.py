@@ -98,8 +98,8 @@ class SequencePlan:
         """β (10,), normal, cut off at ±2, and γ (4,), zero."""
         edge = ndtr(2 / self.spread)
         u = np.random.default_rng(self._key(1, slot % self.shapes)).random(N_BETAS)
-        betas = self.spread * ndtri((1 - edge) + u * (2 * edge - 1))
-        return np.clip(betas, -2, 2).astype(np.float32), np.zeros(N_STYLES, np.float32)
+        betas = np.asarray(self.spread * ndtri((1 - edge) + u * (2 * edge - 1)), np.float32)
+        return betas.clip(-2, 2), np.zeros(N_STYLES, np.float32)
 
     def motion(self, slot: int, attempt: int, clips: list[Clip]) -> Motion:
         """What a sequence shows at its `attempt`. Raises `SimulationError` when no clip is long enough."""
