@@ -1,5 +1,4 @@
 # mypy: ignore-errors
-# ruff: noqa: UP018
 # (Warp reads a kernel's annotations as array types of its own; a type checker can't. A variable that changes in a loop
 # has to be called int or float there.)
 """Raising edges that run too low between their ends: all rounds in one launch (`_round_kernels` has a GPU's)."""
@@ -33,13 +32,20 @@ def suspect_kernel(sheet: Sheet, cloth: Cloth, rules: Rules):
     b = cloth.edges[edge, 1]
     first = sheet.distance[a]
     second = sheet.distance[b]
-    length = wp.length(sheet.place[a] - sheet.place[b])
-    if wp.min(first, second) < 0.0 or wp.max(first, second) >= 0.5 * (rules.margin + length):
+    if first < 0.0 or second < 0.0:
         return
-    bulge = float(0.0)
-    if sheet.face[a] >= 0 and sheet.face[b] >= 0:
-        bulge = rules.bulge * length * wp.length(sheet.gradient[a] - sheet.gradient[b])
-    if 0.5 * (first + second) < 0.5 * rules.margin + bulge:
+    # Most edges are far off, which is to be seen from as few numbers as may be.
+    is_low = first + second < rules.margin
+    if not is_low and (sheet.face[a] < 0 or sheet.face[b] < 0):
+        return  # what bulges there isn't known
+    way = sheet.place[a] - sheet.place[b]
+    beyond = 2.0 * wp.where(first > second, first, second) - rules.margin
+    if beyond >= 0.0 and beyond * beyond >= wp.dot(way, way):
+        return
+    if not is_low:
+        bulge = rules.bulge * wp.length(way) * wp.length(sheet.gradient[a] - sheet.gradient[b])
+        is_low = first + second < rules.margin + 2.0 * bulge
+    if is_low:
         sheet.suspects[wp.atomic_add(sheet.counts, CUTTING, 1)] = edge
 
 

@@ -121,6 +121,15 @@ def sort_kernel(
     extent[1] = high
 
 
+@wp.func
+def beyond(x: float, low: float, high: float):
+    """How far x is outside of an interval; without a look for NaN, as wp.max has."""
+    under = low - x
+    over = x - high
+    most = wp.where(under > over, under, over)
+    return wp.where(most > 0.0, most, 0.0)
+
+
 @wp.kernel
 def scan_kernel(
     body: wp.array(dtype=wp.vec3),
@@ -176,9 +185,13 @@ def scan_kernel(
                         rest = 0
                     p = points[here]
                     height = wp.dot(normal, p - a)
-                    beside = wp.max(wp.max(box_low - p, p - box_high), wp.vec3(0.0, 0.0, 0.0))
+                    x = beyond(p[0], box_low[0], box_high[0])
+                    y = beyond(p[1], box_low[1], box_high[1])
+                    z = beyond(p[2], box_low[2], box_high[2])
+                    beside = x * x + y * y + z * z
+                    above = height * height
                     # Neither its plane nor its box is ever farther than a face.
-                    if wp.max(height * height, wp.dot(beside, beside)) < squared[here]:
+                    if wp.where(above > beside, above, beside) < squared[here]:
                         w, _feature = closest_on_triangle(p, a, b, c)
                         offset = (p - a) - (w[1] * (b - a) + w[2] * (c - a))
                         length = wp.dot(offset, offset)

@@ -14,8 +14,11 @@ from refu_core.sdf._kernels import closest_on_triangle, offset_from
 WIDTH = wp.constant(8)
 _FAR = wp.constant(1.0e36)  # [m²]
 Eight = wp.types.vector(length=8, dtype=wp.float32)
-_Stack = wp.types.vector(length=64, dtype=wp.int32)  # seven more a level than are taken off it: nine levels
-MAX_FACES = 8**8
+_Queue = wp.types.vector(length=64, dtype=wp.int32)
+_LAST = wp.constant(63)
+_FEW = wp.constant(12)
+"""While no more than this wait, nodes are looked at as they come. Twelve and six levels of seven more have room."""
+MAX_FACES = 8**6
 
 
 @wp.struct
@@ -30,6 +33,22 @@ class Boxes:
     """Number of the first face."""
 
 
+@wp.func
+def least(a: float, b: float, c: float):
+    """Without a look for NaN, as wp.min has."""
+    lower = wp.where(b < a, b, a)
+    return wp.where(c < lower, c, lower)
+
+
+@wp.func
+def least_of(eight: Eight):
+    return least(
+        least(eight[0], eight[1], eight[2]),
+        least(eight[3], eight[4], eight[5]),
+        wp.where(eight[7] < eight[6], eight[7], eight[6]),
+    )
+
+
 @wp.kernel(enable_backward=False)
 def fit_kernel(
     points: wp.array(dtype=wp.vec3),
@@ -40,24 +59,42 @@ def fit_kernel(
 ):
     """Fits the boxes to a pose, from the faces to the root; `bounds` are those of `boxes`, number by number."""
     n = boxes.order.shape[0]
-    for k in range(n):
-        face = boxes.order[k]
-        a = points[faces[face, 0]]
-        b = points[faces[face, 1]]
-        c = points[faces[face, 2]]
-        low = wp.min(wp.min(a, b), c)
-        high = wp.max(wp.max(a, b), c)
-        place = boxes.first + k - 1
-        for axis in range(3):
-            bounds[place / WIDTH, axis, place & 7] = low[axis]
-            bounds[place / WIDTH, axis + 3, place & 7] = high[axis]
     last = (boxes.first + n - 2) / WIDTH
-    for back in range(last):
+    n_above = (boxes.first - 1) / WIDTH
+    for back in range(last + 1):
         node = last - back
-        place = node - 1
-        for axis in range(3):
-            bounds[place / WIDTH, axis, place & 7] = wp.min(boxes.bounds[node, axis])
-            bounds[place / WIDTH, axis + 3, place & 7] = wp.max(boxes.bounds[node, axis + 3])
+        if node >= n_above:
+            low_x = Eight(wp.inf)
+            low_y = Eight(wp.inf)
+            low_z = Eight(wp.inf)
+            high_x = Eight(-wp.inf)
+            high_y = Eight(-wp.inf)
+            high_z = Eight(-wp.inf)
+            for k in range(8):
+                place = WIDTH * (node - n_above) + k
+                if place < n:
+                    face = boxes.order[place]
+                    a = points[faces[face, 0]]
+                    b = points[faces[face, 1]]
+                    c = points[faces[face, 2]]
+                    low_x[k] = least(a[0], b[0], c[0])
+                    low_y[k] = least(a[1], b[1], c[1])
+                    low_z[k] = least(a[2], b[2], c[2])
+                    high_x[k] = -least(-a[0], -b[0], -c[0])
+                    high_y[k] = -least(-a[1], -b[1], -c[1])
+                    high_z[k] = -least(-a[2], -b[2], -c[2])
+            boxes.bounds[node, 0] = low_x
+            boxes.bounds[node, 1] = low_y
+            boxes.bounds[node, 2] = low_z
+            boxes.bounds[node, 3] = high_x
+            boxes.bounds[node, 4] = high_y
+            boxes.bounds[node, 5] = high_z
+        if node > 0:
+            above = (node - 1) / WIDTH
+            child = (node - 1) & 7
+            for axis in range(3):
+                bounds[above, axis, child] = least_of(boxes.bounds[node, axis])
+                bounds[above, axis + 3, child] = -least_of(-boxes.bounds[node, axis + 3])
 
 
 @wp.func
@@ -111,17 +148,23 @@ def closest_in_boxes(
     squared = wp.dot(offset, offset)
     if not squared < _FAR:  # of a face without area it isn't a number
         squared = _FAR
-    stack = _Stack()  # begins with the root
-    n = int(1)
-    while n > 0:
-        n -= 1
-        place = stack[n]
+    # First come, first served: so a processor is at the next node while it still compares boxes of this one.
+    queue = _Queue()  # begins with the root
+    head = int(0)
+    tail = int(1)
+    while head < tail:
+        place = queue[head & _LAST]
+        if tail - head <= _FEW:
+            head += 1
+        else:
+            tail -= 1
+            place = queue[tail & _LAST]
         if place < boxes.first:
             gaps = squared_gaps(p, place, boxes)
             for k in range(8):
                 # Written in any case, counted if it is of use: there is nothing to be foreseen.
-                stack[n] = 8 * place + 1 + k
-                n += wp.where(gaps[k] < squared, 1, 0)
+                queue[tail & _LAST] = 8 * place + 1 + k
+                tail += wp.where(gaps[k] < squared, 1, 0)
         else:
             other = boxes.order[place - boxes.first]
             a = points[faces[other, 0]]
@@ -129,7 +172,7 @@ def closest_in_boxes(
             ac = points[faces[other, 2]] - a
             normal = wp.cross(ab, ac)
             height = wp.dot(normal, p - a)
-            if height * height < squared * wp.dot(normal, normal):
+            if other != near and height * height < squared * wp.dot(normal, normal):
                 w, _feature = closest_on_triangle(p, a, a + ab, a + ac)
                 offset = (p - a) - (w[1] * ab + w[2] * ac)
                 length = wp.dot(offset, offset)
