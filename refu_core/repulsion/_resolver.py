@@ -57,6 +57,7 @@ class Resolver:
         self._read_counts = self._counts.numpy() if self._is_serial else None
         self._sheet = self._bind_sheet()
         self._commands: dict[str, Any] = {}
+        self._dims: dict[str, int] = {}
         self._recorded_for: tuple[Any, ...] = ()
 
     @torch.no_grad()
@@ -219,10 +220,13 @@ class Resolver:
         command = self._commands[name]
         if parameter is not None:
             command.set_param_at_index(*parameter)
-        command.set_dim(n)
+        if self._dims.get(name) != n:
+            command.set_dim(n)
+            self._dims[name] = n
         command.launch()
 
     def _command(self, name: str, kernel: Any, inputs: list[Any]) -> None:
+        self._dims[name] = 1
         self._commands[name] = wp.launch(kernel, dim=1, inputs=inputs, device=str(self.device), record_cmd=True)
 
     def _record(self, sdf: ExactSdf | BandSdf | ApproxSdf, margin: float) -> None:

@@ -35,7 +35,24 @@ _MOST_CELLS = wp.constant(1.0e9)  # farther from the origin a cell's number woul
 
 @wp.func
 def cell_number(x: float, per_metre: float):
-    return int(wp.floor(wp.clamp(x * per_metre, -_MOST_CELLS, _MOST_CELLS)))
+    cell = x * per_metre
+    cell = wp.where(cell < _MOST_CELLS, cell, _MOST_CELLS)
+    return int(wp.floor(wp.where(cell > -_MOST_CELLS, cell, -_MOST_CELLS)))
+
+
+@wp.func
+def lesser(p: wp.vec3, q: wp.vec3):
+    """By coordinate, of numbers: wp.min would look for NaN."""
+    return wp.vec3(
+        wp.where(q[0] < p[0], q[0], p[0]), wp.where(q[1] < p[1], q[1], p[1]), wp.where(q[2] < p[2], q[2], p[2])
+    )
+
+
+@wp.func
+def greater(p: wp.vec3, q: wp.vec3):
+    return wp.vec3(
+        wp.where(q[0] > p[0], q[0], p[0]), wp.where(q[1] > p[1], q[1], p[1]), wp.where(q[2] > p[2], q[2], p[2])
+    )
 
 
 @wp.func
@@ -85,8 +102,8 @@ def sort_kernel(
     high = points[0]
     for q in range(n):
         p = points[q]
-        low = wp.min(low, p)
-        high = wp.max(high, p)
+        low = lesser(low, p)
+        high = greater(high, p)
         row = row_of(cell_number(p[0], per_metre), cell_number(p[2], per_metre))
         r = number_of_row[row]
         if r < 0:
@@ -152,10 +169,10 @@ def scan_kernel(
     c = body[faces[f, 2]]
     wide = limit * 1.0001  # a hair more, for rounding
     reach = wp.vec3(wide, wide, wide)
-    box_low = wp.min(wp.min(a, b), c)
-    box_high = wp.max(wp.max(a, b), c)
-    low = wp.max(box_low - reach, extent[0])
-    high = wp.min(box_high + reach, extent[1])
+    box_low = lesser(lesser(a, b), c)
+    box_high = greater(greater(a, b), c)
+    low = greater(box_low - reach, extent[0])
+    high = lesser(box_high + reach, extent[1])
     if low[0] > high[0] or low[1] > high[1] or low[2] > high[2]:
         return
     i0 = cell_number(low[0], per_metre)
