@@ -33,7 +33,8 @@ class LaplacianSmoothing:
     def transposed(self, components: Tensor) -> Tensor:
         """`components` @ S of the same shape (R, 3 V), where S smooths: (components @ S) @ x = components @ (S x)."""
         columns = components.detach().cpu().view(len(components), -1, 3).movedim(-2, 0)
-        return self._apply(sparse.csr_array(self._map.T), columns).movedim(0, -2).reshape(components.shape).to(components)
+        smoothed = self._apply(sparse.csr_array(self._map.T), columns)
+        return smoothed.movedim(0, -2).reshape(components.shape).to(components)
 
     def _apply(self, matrix: sparse.csr_array, columns: Tensor) -> Tensor:
         x = columns.double().numpy().reshape(len(columns), -1)
