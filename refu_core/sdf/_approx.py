@@ -84,6 +84,8 @@ class ApproxSdf(MeshSdf):
             msg = f"the approximate distance is for bodies of up to {MAX_FACES} faces, got {len(self.faces)}: use exact"
             raise MeshError(msg)
         self._exact_from = exact_from
+        # A GPU isn't waited for to know whether anything is that deep.
+        self._is_serial = self.device.type == "cpu"
         part = _part_of_faces(body)
         self._links = torch.zeros(len(part), 2, 4, dtype=torch.int32, device=self.device)
         self._links[:, 0, :3] = self.faces
@@ -131,7 +133,7 @@ class ApproxSdf(MeshSdf):
         near = self._seek(points) if near is None else near
         if self._walk is not None:
             found = self._walk.ask(points, near, last=self._order(near))
-            if len(points) and float(found.distance.min()) < -self._exact_from:
+            if len(points) and (not self._is_serial or float(found.distance.min()) < -self._exact_from):
                 self._ask_deep(points, found)
             return found
         found = Found.empty(len(points), self.device)

@@ -29,7 +29,7 @@ from refu_core import GarmentPipeline, SmplFrame
 from refu_core.errors import MeshError
 from refu_core.realtime._graph import CudaCapture, StepGraphs
 from refu_core.realtime._step import Step
-from refu_core.sdf import ExactSdf, _mesh
+from refu_core.sdf import ApproxSdf, ExactSdf, _mesh
 
 CPU = torch.device("cpu")
 
@@ -121,6 +121,8 @@ def as_on_a_gpu(pipeline: GarmentPipeline) -> Step:
     if pipeline._collisions is not None:
         if isinstance(pipeline._collisions._sdf, ExactSdf):
             pipeline._collisions._sdf._rebuild_distance = math.inf
+        if isinstance(pipeline._collisions._sdf, ApproxSdf):
+            pipeline._collisions._sdf._is_serial = False
         for fabric in pipeline._collisions._fabrics.values():
             fabric.resolver._is_serial = False
     return pipeline._step
