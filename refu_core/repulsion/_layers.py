@@ -30,6 +30,9 @@ _FADE = 0.02
 """How far beyond its open rims a sheet is still felt, less and less [m]; so cloth runs smoothly over a waistband."""
 _AGREEMENT = 0.25
 """Cosine of the garments' normals from which on a push counts in full; at a right angle it doesn't count at all."""
+_DOUBT = 0.012
+"""Where a search ended this far below the sheet [m] the closest place is asked for in a tree: it may be of another
+fold, and the push in another direction."""
 _STRETCH = 1.5
 """How much longer than at rest an edge may be."""
 _SPACING = 0.05
@@ -39,6 +42,9 @@ _SLIDES = 0.14
 _ROUNDS = 6
 """How far the neighbourhood of a first push reaches [edges], and how often it is swept: even, so that the field ends
 where it began."""
+_LATER_REACH = 0.02
+"""How far a second push, which is a correction, feels the sheet [m]: what is as deep after the first one is between
+folds, and which of them is closest changes from frame to frame."""
 _LATER_ROUNDS = 2
 """Those of a second push, which is a correction."""
 
@@ -54,7 +60,8 @@ class Layer:
 
     The closest point is looked for downhill from the nearest of a few places around what was closest at rest. As cloth
     slides by a few edges only, that takes half the time that a tree does. Where the sheet is folded such a search may
-    end in the wrong fold, and in the next frame in another one: so a vertex looks at what its neighbours found, too.
+    end in the wrong fold, and in the next frame in another one: so a vertex looks at what its neighbours found, too;
+    and the closest place to one that ends more than a centimetre below the sheet is asked for in a tree.
     """
 
     def __init__(
@@ -81,13 +88,17 @@ class Layer:
         self._push = torch.zeros(len(meets), 3, device=self.device)
         self._fields = torch.zeros(2, len(rows) + 1, 3, device=self.device)
         self._count = torch.zeros(1, dtype=torch.int32, device=self.device)
+        self._n_doubtful = torch.zeros(1, dtype=torch.int32, device=self.device)
+        self._tree: Any = None
+        self._tree_is_late = True
         self._commands: dict[str, Any] = {}
         if len(meets):
             cuts = [_cut(above_faces, above_blend), _cut(below_faces, below_blend)]
             lists = [
                 _ints(values, self.device) for values in (*_starts(rest[meets], rest_below), rows, ring_start, ring)
             ]
-            self._record(_rules(gap, self._below, below_blend), *cuts, *lists)
+            rules, later = (_rules(gap, reach, self._below, below_blend) for reach in (LAYER_REACH, _LATER_REACH))
+            self._record(rules, later, *cuts, *lists)
 
     @torch.no_grad()
     def __call__(self, above: Tensor, below: Tensor) -> tuple[Tensor, int]:
@@ -100,12 +111,12 @@ class Layer:
             return above, 0
         with torch_stream(self.device):
             self._take(above, below)
-            self._look("search")
+            self._look("search", waits=True)
             n_low = int(self._count)
             if n_low:
                 self._move(_ROUNDS)
                 # What has left the sheet at one place may have come to another, and be too low there.
-                self._look("search again")
+                self._look("search again", waits=True)
                 if int(self._count):
                     self._move(_LATER_ROUNDS)
         return (self._above.clone(), n_low) if n_low else (above, 0)
@@ -118,10 +129,10 @@ class Layer:
             return above, torch.zeros_like(self._count)
         with torch_stream(self.device):
             self._take(above, below)
-            self._look("search")
+            self._look("search", waits=False)
             n_low = self._count.clone()
             self._move(_ROUNDS)
-            self._look("search again")
+            self._look("search again", waits=False)
             self._move(_LATER_ROUNDS)
         return self._above.clone(), n_low
 
@@ -138,12 +149,22 @@ class Layer:
         self._above.copy_(above)
         self._below.copy_(below)
         self._commands["normals"].launch()
+        self._tree_is_late = True
 
-    def _look(self, search: str) -> None:
-        """What has to be pushed, and how many vertices that are."""
+    def _look(self, search: str, *, waits: bool) -> None:
+        """What has to be pushed, and how many vertices that are; a device that isn't waited for asks about everyone."""
+        lift, ask = (search.replace("search", step) for step in ("lift", "ask"))
         self._count.zero_()
+        self._n_doubtful.zero_()
         self._commands[search].launch()
-        self._commands["lift"].launch()
+        self._commands[lift].launch()
+        n = int(self._n_doubtful) if waits else self._n_candidates
+        if n:
+            if self._tree_is_late:
+                self._tree.refit()
+                self._tree_is_late = False
+            self._commands[ask].set_dim(n)
+            self._commands[ask].launch()
 
     def _move(self, blend_rounds: int) -> None:
         """Pushes those with their neighbourhood."""
@@ -154,24 +175,41 @@ class Layer:
         self._commands["move"].launch()
 
     def _record(
-        self, rules: Any, above_cut: Any, below_cut: Any, near_start: Any, near: Any, rows: Any, start: Any, ring: Any
+        self,
+        rules: Any,
+        later: Any,
+        above_cut: Any,
+        below_cut: Any,
+        near_start: Any,
+        near: Any,
+        rows: Any,
+        start: Any,
+        ring: Any,
     ) -> None:
         """Records the launches of a frame: each of them is shorter than what Python makes of its arguments."""
         above, below, normals, push = (
             as_warp(tensor, wp.vec3) for tensor in (self._above, self._below, self._normals, self._push)
         )
         fields = [as_warp(field, wp.vec3) for field in self._fields]
-        found, closest = (wp.zeros(self._n_candidates, dtype=wp.int32, device=str(self.device)) for _ in range(2))
+        self._tree = wp.Mesh(below, below_cut.faces.flatten())
+        found, closest, doubtful = (
+            wp.zeros(self._n_candidates, dtype=wp.int32, device=str(self.device)) for _ in range(3)
+        )
         itself = _ints(np.arange(self._n_candidates + 1), self.device)
         search = [below, below_cut, above, rows]
         garments = [below, normals, below_cut, above, above_cut, rows]
-        pushed = [start, ring, found, rules, closest, push, as_warp(self._count, wp.int32)]
+        pushed = [closest, push, as_warp(self._count, wp.int32)]
+        doubts = [doubtful, as_warp(self._n_doubtful, wp.int32)]
         blend = [push, self._n_candidates, start, ring]
+        again = [start, ring, found, later, *pushed, *doubts]
         for name, kernel, size, arguments in (
             ("normals", kernels.normals_kernel, len(self._below), [below, below_cut, normals]),
             ("search", kernels.search_kernel, self._n_candidates, [*search, near_start, near, found]),
             ("search again", kernels.search_kernel, self._n_candidates, [*search, itself, closest, found]),
-            ("lift", kernels.lift_kernel, self._n_candidates, [*garments, *pushed]),
+            ("lift", kernels.lift_kernel, self._n_candidates, [*garments, start, ring, found, rules, *pushed, *doubts]),
+            ("lift again", kernels.lift_kernel, self._n_candidates, [*garments, *again]),
+            ("ask again", kernels.ask_kernel, self._n_candidates, [self._tree.id, *garments, later, *doubts, *pushed]),
+            ("ask", kernels.ask_kernel, self._n_candidates, [self._tree.id, *garments, rules, *doubts, *pushed]),
             ("spread0", kernels.spread_kernel, self._n_region, [*blend, fields[0], fields[1]]),
             ("spread1", kernels.spread_kernel, self._n_region, [*blend, fields[1], fields[0]]),
             ("move", kernels.move_kernel, self._n_region, [rows, fields[0], above]),
@@ -187,11 +225,12 @@ def _ints(values: NDArray[Any], device: torch.device) -> Any:
     return wp.array(values.astype(np.int32), dtype=wp.int32, device=str(device))
 
 
-def _rules(gap: float, below: Tensor, blend: Blend) -> Any:
+def _rules(gap: float, reach: float, below: Tensor, blend: Blend) -> Any:
     start, end = _half_edges(blend)
     rest = below.cpu().numpy()
     rules = kernels.LayerRules()
-    rules.gap, rules.reach, rules.fade, rules.agreement = gap, LAYER_REACH, _FADE, _AGREEMENT
+    rules.gap, rules.reach, rules.fade, rules.agreement = gap, reach, _FADE, _AGREEMENT
+    rules.doubt = _DOUBT
     rules.longest = _STRETCH * float(np.linalg.norm(rest[start] - rest[end], axis=1).max())
     return rules
 

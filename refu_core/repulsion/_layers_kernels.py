@@ -36,6 +36,7 @@ class LayerRules:
     longest: wp.float32
     fade: wp.float32
     agreement: wp.float32
+    doubt: wp.float32
 
 
 @wp.func
@@ -141,6 +142,40 @@ def search_kernel(
     found[k] = v
 
 
+@wp.func
+def normal_on(face: int, w: wp.vec3, normals: wp.array(dtype=wp.vec3), cut: Cut):
+    """Unit normal of a garment at a place on a face, between those of its vertices."""
+    a = cut.faces[face, 0]
+    b = cut.faces[face, 1]
+    c = cut.faces[face, 2]
+    return wp.normalize(w[0] * normals[a] + w[1] * normals[b] + w[2] * normals[c])
+
+
+@wp.func
+def lift_off(
+    i: int,
+    face: int,
+    feature: int,
+    offset: wp.vec3,
+    normal: wp.vec3,
+    below_cut: Cut,
+    above: wp.array(dtype=wp.vec3),
+    above_cut: Cut,
+    rules: LayerRules,
+):
+    """What brings vertex i to the gap above the place on the sheet that it is off by `offset`."""
+    height = wp.dot(offset, normal)
+    far = wp.length(offset)
+    if height >= rules.gap or far > rules.reach:
+        return wp.vec3(0.0, 0.0, 0.0)
+    share = wp.clamp(wp.dot(normal_at(i, above, above_cut), normal) / rules.agreement, 0.0, 1.0)
+    # Whatever ends does so gradually, or cloth would jump from frame to frame.
+    share *= wp.min(1.0, 4.0 * (1.0 - far / rules.reach))
+    if (below_cut.rim[face] >> feature) & 1 != 0:
+        share *= wp.max(0.0, 1.0 - wp.length(offset - height * normal) / rules.fade)
+    return share * (rules.gap - height) * normal
+
+
 @wp.kernel(enable_backward=False)
 def lift_kernel(
     # the garment below
@@ -159,11 +194,14 @@ def lift_kernel(
     closest: wp.array(dtype=int),
     push: wp.array(dtype=wp.vec3),
     count: wp.array(dtype=int),
+    doubtful: wp.array(dtype=int),
+    n_doubtful: wp.array(dtype=int),
 ):
     """What brings each candidate to the gap above the sheet, and how many they are that lack something.
 
     A fold that one candidate's search ended in is seldom in the way of its neighbours': what these `found` is looked
-    at, too. `closest` is the vertex of the sheet that each has come to, -1 where that is too far away.
+    at, too. Whoever is far below the sheet is `doubtful`, and only listed. `closest` is the vertex of the sheet that
+    each has come to, -1 where that is too far away.
     """
     k = wp.tid()
     i = candidates[k]
@@ -190,23 +228,58 @@ def lift_kernel(
         return
     closest[k] = v
     face, feature, w, offset = nearest_face(p, v, below, below_cut)
-    if wp.length(offset) > rules.reach:
+    normal = normal_on(face, w, below_normals, below_cut)
+    if wp.dot(offset, normal) >= rules.gap:
         return
-    a = below_cut.faces[face, 0]
-    b = below_cut.faces[face, 1]
-    c = below_cut.faces[face, 2]
-    normal = wp.normalize(w[0] * below_normals[a] + w[1] * below_normals[b] + w[2] * below_normals[c])
-    height = wp.dot(offset, normal)
-    if height >= rules.gap:
+    if wp.length(offset) > rules.doubt:
+        doubtful[wp.atomic_add(n_doubtful, 0, 1)] = k
         return
-    own = normal_at(i, above, above_cut)
-    share = wp.clamp(wp.dot(own, normal) / rules.agreement, 0.0, 1.0)
-    # Whatever ends does so gradually, or cloth would jump from frame to frame.
-    share *= wp.min(1.0, 4.0 * (1.0 - wp.length(offset) / rules.reach))
-    if (below_cut.rim[face] >> feature) & 1 != 0:
-        share *= wp.max(0.0, 1.0 - wp.length(offset - height * normal) / rules.fade)
-    if share > 0.0:
-        push[k] = share * (rules.gap - height) * normal
+    lift = lift_off(i, face, feature, offset, normal, below_cut, above, above_cut, rules)
+    if wp.length_sq(lift) > 0.0:
+        push[k] = lift
+        wp.atomic_add(count, 0, 1)
+
+
+@wp.kernel(enable_backward=False)
+def ask_kernel(
+    tree: wp.uint64,
+    # the garment below
+    below: wp.array(dtype=wp.vec3),
+    below_normals: wp.array(dtype=wp.vec3),
+    below_cut: Cut,
+    # the garment above
+    above: wp.array(dtype=wp.vec3),
+    above_cut: Cut,
+    candidates: wp.array(dtype=int),
+    rules: LayerRules,
+    doubtful: wp.array(dtype=int),
+    n_doubtful: wp.array(dtype=int),
+    # outputs, by candidate
+    closest: wp.array(dtype=int),
+    push: wp.array(dtype=wp.vec3),
+    count: wp.array(dtype=int),
+):
+    """The same of the doubtful, with the closest place of the whole sheet."""
+    n = wp.tid()
+    if n >= n_doubtful[0]:
+        return
+    k = doubtful[n]
+    i = candidates[k]
+    p = above[i]
+    found = wp.mesh_query_point_no_sign(tree, p, rules.reach)
+    if not found.result:
+        return
+    face = found.face
+    w, feature = closest_on_triangle(
+        p, below[below_cut.faces[face, 0]], below[below_cut.faces[face, 1]], below[below_cut.faces[face, 2]]
+    )
+    offset = offset_from(p, face, w, below, below_cut.faces)
+    normal = normal_on(face, w, below_normals, below_cut)
+    corner = wp.where(w[0] >= w[1] and w[0] >= w[2], 0, wp.where(w[1] >= w[2], 1, 2))
+    closest[k] = below_cut.faces[face, corner]
+    lift = lift_off(i, face, feature, offset, normal, below_cut, above, above_cut, rules)
+    if wp.length_sq(lift) > 0.0:
+        push[k] = lift
         wp.atomic_add(count, 0, 1)
 
 

@@ -20,7 +20,7 @@ from refu_core.garments import LAYERS, inner_first, load_garment
 from refu_core.repulsion import LAYER_GAP, LAYER_REACH, Blend, Layer
 
 Array = NDArray[np.float64]
-FADE, AGREEMENT = 0.02, 0.25
+FADE, AGREEMENT, LATER_REACH = 0.02, 0.25, 0.02
 
 
 def sheet(n: int, *, step: float = 0.01, height: float = 0.0) -> tuple[Tensor, Tensor]:
@@ -46,7 +46,9 @@ def on_rim(faces: NDArray[np.int64]) -> set[tuple[int, int]]:
     return {edge for edge, n_faces in edges.items() if n_faces == 1}
 
 
-def wanted_pushes(above: Array, above_faces: NDArray[np.int64], below: Array, below_faces: NDArray[np.int64]) -> Array:
+def wanted_pushes(
+    above: Array, above_faces: NDArray[np.int64], below: Array, below_faces: NDArray[np.int64], *, reach: float
+) -> Array:
     """The push of each vertex by the closest of all triangles, one vertex at a time."""
     rim = on_rim(below_faces)
     rim_vertices = {v for edge in rim for v in edge}
@@ -60,9 +62,9 @@ def wanted_pushes(above: Array, above_faces: NDArray[np.int64], below: Array, be
         normal /= np.linalg.norm(normal)
         offset = p - closest[i]
         height = offset @ normal
-        if height >= LAYER_GAP or np.linalg.norm(offset) > LAYER_REACH:
+        if height >= LAYER_GAP or np.linalg.norm(offset) > reach:
             continue
-        share = np.clip(own[i] @ normal / AGREEMENT, 0, 1) * min(1, 4 - 4 * np.linalg.norm(offset) / LAYER_REACH)
+        share = np.clip(own[i] @ normal / AGREEMENT, 0, 1) * min(1, 4 - 4 * np.linalg.norm(offset) / reach)
         at = tuple(sorted(int(corners[k]) for k in range(3) if weight[k] > 1e-6))
         if at in rim or (len(at) == 1 and at[0] in rim_vertices):
             share *= max(0, 1 - np.linalg.norm(offset - height * normal) / FADE)
@@ -91,8 +93,10 @@ def test_equals_the_search_over_all_triangles(seed: int, height: float, shift: f
     high = wavy(above, seed + 1, amplitude=0.004) + torch.tensor([shift, height, 0.3 * shift])
     found, n_low = layer(high, low)
     wanted, blend, counts = high.double(), Blend.of_faces(above_faces, len(above)), []
-    for rounds in (6, 2):
-        push = wanted_pushes(wanted.numpy(), above_faces.numpy(), low.double().numpy(), below_faces.numpy())
+    for rounds, reach in ((6, LAYER_REACH), (2, LATER_REACH)):
+        push = wanted_pushes(
+            wanted.numpy(), above_faces.numpy(), low.double().numpy(), below_faces.numpy(), reach=reach
+        )
         counts.append(int((push != 0).any(axis=1).sum()))
         field = blend.spread(torch.from_numpy(push).float()[:, None], steps=rounds * (1.0,), reach=rounds)
         wanted = wanted + field[:, 0].double()
@@ -209,6 +213,7 @@ def test_worn_together(top: str, backbone: str, sdf: str) -> None:
                 faces[top],
                 out["short-pant-male"].local.astype(np.float64),
                 faces["short-pant-male"],
+                reach=LAYER_REACH,
             )
             for mesh in (out[top].raw, out[top].local)
         ]
