@@ -74,7 +74,7 @@ def not_a_number(mesh: GarmentMesh, _frame: SmplFrame, _call: int) -> GarmentMes
 
 
 def imprecise(mesh: GarmentMesh, _frame: SmplFrame, _call: int) -> GarmentMesh:
-    return replace(mesh, raw=mesh.raw.astype(np.float16).astype(np.float32))
+    return replace(mesh, before=lambda: mesh.raw.astype(np.float16).astype(np.float32))
 
 
 def shrunk(mesh: GarmentMesh, _frame: SmplFrame, _call: int) -> GarmentMesh:
@@ -119,7 +119,10 @@ WRONG: list[tuple[str, Spoil]] = [
     ("invariance: the person 100 km away", far_off),
     ("invariance: left and right exchanged", lambda mesh, *_: moved(mesh, (0.03, 0, 0))),
     ("invariance: what came before", remembering),
-    ("invariance: a batch of 64, predicted", lambda mesh, _, call: replace(mesh, raw=mesh.raw + 1e-5 * call)),
+    (
+        "invariance: a batch of 64, predicted",
+        lambda mesh, _, call: replace(mesh, before=lambda: mesh.raw + 1e-5 * call),
+    ),
     ("invariance: a batch of 64, resolved", remembering),
 ]
 

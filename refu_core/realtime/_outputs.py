@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -59,12 +59,17 @@ class GarmentMesh:
 
     local: NDArray[np.float32]
     """Vertices relative to the body's own origin, that is without the translation [m], shape (V, 3)."""
-    raw: NDArray[np.float32]
-    """The same before collision handling [m], shape (V, 3)."""
+    before: Callable[[], NDArray[np.float32]]
+    """Makes `raw`: who wants a garment as it is worn has no use for it."""
     faces: NDArray[np.int64]
     """Counter-clockwise from outside, shape (F, 3)."""
     transl: NDArray[np.float64]
     """Translation of the person [m], shape (3,)."""
+
+    @property
+    def raw(self) -> NDArray[np.float32]:
+        """Vertices before collision handling, without the translation [m], shape (V, 3)."""
+        return self.before()
 
     @property
     def vertices(self) -> NDArray[np.float64]:
@@ -77,9 +82,14 @@ class PipelineOutput(Mapping[str, GarmentMesh]):
     """The garments of one person in one frame, by name."""
 
     garments: Mapping[str, GarmentMesh]
-    body: NDArray[np.float32]
-    """Vertices of the posed body without the translation, SMPL axes [m], shape (V, 3)."""
+    posed_body: Callable[[], NDArray[np.float32]]
+    """Makes `body`, where somebody wants it."""
     stats: FrameStats
+
+    @property
+    def body(self) -> NDArray[np.float32]:
+        """Vertices of the posed body without the translation, SMPL axes [m], shape (V, 3)."""
+        return self.posed_body()
 
     def __getitem__(self, name: str) -> GarmentMesh:
         return self.garments[name]

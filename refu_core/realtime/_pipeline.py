@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, overload
 
@@ -32,7 +33,7 @@ from refu_core.weights import shipped_weights
 if TYPE_CHECKING:
     from os import PathLike
 
-    from numpy.typing import ArrayLike
+    from numpy.typing import ArrayLike, NDArray
 
 
 class GarmentPipeline:
@@ -236,11 +237,11 @@ class GarmentPipeline:
         outputs = []
         for frame, (body, worn) in zip(frames, self._step.unpacked(packed), strict=True):
             meshes = {
-                name: GarmentMesh(one.local, one.raw, self._wearables[name].faces, frame.transl)
+                name: GarmentMesh(one.local, partial(_itself, one.raw), self._wearables[name].faces, frame.transl)
                 for name, one in worn.items()
             }
             counts = {name: one.counts for name, one in worn.items()}
-            outputs.append(PipelineOutput(meshes, body, FrameStats({}, counts, skipped)))
+            outputs.append(PipelineOutput(meshes, partial(_itself, body), FrameStats({}, counts, skipped)))
         took = {"step": clock.lap() / len(frames)}
         return [replace(output, stats=replace(output.stats, stage_ms=took)) for output in outputs]
 
@@ -312,8 +313,7 @@ class GarmentPipeline:
                 vertices = done.vertices
                 counts = GarmentStats(done.n_inside, done.n_pushed, done.n_unresolved, done.max_depth, n_layered)
             worn[name] = vertices
-            local, before = (turn(points).cpu().numpy() for points in (vertices, raw))
-            meshes[name] = GarmentMesh(local, before, wearable.faces, frame.transl)
+            meshes[name] = GarmentMesh(turn.to_host(vertices), turn.later(raw), wearable.faces, frame.transl)
             own_ms = clock.lap()
             layers_ms, refu_ms = layers_ms + own_layers_ms, refu_ms + own_ms
             stats[name] = replace(counts, ms=dress_ms + own_layers_ms + own_ms)
@@ -321,7 +321,7 @@ class GarmentPipeline:
         in_order = {name: meshes[name] for name in self._wearables}
         counts_in_order = {name: stats[name] for name in in_order}
         took = FrameStats(stage_ms, counts_in_order, {**skipped, "band": n_clipped})
-        return PipelineOutput(in_order, turn(body).cpu().numpy(), took)
+        return PipelineOutput(in_order, turn.later(body), took)
 
 
 def _key(frame: SmplFrame, *, of_pose: bool = True) -> bytes:
@@ -335,7 +335,11 @@ def _moved(output: PipelineOutput, frame: SmplFrame) -> PipelineOutput:
     garments = {name: replace(mesh, transl=frame.transl) for name, mesh in output.items()}
     counts = {name: replace(one, ms=0.0) for name, one in output.stats.garments.items()}
     took = FrameStats(dict.fromkeys(output.stats.stage_ms, 0.0), counts, {"unchanged": 1})
-    return PipelineOutput(garments, output.body, took)
+    return PipelineOutput(garments, output.posed_body, took)
+
+
+def _itself(array: NDArray[np.float32]) -> NDArray[np.float32]:
+    return array
 
 
 def _style(value: ArrayLike, device: torch.device) -> Tensor:

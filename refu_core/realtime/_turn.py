@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from refu_core.body import rotvec_to_rotmat
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,3 +47,12 @@ class RootTurn:
     def __call__(self, points: Tensor) -> Tensor:
         """Points [m], shape (N, 3), as the world sees them, of those that the root sees."""
         return torch.addmm(self.shift, points, self.rotation.T)
+
+    def to_host(self, points: Tensor) -> NDArray[np.float32]:
+        """The same as an array."""
+        seen: NDArray[np.float32] = self(points).cpu().numpy()
+        return seen
+
+    def later(self, points: Tensor) -> Callable[[], NDArray[np.float32]]:
+        """`to_host` of points that nobody will write to, when it is first asked for."""
+        return functools.cache(functools.partial(self.to_host, points))

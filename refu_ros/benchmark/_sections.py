@@ -273,8 +273,8 @@ def _dressing(paper: PaperStructure, name: str) -> Callable[[Sequence[SmplFrame]
         outputs = []
         for frame in frames:
             vertices = paper(frame)
-            mesh = GarmentMesh(np.nan_to_num(vertices), vertices, faces, frame.transl)
-            outputs.append(PipelineOutput({name: mesh}, np.empty((0, 3), np.float32), FrameStats(paper.stage_ms)))
+            mesh = GarmentMesh(np.nan_to_num(vertices), lambda: np.empty((0, 3), np.float32), faces, frame.transl)
+            outputs.append(PipelineOutput({name: mesh}, mesh.before, FrameStats(paper.stage_ms)))
         return outputs
 
     return dress
