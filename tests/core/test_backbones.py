@@ -333,6 +333,20 @@ def test_codes_of_a_basis_measure_vertices(garment: GarmentTemplate, basis: Basi
         torch.testing.assert_close(norms, rest.square().sum((1, 2)), rtol=1e-2, atol=0)
 
 
+@pytest.mark.parametrize("n", [2, 3, 4, 7, 16, 17])
+@pytest.mark.parametrize("n_vertices", [1, 16, 107])
+def test_a_few_codes_at_once_are_decoded_as_one_by_one(n: int, n_vertices: int) -> None:
+    decoder = BasisDecoder(torch.randn(n_vertices, 3), torch.randn(9, 3 * n_vertices))
+    code = torch.randn(n, 9, requires_grad=True)
+    with torch.no_grad():
+        together = decoder(code)
+        one_by_one = torch.cat([decoder(row[None]) for row in code])
+        torch.testing.assert_close(together, one_by_one, rtol=0, atol=2e-5)
+        decoder.components *= 2
+        torch.testing.assert_close(decoder(code) - decoder.mean.view(-1, 3), 2 * (together - decoder.mean.view(-1, 3)))
+    assert decoder(code).requires_grad
+
+
 def test_a_basis_that_does_not_fit_is_refused() -> None:
     with pytest.raises(WeightsError, match=r"wanted a basis of \(R, 30\)"):
         BasisDecoder(torch.zeros(10, 3), torch.zeros(4, 33))
