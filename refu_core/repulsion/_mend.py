@@ -27,7 +27,8 @@ DETOUR = 2.0
 """nor is one that is longer than this multiple of the depth: there the cloth isn't in the middle of a limb but has been
 folded, and its normal leads a single vertex through a whole thigh, centimetres past all others."""
 TURNING = 0.5
-"""TODO"""
+"""From so many depths short of the longest detour on, the direction turns by degrees from the cloth's normal to the
+shortest way: a vertex whose detour gets too long arrives there, and doesn't leap."""
 
 
 def mend(
@@ -97,8 +98,8 @@ def turn_outward(
 
     In the middle of a thin limb the closest skin of one vertex is in front and that of the next one behind: they would
     be torn apart, and the cloth between them end within the limb. So what is deep, and would leave against the outward
-    normal of the cloth (R, 3), goes along that normal instead; its distance is then how far that is. Where
-    that is nearly too far it goes between the two, if the body ends there as soon.
+    normal of the cloth (R, 3), goes along that normal instead; its distance is then how far that is. Where that is
+    nearly too far it goes between the two, if the body ends there as soon.
 
     `query` gives the distances of points (R', 3), which are those number `at` (R',). Returns how often it was asked,
     too.
