@@ -18,7 +18,7 @@ RETREAT_STEPS = 8
 BULGE = 0.375
 """How far skin is expected to bulge to the middle of an edge, a length of the edge and a radian between the normals
 below its ends: three times as far as a circle does."""
-THROUGH = 0.01
+THROUGH = 0.005
 """How much a middle may lack for the edge to be raised in full [m]; at twice that it isn't at all. An edge that cuts a
 corner lacks less; one that lacks more runs through a limb, no rise clears it, and its ends would be thrown far off the
 skin, to whichever side is closest to the middle."""
