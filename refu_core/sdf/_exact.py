@@ -132,15 +132,6 @@ class ExactSdf(MeshSdf):
             return self._few.ask(points, near)
         return self._launch(points, _UNLIMITED, near)
 
-    def record(self, points: Any, rows: Any, answers: Found) -> Any:
-        """A launch on a CPU to be repeated, for those of the points that are in rows; the BVH must not be rebuilt.
-
-        What the answers' faces are before counts as near.
-        """
-        outputs = answers.as_warp()
-        inputs = self._inputs(points, outputs[0], rows=rows)
-        return wp.launch(closest_kernel, len(rows), inputs, outputs, device="cpu", record_cmd=True)
-
     def _launch(self, points: Tensor, max_distance: float, near: Tensor | None = None) -> Found:
         found = Found.empty(len(points), self.device)
         if len(points):
@@ -155,14 +146,7 @@ class ExactSdf(MeshSdf):
                 )
         return found
 
-    def _inputs(
-        self,
-        points: Any,
-        near: Any,
-        *,
-        rows: Any = None,
-        max_distance: float = _UNLIMITED,
-    ) -> list[Any]:
-        """What `closest_kernel` reads, for points with or without near faces, all of them or some rows."""
+    def _inputs(self, points: Any, near: Any, *, max_distance: float = _UNLIMITED) -> list[Any]:
+        """What `closest_kernel` reads, for points with or without near faces."""
         body = [self._mesh.id, self._points_wp, self._faces, *self._topology]
-        return [*body, points, near, self._none if rows is None else rows, max_distance, self._by_winding]
+        return [*body, points, near, max_distance, self._by_winding]

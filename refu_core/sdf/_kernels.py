@@ -206,7 +206,6 @@ def closest_kernel(
     fan_face: wp.array(dtype=int),
     queries: wp.array(dtype=wp.vec3),
     near: wp.array(dtype=int),
-    rows: wp.array(dtype=int),
     max_distance: float,
     by_winding: bool,
     # outputs
@@ -216,12 +215,9 @@ def closest_kernel(
 ):
     """Closest point, signed distance there and its gradient; face -1 where nothing is close enough.
 
-    Of the queries numbered `rows`, or of all where there are no rows. Where a face `near` is known (not -1), nothing
-    farther away than that is looked at.
+    Where a face `near` is known (not -1), nothing farther away than that is looked at.
     """
     i = wp.tid()
-    if rows.shape[0] > 0:
-        i = rows[i]
     p = queries[i]
     limit = float(max_distance)
     if near.shape[0] > 0 and near[i] >= 0:
