@@ -21,10 +21,9 @@ from numpy.typing import NDArray
 
 from msg_adapters import INPUT_TYPES, MARKER_ARRAY, BagWriter, encode_points, encoder_for, vertices_ros_from_smpl
 from refu_core import SmplFrame, load_body, load_garment
-from refu_core.evaluation.render import GARMENT_COLOURS
 from refu_core.simulation import GarmentDataset, GarmentSequences, SequencePlan
 from refu_core.simulation._plan import TEST
-from refu_ros.truth import TOPIC as TRUTH_TOPIC
+from refu_lab.truth import TOPIC as TRUTH_TOPIC
 
 START_NS = 1_700_000_000_000_000_000
 TOPIC = "/smpl_params"
@@ -80,6 +79,7 @@ def sequence_moments(sequences: GarmentSequences) -> Iterator[Moment]:
 def write_bag(path: Path, garment: str, moments: Iterator[Moment]) -> tuple[int, int]:
     """One bag as a rosbag2 directory; returns the number of frames and of those with ground truth."""
     encode = encoder_for("multiarray")
+    color = (*load_garment(garment).card.color, 1.0)
     frames = truths = 0
     with BagWriter(path, overwrite=True) as bag:
         bag.add_topic(TOPIC, INPUT_TYPES["multiarray"])
@@ -90,7 +90,6 @@ def write_bag(path: Path, garment: str, moments: Iterator[Moment]) -> tuple[int,
             if vertices is not None:
                 truths += 1
                 points = vertices_ros_from_smpl(vertices.astype(np.float64) + frame.transl)
-                color = (*GARMENT_COLOURS[garment], 1.0)
                 data = encode_points(points, ns=garment, stamp_ns=frame.stamp_ns, color=color)
                 bag.write(TRUTH_TOPIC, data, log_time_ns=frame.stamp_ns)
     return frames, truths

@@ -18,7 +18,7 @@ from msg_adapters.bags import (
 from msg_adapters.definitions import MessageDefinition, message_definition
 from msg_adapters.diagnostics import DIAGNOSTIC_ARRAY, DiagnosticStatus, encode_diagnostics
 from msg_adapters.errors import AdapterError, BagError, DecodeError, EncodeError, MotionFileError
-from msg_adapters.inputs import INPUT_TYPES, Decoder, Encoder, InputType, decoder_for, encoder_for
+from msg_adapters.inputs import INPUT_TYPES, Decoder, Encoder, InputType, decoder_for, encoder_for, frame_id_of
 from msg_adapters.joints import SMPL_JOINTS
 from msg_adapters.markers import (
     MARKER_ARRAY,
@@ -71,6 +71,7 @@ __all__ = [
     "encode_diagnostics",
     "encode_points",
     "encoder_for",
+    "frame_id_of",
     "garment_namespace",
     "iter_smpl_frames",
     "message_definition",

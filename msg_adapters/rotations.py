@@ -11,6 +11,7 @@ if TYPE_CHECKING:
 
 Float64Array = np.ndarray[Any, np.dtype[np.float64]]
 
+_NEXT, _LAST = [1, 2, 0], [2, 0, 1]
 _SMALL = 1e-8  # below it, sin(x)/x equals its limit to the last digit of float64
 
 
@@ -20,6 +21,13 @@ def quaternion_from_rotvec(rotvec: ArrayLike) -> NDArray[np.float64]:
     angle = np.linalg.norm(rotvec, axis=-1, keepdims=True)
     half_sinc = np.where(angle < _SMALL, 0.5, np.sin(0.5 * angle) / np.maximum(angle, _SMALL))
     return np.concatenate([half_sinc * rotvec, np.cos(0.5 * angle)], axis=-1)
+
+
+def quaternion_product(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Unit quaternions xyzw, shape (..., 4), of first's rotation with second's in its frame, shapes (..., 4)."""
+    u, v, a, b = first[..., :3], second[..., :3], first[..., 3:], second[..., 3:]
+    cross = u[..., _NEXT] * v[..., _LAST] - u[..., _LAST] * v[..., _NEXT]  # np.cross takes ten times as long for few
+    return np.concatenate([a * v + b * u + cross, a * b - (u * v).sum(axis=-1, keepdims=True)], axis=-1)
 
 
 def rotvec_from_quaternion(quaternion: ArrayLike) -> NDArray[np.float64]:

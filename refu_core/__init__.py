@@ -1,7 +1,10 @@
-"""Garments on SMPL bodies, free of body-garment collisions: body, garments, signed distance, repulsion, real-time path.
+"""Garments on SMPL bodies in real time, free of body-garment collisions.
 
-The names below are imported on first use, so that code which only needs the frame type (bag readers, message
-adapters) doesn't pay for torch and warp.
+Start with `GarmentPipeline.load(["tshirt-male"])` and call it with a `SmplFrame`. The parts can be used alone, each
+from the package it is in: `body`, `garments`, `backbones`, `sdf`, `refu` (the paper's layer), `contact` (what brings a
+garment off the body), `realtime`, `metrics`, `simulation`, `training`. The names most often needed are here, too.
+
+Most names are imported when they are first used: code that needs `SmplFrame` alone doesn't wait for torch and warp.
 """
 
 from __future__ import annotations
@@ -11,39 +14,72 @@ from typing import TYPE_CHECKING, Any
 
 from refu_core.errors import BodyError, FrameError, GarmentError, MeshError, RefuError, WeightsError
 from refu_core.frames import SmplFrame
+from refu_core.modes import BackboneName, SdfMode
 
 if TYPE_CHECKING:
     from refu_core.body import SmplBody, load_body
+    from refu_core.contact import Limbs, Resolver
     from refu_core.garments import GarmentTemplate, load_garment
-    from refu_core.realtime import GarmentPipeline
+    from refu_core.realtime import GarmentPipeline, PipelineOutput, Wearer, dress
+    from refu_core.refu import Refu
+    from refu_core.sdf import ApproxSdf, BandSdf, BodySdf, ExactSdf, SdfSample
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __all__ = [
+    "ApproxSdf",
+    "BackboneName",
+    "BandSdf",
     "BodyError",
+    "BodySdf",
+    "ExactSdf",
     "FrameError",
     "GarmentError",
     "GarmentPipeline",
     "GarmentTemplate",
+    "Limbs",
     "MeshError",
+    "PipelineOutput",
+    "Refu",
     "RefuError",
+    "Resolver",
+    "SdfMode",
+    "SdfSample",
     "SmplBody",
     "SmplFrame",
+    "Wearer",
     "WeightsError",
+    "dress",
     "load_body",
     "load_garment",
 ]
 
 _LAZY = {
-    "GarmentPipeline": "refu_core.realtime",
-    "GarmentTemplate": "refu_core.garments",
-    "SmplBody": "refu_core.body",
-    "load_body": "refu_core.body",
-    "load_garment": "refu_core.garments",
+    "ApproxSdf": "sdf",
+    "BandSdf": "sdf",
+    "BodySdf": "sdf",
+    "ExactSdf": "sdf",
+    "GarmentPipeline": "realtime",
+    "GarmentTemplate": "garments",
+    "Limbs": "contact",
+    "PipelineOutput": "realtime",
+    "Refu": "refu",
+    "Resolver": "contact",
+    "SdfSample": "sdf",
+    "SmplBody": "body",
+    "Wearer": "realtime",
+    "dress": "realtime",
+    "load_body": "body",
+    "load_garment": "garments",
 }
+"""The package that each name is imported from on first use."""
 
 
 def __getattr__(name: str) -> Any:
     if name not in _LAZY:
         msg = f"module {__name__!r} has no attribute {name!r}"
         raise AttributeError(msg)
-    return getattr(import_module(_LAZY[name]), name)
+    return getattr(import_module(f"{__name__}.{_LAZY[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

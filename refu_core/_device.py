@@ -17,11 +17,17 @@ def checked_device(name: str) -> torch.device:
     """The torch device of a name. Raises `RefuError` for one that there isn't."""
     try:
         device = torch.device(name)
-    except RuntimeError as error:
+    except (RuntimeError, ValueError, TypeError) as error:
         msg = f"no device {name!r}: wanted cpu or cuda"
         raise RefuError(msg) from error
+    if device.type not in ("cpu", "cuda"):
+        msg = f"no device {name!r}: wanted cpu or cuda"
+        raise RefuError(msg)
     if device.type == "cuda" and not torch.cuda.is_available():
         msg = f"no device {name!r}: this torch build or machine has no CUDA; use cpu"
+        raise RefuError(msg)
+    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
+        msg = f"no device {name!r}: the last one is cuda:{torch.cuda.device_count() - 1}"
         raise RefuError(msg)
     return device
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import struct
 import zipfile
@@ -9,18 +10,29 @@ import zlib
 from tokenize import TokenError
 from typing import IO, TYPE_CHECKING, Any
 
+import numpy as np
 from numpy.lib import format as npy
 
+from refu_core._files import open_file
+
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Collection
     from pathlib import Path
 
     from numpy.typing import NDArray
 
     from refu_core.errors import RefuError
 
-MAX_BYTES = 1 << 30
-"""An archive that unpacks to more is refused before anything is unpacked."""
+MAX_BYTES = 256 << 20
+"""All arrays that are taken from a file together, as float64: a body of 100,000 vertices, an hour of motion at 120 Hz
+(half an hour with the hands of SMPL-X). What would be more is refused before any of it is unpacked."""
+_MAX_FILE_BYTES = 1 << 32
+"""Of which only the directory and the arrays that are wanted are read."""
+_MAX_READ = 1 << 20
+"""A directory of more is cut off there, and so refused; the arrays are read in smaller steps."""
+_MAX_TEXT_BYTES = 4096
+_MAX_AXES = 32
+_MAX_HEADER_BYTES = 1 << 14
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """What numpy writes; other methods ask for gigabytes of their own."""
 DAMAGE = (
@@ -30,55 +42,98 @@ DAMAGE = (
 """What zipfile and numpy raise on damaged files."""
 
 
-def read_npz(path: Path, *, keys: Iterable[str], error: type[RefuError]) -> dict[str, NDArray[Any]]:
-    """The arrays of an `.npz` whose names are in `keys` (those that are there).
+class ArrayBudget:
+    """The numbers that may still be taken from a file."""
+
+    def __init__(self) -> None:
+        self._left = MAX_BYTES // 8
+
+    def take(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+        """Raises `ValueError` where an array is too much, has no size, or isn't of plain numbers or a word of text."""
+        if len(shape) > _MAX_AXES:
+            msg = f"an array of {len(shape)} axes"
+            raise ValueError(msg)
+        # An axis of length 0 makes no array small: code loops over the others.
+        count = math.prod(max(n, 1) for n in shape)
+        is_text = dtype.kind in "US"
+        if is_text and count * max(dtype.itemsize, 1) > _MAX_TEXT_BYTES:
+            msg = f"an array {shape} of {dtype}, at most {_MAX_TEXT_BYTES} bytes of text are read"
+            raise ValueError(msg)
+        if not is_text and (dtype.kind not in "biuf" or dtype.itemsize > 8):
+            msg = f"an array of {dtype}, wanted plain numbers of at most 64 bits"
+            raise ValueError(msg)
+        self._left -= count
+        if self._left < 0:
+            msg = f"an array {shape} takes {count >> 17} MiB as float64, at most {MAX_BYTES >> 20} MiB are read"
+            raise ValueError(msg)
+
+
+def read_npz(path: Path, *, keys: Collection[str], error: type[RefuError], wanted: str) -> dict[str, NDArray[Any]]:
+    """The arrays of an `.npz` whose names are in `keys` (those that are there): numbers, or a word of text.
 
     Raises:
-        error: the file can't be read, holds pickled objects under one of the keys, unpacks to more than 1 GiB, or to
-            less than an array's header says.
+        error: the file can't be read, holds anything else under one of the keys, or more than `MAX_BYTES`.
     """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            size = sum(entry.file_size for entry in archive.infolist())
-            if size > MAX_BYTES:
-                msg = f"{path}: unpacks to {size >> 20} MiB, at most {MAX_BYTES >> 20} MiB are read"
-                raise error(msg)
-            entries = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
-            return {key: _read_entry(archive, entries[key]) for key in keys if key in entries}
-    except DAMAGE as cause:
-        if isinstance(cause, error):  # ours is a ValueError too
-            raise
-        msg = f"{path}: can't be read as .npz: {cause}"
-        raise error(msg) from cause
+    with open_file(path, most=_MAX_FILE_BYTES, error=error, wanted=wanted) as file:
+        file.step = _MAX_READ
+        try:
+            with zipfile.ZipFile(file) as archive:
+                names = {entry: entry.filename.removesuffix(".npy") for entry in archive.infolist()}
+                entries = {name: entry for entry, name in names.items() if name in keys}
+                if len(entries) < sum(name in keys for name in names.values()):
+                    msg = "it has two arrays of one name"
+                    raise ValueError(msg)
+                size = sum(entry.file_size for entry in entries.values())
+                if size > MAX_BYTES:
+                    msg = f"unpacks to {size >> 20} MiB, at most {MAX_BYTES >> 20} MiB are read"
+                    raise ValueError(msg)
+                budget = ArrayBudget()
+                for entry in entries.values():
+                    _check_entry(archive, entry, budget)
+                return {key: _read_entry(archive, entry) for key, entry in entries.items()}
+        except DAMAGE as cause:
+            msg = f"{path}: can't be read as .npz: {str(cause) or type(cause).__name__}"
+            raise error(msg) from cause
 
 
-def check_npy(file: IO[bytes], size: int) -> None:
+def check_npy(file: IO[bytes], size: int) -> tuple[tuple[int, ...], np.dtype[Any]]:
     """Checks that a file of `size` bytes, read from its start on, holds the array that its header announces.
 
     Numpy makes room for what a header says before it looks for it, and lengthens a file that it maps to write.
 
+    Returns:
+        The array's shape and type.
+
     Raises `ValueError`, and what else numpy raises on damaged headers.
     """
-    version = npy.read_magic(file)
+    head = io.BytesIO(file.read(_MAX_HEADER_BYTES))
+    version = npy.read_magic(head)
     if version not in ((1, 0), (2, 0)):
         msg = f"an array of the version {version}, which isn't read"
         raise ValueError(msg)
-    shape, _, dtype = (npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0)(file)
+    shape, _, dtype = (npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0)(head)
     if dtype.hasobject:
         msg = "Object arrays cannot be loaded: they are pickles"
         raise ValueError(msg)
-    wanted, there = dtype.itemsize * math.prod(shape), size - file.tell()
+    wanted, there = dtype.itemsize * math.prod(shape), size - head.tell()
     if wanted != there or min(shape, default=0) < 0:
         msg = f"an array {shape} of {dtype} takes {wanted} bytes, the file has {there}"
         raise ValueError(msg)
+    return shape, dtype
 
 
-def _read_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray[Any]:
+def _check_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, budget: ArrayBudget) -> None:
     if entry.compress_type not in _METHODS:
         msg = f"{entry.filename} is compressed by the method {entry.compress_type}, only deflate is read"
         raise ValueError(msg)
+    if entry.compress_size > entry.file_size + (entry.file_size >> 8) + 1024:
+        msg = f"{entry.filename} takes {entry.compress_size} bytes packed, and {entry.file_size} unpacked"
+        raise ValueError(msg)
     with archive.open(entry) as file:
-        check_npy(file, entry.file_size)
+        budget.take(*check_npy(file, entry.file_size))
+
+
+def _read_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray[Any]:
     with archive.open(entry) as file:
         array: NDArray[Any] = npy.read_array(file, allow_pickle=False)
     return array

@@ -13,6 +13,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from refu_core._kernel_cache import guard, no_cache
+
 
 @contextlib.contextmanager
 def _no_stderr() -> Iterator[None]:
@@ -35,7 +37,11 @@ def _start_quietly() -> None:
         wp.config.quiet = True
     with warnings.catch_warnings(), contextlib.nullcontext() if torch.cuda.is_available() else _no_stderr():
         warnings.filterwarnings("ignore", "Support for Python", FutureWarning)  # by releases to come: pip minds that
-        wp.init()
+        try:
+            wp.init()
+        except OSError as error:
+            raise no_cache(error) from error
+    guard()
 
 
 _start_quietly()

@@ -2,9 +2,40 @@
 
 from __future__ import annotations
 
+_MAX_TEXT = 300
+
+
+def printable(text: object) -> str:
+    """One line for a terminal, a log or diagnostics, whatever a file or a peer has put into the text.
+
+    Control characters, lone surrogates and the like are escaped; of a text above 300 characters the middle is left out.
+    """
+    line = _shortened(" ".join(_shortened(str(text), 4 * _MAX_TEXT).split()), _MAX_TEXT)
+    return _shortened("".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line), _MAX_TEXT)
+
+
+def _shortened(text: str, most: int) -> str:
+    """The start says where the fault is, the end what to do."""
+    return text if len(text) <= most else f"{text[: most - most // 3 - 3]} … {text[-(most // 3) :]}"
+
 
 class RefuError(Exception):
-    """Base of every error this project raises on purpose; the commands turn it into one line and exit code 2."""
+    """Base of every error this project raises on purpose; the commands turn it into one line and exit code 2.
+
+    Its message is safe to print: what a hostile file has put into it is escaped and bounded here, once for all.
+    """
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*(printable(arg) if isinstance(arg, str) else arg for arg in args))
+
+
+def require_type(
+    value: object, kind: type | tuple[type, ...], wanted: str, *, error: type[RefuError] = RefuError
+) -> None:
+    """Raises `error`, with what was `wanted` and what came, for a value of another type."""
+    if not isinstance(value, kind):
+        msg = f"wanted {wanted}, got {type(value).__name__}"
+        raise error(msg)
 
 
 class FrameError(RefuError, ValueError):

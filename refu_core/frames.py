@@ -15,11 +15,19 @@ if TYPE_CHECKING:
 N_JOINTS = 24
 N_BETAS = 10
 N_STYLES = 4
+# Limits of two levels. A frame holds whatever can be computed with: a study may go beyond all bodies. A stream of
+# messages has no such wish, so a node refuses (`refu_ros._scene.check_plausible`) what is beyond the plausible: no
+# sender means it.
 MAX_ANGLE = 1e4
 """Rotation vectors have components up to this [rad]; in float32 larger ones no longer say which way a limb points."""
 MAX_COEFFICIENT = 100.0
 """β and γ have components up to this: at 20 standard deviations no body is one, at 10,000 it is 500 m long, and a
 signed distance that looks around it centimetre by centimetre would never end."""
+PLAUSIBLE_ANGLE = 1e3
+"""[rad]"""
+PLAUSIBLE_COEFFICIENT = 20.0
+PLAUSIBLE_TRANSL = 1e9
+"""[m]"""
 
 
 def _array(
@@ -76,4 +84,8 @@ class SmplFrame:
         object.__setattr__(self, "transl", _array("transl", self.transl, (3,), np.float64))
         if self.style is not None:
             object.__setattr__(self, "style", _array("style", self.style, (N_STYLES,), np.float32, MAX_COEFFICIENT))
-        object.__setattr__(self, "stamp_ns", int(self.stamp_ns))
+        try:
+            object.__setattr__(self, "stamp_ns", int(self.stamp_ns))
+        except (TypeError, ValueError, OverflowError) as error:
+            msg = f"stamp_ns must be a whole number of nanoseconds, got {self.stamp_ns!r}"
+            raise FrameError(msg) from error

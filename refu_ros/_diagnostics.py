@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import socket
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from msg_adapters import DiagnosticStatus
@@ -12,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from refu_ros._recorder import RecorderState
-    from refu_ros._settings import NodeSettings
+    from refu_ros._settings import NodeSettings, PipelineKey
     from refu_ros._statistics import Report
 
 _OVER_BUDGET = 0.1
@@ -32,28 +34,52 @@ def statuses(
     recording: RecorderState | None,
     recording_error: str,
     listening_for: float | None = math.inf,
-    device: str = "",
+    in_use: PipelineKey | None = None,
+    input_frame: str = "",
     n_namesakes: int = 0,
 ) -> list[DiagnosticStatus]:
-    """Input, output and recording; `state` is the lifecycle's, `persons` are those in the scene.
+    """Node, input, output and recording; `state` is the lifecycle's, `persons` are those in the scene.
 
-    `listening_for` is the time since the inputs were subscribed to [s], None where they aren't; `device` is the one
-    that is computed on, where it isn't the settings'; `n_namesakes` are other nodes of this name.
+    `node` is the name with its namespace; `listening_for` is the time since the inputs were subscribed to [s], None
+    where they aren't; `in_use` is what is computed with; `input_frame` is the sender's, where it isn't the markers';
+    `n_namesakes` are other nodes of this name.
     """
     active = state == "active"
-    return [
-        _input(report, settings, f"{node}: input", persons=persons, active=active, listening_for=listening_for),
+    found = [
+        _node(report, f"{node}: node", state=state),
+        _input(
+            report,
+            settings,
+            f"{node}: input",
+            persons=persons,
+            active=active,
+            listening_for=listening_for,
+            input_frame=input_frame,
+        ),
         _output(
             report,
             settings,
             f"{node}: garments",
             state=state,
             resting=listening_for is None,
-            device=device,
+            in_use=in_use,
             n_namesakes=n_namesakes,
         ),
-        _recording(recording, f"{node}: recording", error=recording_error),
+        _recording(recording, settings, f"{node}: recording", error=recording_error),
     ]
+    host = socket.gethostname()  # two robots' nodes of one name are told apart by it
+    return [replace(status, hardware_id=host) for status in found]
+
+
+def _node(report: Report, name: str, *, state: str) -> DiagnosticStatus:
+    """What went wrong though nobody's frame was the reason: requests without sense, clocks, callbacks."""
+    faults = {key: n for key, n in report.recent.items() if key.startswith("fault.")}
+    values = {"state": state, "last fault": report.reasons.get("fault", "")}
+    values |= {f"faults: {where}": str(n) for where, n in sorted(report.group("fault").items())}
+    if not faults:
+        return DiagnosticStatus(OK, name, state, values=values)
+    message = f"{sum(faults.values())} faults, the last: {report.reasons.get('fault', '')}"
+    return DiagnosticStatus(WARN, name, message, values=values)
 
 
 def _input(
@@ -64,6 +90,7 @@ def _input(
     persons: Sequence[str],
     active: bool,
     listening_for: float | None,
+    input_frame: str,
 ) -> DiagnosticStatus:
     invalid, received = report.recent["drop.invalid"], report.recent["received"]
     missing = [] if settings.follow_humans else [person for person in settings.persons if person not in persons]
@@ -93,6 +120,7 @@ def _input(
         "received": str(report.total["received"]),
         "persons": ", ".join(filter(None, persons)) or str(len(persons)),
         "input type": settings.input_type,
+        "frame": f"{input_frame}, shown as {settings.frame_id}" if input_frame else settings.frame_id,
         "stamps that went back": str(report.total["back_in_time"]),
     }
     values |= {f"dropped: {cause}": str(n) for cause, n in sorted(report.group("drop").items())}
@@ -100,7 +128,14 @@ def _input(
 
 
 def _output(
-    report: Report, settings: NodeSettings, name: str, *, state: str, resting: bool, device: str, n_namesakes: int
+    report: Report,
+    settings: NodeSettings,
+    name: str,
+    *,
+    state: str,
+    resting: bool,
+    in_use: PipelineKey | None,
+    n_namesakes: int,
 ) -> DiagnosticStatus:
     stale, received = report.recent["drop.stale"], report.recent["received"]
     causes = ("device", "failed", "not_finite")
@@ -130,18 +165,25 @@ def _output(
         "latency p95 [ms]": f"{p95:.1f}",
         "latency p99 [ms]": f"{p99:.1f}",
         "penetrating vertices found": str(found),
-        "penetrating vertices resolved": str(found - unresolved),
+        "penetrating vertices resolved": str(max(found - unresolved, 0)),
         "penetrating vertices unresolved": str(unresolved),
-        "garments": ", ".join(settings.garments),
-        "backbone": settings.backbone,
-        "sdf": settings.sdf,
-        "device": device or settings.device,
+        "frames beyond the promised poses and shapes": str(report.total["beyond_promise"]),
     }
+    if in_use is not None:
+        values |= {
+            "garments": ", ".join(in_use.garments),
+            "backbone": in_use.backbone,
+            "sdf": in_use.sdf,
+            "weights": in_use.weights or "those that ship",
+            "device": in_use.device,
+        }
+        if in_use != settings.pipeline:
+            values["asked for"] = str(settings.pipeline)
     values |= {f"skipped: {kind}": str(n) for kind, n in sorted(report.group("skip").items())}
     return DiagnosticStatus(level, name, message, values=values)
 
 
-def _recording(state: RecorderState | None, name: str, *, error: str) -> DiagnosticStatus:
+def _recording(state: RecorderState | None, settings: NodeSettings, name: str, *, error: str) -> DiagnosticStatus:
     level, message = (ERROR, f"not recording: {error}") if error else (OK, "not recording")
     if state is None:
         return DiagnosticStatus(level, name, message)
@@ -151,11 +193,14 @@ def _recording(state: RecorderState | None, name: str, *, error: str) -> Diagnos
             level, message = WARN, f"disk nearly full: {state.free_bytes / 1e6:.0f} MB left"
         elif state.dropped:
             level, message = WARN, f"{state.dropped} messages not recorded: the disk is too slow"
+        elif state.at_risk_s > settings.record_sync_period:
+            level, message = WARN, f"a power cut would take the last {state.at_risk_s:.1f} s: the disk is too slow"
     values = {
         "path": str(state.path),
         "messages": str(state.written),
         "queued": str(state.queued),
         "dropped": str(state.dropped),
+        "at risk in a power cut [s]": f"{state.at_risk_s:.1f}",
         "size [MB]": f"{state.size_bytes / 1e6:.1f}",
         "disk free [MB]": "unknown" if state.free_bytes is None else f"{state.free_bytes / 1e6:.0f}",
     }

@@ -16,13 +16,15 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 
 import msg_adapters as adapters
 from refu_core import FrameError, RefuError
+from refu_core.errors import printable
 from refu_ros._diagnostics import statuses
+from refu_ros._guard import GuardedNode, answer_no, transition
 from refu_ros._interfaces import interface
 from refu_ros._loader import PipelineLoader
 from refu_ros._parameters import declare_settings
-from refu_ros._recorder import Recorder
+from refu_ros._recording import Recording
 from refu_ros._scene import Scene, check_plausible
-from refu_ros._statistics import Statistics, printable
+from refu_ros._settings import specs
 from refu_ros._worker import Worker
 
 if TYPE_CHECKING:
@@ -37,9 +39,10 @@ _GRACE_S = 5.0
 """How long the inputs stay subscribed to when nobody is left: many a viewer is only restarted [s]."""
 _INPUT_QOS = adapters.QosProfile(reliability="best_effort", depth=1)
 _OUTPUT_QOS = adapters.QosProfile(reliability="reliable", depth=5)
+_OVERRIDABLE = QoSOverridingOptions.with_default_policies()
 
 
-class GarmentNode(LifecycleNode):  # type: ignore[misc]
+class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
     """Garments of everybody in the scene. `close` it before it is destroyed.
 
     Raises `RefuError` for parameters that have no meaning.
@@ -51,91 +54,100 @@ class GarmentNode(LifecycleNode):  # type: ignore[misc]
         self.failed = False
         """Whether it ended because its device did."""
         self.settings = declare_settings(self)
-        self._statistics = Statistics()
+        self.recording = Recording(self.get_logger().info, sync_period=self.settings.record_sync_period)
         self._state = "unconfigured"
         self._scene: Scene | None = None
         self._worker: Worker | None = None
         self._loader: PipelineLoader | None = None
         self._pipeline: GarmentPipeline | None = None
-        self._recorder: Recorder | None = None
-        self._recording_error = ""
-        self._closing: list[Recorder] = []
+        self._in_use: PipelineKey | None = None
         self._lost = ""
         self._inputs: dict[str, Any] = {}
+        self._input_frame = ""
         self._listening_since: float | None = None
         self._wanted_at = 0.0
-        self._garments: Any = None
-        self._body: Any = None
+        self._has_sent = False
         self._decoder = adapters.decoder_for(self.settings.layout)
         self._input_type = adapters.INPUT_TYPES[self.settings.layout]
+        # These live as long as the node: who looks stays connected while it is configured anew.
+        self._garments, self._body = (
+            self.create_lifecycle_publisher(
+                interface(adapters.MARKER_ARRAY),
+                topic,
+                _ros_qos(_OUTPUT_QOS),
+                qos_overriding_options=_OVERRIDABLE,
+                event_callbacks=PublisherEventCallbacks(matched=lambda _: self._attend()),
+            )
+            for topic in ("garments", "body")
+        )
         self._diagnostics = self.create_publisher(interface(adapters.DIAGNOSTIC_ARRAY), DIAGNOSTICS_TOPIC, 10)
-        self.create_service(interface("std_srvs/srv/SetBool"), "~/record", self._on_record)
+        switch = self.guarded("record", self._on_record, answer_no)
+        self.create_service(interface("std_srvs/srv/SetBool"), "~/record", switch)
         self.add_on_set_parameters_callback(self._on_parameters)
         # Steady time: a simulation that stands still must not stop the diagnostics.
-        self.create_timer(1.0, self._on_second, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(1.0, self.guarded("each second", self._on_second), clock=steady)
 
     # Lifecycle ------------------------------------------------------------------------------------
 
+    @transition
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Loads the garments and offers the topics."""
+        """Loads the garments."""
         try:
-            self._pipeline = self.settings.pipeline.load()
-            marker_array = interface(adapters.MARKER_ARRAY)
-            self._garments, self._body = (
-                self.create_lifecycle_publisher(
-                    marker_array,
-                    topic,
-                    _ros_qos(_OUTPUT_QOS),
-                    qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-                    event_callbacks=PublisherEventCallbacks(matched=lambda _: self._attend()),
-                )
-                for topic in ("garments", "body")
-            )
             interface(self._input_type)
-        except Exception as error:  # rclpy would swallow it
-            self.get_logger().error(f"can't be configured: {error}")
+            self._pipeline, self._in_use = self.settings.pipeline.load(), self.settings.pipeline
+        except RefuError as error:
+            self.get_logger().error(f"can't be configured: {printable(error)}")
             return TransitionCallbackReturn.FAILURE
         self._loader = PipelineLoader(self._on_loaded, self._on_not_loaded)
         self._state = "inactive"
+        self.get_logger().info(f"configured with {self._in_use}")
         return super().on_configure(state)
 
+    @transition
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Dresses who sends, as soon as somebody wants that."""
-        result = super().on_activate(state)
         assert self._pipeline is not None
-        if self.settings.record and not self._recording:
-            try:
-                self._start_recording(self.settings.record)
-            except RefuError as error:  # no reason to leave people undressed
-                self._recording_error = printable(error)
-        self._scene = Scene(self._statistics)
-        self._worker = Worker(self._scene, self._statistics, self, settings=self.settings, pipeline=self._pipeline)
+        self.recording.try_start(self.settings.record)  # where it can't: no reason to leave people undressed
+        result = super().on_activate(state)
+        self._scene = Scene(self.statistics)
+        self._worker = Worker(self._scene, self.statistics, self, settings=self.settings, pipeline=self._pipeline)
         self._worker.start()
+        self._has_sent = False
+        self._state = "active"
         try:
             self._subscribe()  # in any case: what is wrong with the inputs has to show at the start
-        except Exception as error:  # rclpy would swallow it
-            self.get_logger().error(f"can't be activated: {error}")
+        except Exception as error:
+            self.get_logger().error(f"can't be activated: {printable(error)}")
             self.on_deactivate(state)
             return TransitionCallbackReturn.FAILURE
-        self._state = "active"
+        self.get_logger().info(f"active: publishes {self._garments.topic_name} and {self._body.topic_name}")
         return result
 
+    @transition
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Clears the scene, ends a recording, and waits for both."""
         self._deactivate()
         return super().on_deactivate(state)
 
+    @transition
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Takes the topics back."""
+        """Forgets the garments."""
         self._cleanup()
         return super().on_cleanup(state)
 
+    @transition
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Everything that is queued gets into the file before this returns."""
+        """Everything that is queued gets into the file before this returns. The node ends: it was told to."""
+        self.finalized = True
         self.close()
         self._state = "finalized"
-        self.finalized = True
         return super().on_shutdown(state)
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """After a transition that raised: begins anew."""
+        self.guarded("on_error", self.close)()
+        return super().on_error(state)
 
     def close(self) -> None:
         """Ends threads and files in the order data flows. May be called more than once."""
@@ -147,20 +159,15 @@ class GarmentNode(LifecycleNode):  # type: ignore[misc]
         if self._worker is not None:
             self._worker.stop()
         self._worker = self._scene = None
-        self._stop_recording()
-        for recorder in self._closing:
-            recorder.close()
-        self._closing.clear()
+        self.recording.close()
         if self._state == "active":
             self._state = "inactive"
+            self.get_logger().info("not active any more")
 
     def _cleanup(self) -> None:
         if self._loader is not None:
             self._loader.close()
-        self._loader = self._pipeline = None
-        for publisher in filter(None, (self._garments, self._body)):
-            self.destroy_lifecycle_publisher(publisher)
-        self._garments = self._body = None
+        self._loader = self._pipeline = self._in_use = None
         self._state = "unconfigured"
 
     # Input ----------------------------------------------------------------------------------------
@@ -189,6 +196,8 @@ class GarmentNode(LifecycleNode):  # type: ignore[misc]
                 self._listen(person, f"{person}/smpl_params" if person else "smpl_params")
 
     def _unsubscribe(self) -> None:
+        if self._inputs:
+            self.get_logger().info("listening to nobody")
         for subscription in self._inputs.values():
             self.destroy_subscription(subscription)
         self._inputs.clear()
@@ -196,22 +205,24 @@ class GarmentNode(LifecycleNode):  # type: ignore[misc]
 
     def _listen(self, person: str, topic: str) -> None:
         full_name = self.resolve_topic_name(topic)
+        self.get_logger().info(f"listening to {full_name} ({self._input_type})")
         self._inputs[person] = self.create_subscription(
             interface(self._input_type),
             topic,
             lambda data: self._on_input(person, full_name, data),
             _ros_qos(_INPUT_QOS),
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            # Overrides are parameters, which never go: only topics that don't come and go have them.
+            qos_overriding_options=None if self.settings.follow_humans else _OVERRIDABLE,
             raw=True,
         )
 
     def _on_input(self, person: str, topic: str, data: bytes) -> None:
         if self._scene is None:
             return
-        self._statistics.receive()
-        self._record(topic, self._input_type, data, _INPUT_QOS)
+        self.statistics.receive()
+        self.recording.put(topic, self._input_type, data, _INPUT_QOS)
         if not (self.watched() or self.body_watched()):
-            self._statistics.skip("unwatched")
+            self.statistics.skip("unwatched")
             return
         try:
             frame = self._decoder.from_bytes(data)
@@ -219,10 +230,21 @@ class GarmentNode(LifecycleNode):  # type: ignore[misc]
                 frame = replace(frame, stamp_ns=self.now_ns())
             check_plausible(frame)
         except (adapters.AdapterError, FrameError) as error:
-            self._statistics.drop("invalid", str(error))
+            self.statistics.drop("invalid", str(error))
             self.get_logger().warning(f"{topic}: {printable(error)}", throttle_duration_sec=_LOG_PERIOD_S)
             return
+        self._compare_frames(topic, printable(adapters.frame_id_of(data, self.settings.layout)))
         self._scene.put(person, frame)
+
+    def _compare_frames(self, topic: str, given: str) -> None:
+        """Says, once, that the sender's frame isn't the garments', where the sender names one."""
+        differs = given not in ("", self.settings.frame_id)
+        if differs and not self._input_frame:
+            self.get_logger().warning(
+                f"{topic} is in the frame {given}, the garments are in {self.settings.frame_id}, and nothing is "
+                "transformed: set frame_id to the sender's frame if they are the same place"
+            )
+        self._input_frame = given if differs else ""
 
     def _follow_humans(self) -> None:
         """Listens to bodies that have come and no longer to those that have gone (REP-155)."""
@@ -239,7 +261,7 @@ class GarmentNode(LifecycleNode):  # type: ignore[misc]
 
     def watched(self) -> bool:
         """Whether anybody listens to `garments` or they are recorded."""
-        return self._recording or self._garments.get_subscription_count() > 0
+        return self.recording.running or self._garments.get_subscription_count() > 0
 
     def body_watched(self) -> bool:
         """Whether anybody listens to `body`."""
@@ -252,7 +274,10 @@ class GarmentNode(LifecycleNode):  # type: ignore[misc]
     def send_garments(self, data: bytes) -> None:
         """Publishes and records."""
         self._garments.publish(data)
-        self._record(self._garments.topic_name, adapters.MARKER_ARRAY, data, _OUTPUT_QOS)
+        self.recording.put(self._garments.topic_name, adapters.MARKER_ARRAY, data, _OUTPUT_QOS)
+        if not self._has_sent:
+            self._has_sent = True
+            self.get_logger().info("the first garments are out")
 
     def send_body(self, data: bytes) -> None:
         """Publishes; bodies follow from the recorded inputs."""
@@ -262,7 +287,7 @@ class GarmentNode(LifecycleNode):  # type: ignore[misc]
         """Goes on on the CPU, or ends, as `on_device_loss` says."""
         self._lost = f"{self.settings.device} has failed ({reason})"
         stops = self.settings.on_device_loss == "stop"
-        self._statistics.set_error(f"{self._lost}: {'the node ends' if stops else 'loading for the cpu'}")
+        self.statistics.set_error(f"{self._lost}: {'the node ends' if stops else 'loading for the cpu'}")
         self.get_logger().error(f"{self._lost}: {'the node ends' if stops else 'the cpu takes over'}")
         if stops:
             self.failed = self.finalized = True
@@ -278,15 +303,19 @@ class GarmentNode(LifecycleNode):  # type: ignore[misc]
     # Parameters -----------------------------------------------------------------------------------
 
     def _on_parameters(self, parameters: list[Any]) -> SetParametersResult:
+        values = {parameter.name: parameter.value for parameter in parameters if parameter.name in specs()}
+        if not values:  # rclpy's own, the QoS of a topic for instance
+            return SetParametersResult(successful=True)
         try:
-            settings = self.settings.changed({parameter.name: parameter.value for parameter in parameters})
+            settings = self.settings.changed(values)
+            reload = settings.pipeline != self.settings.pipeline
+            if reload:
+                settings.pipeline.check()
             if settings.record != self.settings.record and self._state == "active":
-                self._stop_recording()
-                if settings.record:
-                    self._start_recording(settings.record)
+                self.recording.start(settings.record)
         except RefuError as error:
-            return SetParametersResult(successful=False, reason=str(error))
-        reload = settings.pipeline != self.settings.pipeline
+            self.statistics.fault("refused parameters", printable(error))
+            return SetParametersResult(successful=False, reason=printable(error))
         if settings.device != self.settings.device:
             self._lost = ""  # the operator knows better
         self.settings = settings
@@ -298,63 +327,23 @@ class GarmentNode(LifecycleNode):  # type: ignore[misc]
         return SetParametersResult(successful=True)
 
     def _on_loaded(self, pipeline: GarmentPipeline, key: PipelineKey) -> None:
-        self._pipeline = pipeline
+        self._pipeline, self._in_use = pipeline, key
         if self._worker is not None:
             self._worker.use(pipeline)
-        self._statistics.set_error(f"{self._lost}: on the cpu now; set device to try it again" if self._lost else "")
-        self.get_logger().info(f"now with {', '.join(key.garments)} ({key.backbone}, {key.sdf}, {key.device})")
+        self.statistics.set_error(f"{self._lost}: on the cpu now; set device to try it again" if self._lost else "")
+        self.get_logger().info(f"now with {key}")
 
     def _on_not_loaded(self, error: Exception, key: PipelineKey) -> None:
-        text = f"{', '.join(key.garments)} ({key.backbone}, {key.sdf}, {key.device}) can't be loaded: {error}"
-        self._statistics.set_error(text)
+        text = printable(f"{key} can't be loaded, {self._in_use} stays: {error}")
+        self.statistics.set_error(text)
         self.get_logger().error(text)
 
-    # Recording ------------------------------------------------------------------------------------
-
-    @property
-    def _recording(self) -> bool:
-        return self._recorder is not None and self._recorder.running
-
-    def _start_recording(self, path: str) -> None:
-        self._recorder = Recorder(path)
-        self._recording_error = ""
-        self.get_logger().info(f"recording to {self._recorder.path}")
-
-    def _stop_recording(self) -> None:
-        self._recording_error = ""
-        if self._recorder is not None:
-            self._recorder.stop()
-            self._closing.append(self._recorder)
-            self._recorder = None
-
-    def _record(self, topic: str, message_type: str, data: bytes, qos: adapters.QosProfile) -> None:
-        recorder = self._recorder
-        if recorder is not None:
-            recorder.put(topic, message_type, data, time_ns=time.time_ns(), qos=qos)
-
     def _on_record(self, request: Any, response: Any) -> Any:
-        response.success, response.message = self._switch_recording(on=request.data)
-        return response
-
-    def _switch_recording(self, *, on: bool) -> tuple[bool, str]:
-        if not on:
-            recorder = self._recorder
-            self._stop_recording()
-            return (False, "nothing is recorded") if recorder is None else (True, f"{recorder.path} is being closed")
-        if self._state != "active":
-            return False, f"the node is {self._state}: activate it first"
-        if self._recording and self._recorder is not None:
-            return False, f"already recording to {self._recorder.path}"
-        if not self.settings.record:
-            return False, "no directory: set the parameter record to one, which also starts the recording"
-        try:
-            self._stop_recording()
-            self._start_recording(self.settings.record)
-        except RefuError as error:
-            return False, str(error)
-        assert self._recorder is not None
+        refusal = "" if self._state == "active" else f"the node is {self._state}: activate it first"
+        done = self.recording.switch(self.settings.record, on=request.data, refusal=refusal)
+        response.success, response.message = done
         self._attend()
-        return True, f"recording to {self._recorder.path}"
+        return response
 
     # Once a second --------------------------------------------------------------------------------
 
@@ -362,10 +351,9 @@ class GarmentNode(LifecycleNode):  # type: ignore[misc]
         self._attend()
         if self._listening_since is not None and self.settings.follow_humans:
             self._follow_humans()
-        self._closing = [recorder for recorder in self._closing if not recorder.finished]
-        report = self._statistics.report()
-        recording = None if self._recorder is None else self._recorder.state()
-        error = recording.error if recording is not None else self._recording_error
+        self.recording.tell_closed()
+        report = self.statistics.report()
+        recording, error = self.recording.state()
         if error:
             self.get_logger().error(f"not recording: {error}", throttle_duration_sec=60.0)
         if report.recent["drop.failed"]:
@@ -374,19 +362,20 @@ class GarmentNode(LifecycleNode):  # type: ignore[misc]
             statuses(
                 report,
                 self.settings,
-                node=self.get_name(),
+                node=self.get_fully_qualified_name().lstrip("/"),
                 state=self._state,
+                in_use=self._in_use,
+                input_frame=self._input_frame,
                 persons=() if self._scene is None else self._scene.persons,
                 recording=recording,
                 recording_error=error,
                 listening_for=None if self._listening_since is None else time.monotonic() - self._listening_since,
-                device="cpu" if self._lost else "",
                 n_namesakes=self._count_namesakes(),
             ),
             stamp_ns=self.now_ns(),
         )
         self._diagnostics.publish(data)
-        self._record(DIAGNOSTICS_TOPIC, adapters.DIAGNOSTIC_ARRAY, data, _OUTPUT_QOS)
+        self.recording.put(DIAGNOSTICS_TOPIC, adapters.DIAGNOSTIC_ARRAY, data, _OUTPUT_QOS)
 
     def _count_namesakes(self) -> int:
         """Other nodes of this name: they answer each other's parameters and services, and mix on their topics."""

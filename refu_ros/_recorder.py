@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import itertools
+import math
 import shutil
 import threading
+import time
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 MAX_QUEUED_BYTES = 64 << 20
+SYNC_PERIOD_S = 1.0
 _MAX_QUEUED_MESSAGES = 10_000
 
 
@@ -33,6 +36,8 @@ class RecorderState:
     """On the disk; None where that can't be known."""
     error: str
     """Why it stopped, or empty."""
+    at_risk_s: float = 0.0
+    """Age of the oldest message that a power cut would take; 0 where the disk is waited for at the end alone."""
 
 
 @dataclass(frozen=True)
@@ -42,42 +47,73 @@ class _Message:
     qos: QosProfile
     data: bytes
     time_ns: int
+    since: float
+    """When it was put into the queue, on the monotonic clock."""
+
+
+_SYNC = _Message("", "", QosProfile(), b"", 0, 0.0)
+"""Stands for the moment when what was written has to get to the disk."""
 
 
 def free_path(path: Path) -> Path:
-    """`path` where it can take a bag, else the first of `path-1`, `path-2`, … : a recording never replaces another."""
-    for candidate in itertools.chain([path], (path.with_name(f"{path.name}-{i}") for i in itertools.count(1))):
+    """`path` where it can take a bag, else the first of `path-1`, `path-2`, … : a recording never replaces another.
+
+    Raises `BagError` where something is in the way that isn't a bag, and for a name that no terminal should be sent.
+    """
+    if not str(path).isprintable():
+        msg = f"{path}: wanted a name of printable characters"
+        raise BagError(msg)
+    names = (f"{path.stem}-{i}{path.suffix}" for i in itertools.count(1))
+    for candidate in itertools.chain([path], map(path.with_name, names) if path.name else ()):
         if not candidate.exists() or (candidate.is_dir() and not any(candidate.iterdir())):
             return candidate
-    raise AssertionError  # unreachable: the numbers don't end
+        if not (candidate.is_dir() or (path.suffix == ".mcap" and candidate.is_file())):
+            break
+    msg = f"{path}: {candidate} isn't a bag; wanted a directory, or a .mcap file, that is new"
+    raise BagError(msg)
 
 
 class Recorder:
     """Writes messages to a rosbag2 bag in a thread of its own. `put` never blocks: where the disk can't follow,
     messages are dropped and counted. A failure (a full disk) ends the recording, not the caller.
 
-    Raises `BagError` when the bag can't be opened.
+    Of what was put in, a power cut takes no more than the last `sync_period` seconds, as long as the disk takes a
+    message to heart within half of that; `RecorderState.at_risk_s` says whether it does. At 0 the disk is waited for
+    only when the recording ends.
+
+    The bag is open when the constructor returns: start a new recording before the old one is stopped, and where that
+    fails nothing has happened to the old one.
+
+    Raises `BagError` when the bag can't be opened, whatever `path` is.
     """
 
     def __init__(
         self,
         path: str | Path,
         *,
+        sync_period: float = SYNC_PERIOD_S,
         max_queued_bytes: int = MAX_QUEUED_BYTES,
         open_bag: Callable[[Path], BagWriter] = BagWriter,
     ) -> None:
         try:
             self.path = free_path(Path(path).expanduser().absolute())
             self._bag = open_bag(self.path)
-        except OSError as error:
-            msg = f"{path}: can't be recorded to: {error.strerror or error}"
+        except BagError:
+            raise
+        except (OSError, ValueError, RuntimeError) as error:  # ~nobody is a RuntimeError
+            msg = f"{path}: can't be recorded to: {getattr(error, 'strerror', None) or error}"
             raise BagError(msg) from error
+        self._sync_after = 0.5 * sync_period if sync_period else math.inf
         self._max_queued_bytes = max_queued_bytes
         self._changed = threading.Condition()
         self._queue: deque[_Message] = deque()
         self._queued_bytes = 0
         self._dropped = 0
         self._written = 0
+        self._unsynced: float | None = None
+        """When the oldest of those messages came that are written, but not known to be on the disk."""
+        self._synced = -math.inf
+        """When the disk was waited for last: of a queue that has grown, each message has waited long enough."""
         self._error = ""
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name="recorder")
@@ -92,7 +128,7 @@ class Recorder:
             if full:
                 self._dropped += 1
                 return
-            self._queue.append(_Message(topic, message_type, qos, data, time_ns))
+            self._queue.append(_Message(topic, message_type, qos, data, time_ns, time.monotonic()))
             self._queued_bytes += len(data)
             self._changed.notify()
 
@@ -126,29 +162,58 @@ class Recorder:
         except OSError:
             size, free = 0, None
         with self._changed:
-            return RecorderState(self.path, self._written, len(self._queue), self._dropped, size, free, self._error)
+            now = time.monotonic()
+            oldest = self._queue[0].since if self._queue else now
+            if self._unsynced is not None:
+                oldest = self._unsynced
+            return RecorderState(
+                path=self.path,
+                written=self._written,
+                queued=len(self._queue),
+                dropped=self._dropped,
+                size_bytes=size,
+                free_bytes=free,
+                at_risk_s=now - oldest if self._sync_after < math.inf else 0.0,
+                error=self._error,
+            )
 
     def _run(self) -> None:
         try:
-            while (message := self._next()) is not None:
-                self._bag.add_topic(message.topic, message.message_type, qos=message.qos)
-                self._bag.write(message.topic, message.data, log_time_ns=message.time_ns)
-                with self._changed:
-                    self._written += 1
-            self._bag.finish()
-        except (BagError, OSError) as error:
+            with self._bag:
+                while (message := self._next()) is not None:
+                    if message is _SYNC:
+                        self._bag.sync()
+                    else:
+                        self._bag.add_topic(message.topic, message.message_type, qos=message.qos)
+                        self._bag.write(message.topic, message.data, log_time_ns=message.time_ns)
+                    with self._changed:
+                        if message is _SYNC:
+                            self._unsynced = None
+                        else:
+                            self._written += 1
+            self._unsynced = None
+        except Exception as error:  # whatever it is, it ends the recording alone
             with self._changed:
-                self._error = str(error)
+                self._error = str(error) or type(error).__name__
                 self._dropped += 1 + len(self._queue)
                 self._queue.clear()
                 self._queued_bytes = 0
 
     def _next(self) -> _Message | None:
+        """The next message, `_SYNC` when one has waited for the disk long enough, or None at the end."""
         with self._changed:
-            while not self._queue and not self._stopping:
-                self._changed.wait()
-            if not self._queue:
-                return None
-            message = self._queue.popleft()
-            self._queued_bytes -= len(message.data)
-            return message
+            while True:
+                now = time.monotonic()
+                since = math.inf if self._unsynced is None else max(self._unsynced, self._synced)
+                left = since + self._sync_after - now
+                if left <= 0:
+                    self._synced = now
+                    return _SYNC
+                if self._queue:
+                    message = self._queue.popleft()
+                    self._unsynced = message.since if self._unsynced is None else self._unsynced
+                    self._queued_bytes -= len(message.data)
+                    return message
+                if self._stopping:
+                    return None
+                self._changed.wait(left if left < math.inf else None)

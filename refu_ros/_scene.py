@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from refu_core import FrameError
+from refu_core.frames import PLAUSIBLE_ANGLE, PLAUSIBLE_COEFFICIENT, PLAUSIBLE_TRANSL
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -17,9 +18,6 @@ if TYPE_CHECKING:
     from refu_core import SmplFrame
     from refu_ros._statistics import Statistics
 
-_MAX_ANGLE = 1e3
-_MAX_BETA = 20.0
-_MAX_TRANSL = 1e9
 _MAX_STAMP_NS = 2**31 * 10**9
 
 
@@ -38,16 +36,21 @@ def check_plausible(frame: SmplFrame) -> None:
     Raises `FrameError`.
     """
     for name, value, limit in (
-        ("pose", frame.pose, _MAX_ANGLE),
-        ("betas", frame.betas, _MAX_BETA),
-        ("transl", frame.transl, _MAX_TRANSL),
+        ("pose", frame.pose, PLAUSIBLE_ANGLE),
+        ("betas", frame.betas, PLAUSIBLE_COEFFICIENT),
+        ("transl", frame.transl, PLAUSIBLE_TRANSL),
     ):
         largest = float(np.abs(value).max())
         if largest > limit:
             msg = f"{name}: wanted magnitudes up to {limit:g}, got {largest:g}"
             raise FrameError(msg)
-    if not 0 <= frame.stamp_ns < _MAX_STAMP_NS:
-        msg = f"wanted a stamp that fits a ROS time, got {frame.stamp_ns} ns"
+    check_stamp(frame.stamp_ns)
+
+
+def check_stamp(stamp_ns: int) -> None:
+    """Raises `FrameError` for a time [ns] that no message holds, or before the clock's beginning."""
+    if not 0 <= stamp_ns < _MAX_STAMP_NS:
+        msg = f"wanted a stamp that fits a ROS time, got {stamp_ns} ns"
         raise FrameError(msg)
 
 

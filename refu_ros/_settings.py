@@ -6,23 +6,26 @@ import math
 import re
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from msg_adapters import INPUT_TYPES, InputAxes, InputType
 from refu_core import GarmentPipeline, RefuError, SmplFrame, load_garment
-from refu_core.backbones import BACKBONES
+from refu_core._device import checked_device
 from refu_core.frames import N_JOINTS
-from refu_core.realtime import SDF_MODES
-from refu_core.repulsion import DEFAULT_MARGIN
+from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN, MAX_MARGIN, BackboneName, SdfMode
+from refu_core.weights import weights_folder
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from refu_core import GarmentTemplate
 
-_PERSON = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+_PERSON = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,99}")
+_FRAME = re.compile(r"[^/\s\x00-\x1f\x7f][^\s\x00-\x1f\x7f]{0,254}")
+_SLOWEST_HZ = 0.01
 
 
 class SettingsError(RefuError, ValueError):
@@ -55,6 +58,20 @@ class PipelineKey:
     weights: str
     device: str
 
+    def __str__(self) -> str:
+        weights = f", weights {self.weights}" if self.weights else ""
+        return f"{', '.join(self.garments)} ({self.backbone}, {self.sdf}, {self.device}{weights})"
+
+    def check(self) -> None:
+        """Raises `RefuError` for what can't be loaded, as far as that shows without loading it."""
+        checked_device(self.device)
+        for name in self.garments if self.backbone != "skinned" else ():
+            folder = weights_folder(name, self.weights or None)
+            path = folder / f"{self.backbone}-{self.sdf}.safetensors"
+            if not path.is_file():
+                msg = f"no weights of {self.backbone} {self.sdf} for {name}: {path} is missing; train them (refu train)"
+                raise SettingsError(msg)
+
     def load(self) -> GarmentPipeline:
         """Loads it, which takes some tenths of a second, and runs it once: the first frame is the slowest.
 
@@ -78,17 +95,15 @@ class NodeSettings:
     Raises `SettingsError` for a value out of range and for values that can't go together.
     """
 
-    garments: tuple[str, ...] = _parameter(
-        ("tshirt-male", "short-pant-male"), "Garments that every person wears; all of one body."
-    )
+    garments: tuple[str, ...] = _parameter(DEFAULT_GARMENTS, "Garments that every person wears; all of one body.")
     backbone: str = _parameter(
-        "tailornet", "What predicts the garment before collisions are handled.", choices=tuple(BACKBONES)
+        "tailornet", "What predicts the garment before collisions are handled.", choices=tuple(BackboneName)
     )
     weights: str = _parameter(
         "", "Folder with a folder a garment of weights of one's own (refu train); empty for those that ship."
     )
-    sdf: str = _parameter("hybrid", "How collisions are found.", choices=SDF_MODES)
-    margin: float = _parameter(DEFAULT_MARGIN, "Clearance that is kept from the skin [m].", low=0.0, high=0.05)
+    sdf: str = _parameter("hybrid", "How collisions are found.", choices=tuple(SdfMode))
+    margin: float = _parameter(DEFAULT_MARGIN, "Clearance that is kept from the skin [m].", low=0.0, high=MAX_MARGIN)
     device: str = _parameter("cpu", "Torch device: cpu or cuda.")
     on_device_loss: str = _parameter(
         "cpu", "When the device fails: go on on the cpu, with an ERROR, or stop the node.", choices=("cpu", "stop")
@@ -121,10 +136,23 @@ class NodeSettings:
         1.0, "A person who hasn't sent for so long leaves the scene [s].", low=0.05, high=3600.0
     )
     max_rate: float = _parameter(0.0, "At most so many frames a second; 0 for no limit [Hz].", low=0.0, high=1000.0)
+    marker_lifetime: float = _parameter(
+        2.0,
+        "How long viewers show a garment that isn't renewed, should the node end without a word; 0 for ever [s].",
+        low=0.0,
+        high=1e6,
+    )
     max_distance: float = _parameter(
         0.0, "A person farther from the origin of frame_id isn't dressed; 0 for no limit [m].", low=0.0, high=1e6
     )
     record: str = _parameter("", "Directory that inputs and outputs are recorded to as a bag; empty for none.")
+    record_sync_period: float = _parameter(
+        1.0,
+        "A power cut takes no more than so much of a recording [s]; at 0 the disk is waited for at its end alone.",
+        low=0.0,
+        high=3600.0,
+        live=False,
+    )
     lazy: bool = _parameter(
         True,
         "Whether the inputs are subscribed to only while somebody wants the output, or it is recorded.",
@@ -146,8 +174,15 @@ class NodeSettings:
         if self.follow_humans and self.input_type != "joint_state":
             msg = f"follow_humans: REP-155 has bodies as joint_state, but input_type is {self.input_type}"
             raise SettingsError(msg)
-        if not self.frame_id or "\0" in self.frame_id + self.record + self.weights:
-            msg = f"frame_id, record, weights: wanted names without NUL, the frame's not empty, got {self.frame_id!r}"
+        if not _FRAME.fullmatch(self.frame_id):
+            msg = f"frame_id: wanted a name as tf2 has them, without a leading slash or spaces, got {self.frame_id!r}"
+            raise SettingsError(msg)
+        for name, path in (("record", self.record), ("weights", self.weights)):
+            if path and not _names_a_folder(path):
+                msg = f"{name}: wanted the path of a folder, got {path!r}"
+                raise SettingsError(msg)
+        if 0 < self.max_rate < _SLOWEST_HZ:
+            msg = f"max_rate: wanted {_SLOWEST_HZ:g} to 1000, or 0 for no limit, got {self.max_rate:g}"
             raise SettingsError(msg)
         self._check_garments()
 
@@ -180,6 +215,14 @@ class NodeSettings:
         return PipelineKey(
             garments=self.garments, sdf=self.sdf, backbone=self.backbone, weights=self.weights, device=self.device
         )
+
+    @property
+    def lifetime_ns(self) -> int:
+        """Of the markers [ns]: as asked, but never so short that somebody who is here would flicker."""
+        if not self.marker_lifetime:
+            return 0
+        slowest = 1 / self.max_rate if self.max_rate else 0.0
+        return round(1e9 * max(self.marker_lifetime, 2 * self.person_timeout, 2 * slowest))
 
     @property
     def axes(self) -> InputAxes:
@@ -227,11 +270,19 @@ def _coerce(name: str, value: Any) -> Any:
             wanted = f"a list of {len(default)} numbers"
         value = items
     if not right:
-        msg = f"{name}: wanted {wanted}, got {value!r}"
+        hint = "" if value is not None else ": no value, or whole numbers and decimals mixed; write all as decimals"
+        msg = f"{name}: wanted {wanted}, got {value!r}{hint}"
         raise SettingsError(msg)
     if isinstance(default, tuple):
         return tuple(map(type(default[0]), value))
     return type(default)(value)
+
+
+def _names_a_folder(path: str) -> bool:
+    try:
+        return "\0" not in path and Path(path).expanduser().absolute().name != ""
+    except RuntimeError:  # the home of a user that there isn't
+        return False
 
 
 def _is_number(value: Any) -> bool:

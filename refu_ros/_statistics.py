@@ -10,17 +10,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from refu_core.errors import printable
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
 _WINDOW = 1000
 """Latencies that percentiles are taken of."""
-_MAX_TEXT = 300
-
-
-def printable(text: object) -> str:
-    """A line for logs and diagnostics, whatever a hostile message has put into the text."""
-    return "".join(c if c.isprintable() else "?" for c in str(text)[:_MAX_TEXT])
 
 
 @dataclass(frozen=True)
@@ -37,7 +33,7 @@ class Report:
     silent_for: float | None
     """Since the last input of anybody [s]; None if there was none."""
     reasons: dict[str, str] = field(default_factory=dict)
-    """The newest reason for each kind of drop."""
+    """The newest reason for each kind of drop, and for a fault."""
 
     def rate(self, key: str) -> float:
         """Events a second since the last report [Hz]."""
@@ -51,7 +47,8 @@ class Report:
 class Statistics:
     """Counters that any thread may raise.
 
-    Keys: received, ticks, frames, drop.<cause>, skip.<kind>, penetration.<found|unresolved>, back_in_time.
+    Keys: received, ticks, frames, drop.<cause>, skip.<kind>, fault.<where>, penetration.<found|unresolved>,
+    back_in_time, beyond_promise.
     """
 
     def __init__(self, *, clock: Callable[[], float] = time.monotonic) -> None:
@@ -78,10 +75,21 @@ class Statistics:
             if reason:
                 self._reasons[cause] = printable(reason)
 
+    def fault(self, where: str, reason: str) -> None:
+        """A callback failed, or a request made no sense."""
+        with self._lock:
+            self._total[f"fault.{where}"] += 1
+            self._reasons["fault"] = printable(reason)
+
     def back_in_time(self) -> None:
         """A frame is older by its stamp than its person's frame before."""
         with self._lock:
             self._total["back_in_time"] += 1
+
+    def beyond_promise(self) -> None:
+        """A frame's joints or shape are outside of the range that "nothing inside" is promised for."""
+        with self._lock:
+            self._total["beyond_promise"] += 1
 
     def skip(self, kind: str) -> None:
         """Work was left out that nobody needed."""

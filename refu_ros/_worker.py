@@ -5,14 +5,13 @@ from __future__ import annotations
 import threading
 import time
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import torch
 
 from msg_adapters import EncodeError, MarkerArrayEncoder, MarkerMesh, encode_delete, garment_namespace
 from refu_core._device import is_device_loss
-from refu_core.evaluation.render import GARMENT_COLOURS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -173,6 +172,8 @@ class Worker:
             self._dressed[person] = _Dressed(_inputs(todo[person]), output)
             found += sum(stats.n_inside for stats in output.stats.garments.values())
             unresolved += sum(stats.n_unresolved for stats in output.stats.garments.values())
+            if not output.stats.within_promise:
+                self._statistics.beyond_promise()
         return found, unresolved
 
     def _infer(self, frames: Mapping[str, SmplFrame]) -> dict[str, PipelineOutput]:
@@ -229,7 +230,12 @@ class Worker:
             self._bodies_shown.update(persons)
 
     def _encoder(self, kind: str, persons: tuple[str, ...], settings: NodeSettings) -> MarkerArrayEncoder:
-        key = (kind, persons, settings.frame_id, settings.axes)
+        placed: dict[str, Any] = {
+            "frame_id": settings.frame_id,
+            "axes": settings.axes,
+            "lifetime_ns": settings.lifetime_ns,
+        }
+        key = (kind, persons, *placed.values())
         if key not in self._encoders:
             if len(self._encoders) >= _MAX_ENCODERS:
                 self._encoders.clear()
@@ -238,7 +244,7 @@ class Worker:
                 for person in persons
                 for mesh in (self._garment_meshes if kind == "garments" else self._body_mesh)(person)
             ]
-            self._encoders[key] = MarkerArrayEncoder(meshes, frame_id=settings.frame_id, axes=settings.axes)
+            self._encoders[key] = MarkerArrayEncoder(meshes, **placed)
         return self._encoders[key]
 
     def _garment_meshes(self, person: str) -> list[MarkerMesh]:
@@ -247,7 +253,7 @@ class Worker:
                 ns=garment_namespace(name, person),
                 faces=garment.faces.cpu().numpy(),
                 n_vertices=garment.n_vertices,
-                color=(*GARMENT_COLOURS[name], 1.0),
+                color=(*garment.card.color, 1.0),
             )
             for name, garment in self._pipeline.garments.items()
         ]

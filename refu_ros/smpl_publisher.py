@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
-import signal
 import sys
 import threading
 from dataclasses import dataclass, fields, replace
@@ -11,20 +9,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import rclpy
 from rcl_interfaces.msg import ParameterDescriptor
-from rclpy.exceptions import ParameterException
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from rclpy.signals import SignalHandlerOptions
-from rclpy.utilities import remove_ros_args
 from scipy.spatial.transform import Rotation
 
 from msg_adapters import INPUT_TYPES, SMPL_JOINTS, BagError, Motion, encoder_for, iter_smpl_frames, read_motion
 from refu_core import FrameError, RefuError, SmplFrame
+from refu_ros._guard import GuardedNode
 from refu_ros._interfaces import interface
+from refu_ros._program import make_executor, on_signals, run, spin
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -32,7 +26,6 @@ if TYPE_CHECKING:
     from msg_adapters import Encoder, InputType
 
 TOPIC = "smpl_params"
-EXIT_BAD_INPUT = 2
 _MARCH_FPS = 30.0
 _MARCH_STEPS_S = 1.2
 _ROOT_HEIGHT_M = 1.156  # of the built-in male body's root above its soles
@@ -110,7 +103,7 @@ def in_place(motion: Motion, *, up: int) -> Motion:
     return replace(motion, transl=held)
 
 
-class SmplPublisher(Node):  # type: ignore[misc]  # rclpy has no types
+class SmplPublisher(GuardedNode):
     """Publishes frame after frame at a steady rate, stamped with the time they are sent."""
 
     def __init__(self, **options: Any) -> None:
@@ -132,7 +125,7 @@ class SmplPublisher(Node):  # type: ignore[misc]  # rclpy has no types
             )
             for name in names or ("",)
         ]
-        self.create_timer(1 / self.motion.fps, self._tick)
+        self.create_timer(1 / self.motion.fps, self.guarded("tick", self._tick))
         self.get_logger().info(
             f"{self.options.motion or 'march on the spot'}: {len(self.motion)} frames at {self.motion.fps:g} Hz as "
             f"{INPUT_TYPES[self.options.input_type]} on {', '.join(output.topic_name for output in self._outputs)}"
@@ -195,42 +188,28 @@ class SmplPublisher(Node):  # type: ignore[misc]  # rclpy has no types
         self._index += 1
 
 
-def _parse(arguments: Sequence[str]) -> None:
-    """Answers --help; everything else is a ROS parameter."""
+def _listing() -> str:
     defaults = {field.name: field.default for field in fields(PublisherOptions)}
-    listing = "\n".join(f"  {name:<11} {text} (default: {defaults[name]!r})" for name, text in DESCRIPTIONS.items())
-    argparse.ArgumentParser(
-        prog="smpl_publisher",
-        usage="smpl_publisher [--help] [--ros-args -p NAME:=VALUE ...]",
-        description=__doc__,
-        epilog=f"parameters:\n{listing}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    ).parse_args(arguments)
+    return "\n".join(
+        ["parameters:", *(f"  {name:<12}{text} ({defaults[name]!r})" for name, text in DESCRIPTIONS.items())]
+    )
+
+
+def _live() -> int:
+    node = SmplPublisher()
+    told = threading.Event()
+    on_signals(told.set)
+    executor = make_executor()
+    executor.add_node(node)
+    spin(executor, node, until=lambda: told.is_set() or node.finished)
+    executor.shutdown()
+    node.destroy_node()
+    return 0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the node until SIGINT, SIGTERM or the end of the motion; returns the exit code."""
-    arguments = sys.argv if arguments is None else ["smpl_publisher", *arguments]
-    _parse(remove_ros_args(arguments)[1:])
-    # rclpy's own handlers tear the context down under a running callback; a flag lets the loop end by itself.
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
-    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-    try:
-        node = SmplPublisher()
-        executor = SingleThreadedExecutor()
-        executor.add_node(node)
-        while not (stop.is_set() or node.finished) and rclpy.ok():
-            executor.spin_once(timeout_sec=0.1)
-        executor.shutdown()
-        node.destroy_node()
-    except (RefuError, ParameterException) as error:
-        print(f"smpl_publisher: error: {' '.join(str(error).split())}", file=sys.stderr)
-        return EXIT_BAD_INPUT
-    finally:
-        rclpy.try_shutdown()
-    return 0
+    return run("smpl_publisher", arguments, description=__doc__, listing=_listing, live=_live)
 
 
 if __name__ == "__main__":

@@ -36,7 +36,7 @@ from asset_tools.surfaces import (
 from numpy.typing import NDArray
 
 from refu_core.body import JOINT_NAMES, PARENTS
-from refu_core.evaluation._shading import light_kernel
+from refu_lab._ray_kernels import light_kernel
 
 PEOPLE = 600
 """Drawn of either gender."""

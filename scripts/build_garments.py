@@ -41,6 +41,7 @@ from build_bodies import PEOPLE
 from numpy.typing import NDArray
 
 from refu_core.body import SmplBody, load_body
+from refu_core.garments import GarmentCard, Tailoring, card_to_json
 from refu_core.sdf import ExactSdf
 
 Field = Callable[[Vertices], NDArray[np.float64]]
@@ -66,6 +67,7 @@ class Garment:
     """Clearance from the body before smoothing [m], at points (P, 3)."""
     skin_smoothing: int
     """Rounds of smoothing of the skinning weights."""
+    card: GarmentCard
     flare: Field | None = None
     """Extra distance from the vertical axis through the body [m], at points (P, 3)."""
 
@@ -113,6 +115,12 @@ def skirt_flare(p: Vertices) -> NDArray[np.float64]:
     return 0.055 * np.clip((-0.24 - p[:, 1]) / 0.33, 0, None)
 
 
+_TRUNK = (0, 1, 2, 3, 6, 9, 12, 13, 14)
+"""Joints between hips and neck."""
+_PROVENANCE = (
+    "MakeHuman's clothes helpers, targets and skinning weights (CC0 1.0), cut and draped by scripts/build_garments.py, "
+    "styles by scripts/build_styles.py; CC0 1.0"
+)
 GARMENTS = (
     Garment(
         name="shirt-male",
@@ -127,6 +135,19 @@ GARMENTS = (
         vertices=9723,
         ease=shirt_ease,
         skin_smoothing=12,
+        card=GarmentCard(
+            layer=2,
+            color=(0.36, 0.55, 0.78),
+            joints=(*_TRUNK, 16, 17, 18, 19, 20, 21),
+            held_at_waist=False,
+            tailoring=(
+                Tailoring("length", 0.0, 0.03),
+                Tailoring("sleeve_length", -0.01, 0.02),
+                Tailoring("ease", 0.012, 0.004),
+                Tailoring("neckline", 0.008, 0.007),
+            ),
+            provenance=_PROVENANCE,
+        ),
     ),
     Garment(
         name="tshirt-male",
@@ -141,6 +162,19 @@ GARMENTS = (
         vertices=7702,
         ease=tshirt_ease,
         skin_smoothing=12,
+        card=GarmentCard(
+            layer=1,
+            color=(0.25, 0.62, 0.57),
+            joints=(*_TRUNK, 16, 17, 18, 19),
+            held_at_waist=False,
+            tailoring=(
+                Tailoring("length", 0.0, 0.03),
+                Tailoring("sleeve_length", 0.0, 0.025),
+                Tailoring("ease", 0.012, 0.004),
+                Tailoring("neckline", 0.010, 0.008),
+            ),
+            provenance=_PROVENANCE,
+        ),
     ),
     Garment(
         name="short-pant-male",
@@ -150,6 +184,19 @@ GARMENTS = (
         vertices=2710,
         ease=shorts_ease,
         skin_smoothing=4,
+        card=GarmentCard(
+            layer=0,
+            color=(0.30, 0.34, 0.47),
+            joints=(0, 1, 2, 4, 5),
+            held_at_waist=True,
+            tailoring=(
+                Tailoring("length", 0.0, 0.03),
+                Tailoring("flare", 0.008, 0.008),
+                Tailoring("ease", 0.007, 0.003),
+                Tailoring("rise", 0.0, 0.010),
+            ),
+            provenance=_PROVENANCE,
+        ),
     ),
     Garment(
         name="skirt-female",
@@ -159,6 +206,19 @@ GARMENTS = (
         vertices=7130,
         ease=skirt_ease,
         skin_smoothing=60,
+        card=GarmentCard(
+            layer=0,
+            color=(0.80, 0.40, 0.42),
+            joints=(0, 1, 2, 4, 5),
+            held_at_waist=True,
+            tailoring=(
+                Tailoring("length", 0.0, 0.04),
+                Tailoring("flare", 0.02, 0.022),
+                Tailoring("ease", 0.005, 0.004),
+                Tailoring("rise", 0.0, 0.010),
+            ),
+            provenance=_PROVENANCE,
+        ),
         flare=skirt_flare,
     ),
 )
@@ -185,6 +245,7 @@ def main() -> None:
             weights=template.weights.astype(np.float32),
             shapedirs=template.shapedirs.astype(np.float32),
             body=np.array(garment.body),
+            card=np.array(card_to_json(garment.card).encode()),
         )
         report(garment, template, body)
 

@@ -3,8 +3,8 @@
 
     python scripts/build_styles.py [--assets refu_core/assets] [--output DIR] [GARMENT ...]
 
-Replaces a garment's `v_template` by the mean cut and adds `styledirs`, `tailoring`, `tailoring_from_style`; about a
-minute a garment. See docs/dataset.md, "Styles".
+Replaces a garment's `v_template` by the mean cut and adds `styledirs` and `tailoring_from_style`; about a
+minute a garment. See docs/guide/data.md, "Styles".
 """
 
 from __future__ import annotations
@@ -39,7 +39,6 @@ def main() -> int:
             arrays = {key: data[key] for key in data.files}
         arrays["v_template"] = basis.v_template
         arrays["styledirs"] = basis.styledirs
-        arrays["tailoring"] = np.array([f"{p.name} {p.std:g} m" for p in basis.parameters])
         arrays["tailoring_from_style"] = basis.tailoring_from_style
         args.output.mkdir(parents=True, exist_ok=True)
         np.savez_compressed(args.output / f"garment_{name}.npz", **arrays)

@@ -11,7 +11,8 @@ from pathlib import Path
 
 from PIL import Image
 
-from refu_core.simulation import GarmentDataset, contact_sheet
+from refu_core.simulation import GarmentDataset
+from refu_lab.contact_sheet import contact_sheet
 
 
 def main() -> None:

@@ -13,11 +13,11 @@ from scipy.spatial.transform import Rotation
 
 import msg_adapters as adapters
 from refu_core import GarmentPipeline
-from refu_core.evaluation.render import GARMENT_COLOURS, Camera, RenderMesh, render
+from refu_core.modes import DEFAULT_GARMENTS
+from refu_lab.render import Camera, RenderMesh, render
 
 ROOT = Path(__file__).parents[1]
 SIZE = (330, 500)
-GARMENTS = ("tshirt-male", "short-pant-male")
 PICTURES = (  # bag, frame, yaw of the camera relative to the person [degrees]
     ("walk", 18, 35.0),
     ("reach_squat", 62, 35.0),
@@ -28,7 +28,7 @@ PICTURES = (  # bag, frame, yaw of the camera relative to the person [degrees]
 
 def main() -> None:
     """Writes the picture."""
-    pipeline = GarmentPipeline.load(GARMENTS)
+    pipeline = GarmentPipeline.load(DEFAULT_GARMENTS)
     body_faces = pipeline.body.faces.numpy()
     columns = []
     for bag, index, yaw in PICTURES:
@@ -38,7 +38,9 @@ def main() -> None:
         forward = Rotation.from_rotvec(frame.pose[0]).apply([0.0, 0.0, 1.0])
         camera = Camera.framing(output.body, size=SIZE, yaw=float(np.degrees(np.arctan2(*forward[[0, 2]]))) + yaw)
         meshes = [RenderMesh(output.body, body_faces)]
-        meshes += [RenderMesh(mesh.local, mesh.faces, GARMENT_COLOURS[name]) for name, mesh in output.items()]
+        meshes += [
+            RenderMesh(mesh.local, mesh.faces, pipeline.garments[name].card.color) for name, mesh in output.items()
+        ]
         columns.append(render(meshes, camera=camera, size=SIZE, samples=16))
     path = ROOT / "docs" / "images" / "replay.png"
     path.parent.mkdir(parents=True, exist_ok=True)

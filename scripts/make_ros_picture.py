@@ -12,18 +12,18 @@ from PIL import Image
 
 from msg_adapters import iter_smpl_frames
 from refu_core import GarmentPipeline, SmplFrame
-from refu_core.evaluation.render import GARMENT_COLOURS, Camera, RenderMesh, render
+from refu_core.modes import DEFAULT_GARMENTS
+from refu_lab.render import Camera, RenderMesh, render
 
 ROOT = Path(__file__).parents[1]
 SIZE = (900, 480)
-GARMENTS = ("tshirt-male", "short-pant-male")
 FRAMES = (18, 70, 122)
 SPACING_M = 1.0
 
 
 def main() -> None:
     """Writes the picture."""
-    pipeline = GarmentPipeline.load(GARMENTS)
+    pipeline = GarmentPipeline.load(DEFAULT_GARMENTS)
     recorded = [record.frame for record in iter_smpl_frames(ROOT / "bags" / "walk")]
     meshes = []
     for i, index in enumerate(FRAMES):
@@ -32,7 +32,9 @@ def main() -> None:
         place = np.array([(i - 1) * SPACING_M, frame.transl[1], 0.0])
         output = pipeline(SmplFrame(frame.pose, betas=frame.betas, transl=place))
         meshes.append(RenderMesh(output.body + place, pipeline.body.faces.numpy()))
-        meshes += [RenderMesh(mesh.vertices, mesh.faces, GARMENT_COLOURS[name]) for name, mesh in output.items()]
+        meshes += [
+            RenderMesh(mesh.vertices, mesh.faces, pipeline.garments[name].card.color) for name, mesh in output.items()
+        ]
     camera = Camera.framing(np.concatenate([mesh.vertices for mesh in meshes]), size=SIZE, yaw=28.0, pitch=10.0)
     path = ROOT / "docs" / "images" / "ros.png"
     Image.fromarray(render(meshes, camera=camera, size=SIZE, samples=16)).save(path, optimize=True)

@@ -6,7 +6,7 @@ itself: edges against triangles in double precision. Stretch: edges of the store
 
     python scripts/verify_dataset.py data/tshirt-male --processes 2 --json report.json
 
-The set's files are read as docs/dataset.md describes them, not through the project's own reader. Exit code 1 where a
+The set's files are read as docs/guide/data.md describes them, not through the project's own reader. Exit code 1 where a
 sample isn't what it should be.
 """
 
@@ -72,8 +72,7 @@ class Judge:
         self._body = load_body(body)
         self._faces = self._garment.faces.numpy().astype(np.int64)
         self._body_faces = self._body.faces.numpy().astype(np.int64)
-        half = np.sort(self._faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-        self._edges = np.unique(half, axis=0)
+        self._edges = self._garment.mesh.edges
         self._lengths: tuple[bytes, F64] | None = None
 
     def judge(self, place: str, slot: int, vertices: F64, pose: Any, betas: Any, style: Any) -> Verdict:

@@ -1,4 +1,4 @@
-"""A data set in the documented format (docs/dataset.md), written without the project's writer."""
+"""A data set in the documented format (docs/guide/data.md), written without the project's writer."""
 
 from __future__ import annotations
 

@@ -3,36 +3,45 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
 import os
+import re
 import resource
 import runpy
+import struct
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load as load_tensors
+from safetensors.torch import save as save_tensors
 
 from msg_adapters import BagError, BagReader, BagWriter, QosProfile
+from msg_adapters.diagnostics import DiagnosticStatus
 from refu_core import GarmentPipeline, SmplFrame, WeightsError, load_body
 from refu_core._device import is_device_loss
 from refu_core.backbones import TailorNetConfig
 from refu_core.training import load_checkpoint, save_checkpoint
 from refu_core.weights import save_weights
+from refu_lab.cli import main
 from refu_ros._diagnostics import statuses
 from refu_ros._recorder import Recorder
 from refu_ros._scene import Scene
 from refu_ros._settings import NodeSettings
 from refu_ros._statistics import Statistics
 from refu_ros._worker import Worker
-from refu_ros.cli import main
-from refu_ros.fuzz._results import small_weights
+from tests.core.test_files import SPECIAL
+from tests.fuzz.corpus import small_weights
+from tests.limits import refusal
 
 GARMENT = "short-pant-male"
 KILL_TEST = Path(__file__).parents[1] / "scripts" / "kill_test.py"
@@ -81,7 +90,14 @@ def test_missing_weights_say_what_to_do(weights: Path, tmp_path: Path, name: str
         load(tmp_path)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.999])
+@pytest.mark.parametrize("name", ["tailornet-hybrid.safetensors", "basis.json"])
+def test_empty_weights_are_refused(weights: Path, tmp_path: Path, name: str) -> None:
+    (copy_of(weights, tmp_path) / GARMENT / name).write_bytes(b"")
+    with pytest.raises(WeightsError, match=f"{name}: can't be read: an empty file; wanted weights or their card"):
+        load(tmp_path)
+
+
+@pytest.mark.parametrize("share", [0.01, 0.3, 0.999])
 @pytest.mark.parametrize("name", ["tailornet-hybrid.safetensors", "basis.safetensors"])
 def test_truncated_weights_are_refused(weights: Path, tmp_path: Path, name: str, share: float) -> None:
     path = copy_of(weights, tmp_path) / GARMENT / name
@@ -115,6 +131,101 @@ def test_weights_of_another_version_are_refused(
     with pytest.raises(WeightsError, match=reason):
         load(tmp_path)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # [KiB]; the last one asks for 1 TB
+
+
+@pytest.mark.parametrize(
+    ("refu", "reason"),
+    [
+        ({"margin": 1e9}, r"wanted a margin of 0 to 0.05 m .* got 1e\+09 m"),
+        ({"least": 7.0}, "a least scale of 0 to 1, got 0.004 m and 7"),
+        ({"least": "nan"}, "a least scale of 0 to 1"),
+        ({"margin": "inf"}, "doesn't fit its card"),
+        ({"n_vertices": 10**30}, "doesn't fit its card"),
+        ({"scale": []}, "doesn't fit its card"),
+    ],
+)
+def test_layers_that_make_no_sense_are_refused(
+    weights: Path, tmp_path: Path, refu: dict[str, Any], reason: str
+) -> None:
+    card = copy_of(weights, tmp_path) / GARMENT / "tailornet-hybrid.json"
+    edit_card(card, refu=json.loads(card.read_text())["refu"] | refu)
+    assert re.search(reason, refusal(lambda: load(tmp_path)))
+
+
+@pytest.mark.parametrize("number", ["NaN", "Infinity", "-1e999"])
+def test_cards_of_numbers_that_are_not_finite_are_refused(weights: Path, tmp_path: Path, number: str) -> None:
+    card = copy_of(weights, tmp_path) / GARMENT / "tailornet-hybrid.json"
+    card.write_text(card.read_text().replace("{", f'{{"x": {number},', 1))
+    assert "a finite number was expected" in refusal(lambda: load(tmp_path))
+
+
+def forge(stem: Path, data: bytes | Path) -> None:
+    """Puts tensors under a card, which then has their hash."""
+    path = stem.with_suffix(".safetensors")
+    if isinstance(data, Path):
+        path.unlink()
+        path.symlink_to(data)
+        return
+    path.write_bytes(data)
+    edit_card(stem.with_suffix(".json"), sha256=hashlib.sha256(data).hexdigest())
+
+
+@pytest.mark.parametrize("largest", [1e-4, 1e4, 6e4])
+def test_weights_whose_garment_is_nowhere_near_the_body_are_refused(
+    weights: Path, tmp_path: Path, largest: float
+) -> None:
+    stem = copy_of(weights, tmp_path) / GARMENT / "tailornet-hybrid"
+    tensors = load_tensors(stem.with_suffix(".safetensors").read_bytes())
+    full = {k: torch.full_like(v, largest) if k.endswith("weight") else v for k, v in tensors.items()}
+    forge(stem, save_tensors(full))
+    if largest < 1:
+        load(tmp_path)
+    else:
+        assert re.search("weights of at most 10000|of a body at rest", refusal(lambda: load(tmp_path)))
+
+
+def header(entries: Any, rest: bytes = b"") -> bytes:
+    text = entries if isinstance(entries, bytes) else json.dumps(entries).encode()
+    return struct.pack("<Q", len(text)) + text + rest
+
+
+TENSORS: dict[str, bytes | Path] = {
+    "eight-bit floats": header({"a": {"dtype": "F8_E4M3", "shape": [4], "data_offsets": [0, 4]}}, bytes(4)),
+    "complex numbers": header({"a": {"dtype": "C64", "shape": [1], "data_offsets": [0, 8]}}, bytes(8)),
+    "a header of gigabytes": struct.pack("<Q", 1 << 40) + bytes(100),
+    "a header of brackets": header(b"[" * 500_000),
+    "a header that is a list": header([]),
+    "no header": bytes(8),
+    "a tensor that isn't there": header({"a": {"dtype": "F32", "shape": [1 << 40], "data_offsets": [0, 1 << 42]}}),
+    "a negative shape": header({"a": {"dtype": "F32", "shape": [-1, -1], "data_offsets": [0, 4]}}, bytes(4)),
+    "a shape of words": header({"a": {"dtype": "F32", "shape": ["x"], "data_offsets": [0, 4]}}, bytes(4)),
+    "an endless device": Path("/dev/zero"),
+    "a process's memory": Path("/proc/self/mem"),
+}
+
+
+@pytest.mark.parametrize("data", TENSORS.values(), ids=TENSORS)
+def test_hostile_tensors_are_refused(weights: Path, tmp_path: Path, data: bytes | Path) -> None:
+    forge(copy_of(weights, tmp_path) / GARMENT / "tailornet-hybrid", data)
+    assert "tailornet-hybrid.safetensors" in refusal(lambda: load(tmp_path))
+
+
+@pytest.mark.parametrize("gigabytes", [2, 6])
+def test_sparse_tensors_are_refused_before_they_are_read(weights: Path, tmp_path: Path, gigabytes: int) -> None:
+    with (copy_of(weights, tmp_path) / GARMENT / "tailornet-hybrid.safetensors").open("wb") as file:
+        file.truncate(gigabytes << 30)
+    assert refusal(lambda: load(tmp_path))
+
+
+@pytest.mark.parametrize("suffix", [".json", ".safetensors"])
+@pytest.mark.parametrize(("lay", "said"), SPECIAL)
+def test_weights_that_are_no_files(
+    weights: Path, tmp_path: Path, lay: Callable[[Path], object], said: str, suffix: str
+) -> None:
+    path = (copy_of(weights, tmp_path) / GARMENT / "tailornet-hybrid").with_suffix(suffix)
+    path.unlink()
+    lay(path)
+    assert re.search(said, refusal(lambda: load(tmp_path)))
 
 
 # Devices ------------------------------------------------------------------------------------------
@@ -176,6 +287,11 @@ def turned(i: int) -> SmplFrame:
     return SmplFrame(pose, stamp_ns=i)
 
 
+def status_of(part: str, found: list[DiagnosticStatus]) -> DiagnosticStatus:
+    (one,) = (status for status in found if status.name == f"n: {part}")
+    return one
+
+
 def test_a_lost_device_is_reported_once_and_another_pipeline_takes_over() -> None:
     pipeline = GarmentPipeline.load([GARMENT], backbone="skinned", sdf="none")
     statistics, outlet = Statistics(), Outlet(pipeline)
@@ -193,12 +309,14 @@ def test_a_lost_device_is_reported_once_and_another_pipeline_takes_over() -> Non
     report = statistics.report()
     assert report.total["drop.device"] == 3
     parts = {"node": "n", "state": "active", "persons": ("",), "recording": None, "recording_error": ""}
-    output = statuses(report, settings, **parts)[1]  # type: ignore[arg-type]
+    output = status_of("garments", statuses(report, settings, **parts))  # type: ignore[arg-type]
     assert (output.level, "the device has failed" in output.message) == (2, True)
     worker.use(pipeline)
     tick(6)
     assert outlet.sent == 3
-    assert statuses(statistics.report(), settings, **parts, device="cpu")[1].values["device"] == "cpu"  # type: ignore[arg-type]
+    in_use = replace(settings.pipeline, device="cpu")
+    found = statuses(statistics.report(), settings, **parts, in_use=in_use)  # type: ignore[arg-type]
+    assert status_of("garments", found).values["device"] == "cpu"
 
 
 def test_a_command_whose_device_fails_says_so_in_one_line(
@@ -207,7 +325,7 @@ def test_a_command_whose_device_fails_says_so_in_one_line(
     def lost() -> None:
         raise RuntimeError(LOST)
 
-    monkeypatch.setattr("refu_ros.info.collect", lost)
+    monkeypatch.setattr("refu_lab.info.collect", lost)
     assert main(["info"]) == 1
     assert capsys.readouterr().err == (
         "refu: error: the device has failed: CUDA error: unspecified launch failure; run it again, or on the cpu\n"
@@ -225,7 +343,8 @@ def test_a_clock_set_back_loses_nothing_and_is_reported(tmp_path: Path) -> None:
         assert scene.take(timeout=0.0)["ann"].frame.stamp_ns == stamp
     statistics.receive()
     parts = {"node": "n", "state": "active", "recording": None, "recording_error": ""}
-    first = statuses(statistics.report(), NodeSettings(), persons=("",), **parts)[0]  # type: ignore[arg-type]
+    found = statuses(statistics.report(), NodeSettings(), persons=("",), **parts)  # type: ignore[arg-type]
+    first = status_of("input", found)
     assert (first.level, first.values["stamps that went back"]) == (1, "1")
     assert "was a clock set back" in first.message
     times = [100, 200, 50, 60, 300]
@@ -242,7 +361,8 @@ def test_a_clock_set_back_loses_nothing_and_is_reported(tmp_path: Path) -> None:
 
 def test_nodes_of_one_name_are_reported() -> None:
     parts: dict[str, Any] = {"state": "active", "persons": ("",), "recording": None, "recording_error": ""}
-    status = statuses(Statistics().report(), NodeSettings(), node="n", n_namesakes=1, **parts)[1]
+    found = statuses(Statistics().report(), NodeSettings(), node="n", n_namesakes=1, **parts)
+    status = status_of("garments", found)
     assert (status.level, status.message) == (1, "2 nodes have this name: start others with -r __node:=another_name")
 
 
@@ -347,7 +467,7 @@ def refuse(event, arguments):
         sys.stderr.write(f"network: {event} {arguments}\\n")
         raise OSError("there is no network")
 sys.addaudithook(refuse)
-from refu_ros.cli import main
+from refu_lab.cli import main
 sys.exit(main(sys.argv[1:]))
 """
 

@@ -2,6 +2,9 @@
 
 A record is an opcode, a length and its content; a chunk's content is again records, compressed. What is damaged is
 reported and left out; what comes before it (and, where the framing holds, after it) is read.
+
+The mcap package's own StreamReader isn't used: it ends at the first damage, takes a field that is cut short for a whole
+one, reads into memory what nobody wants, and bounds neither what a chunk unpacks to nor how many records that makes.
 """
 
 from __future__ import annotations
@@ -15,10 +18,12 @@ from typing import TYPE_CHECKING, BinaryIO
 
 import zstandard
 
+from msg_adapters.definitions import full_type_name
 from msg_adapters.errors import BagError
+from refu_core._files import open_file
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
     from pathlib import Path
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -28,18 +33,52 @@ _WANTED = frozenset({FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, STATISTICS, DATA_E
 _RECORD_HEADER = struct.Struct("<BQ")
 _MESSAGE_HEADER = struct.Struct("<HIQQ")
 _FOOTER = struct.Struct("<QQI")
+_MAX_CHANNELS = 1 << 16
 _FOOTER_BYTES = _RECORD_HEADER.size + _FOOTER.size + len(MAGIC)
-MAX_CHUNK_BYTES = 256 << 20
+_LONGEST = 1 << 62
+_NO_OPCODE = "zeros where a record should start"  # what many a disk makes of the end that it never got
+MAX_CHUNK_BYTES = 128 << 20
 """A chunk that claims to unpack to more is left out: a few kilobytes could otherwise claim all memory."""
 
 
 _MAX_RATIO, _SMALL_CHUNK = 1000, 8 << 20
-"""A chunk above that size [bytes] that claims to be so much larger than it is packed is a bomb: recorders fill theirs
-to less than a megabyte, and the few messages that are larger aren't all one byte."""
+"""A chunk above that size [bytes] that claims to be so much larger than it is packed is a bomb."""
 
 
 class DamageError(Exception):
-    """A record whose content can't be read; never leaves this package."""
+    """Something that can't be read, as a template and its values; never leaves this package."""
+
+    def __init__(self, template: str, *values: object) -> None:
+        super().__init__(template, *values)
+        self.template = template
+        """The same for all damage of a kind: a file may have a million of one kind."""
+
+    def __str__(self) -> str:
+        return self.template.format(*self.args[1:])
+
+
+class Budget:
+    """What one pass over a bag may cost, by the bytes that it has on the disk.
+
+    Recorders are far from it: of their records each takes more than 16 bytes of the file even when it is compressed,
+    and chunks unpack to no more than some hundred times their size. A kilobyte that is made for it stands for a
+    million empty records.
+    """
+
+    def __init__(self, size: int) -> None:
+        self._left = {
+            "records": (1 << 14) + size // 16,
+            "bytes unpacked": (192 << 20) + 128 * size,
+            "bytes of declarations": (16 << 20) + 2 * size,
+        }
+
+    def spend(self, what: str, amount: int = 1) -> None:
+        """Raises `DamageError` when there is nothing left."""
+        left = self._left[what] - amount
+        if left < 0:
+            msg = "more {} than a bag of this size has; the rest is left out"
+            raise DamageError(msg, what)
+        self._left[what] = left
 
 
 class _Fields:
@@ -51,8 +90,8 @@ class _Fields:
 
     def take(self, size: int) -> memoryview:
         if size > len(self._content) - self._at:
-            msg = f"a field of {size} bytes where {len(self._content) - self._at} are left"
-            raise DamageError(msg)
+            msg = "a field of {} bytes where {} are left"
+            raise DamageError(msg, size, len(self._content) - self._at)
         view = self._content[self._at : self._at + size]
         self._at += size
         return view
@@ -64,13 +103,14 @@ class _Fields:
         try:
             return str(self.take(self.number(4)), "utf-8")
         except UnicodeDecodeError as error:
-            msg = f"a string that isn't UTF-8 ({error.reason})"
-            raise DamageError(msg) from None
+            msg = "a string that isn't UTF-8 ({})"
+            raise DamageError(msg, error.reason) from None
 
-    def string_map(self) -> dict[str, str]:
+    def string_map(self, budget: Budget) -> dict[str, str]:
         entries = _Fields(self.take(self.number(4)))
         result = {}
         while entries._at < len(entries._content):
+            budget.spend("records")
             key = entries.string()
             result[key] = entries.string()
         return result
@@ -81,9 +121,10 @@ class Schema:
     """A message type and its definition."""
 
     id: int
-    name: str
-    encoding: str
-    data: bytes
+    type_name: str
+    """`package/msg/Type`."""
+    definition: str
+    """Text of the message type (`ros2msg`); empty where it is in another language."""
 
 
 @dataclass(frozen=True)
@@ -119,20 +160,22 @@ class Record:
 def parse_schema(content: memoryview) -> Schema:
     """Raises `DamageError`, like all parsers here."""
     fields = _Fields(content)
-    return Schema(fields.number(2), fields.string(), fields.string(), bytes(fields.take(fields.number(4))))
+    schema_id, name, encoding = fields.number(2), fields.string(), fields.string()
+    text = str(fields.take(fields.number(4)), "utf-8", "replace") if encoding == "ros2msg" else ""
+    return Schema(schema_id, full_type_name(name), text)
 
 
-def parse_channel(content: memoryview) -> Channel:
+def parse_channel(content: memoryview, budget: Budget) -> Channel:
     """A channel record."""
     fields = _Fields(content)
-    return Channel(fields.number(2), fields.number(2), fields.string(), fields.string(), fields.string_map())
+    return Channel(fields.number(2), fields.number(2), fields.string(), fields.string(), fields.string_map(budget))
 
 
 def parse_message(content: memoryview) -> Message:
     """A message record."""
     if len(content) < _MESSAGE_HEADER.size:
-        msg = f"a message record of {len(content)} bytes"
-        raise DamageError(msg)
+        msg = "a message record of {} bytes"
+        raise DamageError(msg, len(content))
     channel_id, _, log_time_ns, publish_time_ns = _MESSAGE_HEADER.unpack_from(content)
     return Message(channel_id, log_time_ns, publish_time_ns, content[_MESSAGE_HEADER.size :])
 
@@ -142,6 +185,9 @@ def parse_message_counts(content: memoryview) -> dict[int, int]:
     fields = _Fields(content)
     fields.take(8 + 2 + 4 + 4 + 4 + 4 + 8 + 8)
     counts = _Fields(fields.take(fields.number(4)))
+    if len(counts._content) > _MAX_CHANNELS * 10:
+        msg = "statistics of more channels than there can be"
+        raise DamageError(msg)
     result = {}
     while counts._at < len(counts._content):
         channel_id = counts.number(2)
@@ -149,7 +195,7 @@ def parse_message_counts(content: memoryview) -> dict[int, int]:
     return result
 
 
-def unpack_chunk(content: memoryview) -> memoryview:
+def unpack_chunk(content: memoryview, budget: Budget) -> memoryview:
     """The records of a chunk, decompressed and checked."""
     fields = _Fields(content)
     fields.take(16)  # first and last log time
@@ -157,15 +203,16 @@ def unpack_chunk(content: memoryview) -> memoryview:
     compression = fields.string()
     packed = fields.take(fields.number(8))
     if size > MAX_CHUNK_BYTES:
-        msg = f"a chunk that unpacks to {size >> 20} MiB, at most {MAX_CHUNK_BYTES >> 20} are read"
-        raise DamageError(msg)
+        msg = "a chunk that unpacks to {} MiB, at most {} are read"
+        raise DamageError(msg, size >> 20, MAX_CHUNK_BYTES >> 20)
     if size > max(_SMALL_CHUNK, _MAX_RATIO * len(packed)):
-        msg = f"a chunk of {len(packed)} bytes that unpacks to {size >> 20} MiB"
-        raise DamageError(msg)
+        msg = "a chunk of {} bytes that unpacks to {} MiB"
+        raise DamageError(msg, len(packed), size >> 20)
+    budget.spend("bytes unpacked", size)
     records = packed if not compression else memoryview(_decompress(compression, packed, size))
     if len(records) != size:
-        msg = f"a chunk that unpacks to {len(records)} bytes where {size} were announced"
-        raise DamageError(msg)
+        msg = "a chunk that unpacks to {} bytes where {} were announced"
+        raise DamageError(msg, len(records), size)
     if crc and zlib.crc32(records) != crc:
         msg = "a chunk whose checksum is wrong"
         raise DamageError(msg)
@@ -181,8 +228,8 @@ def _decompress(compression: str, packed: memoryview, size: int) -> bytes:
             ) as reader:
                 return reader.read(size + 1)
         except (zstandard.ZstdError, MemoryError) as error:
-            msg = f"a chunk that zstd can't unpack ({error})"
-            raise DamageError(msg) from None
+            msg = "a chunk that zstd can't unpack ({})"
+            raise DamageError(msg, error) from None
     if compression == "lz4":
         try:
             lz4 = import_module("lz4.frame")  # optional: rosbag2 compresses with zstd
@@ -192,10 +239,10 @@ def _decompress(compression: str, packed: memoryview, size: int) -> bytes:
         try:
             return bytes(lz4.LZ4FrameDecompressor().decompress(packed, max_length=size + 1))
         except (RuntimeError, EOFError, MemoryError) as error:
-            msg = f"a chunk that lz4 can't unpack ({error})"
-            raise DamageError(msg) from None
-    msg = f"a chunk of unknown compression {compression!r}"
-    raise DamageError(msg)
+            msg = "a chunk that lz4 can't unpack ({})"
+            raise DamageError(msg, error) from None
+    msg = "a chunk of unknown compression {!r}"
+    raise DamageError(msg, compression)
 
 
 def split_records(content: memoryview) -> Iterator[tuple[int, memoryview]]:
@@ -203,16 +250,15 @@ def split_records(content: memoryview) -> Iterator[tuple[int, memoryview]]:
     at = 0
     while at < len(content):
         if len(content) - at < _RECORD_HEADER.size:
-            msg = f"{len(content) - at} bytes where a record should start"
-            raise DamageError(msg)
+            msg = "{} bytes where a record should start"
+            raise DamageError(msg, len(content) - at)
         opcode, length = _RECORD_HEADER.unpack_from(content, at)
         if opcode == 0:
-            msg = "a record without an opcode"  # the format has none; nothing but zeros would be millions of them
-            raise DamageError(msg)
+            raise DamageError(_NO_OPCODE)
         at += _RECORD_HEADER.size
         if length > len(content) - at:
-            msg = f"a record of {length} bytes where {len(content) - at} are left"
-            raise DamageError(msg)
+            msg = "a record of {} bytes where {} are left"
+            raise DamageError(msg, length, len(content) - at)
         yield opcode, content[at : at + length]
         at += length
 
@@ -222,11 +268,8 @@ def open_mcap(path: Path) -> BinaryIO:
 
     Raises `BagError` when it can't be opened or isn't an MCAP file.
     """
-    try:
-        file = path.open("rb")
-    except OSError as error:
-        msg = f"{path}: can't be opened: {error.strerror}"
-        raise BagError(msg) from error
+    wanted = "a .mcap file, a rosbag2 directory or an AMASS-style .npz"
+    file = open_file(path, most=_LONGEST, error=BagError, wanted=wanted)
     try:
         start = file.read(len(MAGIC))
     except OSError as error:
@@ -235,18 +278,17 @@ def open_mcap(path: Path) -> BinaryIO:
         raise BagError(msg) from error
     if start != MAGIC:
         file.close()
-        what = "an empty file" if not start else "not an MCAP file"
-        hint = "; convert it with `ros2 bag convert`" if start.startswith((b"SQLite", b"#ROSBAG")) else ""
-        msg = f"{path}: {what}{hint or '; wanted a .mcap file, a rosbag2 directory or an AMASS-style .npz'}"
+        sqlite = start.startswith((b"SQLite", b"#ROSBAG"))
+        msg = f"{path}: not an MCAP file; {'convert it with `ros2 bag convert`' if sqlite else f'wanted {wanted}'}"
         raise BagError(msg)
     return file
 
 
-def read_summary(file: BinaryIO) -> list[tuple[int, memoryview]] | None:
-    """The records of the summary section; None where the file has none, or a damaged one. Leaves the file elsewhere."""
+def read_summary(file: BinaryIO) -> Iterable[tuple[int, memoryview]]:
+    """The records of the summary section, none where the file has none or a damaged one. Leaves the file elsewhere."""
     size = file.seek(0, os.SEEK_END)
     if size < len(MAGIC) + _FOOTER_BYTES:
-        return None
+        return ()
     file.seek(size - _FOOTER_BYTES)
     tail = file.read(_FOOTER_BYTES)
     opcode, length = _RECORD_HEADER.unpack_from(tail)
@@ -254,15 +296,17 @@ def read_summary(file: BinaryIO) -> list[tuple[int, memoryview]] | None:
     section = size - _FOOTER_BYTES - start
     whole = tail.endswith(MAGIC) and opcode == FOOTER and length == _FOOTER.size
     if not whole or start < len(MAGIC) or not 0 < section <= MAX_CHUNK_BYTES:
-        return None
+        return ()
     file.seek(start)
     summary = file.read(section)
     if crc and zlib.crc32(summary + tail[: -len(MAGIC) - 4]) != crc:
-        return None
+        return ()
     try:
-        return list(split_records(memoryview(summary)))
+        for _ in split_records(memoryview(summary)):  # all of it or nothing
+            pass
     except DamageError:
-        return None
+        return ()
+    return split_records(memoryview(summary))
 
 
 def iter_records(file: BinaryIO) -> Iterator[Record]:
@@ -275,15 +319,17 @@ def iter_records(file: BinaryIO) -> Iterator[Record]:
     while True:
         header = file.read(_RECORD_HEADER.size)
         if len(header) < _RECORD_HEADER.size:
-            msg = f"the file ends at byte {size} without its closing records"
-            raise DamageError(msg)
+            msg = "the file ends at byte {} without its closing records"
+            raise DamageError(msg, size)
         opcode, length = _RECORD_HEADER.unpack(header)
+        if opcode == 0:
+            raise DamageError(_NO_OPCODE)
         if length > size - at - _RECORD_HEADER.size:
-            msg = f"the record at byte {at} wants {length} bytes, the file has {size - at - _RECORD_HEADER.size} left"
-            raise DamageError(msg)
+            msg = "the record at byte {} wants {} bytes, the file has {} left"
+            raise DamageError(msg, at, length, size - at - _RECORD_HEADER.size)
         if opcode in _WANTED and length > MAX_CHUNK_BYTES:
-            msg = f"the record at byte {at} has {length >> 20} MiB, at most {MAX_CHUNK_BYTES >> 20} are read"
-            raise DamageError(msg)
+            msg = "the record at byte {} has {} MiB, at most {} are read"
+            raise DamageError(msg, at, length >> 20, MAX_CHUNK_BYTES >> 20)
         if opcode in _WANTED:
             yield Record(opcode, memoryview(file.read(length)), at)
         else:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import yaml
 
 from msg_adapters.errors import BagError
+from refu_core._files import read_file
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -19,6 +21,11 @@ MAX_TIME_NS = 2**63 - 1
 """rosbag2 keeps times in signed 64 bits."""
 _KEY = "rosbag2_bagfile_information"
 _MAX_BYTES = 1 << 20
+_MAX_EVENTS, _MAX_DEPTH = 100_000, 30
+_UNREADABLE = (yaml.YAMLError, KeyError, TypeError, AttributeError, ValueError)
+_NUMBER = re.compile(r"[-+]?\d{1,19}")
+_DIRECTIVE = re.compile(r"(?:^|[\r\n\x85\u2028\u2029])\ufeff?%")
+_PARSER = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
 _FOREVER = {"sec": 9223372036, "nsec": 854775807}  # rmw's infinite duration: 2^63 - 1 nanoseconds
 
 
@@ -69,22 +76,68 @@ class _Dumper(yaml.SafeDumper):
         return True
 
 
-class _Loader(yaml.SafeLoader):
-    """Refuses aliases, which rosbag2 doesn't write: a few lines of them stand for more text than fits any memory."""
+def _load(text: str | bytes) -> Any:
+    """The value of a YAML document as rosbag2 writes them: each scalar is text, a whole number, a truth or nothing.
 
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        if self.check_event(yaml.AliasEvent):
-            msg = "aliases aren't read"
+    It is built from the parser's events, as what takes more time than the text is long, or makes anything but plain
+    values, has no place in it: aliases, directives, tags, numbers of base 60, a thousand lists in each other.
+
+    Raises one of `_UNREADABLE`.
+    """
+    text = str(text, "utf-8") if isinstance(text, bytes) else text
+    nodes: list[list[Any]] = [[]]
+    """What is open, a mapping as its keys and values in turn."""
+    is_odd = _DIRECTIVE.search(text) is not None
+    for count, event in enumerate(yaml.parse(text, Loader=_PARSER)):
+        is_odd |= count > _MAX_EVENTS or len(nodes) > _MAX_DEPTH or isinstance(event, yaml.AliasEvent)
+        if is_odd:
+            msg = "directives, aliases, or more than is read"
             raise yaml.YAMLError(msg)
-        return super().compose_node(parent, index)
+        if isinstance(event, yaml.ScalarEvent):
+            nodes[-1].append(_scalar(event.value) if event.implicit[0] else event.value)
+        elif isinstance(event, (yaml.SequenceStartEvent, yaml.MappingStartEvent)):
+            nodes.append([])
+        elif isinstance(event, (yaml.SequenceEndEvent, yaml.MappingEndEvent)):
+            items = nodes.pop()
+            is_list = isinstance(event, yaml.SequenceEndEvent)
+            nodes[-1].append(items if is_list else dict(zip(items[::2], items[1::2], strict=True)))
+    return nodes[0][0] if nodes[0] else None
+
+
+def _scalar(text: str) -> Any:
+    if _NUMBER.fullmatch(text):
+        return int(text)
+    return {"true": True, "false": False, "null": None, "~": None, "": None}.get(text, text)
+
+
+def read_profiles(text: str) -> list[Any]:
+    """The offered profiles of another bag's topic; none where the text has one that rosbag2 couldn't decode."""
+    wanted = QosProfile().to_metadata()
+    try:
+        profiles = _load(text)
+    except _UNREADABLE:
+        return []
+    whole = isinstance(profiles, list) and all(_like(profile, wanted) for profile in profiles)
+    return [{key: profile[key] for key in wanted} for profile in profiles] if whole else []
+
+
+def _like(value: Any, wanted: Any) -> bool:
+    """Whether a value has the same keys and types; bags before version 9 have numbers for names."""
+    if isinstance(wanted, dict):
+        return isinstance(value, dict) and all(_like(value.get(key), inner) for key, inner in wanted.items())
+    return type(value) is type(wanted) or (isinstance(wanted, str) and type(value) is int)
 
 
 def _dump(value: Any) -> str:
     return yaml.dump(value, Dumper=_Dumper, sort_keys=False, default_flow_style=False)
 
 
-def dump_metadata(*, file_name: str, topics: Sequence[TopicSummary], start_ns: int, end_ns: int) -> str:
-    """The text of metadata.yaml for a bag of one file; times are log times [ns]."""
+def dump_metadata(*, file_name: str, topics: Sequence[TopicSummary], start_ns: int, end_ns: int) -> tuple[str, str]:
+    """A bag of one file described for rosbag2: the text of metadata.yaml, and that of the MCAP file's own record.
+
+    rosbag2 decodes the record as it is, where metadata.yaml has one key around the same mapping. Times are log times
+    [ns].
+    """
     count = sum(topic.message_count for topic in topics)
     duration = {"nanoseconds": end_ns - start_ns}
     start = {"nanoseconds_since_epoch": start_ns}
@@ -100,7 +153,7 @@ def dump_metadata(*, file_name: str, topics: Sequence[TopicSummary], start_ns: i
                     "name": topic.name,
                     "type": topic.message_type,
                     "serialization_format": "cdr",
-                    "offered_qos_profiles": yaml.safe_load(topic.qos) or [],
+                    "offered_qos_profiles": _load(topic.qos) or [],
                     "type_description_hash": topic.type_hash,
                 },
                 "message_count": topic.message_count,
@@ -115,7 +168,7 @@ def dump_metadata(*, file_name: str, topics: Sequence[TopicSummary], start_ns: i
         "custom_data": None,
         "ros_distro": "jazzy",
     }
-    return _dump({_KEY: information})
+    return _dump({_KEY: information}), _dump(information)
 
 
 def read_file_paths(directory: Path) -> list[Path]:
@@ -124,27 +177,18 @@ def read_file_paths(directory: Path) -> list[Path]:
     Raises `BagError` where the metadata can't be read, or names another storage or rosbag2's own compression.
     """
     path = directory / METADATA_FILE
+    text = read_file(path, most=_MAX_BYTES, error=BagError, wanted="rosbag2's metadata")
     try:
-        with path.open("rb") as file:
-            text = file.read(_MAX_BYTES + 1)
-        if len(text) > _MAX_BYTES:
-            msg = f"{path}: larger than {_MAX_BYTES >> 20} MiB"
-            raise BagError(msg)
-        information = yaml.load(text, Loader=_Loader)[_KEY]
+        information = _load(text)[_KEY]
         storage = str(information["storage_identifier"])
         compression = str(information.get("compression_mode") or "none").lower()
-        names = [str(name) for name in information["relative_file_paths"]]
-    except OSError as error:
-        msg = f"{path}: can't be read: {error.strerror}"
-        raise BagError(msg) from error
-    except (yaml.YAMLError, KeyError, TypeError, AttributeError, ValueError, RecursionError) as error:
-        if isinstance(error, BagError):
-            raise
+        # Only names count: bags of old versions list paths with the directory, and a bag is read from one place.
+        names = [name.replace("\\", "/").rsplit("/", maxsplit=1)[-1] for name in information["relative_file_paths"]]
+    except _UNREADABLE as error:
         msg = f"{path}: not rosbag2 metadata ({type(error).__name__}); give one of the bag's .mcap files instead"
         raise BagError(msg) from error
     if storage != "mcap" or compression != "none":
         msg = f"{directory}: stored as {storage} with compression mode {compression}, only plain mcap is read; "
         msg += "convert it with `ros2 bag convert`"
         raise BagError(msg)
-    # Only names count: bags of old versions list paths that include the directory, and a bag is read from one place.
-    return [directory / name.replace("\\", "/").rsplit("/", maxsplit=1)[-1] for name in names]
+    return [directory / name for name in dict.fromkeys(names)]

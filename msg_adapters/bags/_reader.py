@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from msg_adapters.bags import _mcap
 from msg_adapters.bags._metadata import MAX_TIME_NS, METADATA_FILE, read_file_paths
-from msg_adapters.definitions import full_type_name
 from msg_adapters.errors import BagError
+from refu_core.errors import printable
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
     from types import TracebackType
 
     from typing_extensions import Self
+
+
+_MAX_WARNINGS = 20
 
 
 @dataclass(frozen=True)
@@ -46,25 +50,41 @@ class BagMessage:
     data: bytes
 
 
+@dataclass
+class _Damage:
+    first: str
+    count: int = 1
+
+
 class _Catalogue:
     """The schemas and channels of one file, as they are met."""
 
-    def __init__(self) -> None:
+    def __init__(self, budget: _mcap.Budget) -> None:
         self.schemas: dict[int, _mcap.Schema] = {}
         self.channels: dict[int, _mcap.Channel] = {}
+        self._budget = budget
+        self._known: dict[tuple[int, bytes], bytes] = {}
 
     def add(self, opcode: int, content: memoryview) -> None:
         """Take in a schema or channel record; raises `DamageError`."""
+        if opcode not in (_mcap.SCHEMA, _mcap.CHANNEL):
+            return
+        raw = bytes(content)
+        key = opcode, raw[:2]  # its number
+        if self._known.get(key) == raw:  # each chunk may have it, and so has the summary
+            return
+        self._budget.spend("bytes of declarations", len(content))
         if opcode == _mcap.SCHEMA:
             schema = _mcap.parse_schema(content)
             self.schemas[schema.id] = schema
-        elif opcode == _mcap.CHANNEL:
-            channel = _mcap.parse_channel(content)
+        else:
+            channel = _mcap.parse_channel(content, self._budget)
             self.channels[channel.id] = channel
+        self._known[key] = raw
 
     def message_type(self, channel: _mcap.Channel) -> str:
         schema = self.schemas.get(channel.schema_id)
-        return full_type_name(schema.name) if schema else ""
+        return schema.type_name if schema else ""
 
     def topics(self, counts: dict[int, int]) -> dict[str, TopicInfo]:
         """The topics by name; two channels of one topic (two publishers) are one."""
@@ -76,13 +96,12 @@ class _Catalogue:
                 topics[channel.topic] = replace(known, message_count=known.message_count + count)
                 continue
             schema = self.schemas.get(channel.schema_id)
-            text = schema.data.decode("utf-8", "replace") if schema and schema.encoding == "ros2msg" else ""
             topics[channel.topic] = TopicInfo(
                 name=channel.topic,
                 message_type=self.message_type(channel),
                 encoding=channel.encoding,
                 message_count=count,
-                definition=text,
+                definition=schema.definition if schema else "",
                 type_hash=channel.metadata.get("topic_type_hash", ""),
                 qos=channel.metadata.get("offered_qos_profiles", ""),
             )
@@ -93,7 +112,8 @@ class BagReader:
     """Streams a bag, one chunk in memory at a time.
 
     A file without its closing records (a recorder that was killed) and damaged chunks aren't errors: what can be read
-    is, `truncated` and `warnings` say what couldn't.
+    is, `truncated` and `warnings` say what couldn't. What a pass may cost is bounded by the size of the bag, see
+    `_mcap.Budget`.
 
     Raises `BagError` when there is no such bag, or it isn't MCAP.
     """
@@ -102,7 +122,12 @@ class BagReader:
         self.path = Path(path)
         self.truncated = False
         """Whether something couldn't be read; final when `messages` is exhausted."""
-        self.warnings: list[str] = []
+        self._notes: list[str] = []
+        self._damages: dict[tuple[Path, str], _Damage] = {}
+        """Of the last pass: the first damage of each kind in each file, and how often it occurs."""
+        self._claimed = False
+        """Whether a summary was asked how many messages there are."""
+        self._size = 0
         self._files = self._find_files()
         self._topics: tuple[TopicInfo, ...] | None = None
 
@@ -114,59 +139,92 @@ class BagReader:
     ) -> None:
         """Nothing is open between calls."""
 
+    @property
+    def warnings(self) -> list[str]:
+        """What the last pass couldn't read: a line for each kind of damage in a file, with how often it occurs."""
+        lines = [
+            damage.first if damage.count == 1 else f"{damage.first} (and {damage.count - 1} more like it)"
+            for damage in self._damages.values()
+        ]
+        more = len(lines) - _MAX_WARNINGS
+        return self._notes + lines[:_MAX_WARNINGS] + ([f"{self.path}: {more} warnings more"] if more > 0 else [])
+
     def _find_files(self) -> list[Path]:
-        if not self.path.exists():
-            msg = f"{self.path}: no such file or directory"
-            raise BagError(msg)
-        if not self.path.is_dir():
+        if not os.path.isdir(self.path):  # noqa: PTH112 - whatever the name is, this answers
             files = [self.path]
-        elif (self.path / METADATA_FILE).exists():
+        elif os.path.lexists(self.path / METADATA_FILE):
             files = read_file_paths(self.path)
         else:
-            files = sorted(self.path.glob("*.mcap"))
-            self._warn(
+            try:
+                files = sorted(self.path.glob("*.mcap"))
+            except OSError as error:
+                msg = f"{self.path}: can't be read: {error.strerror}"
+                raise BagError(msg) from error
+            self._notes.append(
                 f"{self.path}: no {METADATA_FILE} (was the recording interrupted?); its .mcap files are read by name"
             )
         if not files:
             msg = f"{self.path}: no .mcap file in this directory"
             raise BagError(msg)
-        for file in files:
-            _mcap.open_mcap(file).close()
+        for path in files:
+            with _mcap.open_mcap(path) as file:
+                self._size += os.fstat(file.fileno()).st_size
         return files
 
-    def _warn(self, warning: str) -> None:
-        if warning not in self.warnings:
-            self.warnings.append(warning)
-
-    def _damage(self, path: Path, what: object) -> None:
+    def _damage(self, path: Path, damage: _mcap.DamageError, where: str = "") -> None:
         self.truncated = True
-        self._warn(f"{path}: damaged: {what}")
+        known = self._damages.get((path, damage.template))
+        if known:
+            known.count += 1
+        else:
+            self._damages[path, damage.template] = _Damage(printable(f"{path}: damaged: {damage}{where}"))
+
+    def _begin(self) -> _mcap.Budget:
+        self._damages = {}
+        return _mcap.Budget(self._size)
 
     @property
     def topics(self) -> tuple[TopicInfo, ...]:
         """The bag's topics by name, with message counts: from the summaries, or by reading what there is."""
         if self._topics is None:
-            merged: dict[str, TopicInfo] = {}
-            for path in self._files:
-                for name, topic in self._file_topics(path).items():
-                    known = merged.get(name, replace(topic, message_count=0))
-                    merged[name] = replace(known, message_count=known.message_count + topic.message_count)
-            self._topics = tuple(merged[name] for name in sorted(merged))
+            self._topics = self._merge_topics(claimed=True)
+            if not any(topic.message_count for topic in self._topics):
+                return self.count()
         return self._topics
+
+    def count(self) -> tuple[TopicInfo, ...]:
+        """The topics with message counts by reading, whatever the summaries claim."""
+        if self._topics is None or self._claimed:
+            self._topics = self._merge_topics(claimed=False)
+            self._claimed = False
+        return self._topics
+
+    def _merge_topics(self, *, claimed: bool) -> tuple[TopicInfo, ...]:
+        budget = self._begin()
+        merged: dict[str, TopicInfo] = {}
+        for path in self._files:
+            for name, topic in self._file_topics(path, budget, claimed=claimed).items():
+                known = merged.get(name)
+                count = topic.message_count + (known.message_count if known else 0)
+                merged[name] = replace(known, message_count=count) if known else topic
+        return tuple(merged[name] for name in sorted(merged))
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[BagMessage]:
         """The messages of some topics (None: of all), in the order they were recorded.
 
         Raises `BagError` when a file can't be read any more, or a chunk's compression isn't installed.
         """
+        budget = self._begin()
         for path in self._files:
-            catalogue, _ = self._summary(path)
-            for message in self._file_messages(path, catalogue):
+            catalogue, _ = self._summary(path, budget)
+            for message in self._file_messages(path, catalogue, budget):
                 channel = catalogue.channels.get(message.channel_id)
                 if channel is None:
-                    self._damage(path, f"a message of the undeclared channel {message.channel_id}")
+                    self._damage(path, _mcap.DamageError("a message of the undeclared channel {}", message.channel_id))
                 elif max(message.log_time_ns, message.publish_time_ns) > MAX_TIME_NS:
-                    self._damage(path, f"a message on {channel.topic} at a time that ROS can't hold")
+                    self._damage(
+                        path, _mcap.DamageError("a message on {} at a time that ROS can't hold", channel.topic)
+                    )
                 elif topics is None or channel.topic in topics:
                     yield BagMessage(
                         topic=channel.topic,
@@ -176,45 +234,50 @@ class BagReader:
                         data=bytes(message.data),
                     )
 
-    def _summary(self, path: Path) -> tuple[_Catalogue, dict[int, int] | None]:
+    def _summary(self, path: Path, budget: _mcap.Budget) -> tuple[_Catalogue, dict[int, int] | None]:
         """What the file's end says of its channels, and how many messages each has (None: it doesn't)."""
-        catalogue = _Catalogue()
+        catalogue = _Catalogue(budget)
         counts: dict[int, int] | None = None
-        with _mcap.open_mcap(path) as file:
-            summary = _mcap.read_summary(file)
         try:
-            for opcode, content in summary or ():
-                catalogue.add(opcode, content)
-                if opcode == _mcap.STATISTICS:
-                    counts = _mcap.parse_message_counts(content)
+            with _mcap.open_mcap(path) as file:
+                for opcode, content in _mcap.read_summary(file):
+                    catalogue.add(opcode, content)
+                    if opcode == _mcap.STATISTICS:
+                        counts = _mcap.parse_message_counts(content)
         except _mcap.DamageError as damage:
             self._damage(path, damage)
+        except OSError as error:
+            raise _unreadable(path, error) from error
         return catalogue, counts
 
-    def _file_topics(self, path: Path) -> dict[str, TopicInfo]:
-        catalogue, counts = self._summary(path)
-        if counts is None or not catalogue.channels.keys() >= counts.keys():
+    def _file_topics(self, path: Path, budget: _mcap.Budget, *, claimed: bool) -> dict[str, TopicInfo]:
+        catalogue, counts = self._summary(path, budget)
+        if claimed and counts is not None and catalogue.channels.keys() >= counts.keys():
+            self._claimed = True
+        else:
             counts = {}
-            for message in self._file_messages(path, catalogue):
+            for message in self._file_messages(path, catalogue, budget):
                 counts[message.channel_id] = counts.get(message.channel_id, 0) + 1
         return catalogue.topics(counts)
 
-    def _file_messages(self, path: Path, catalogue: _Catalogue) -> Iterator[_mcap.Message]:
+    def _file_messages(self, path: Path, catalogue: _Catalogue, budget: _mcap.Budget) -> Iterator[_mcap.Message]:
         with _mcap.open_mcap(path) as file:
             try:
                 for record in _mcap.iter_records(file):
-                    yield from self._record_messages(path, record, catalogue)
+                    yield from self._record_messages(path, record, catalogue, budget)
             except _mcap.DamageError as damage:
                 self._damage(path, damage)
             except OSError as error:
-                msg = f"{path}: can't be read: {error.strerror}"
-                raise BagError(msg) from error
+                raise _unreadable(path, error) from error
 
-    def _record_messages(self, path: Path, record: _mcap.Record, catalogue: _Catalogue) -> Iterator[_mcap.Message]:
+    def _record_messages(
+        self, path: Path, record: _mcap.Record, catalogue: _Catalogue, budget: _mcap.Budget
+    ) -> Iterator[_mcap.Message]:
         """The messages of a record of the file; a damaged one is left out, the next one may be whole."""
         try:
             if record.opcode == _mcap.CHUNK:
-                for opcode, content in _mcap.split_records(_mcap.unpack_chunk(record.content)):
+                for opcode, content in _mcap.split_records(_mcap.unpack_chunk(record.content, budget)):
+                    budget.spend("records")
                     if opcode == _mcap.MESSAGE:
                         yield _mcap.parse_message(content)
                     else:
@@ -224,4 +287,8 @@ class BagReader:
             else:
                 catalogue.add(record.opcode, record.content)
         except _mcap.DamageError as damage:
-            self._damage(path, f"{damage}, in the record at byte {record.offset}")
+            self._damage(path, damage, f", in the record at byte {record.offset}")
+
+
+def _unreadable(path: Path, error: OSError) -> BagError:
+    return BagError(f"{path}: can't be read: {error.strerror}")

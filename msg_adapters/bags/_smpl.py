@@ -133,7 +133,15 @@ def open_smpl_bag(path: str | Path, *, topic: str | None = None, input_type: str
         why = "; " + "; ".join(reader.warnings) if reader.warnings else ""
         msg = f"{reader.path}: no message in this bag{why}"
         raise BagError(msg)
-    chosen = _choose(reader.path, topics, topic, input_type)
+    try:
+        chosen = _choose(reader.path, topics, topic, input_type)
+        doubtful = not chosen.message_count
+    except BagError:
+        doubtful = any(not info.message_count and info.message_type in INPUT_TYPES.values() for info in topics)
+        if not doubtful:
+            raise
+    if doubtful:  # a summary isn't believed that a topic is empty
+        chosen = _choose(reader.path, reader.count(), topic, input_type)
     if chosen.encoding != "cdr":
         msg = (
             f"{reader.path}: {chosen.name} is encoded as {chosen.encoding or 'nothing'}; wanted cdr, as ROS 2 writes it"

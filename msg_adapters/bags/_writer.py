@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -10,7 +11,14 @@ from typing import TYPE_CHECKING, BinaryIO, Literal
 
 from mcap.writer import CompressionType, Writer
 
-from msg_adapters.bags._metadata import MAX_TIME_NS, METADATA_FILE, QosProfile, TopicSummary, dump_metadata
+from msg_adapters.bags._metadata import (
+    MAX_TIME_NS,
+    METADATA_FILE,
+    QosProfile,
+    TopicSummary,
+    dump_metadata,
+    read_profiles,
+)
 from msg_adapters.definitions import full_type_name, message_definition
 from msg_adapters.errors import BagError
 
@@ -36,10 +44,12 @@ class _Topic:
 class BagWriter:
     """Writes one bag: a single file where `path` ends in `.mcap`, otherwise a rosbag2 directory.
 
-    Each chunk that is full is on disk: a process that is killed leaves a file that can be read up to there. Leaving
+    Each chunk that is full is the system's to write: a process that is killed leaves a file that can be read up to
+    there. What must survive a power cut as well is what came before the last `sync`, or a bag that is finished. Leaving
     the `with` block finishes the bag, also after an exception.
 
-    Raises `BagError` when the path can't be written, or holds something and `overwrite` isn't set.
+    Raises `BagError` when the path can't be written, or holds something and `overwrite` isn't set; nothing is left
+    behind then.
     """
 
     def __init__(
@@ -52,18 +62,27 @@ class BagWriter:
     ) -> None:
         self.path = Path(path)
         self._directory = None if self.path.suffix == ".mcap" else self.path
-        self.file_path = self.path if self._directory is None else self.path / f"{self.path.name}_0.mcap"
+        self.file_path = self.path if self._directory is None else self.path / f"{self.path.absolute().name}_0.mcap"
         """The MCAP file itself."""
+        self._entered: list[Path] = []
+        """Directories with entries that a power cut may still take."""
         self._topics: dict[str, _Topic] = {}
         self._start_ns, self._end_ns = MAX_TIME_NS, 0
         self._finished = False
-        with self._writing():
-            self._stream = self._open(overwrite=overwrite)
-            self._writer = Writer(self._stream, chunk_size=chunk_bytes, compression=_COMPRESSION[compression])
-            self._writer.start(profile="ros2", library="refu-ros")
-            self._stream.flush()
-            self._whole = self._stream.tell()
-            """Where the last complete record ends."""
+        made: list[Path] = []
+        try:
+            with self._writing():
+                self._stream = self._open(made, overwrite=overwrite)
+                self._writer = Writer(self._stream, chunk_size=chunk_bytes, compression=_COMPRESSION[compression])
+                self._writer.start(profile="ros2", library="refu-ros")
+                self._stream.flush()
+                self._whole = self._stream.tell()
+                """Where the last complete record ends."""
+        except BagError:
+            for path in reversed(made):
+                with suppress(OSError):  # a directory that somebody else has put something into
+                    path.rmdir() if path.is_dir() else path.unlink()
+            raise
 
     def __enter__(self) -> Self:
         return self
@@ -108,7 +127,7 @@ class BagWriter:
         if definition is None:
             builtin = message_definition(message_type)
             definition, type_hash = builtin.text, type_hash or builtin.type_hash
-        profiles = qos if isinstance(qos, str) else qos.to_yaml()
+        profiles = (qos if read_profiles(qos) else "") if isinstance(qos, str) else qos.to_yaml()
         with self._writing():
             schema_id = self._writer.register_schema(message_type, "ros2msg", definition.encode())
             metadata = {"offered_qos_profiles": profiles, "topic_type_hash": type_hash or ""}
@@ -140,26 +159,51 @@ class BagWriter:
         self._start_ns = min(self._start_ns, log_time_ns)
         self._end_ns = max(self._end_ns, log_time_ns)
 
+    def sync(self) -> None:
+        """Bring everything that was written so far to the disk, where it survives a power cut and can be read.
+
+        Ends the chunk under way, so it shouldn't be called for each message. Blocks until the disk has it all.
+
+        Raises `BagError` when writing fails.
+        """
+        with self._writing():
+            self._writer.flush()
+            self._whole = self._stream.tell()
+            self._sync_stream()
+
     def finish(self) -> None:
-        """Write what is buffered, the summary and the metadata; a second call does nothing.
+        """Write what is buffered, the summary and the metadata, and bring it to the disk; a second call does nothing.
 
         Raises `BagError` when writing fails; the file stays readable up to its last whole chunk.
         """
         if self._finished:
             return
-        text = self._metadata()
+        text, record = self._metadata()
         with self._writing():
-            self._writer.add_metadata("rosbag2", {"serialized_metadata": text})
+            self._writer.flush()
+            self._writer.add_metadata("rosbag2", {"serialized_metadata": record})
             self._writer.finish()
+            self._stream.flush()
+            self._sync_stream()
             self._finished = True
             self._stream.close()
             if self._directory is not None:
                 # Under another name first: a reader never meets half of it.
                 partial = self._directory / f"{METADATA_FILE}.partial"
-                partial.write_text(text, encoding="utf-8")
+                with partial.open("w", encoding="utf-8") as file:
+                    file.write(text)
+                    file.flush()
+                    _to_disk(file.fileno())
                 partial.replace(self._directory / METADATA_FILE)
+                _entries_to_disk(self._directory)
 
-    def _metadata(self) -> str:
+    def _sync_stream(self) -> None:
+        _to_disk(self._stream.fileno())
+        while self._entered:  # a file that its directory doesn't know is lost with all its content
+            _entries_to_disk(self._entered[-1])
+            self._entered.pop()
+
+    def _metadata(self) -> tuple[str, str]:
         topics = [
             TopicSummary(name, topic.message_type, topic.type_hash, topic.qos, topic.message_count)
             for name, topic in self._topics.items()
@@ -167,15 +211,29 @@ class BagWriter:
         start_ns = min(self._start_ns, self._end_ns)
         return dump_metadata(file_name=self.file_path.name, topics=topics, start_ns=start_ns, end_ns=self._end_ns)
 
-    def _open(self, *, overwrite: bool) -> BinaryIO:
+    def _open(self, made: list[Path], *, overwrite: bool) -> BinaryIO:
+        """The file; `made` gets what wasn't there before, in order."""
+        str(self.file_path).encode()  # metadata and diagnostics, which name it, are UTF-8
         if self._directory is not None:
             self._clear(self._directory, overwrite=overwrite)
-        self.file_path.parent.mkdir(parents=True, exist_ok=True)
+        parent = self.file_path.absolute().parent
+        new = [folder for folder in (parent, *parent.parents) if not folder.exists()]
+        for folder in reversed(new):
+            folder.mkdir(exist_ok=True)
+            made.append(folder)
+        self._entered = [*(folder.parent for folder in made), parent]
+        if overwrite and self.file_path.is_fifo():
+            msg = f"{self.path}: a FIFO; choose another path"
+            raise BagError(msg)
+        fresh = not self.file_path.exists()
         try:
-            return self.file_path.open("wb" if overwrite else "xb")
+            stream = self.file_path.open("wb" if overwrite else "xb")
         except FileExistsError as error:
             msg = f"{self.path}: exists already; choose another path, or overwrite it"
             raise BagError(msg) from error
+        if fresh:
+            made.append(self.file_path)
+        return stream
 
     def _clear(self, directory: Path, *, overwrite: bool) -> None:
         """Make way for a new bag: of an old one, its own files are removed and nothing else."""
@@ -196,12 +254,12 @@ class BagWriter:
             raise BagError(msg)
         try:
             yield
-        except OSError as error:
-            self._abandon()
-            msg = f"{self.path}: can't be written: {error.strerror or error}"
-            raise BagError(msg) from error
         except BagError:
             raise
+        except (OSError, ValueError) as error:  # ValueError: a name that no file system takes
+            self._abandon()
+            msg = f"{self.path}: can't be written: {getattr(error, 'strerror', None) or error}"
+            raise BagError(msg) from error
         except BaseException:
             self._abandon()
             raise
@@ -216,3 +274,19 @@ class BagWriter:
             stream.close()
         with suppress(OSError):  # readers cope with a torn end as well
             os.truncate(self.file_path, getattr(self, "_whole", 0))
+
+
+def _to_disk(descriptor: int) -> None:
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # what isn't kept on a disk can't be brought there
+            raise
+
+
+def _entries_to_disk(directory: Path) -> None:
+    descriptor = os.open(directory, os.O_RDONLY)
+    try:
+        _to_disk(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,4 +1,4 @@
-"""sensor_msgs/JointState: rotation vector components as joints `<joint>_x|y|z` [rad], in any order.
+"""sensor_msgs/JointState: rotation vector components as joints `<joint>_x|y|z` [rad], in any order, or ROS4HRI's.
 
 Optional entries: `beta_0` ... `beta_9` (those left out are zero) and `transl_x|y|z` [m] (all three or none). Names of
 other joints (a jaw, fingers) are ignored; `velocity` and `effort` aren't read.
@@ -13,12 +13,13 @@ import numpy as np
 
 from msg_adapters.cdr import CdrReader, CdrWriter
 from msg_adapters.errors import DecodeError
+from msg_adapters.inputs import _ros4hri
 from msg_adapters.inputs._frame import decoding, reading_fields, smpl_frame, stamp_ns_of
 from msg_adapters.joints import SMPL_JOINTS
 from refu_core.frames import N_BETAS
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -52,39 +53,62 @@ class _Layout:
     slots: NDArray[np.intp]
     """Their places in `_NAMES`; as many."""
 
+    ros4hri: bool
+    """Whether the places are those in `_ros4hri.AXES` instead."""
+
     @classmethod
     def of(cls, names: Sequence[str]) -> _Layout:
         """Raises `DecodeError` for names that make no body."""
-        slots: dict[int, int] = {}
-        for position, name in enumerate(names):
-            slot = _SLOTS.get(name)
-            if slot is None:
-                if name.startswith(("beta", "transl")):  # a typing error here would silently leave the body at zero
-                    msg = (
-                        f"unknown name {name!r}; wanted beta_0 ... beta_{N_BETAS - 1} and transl_x, transl_y, transl_z"
-                    )
-                    raise DecodeError(msg)
-                continue
-            if slot in slots:
-                msg = f"the name {name} occurs twice"
+        body = None if any(name in _SLOTS for name in names) else _ros4hri.body_of(names)
+        if body is not None:
+            wanted = [f"{joint}_{body}" for joint in _ros4hri.AXES]
+            places = _places(names, {name: slot for slot, name in enumerate(wanted)})
+            _check_complete(wanted, places, f"wanted the {len(wanted)} joints of ROS4HRI's human_description")
+        else:
+            misspelt = [name for name in names if name.startswith(("beta", "transl")) and name not in _SLOTS]
+            if misspelt:  # left alone, they would silently leave the body at zero
+                msg = (
+                    f"unknown name {misspelt[0]!r}; "
+                    f"wanted beta_0 ... beta_{N_BETAS - 1} and transl_x, transl_y, transl_z"
+                )
                 raise DecodeError(msg)
-            slots[slot] = position
-        missing = [name for name in _POSE_NAMES if _SLOTS[name] not in slots]
-        if missing:
-            msg = f"{len(missing)} of {_N_POSE} names are missing: {_listing(missing)}; wanted x, y, z of 24 joints"
-            raise DecodeError(msg)
-        n_transl = sum(_SLOTS[name] in slots for name in _TRANSL_NAMES)
-        if n_transl not in (0, len(_TRANSL_NAMES)):
-            msg = f"{n_transl} of transl_x, transl_y, transl_z given; wanted all three or none"
-            raise DecodeError(msg)
-        return cls(len(names), np.array([*slots.values()], np.intp), np.array([*slots], np.intp))
+            places = _places(names, _SLOTS)
+            _check_complete(_POSE_NAMES, places, "wanted x, y, z of 24 joints, or ROS4HRI's waist_<id> and the others")
+            n_transl = sum(name in places for name in _TRANSL_NAMES)
+            if n_transl not in (0, len(_TRANSL_NAMES)):
+                msg = f"{n_transl} of transl_x, transl_y, transl_z given; wanted all three or none"
+                raise DecodeError(msg)
+        given, slots = zip(*places.values(), strict=True)
+        return cls(len(names), np.array(given, np.intp), np.array(slots, np.intp), body is not None)
 
     def frame(self, position: NDArray[Any], stamp_ns: int) -> SmplFrame:
         """The frame of as many positions as there are names."""
         values = np.zeros(len(_NAMES))
         values[self.slots] = position[self.given]
+        if self.ros4hri:
+            pose = _ros4hri.pose_of(values[: len(_ros4hri.AXES)])
+            return smpl_frame(pose, None, -_ros4hri.PELVIS, stamp_ns=stamp_ns)
         pose, betas, transl = np.split(values, [_N_POSE, _N_POSE + _N_BETA])
         return smpl_frame(pose, betas, transl, stamp_ns=stamp_ns)
+
+
+def _places(names: Sequence[str], slots: Mapping[str, int]) -> dict[str, tuple[int, int]]:
+    """Position in the message, and slot, of each name that has one."""
+    places: dict[str, tuple[int, int]] = {}
+    for position, name in enumerate(names):
+        if name in places:
+            msg = f"the name {name} occurs twice"
+            raise DecodeError(msg)
+        if name in slots:
+            places[name] = position, slots[name]
+    return places
+
+
+def _check_complete(wanted: Sequence[str], given: Mapping[str, Any], what: str) -> None:
+    missing = [name for name in wanted if name not in given]
+    if missing:
+        msg = f"{len(missing)} of {len(wanted)} names are missing: {_listing(missing)}; {what}"
+        raise DecodeError(msg)
 
 
 _last: tuple[tuple[str, bytes], _Layout] | None = None
@@ -122,6 +146,18 @@ def from_bytes(data: Buffer) -> SmplFrame:
             if len(raw[1]) <= _MOST_REMEMBERED:
                 _last = raw, layout
         return layout.frame(position, stamp_ns)
+
+
+def body_of(data: Buffer) -> str | None:
+    """The id of the ROS4HRI body in a message that could be decoded, None for SMPL's joints."""
+    reader, names = CdrReader(data), []
+    reader.stamp_ns()
+    reader.string()
+    for _ in range(reader.length(item_bytes=_MIN_NAME_BYTES)):
+        names.append(reader.string())
+        if names[-1] in _SLOTS:  # the first one is, where they are SMPL's
+            return None
+    return _ros4hri.body_of(names)
 
 
 def from_message(message: Any) -> SmplFrame:

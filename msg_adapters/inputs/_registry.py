@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
+from msg_adapters.cdr import CdrReader
 from msg_adapters.definitions import full_type_name
 from msg_adapters.errors import DecodeError
 from msg_adapters.inputs import _joint_state, _multiarray, _pose_array, _smpl
@@ -86,3 +87,17 @@ def decoder_for(name: str, *, definition: str | None = None) -> Decoder:
 def encoder_for(name: str) -> Encoder:
     """The encoder of an input type or of a message type's name; raises `DecodeError` for any other name."""
     return _ENCODERS[_input_type(name)]
+
+
+def frame_id_of(data: Buffer, input_type: InputType) -> str:
+    """The frame of a message that could be decoded: its header's `frame_id`; empty where its type has no header.
+
+    A body of ROS4HRI is in its own frame, `body_<id>`, whatever camera the header names.
+    """
+    if input_type == "multiarray":
+        return ""
+    if input_type == "joint_state" and (body := _joint_state.body_of(data)):
+        return f"body_{body}"
+    reader = CdrReader(data)
+    reader.stamp_ns()
+    return reader.string()

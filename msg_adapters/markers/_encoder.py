@@ -46,6 +46,7 @@ def _write_marker(
     n_colors: int = 0,
     kind: int = TRIANGLE_LIST,
     size: float = 1.0,
+    lifetime_ns: int = 0,
 ) -> tuple[int, int, int]:
     """Append one visualization_msgs/Marker; returns the payload offsets of its stamp, points and colours."""
     ns, marker_id = key
@@ -55,7 +56,7 @@ def _write_marker(
     writer.numbers("ddddddd", *_IDENTITY_POSE)
     writer.numbers("ddd", size, size, size)
     writer.numbers("ffff", *color)
-    writer.stamp(0)  # lifetime: forever
+    writer.stamp(lifetime_ns)
     writer.numbers("B", 0)  # frame_locked
     writer.numbers("I", n_points)
     points_at = writer.array("f8", np.zeros(n_points * 3))
@@ -91,12 +92,19 @@ class _Slot:
 class MarkerArrayEncoder:
     """Encodes frames of a fixed set of meshes as `visualization_msgs/MarkerArray` in CDR.
 
-    One encoder serves one thread at a time.
+    One encoder serves one thread at a time. Viewers forget a mesh that isn't renewed for `lifetime_ns`; 0: never.
 
     Raises `EncodeError` for no mesh at all, and for two meshes of one namespace and id.
     """
 
-    def __init__(self, meshes: Sequence[MarkerMesh], *, frame_id: str = "map", axes: InputAxes = "smpl") -> None:
+    def __init__(
+        self,
+        meshes: Sequence[MarkerMesh],
+        *,
+        frame_id: str = "map",
+        axes: InputAxes = "smpl",
+        lifetime_ns: int = 0,
+    ) -> None:
         keys = [(mesh.ns, mesh.id) for mesh in meshes]
         if not keys or len(set(keys)) != len(keys):
             msg = f"wanted meshes with distinct (namespace, id), got {keys}"
@@ -116,6 +124,7 @@ class MarkerArrayEncoder:
                 color=mesh.color,
                 n_points=mesh.faces.size,
                 n_colors=mesh.faces.size if mesh.vertex_colors else 0,
+                lifetime_ns=lifetime_ns,
             )
             for mesh in meshes
         ]

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from refu_core._warp import argument, is_plain
-from refu_core.backbones._kernels import ROWS, WIDTH, Strip, decode_kernel
+from refu_core.backbones._decode_kernels import ROWS, WIDTH, Strip, decode_kernel
 from refu_core.errors import WeightsError
 from refu_core.garments import GarmentTemplate
 

@@ -13,14 +13,6 @@ from refu_core.frames import N_BETAS, N_STYLES
 N_STYLE_SHAPE = N_BETAS + N_STYLES
 """Width of (β, γ)."""
 
-GARMENT_JOINTS: dict[str, tuple[int, ...]] = {
-    "shirt-male": (0, 1, 2, 3, 6, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21),
-    "tshirt-male": (0, 1, 2, 3, 6, 9, 12, 13, 14, 16, 17, 18, 19),
-    "short-pant-male": (0, 1, 2, 4, 5),
-    "skirt-female": (0, 1, 2, 4, 5),
-}
-"""Joints that a garment can feel (Patel et al. 2020); the others would only be a source of overfitting."""
-
 ENCODINGS: tuple[str, ...] = ("matrix", "rotvec")
 
 
@@ -47,7 +39,7 @@ class PoseFeatures(nn.Module):
     """θ as a network's input.
 
     `matrix`: world up in the root's frame, then R - 1 of every other joint of `joints`, nine numbers each: free of the
-    jumps of rotation vectors and, with few samples, the representation that generalises best (docs/training.md).
+    jumps of rotation vectors and, with few samples, the representation that generalises best (docs/guide/train.md).
     `rotvec`: the paper's 72 numbers, heading removed from the root, joints that aren't in `joints` zeroed.
     """
 

@@ -10,15 +10,13 @@ import torch
 from torch import Tensor, nn
 
 from refu_core.backbones._decoder import BasisDecoder
-from refu_core.backbones._presets import backbone_name, build_backbone, config_from_card, config_to_card
-from refu_core.backbones._protocol import Backbone, Skinned
+from refu_core.backbones._presets import Network, backbone_name, build_backbone, config_from_card, config_to_card
+from refu_core.backbones._protocol import MAX_OFFSET, Backbone, Skinned
 from refu_core.errors import WeightsError
+from refu_core.frames import N_BETAS, N_JOINTS
 from refu_core.garments import GarmentTemplate, load_garment
-from refu_core.weights import Weights, build_for, load_weights, save_weights, shipped_weights
-
-BACKBONES: tuple[str, ...] = ("skinned", "tailornet", "mlp", "gcnn")
-MODES: tuple[str, ...] = ("none", "approx", "accurate", "hybrid")
-"""What a backbone was trained with: nothing, or ReFU with one SDF or the other (paper, Sec. 4.1)."""
+from refu_core.modes import BackboneName, SdfMode
+from refu_core.weights import Weights, build_for, load_weights, save_weights, weights_folder
 
 _PREFIX = "backbone."
 
@@ -78,33 +76,41 @@ def save_backbone(
     return save_weights(stem, {**tensors, **(others or {})}, {**described, **card})
 
 
-def read_backbone(
-    stem: Path, garment: GarmentTemplate, *, expect: Mapping[str, Any], device: str | torch.device = "cpu"
-) -> nn.Module:
-    """Reads what `save_backbone` wrote, in float32 and ready for use (`eval`).
+def backbone_from_weights(weights: Weights, garment: GarmentTemplate, *, device: str | torch.device = "cpu") -> Network:
+    """The backbone in `weights`, with the basis beside them, in float32 and ready for use (`eval`).
 
     Raises:
-        WeightsError: missing, damaged, not as expected, or of another version.
+        WeightsError: of another version or garment, or the basis is missing, damaged or another one.
     """
-    weights = load_weights(stem, expect=expect)
-    config = config_from_card(str(weights.card.get("backbone")), weights.card.get("config") or {})
+    card = weights.card
+    config = config_from_card(str(card.get("backbone")), card.get("config") or {})
     basis = None
-    if "basis_sha256" in weights.card:
-        basis, digest = load_basis(stem.parent, expect=expect)
-        if digest != weights.card["basis_sha256"]:
+    if "basis_sha256" in card:
+        identity = {key: card[key] for key in ("garment", "body_fingerprint") if key in card}
+        basis, digest = load_basis(weights.path.parent, expect=identity)
+        if digest != card["basis_sha256"]:
             msg = f"{weights.path}: made for another basis than the one beside it; get both files again"
             raise WeightsError(msg)
     tensors = {k[len(_PREFIX) :]: v for k, v in weights.tensors.items() if k.startswith(_PREFIX)}
+    template = garment.to(device="cpu")
     try:
         module = build_for(
             tensors,
-            lambda: build_backbone(config, garment, basis=basis, pivots=tensors.get("pivots")),
+            lambda: build_backbone(config, template, basis=basis, pivots=tensors.get("pivots")),
             shared="decoder.",
         )
     except WeightsError as error:
         msg = f"{weights.path}: doesn't fit {garment.name}: {error}"
         raise WeightsError(msg) from error
-    return module.float().to(device).eval()
+    module = module.float().to(device).eval()
+    with torch.no_grad():
+        at_rest = module(torch.zeros(1, N_BETAS, device=device), torch.zeros(1, N_JOINTS, 3, device=device), None)
+    offset = 0.0 if at_rest.displacement is None else float(at_rest.displacement.abs().max())
+    if not offset <= MAX_OFFSET:  # nor NaN
+        msg = f"{weights.path}: wanted a garment within {MAX_OFFSET:g} m of a body at rest, this one is "
+        msg += f"{offset:.3g} m off; train it again"
+        raise WeightsError(msg)
+    return module
 
 
 def load_backbone(
@@ -130,23 +136,26 @@ def load_backbone(
         GarmentError: there is no such garment.
         WeightsError: there is no such backbone or mode, no weights of it, or they are for another body.
     """
-    if name not in BACKBONES:
-        msg = f"no backbone {name!r}: wanted {', '.join(BACKBONES)}"
-        raise WeightsError(msg)
-    if mode not in MODES:
-        msg = f"no mode {mode!r} of a backbone: wanted {', '.join(MODES)}"
-        raise WeightsError(msg)
-    if name == "skinned":
-        return Skinned()
     template = load_garment(garment) if isinstance(garment, str) else garment
-    folder = shipped_weights(template.name) if folder is None else folder
-    expect = {"garment": template.name}
+    weights = backbone_weights(name, template.name, mode=mode, body_fingerprint=body_fingerprint, folder=folder)
+    if weights is None:
+        return Skinned()
+    return backbone_from_weights(weights, template, device=device).requires_grad_(False)
+
+
+def backbone_weights(
+    name: str, garment: str, *, mode: str, body_fingerprint: str | None = None, folder: Path | None = None
+) -> Weights | None:
+    """What `load_backbone` makes its backbone of; None for `skinned`, which needs none. Raises as it does."""
+    kind = BackboneName.of(name, "backbone", error=WeightsError)
+    mode = SdfMode.of(mode, "mode of a backbone", error=WeightsError)
+    if kind is BackboneName.SKINNED:
+        return None
+    expect = {"garment": garment}
     if body_fingerprint is not None:
         expect["body_fingerprint"] = body_fingerprint
-    module = read_backbone(folder / f"{name}-{mode}", template.to(device="cpu"), expect=expect, device=device)
-    module.requires_grad_(False)
-    backbone: Backbone = module
-    return backbone
+    folder = weights_folder(garment) if folder is None else folder
+    return load_weights(folder / f"{name}-{mode}", expect=expect)
 
 
 def _tensor(weights: Weights, name: str) -> Tensor:

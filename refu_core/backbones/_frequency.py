@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy import sparse
 from torch import Tensor
 
 from refu_core.garments import GarmentTemplate
+from refu_core.mesh import Connectivity
 
 STEPS = 80
 STEP_SIZE = 0.15
@@ -22,7 +22,7 @@ class LaplacianSmoothing:
     """
 
     def __init__(self, garment: GarmentTemplate, *, steps: int = STEPS, step_size: float = STEP_SIZE) -> None:
-        self._map = _one_step(garment.faces.cpu().numpy(), garment.n_vertices, step_size)
+        self._map = _one_step(garment.mesh, step_size)
         self._steps = steps
 
     def __call__(self, vertices: Tensor) -> Tensor:
@@ -43,13 +43,12 @@ class LaplacianSmoothing:
         return torch.as_tensor(x).view(columns.shape)
 
 
-def _one_step(faces: NDArray[np.int64], n_vertices: int, step_size: float) -> sparse.csr_array:
-    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1)
-    edges, count = np.unique(edges, axis=0, return_counts=True)
+def _one_step(mesh: Connectivity, step_size: float) -> sparse.csr_array:
+    n_vertices = mesh.n_vertices
     border = np.zeros(n_vertices, bool)
-    border[edges[count == 1]] = True
-    ends = np.concatenate((edges, edges[:, ::-1]))
-    along = np.concatenate((count, count)) == 1
+    border[mesh.boundary] = True
+    ends = np.concatenate((mesh.edges, mesh.edges[:, ::-1]))
+    along = np.tile(mesh.n_faces_of_edge == 1, 2)
     ends = ends[along | ~border[ends[:, 0]]]  # row: the vertex that moves, column: a neighbour that it listens to
     links = sparse.csr_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(n_vertices, n_vertices))
     mean = sparse.diags_array(1 / np.maximum(links.sum(1), 1)) @ links

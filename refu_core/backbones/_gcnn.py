@@ -12,7 +12,7 @@ from torch.nn import functional
 from refu_core.backbones._features import N_STYLE_SHAPE, PoseFeatures, style_shape
 from refu_core.backbones._graph import MeshGraph, Neighbours
 from refu_core.backbones._perceptron import Perceptron
-from refu_core.backbones._protocol import Prediction
+from refu_core.backbones._protocol import Prediction, WithoutWearerCode
 from refu_core.errors import WeightsError
 from refu_core.garments import GarmentTemplate
 
@@ -90,7 +90,7 @@ class UpConv(nn.Module):
         return math.sqrt(1 - self.residual) * (conv + self.bias) + math.sqrt(self.residual) * passed
 
 
-class Gcnn(nn.Module):
+class Gcnn(WithoutWearerCode, nn.Module):
     """A mesh decoder conditioned on (θ, β, γ).
 
     The original is an autoencoder of meshes, and there is no mesh to encode at run time: how (θ, β, γ) enter is this
@@ -101,8 +101,7 @@ class Gcnn(nn.Module):
         super().__init__()
         self.config = config
         self.n_vertices = garment.n_vertices
-        faces = garment.faces.cpu().numpy()
-        graph = MeshGraph.of(faces, garment.n_vertices, levels=len(config.channels), stride=config.stride)
+        graph = MeshGraph.of(garment.mesh, levels=len(config.channels), stride=config.stride)
         self.features = PoseFeatures(config.joints, config.encoding)
         self.feature_size = graph.sizes[-1] * config.channels[0]
         """M, the size of z."""
@@ -123,7 +122,14 @@ class Gcnn(nn.Module):
         self.mean: Tensor
         self.scale: Tensor
 
-    def forward(self, betas: Tensor, pose: Tensor, style: Tensor | None) -> Prediction:
+    def forward(
+        self,
+        betas: Tensor,
+        pose: Tensor,
+        style: Tensor | None,
+        *,
+        wearer_code: Tensor | None = None,  # noqa: ARG002
+    ) -> Prediction:
         """Predicts for betas (B, 10), pose (B, 24, 3) [rad] and style (B, 4)."""
         z = self.head(torch.cat((self.features(pose), style_shape(betas, style)), 1))
         x = z.view(len(z), -1, self.config.channels[0]).transpose(0, 1)

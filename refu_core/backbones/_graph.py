@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from refu_core.mesh import Connectivity
+
 
 @dataclass(frozen=True, eq=False)
 class Neighbours:
@@ -42,12 +44,10 @@ class MeshGraph:
     """From level l + 1 to level l: the coarse vertices that a fine one hears, shape (V_l, n)."""
 
     @staticmethod
-    def of(faces: NDArray[np.int64], n_vertices: int, *, levels: int, stride: int = 2) -> MeshGraph:
-        """Samples the vertex graph of `faces` (F, 3) `levels` times."""
-        a, b = faces[:, [0, 1, 2]].ravel(), faces[:, [1, 2, 0]].ravel()
-        ends = (np.concatenate((a, b)), np.concatenate((b, a)))
-        links = _binary(sparse.csr_array((np.ones(2 * len(a)), ends), shape=(n_vertices, n_vertices)))
-        sizes, ups = [n_vertices], []
+    def of(mesh: Connectivity, *, levels: int, stride: int = 2) -> MeshGraph:
+        """Samples the vertex graph of a mesh `levels` times."""
+        links = mesh.adjacency_matrix()
+        sizes, ups = [mesh.n_vertices], []
         for _ in range(levels):
             kept = _sample(links, stride)
             # A fine vertex is within stride - 1 links of a kept one; one more link blends between several.

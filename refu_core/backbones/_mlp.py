@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from refu_core.backbones._decoder import Decoder
 from refu_core.backbones._features import N_STYLE_SHAPE, PoseFeatures, style_shape
 from refu_core.backbones._perceptron import Perceptron
-from refu_core.backbones._protocol import Prediction
+from refu_core.backbones._protocol import Prediction, WithoutWearerCode
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class MlpConfig:
         return cls(joints, "rotvec", (1024, 1024, 1024, 1024), "relu", 0.2)
 
 
-class Mlp(nn.Module):
+class Mlp(WithoutWearerCode, nn.Module):
     """(θ, β, γ) to displacements by one perceptron of five layers."""
 
     def __init__(self, config: MlpConfig, decoder: Decoder) -> None:
@@ -45,7 +45,14 @@ class Mlp(nn.Module):
             dropout=config.dropout,
         )
 
-    def forward(self, betas: Tensor, pose: Tensor, style: Tensor | None) -> Prediction:
+    def forward(
+        self,
+        betas: Tensor,
+        pose: Tensor,
+        style: Tensor | None,
+        *,
+        wearer_code: Tensor | None = None,  # noqa: ARG002
+    ) -> Prediction:
         """Predicts for betas (B, 10), pose (B, 24, 3) [rad] and style (B, 4)."""
         return Prediction(self.decoder(self.code(self.features(pose), style_shape(betas, style))), None)
 

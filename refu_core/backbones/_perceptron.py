@@ -75,16 +75,9 @@ class StackedPerceptrons(nn.Module):
         """Takes shift and scale from the inputs of the training set, shape (N, I); one scale a group (I,) of inputs."""
         _standardise(self.shift, self.scale, inputs, groups)
 
-    def select(self, active: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """Weights (A, I, O) and biases (A, O) of the perceptrons `active` (A,), layer by layer: copies."""
-        return [(w[active], b[active]) for w, b in zip(self.weights, self.biases, strict=True)]
-
-    def forward(self, x: Tensor, mixture: Tensor, selected: list[tuple[Tensor, Tensor]] | None = None) -> Tensor:
-        """Σ_k mixture[:, k] · perceptron_k(x), shape (B, O), of x (B, I) and mixture (B, K).
-
-        With `selected`, the perceptrons are those that `select` gave, and the mixture's columns are theirs.
-        """
-        layers = selected or list(zip(self.weights, self.biases, strict=True))
+    def forward(self, x: Tensor, mixture: Tensor) -> Tensor:
+        """Σ_k mixture[:, k] · perceptron_k(x), shape (B, O), of x (B, I) and mixture (B, K)."""
+        layers = list(zip(self.weights, self.biases, strict=True))
         h = ((x - self.shift) * self.scale).expand(mixture.shape[1], -1, -1)  # (K, B, I)
         for weight, bias in layers[:-1]:
             h = self.activation(torch.baddbmm(bias[:, None], h, weight))

@@ -9,7 +9,6 @@ from typing import Any
 from torch import Tensor, nn
 
 from refu_core.backbones._decoder import BasisDecoder, Decoder, DenseDecoder
-from refu_core.backbones._features import GARMENT_JOINTS
 from refu_core.backbones._gcnn import Gcnn, GcnnConfig
 from refu_core.backbones._mlp import Mlp, MlpConfig
 from refu_core.backbones._tailornet import TailorNet, TailorNetConfig
@@ -29,12 +28,12 @@ TRAINABLE: tuple[str, ...] = tuple(_CONFIGS)
 """Backbones that have weights."""
 
 BackboneConfig = TailorNetConfig | MlpConfig | GcnnConfig
+Network = TailorNet | Mlp | Gcnn
+"""A backbone that is trained."""
 
 
-def backbone_config(name: str, garment: str, *, preset: str = "realtime") -> BackboneConfig:
+def backbone_config(name: str, garment: GarmentTemplate, *, preset: str = "realtime") -> BackboneConfig:
     """The configuration of the backbone `name` for a garment.
-
-    A garment that isn't built in gets the joints of the shirt, which has the most.
 
     Raises:
         WeightsError: no such backbone, or no such preset.
@@ -45,8 +44,7 @@ def backbone_config(name: str, garment: str, *, preset: str = "realtime") -> Bac
     if preset not in PRESETS:
         msg = f"no preset {preset!r}: wanted {' or '.join(PRESETS)}"
         raise WeightsError(msg)
-    joints = GARMENT_JOINTS.get(garment, GARMENT_JOINTS["shirt-male"])
-    config = _CONFIGS[name]
+    config, joints = _CONFIGS[name], garment.card.joints
     return config.paper(joints) if preset == "paper" else config(joints)
 
 
@@ -61,7 +59,7 @@ def build_backbone(
     *,
     basis: BasisDecoder | None = None,
     pivots: Tensor | None = None,
-) -> TailorNet | Mlp | Gcnn:
+) -> Network:
     """An untrained backbone.
 
     Args:

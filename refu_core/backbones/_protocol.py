@@ -16,17 +16,47 @@ class Prediction(NamedTuple):
     """Global garment feature z = h(β, θ, γ) that the ReFU scale is predicted from, shape (B, M); None without one."""
 
 
+MAX_OFFSET = 2.0
+"""No vertex is further from where the template has it [m], whatever a network says; as in the data it learns from."""
+
+
 class Backbone(Protocol):
     """Predicts one garment."""
 
-    def __call__(self, betas: Tensor, pose: Tensor, style: Tensor | None) -> Prediction:
-        """Predicts for betas (B, 10), pose (B, 24, 3) [rad] and style (B, 4)."""
+    def wearer_code(self, betas: Tensor, style: Tensor | None) -> Tensor | None:
+        """What depends on betas (B, 10) and style (B, 4) only, shape (B, K): to be computed once a person.
+
+        None where there is no such thing.
+        """
+        ...
+
+    def __call__(
+        self, betas: Tensor, pose: Tensor, style: Tensor | None, *, wearer_code: Tensor | None = None
+    ) -> Prediction:
+        """Predicts for betas (B, 10), pose (B, 24, 3) [rad] and style (B, 4).
+
+        Given the `wearer_code` of (β, γ), that isn't computed again.
+        """
         ...
 
 
-class Skinned:
+class WithoutWearerCode:
+    """A backbone that computes all of a frame anew."""
+
+    def wearer_code(self, betas: Tensor, style: Tensor | None) -> None:
+        """None: there is nothing to keep."""
+
+
+class Skinned(WithoutWearerCode):
     """No network: the template follows the skin. What every other backbone is measured against."""
 
-    def __call__(self, betas: Tensor, pose: Tensor, style: Tensor | None) -> Prediction:  # noqa: ARG002
+    def __call__(
+        self,
+        betas: Tensor,  # noqa: ARG002
+        pose: Tensor,  # noqa: ARG002
+        style: Tensor | None,  # noqa: ARG002
+        *,
+        wearer_code: Tensor | None = None,  # noqa: ARG002
+    ) -> Prediction:
         """Predicts no displacement."""
         return Prediction(None, None)

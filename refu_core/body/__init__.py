@@ -1,14 +1,25 @@
 """SMPL-layout body models: linear blend skinning, loaders, and the built-in CC0 bodies."""
 
 from refu_core.body._io import BUILTIN_BODIES, load_body
-from refu_core.body._kinematics import JOINT_NAMES, PARENTS, RigidTransforms, forward_kinematics, rotvec_to_rotmat
+from refu_core.body._kinematics import (
+    JOINT_NAMES,
+    PARENTS,
+    RigidTransforms,
+    forward_kinematics,
+    rotvec_to_rotmat,
+)
 from refu_core.body._model import BodyOutput, Shape, SmplBody
+from refu_core.body._parts import ARMS, LEGS, MIRRORED_JOINTS, SEGMENTS, joints_of, part_of_faces, weight_of_parts
 from refu_core.body._skinning import Skinning, apply_transforms, blend_transforms, unapply_transforms
 
 __all__ = [
+    "ARMS",
     "BUILTIN_BODIES",
     "JOINT_NAMES",
+    "LEGS",
+    "MIRRORED_JOINTS",
     "PARENTS",
+    "SEGMENTS",
     "BodyOutput",
     "RigidTransforms",
     "Shape",
@@ -17,7 +28,10 @@ __all__ = [
     "apply_transforms",
     "blend_transforms",
     "forward_kinematics",
+    "joints_of",
     "load_body",
+    "part_of_faces",
     "rotvec_to_rotmat",
     "unapply_transforms",
+    "weight_of_parts",
 ]

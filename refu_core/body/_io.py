@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 from importlib import resources
+from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
 
 from refu_core._npz import read_npz
 from refu_core.body._model import BodyArrays, SmplBody
 from refu_core.body._pickle import read_smpl_pickle
-from refu_core.errors import BodyError
-
-if TYPE_CHECKING:
-    import os
+from refu_core.errors import BodyError, require_type
 
 BUILTIN_BODIES: tuple[str, ...] = ("male", "female", "neutral")
 _KEYS = ("v_template", "f", "weights", "J_regressor", "kintree_table", "shapedirs", "posedirs")
+_WANTED = "a body model, an .npz or an official .pkl file"
 
 
 def load_body(
-    source: str | os.PathLike[str], *, device: str | torch.device = "cpu", dtype: torch.dtype = torch.float32
+    source: str | PathLike[str], *, device: str | torch.device = "cpu", dtype: torch.dtype = torch.float32
 ) -> SmplBody:
     """Loads a body model.
 
@@ -37,14 +35,16 @@ def load_body(
     if str(source) in BUILTIN_BODIES:
         name = str(source)
         with resources.as_file(resources.files("refu_core") / "assets" / f"body_{name}.npz") as path:
-            data = read_npz(path, keys=_KEYS, error=BodyError)
+            data = read_npz(path, keys=_KEYS, error=BodyError, wanted=_WANTED)
         return SmplBody(BodyArrays.from_mapping(data, source=f"body {name}"), name=name, device=device, dtype=dtype)
+    require_type(source, (str, PathLike), "a body's name or path", error=BodyError)
     path = Path(source)
-    if not path.is_file():
+    if not path.suffix:
         msg = f"no body {str(source)!r}: wanted one of {', '.join(BUILTIN_BODIES)}, or the path of an .npz or .pkl file"
         raise BodyError(msg)
     if path.suffix not in (".npz", ".pkl"):
-        msg = f"{path}: a body model must be an .npz or an official .pkl file, got {path.suffix or 'no suffix'!r}"
+        msg = f"{path}: a body model must be an .npz or an official .pkl file, got {path.suffix!r}"
         raise BodyError(msg)
-    data = read_npz(path, keys=_KEYS, error=BodyError) if path.suffix == ".npz" else read_smpl_pickle(path, keys=_KEYS)
+    read = read_npz if path.suffix == ".npz" else read_smpl_pickle
+    data = read(path, keys=_KEYS, error=BodyError, wanted=_WANTED)
     return SmplBody(BodyArrays.from_mapping(data, source=str(path)), name=path.stem, device=device, dtype=dtype)

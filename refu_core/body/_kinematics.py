@@ -10,7 +10,7 @@ import warp as wp
 from torch import Tensor
 
 from refu_core._warp import argument, is_plain, torch_stream
-from refu_core.body._kernels import chain_kernel, rotation_kernel
+from refu_core.body._pose_kernels import chain_kernel, rotation_kernel
 
 JOINT_NAMES: tuple[str, ...] = (
     "pelvis",
@@ -41,7 +41,7 @@ JOINT_NAMES: tuple[str, ...] = (
 """Names of the SMPL joints in their order."""
 
 PARENTS: tuple[int, ...] = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
-"""Parent of each SMPL joint; the root's is -1, and a parent stands before its children."""
+"""Parent of each SMPL joint, -1 for the root; parents come before their children."""
 
 
 def rotvec_to_rotmat(rotvec: Tensor) -> Tensor:
@@ -108,8 +108,8 @@ def forward_kinematics(rotations: Tensor, joints: Tensor) -> tuple[Tensor, Rigid
     pose[:, :n, :3, :3] = rotations
     pose[:, 0, :3, 3] = joints[:, 0]
     pose[:, 1:n, :3, 3] = joints[:, 1:] - joints[:, chains[0][1:n]]
-    # Each round multiplies the chain that a joint has by the one that ends where its own begins, and so doubles it:
-    # four products in place of 23, one after another.
+    # Each round multiplies a joint's chain by the one that ends where it begins, which doubles its length: four
+    # products instead of 23 in a row.
     for above in chains:
         pose = pose[:, above] @ pose
     rotation, posed = pose[:, :n, :3, :3], pose[:, :n, :3, 3]

@@ -78,7 +78,8 @@ class BodyArrays:
                 msg = f"{source}: {key} is not an array of numbers: {error}"
                 raise BodyError(msg) from error
             # The parent of the root is 2**32 - 1 in official files; all else is metres, shares and indices.
-            if not np.isfinite(array).all() or (key != "kintree_table" and np.abs(array).max(initial=0) > _LARGEST):
+            largest = max(-array.min(initial=0), array.max(initial=0))  # NaN where there is one
+            if not np.isfinite(largest) or (key != "kintree_table" and largest > _LARGEST):
                 msg = f"{source}: {key} has values that are NaN or infinite, or beyond {_LARGEST:g}"
                 raise BodyError(msg)
             return array
@@ -97,7 +98,7 @@ class BodyArrays:
             raise BodyError(msg)
         arrays = cls(
             v_template=v_template,
-            faces=numbers("f").astype(np.int64),
+            faces=np.atleast_1d(numbers("f")).astype(np.int64),
             weights=numbers("weights"),
             joint_regressor=numbers("J_regressor"),
             shapedirs=shapedirs[:, :, :N_BETAS],
@@ -119,8 +120,8 @@ class BodyArrays:
         if arrays.faces.min(initial=0) < 0 or arrays.faces.max(initial=0) >= n:
             msg = f"{source}: faces must index {n} vertices, got {arrays.faces.min()} to {arrays.faces.max()}"
             raise BodyError(msg)
-        if np.abs(arrays.weights.sum(1) - 1).max() > 1e-3:
-            msg = f"{source}: the skinning weights of a vertex must sum to one"
+        if np.abs(arrays.weights.sum(1) - 1).max() > 1e-3 or arrays.weights.min() < -1e-3:
+            msg = f"{source}: the skinning weights of a vertex must sum to one, and none be negative"
             raise BodyError(msg)
         return arrays
 
@@ -179,7 +180,7 @@ class SmplBody:
         return SmplBody(self._arrays, name=self.name, device=device or self.device, dtype=dtype or self.dtype)
 
     def _batch(self, name: str, value: ArrayLike | Tensor, width: tuple[int, ...]) -> Tensor:
-        tensor = _tensor(value, self.device).to(self.dtype)
+        tensor = _tensor(name, value, self.device).to(self.dtype)
         size = int(np.prod(width))
         if tensor.shape[1:] not in (width, (size,)) or tensor.ndim < 2:
             msg = f"{name} must have the shape (B, {', '.join(map(str, width))}), got {tuple(tensor.shape)}"
@@ -219,7 +220,7 @@ class SmplBody:
         posed = self.posed(theta, self.shape(beta))
         if transl is None:
             return posed
-        shift = _tensor(transl, self.device)
+        shift = _tensor("transl", transl, self.device)
         if shift.ndim != 2 or shift.shape[1] != 3 or len(shift) not in (1, batch):
             msg = f"transl must have the shape ({batch}, 3), got {tuple(shift.shape)}"
             raise FrameError(msg)
@@ -241,6 +242,12 @@ class SmplBody:
         return BodyOutput(self._skinning(vertices, transforms), joints, transforms)
 
 
-def _tensor(value: ArrayLike | Tensor, device: torch.device) -> Tensor:
+def _tensor(name: str, value: ArrayLike | Tensor, device: torch.device) -> Tensor:
     """A tensor on `device`; arrays are copied, since a frame's are read-only."""
-    return value.to(device) if isinstance(value, Tensor) else torch.tensor(np.asarray(value), device=device)
+    if isinstance(value, Tensor):
+        return value.to(device)
+    try:
+        return torch.tensor(np.asarray(value), device=device)
+    except (TypeError, ValueError) as error:
+        msg = f"{name} must be an array or tensor of numbers, got {type(value).__name__}"
+        raise FrameError(msg) from error

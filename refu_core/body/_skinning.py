@@ -7,8 +7,8 @@ import warp as wp
 from torch import Tensor
 
 from refu_core._warp import argument, is_plain, torch_stream
-from refu_core.body._kernels import skin_kernel, vec12
 from refu_core.body._kinematics import RigidTransforms
+from refu_core.body._pose_kernels import Transform, skin_kernel
 
 _MIN_DETERMINANT = 1e-4
 """Blends of rotations almost half a turn apart collapse; below this determinant unposing is bounded, not exact."""
@@ -65,7 +65,7 @@ class Skinning:
                         argument(self._start, wp.int32),
                         argument(self._joint, wp.int32),
                         argument(self._weight, wp.float32),
-                        argument(stacked, vec12),
+                        argument(stacked, Transform),
                     ],
                     [argument(posed, wp.vec3)],
                     device=str(points.device),

@@ -1,13 +1,19 @@
-"""Garment templates: the four built-in garments, how they follow shape and style, how they are posed and unposed."""
+"""Garments: their files, how they follow shape and style, how they are posed and unposed."""
 
-from refu_core.garments._template import (
-    BUILTIN_GARMENTS,
-    LAYERS,
-    N_STYLES,
-    GarmentTemplate,
-    inner_first,
-    load_garment,
-    unique_edges,
-)
+from refu_core.frames import N_STYLES
+from refu_core.garments._card import GarmentCard, Tailoring, card_to_json
+from refu_core.garments._file import load_garment
+from refu_core.garments._template import GarmentTemplate, inner_first
+from refu_core.modes import BUILTIN_GARMENTS, DEFAULT_GARMENTS
 
-__all__ = ["BUILTIN_GARMENTS", "LAYERS", "N_STYLES", "GarmentTemplate", "inner_first", "load_garment", "unique_edges"]
+__all__ = [
+    "BUILTIN_GARMENTS",
+    "DEFAULT_GARMENTS",
+    "N_STYLES",
+    "GarmentCard",
+    "GarmentTemplate",
+    "Tailoring",
+    "card_to_json",
+    "inner_first",
+    "load_garment",
+]

@@ -2,40 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
-from importlib import resources
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from refu_core._npz import read_npz
 from refu_core.body import RigidTransforms, Skinning, blend_transforms, unapply_transforms
 from refu_core.errors import GarmentError
-from refu_core.frames import N_STYLES as N_STYLES
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-BUILTIN_GARMENTS: tuple[str, ...] = ("shirt-male", "tshirt-male", "short-pant-male", "skirt-female")
-
-LAYERS: Mapping[str, int] = {"short-pant-male": 0, "skirt-female": 0, "tshirt-male": 1, "shirt-male": 2}
-"""Which garments are worn over which: those of a higher number over those of a lower one. Tops hang over bottoms, and
-a shirt over a T-shirt. A garment that isn't listed is an outermost one; of one layer, the later named is the outer."""
+from refu_core.garments._card import GarmentCard
+from refu_core.mesh import Connectivity
 
 
-def inner_first(names: Iterable[str]) -> list[str]:
-    """Names of garments worn together, from the skin outwards (`LAYERS`)."""
-    return sorted(names, key=lambda name: LAYERS.get(name, max(LAYERS.values())))
-
-
-def unique_edges(faces: Tensor) -> Tensor:
-    """The edges of triangles (F, 3), each once, lower vertex first, shape (E, 2), int64."""
-    corners = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).cpu().numpy()
-    return torch.as_tensor(np.unique(np.sort(corners, 1), axis=0), device=faces.device)
+def inner_first(garments: Mapping[str, GarmentTemplate]) -> list[str]:
+    """Names of garments worn together, from the skin outwards (`GarmentCard.layer`)."""
+    return sorted(garments, key=lambda name: garments[name].card.layer)
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,12 +26,15 @@ class GarmentTemplate:
     """One garment of V vertices and F faces, made for one body.
 
     Posing is g_i = T_i(θ, β) (t_i(β, γ) + D_i) with the template t, a backbone's displacement D, and the body's blended
-    transforms T at the garment's own skinning weights (paper, section "Train Backbone with ReFU"; Patel et al. 2020).
+    transforms T at the garment's own skinning weights (Patel et al. 2020).
     """
 
     name: str
+    """That of its file, and of the folder of its weights."""
     body: str
     """Name of the built-in body that the garment was cut for."""
+    card: GarmentCard
+    """What is known of it besides its mesh."""
     faces: Tensor
     """Counter-clockwise from outside, shape (F, 3), int64."""
     weights: Tensor
@@ -66,16 +52,20 @@ class GarmentTemplate:
         return len(self.v_template)
 
     @cached_property
+    def mesh(self) -> Connectivity:
+        """What is next to what in it."""
+        return Connectivity.of(self.faces.cpu().numpy(), self.n_vertices)
+
+    @cached_property
     def edges(self) -> Tensor:
         """Each edge once, lower vertex first, shape (E, 2), int64."""
-        return unique_edges(self.faces)
+        return torch.as_tensor(self.mesh.edges.astype(np.int64), device=self.faces.device)
 
     def to(self, *, device: str | torch.device | None = None, dtype: torch.dtype | None = None) -> GarmentTemplate:
         """The same garment on another device or in another precision."""
         styledirs = None if self.styledirs is None else self.styledirs.to(device=device, dtype=dtype)
-        return GarmentTemplate(
-            name=self.name,
-            body=self.body,
+        return replace(
+            self,
             faces=self.faces.to(device=device),
             weights=self.weights.to(device=device, dtype=dtype),
             v_template=self.v_template.to(device=device, dtype=dtype),
@@ -112,32 +102,3 @@ class GarmentTemplate:
     def unpose(self, posed: Tensor, transforms: RigidTransforms) -> Tensor:
         """The inverse of `pose`, exact to rounding (see `refu_core.body.unapply_transforms`)."""
         return unapply_transforms(posed, self.vertex_transforms(transforms))
-
-
-def load_garment(
-    name: str, *, device: str | torch.device = "cpu", dtype: torch.dtype = torch.float32
-) -> GarmentTemplate:
-    """Loads a built-in garment: `shirt-male`, `tshirt-male`, `short-pant-male` or `skirt-female`.
-
-    Raises:
-        GarmentError: there is no garment of that name.
-    """
-    if name not in BUILTIN_GARMENTS:
-        msg = f"no garment {name!r}: wanted one of {', '.join(BUILTIN_GARMENTS)}"
-        raise GarmentError(msg)
-    with resources.as_file(resources.files("refu_core") / "assets" / f"garment_{name}.npz") as path:
-        data = read_npz(path, keys=("v_template", "f", "weights", "shapedirs", "styledirs", "body"), error=GarmentError)
-
-    def tensor(array: NDArray[Any]) -> Tensor:
-        return torch.tensor(array, device=device, dtype=dtype)
-
-    n = len(data["v_template"])
-    return GarmentTemplate(
-        name=name,
-        body=str(data["body"]),
-        faces=torch.tensor(data["f"].astype(np.int64), device=device),
-        weights=tensor(data["weights"]),
-        v_template=tensor(data["v_template"]),
-        shapedirs=tensor(data["shapedirs"].reshape(n * 3, -1)),
-        styledirs=tensor(data["styledirs"].reshape(n * 3, -1)) if "styledirs" in data else None,
-    )

@@ -1,14 +1,27 @@
 """From a frame of body parameters to garments: what the node, the replay and a Python user call."""
 
-from refu_core.realtime._outputs import SDF_MODES, SKIPS, FrameStats, GarmentMesh, GarmentStats, PipelineOutput
+from refu_core.realtime._contact import ContactStage
+from refu_core.realtime._dress import Drape, Dressed, dress
+from refu_core.realtime._outputs import SKIPS, FrameStats, GarmentMesh, GarmentStats, PipelineOutput
 from refu_core.realtime._pipeline import GarmentPipeline
+from refu_core.realtime._promise import PROMISED_POSES, PROMISED_SIZE, within_promise
+from refu_core.realtime._wearer import Outfit, Wearable, Wearer
 
 __all__ = [
-    "SDF_MODES",
+    "PROMISED_POSES",
+    "PROMISED_SIZE",
     "SKIPS",
+    "ContactStage",
+    "Drape",
+    "Dressed",
     "FrameStats",
     "GarmentMesh",
     "GarmentPipeline",
     "GarmentStats",
+    "Outfit",
     "PipelineOutput",
+    "Wearable",
+    "Wearer",
+    "dress",
+    "within_promise",
 ]

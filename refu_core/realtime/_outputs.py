@@ -1,8 +1,8 @@
-"""What the pipeline hands out: garments, and what handling them took."""
+"""What the pipeline returns: garments, and statistics of the frame."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -10,17 +10,12 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-SDF_MODES: tuple[str, ...] = ("hybrid", "approx", "accurate", "none")
-"""How collisions are found (paper, Sec. 4.1): with the approximate signed distance, by weights that were trained with
-the accurate one in the loss or without it; with the accurate one; or not at all (the raw backbone)."""
-
 SKIPS: Mapping[str, str] = {
     "band": "distances of vertices that are farther off the skin than they matter (accurate)",
-    "pivots": "networks of TailorNet's mixture whose weights together are at most a thousandth",
     "rest": "bodies and garments of some (β, γ) before they are posed, while these are those of the last frame",
     "unchanged": "persons whose (β, θ, γ) are those of the last frame: they keep their garments",
 }
-"""What isn't computed where it would change nothing, or next to nothing, by name."""
+"""What is left out where it would change nothing, by name."""
 
 
 @dataclass(frozen=True)
@@ -32,13 +27,20 @@ class GarmentStats:
     n_pushed: int = 0
     """Vertices that were moved: inside, or nearer to the skin than the margin."""
     n_unresolved: int = 0
-    """Vertices still inside afterwards; only where the body touches itself."""
+    """Vertices inside the body afterwards, mostly where it touches itself: certified by their winding numbers, unless
+    the pipeline was loaded with `certify=False`; then by the distances that pushed them. 0 with `sdf="none"`."""
     max_depth: float = 0.0
     """Deepest penetration before, likewise [m]."""
     n_layered: int = 0
     """Vertices that were moved since they were under another garment, or nearer to it than the gap between garments."""
     ms: float = 0.0
     """Wall time of the stages that were run for this garment alone: backbone, layers and refu [ms]; 0 in a graph."""
+
+    @classmethod
+    def of(cls, numbers: Sequence[float], *, ms: float = 0.0) -> GarmentStats:
+        """Of `n_inside`, `n_pushed`, `n_unresolved`, `max_depth` and `n_layered`."""
+        n_inside, n_pushed, n_unresolved, max_depth, n_layered = numbers
+        return cls(int(n_inside), int(n_pushed), int(n_unresolved), max_depth, int(n_layered), ms)
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,10 @@ class FrameStats:
     """Wall time of each stage, all garments together [ms]: body, backbone, sdf (new pose), refu (distances, pushes),
     and layers where garments are worn over each other; on CUDA, where a graph makes one of them, step."""
     garments: Mapping[str, GarmentStats] = field(default_factory=dict)
+    is_certified: bool = False
+    """Whether `n_unresolved` counts every vertex inside, whatever the frame."""
+    within_promise: bool = True
+    """Whether joints and β are within the range that "nothing inside" is promised for (docs/reliability.md)."""
     skipped: Mapping[str, int] = field(default_factory=dict)
     """How much of what `SKIPS` names was left out: vertices, networks, meshes and persons."""
 
@@ -60,7 +66,7 @@ class GarmentMesh:
     local: NDArray[np.float32]
     """Vertices relative to the body's own origin, that is without the translation [m], shape (V, 3)."""
     before: Callable[[], NDArray[np.float32]]
-    """Makes `raw`: who wants a garment as it is worn has no use for it."""
+    """Makes `raw` when it is asked for."""
     faces: NDArray[np.int64]
     """Counter-clockwise from outside, shape (F, 3)."""
     transl: NDArray[np.float64]
@@ -83,7 +89,7 @@ class PipelineOutput(Mapping[str, GarmentMesh]):
 
     garments: Mapping[str, GarmentMesh]
     posed_body: Callable[[], NDArray[np.float32]]
-    """Makes `body`, where somebody wants it."""
+    """Makes `body` when it is asked for."""
     stats: FrameStats
 
     @property

@@ -2,42 +2,57 @@
 
 from __future__ import annotations
 
-import time
+import os
+import threading
+from collections import OrderedDict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING, overload
+from numbers import Real
+from types import NoneType
+from typing import TYPE_CHECKING, NoReturn, overload
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from refu_core._device import checked_device
-from refu_core.backbones import TailorNet, load_backbone
 from refu_core.body import SmplBody, load_body
-from refu_core.errors import GarmentError, RefuError
+from refu_core.errors import FrameError, GarmentError, RefuError, require_type
 from refu_core.frames import SmplFrame
 from refu_core.garments import N_STYLES, GarmentTemplate, load_garment
-from refu_core.realtime._collisions import Collisions
+from refu_core.modes import DEFAULT_MARGIN, MAX_MARGIN, SdfMode
+from refu_core.realtime._contact import ContactStage
+from refu_core.realtime._frame import FrameStep, StageClock
 from refu_core.realtime._graph import StepGraphs
-from refu_core.realtime._outfit import Outfit
-from refu_core.realtime._outputs import SDF_MODES, SKIPS, FrameStats, GarmentMesh, GarmentStats, PipelineOutput
-from refu_core.realtime._step import Step
-from refu_core.realtime._turn import RootTurn
-from refu_core.realtime._wearable import Dressed, Figures, Wearable
-from refu_core.repulsion import DEFAULT_MARGIN, read_refu
+from refu_core.realtime._outputs import SKIPS, FrameStats, GarmentMesh, GarmentStats, PipelineOutput
+from refu_core.realtime._promise import within_promise
+from refu_core.realtime._wearer import Outfit, Wearable, Wearer
+from refu_core.refu import load_trained
 from refu_core.sdf import require_outward
-from refu_core.weights import shipped_weights
+from refu_core.weights import weights_folder
 
 if TYPE_CHECKING:
     from os import PathLike
 
     from numpy.typing import ArrayLike, NDArray
 
+    from refu_core.realtime._frame import Person
+
+_MOST_WEARERS = 64
+"""Persons whose (β, γ) are remembered, those seen last; each takes about half a megabyte a garment."""
+
+
+_ON_GPU = threading.Lock()
+"""Shared by all pipelines on a GPU: the stream that Warp works on is the device's, not the thread's."""
+
 
 class GarmentPipeline:
-    """Predicts garments on SMPL bodies, frame by frame, and pushes them out of the body (paper, Fig. "pipeline").
+    """Predicts garments on SMPL bodies, frame by frame, and brings them off the body (paper, Sec. 3).
+
+    Any thread may call a pipeline, set its `margin`, and read what it has returned; calls wait for each other. For
+    frames at the same time, load a pipeline for each thread. Load one in each process, after the fork: it can't be
+    pickled.
 
     Example:
         >>> pipeline = GarmentPipeline.load(["tshirt-male"])
@@ -48,27 +63,33 @@ class GarmentPipeline:
 
     def __init__(
         self,
-        body: SmplBody,
-        wearables: Mapping[str, Wearable],
+        outfit: Outfit,
+        contact: ContactStage | None,
         *,
-        collisions: Collisions | None,
-        outfit: Outfit | None,
         margin: float | None,
         style: Tensor | None,
         no_skip: Collection[str] = (),
         graph: bool = True,
     ) -> None:
-        self.body = body
+        self.outfit = outfit
+        """The body model, the garments and their networks."""
         self._margin = margin
-        self._wearables = wearables
         self._style = style
-        self._collisions = collisions
-        self._outfit = outfit
         self._skips = frozenset(SKIPS) - frozenset(no_skip)
-        self._step = Step(body, wearables, collisions=collisions, outfit=outfit)
-        self._graphs = StepGraphs(self._step, body.device) if graph and body.device.type == "cuda" else None
-        self._figures: Figures | None = None
+        self._step = FrameStep(outfit, contact)
+        on_gpu = outfit.body.device.type == "cuda"
+        self._graphs = StepGraphs(self._step.packed, outfit.body.device) if graph and on_gpu else None
+        self._is_certified = contact is not None and contact.winding is not None
+        self._lock = _ON_GPU if on_gpu else threading.Lock()
+        self._faces = {name: one.template.faces.cpu().numpy() for name, one in outfit.wearables.items()}
+        self._wearers: OrderedDict[bytes, Wearer] = OrderedDict()
+        self._batch: tuple[tuple[Wearer, ...], Wearer] | None = None
         self._last: dict[bytes, PipelineOutput] = {}
+
+    @property
+    def body(self) -> SmplBody:
+        """The body model that the garments are worn on."""
+        return self.outfit.body
 
     @property
     def margin(self) -> float | None:
@@ -77,13 +98,20 @@ class GarmentPipeline:
 
     @margin.setter
     def margin(self, margin: float | None) -> None:
-        self._margin = margin
-        self._last = {}  # what nobody moved for is not what it would be now
+        _check_margin(margin)
+        with self._lock:
+            self._margin = margin
+            self._last = {}  # what nobody moved for is not what it would be now
+
+    def __reduce__(self) -> NoReturn:
+        """Raises `RefuError`: memory that kernels work in can't be taken elsewhere."""
+        msg = "a pipeline can't be pickled or copied: load one in each process, or call one from all threads"
+        raise RefuError(msg)
 
     @classmethod
     def load(
         cls,
-        garments: Sequence[str],
+        garments: Sequence[str | PathLike[str] | GarmentTemplate],
         *,
         sdf: str = "hybrid",
         backbone: str = "tailornet",
@@ -93,11 +121,12 @@ class GarmentPipeline:
         device: str = "cpu",
         no_skip: Collection[str] = (),
         graph: bool = True,
+        certify: bool = True,
     ) -> GarmentPipeline:
         """Loads garments and what they need.
 
         Args:
-            garments: names of built-in garments of one body.
+            garments: of one body: names of built-in ones, paths of garment files, or templates.
             sdf: `hybrid`, `approx`, `accurate` or `none`.
             backbone: `tailornet`, `mlp`, `gcnn`, or `skinned`, which needs no weights.
             style: γ of all garments, shape (4,); the mean style if not given.
@@ -106,77 +135,63 @@ class GarmentPipeline:
             device: torch device, `cpu` or `cuda`.
             no_skip: names of `SKIPS` that are computed nevertheless, to see what skipping them is worth.
             graph: on CUDA, capture the whole of a frame as a CUDA graph; without, it is launched stage by stage.
+            certify: count what is still inside (`n_unresolved`) by winding numbers, which nothing escapes, for an
+                eighth of a frame's time; without, by the distances that pushed it, which may be wrong.
 
         Raises:
             GarmentError: no garment, an unknown one, garments of two bodies, or a bad style.
             WeightsError: no such backbone, or no weights of it for a garment, a mode, and the garment's body.
             RefuError: an unknown mode, margin, device or skip.
         """
-        if isinstance(garments, str):
+        if isinstance(garments, (str, os.PathLike, GarmentTemplate)):
             garments = [garments]
+        require_type(garments, Collection, "names of garments", error=GarmentError)
         if not garments:
             msg = "no garment was asked for: name at least one"
             raise GarmentError(msg)
-        if sdf not in SDF_MODES:
-            msg = f"no sdf mode {sdf!r}: wanted {', '.join(SDF_MODES)}"
-            raise RefuError(msg)
-        if margin is not None and not 0 <= margin <= 0.05:
-            msg = f"the margin must be between 0 and 0.05 m, got {margin}"
-            raise RefuError(msg)
+        mode = SdfMode.of(sdf, "sdf mode")
+        _check_margin(margin)
         unknown = sorted({no_skip} if isinstance(no_skip, str) else set(no_skip) - set(SKIPS))
         if unknown:
             msg = f"nothing is skipped by the name {', '.join(unknown)}: wanted a collection of {', '.join(SKIPS)}"
             raise RefuError(msg)
         torch_device = checked_device(device)
-        templates = {name: load_garment(name, device=torch_device) for name in dict.fromkeys(garments)}
+        templates: dict[str, GarmentTemplate] = {}
+        for one in garments:
+            template = one if isinstance(one, GarmentTemplate) else load_garment(one)
+            templates[template.name] = template.to(device=torch_device)
         worn_by = {template.body for template in templates.values()}
         if len(worn_by) > 1:
             cut_for = ", ".join(f"{name} ({template.body})" for name, template in templates.items())
             msg = f"one person wears garments of one body: got {cut_for}"
             raise GarmentError(msg)
         body = load_body(worn_by.pop(), device=torch_device)
-        collisions = None
-        if sdf != "none":
-            is_accurate, uses_band = sdf == "accurate", "band" not in no_skip
-            collisions = Collisions(body, templates, is_accurate=is_accurate, uses_band=uses_band)
-        wearables: dict[str, Wearable] = {}
+        wearables = {}
         for name, template in templates.items():
-            folder = shipped_weights(name) if weights is None else Path(weights) / name
-            network = load_backbone(
-                backbone, template, mode=sdf, body_fingerprint=body.fingerprint, folder=folder, device=torch_device
-            )
-            if "pivots" in no_skip and isinstance(network, TailorNet):
-                network.skips_pivots = False
-            refu = None
-            if backbone != "skinned" and sdf != "none":
-                refu = read_refu(folder / f"{backbone}-{sdf}", device=torch_device)
-            wearables[name] = Wearable(
+            network, refu = load_trained(
+                backbone,
                 template,
-                network,
-                refu,
-                template.faces.cpu().numpy(),
-                DEFAULT_MARGIN if refu is None else float(refu.margin),
+                mode=mode,
+                body_fingerprint=body.fingerprint,
+                folder=weights_folder(name, weights),
+                device=torch_device,
             )
+            kept = DEFAULT_MARGIN if refu is None else float(refu.margin)
+            wearables[name] = Wearable(template, network, refu, kept)
+        outfit = Outfit(body, wearables)
         gamma = None if style is None else _style(style, torch_device)
         if gamma is not None:
             for template in templates.values():
                 template.rest(gamma.new_zeros(1, 10), gamma)  # says now, not in the first frame, if it has no styles
-        outfit = Outfit(templates) if collisions is not None and len(templates) > 1 else None
-        return cls(
-            body,
-            wearables,
-            collisions=collisions,
-            outfit=outfit,
-            margin=margin,
-            style=gamma,
-            no_skip=no_skip,
-            graph=graph,
-        )
+        contact = None
+        if mode is not SdfMode.NONE:
+            contact = ContactStage(outfit, sdf=mode, uses_band="band" not in no_skip, certify=certify)
+        return cls(outfit, contact, margin=margin, style=gamma, no_skip=no_skip, graph=graph)
 
     @property
     def garments(self) -> dict[str, GarmentTemplate]:
         """The loaded garments by name."""
-        return {name: wearable.template for name, wearable in self._wearables.items()}
+        return {name: wearable.template for name, wearable in self.outfit.wearables.items()}
 
     @overload
     def __call__(self, frames: SmplFrame) -> PipelineOutput: ...
@@ -189,10 +204,18 @@ class GarmentPipeline:
         """Dresses one person, or a batch of persons (one frame each).
 
         A person whose (β, θ, γ) are among those of the last call gets the arrays of that call: copy them to write in.
+
+        Raises:
+            FrameError: what was given isn't a frame, or holds something else.
         """
-        if isinstance(frames, SmplFrame):
-            return self._dress_all([frames])[0]
-        return self._dress_all(frames)
+        if not isinstance(frames, SmplFrame):
+            require_type(frames, Sequence, "a SmplFrame or a sequence of them", error=FrameError)
+            for one in frames:
+                require_type(one, SmplFrame, "a SmplFrame in every place of the sequence", error=FrameError)
+        with self._lock:
+            if isinstance(frames, SmplFrame):
+                return self._dress_all([frames])[0]
+            return self._dress_all(frames)
 
     def _dress_all(self, frames: Sequence[SmplFrame]) -> list[PipelineOutput]:
         keys = [_key(frame) for frame in frames]
@@ -208,134 +231,99 @@ class GarmentPipeline:
         ]
 
     def _run(self, frames: Sequence[SmplFrame]) -> list[PipelineOutput]:
+        clocks = [StageClock() for _ in frames]
+        found = [self._wearer(frame) for frame in frames]
+        wearer = self._together(tuple(wearer for wearer, _ in found))
+        pose = torch.as_tensor(np.stack([f.pose for f in frames]))
+        margins = tuple(one.margin if self.margin is None else self.margin for one in self.outfit.wearables.values())
         if self._graphs is not None:
-            return self._replay(frames, self._graphs)
-        clock = _StageClock()
-        figures, skipped = self._figures_of(frames)
-        pose = torch.as_tensor(np.stack([f.pose for f in frames]), device=self.body.device)
-        turns, at_root = RootTurn.taken_off(pose, figures.body.joints)
-        posed = self.body.posed(at_root, figures.body)
-        stages = {"body": clock.lap() / len(frames)}
-        dressed: dict[str, tuple[Dressed, float]] = {}
-        for name, wearable in self._wearables.items():
-            worn = wearable.dress(pose, figures, posed.transforms, self._collisions)
-            dressed[name] = worn, clock.lap() / len(frames)
-            if isinstance(wearable.backbone, TailorNet):
-                skipped["pivots"] = skipped.get("pivots", 0) + wearable.backbone.n_skipped
-        stages["backbone"] = sum(ms for _, ms in dressed.values())
+            packed = self._graphs({"pose": pose, **wearer.tensors()}, margins)
+            outputs = [
+                self._unpacked(frame, parts) for frame, parts in zip(frames, self._step.unpacked(packed), strict=True)
+            ]
+            clocks[0].lap("step")
+            took = {"step": clocks[0].stages["step"] / len(frames)}
+            return [replace(one, stats=replace(one.stats, stage_ms=took)) for one in outputs]
+        persons = self._step(pose.to(self.body.device), wearer, margins, clocks)
         return [
-            self._handle_collisions(i, frame, posed.vertices[i], turns[i], dressed, stages, skipped)
-            for i, frame in enumerate(frames)
+            self._output(frame, person, clock, skipped)
+            for frame, person, clock, (_, skipped) in zip(frames, persons, clocks, found, strict=True)
         ]
 
-    def _replay(self, frames: Sequence[SmplFrame], graphs: StepGraphs) -> list[PipelineOutput]:
-        clock = _StageClock()
-        figures, skipped = self._figures_of(frames)
-        pose = torch.as_tensor(np.stack([f.pose for f in frames]))
-        margins = tuple(one.margin if self.margin is None else self.margin for one in self._wearables.values())
-        packed = graphs(self._step.inputs(pose, figures), margins)
-        outputs = []
-        for frame, (body, worn) in zip(frames, self._step.unpacked(packed), strict=True):
-            meshes = {
-                name: GarmentMesh(one.local, partial(_itself, one.raw), self._wearables[name].faces, frame.transl)
-                for name, one in worn.items()
-            }
-            counts = {name: one.counts for name, one in worn.items()}
-            outputs.append(PipelineOutput(meshes, partial(_itself, body), FrameStats({}, counts, skipped)))
-        took = {"step": clock.lap() / len(frames)}
-        return [replace(output, stats=replace(output.stats, stage_ms=took)) for output in outputs]
+    def _wearer(self, frame: SmplFrame) -> tuple[Wearer, dict[str, int]]:
+        """What depends on the person's (β, γ), and how much of it was known."""
+        key = _key(frame, of_pose=False)
+        known = self._wearers.pop(key, None) if "rest" in self._skips else None
+        if known is not None:
+            self._wearers[key] = known
+            return known, {"rest": 1 + len(self.outfit.wearables)}
+        betas = torch.tensor(frame.betas, device=self.body.device)[None]
+        style = self._style if frame.style is None else torch.tensor(frame.style, device=self.body.device)[None]
+        wearer = Wearer.of(self.outfit, betas, style)
+        if self._step.contact is not None:  # of a body that its β turn inside out, every vertex would be inside
+            require_outward(wearer.shape.vertices, self.body.faces)
+        while len(self._wearers) >= _MOST_WEARERS:
+            self._wearers.popitem(last=False)
+        self._wearers[key] = wearer
+        return wearer, {}
 
-    def _figures_of(self, frames: Sequence[SmplFrame]) -> tuple[Figures, dict[str, int]]:
-        """The bodies and garments of the persons' (β, γ), and what of that was known from the last frame."""
-        key = b"".join(_key(frame, of_pose=False) for frame in frames)
-        if self._figures is not None and self._figures.key == key and "rest" in self._skips:
-            return self._figures, {"rest": 1 + len(self._wearables)}
-        betas = torch.as_tensor(np.stack([f.betas for f in frames]), device=self.body.device)
-        style = self._styles(frames)
-        mean = betas.new_zeros(1, betas.shape[1])
-        templates = self.garments.items()
-        shape = self.body.shape(betas)
-        if self._collisions is not None:  # of a body that its β turn inside out, every vertex would be inside
-            require_outward(shape.vertices, self.body.faces)
-        self._figures = Figures(
-            key,
-            betas,
-            style,
-            shape,
-            {name: template.rest(betas, style) for name, template in templates},
-            {name: template.rest(mean, style) for name, template in templates},
-        )
-        return self._figures, {}
+    def _together(self, wearers: tuple[Wearer, ...]) -> Wearer:
+        """One wearer of all; that of the last call for the same persons."""
+        if self._batch is None or self._batch[0] != wearers:
+            self._batch = wearers, Wearer.together(wearers)
+        return self._batch[1]
 
-    def _styles(self, frames: Sequence[SmplFrame]) -> Tensor | None:
-        """γ of each frame, shape (B, 4): its own, else the pipeline's; None where nobody gave any."""
-        if self._style is None and all(frame.style is None for frame in frames):
-            return None
-        usual = np.zeros(N_STYLES, np.float32) if self._style is None else self._style[0].cpu().numpy()
-        own = [usual if frame.style is None else frame.style for frame in frames]
-        return torch.as_tensor(np.stack(own), device=self.body.device)
+    def _output(self, frame: SmplFrame, person: Person, clock: StageClock, skipped: dict[str, int]) -> PipelineOutput:
+        meshes, stats, n_clipped = {}, {}, 0
+        for name in self.outfit.wearables:
+            worn = person.garments[name]
+            meshes[name] = GarmentMesh(
+                person.turn.to_host(worn.vertices), person.turn.later(worn.raw), self._faces[name], frame.transl
+            )
+            stats[name] = GarmentStats.of(worn.numbers.tolist(), ms=clock.garments[name])
+            n_clipped += int(worn.n_clipped)
+        took = self._stats(frame, clock.stages, stats, {**skipped, "band": n_clipped})
+        return PipelineOutput(meshes, person.turn.later(person.body), took)
 
-    def _handle_collisions(
+    def _unpacked(self, frame: SmplFrame, parts: list[NDArray[np.float32]]) -> PipelineOutput:
+        body, *rest = parts
+        meshes, stats = {}, {}
+        for i, name in enumerate(self.outfit.wearables):
+            vertices, raw, numbers = rest[3 * i : 3 * i + 3]
+            meshes[name] = GarmentMesh(vertices, partial(_itself, raw), self._faces[name], frame.transl)
+            stats[name] = GarmentStats.of(numbers.tolist())
+        return PipelineOutput(meshes, partial(_itself, body), self._stats(frame, {}, stats, {}))
+
+    def _stats(
         self,
-        person: int,
         frame: SmplFrame,
-        body: Tensor,
-        turn: RootTurn,
-        dressed: Mapping[str, tuple[Dressed, float]],
-        stages: Mapping[str, float],
+        stage_ms: Mapping[str, float],
+        garments: Mapping[str, GarmentStats],
         skipped: Mapping[str, int],
-    ) -> PipelineOutput:
-        clock = _StageClock()
-        if self._collisions is not None:
-            self._collisions.update(body)
-        sdf_ms = clock.lap()
-        meshes: dict[str, GarmentMesh] = {}
-        stats: dict[str, GarmentStats] = {}
-        worn: dict[str, Tensor] = {}
-        layers_ms = refu_ms = 0.0
-        n_clipped = 0
-        # From the skin outwards. A garment is brought off those below it first: the body has the last word.
-        for name in self._wearables if self._outfit is None else self._outfit.order:
-            wearable, (one, dress_ms), counts, n_layered = self._wearables[name], dressed[name], GarmentStats(), 0
-            raw = vertices = one.posed[person]
-            if self._outfit is not None:
-                vertices, n_layered = self._outfit.lift(name, vertices, worn)
-            own_layers_ms = clock.lap()
-            if self._collisions is not None:
-                done, n_unasked = self._collisions.resolve(
-                    name,
-                    vertices,
-                    margin=wearable.margin if self.margin is None else self.margin,
-                    scale=one.scale[person],
-                    near=None if one.near is None else one.near[person],
-                )
-                n_clipped += n_unasked
-                vertices = done.vertices
-                counts = GarmentStats(done.n_inside, done.n_pushed, done.n_unresolved, done.max_depth, n_layered)
-            worn[name] = vertices
-            meshes[name] = GarmentMesh(turn.to_host(vertices), turn.later(raw), wearable.faces, frame.transl)
-            own_ms = clock.lap()
-            layers_ms, refu_ms = layers_ms + own_layers_ms, refu_ms + own_ms
-            stats[name] = replace(counts, ms=dress_ms + own_layers_ms + own_ms)
-        stage_ms = {**stages, "sdf": sdf_ms, **({} if self._outfit is None else {"layers": layers_ms}), "refu": refu_ms}
-        in_order = {name: meshes[name] for name in self._wearables}
-        counts_in_order = {name: stats[name] for name in in_order}
-        took = FrameStats(stage_ms, counts_in_order, {**skipped, "band": n_clipped})
-        return PipelineOutput(in_order, turn.later(body), took)
+    ) -> FrameStats:
+        return FrameStats(stage_ms, garments, self._is_certified, within_promise(frame), skipped)
 
 
 def _key(frame: SmplFrame, *, of_pose: bool = True) -> bytes:
-    """Tells apart what is different of two persons but where they are."""
+    """Equal for two persons who differ in their place alone."""
     style = b"" if frame.style is None else b"s" + frame.style.tobytes()
     return frame.betas.tobytes() + (frame.pose.tobytes() if of_pose else b"") + style
 
 
 def _moved(output: PipelineOutput, frame: SmplFrame) -> PipelineOutput:
-    """What a person wore in the last frame, where it is now: the same arrays."""
+    """The same arrays for a person who has moved without changing pose."""
     garments = {name: replace(mesh, transl=frame.transl) for name, mesh in output.items()}
     counts = {name: replace(one, ms=0.0) for name, one in output.stats.garments.items()}
-    took = FrameStats(dict.fromkeys(output.stats.stage_ms, 0.0), counts, {"unchanged": 1})
+    stage_ms = dict.fromkeys(output.stats.stage_ms, 0.0)
+    took = replace(output.stats, stage_ms=stage_ms, garments=counts, skipped={"unchanged": 1})
     return PipelineOutput(garments, output.posed_body, took)
+
+
+def _check_margin(margin: float | None) -> None:
+    require_type(margin, (Real, NoneType), "a margin in metres, or None")
+    if margin is not None and not 0 <= margin <= MAX_MARGIN:
+        msg = f"the margin must be between 0 and {MAX_MARGIN} m, got {margin}"
+        raise RefuError(msg)
 
 
 def _itself(array: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -343,21 +331,12 @@ def _itself(array: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _style(value: ArrayLike, device: torch.device) -> Tensor:
-    style = np.asarray(value, dtype=np.float32)
+    try:
+        style = np.asarray(value, dtype=np.float32)
+    except (TypeError, ValueError) as error:
+        msg = f"style must be {N_STYLES} finite numbers, got {value!r}"
+        raise GarmentError(msg) from error
     if style.shape != (N_STYLES,) or not np.isfinite(style).all():
         msg = f"style must be {N_STYLES} finite numbers, got {np.array2string(style, threshold=8)}"
         raise GarmentError(msg)
     return torch.as_tensor(style, device=device)[None]
-
-
-class _StageClock:
-    """Wall time between laps."""
-
-    def __init__(self) -> None:
-        self._last = time.perf_counter()
-
-    def lap(self) -> float:
-        """Milliseconds since the last lap."""
-        now = time.perf_counter()
-        ms, self._last = 1e3 * (now - self._last), now
-        return ms

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 class RootTurn:
     """Turns one person about their root.
 
-    A person is dressed as the root sees them: grids, tables and thresholds are then the same whichever way the person
-    faces or lies. In world axes the approximate distance looks up other guides after a turn, and rounding decides anew
-    on which side of a threshold a vertex is: millimetres at a fold, and centimetres where limbs run into each other.
+    A person is dressed as the root sees them, so grids, tables and thresholds are the same whichever way the person
+    faces or lies. In world axes a turn would move vertices by millimetres at a fold, and by centimetres where limbs run
+    into each other: the approximate distance would look up other guides, and rounding would decide thresholds anew.
     """
 
     rotation: Tensor
@@ -45,7 +45,7 @@ class RootTurn:
         return [RootTurn(*turn) for turn in zip(rotations, shifts, strict=True)], at_root
 
     def __call__(self, points: Tensor) -> Tensor:
-        """Points [m], shape (N, 3), as the world sees them, of those that the root sees."""
+        """Points [m], shape (N, 3), from the root's axes to the world's."""
         return torch.addmm(self.shift, points, self.rotation.T)
 
     def to_host(self, points: Tensor) -> NDArray[np.float32]:
@@ -54,5 +54,5 @@ class RootTurn:
         return seen
 
     def later(self, points: Tensor) -> Callable[[], NDArray[np.float32]]:
-        """`to_host` of points that nobody will write to, when it is first asked for."""
+        """`to_host`, computed when it is first asked for; the points must not be written to."""
         return functools.cache(functools.partial(self.to_host, points))

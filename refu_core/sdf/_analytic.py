@@ -1,4 +1,4 @@
-"""Signed distance to a known face, edge or vertex, in torch: its and its gradient's exact first derivatives."""
+"""Signed distance to a known face, edge or vertex, in torch, with exact first derivatives of it and its gradient."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from refu_core.sdf._kernels import EDGE, ON_SURFACE, VERTEX
+from refu_core.sdf._closest_kernels import EDGE, ON_SURFACE, VERTEX
 from refu_core.sdf._protocol import SdfSample
 
 

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 import warp as wp
 from numpy.typing import NDArray
@@ -15,11 +12,17 @@ from torch import Tensor
 
 from refu_core._warp import as_warp
 from refu_core.errors import MeshError
+from refu_core.mesh import Adjacency
 from refu_core.sdf._box_tree import BoxTree
+from refu_core.sdf._exact import ExactSdf
 from refu_core.sdf._mesh import Found, MeshSdf, Recorded
-from refu_core.sdf._protocol import SdfSample
+from refu_core.sdf._protocol import GarmentSdf, SdfSample
+from refu_core.sdf._query_kernels import query_skin_kernel
 from refu_core.sdf._scan import Scan
-from refu_core.sdf._skin import ask_kernel
+
+if TYPE_CHECKING:
+    from refu_core.body import SmplBody
+    from refu_core.garments import GarmentTemplate
 
 BAND = 0.008
 """Width of the band on either side of the skin [m]. It must hold the margin that is kept; and a garment's edges must be
@@ -28,54 +31,38 @@ _FEW = 200
 """Fewer points than this are cheaper in a tree than in cells, which all faces of the body have to look through."""
 
 
-@dataclass(frozen=True, eq=False)
 class Links:
-    """The edges of a garment, by vertex."""
+    """The edges of a garment as the kernels of the band read them."""
 
-    start: Tensor
-    """The neighbours of vertex v are `linked[start[v]:start[v + 1]]`; int32, shape (N + 1,)."""
-    linked: Tensor
-    """Int32, shape (2 E,)."""
-
-    @staticmethod
-    def of(edges: Tensor, n_vertices: int) -> Links:
-        """From the edges of a garment of `n_vertices`, each once, integers of shape (E, 2)."""
-        both = torch.cat((edges, edges.flip(1))).cpu().numpy()
-        order = np.argsort(both[:, 0], kind="stable")
-        linked = both[order, 1].astype(np.int32)
-        start = np.searchsorted(both[order, 0], np.arange(n_vertices + 1)).astype(np.int32)
-        return Links(torch.from_numpy(start), torch.from_numpy(linked))
-
-    @cached_property
-    def arrays(self) -> list[Any]:
-        """The same as kernels take them."""
-        return [as_warp(tensor, wp.int32) for tensor in (self.start, self.linked)]
+    def __init__(self, ring: Adjacency) -> None:
+        """From the neighbours of each vertex (`Connectivity.ring`)."""
+        self.n_vertices = len(ring.start) - 1
+        self.arrays = [as_warp(torch.from_numpy(array), wp.int32) for array in ring]
 
 
 class BandSdf(MeshSdf):
-    """The exact signed distance, for garments on one CPU core: what lies farther off the skin than a band isn't asked.
+    """The exact signed distance for garments on one CPU core; beyond a band around the skin only the side is computed.
 
-    Of a garment that is worn, one vertex in ten is near the skin, and a tree must be walked down for each one to know
-    which. Here the vertices are put into the cells of a grid, and the faces of the body, whose boxes cover few of them,
-    look for vertices to be closest to: that is exact for every vertex within the band of any face.
+    One vertex in ten of a worn garment is near the skin, but a tree has to be walked down for each vertex to know
+    which. Here the vertices are put into the cells of a grid, and the faces of the body look for the vertices in the
+    few cells that their boxes cover. That is exact for every vertex within the band of any face.
 
-    The rest is farther away, on either side. Which one, the garment's edges say: where an edge is shorter than the sum
-    of its ends' distances to the skin, no skin lies between them. So the side spreads from the vertices in the band,
-    where it is known, to all that such edges reach. A vertex that may be inside, because one inside reaches it, or
-    that is reached from nowhere, is asked in the tree like any other point. So no vertex inside is ever taken for one
-    outside, in whatever pose and after whatever jump: nothing is carried over from the last frame.
+    The other vertices are farther away, on one side or the other. The garment's edges say which: where an edge is
+    shorter than the sum of its ends' distances, no skin lies between them. So the side spreads from the band, where it
+    is known, along such edges. A vertex that may be inside, or that no edge reaches, is asked in the tree. So no vertex
+    inside is ever taken for one outside, whatever the pose: nothing is carried over from the last frame.
 
-    Where the body runs into itself "inside" is the pseudo-normal's word, as for `ExactSdf`, and not continuous: a
-    vertex deep in one thigh may be reached from the skin of the other, which is buried there, and outside of that. What
-    is reached from both sides is asked; and so are pieces of fewer than some hundred vertices, since what the skin of a
-    limb shuts in is one, while what a worn garment has outside hangs together.
+    Where the body runs into itself, "inside" is what the pseudo-normal says, as for `ExactSdf`, and not continuous. A
+    vertex deep in one thigh may be outside of the other's skin, which is buried there, and be reached from it. So what
+    is reached from both sides is asked in the tree, and so are pieces of fewer than some hundred vertices: what a limb
+    encloses is small, and the outside of a worn garment hangs together.
     """
 
     def __init__(self, faces: Tensor | NDArray[Any], *, band: float = BAND, rest: Tensor | None = None) -> None:
         """For bodies of these `faces`, shape (F, 3), counter-clockwise seen from outside; `band` in metres.
 
         `rest` are vertices [m], shape (V, 3), of a pose with the limbs apart. It is a matter of speed: a tree built for
-        it groups no two limbs, and fits whatever pose comes better than one that is built for the first that does.
+        such a pose groups no two limbs, and so fits all later poses better.
 
         Raises `MeshError` when the faces aren't a closed, consistently oriented surface, or the band isn't positive.
         """
@@ -102,8 +89,8 @@ class BandSdf(MeshSdf):
         where = self._checked(points)
         if not len(where):
             return SdfSample(where[:, 0], where, torch.empty(0, dtype=torch.int32))
-        if len(links.start) != len(where) + 1:
-            msg = f"the links are of {len(links.start) - 1} vertices, got {len(where)}"
+        if links.n_vertices != len(where):
+            msg = f"the links are of {links.n_vertices} vertices, got {len(where)}"
             raise MeshError(msg)
         scan = self._scan_of_pose()
         found = scan.near(where, beyond=self.band)
@@ -122,6 +109,15 @@ class BandSdf(MeshSdf):
             # Farther out than the band a distance is clipped where it happens to be known, too.
             found.distance.clamp_(max=self.band)
         return found.sample()
+
+    def of_garment(self, garment: GarmentTemplate) -> GarmentSdf:
+        """As `BodySdf.of_garment`; distances beyond the band are computed only where `reach` asks for them."""
+        links = Links(garment.mesh.ring)
+
+        def ask(vertices: Tensor, *, on_mean: Tensor, reach: float = math.inf) -> SdfSample:  # noqa: ARG001
+            return self.clipped(vertices, links) if reach <= self.band else self.query(vertices)
+
+        return ask
 
     def skin(self) -> Any:
         """As `MeshSdf.skin`."""
@@ -142,7 +138,7 @@ class BandSdf(MeshSdf):
         if near is not None or len(points) < _FEW:
             skin = self.skin()
             if self._few is None:
-                self._few = Recorded(ask_kernel, lambda points, near: [skin, points, near, self._none])
+                self._few = Recorded(query_skin_kernel, lambda points, near: [skin, points, near, self._none])
             return self._few.ask(points, near)
         scan = self._scan_of_pose()
         found = scan.near(points, beyond=math.inf)
@@ -157,18 +153,28 @@ class BandSdf(MeshSdf):
         if self._tree is None:
             self._tree = BoxTree(self.faces, points)
         if not self._tree_is_posed:
-            self._tree.fit(self._points_wp)
+            self._tree.fit(self._posed.points)
             self._tree_is_posed = True
         return self._tree
 
     def _scan_of_pose(self) -> Scan:
         if self._scan is None:
-            body = [self._points_wp, self._faces, *self._topology]
-            self._scan = Scan(body, len(self.faces), self.band, self._record)
+            self._scan = Scan(self._posed, len(self.faces), self.band, self._record)
         return self._scan
 
     def _record(self, points: Any, rows: Any, answers: Found) -> Any:
-        """A launch to be repeated, of those of the points that are in rows; the answers' faces before count as near."""
+        """A recorded launch that asks for the points in `rows`; the faces that `answers` has already are hints."""
         outputs = answers.as_warp()
         inputs = [self.skin(), points, outputs[0], rows]
-        return wp.launch(ask_kernel, len(rows), inputs, outputs, device="cpu", record_cmd=True)
+        return wp.launch(query_skin_kernel, len(rows), inputs, outputs, device="cpu", record_cmd=True)
+
+
+def exact_sdf(body: SmplBody, *, uses_band: bool = True) -> BandSdf | ExactSdf:
+    """The exact signed distance to posed bodies of a model, the fastest for garments on its device.
+
+    On a CPU that is `BandSdf`, unless `uses_band` is false. A GPU walks the tree faster than it sorts out what needn't
+    be asked.
+    """
+    if body.device.type == "cpu" and uses_band:
+        return BandSdf(body.faces, rest=body.v_template)
+    return ExactSdf(body.faces, device=body.device)

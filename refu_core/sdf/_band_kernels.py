@@ -1,6 +1,3 @@
-# mypy: ignore-errors
-# ruff: noqa: RUF046, UP018  (to Warp, int(0) is a variable and 0 a constant)
-# (Warp reads a kernel's annotations as array types of its own; a type checker can't.)
 """Closest faces within a band of the skin: the points lie in cells, the faces look for them there. For one CPU core.
 
 Cells are those of a grid that repeats itself after 128 × 64 × 64 of them, so that no place is outside of it and
@@ -11,7 +8,7 @@ at a time, and the points lie sorted by row and cell, so that what a face sees o
 
 import warp as wp
 
-from refu_core.sdf._kernels import closest_on_triangle, measured_to
+from refu_core.sdf._closest_kernels import PosedMesh, closest_on_triangle, measured_to
 
 wp.set_module_options({"enable_backward": False})
 
@@ -34,14 +31,14 @@ _MOST_CELLS = wp.constant(1.0e9)  # farther from the origin a cell's number woul
 
 
 @wp.func
-def cell_number(x: float, per_metre: float):
+def cell_number(x: float, per_metre: float) -> int:
     cell = x * per_metre
     cell = wp.where(cell < _MOST_CELLS, cell, _MOST_CELLS)
     return int(wp.floor(wp.where(cell > -_MOST_CELLS, cell, -_MOST_CELLS)))
 
 
 @wp.func
-def lesser(p: wp.vec3, q: wp.vec3):
+def lesser(p: wp.vec3, q: wp.vec3) -> wp.vec3:
     """By coordinate, of numbers: wp.min would look for NaN."""
     return wp.vec3(
         wp.where(q[0] < p[0], q[0], p[0]), wp.where(q[1] < p[1], q[1], p[1]), wp.where(q[2] < p[2], q[2], p[2])
@@ -49,19 +46,19 @@ def lesser(p: wp.vec3, q: wp.vec3):
 
 
 @wp.func
-def greater(p: wp.vec3, q: wp.vec3):
+def greater(p: wp.vec3, q: wp.vec3) -> wp.vec3:
     return wp.vec3(
         wp.where(q[0] > p[0], q[0], p[0]), wp.where(q[1] > p[1], q[1], p[1]), wp.where(q[2] > p[2], q[2], p[2])
     )
 
 
 @wp.func
-def row_of(i: int, j: int):
+def row_of(i: int, j: int) -> int:
     return (i & _LAST_X) * ROWS_Z + (j & _LAST_Z)
 
 
 @wp.func
-def row_mask(first: int, last: int):
+def row_mask(first: int, last: int) -> wp.uint64:
     """The bits of cells `first` to `last` in a row that repeats itself."""
     if last - first >= _LAST:
         return ~wp.uint64(0)
@@ -72,30 +69,33 @@ def row_mask(first: int, last: int):
     return (bits << shift) | (bits >> (wp.uint64(ROW) - shift))
 
 
-@wp.kernel
-def sort_kernel(
-    points: wp.array(dtype=wp.vec3),
-    sizes: wp.array(dtype=int),
-    limit: float,
-    per_metre: float,
-    # what the last call left, to be replaced
-    number_of_row: wp.array(dtype=int),
-    rows: wp.array(dtype=int),
-    occupied: wp.array(dtype=wp.uint64),
-    start: wp.array2d(dtype=int),
-    # outputs
-    slot: wp.array(dtype=int),
-    sorted_points: wp.array(dtype=wp.vec3),
-    squared: wp.array(dtype=float),
-    face: wp.array(dtype=int),
-    extent: wp.array(dtype=wp.vec3),
-):
-    """Sorts the first `sizes[0]` points into cells; `extent` becomes their bounds, `sizes[1]` the number of rows.
+@wp.struct
+class Cells:
+    """Points in the cells of the grid, and what is closest to each so far."""
 
-    Cell k of the row numbered r holds the sorted points `start[r, k]` to `start[r, k + 1]`, point q lies at `slot[q]`.
-    """
+    limit: wp.float32
+    """Distance [m] beyond which no face is close."""
+    per_metre: wp.float32
+    number_of_row: wp.array[wp.int32]
+    rows: wp.array[wp.int32]
+    occupied: wp.array[wp.uint64]
+    start: wp.array2d[wp.int32]
+    """Cell k of the row numbered r holds the sorted points `start[r, k]` to `start[r, k + 1]`."""
+    extent: wp.array[wp.vec3]
+    """Least and greatest coordinates of the points."""
+    slot: wp.array[wp.int32]
+    """Where point q lies among those sorted."""
+    points: wp.array[wp.vec3]
+    squared: wp.array[wp.float32]
+    face: wp.array[wp.int32]
+    """Sorted points, the squared distance of the closest face, and that face, or -1."""
+
+
+@wp.kernel
+def sort_kernel(points: wp.array[wp.vec3], sizes: wp.array[int], cells: Cells) -> None:
+    """Sorts the first `sizes[0]` points into cells, in place of the last; `sizes[1]` becomes the number of rows."""
     for r in range(sizes[1]):
-        number_of_row[rows[r]] = -1
+        cells.number_of_row[cells.rows[r]] = -1
     n = sizes[0]
     n_rows = int(0)
     low = points[0]
@@ -104,42 +104,42 @@ def sort_kernel(
         p = points[q]
         low = lesser(low, p)
         high = greater(high, p)
-        row = row_of(cell_number(p[0], per_metre), cell_number(p[2], per_metre))
-        r = number_of_row[row]
+        row = row_of(cell_number(p[0], cells.per_metre), cell_number(p[2], cells.per_metre))
+        r = cells.number_of_row[row]
         if r < 0:
             r = n_rows
             n_rows += 1
-            number_of_row[row] = r
-            rows[r] = row
-            occupied[r] = wp.uint64(0)
+            cells.number_of_row[row] = r
+            cells.rows[r] = row
+            cells.occupied[r] = wp.uint64(0)
             for k in range(ROW + 2):
-                start[r, k] = 0
-        cell = cell_number(p[1], per_metre) & _LAST
-        occupied[r] = occupied[r] | (wp.uint64(1) << wp.uint64(cell))
-        start[r, cell + 2] = start[r, cell + 2] + 1
-        slot[q] = r * ROW + cell
+                cells.start[r, k] = 0
+        cell = cell_number(p[1], cells.per_metre) & _LAST
+        cells.occupied[r] = cells.occupied[r] | (wp.uint64(1) << wp.uint64(cell))
+        cells.start[r, cell + 2] = cells.start[r, cell + 2] + 1
+        cells.slot[q] = r * ROW + cell
     sizes[1] = n_rows
     before = int(0)
     for r in range(n_rows):
         for k in range(ROW + 2):
-            before += start[r, k]
-            start[r, k] = before
+            before += cells.start[r, k]
+            cells.start[r, k] = before
     # Now cell k begins at start[r, k + 1], which is counted up to where it ends, and so to where cell k + 1 begins.
     for q in range(n):
-        r = slot[q] / ROW
-        cell = slot[q] & _LAST
-        s = start[r, cell + 1]
-        start[r, cell + 1] = s + 1
-        slot[q] = s
-        sorted_points[s] = points[q]
-        squared[s] = limit * limit
-        face[s] = -1
-    extent[0] = low
-    extent[1] = high
+        r = cells.slot[q] // ROW
+        cell = cells.slot[q] & _LAST
+        s = cells.start[r, cell + 1]
+        cells.start[r, cell + 1] = s + 1
+        cells.slot[q] = s
+        cells.points[s] = points[q]
+        cells.squared[s] = cells.limit * cells.limit
+        cells.face[s] = -1
+    cells.extent[0] = low
+    cells.extent[1] = high
 
 
 @wp.func
-def beyond(x: float, low: float, high: float):
+def beyond(x: float, low: float, high: float) -> float:
     """How far x is outside of an interval; without a look for NaN, as wp.max has."""
     under = low - x
     over = x - high
@@ -148,59 +148,46 @@ def beyond(x: float, low: float, high: float):
 
 
 @wp.kernel
-def scan_kernel(
-    body: wp.array(dtype=wp.vec3),
-    faces: wp.array2d(dtype=int),
-    limit: float,
-    per_metre: float,
-    extent: wp.array(dtype=wp.vec3),
-    number_of_row: wp.array(dtype=int),
-    occupied: wp.array(dtype=wp.uint64),
-    start: wp.array2d(dtype=int),
-    points: wp.array(dtype=wp.vec3),
-    # kept up to date
-    squared: wp.array(dtype=float),
-    face: wp.array(dtype=int),
-):
+def scan_kernel(mesh: PosedMesh, cells: Cells) -> None:
     """Each face asks the sorted points in the cells around it whether it is the closest one so far."""
     f = wp.tid()
-    a = body[faces[f, 0]]
-    b = body[faces[f, 1]]
-    c = body[faces[f, 2]]
-    wide = limit * 1.0001  # a hair more, for rounding
+    a = mesh.points[mesh.faces[f, 0]]
+    b = mesh.points[mesh.faces[f, 1]]
+    c = mesh.points[mesh.faces[f, 2]]
+    wide = cells.limit * 1.0001  # a hair more, for rounding
     reach = wp.vec3(wide, wide, wide)
     box_low = lesser(lesser(a, b), c)
     box_high = greater(greater(a, b), c)
-    low = greater(box_low - reach, extent[0])
-    high = lesser(box_high + reach, extent[1])
+    low = greater(box_low - reach, cells.extent[0])
+    high = lesser(box_high + reach, cells.extent[1])
     if low[0] > high[0] or low[1] > high[1] or low[2] > high[2]:
         return
-    i0 = cell_number(low[0], per_metre)
-    j0 = cell_number(low[2], per_metre)
-    k0 = cell_number(low[1], per_metre)
+    i0 = cell_number(low[0], cells.per_metre)
+    j0 = cell_number(low[2], cells.per_metre)
+    k0 = cell_number(low[1], cells.per_metre)
     # Once around the grid is enough, however large the face.
-    i1 = wp.min(cell_number(high[0], per_metre), i0 + _LAST_X)
-    j1 = wp.min(cell_number(high[2], per_metre), j0 + _LAST_Z)
-    k1 = wp.min(cell_number(high[1], per_metre), k0 + _LAST)
+    i1 = wp.min(cell_number(high[0], cells.per_metre), i0 + _LAST_X)
+    j1 = wp.min(cell_number(high[2], cells.per_metre), j0 + _LAST_Z)
+    k1 = wp.min(cell_number(high[1], cells.per_metre), k0 + _LAST)
     mask = row_mask(k0, k1)
     first_cell = k0 & _LAST
     last_cell = first_cell + (k1 - k0)
     normal = wp.normalize(wp.cross(b - a, c - a))
     for i in range(i0, i1 + 1):
         for j in range(j0, j1 + 1):
-            r = number_of_row[row_of(i, j)]
-            if r >= 0 and (occupied[r] & mask) != wp.uint64(0):
-                here = start[r, first_cell]
-                end = start[r, wp.min(last_cell, _LAST) + 1]
+            r = cells.number_of_row[row_of(i, j)]
+            if r >= 0 and (cells.occupied[r] & mask) != wp.uint64(0):
+                here = cells.start[r, first_cell]
+                end = cells.start[r, wp.min(last_cell, _LAST) + 1]
                 rest = int(0)  # of a row that repeats itself: its beginning
                 if last_cell > _LAST:
-                    rest = start[r, last_cell - _LAST] - start[r, 0]
+                    rest = cells.start[r, last_cell - _LAST] - cells.start[r, 0]
                 while here < end or rest > 0:
                     if here == end:
-                        here = start[r, 0]
+                        here = cells.start[r, 0]
                         end = here + rest
                         rest = 0
-                    p = points[here]
+                    p = cells.points[here]
                     height = wp.dot(normal, p - a)
                     x = beyond(p[0], box_low[0], box_high[0])
                     y = beyond(p[1], box_low[1], box_high[1])
@@ -208,47 +195,42 @@ def scan_kernel(
                     beside = x * x + y * y + z * z
                     above = height * height
                     # Neither its plane nor its box is ever farther than a face.
-                    if wp.where(above > beside, above, beside) < squared[here]:
+                    if wp.where(above > beside, above, beside) < cells.squared[here]:
                         w, _feature = closest_on_triangle(p, a, b, c)
                         offset = (p - a) - (w[1] * (b - a) + w[2] * (c - a))
                         length = wp.dot(offset, offset)
-                        if length < squared[here]:
-                            squared[here] = length
-                            face[here] = f
+                        if length < cells.squared[here]:
+                            cells.squared[here] = length
+                            cells.face[here] = f
                     here += 1
 
 
 @wp.kernel
 def finish_kernel(
-    body: wp.array(dtype=wp.vec3),
-    faces: wp.array2d(dtype=int),
-    across: wp.array2d(dtype=int),
-    fan_start: wp.array(dtype=int),
-    fan_face: wp.array(dtype=int),
-    points: wp.array(dtype=wp.vec3),
-    slot: wp.array(dtype=int),
-    face: wp.array(dtype=int),
-    beyond: wp.array(dtype=float),
+    mesh: PosedMesh,
+    points: wp.array[wp.vec3],
+    cells: Cells,
+    beyond: wp.array[float],
     # outputs
-    out_face: wp.array(dtype=int),
-    out_distance: wp.array(dtype=float),
-    out_gradient: wp.array(dtype=wp.vec3),
-):
+    out_face: wp.array[int],
+    out_distance: wp.array[float],
+    out_gradient: wp.array[wp.vec3],
+) -> None:
     """Signed distance and gradient from the closest faces; where there is none, the distance `beyond` and no more."""
     q = wp.tid()
-    f = face[slot[q]]
+    f = cells.face[cells.slot[q]]
     out_face[q] = f
     if f < 0:
         out_distance[q] = beyond[0]
         out_gradient[q] = wp.vec3(0.0, 1.0, 0.0)
         return
-    distance, gradient = measured_to(points[q], f, body, faces, across, fan_start, fan_face)
+    distance, gradient = measured_to(points[q], f, mesh)
     out_distance[q] = distance
     out_gradient[q] = gradient
 
 
 @wp.func
-def is_free(p: wp.vec3, q: wp.vec3, distances: float):
+def is_free(p: wp.vec3, q: wp.vec3, distances: float) -> bool:
     """Whether no skin can lie between two points whose distances to it add up to `distances`."""
     # The balls around them are free of it, and they overlap; less a hair for rounding.
     way = q - p
@@ -256,19 +238,19 @@ def is_free(p: wp.vec3, q: wp.vec3, distances: float):
 
 
 @wp.kernel
-def spread_kernel(
-    points: wp.array(dtype=wp.vec3),
-    sizes: wp.array(dtype=int),
-    link_start: wp.array(dtype=int),
-    linked: wp.array(dtype=int),
-    distance: wp.array(dtype=float),
+def spread_sides_kernel(
+    points: wp.array[wp.vec3],
+    sizes: wp.array[int],
+    link_start: wp.array[int],
+    linked: wp.array[int],
+    distance: wp.array[float],
     # kept up to date
-    face: wp.array(dtype=int),
+    face: wp.array[int],
     # outputs
-    state: wp.array(dtype=int),
-    queue: wp.array(dtype=int),
-    asked: wp.array(dtype=int),
-):
+    state: wp.array[int],
+    queue: wp.array[int],
+    asked: wp.array[int],
+) -> None:
     """On which side of the skin the vertices beyond the band are, by way of the garment's edges.
 
     `asked` lists those that may be inside, and one of each large patch that no vertex of the band reaches; `sizes[2]`

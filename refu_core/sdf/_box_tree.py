@@ -12,7 +12,7 @@ from torch import Tensor
 
 from refu_core._warp import as_warp
 from refu_core.errors import MeshError
-from refu_core.sdf._boxes import MAX_FACES, WIDTH, Boxes, Eight, fit_kernel
+from refu_core.sdf._box_kernels import MAX_FACES, WIDTH, Boxes, Eight, fit_kernel
 
 _WIDTH = int(WIDTH)
 

@@ -12,13 +12,13 @@ from torch import Tensor
 
 from refu_core._warp import as_warp, torch_stream
 from refu_core.errors import MeshError
-from refu_core.sdf._kernels import closest_kernel
+from refu_core.sdf._closest_kernels import closest_kernel
 from refu_core.sdf._mesh import Found, MeshSdf, Recorded
 
 REBUILD_DISTANCE = 0.4
-"""How far a vertex may move, on a CPU, before the BVH is built anew [m]. A refit costs 0.2 ms and leaves the tree as it
-was; once the limbs it grouped have parted its boxes overlap, and queries take 1.5 to 2.5 times as long. Building takes
-about as long as asking for one garment does, and at this distance is called for every 10 to 30 frames of a motion."""
+"""How far a vertex may move, on a CPU, before the BVH is built anew [m]. A refit costs 0.2 ms and keeps the tree. Once
+limbs that it grouped have parted, its boxes overlap, and queries take 1.5 to 2.5 times as long. Building takes about as
+long as the query of one garment; with this distance it happens every 10 to 30 frames of a motion."""
 
 _FEW = 2048
 """More points than this are worth a launch of their own."""
@@ -90,7 +90,7 @@ class ExactSdf(MeshSdf):
         self._few = self._skin = None
         with torch_stream(self.device):
             self._mesh = wp.Mesh(
-                self._points_wp, as_warp(self.faces.view(-1), wp.int32), support_winding_number=self._by_winding
+                self._posed.points, as_warp(self.faces.view(-1), wp.int32), support_winding_number=self._by_winding
             )
 
     def _has_drifted(self) -> bool:
@@ -148,5 +148,4 @@ class ExactSdf(MeshSdf):
 
     def _inputs(self, points: Any, near: Any, *, max_distance: float = _UNLIMITED) -> list[Any]:
         """What `closest_kernel` reads, for points with or without near faces."""
-        body = [self._mesh.id, self._points_wp, self._faces, *self._topology]
-        return [*body, points, near, max_distance, self._by_winding]
+        return [self._mesh.id, self._posed, points, near, max_distance, self._by_winding]

@@ -1,10 +1,10 @@
-"""What the exact and the approximate distance to a posed mesh share: the pose, checks, and derivatives."""
+"""What the exact and the approximate distance to a posed mesh share: the pose, the checks, the derivatives."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 import warp as wp
@@ -13,11 +13,14 @@ from torch import Tensor
 
 from refu_core._warp import as_warp, torch_stream
 from refu_core.errors import MeshError
+from refu_core.mesh import Connectivity
 from refu_core.sdf._analytic import Feature, signed_distance
-from refu_core.sdf._kernels import feature_kernel
-from refu_core.sdf._protocol import SdfSample
-from refu_core.sdf._skin import Skin
-from refu_core.sdf._topology import Topology
+from refu_core.sdf._closest_kernels import PosedMesh, feature_kernel
+from refu_core.sdf._protocol import GarmentSdf, SdfSample, plain_garment_sdf
+from refu_core.sdf._query_kernels import Skin
+
+if TYPE_CHECKING:
+    from refu_core.garments import GarmentTemplate
 
 
 class Found(NamedTuple):
@@ -47,10 +50,10 @@ class Found(NamedTuple):
 
 
 class Recorded:
-    """A launch on a CPU, recorded once, with memory of its own for what is asked and answered.
+    """A launch on a CPU, recorded once, with memory of its own for questions and answers.
 
-    What Python makes of a launch's arguments, time and again the same ones, takes three times as long as 50 points do;
-    and memory that is new for every frame must be cleared by the system first.
+    Making a launch's arguments in Python takes three times as long as 50 points do, and new memory must be cleared by
+    the system first.
     """
 
     def __init__(self, kernel: Any, inputs: Callable[[Any, Any], list[Any]]) -> None:
@@ -87,31 +90,28 @@ class Recorded:
         inputs = self._inputs(as_warp(self._points, wp.vec3), as_warp(self._near, wp.int32))
         self._n_inputs = len(inputs)
         self._command = wp.launch(
-            self._kernel,
-            dim=n,
-            inputs=inputs,
-            outputs=self._found.as_warp(),
-            device="cpu",
-            record_cmd=True,
+            self._kernel, dim=n, inputs=inputs, outputs=self._found.as_warp(), device="cpu", record_cmd=True
         )
 
 
 class MeshSdf(ABC):
-    """A signed distance to faces of the posed body itself: whoever finds a face gets its exact first derivatives."""
+    """A signed distance to faces of the posed body: subclasses find faces, exact first derivatives come from here."""
+
+    is_exact = True
+    """Whether the face found is always the closest one."""
 
     def __init__(self, faces: Tensor | NDArray[Any], *, device: str | torch.device = "cpu") -> None:
-        topology = Topology.of_closed_mesh(faces.cpu() if isinstance(faces, Tensor) else faces)
+        mesh = Connectivity.of(faces.cpu() if isinstance(faces, Tensor) else faces)
         self.device = torch.device(device)
-        self.n_vertices = topology.n_vertices
-        self.faces = torch.as_tensor(topology.faces, device=self.device)
-        self._faces = as_warp(self.faces, wp.int32)
-        self._topology = [
-            wp.array(array, dtype=wp.int32, device=str(self.device))
-            for array in (topology.across, topology.fan_start, topology.fan_face)
-        ]
+        self.n_vertices = mesh.n_vertices
+        self.faces = torch.as_tensor(mesh.faces, device=self.device)
+        self._posed = PosedMesh()
+        self._posed.faces = as_warp(self.faces, wp.int32)
+        fan_start, fan_face = mesh.fan
+        for name, array in (("across", mesh.across), ("fan_start", fan_start), ("fan_face", fan_face)):
+            setattr(self._posed, name, wp.array(array, dtype=wp.int32, device=str(self.device)))
         self._vertices: Tensor | None = None  # as given, with its graph
         self._points: Tensor | None = None  # float32 copy that the kernels read
-        self._points_wp: Any = None
         self._skin: Any = None
 
     def update(self, vertices: Tensor, *, pose: Tensor | None = None, betas: Tensor | None = None) -> None:
@@ -120,6 +120,7 @@ class MeshSdf(ABC):
         Raises `MeshError` for a wrong shape, values that aren't finite, or a body turned inside out.
         """
         del pose, betas
+        require_tensor("the body's vertices", vertices)
         if vertices.ndim != 2 or vertices.shape[1] != 3 or len(vertices) < self.n_vertices:
             msg = f"the body's vertices must have the shape ({self.n_vertices}, 3), got {tuple(vertices.shape)}"
             raise MeshError(msg)
@@ -128,7 +129,7 @@ class MeshSdf(ABC):
         if self._points is None or is_new:
             require_outward(vertices.detach().to(self.device).double()[None], self.faces)
             self._points = torch.empty(len(vertices), 3, device=self.device)
-            self._points_wp = as_warp(self._points, wp.vec3)
+            self._posed.points = as_warp(self._points, wp.vec3)
             self._skin = None
         self._vertices = vertices
         self._points.copy_(vertices.detach())
@@ -138,7 +139,7 @@ class MeshSdf(ABC):
         """Signed distance and gradient at `points` [m], shape (N, 3), differentiable as the class says.
 
         `near`, integers of shape (N,), may name a body face near each point: the `face` of an earlier sample, or what
-        `nearest_faces` says of a garment.
+        `RestFaces` says of a garment.
 
         Raises `MeshError` for a wrong shape, values that aren't finite, or when no body was set with `update`.
         """
@@ -154,6 +155,10 @@ class MeshSdf(ABC):
         feature = Feature(kind, normal.to(points), found.distance.sign().to(points), barycentrics.to(points))
         return signed_distance(points, corners, feature)._replace(face=found.face.clone())
 
+    def of_garment(self, garment: GarmentTemplate) -> GarmentSdf:  # noqa: ARG002
+        """As `BodySdf.of_garment`."""
+        return plain_garment_sdf(self)
+
     def _features(self, points: Tensor, face: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Of each point's closest face: `Feature.kind`, int32 (N,), barycentrics and unit pseudo-normals, (N, 3)."""
         kind = torch.empty_like(face)
@@ -163,13 +168,7 @@ class MeshSdf(ABC):
                 wp.launch(
                     feature_kernel,
                     dim=len(face),
-                    inputs=[
-                        self._points_wp,
-                        self._faces,
-                        *self._topology,
-                        as_warp(points, wp.vec3),
-                        as_warp(face, wp.int32),
-                    ],
+                    inputs=[self._posed, as_warp(points, wp.vec3), as_warp(face, wp.int32)],
                     outputs=[as_warp(kind, wp.int32), as_warp(barycentrics, wp.vec3), as_warp(normal, wp.vec3)],
                     device=str(self.device),
                 )
@@ -187,8 +186,7 @@ class MeshSdf(ABC):
 
     def _bind_skin(self) -> Any:
         skin = Skin()
-        skin.points, skin.faces = self._points_wp, self._faces
-        skin.across, skin.fan_start, skin.fan_face = self._topology
+        skin.mesh = self._posed
         return skin
 
     @abstractmethod
@@ -203,20 +201,18 @@ class MeshSdf(ABC):
         """
 
     def _checked(self, points: Tensor) -> Tensor:
-        if points.ndim != 2 or points.shape[1] != 3:
-            msg = f"points must have the shape (N, 3), got {tuple(points.shape)}"
-            raise MeshError(msg)
-        require_finite("points", points)
+        require_points(points)
         return points.detach().to(device=self.device, dtype=torch.float32).contiguous()
 
     def _checked_faces(self, near: Tensor | None, n: int) -> Tensor | None:
         if near is None:
             return None
-        if near.shape != (n,) or near.is_floating_point():
-            msg = f"near must be integers of the shape ({n},), got {near.dtype} of shape {tuple(near.shape)}"
+        if not isinstance(near, Tensor) or near.shape != (n,) or near.is_floating_point():
+            got = f"{near.dtype} of shape {tuple(near.shape)}" if isinstance(near, Tensor) else type(near).__name__
+            msg = f"near must be integers of the shape ({n},), got {got}"
             raise MeshError(msg)
         near = near.to(device=self.device, dtype=torch.int32).contiguous()
-        # Clamping is cheaper than waiting for a check's answer, and a face that isn't one can't be read.
+        # Clamped and not checked: a device would have to be waited for, and no kernel may read beyond the faces.
         return near.clamp(0, len(self.faces) - 1)
 
     def _require_update(self) -> Tensor:
@@ -232,6 +228,23 @@ def require_outward(vertices: Tensor, faces: Tensor) -> None:
     if not bool(((a * torch.linalg.cross(b, c)).sum((1, 2)) > 0).all()):
         msg = "the body's faces must be counter-clockwise seen from outside: this body has a negative volume"
         raise MeshError(msg)
+
+
+def require_tensor(name: str, value: object) -> None:
+    """Raises `MeshError` for what isn't a tensor of floating-point numbers."""
+    if not isinstance(value, Tensor) or not value.is_floating_point():
+        got = value.dtype if isinstance(value, Tensor) else type(value).__name__
+        msg = f"{name} must be a floating-point torch.Tensor, got {got}: torch.as_tensor(..., dtype=torch.float32)"
+        raise MeshError(msg)
+
+
+def require_points(points: Tensor) -> None:
+    """Raises `MeshError` for what isn't a tensor of finite points, shape (N, 3)."""
+    require_tensor("points", points)
+    if points.ndim != 2 or points.shape[1] != 3:
+        msg = f"points must have the shape (N, 3), got {tuple(points.shape)}"
+        raise MeshError(msg)
+    require_finite("points", points)
 
 
 def require_finite(name: str, values: Tensor) -> None:

@@ -1,4 +1,4 @@
-"""The paper's network for the signed distance to the body, conditioned on β and θ (supplement, "SDF Network")."""
+"""The paper's network for the signed distance to the body, conditioned on β and θ (supplement, Sec. A)."""
 
 from __future__ import annotations
 
@@ -12,14 +12,16 @@ from torch import Tensor, nn
 from refu_core.body import SmplBody, rotvec_to_rotmat
 from refu_core.errors import MeshError, WeightsError
 from refu_core.frames import N_BETAS, N_JOINTS
-from refu_core.sdf._mesh import require_finite
-from refu_core.sdf._protocol import SdfSample
+from refu_core.sdf._mesh import require_points
+from refu_core.sdf._protocol import GarmentSdf, SdfSample, plain_garment_sdf
 from refu_core.weights import Weights, build_for, config_of_card, load_weights, save_weights
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
     from typing import Any
+
+    from refu_core.garments import GarmentTemplate
 
 _CONDITION = N_BETAS + 3 * (N_JOINTS - 1)
 _MOST_LAYERS = 64
@@ -58,7 +60,7 @@ SDF_PRESETS: dict[str, SdfNetworkConfig] = {
 class SdfNetwork(nn.Module):
     """f(x, β, θ): fully connected, softplus between the layers, the point joined again at the layer `skip`.
 
-    Drawn as the distance to a sphere (Atzmon and Lipman 2020; the paper follows Gropp et al. 2020, who do so, too).
+    It starts as the distance to a sphere (Atzmon and Lipman 2020).
     """
 
     def __init__(self, config: SdfNetworkConfig | None = None) -> None:
@@ -114,7 +116,7 @@ def with_gradient(
 class NeuralSdf:
     """Signed distance by a trained `SdfNetwork` (the paper's "Approx. SDF"): it stands for the body, faces and all.
 
-    The gradient is the network's own, by backpropagation, normalised (Eq. gradient). Both are differentiable with
+    The gradient is the network's own, by backpropagation, normalised (paper, Eq. 3). Both are differentiable with
     respect to the points and the network's weights.
     """
 
@@ -146,10 +148,7 @@ class NeuralSdf:
         if self._posed is None:
             msg = "no body yet: call update(vertices, pose=..., betas=...) before asking for distances"
             raise MeshError(msg)
-        if points.ndim != 2 or points.shape[1] != 3:
-            msg = f"points must have the shape (N, 3), got {tuple(points.shape)}"
-            raise MeshError(msg)
-        require_finite("points", points)
+        require_points(points)
         rotation, root, betas, pose = (value.to(points) for value in self._posed)
         own = (points - root) @ rotation + root
         weights_learn = next(self.network.parameters()).requires_grad
@@ -161,6 +160,10 @@ class NeuralSdf:
         distance = torch.cat([part[0][0] for part in parts])
         gradient = torch.cat([part[1][0] for part in parts]) @ rotation.T
         return SdfSample(distance, torch.nn.functional.normalize(gradient, dim=-1))
+
+    def of_garment(self, garment: GarmentTemplate) -> GarmentSdf:  # noqa: ARG002
+        """As `BodySdf.of_garment`."""
+        return plain_garment_sdf(self)
 
 
 def body_frame(body: SmplBody, pose: Tensor, betas: Tensor) -> tuple[Tensor, Tensor]:

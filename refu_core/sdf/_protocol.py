@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol, runtime_checkable
+import math
+from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
+
+if TYPE_CHECKING:
+    from refu_core.garments import GarmentTemplate
 
 
 class SdfSample(NamedTuple):
@@ -26,7 +30,7 @@ class SdfSample(NamedTuple):
 
 @runtime_checkable
 class BodySdf(Protocol):
-    """The signed distance function f of one posed body (the paper's Sec. 3.1 and 3.3)."""
+    """The signed distance function f of one posed body (paper, Eq. 1 and Sec. 3.3)."""
 
     def update(self, vertices: Tensor, *, pose: Tensor | None = None, betas: Tensor | None = None) -> None:
         """Takes over a new pose: the body's vertices [m], shape (V, 3).
@@ -44,6 +48,33 @@ class BodySdf(Protocol):
         """
         ...
 
+    def of_garment(self, garment: GarmentTemplate) -> GarmentSdf:
+        """The same distance for all vertices of one garment, of which much is known beforehand."""
+        ...
+
+
+class GarmentSdf(Protocol):
+    """The signed distance of a garment's vertices to one posed body."""
+
+    def __call__(self, vertices: Tensor, *, on_mean: Tensor, reach: float = math.inf) -> SdfSample:
+        """Distance and gradient of posed vertices [m], shape (N, 3). Not differentiable.
+
+        Args:
+            vertices: In the frame of the body's vertices [m], shape (N, 3).
+            on_mean: Where they are on the unposed mean shape [m], shape (N, 3).
+            reach: Distances beyond it [m] may be clipped from above; such a sample's face is -1.
+        """
+        ...
+
+
+def plain_garment_sdf(sdf: BodySdf) -> GarmentSdf:
+    """Of a distance for which one garment is like any other points."""
+
+    def ask(vertices: Tensor, *, on_mean: Tensor, reach: float = math.inf) -> SdfSample:  # noqa: ARG001
+        return sdf.query(vertices)
+
+    return ask
+
 
 def query_batch(
     sdf: BodySdf,
@@ -54,9 +85,9 @@ def query_batch(
     pose: Tensor | None = None,
     betas: Tensor | None = None,
 ) -> SdfSample:
-    """`sdf` of a batch of bodies at points of their own, one body after the other; fields lead with (B, N).
+    """`sdf` of a batch of bodies, each at points of its own; fields lead with (B, N).
 
-    Derivatives of all of them are kept, though `sdf` itself ends at the last body.
+    Bodies are asked one after the other: derivatives of all are kept, and `sdf` ends at the last one.
 
     Args:
         sdf: Any signed distance.

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from refu_core._warp import as_warp, torch_stream
 from refu_core.sdf._exact import ExactSdf
-from refu_core.sdf._walk import look_up_kernel
+from refu_core.sdf._walk_kernels import grid_lookup_kernel
 
 if TYPE_CHECKING:
     from refu_core.body import SmplBody
@@ -22,16 +22,16 @@ _CELL = 0.015
 _BAND = 2
 """Cells around the skin whose closest face is asked for; those farther out take that of the nearest such cell."""
 _BLOCK = 4
-"""Cells of a block's edge, as `look_up_kernel` has it."""
+"""Cells of a block's edge, as `grid_lookup_kernel` has it."""
 _ROOM = 0.1
 """How far the grid reaches beyond the body [m]; places outside of it are looked up at its border."""
 
 
 class RestFaces:
-    """A grid of the rest pose's space that names a near body face, built once a body in three tenths of a second.
+    """A grid over the rest pose that names a near body face, built once a body in three tenths of a second.
 
-    A start need not be the closest face, so one grid of the mean shape does for all shapes: of a garment vertex
-    t(β, γ) + D it wants the place on the mean shape, which is what `GarmentTemplate.rest` adds for β taken off:
+    The face need not be the closest, so one grid of the mean shape does for all shapes. Of a garment vertex t(β, γ) +
+    D it wants the place on the mean shape, without what `GarmentTemplate.rest` adds for β:
 
         near = rest_faces.under(unposed, betas, garment.shapedirs)
         sample = approx_sdf.query(posed, near=near)
@@ -83,11 +83,11 @@ class RestFaces:
         return self._near[:n].clone().view(unposed.shape[:-1])
 
     def _make_room(self, n: int) -> None:
-        """For n places. The launch is recorded: what Python makes of it takes longer than the look-ups do."""
+        """For n places. The launch is recorded: making it in Python takes longer than the look-ups."""
         self._places = torch.empty(n, 3, device=self._device)
         self._near = torch.empty(n, dtype=torch.int32, device=self._device)
         self._look_up = wp.launch(
-            look_up_kernel,
+            grid_lookup_kernel,
             dim=n,
             inputs=[as_warp(self._places, wp.vec3), self._low, _CELL, self._shape, self._grid],
             outputs=[as_warp(self._near, wp.int32)],

@@ -1,4 +1,4 @@
-"""The launches of a scan for what is near the skin, recorded once, and the memory that they work in."""
+"""The scan for what is near the skin: its launches, recorded once, and the memory that they work in."""
 
 from __future__ import annotations
 
@@ -10,7 +10,17 @@ import warp as wp
 from torch import Tensor
 
 from refu_core._warp import as_warp
-from refu_core.sdf._band_kernels import ROW, ROWS_X, ROWS_Z, finish_kernel, scan_kernel, sort_kernel, spread_kernel
+from refu_core.sdf._band_kernels import (
+    ROW,
+    ROWS_X,
+    ROWS_Z,
+    Cells,
+    finish_kernel,
+    scan_kernel,
+    sort_kernel,
+    spread_sides_kernel,
+)
+from refu_core.sdf._closest_kernels import PosedMesh
 from refu_core.sdf._mesh import Found
 
 _N_ROWS = int(ROWS_X) * int(ROWS_Z)
@@ -22,17 +32,19 @@ class Scan:
     Answers lie in memory that the next call overwrites.
     """
 
-    def __init__(self, body: list[Any], n_faces: int, band: float, ask: Callable[[Any, Any, Found], Any]) -> None:
-        """For the arrays of a `body`: points, faces, and the faces' topology; `band` in metres.
+    def __init__(self, body: PosedMesh, n_faces: int, band: float, ask: Callable[[Any, Any, Found], Any]) -> None:
+        """For a `body` of `n_faces`; `band` in metres.
 
         `ask` records the launch that asks the tree for some of the points: of points, rows, and where answers belong.
         """
-        self._body, self._n_faces, self._band, self._record_ask = body, n_faces, band, ask
+        self._body, self._n_faces, self._record_ask = body, n_faces, ask
         self._room = 0
-        self._number_of_row = wp.full(_N_ROWS, -1, dtype=wp.int32, device="cpu")
-        self._rows = wp.empty(_N_ROWS, dtype=wp.int32, device="cpu")
-        self._occupied = wp.empty(_N_ROWS, dtype=wp.uint64, device="cpu")
-        self._extent = wp.zeros(2, dtype=wp.vec3, device="cpu")
+        self._cells = Cells()
+        self._cells.limit, self._cells.per_metre = band, 0.5 / band  # a cell is twice as wide as the band
+        self._cells.number_of_row = wp.full(_N_ROWS, -1, dtype=wp.int32, device="cpu")
+        self._cells.rows = wp.empty(_N_ROWS, dtype=wp.int32, device="cpu")
+        self._cells.occupied = wp.empty(_N_ROWS, dtype=wp.uint64, device="cpu")
+        self._cells.extent = wp.zeros(2, dtype=wp.vec3, device="cpu")
         self._sizes = torch.zeros(4, dtype=torch.int32)
         self._beyond = torch.zeros(1)
         self._state: Tensor
@@ -54,10 +66,10 @@ class Scan:
         return Found(*(field[:n] for field in self._found))
 
     def spread(self, links: list[Any]) -> tuple[int, int]:
-        """Says on which side the points of the last scan are, by the arrays of their `links`.
+        """Finds the side of the points of the last scan, by the arrays of their `links`.
 
-        Returns how many may be inside, and of how many patches that nothing reaches one must be asked: `asked` has
-        them, in this order.
+        Returns how many points may be inside, and how many patches nothing reaches, of which one point each must be
+        asked; `asked` has these points, in this order.
         """
         for k, array in enumerate(links):
             self._spread.set_param_at_index(2 + k, array)
@@ -74,7 +86,7 @@ class Scan:
         return self._asked[:n].long()
 
     def ask(self, n: int, rows: Tensor | None = None) -> None:
-        """Has the tree's answers take the place of the scan's: for n rows to be asked, or others, shape (n,)."""
+        """Replaces the scan's answers by the tree's, for the first n rows to be asked or for `rows`, shape (n,)."""
         if rows is not None:
             self._asked[:n] = rows
         if n:
@@ -86,34 +98,21 @@ class Scan:
         self._points = torch.zeros(n, 3)
         ints = torch.zeros(5, n, dtype=torch.int32)
         self._state, self._asked = ints[:2]
-        state, asked, queue, slot, face = (as_warp(row, wp.int32) for row in ints)
+        cells = self._cells
+        state, asked, queue, cells.slot, cells.face = (as_warp(row, wp.int32) for row in ints)
         self._found = Found.empty(n, self._points.device)
         sizes, beyond = as_warp(self._sizes, wp.int32), as_warp(self._beyond, wp.float32)
         points = as_warp(self._points, wp.vec3)
-        start = wp.empty((min(n, _N_ROWS), ROW + 2), dtype=wp.int32, device="cpu")
-        sorted_points = wp.empty(n, dtype=wp.vec3, device="cpu")
-        squared = wp.empty(n, dtype=wp.float32, device="cpu")
-        per_metre = 0.5 / self._band  # a cell is twice as wide as the band
-        rows = [self._number_of_row, self._rows, self._occupied, start]
-        self._sort = _record(
-            sort_kernel,
-            1,
-            [points, sizes, self._band, per_metre, *rows],
-            [slot, sorted_points, squared, face, self._extent],
-        )
-        cells = [self._extent, self._number_of_row, self._occupied, start, sorted_points]
-        self._scan = _record(
-            scan_kernel, self._n_faces, [*self._body[:2], self._band, per_metre, *cells], [squared, face]
-        )
+        cells.start = wp.empty((min(n, _N_ROWS), ROW + 2), dtype=wp.int32, device="cpu")
+        cells.points = wp.empty(n, dtype=wp.vec3, device="cpu")
+        cells.squared = wp.empty(n, dtype=wp.float32, device="cpu")
         answers = self._found.as_warp()
-        self._finish = _record(finish_kernel, n, [*self._body, points, slot, face, beyond], answers)
+        self._sort = _record(sort_kernel, 1, [points, sizes, cells], [])
+        self._scan = _record(scan_kernel, self._n_faces, [self._body, cells], [])
+        self._finish = _record(finish_kernel, n, [self._body, points, cells, beyond], answers)
         none = [wp.empty(0, dtype=wp.int32, device="cpu")] * 2
-        self._spread = _record(
-            spread_kernel,
-            1,
-            [points, sizes, *none, answers[1]],
-            [answers[0], state, queue, asked],
-        )
+        sides = [answers[0], state, queue, asked]
+        self._spread = _record(spread_sides_kernel, 1, [points, sizes, *none, answers[1]], sides)
         self._ask = self._record_ask(points, asked, self._found)
 
 

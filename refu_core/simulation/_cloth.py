@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from refu_core.simulation._mesh import ClothTopology
 
 F32 = NDArray[np.float32]
+I32 = NDArray[np.int32]
+_Contacts = tuple[I32, F32, F32, F32]
+"""Vertices, or both ends of edges; and of each the place on the skin, its normal and its motion in a substep."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +61,7 @@ _PAIR_REACH = 0.007  # [m]: a vertex this close to another piece of the cloth is
 _MAX_SPEED = 6.0  # [m/s]
 
 
-class Cloth:
+class SimulatedCloth:
     """The simulated garment. Positions are relative to the body's root, in SMPL axes [m]; one thread, deterministic."""
 
     def __init__(self, topology: ClothTopology, sdf: ExactSdf, *, settings: ClothSettings | None = None) -> None:
@@ -73,12 +76,12 @@ class Cloth:
         self._body_faces = sdf.faces.cpu().numpy().astype(np.int32)
         n = topology.n_vertices
         # Bends first: in each sweep the stiffer edges have the last word.
-        self._ends = np.concatenate((topology.bends[topology.bend_order], topology.edges[topology.stretch_order]))
+        self._ends = np.concatenate((topology.bends[topology.bend_order], topology.mesh.edges[topology.stretch_order]))
         h2 = self.settings.substep**2
         self._softness = np.concatenate(
             (
                 np.full(len(topology.bends), self.settings.bend_compliance / h2, np.float32),
-                np.full(len(topology.edges), self.settings.stretch_compliance / h2, np.float32),
+                np.full(len(topology.mesh.edges), self.settings.stretch_compliance / h2, np.float32),
             )
         )
         self.positions: F32 = np.zeros((n, 3), np.float32)
@@ -124,7 +127,7 @@ class Cloth:
                 self._longest, np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).astype(np.float32)
             )
         self._longest = np.minimum(self._longest, self._shortest * np.float32(1 + self.settings.most_ease))
-        self._edge_length = float(np.median(self._shortest[-len(self.topology.edges) :]))
+        self._edge_length = float(np.median(self._shortest[-len(self.topology.mesh.edges) :]))
         area = self.topology.vertex_areas(self._rest)
         # Slivers would get next to no mass and soak up every correction of their neighbours.
         area = np.maximum(area, 0.25 * np.median(area))
@@ -189,7 +192,7 @@ class Cloth:
             if first == 0 or careful:
                 pairs = find_pairs(
                     self.positions,
-                    self.topology.faces,
+                    self.topology.mesh.faces,
                     self._rest,
                     np.float32(2.2 * self._edge_length),
                     np.float32(_PAIR_REACH),
@@ -203,12 +206,12 @@ class Cloth:
                     *contacts, np.float32(s.margin), np.float32(s.friction),
                     anchor_vertex, anchor, anchor_motion, np.float32(s.anchor_stiffness),
                     *pairs, np.float32(s.thickness),
-                    *edges, np.float32(s.edge_margin),
+                    *edges, np.float32(s.edge_margin),  # type: ignore[arg-type]  # mypy loses count after two unpackings
                     s.iterations, np.float32(_MAX_SPEED * s.substep),
                 )  # fmt: skip
         return float(np.sqrt((self.velocities**2).sum(1).mean()))
 
-    def _contacts(self, body: F32, motion: F32 | None, *, everything: bool) -> tuple[Any, ...]:
+    def _contacts(self, body: F32, motion: F32 | None, *, everything: bool) -> _Contacts:
         stale = stale_points(
             self.positions, self._asked_at, self._asked_distance, np.float32(_NEAR), np.float32(_SLIDE), everything
         )
@@ -220,29 +223,28 @@ class Cloth:
             self._weights[stale] = found.barycentrics.numpy()
             self._asked_at[stale] = asked
             self._asked_distance[stale] = np.minimum(found.distance.numpy(), _REACH) * found.sign.numpy()
-        contacts: tuple[Any, ...] = refresh_points(
+        return refresh_points(
             self.positions, self._face, self._weights, self._asked_distance, self._normal, stale,
             self._body_faces, body, body if motion is None else motion, motion is not None, np.float32(_NEAR),
         )  # fmt: skip
-        return contacts
 
-    def _edge_contacts(self, body: F32, motion: F32 | None) -> tuple[Any, ...]:
+    def _edge_contacts(self, body: F32, motion: F32 | None) -> _Contacts:
         near = self._asked_distance < _NEAR
-        ends = self.topology.edges[near[self.topology.edges].all(1)]
+        ends = self.topology.mesh.edges[near[self.topology.mesh.edges].all(1)]
         middle = self.positions[ends].mean(1)
         self._sdf.update(torch.from_numpy(body))
         found = self._sdf.closest(torch.from_numpy(middle), max_distance=_REACH)
         distance = np.minimum(found.distance.numpy(), _REACH) * found.sign.numpy()
-        which, *rest = refresh_points(
+        which, point, direction, moved = refresh_points(
             middle, found.face.numpy(), found.barycentrics.numpy(), distance, np.zeros_like(middle),
             np.arange(len(middle), dtype=np.int32),
             self._body_faces, body, body if motion is None else motion, motion is not None, np.float32(_NEAR),
         )  # fmt: skip
-        return (ends[which], *rest)
+        return ends[which], point, direction, moved
 
     def stretch(self, positions: F32 | None = None) -> F32:
         """Length of each edge over its rest length, shape (E,); of vertices at `positions` if given, (N, 3) [m]."""
-        ends = (self.positions if positions is None else positions)[self.topology.edges]
+        ends = (self.positions if positions is None else positions)[self.topology.mesh.edges]
         order = self.topology.stretch_order
         ratio = np.empty(len(order), np.float32)
         ratio[order] = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)[order] / self._longest[-len(order) :]

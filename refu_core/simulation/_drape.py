@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from refu_core.frames import N_BETAS, N_JOINTS
 from refu_core.garments import N_STYLES
 from refu_core.sdf import ExactSdf
-from refu_core.simulation._cloth import Cloth, ClothSettings
+from refu_core.simulation._cloth import ClothSettings, SimulatedCloth
 from refu_core.simulation._mesh import ClothTopology
 
 if TYPE_CHECKING:
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 
 GRAVITY = 9.81
 """[m/s²], along -y of the world."""
-HELD_AT_WAIST = ("short-pant", "skirt")
-"""Garments (by the start of their name) that a waistband holds; the others hang from the shoulders."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +96,7 @@ def comfort_poses() -> NDArray[np.float32]:
 
 
 @dataclass(frozen=True, eq=False)
-class Drape:
+class SettledDrape:
     """A settled garment."""
 
     vertices: F32
@@ -122,14 +120,14 @@ class Draper:
         self.garment = garment
         self.body = body
         self.settings = settings or DrapeSettings()
-        self.topology = ClothTopology.of(garment.faces.numpy())
+        self.topology = ClothTopology.of(garment.mesh)
         # Which of two equally close faces is found depends on the BVH, and with it a result's last bit: it is built
         # anew for each drape, on a mesh that only depends on the drape, and never in between.
         sdf = ExactSdf(body.faces, rebuild_distance=math.inf)
         self._sdf = sdf
-        self.cloth = Cloth(self.topology, sdf, settings=self.settings.cloth)
+        self.cloth = SimulatedCloth(self.topology, sdf, settings=self.settings.cloth)
         self.waist: NDArray[np.intp] | None = None
-        if garment.name.startswith(HELD_AT_WAIST):
+        if garment.card.held_at_waist:
             vertices = garment.v_template.numpy()
             loop = max(self.topology.boundary_loops(), key=lambda rim: float(vertices[rim, 1].mean()))
             self.waist = np.flatnonzero(self.topology.distance_from(vertices, loop) < self.settings.waistband)
@@ -194,7 +192,9 @@ class Draper:
         self._sdf.update(torch.from_numpy(np.ascontiguousarray(body)))
         self._sdf.rebuild()
 
-    def drape(self, pose: NDArray[np.floating], betas: NDArray[np.floating], style: NDArray[np.floating]) -> Drape:
+    def drape(
+        self, pose: NDArray[np.floating], betas: NDArray[np.floating], style: NDArray[np.floating]
+    ) -> SettledDrape:
         """The garment of `style` (4,) at rest on the body of `betas` (10,) in `pose` (24, 3) [rad].
 
         The root's rotation tilts gravity and not the body: a person who bends forward doesn't swing the cloth about.
@@ -225,7 +225,7 @@ class Draper:
                 break
         for _ in range(s.careful_frames):
             speed = self.cloth.frame(body, body, gravity=gravity, drag=s.drag[2], careful=True)
-        return Drape(
+        return SettledDrape(
             self._with_root(self.cloth.positions, root, betas),
             speed,
             self.stretch(),

@@ -11,52 +11,46 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
 from refu_core.errors import MeshError
+from refu_core.mesh import Connectivity
 
 
 @dataclass(frozen=True, eq=False)
 class ClothTopology:
-    """Connectivity of a garment of N vertices."""
+    """What constraints on a garment of N vertices are between."""
 
-    faces: NDArray[np.int32]
-    """Shape (F, 3)."""
-    edges: NDArray[np.int32]
-    """Each edge once, lower vertex first, shape (E, 2)."""
+    mesh: Connectivity
     bends: NDArray[np.int32]
     """The two vertices opposite each inner edge, shape (B, 2)."""
     stretch_order: NDArray[np.intp]
-    """`edges` by colour: no two neighbours in the list share a vertex, which keeps a processor's pipeline full."""
+    """`mesh.edges` by colour: no two neighbours in the list share a vertex, which keeps a processor's pipeline full."""
     bend_order: NDArray[np.intp]
     """The same for `bends`."""
 
     @staticmethod
-    def of(faces: Any) -> ClothTopology:
-        """The topology of `faces`, integers of shape (F, 3).
+    def of(mesh: Connectivity) -> ClothTopology:
+        """The topology of a garment.
 
         Raises `MeshError` when an edge has more than two faces.
         """
-        array = np.ascontiguousarray(faces, dtype=np.int32)
-        half = np.sort(array[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1)
-        opposite = array[:, [2, 0, 1]].reshape(-1)
-        edges, which, count = np.unique(half, axis=0, return_inverse=True, return_counts=True)
+        opposite = mesh.faces[:, [2, 0, 1]].reshape(-1)
+        count = mesh.n_faces_of_edge
         if count.max(initial=0) > 2:
             msg = f"a garment's edges need one or two faces, got {count.max()} on one edge: clean the mesh"
             raise MeshError(msg)
-        by_edge = opposite[np.argsort(which.ravel(), kind="stable")]
+        by_edge = opposite[np.argsort(mesh.edge_of_corner.ravel(), kind="stable")]
         first = np.concatenate(([0], np.cumsum(count)))[:-1]
         inner = count == 2
         bends = np.stack((by_edge[first[inner]], by_edge[first[inner] + 1]), 1)
-        return ClothTopology(array, edges, bends, _colour_order(edges), _colour_order(bends))
+        return ClothTopology(mesh, bends, _colour_order(mesh.edges), _colour_order(bends))
 
     @property
     def n_vertices(self) -> int:
         """Number of vertices N."""
-        return int(self.faces.max()) + 1
+        return self.mesh.n_vertices
 
     def boundary_loops(self) -> list[NDArray[np.intp]]:
         """Vertices of each hem (waist, cuff, neckline), each sorted by index, in the order of their lowest index."""
-        half = np.sort(self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1)
-        unique, count = np.unique(half, axis=0, return_counts=True)
-        rim = unique[count == 1]
+        rim = self.mesh.boundary
         n = self.n_vertices
         graph = coo_array((np.ones(len(rim)), (rim[:, 0], rim[:, 1])), shape=(n, n))
         _, label = connected_components(graph, directed=False)
@@ -66,16 +60,18 @@ class ClothTopology:
 
     def distance_from(self, vertices: NDArray[Any], sources: NDArray[np.intp]) -> NDArray[np.float64]:
         """Shortest way along the edges of the mesh `vertices` (N, 3) from any of `sources` to each [m], shape (N,)."""
-        i, j = self.edges.T
+        i, j = self.mesh.edges.T
         length = np.linalg.norm(vertices[i] - vertices[j], axis=1) + 1e-9
         graph = coo_array((length, (i, j)), shape=(self.n_vertices,) * 2).tocsr()
         return np.asarray(dijkstra(graph, directed=False, indices=sources, min_only=True))
 
     def vertex_areas(self, vertices: NDArray[Any]) -> NDArray[np.float64]:
         """A third of the area of the faces around each vertex [m²], shape (N,)."""
-        a, b, c = (vertices[self.faces[:, k]].astype(np.float64) for k in range(3))
+        a, b, c = (vertices[self.mesh.faces[:, k]].astype(np.float64) for k in range(3))
         area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
-        return np.bincount(self.faces.ravel(), weights=np.repeat(area, 3), minlength=self.n_vertices).astype(np.float64)
+        return np.bincount(self.mesh.faces.ravel(), weights=np.repeat(area, 3), minlength=self.n_vertices).astype(
+            np.float64
+        )
 
 
 def _colour_order(pairs: NDArray[np.int32]) -> NDArray[np.intp]:

@@ -28,7 +28,7 @@ _MOST_ACCELERATION = 20.0  # [m/s²]: what a jump has; more is a fault of the re
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class DrawnMotion:
     """A stretch of a clip, at `STEPS` simulated frames a frame: n of them."""
 
     poses: NDArray[np.float32]
@@ -58,7 +58,7 @@ def n_steps(n_frames: int) -> int:
     return (n_frames - 1) * STEPS + 1
 
 
-def draw_motion(clips: Sequence[Clip], n_frames: int, rng: np.random.Generator) -> Motion:
+def draw_motion(clips: Sequence[Clip], n_frames: int, rng: np.random.Generator) -> DrawnMotion:
     """A stretch of `n_frames` at `FPS` of one of the clips, mirrored or not.
 
     Raises `SimulationError` when no clip is that long.
@@ -86,7 +86,7 @@ def draw_motion(clips: Sequence[Clip], n_frames: int, rng: np.random.Generator) 
     heading = Rotation.from_rotvec(without_heading(poses[0])[0].astype(np.float64)) * root[0].inv()
     poses[:, 0] = (heading * root).as_rotvec()
     transl -= transl[0] * (1, 0, 1)
-    return Motion(poses, heading.apply(transl), which, first / rate, mirror)
+    return DrawnMotion(poses, heading.apply(transl), which, first / rate, mirror)
 
 
 def make_room_for(

@@ -27,8 +27,15 @@ TRAIN, TEST = 0, 1
 MAX_PIVOTS_SHARE = 0.5
 
 
+def truncated_normal(u: NDArray[np.float64], spread: float) -> NDArray[np.float32]:
+    """Normal numbers of this standard deviation, cut off at ±2, of evenly distributed `u` in [0, 1)."""
+    edge = ndtr(2 / spread)
+    value: NDArray[np.float32] = np.clip(spread * ndtri((1 - edge) + u * (2 * edge - 1)), -2, 2).astype(np.float32)
+    return value
+
+
 @dataclass(frozen=True)
-class Plan:
+class SamplePlan:
     """The slots of one data set.
 
     Half of the training samples belong to `pivots` style-shape pairs with many poses each (TailorNet's high-frequency
@@ -102,14 +109,13 @@ class Plan:
 
     def style_shape(self, pair: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """β (10,) and γ (4,) of a pair, normal, cut off at ±2; the pivots are spread evenly over each coordinate."""
-        edge = ndtr(2 / self.spread)
         if pair < self.pivots:
             rng = np.random.default_rng(self._key(1))
             cells = np.stack([rng.permutation(self.pivots) for _ in range(N_BETAS + N_STYLES)], 1)
             u = (cells[pair] + rng.random((self.pivots, N_BETAS + N_STYLES))[pair]) / self.pivots
         else:
             u = np.random.default_rng(self._key(2, pair)).random(N_BETAS + N_STYLES)
-        value = np.clip(self.spread * ndtri((1 - edge) + u * (2 * edge - 1)), -2, 2).astype(np.float32)
+        value = truncated_normal(u, self.spread)
         return value[:N_BETAS], value[N_BETAS:]
 
     def pose(self, slot: int, attempt: int, clips: Sequence[Clip]) -> tuple[NDArray[np.float32], int, int]:

@@ -12,18 +12,16 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from refu_core._npz import read_npz
-from refu_core.evaluation.self_contact import SelfContactDetector
+from refu_core._amass import n_resampled, read_recording
+from refu_core.body import ARMS, LEGS, MIRRORED_JOINTS, joints_of
 from refu_core.frames import N_BETAS, N_JOINTS
+from refu_core.metrics._self_contact import SelfContactDetector
 from refu_core.simulation._drape import canonical_pose
 from refu_core.simulation._errors import SimulationError
 
 if TYPE_CHECKING:
     from refu_core.body import SmplBody
     from refu_core.garments import GarmentTemplate
-
-_BODY_JOINTS = 22  # SMPL-H and SMPL-X share them with SMPL; the hands have no counterpart
-_MIRRORED = np.array([0, 2, 1, 3, 5, 4, 6, 8, 7, 9, 11, 10, 12, 14, 13, 15, 17, 16, 19, 18, 21, 20, 23, 22])
 
 # Range of each joint's rotation vector [degrees] about x, y, z, for the left side where there are two; the right side
 # is its mirror image. x points to the subject's left, y up, z forward, so a thigh is raised by a negative turn about x,
@@ -43,14 +41,9 @@ _LIMITS: dict[int, tuple[tuple[float, float], tuple[float, float], tuple[float, 
     18: ((-20, 20), (-120, 0), (-10, 10)),
     20: ((-20, 20), (-15, 15), (-30, 30)),
 }
-_LIMBS: dict[str, tuple[int, ...]] = {
-    "left_arm": (13, 16, 18, 20, 22),
-    "right_arm": (14, 17, 19, 21, 23),
-    "left_leg": (1, 4, 7, 10),
-    "right_leg": (2, 5, 8, 11),
-}
-
-_FREE_LIMBS = (1, 2, 4, 5, 7, 8, 10, 11, 18, 19, 20, 21, 22, 23)
+# With an arm goes its collar.
+_LIMBS = ((13, *ARMS[0]), (14, *ARMS[1]), *LEGS)
+_FREE_LIMBS = (*LEGS[0], *LEGS[1], *joints_of("left_forearm", "right_forearm"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,12 +60,16 @@ class Clip:
     """Frames a second."""
 
     def resampled(self, fps: float) -> Clip:
-        """The motion at another frame rate, rotations on the shorter arc."""
+        """The motion at another frame rate, rotations on the shorter arc; `SimulationError` for a million frames."""
         n = len(self.poses)
         if n < 2:
             return self
+        try:
+            wanted = np.arange(n_resampled(n, self.fps, fps)) / fps
+        except ValueError as error:
+            msg = f"{self.name}: {error}"
+            raise SimulationError(msg) from error
         times = np.arange(n) / self.fps
-        wanted = np.arange(int(times[-1] * fps + 1e-9) + 1) / fps
         poses = np.stack(
             [Slerp(times, Rotation.from_rotvec(self.poses[:, j]))(wanted).as_rotvec() for j in range(N_JOINTS)], 1
         )
@@ -95,32 +92,11 @@ def load_clips(path: str | Path) -> list[Clip]:
 
 
 def _load_clip(path: Path) -> Clip:
-    keys = ("poses", "trans", "mocap_framerate", "mocap_frame_rate")
-    data = read_npz(path, keys=keys, error=SimulationError)
-    poses = data.get("poses")
-    fps = data.get("mocap_framerate", data.get("mocap_frame_rate"))
-    if (
-        poses is None
-        or poses.ndim != 2
-        or poses.shape[1] not in (72, 156, 165)
-        or poses.dtype.kind != "f"
-        or not len(poses)
-    ):
-        got = "no poses" if poses is None else f"poses of {poses.dtype} and shape {poses.shape}"
-        msg = f"{path}: wanted poses (T, 72) of rotation vectors (or SMPL-H's 156, SMPL-X's 165 columns), got {got}"
+    recording = read_recording(path, error=SimulationError)
+    if not (np.isfinite(recording.poses).all() and np.isfinite(recording.transl).all()):
+        msg = f"{path}: wanted finite poses and trans; cut out the frames that aren't"
         raise SimulationError(msg)
-    if fps is None or fps.size != 1 or fps.dtype.kind not in "iuf" or not 0 < float(fps.reshape(-1)[0]) <= 10_000:
-        msg = f"{path}: wanted mocap_framerate in (0, 10000], got {fps}"
-        raise SimulationError(msg)
-    transl = data.get("trans", np.zeros((len(poses), 3)))
-    is_right = transl.shape == (len(poses), 3) and transl.dtype.kind in "iuf"
-    if not is_right or not (np.isfinite(poses).all() and np.isfinite(transl).all()):
-        msg = f"{path}: wanted finite poses and trans of the shape ({len(poses)}, 3), got {transl.dtype} {transl.shape}"
-        raise SimulationError(msg)
-    joints = np.zeros((len(poses), N_JOINTS, 3), np.float32)
-    n = N_JOINTS if poses.shape[1] == 72 else _BODY_JOINTS
-    joints[:, :n] = poses[:, : 3 * n].reshape(-1, n, 3)
-    return Clip(path.stem, joints, transl.astype(np.float64), float(fps.reshape(-1)[0]))
+    return Clip(path.stem, recording.poses, recording.transl, recording.fps)
 
 
 def split_clips(clips: Sequence[Clip], *, test_every: int = 5) -> tuple[list[Clip], list[Clip]]:
@@ -149,7 +125,7 @@ def without_heading(pose: NDArray[np.floating]) -> NDArray[np.float32]:
 
 def mirrored(pose: NDArray[np.floating]) -> NDArray[np.float32]:
     """The pose (24, 3) of the mirror image, left and right exchanged [rad]."""
-    image: NDArray[np.float32] = np.asarray(pose, np.float32)[_MIRRORED] * np.array([1, -1, -1], np.float32)
+    image: NDArray[np.float32] = np.asarray(pose, np.float32)[MIRRORED_JOINTS,] * np.array([1, -1, -1], np.float32)
     return image
 
 
@@ -159,7 +135,7 @@ def random_pose(rng: np.random.Generator) -> NDArray[np.float32]:
     for joint, ranges in _LIMITS.items():
         low, high = np.radians(ranges).T
         pose[joint] = low + (high - low) * rng.beta(1.6, 1.6, 3)
-        other = _MIRRORED[joint]
+        other = MIRRORED_JOINTS[joint]
         if other != joint:
             pose[other] = (low + (high - low) * rng.beta(1.6, 1.6, 3)) * (1, -1, -1)
     return pose.astype(np.float32)
@@ -212,7 +188,7 @@ class RoomMaker:
         self._detector = SelfContactDetector(body.faces, self._padded(rest))
         main_joint = body.weights.argmax(1)[body.faces[:, 0]].numpy()
         self._limb = np.full(len(main_joint), -1)
-        for k, joints in enumerate(_LIMBS.values()):
+        for k, joints in enumerate(_LIMBS):
             self._limb[np.isin(main_joint, joints)] = k
 
     def _padded(self, vertices: torch.Tensor) -> torch.Tensor:
@@ -276,7 +252,7 @@ class RoomMaker:
     def held_back(self, pose: NDArray[np.float32], share: NDArray[np.floating]) -> NDArray[np.float32]:
         """The pose with each limb at its share, (4,), of its way from the canonical pose."""
         held = pose
-        for k, joints in enumerate(_LIMBS.values()):
+        for k, joints in enumerate(_LIMBS):
             if share[k] < 1:
                 j = list(joints)
                 held = pose.copy() if held is pose else held

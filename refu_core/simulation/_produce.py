@@ -5,14 +5,14 @@ from __future__ import annotations
 import hashlib
 import platform
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from multiprocessing import get_context
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -22,9 +22,7 @@ from refu_core.simulation._selection import CAUSES
 from refu_core.simulation._store import QUANTUM, TO_DO, Shard, locked, read_card, write_card
 
 if TYPE_CHECKING:
-    from refu_core.body import SmplBody
-    from refu_core.garments import GarmentTemplate
-    from refu_core.simulation._poses import Clip
+    from refu_core.simulation._worker import Simulator
 
 
 @dataclass(frozen=True)
@@ -41,69 +39,42 @@ class Progress:
     """What failed in the finished slots, by cause: attempts at a sample, frames of a sequence."""
 
 
-class Simulator(Protocol):
-    """Makes the row of any slot, the same every time."""
-
-    def simulate(self, slot: int) -> dict[str, Any]:
-        """The columns of a slot's row (see `_store`)."""
-
-
-class Job(Protocol):
-    """All that a process needs to make its simulator; small, for it is sent to each of them."""
-
-    @property
-    def rows(self) -> type[Shard]:
-        """The kind of shard that the rows go to."""
-
-    def simulator(self) -> Simulator:
-        """The simulator of this process."""
-
-
-def check_division(shard: tuple[int, int], processes: int) -> None:
-    """Raises `SimulationError` for a shard or a number of processes that can't be."""
-    index, n_shards = shard
-    if not 0 <= index < n_shards or processes < 1:
-        msg = f"wanted a shard (i, n) with 0 <= i < n and at least one process, got {shard} and {processes}"
-        raise SimulationError(msg)
-
-
 def produce(
-    job: Job,
-    simulator: Simulator,
+    make: Callable[[], Simulator],
     output: Path,
     *,
-    card: dict[str, Any],
-    blocks: Sequence[Sequence[int]],
-    shape: tuple[int, ...],
     processes: int,
     shard: tuple[int, int],
     progress: Callable[[Progress], None] | None,
-) -> None:
-    """Simulates what is left of one shard of the set in `output`.
+    **card: Any,
+) -> Simulator:
+    """Simulates what is left of one shard of the set in `output`; returns this process's simulator.
 
     Args:
-        job: for the processes.
-        simulator: for this process, where it is the only one.
+        make: makes a process's simulator; it is sent to each process, so it is small.
         output: directory of the set.
-        card: of the set.
-        blocks: slots of all shards, in runs that one process does.
-        shape: of a row's garment.
         processes: how many.
         shard: which of how many.
         progress: called after each slot.
+        card: what the set's card says besides.
 
     Raises:
         SimulationError: see `simulate_dataset`.
     """
     index, n_shards = shard
-    mine = blocks[index::n_shards]
+    if not 0 <= index < n_shards or processes < 1:
+        msg = f"wanted a shard (i, n) with 0 <= i < n and at least one process, got {shard} and {processes}"
+        raise SimulationError(msg)
+    # Made here although workers make their own: a body or garment that won't do is refused before anything is written.
+    simulator = make()
+    mine = simulator.plan.blocks()[index::n_shards]
     slots = np.array([slot for block in mine for slot in block], np.int32)
-    _open_set(output, card)
+    _open_set(output, _card_of(simulator) | card)
     directory = output / f"shard-{index}-of-{n_shards}"
     if not directory.exists():
-        job.rows.create(directory, slots, shape)
+        simulator.rows.create(directory, slots, simulator.shape)
     with locked(directory):
-        rows = job.rows(directory, mode="r+")
+        rows = simulator.rows(directory, mode="r+")
         if not np.array_equal(rows.arrays["slot"], slots):
             msg = f"{directory}: holds other slots than this plan's; give another output directory"
             raise SimulationError(msg)
@@ -114,25 +85,27 @@ def produce(
         ]
         left = [block for block in left if block]
         started, done, total = time.monotonic(), 0, sum(map(len, left))
-        for n in _simulate(simulator, rows, job, left, processes):
+        for n in _simulate(simulator, rows, make, left, processes):
             done += n
             if progress is not None:
                 pace = (time.monotonic() - started) / done
                 dropped = rows.arrays["dropped"][state != TO_DO].sum(0, dtype=np.int64).tolist()
                 causes = dict(zip(CAUSES, dropped, strict=True))
                 progress(Progress(len(slots) - total + done, len(slots), pace * (total - done), causes))
+    return simulator
 
 
-def _simulate(simulator: Simulator, shard: Shard, job: Job, blocks: list[list[int]], processes: int) -> Iterator[int]:
+def _simulate(
+    simulator: Simulator, shard: Shard, make: Callable[[], Simulator], blocks: list[list[int]], processes: int
+) -> Iterator[int]:
     """Simulates blocks of rows and writes them; yields how many are new, again and again."""
     if processes == 1:
-        for block in blocks:
-            for row in block:
-                shard.write(row, simulator.simulate(int(shard.arrays["slot"][row])))
-                yield 1
+        for row in (row for block in blocks for row in block):
+            shard.write(row, simulator.simulate(int(shard.arrays["slot"][row])))
+            yield 1
         return
     pool = ProcessPoolExecutor(
-        processes, mp_context=get_context("spawn"), initializer=_start_process, initargs=(job, shard.directory)
+        processes, mp_context=get_context("spawn"), initializer=_start_process, initargs=(make, shard.directory)
     )
     try:
         # A whole block goes to one process, for the sake of its common canonical drape.
@@ -150,11 +123,12 @@ def _simulate(simulator: Simulator, shard: Shard, job: Job, blocks: list[list[in
 _state: tuple[Simulator, Shard] | None = None
 
 
-def _start_process(job: Job, directory: Path) -> None:
+def _start_process(make: Callable[[], Simulator], directory: Path) -> None:
     """Prepares this process, once. One thread: the processes are the parallelism."""
     global _state
     torch.set_num_threads(1)
-    _state = job.simulator(), job.rows(directory, mode="r+")
+    simulator = make()
+    _state = simulator, simulator.rows(directory, mode="r+")
 
 
 def _simulate_block(rows: list[int]) -> int:
@@ -166,15 +140,9 @@ def _simulate_block(rows: list[int]) -> int:
     return len(rows)
 
 
-def make_card(
-    kind: str,
-    plan: Any,
-    settings: Any,
-    clips: tuple[list[Clip], list[Clip]],
-    garment: GarmentTemplate,
-    body: SmplBody,
-) -> dict[str, Any]:
-    """What a set of the format `kind` is, before there is anything in it."""
+def _card_of(simulator: Simulator) -> dict[str, Any]:
+    """What a simulator's set is, before there is anything in it."""
+    garment, body, clips = simulator.garment, simulator.body, simulator.clips
     digest = hashlib.sha256()
     for tensor in (garment.faces, garment.weights, garment.v_template, garment.shapedirs, garment.styledirs):
         if tensor is not None:
@@ -183,15 +151,15 @@ def make_card(
     for clip in (*clips[0], *clips[1]):
         motions.update(clip.name.encode() + clip.poses.tobytes())
     return {
-        "format": kind,
-        "garment": plan.garment,
+        "format": simulator.kind,
+        "garment": garment.name,
         "body": body.name,
         "body_fingerprint": body.fingerprint,
         "garment_fingerprint": digest.hexdigest()[:16],
         "motions_fingerprint": motions.hexdigest()[:16],
         "quantum_m": QUANTUM,
-        "plan": asdict(plan),
-        "settings": asdict(settings),
+        "plan": asdict(simulator.plan),
+        "settings": asdict(simulator.settings),
         "clips": {"train": [clip.name for clip in clips[0]], "test": [clip.name for clip in clips[1]]},
         "versions": {
             "python": platform.python_version(),

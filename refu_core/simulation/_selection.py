@@ -11,12 +11,12 @@ import warp as wp
 from numpy.typing import NDArray
 
 from refu_core._warp import as_warp
-from refu_core.evaluation._intersect import crossings
-from refu_core.evaluation.collisions import CollisionChecker
+from refu_core.metrics._collisions import CollisionChecker
+from refu_core.metrics._intersect import crossings
 
 if TYPE_CHECKING:
     from refu_core.simulation._cloth import F32
-    from refu_core.simulation._drape import Drape
+    from refu_core.simulation._drape import SettledDrape
 
 CAUSES = ("no_room", "body_collision", "self_intersection", "stretch", "unsettled")
 """Why a sample isn't taken, in the order of the checks; `no_room` is decided before anything is simulated."""
@@ -66,7 +66,7 @@ class Selector:
         self._body = CollisionChecker(body_faces)
         self._itself = SelfIntersection(garment_faces)
 
-    def cause(self, vertices: F32, body: F32, drape: Drape | None = None) -> str | None:
+    def cause(self, vertices: F32, body: F32, drape: SettledDrape | None = None) -> str | None:
         """One of `CAUSES`, or None for a drape with nothing against it.
 
         Args:

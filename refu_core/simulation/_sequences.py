@@ -7,44 +7,30 @@ import time
 import zlib
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.special import ndtr, ndtri
 
 from refu_core.frames import N_BETAS
 from refu_core.garments import N_STYLES
 from refu_core.simulation._cloth import ClothSettings
-from refu_core.simulation._drape import GRAVITY, Drape, Draper, DrapeSettings
+from refu_core.simulation._drape import GRAVITY, DrapeSettings, SettledDrape
 from refu_core.simulation._errors import SimulationError
-from refu_core.simulation._motion import FPS, STEPS, Motion, draw_motion, make_room_for
-from refu_core.simulation._plan import TEST, TRAIN
-from refu_core.simulation._poses import Clip, RoomMaker, RoomSettings, load_clips, split_clips
-from refu_core.simulation._produce import Progress, check_division, make_card, produce
-from refu_core.simulation._selection import CAUSES, SelectionSettings, Selector
-from refu_core.simulation._store import (
-    DONE,
-    GIVEN_UP,
-    SEQUENCES,
-    SequenceShard,
-    dequantise,
-    gather,
-    quantise,
-    read_card,
-    rows_of,
-    shards_of,
-    write_card,
-)
-from refu_core.simulation._worker import load_pair
+from refu_core.simulation._motion import FPS, STEPS, DrawnMotion, draw_motion, make_room_for
+from refu_core.simulation._plan import TEST, TRAIN, truncated_normal
+from refu_core.simulation._poses import Clip, load_clips, split_clips
+from refu_core.simulation._produce import Progress, produce
+from refu_core.simulation._selection import CAUSES
+from refu_core.simulation._store import DONE, GIVEN_UP, SEQUENCES, SequenceShard, dequantise, quantise
+from refu_core.simulation._summary import summarise_sequences
+from refu_core.simulation._worker import SimulationSettings, Simulator
 
 if TYPE_CHECKING:
-    from refu_core.body import SmplBody
-    from refu_core.garments import GarmentTemplate
     from refu_core.simulation._cloth import F32
-    from refu_core.simulation._store import Shard
 
 
 @dataclass(frozen=True)
@@ -96,19 +82,17 @@ class SequencePlan:
 
     def style_shape(self, slot: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """β (10,), normal, cut off at ±2, and γ (4,), zero."""
-        edge = ndtr(2 / self.spread)
         u = np.random.default_rng(self._key(1, slot % self.shapes)).random(N_BETAS)
-        betas = np.asarray(self.spread * ndtri((1 - edge) + u * (2 * edge - 1)), np.float32)
-        return betas.clip(-2, 2), np.zeros(N_STYLES, np.float32)
+        return truncated_normal(u, self.spread), np.zeros(N_STYLES, np.float32)
 
-    def motion(self, slot: int, attempt: int, clips: list[Clip]) -> Motion:
+    def motion(self, slot: int, attempt: int, clips: list[Clip]) -> DrawnMotion:
         """What a sequence shows at its `attempt`. Raises `SimulationError` when no clip is long enough."""
         rng = np.random.default_rng(self._key(2, slot, attempt))
         return draw_motion(clips, self.n_frames, rng)
 
 
 @dataclass(frozen=True)
-class SequenceSettings:
+class SequenceSettings(SimulationSettings):
     """All settings of a set of sequences but its plan."""
 
     drape: DrapeSettings = field(default_factory=lambda: DrapeSettings(cloth=ClothSettings(refresh=10)))
@@ -117,36 +101,28 @@ class SequenceSettings:
     """Rate at which the cloth's velocity fades in the air that goes with the body [1/s]."""
     rebuild_every: int = 10
     """Simulated frames after which the body's tree of triangles is built anew."""
-    room: RoomSettings = field(default_factory=RoomSettings)
-    selection: SelectionSettings = field(default_factory=SelectionSettings)
-    attempts: int = 8
-    """Stretches of motion that a sequence tries for a first pose with room for the cloth, before it is given up."""
 
 
-class SequenceSimulator:
-    """Simulates whole sequences, in any order, each with the same result every time."""
+class SequenceSimulator(Simulator):
+    """Simulates whole sequences."""
+
+    kind = SEQUENCES
+    rows = SequenceShard
+    plan: SequencePlan
+    settings: SequenceSettings
 
     def __init__(
-        self,
-        plan: SequencePlan,
-        garment: GarmentTemplate,
-        body: SmplBody,
-        clips: tuple[list[Clip], list[Clip]],
-        settings: SequenceSettings,
+        self, plan: SequencePlan, clips: tuple[list[Clip], list[Clip]], settings: SequenceSettings, body: Any
     ) -> None:
-        """For the clips of the training and of the test set.
-
-        Raises `SimulationError` when those of a split are too short.
-        """
-        self.plan = plan
-        self.settings = settings
-        self._clips = clips
-        self._body = body
-        self._draper = Draper(garment, body, settings=settings.drape)
-        self._room = RoomMaker(garment, body, settings=settings.room)
-        self._selector = Selector(body.faces, garment.faces, settings=settings.selection)
+        """As `Simulator`; raises `SimulationError`, too, when the clips of a split are too short."""
+        super().__init__(plan, clips, settings, body)
         for slot in (0, plan.count - 1):
             plan.motion(slot, 0, clips[plan.split_of(slot) == TEST])
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of a row's garments."""
+        return (self.plan.n_frames, *super().shape)
 
     def simulate(self, slot: int) -> dict[str, Any]:
         """The columns of a sequence's row (see `_store`)."""
@@ -157,7 +133,7 @@ class SequenceSimulator:
         row: dict[str, Any] = {"slot": slot, "shape": slot % plan.shapes, "split": split, "betas": betas}
         row |= {"style": style, "state": GIVEN_UP, "dropped": np.zeros(len(CAUSES), np.int32)}
         for attempt in range(self.settings.attempts):
-            motion = plan.motion(slot, attempt, self._clips[split == TEST])
+            motion = plan.motion(slot, attempt, self.clips[split == TEST])
             first = make_room_for(self._room, motion.poses[:1], betas, style)
             if first[2][0]:
                 continue
@@ -187,7 +163,7 @@ class SequenceSimulator:
         shape = torch.from_numpy(betas)[None]
         drape = self._draper.drape(poses[0], betas, style)
         bodies = np.concatenate(
-            [self._body(poses[k : k + 50], shape).vertices.numpy() for k in range(0, len(poses), 50)]
+            [self.body(poses[k : k + 50], shape).vertices.numpy() for k in range(0, len(poses), 50)]
         )
         self._draper.begin(drape.vertices, betas, style, bodies[0])
         gravity = (np.array([0, -GRAVITY, 0]) - acceleration).astype(np.float32)
@@ -214,25 +190,8 @@ class SequenceSimulator:
     def _examine(self, stored: F32, body: F32, stretch: float, *, crowded: bool) -> int:
         """0, or 1 and above for the cause why a frame isn't in the set; a moving cloth may be fast."""
         worst = max(stretch, self._draper.stretch(stored))  # rounding included, as for samples
-        cause = "no_room" if crowded else self._selector.cause(stored, body, Drape(stored, 0.0, worst, 1))
+        cause = "no_room" if crowded else self._selector.cause(stored, body, SettledDrape(stored, 0.0, worst, 1))
         return 0 if cause is None else 1 + CAUSES.index(cause)
-
-
-@dataclass(frozen=True, eq=False)
-class SequenceJob:
-    """What a process needs to simulate sequences."""
-
-    plan: SequencePlan
-    clips: tuple[list[Clip], list[Clip]]
-    settings: SequenceSettings
-    body: str | Path
-
-    rows: ClassVar[type[Shard]] = SequenceShard
-
-    def simulator(self) -> SequenceSimulator:
-        """The simulator of this process."""
-        garment, body = load_pair(self.plan.garment, self.body)
-        return SequenceSimulator(self.plan, garment, body, self.clips, self.settings)
 
 
 def simulate_sequences(
@@ -276,74 +235,11 @@ def simulate_sequences(
         MeshError: the body isn't watertight.
         BodyError, GarmentError: no such body or garment.
     """
-    check_division(shard, processes)
-    output = Path(output)
-    plan = SequencePlan(garment, count, shapes=shapes, seconds=seconds, seed=seed)
     if motions is None:
         msg = f"sequences need recorded motion: give a folder of AMASS-style .npz files, of {seconds:g} s or more each"
         raise SimulationError(msg)
-    settings = settings or SequenceSettings()
+    plan = SequencePlan(garment, count, shapes=shapes, seconds=seconds, seed=seed)
     clips = split_clips(load_clips(motions))
-    template, worn_by = load_pair(garment, body)
-    job = SequenceJob(plan, clips, settings, template.body if body is None else body)
-    simulator = SequenceSimulator(plan, template, worn_by, clips, settings)
-    produce(
-        job,
-        simulator,
-        output,
-        card=make_card(SEQUENCES, plan, settings, clips, template, worn_by) | {"fps": FPS},
-        blocks=plan.blocks(),
-        shape=(plan.n_frames, template.n_vertices, 3),
-        processes=processes,
-        shard=shard,
-        progress=progress,
-    )
+    make = partial(SequenceSimulator, plan, clips, settings or SequenceSettings(), body)
+    produce(make, Path(output), processes=processes, shard=shard, progress=progress, fps=FPS)
     return summarise_sequences(output)
-
-
-def summarise_sequences(output: str | Path) -> dict[str, Any]:
-    """Brings the card of a set of sequences up to date: counts, the frames that are in the set and why others aren't.
-
-    Raises `SimulationError` when `output` holds no set of sequences.
-    """
-    output = Path(output)
-    card = read_card(output, SEQUENCES)
-    shards = shards_of(output, SequenceShard)
-    if not shards:
-        msg = f"{output}: a card and no shard; wanted shard-I-of-N directories beside it"
-        raise SimulationError(msg)
-    where, row = rows_of(shards, (DONE, GIVEN_UP))
-    names = ("state", "split", "cause", "dropped", "share", "stretch", "speed", "seconds")
-    column = {name: gather(shards, where, row, name) for name in names}
-    done = column["state"] == DONE
-    good = column["cause"] == 0
-    frames = int(done.sum()) * int(card["plan"]["seconds"] * FPS + 0.5)
-    card["counts"] = {
-        "train": int((done & (column["split"] == TRAIN)).sum()),
-        "test": int((done & (column["split"] == TEST)).sum()),
-        "given_up": int((column["state"] == GIVEN_UP).sum()),
-        "to_do": int(card["plan"]["count"] - len(done)),
-        "frames": frames,
-        "frames_kept": int(good[done].sum()),
-    }
-    dropped = column["dropped"][done].sum(0, dtype=np.int64).tolist()
-    card["yield"] = {
-        "simulated": frames,
-        "kept_share": float(good[done].sum() / max(frames, 1)),
-        "dropped": dict(zip(CAUSES, dropped, strict=True)),
-    }
-    if done.any():
-        kept = good & done[:, None]
-        card["figures"] = {
-            "seconds_a_frame": float(column["seconds"].sum() / frames),
-            "kept_share_of_worst_sequence": float(good[done].mean(1).min()),
-            "kept_share_of_median_sequence": float(np.median(good[done].mean(1))),
-        }
-        if kept.any():
-            card["figures"] |= {
-                "stretch_p999_median": float(np.median(column["stretch"][kept])),
-                "stretch_p999_largest": float(column["stretch"][kept].max()),
-                "speed_m_s_median": float(np.median(column["speed"][kept])),
-            }
-    write_card(output, card)
-    return card

@@ -1,52 +1,55 @@
-# mypy: ignore-errors
-# (Numba infers the types of these functions from their arguments; a type checker can't follow.)
 """The inner loops of the cloth: extended position-based dynamics (Macklin et al. 2016), Gauss-Seidel, in Numba.
 
 Everything runs on one thread and in a fixed order: a result is the same bit for bit on the same machine. Positions,
-velocities and lengths are float32 in metres and seconds; arrays that aren't described are shaped as in `Cloth`.
+velocities and lengths are float32 in metres and seconds; arrays that aren't described are shaped as in
+`SimulatedCloth`.
 """
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 _TINY = np.float32(1e-12)
+
+_Floats = NDArray[np.float32]
+_Ints = NDArray[np.int32]
 
 
 @numba.njit(cache=True, fastmath=True)
 def substep(
-    x,  # positions (N, 3), updated
-    v,  # velocities (N, 3), updated
-    previous,  # scratch (N, 3)
-    inverse_mass,  # (N,)
-    ends,  # vertices of the distance constraints (E, 2)
-    shortest,  # between these two lengths they give way freely (E,)
-    longest,
-    softness,  # their compliance over h² (E,)
-    h,
-    gravity,  # (3,)
-    damping,
-    contact_vertex,  # (C,)
-    contact_point,  # (C, 3), advanced by contact_motion once
-    contact_normal,  # (C, 3)
-    contact_motion,  # of the skin in this substep (C, 3)
-    margin,
-    friction,
-    anchor_vertex,  # (A,)
-    anchor_point,  # (A, 3), advanced by anchor_motion once
-    anchor_motion,  # (A, 3)
-    anchor_stiffness,  # share of the way to the anchor closed by an iteration
-    pair_vertex,  # self-contacts (S,)
-    pair_face,  # (S, 3) vertices
-    pair_side,  # (S,) side of the face that the vertex was on when the pair was found
-    thickness,
-    edge_ends,  # contacts of edge midpoints (M, 2)
-    edge_point,  # (M, 3), advanced by edge_motion once
-    edge_normal,  # (M, 3)
-    edge_motion,  # (M, 3)
-    edge_margin,
-    iterations,
-    max_step,  # no vertex moves further in one substep; keeps a bad contact from throwing the cloth away
-):
+    x: _Floats,  # positions (N, 3), updated
+    v: _Floats,  # velocities (N, 3), updated
+    previous: _Floats,  # scratch (N, 3)
+    inverse_mass: _Floats,  # (N,)
+    ends: _Ints,  # vertices of the distance constraints (E, 2)
+    shortest: _Floats,  # between these two lengths they give way freely (E,)
+    longest: _Floats,
+    softness: _Floats,  # their compliance over h² (E,)
+    h: float,
+    gravity: _Floats,  # (3,)
+    damping: float,
+    contact_vertex: _Ints,  # (C,)
+    contact_point: _Floats,  # (C, 3), advanced by contact_motion once
+    contact_normal: _Floats,  # (C, 3)
+    contact_motion: _Floats,  # of the skin in this substep (C, 3)
+    margin: float,
+    friction: float,
+    anchor_vertex: _Ints,  # (A,)
+    anchor_point: _Floats,  # (A, 3), advanced by anchor_motion once
+    anchor_motion: _Floats,  # (A, 3)
+    anchor_stiffness: float,  # share of the way to the anchor closed by an iteration
+    pair_vertex: _Ints,  # self-contacts (S,)
+    pair_face: _Ints,  # (S, 3) vertices
+    pair_side: _Floats,  # (S,) side of the face that the vertex was on when the pair was found
+    thickness: float,
+    edge_ends: _Ints,  # contacts of edge midpoints (M, 2)
+    edge_point: _Floats,  # (M, 3), advanced by edge_motion once
+    edge_normal: _Floats,  # (M, 3)
+    edge_motion: _Floats,  # (M, 3)
+    edge_margin: float,
+    iterations: int,
+    max_step: float,  # no vertex moves further in one substep; keeps a bad contact from throwing the cloth away
+) -> None:
     one = np.float32(1.0)
     half = np.float32(0.5)
     n = x.shape[0]
@@ -146,7 +149,9 @@ def substep(
 
 
 @numba.njit(cache=True, fastmath=True)
-def _separate_pairs(x, inverse_mass, pair_vertex, pair_face, pair_side, thickness):
+def _separate_pairs(
+    x: _Floats, inverse_mass: _Floats, pair_vertex: _Ints, pair_face: _Ints, pair_side: _Floats, thickness: float
+) -> None:
     """Pushes a vertex and a face of the cloth apart to `thickness`, on the side where the vertex was found."""
     one = np.float32(1.0)
     slack = np.float32(0.02)  # a vertex over the rim of a face belongs to its neighbour, too
@@ -201,7 +206,9 @@ def _separate_pairs(x, inverse_mass, pair_vertex, pair_face, pair_side, thicknes
 
 
 @numba.njit(cache=True, fastmath=True)
-def find_pairs(x, faces, rest, rest_apart, reach, cell):
+def find_pairs(
+    x: _Floats, faces: _Ints, rest: _Floats, rest_apart: float, reach: float, cell: float
+) -> tuple[_Ints, _Ints, _Floats]:
     """Vertices within `reach` of a face of the same cloth that isn't near it in the rest shape.
 
     Faces are binned by their centres in a grid of the given cell size (at least `reach` plus the longest distance of a
@@ -284,7 +291,9 @@ def find_pairs(x, faces, rest, rest_apart, reach, cell):
 
 
 @numba.njit(cache=True)
-def stale_points(x, asked_at, asked_distance, near, slide, everything):
+def stale_points(
+    x: _Floats, asked_at: _Floats, asked_distance: _Floats, near: float, slide: float, everything: bool
+) -> _Ints:
     """Points whose distance to the skin must be asked again: those that moved too far since the last time."""
     n = x.shape[0]
     out = np.empty(n, np.int32)
@@ -304,7 +313,19 @@ def stale_points(x, asked_at, asked_distance, near, slide, everything):
 
 
 @numba.njit(cache=True)
-def refresh_points(x, face, weights, asked_distance, normal, stale, body_faces, body, motion, moving, near):
+def refresh_points(
+    x: _Floats,
+    face: _Ints,
+    weights: _Floats,
+    asked_distance: _Floats,
+    normal: _Floats,
+    stale: _Ints,
+    body_faces: _Ints,
+    body: _Floats,
+    motion: _Floats,
+    moving: bool,
+    near: float,
+) -> tuple[_Ints, _Floats, _Floats, _Floats]:
     """Contacts of the points near the skin: their number, the point on the skin, its normal, its motion in a substep.
 
     `normal` (N, 3) keeps the direction from the skin to each point as it was when it was asked for; the `stale` ones

@@ -32,6 +32,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from refu_core._files import open_file, read_json
 from refu_core._npz import DAMAGE, check_npy
 from refu_core.simulation._errors import SimulationError
 from refu_core.simulation._selection import CAUSES
@@ -41,7 +42,9 @@ SEQUENCES = "refu-sequences-1"
 QUANTUM = 2.0**-14
 """Unit of stored positions [m]: 0.06 mm, so ±2 m fit and rounding moves a vertex by at most 0.03 mm an axis."""
 TO_DO, DONE, GIVEN_UP = 0, 1, 2
-_MAX_CARD_BYTES = 16 << 20
+_MAX_BYTES = 1 << 40
+_MAX_ROWS = 1 << 22
+"""Of a shard; the largest sets have a hundredth of that."""
 
 
 Columns = dict[str, tuple[tuple[int, ...], str]]
@@ -129,8 +132,11 @@ class Shard:
         try:
             for name in self.columns(()):
                 path = directory / f"{name}.npy"
-                with path.open("rb") as file:
-                    check_npy(file, path.stat().st_size)  # numpy would lengthen a file that was cut short
+                with open_file(path, most=_MAX_BYTES, error=SimulationError, wanted="a column of a data set") as file:
+                    rows = check_npy(file, file.size)[0][:1]  # numpy would lengthen a file that was cut short
+                if rows > (_MAX_ROWS,):
+                    msg = f"{path}: {rows[0]} rows, at most {_MAX_ROWS} are read"
+                    raise SimulationError(msg)
                 self.arrays[name] = np.load(path, mmap_mode=mode)  # type: ignore[arg-type]
         except DAMAGE as error:
             msg = f"{directory}: not a shard of a data set, or a damaged one: {error}"
@@ -193,8 +199,12 @@ class SequenceShard(Shard):
 
 
 def shards_of(directory: Path, kind: type[Shard] = Shard) -> list[Shard]:
-    """The shards of a set, by name; none that is only being laid out."""
-    return [kind(path) for path in sorted(directory.glob("shard-*-of-*")) if path.suffix != ".new"]
+    """The shards of a set, by name; none that is only being laid out. Raises `SimulationError` where there is none."""
+    shards = [kind(path) for path in sorted(directory.glob("shard-*-of-*")) if path.suffix != ".new"]
+    if not shards:
+        msg = f"{directory}: a card and no shard; wanted shard-I-of-N directories beside it"
+        raise SimulationError(msg)
+    return shards
 
 
 def rows_of(shards: Sequence[Shard], states: tuple[int, ...]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -270,16 +280,7 @@ def locked(directory: Path) -> Iterator[None]:
 def read_card(directory: Path, kind: str = FORMAT) -> dict[str, Any]:
     """The card of a data set of the format `kind`. Raises `SimulationError` when there is none, or it can't be read."""
     path = directory / "card.json"
-    try:
-        with path.open("rb") as file:
-            text = file.read(_MAX_CARD_BYTES + 1)
-        if len(text) > _MAX_CARD_BYTES:
-            msg = f"larger than {_MAX_CARD_BYTES >> 20} MiB"
-            raise ValueError(msg)
-        card = json.loads(text)
-    except (OSError, ValueError, RecursionError) as error:
-        msg = f"{path}: wanted the card of a simulated data set: {error}"
-        raise SimulationError(msg) from error
+    card = read_json(path, error=SimulationError, wanted="the card of a simulated data set")
     if not isinstance(card, dict) or card.get("format") != kind:
         got = card.get("format") if isinstance(card, dict) else None
         msg = f"{path}: wanted the card of a data set of the format {kind}, got the format {got!r}"
@@ -311,13 +312,15 @@ def read_by_slot(directory: Path, name: str, shape: tuple[int, ...]) -> NDArray[
     if not path.exists():
         return np.broadcast_to(np.float32(np.nan), shape)
     try:
-        with path.open("rb") as file:
-            check_npy(file, path.stat().st_size)
-        values = np.load(path)
+        with open_file(path, most=_MAX_BYTES, error=SimulationError, wanted=f"{name} of a data set") as file:
+            found, dtype = check_npy(file, file.size)
+            if found == shape and dtype == np.float32:
+                file.seek(0)
+                return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
     except DAMAGE as error:
+        if isinstance(error, SimulationError):
+            raise
         msg = f"{path}: can't be read: {error}"
         raise SimulationError(msg) from error
-    if values.shape != shape or values.dtype != np.float32:
-        msg = f"{path}: wanted float32 of shape {shape}, got {values.dtype} of {values.shape}"
-        raise SimulationError(msg)
-    return np.asarray(values)
+    msg = f"{path}: wanted float32 of shape {shape}, got {dtype} of {found}"
+    raise SimulationError(msg)

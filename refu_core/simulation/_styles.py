@@ -17,64 +17,21 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from refu_core.errors import GarmentError
 from refu_core.frames import N_BETAS
 from refu_core.garments import N_STYLES
 from refu_core.sdf import ExactSdf
-from refu_core.simulation._drape import HELD_AT_WAIST, Draper
+from refu_core.simulation._drape import Draper
 from refu_core.simulation._mesh import ClothTopology
 
 if TYPE_CHECKING:
     from refu_core.body import SmplBody
-    from refu_core.garments import GarmentTemplate
+    from refu_core.garments import GarmentTemplate, Tailoring
     from refu_core.simulation._cloth import F32
 
 F64 = NDArray[np.float64]
 _CLEARANCE = 0.005
 """Distance that a cut made longer or wider keeps from the mean body [m]."""
-
-
-@dataclass(frozen=True)
-class Tailoring:
-    """One tailoring parameter: how far the cut moves at the place where it moves most [m]."""
-
-    name: str
-    mean: float
-    """Added to the template as it was cut: the middle of the range."""
-    std: float
-    """Of the parameter; γ of ±2 reaches two of them."""
-
-
-_PARAMETERS: dict[str, tuple[Tailoring, ...]] = {
-    "shirt": (
-        Tailoring("length", 0.0, 0.03),
-        Tailoring("sleeve_length", -0.01, 0.02),
-        Tailoring("ease", 0.012, 0.004),
-        Tailoring("neckline", 0.008, 0.007),
-    ),
-    "tshirt": (
-        Tailoring("length", 0.0, 0.03),
-        Tailoring("sleeve_length", 0.0, 0.025),
-        Tailoring("ease", 0.012, 0.004),
-        Tailoring("neckline", 0.010, 0.008),
-    ),
-    "short-pant": (
-        Tailoring("length", 0.0, 0.03),
-        Tailoring("flare", 0.008, 0.008),
-        Tailoring("ease", 0.007, 0.003),
-        Tailoring("rise", 0.0, 0.010),
-    ),
-    "skirt": (
-        Tailoring("length", 0.0, 0.04),
-        Tailoring("flare", 0.02, 0.022),
-        Tailoring("ease", 0.005, 0.004),
-        Tailoring("rise", 0.0, 0.010),
-    ),
-}
-
-
-def tailoring_of(garment: str) -> tuple[Tailoring, ...]:
-    """The four tailoring parameters of a built-in garment (`tshirt-male`, …)."""
-    return _PARAMETERS[garment.rpartition("-")[0]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +61,7 @@ class _Cut:
     """The template's geometry that tailoring fields are made of."""
 
     def __init__(self, garment: GarmentTemplate, body: SmplBody) -> None:
-        self.topology = ClothTopology.of(garment.faces.numpy())
+        self.topology = ClothTopology.of(garment.mesh)
         self.x: F64 = garment.v_template.numpy().astype(np.float64)
         self.joints: F64 = body.rest_joints(torch.zeros(1, N_BETAS))[0].double().numpy()
         loops = self.topology.boundary_loops()
@@ -112,17 +69,17 @@ class _Cut:
         self.top = loops[int(np.argmax(height))]
         self.bottom = loops[int(np.argmin(height))]
         self.from_top = self.topology.distance_from(self.x, self.top)
-        self.held = garment.name.startswith(HELD_AT_WAIST)
+        self.held = garment.card.held_at_waist
         self._sdf = ExactSdf(body.faces)
         self._sdf.update(body.rest_vertices(torch.zeros(1, N_BETAS))[0])
 
     def normals(self, smoothing: int = 30) -> F64:
         """Outward unit normals, smoothed so that a wider cut doesn't deepen the folds of the body under it."""
-        a, b, c = (self.x[self.topology.faces[:, k]] for k in range(3))
+        a, b, c = (self.x[self.topology.mesh.faces[:, k]] for k in range(3))
         face = np.cross(b - a, c - a)
         normal = np.zeros_like(self.x)
         for k in range(3):
-            np.add.at(normal, self.topology.faces[:, k], face)
+            np.add.at(normal, self.topology.mesh.faces[:, k], face)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         normal = self.smooth(normal, smoothing)
         unit: F64 = normal / np.linalg.norm(normal, axis=1, keepdims=True)
@@ -130,8 +87,8 @@ class _Cut:
 
     def smooth(self, field: F64, rounds: int = 10) -> F64:
         """A field (N, 3) after `rounds` of moving each vertex halfway to the mean of its neighbours."""
-        i, j = self.topology.edges.T
-        degree = np.bincount(self.topology.edges.ravel(), minlength=len(field))[:, None]
+        i, j = self.topology.mesh.edges.T
+        degree = np.bincount(self.topology.mesh.edges.ravel(), minlength=len(field))[:, None]
         for _ in range(rounds):
             total = np.zeros_like(field)
             np.add.at(total, i, field[j])
@@ -178,7 +135,7 @@ def _ease(cut: _Cut) -> F64:
 
 def _neckline(cut: _Cut) -> F64:
     # Along the cloth, away from the neck: the gradient of the distance from its rim.
-    a, b, c = (cut.topology.faces[:, k] for k in range(3))
+    a, b, c = (cut.topology.mesh.faces[:, k] for k in range(3))
     x, d = cut.x, cut.from_top
     normal = np.cross(x[b] - x[a], x[c] - x[a])
     area2 = (normal**2).sum(1, keepdims=True) + 1e-18
@@ -232,10 +189,19 @@ _ALONG_THE_BODY = ("length", "sleeve_length", "neckline", "rise")
 """Fields that carry cloth to where the body may be wider; what they move is kept outside of it."""
 
 
+def _tailoring(garment: GarmentTemplate) -> tuple[Tailoring, ...]:
+    unknown = [one.name for one in garment.card.tailoring if one.name not in _FIELDS]
+    if unknown or not garment.card.tailoring:
+        msg = f"{garment.name}: wanted {N_STYLES} parameters of tailoring out of {', '.join(_FIELDS)} on its card, "
+        msg += f"got {', '.join(unknown) or 'none'}"
+        raise GarmentError(msg)
+    return garment.card.tailoring
+
+
 def tailored(garment: GarmentTemplate, body: SmplBody) -> tuple[F64, F64]:
     """The mean cut [m], shape (N, 3), and its displacement a standard deviation of each parameter, shape (N, 3, 4)."""
     cut = _Cut(garment, body)
-    parameters = tailoring_of(garment.name)
+    parameters = _tailoring(garment)
     mean = cut.x.copy()
     fields = []
     for parameter in parameters:
@@ -267,6 +233,9 @@ def build_styles(
         n_drapes: how many drapes, besides the mean cut's and two of each parameter.
         seed: of their parameters.
         progress: called with the number of drapes done.
+
+    Raises:
+        GarmentError: its card has no tailoring, or a parameter that there isn't.
     """
     mean, fields = tailored(garment, body)
     n = len(mean)
@@ -292,7 +261,7 @@ def build_styles(
         mean.astype(np.float32),
         (fields @ rotation).astype(np.float32),
         rotation.astype(np.float32),
-        tailoring_of(garment.name),
+        garment.card.tailoring,
         singular**2 / (singular**2).sum(),
         float(explained),
     )

@@ -1,8 +1,9 @@
-"""Simulates slots of a set of samples: draws, drapes, checks, and the row that comes of them."""
+"""Simulates slots of a set: what is common to samples and sequences, and the row of a sample."""
 
 from __future__ import annotations
 
 import time
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -10,13 +11,13 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
-from refu_core.body import SmplBody, load_body
-from refu_core.garments import GarmentTemplate, load_garment
-from refu_core.simulation._drape import Drape, Draper, DrapeSettings
-from refu_core.simulation._plan import TEST, Plan
+from refu_core.body import load_body
+from refu_core.garments import load_garment
+from refu_core.simulation._drape import Draper, DrapeSettings, SettledDrape
+from refu_core.simulation._plan import TEST, SamplePlan
 from refu_core.simulation._poses import Clip, RoomMaker, RoomSettings
 from refu_core.simulation._selection import CAUSES, SelectionSettings, Selector
-from refu_core.simulation._store import DONE, GIVEN_UP, Shard, dequantise, quantise
+from refu_core.simulation._store import DONE, FORMAT, GIVEN_UP, Shard, dequantise, quantise
 
 
 @dataclass(frozen=True)
@@ -27,28 +28,53 @@ class SimulationSettings:
     room: RoomSettings = field(default_factory=RoomSettings)
     selection: SelectionSettings = field(default_factory=SelectionSettings)
     attempts: int = 8
-    """Poses that a slot tries before it is given up."""
+    """Poses that a slot tries before it is given up; of a sequence, stretches of motion whose first pose has room."""
 
 
-class SlotSimulator:
-    """Simulates the slots of a plan, in any order, each with the same result every time."""
+class Simulator(ABC):
+    """Makes the row of any slot of a set, in any order, the same every time; each process has its own."""
+
+    kind: ClassVar[str]
+    """Format of the set."""
+    rows: ClassVar[type[Shard]]
+    """The kind of shard that the rows go to."""
 
     def __init__(
         self,
-        plan: Plan,
-        garment: GarmentTemplate,
-        body: SmplBody,
+        plan: Any,
         clips: tuple[list[Clip], list[Clip]],
         settings: SimulationSettings,
+        body: str | Path | None,
     ) -> None:
-        """For the clips of the training and of the test set."""
+        """For the clips of the training and of the test set, on a body or (None) the one the garment is cut for.
+
+        Raises `BodyError` or `GarmentError` where there is no such body or garment; `MeshError` as `Draper`.
+        """
         self.plan = plan
         self.settings = settings
-        self._clips = clips
-        self._body = body
-        self._draper = Draper(garment, body, settings=settings.drape)
-        self._room = RoomMaker(garment, body, settings=settings.room)
-        self._selector = Selector(body.faces, garment.faces, settings=settings.selection)
+        self.clips = clips
+        self.garment = load_garment(plan.garment)
+        self.body = load_body(self.garment.body if body is None else body)
+        self._draper = Draper(self.garment, self.body, settings=settings.drape)
+        self._room = RoomMaker(self.garment, self.body, settings=settings.room)
+        self._selector = Selector(self.body.faces, self.garment.faces, settings=settings.selection)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of a row's garment."""
+        return (self.garment.n_vertices, 3)
+
+    @abstractmethod
+    def simulate(self, slot: int) -> dict[str, Any]:
+        """The columns of a slot's row (see `_store`)."""
+
+
+class SlotSimulator(Simulator):
+    """Simulates samples."""
+
+    kind = FORMAT
+    rows = Shard
+    plan: SamplePlan
 
     def simulate(self, slot: int) -> dict[str, Any]:
         """The columns of a slot's row (see `_store`)."""
@@ -60,7 +86,7 @@ class SlotSimulator:
         dropped = np.zeros(len(CAUSES), np.uint8)
         row: dict[str, Any] = {"slot": slot, "pair": pair, "split": split, "betas": betas, "style": style}
         for attempt in range(self.settings.attempts):
-            pose, clip, frame = plan.pose(slot, attempt, self._clips[split == TEST])
+            pose, clip, frame = plan.pose(slot, attempt, self.clips[split == TEST])
             made = self._room.make_room(pose, betas, style)
             if made is None:
                 dropped[CAUSES.index("no_room")] += 1
@@ -78,35 +104,12 @@ class SlotSimulator:
             row["state"] = GIVEN_UP
         return row | {"dropped": dropped, "seconds": time.perf_counter() - start}
 
-    def _examine(self, drape: Drape, pose: Any, betas: Any) -> tuple[str | None, Any]:
+    def _examine(self, drape: SettledDrape, pose: Any, betas: Any) -> tuple[str | None, Any]:
         if not np.isfinite(drape.vertices).all() or np.abs(drape.vertices).max() > 1.9:
             return "unsettled", None
         stored = quantise(drape.vertices)
-        body = self._body(pose[None], torch.as_tensor(betas)[None]).vertices[0].numpy()
+        body = self.body(pose[None], torch.as_tensor(betas)[None]).vertices[0].numpy()
         # What is checked is what will be read, rounding included.
         read = dequantise(stored)
         judged = replace(drape, stretch=max(drape.stretch, self._draper.stretch(read)))
         return self._selector.cause(read, body, judged), stored
-
-
-@dataclass(frozen=True, eq=False)
-class SampleJob:
-    """What a process needs to simulate slots of a set of samples."""
-
-    plan: Plan
-    clips: tuple[list[Clip], list[Clip]]
-    settings: SimulationSettings
-    body: str | Path
-
-    rows: ClassVar[type[Shard]] = Shard
-
-    def simulator(self) -> SlotSimulator:
-        """The simulator of this process."""
-        garment, body = load_pair(self.plan.garment, self.body)
-        return SlotSimulator(self.plan, garment, body, self.clips, self.settings)
-
-
-def load_pair(garment: str, body: str | Path | None) -> tuple[GarmentTemplate, SmplBody]:
-    """The garment and the body it is worn on: its own if `body` is None."""
-    template = load_garment(garment)
-    return template, load_body(template.body if body is None else body)

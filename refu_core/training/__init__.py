@@ -1,7 +1,7 @@
 """Training of backbones, SDF networks and ReFU; needs the extra `train`."""
 
 from refu_core.training._checkpoint import load_checkpoint, save_checkpoint
-from refu_core.training._data import Samples, output_basis, read_samples, split_validation
+from refu_core.training._data import TrainingSamples, output_basis, read_samples, split_validation
 from refu_core.training._figures import backbone_figures, displacements, posed_errors
 from refu_core.training._finetune import FINETUNE_MODES, FinetuneSettings, finetune
 from refu_core.training._loop import LoopSettings
@@ -18,9 +18,9 @@ __all__ = [
     "Losses",
     "Mirror",
     "PretrainSettings",
-    "Samples",
     "SdfSettings",
     "TrainingLog",
+    "TrainingSamples",
     "backbone_figures",
     "collision_loss",
     "displacements",

@@ -12,7 +12,11 @@ from typing import Any
 
 import torch
 
-from refu_core.errors import WeightsError
+from refu_core._files import open_file
+from refu_core.errors import RefuError, WeightsError
+
+_MAX_BYTES = 16 << 30
+"""Weights of the paper's sizes, and the two moments of each that Adam keeps, are 8 GB."""
 
 
 def save_checkpoint(path: Path, state: Mapping[str, Any]) -> None:
@@ -40,13 +44,14 @@ def save_checkpoint(path: Path, state: Mapping[str, Any]) -> None:
             part.unlink()
 
 
-def load_checkpoint(path: Path) -> dict[str, Any] | None:
+def load_checkpoint(path: Path, identity: str | None = None) -> dict[str, Any] | None:
     """What `save_checkpoint` wrote; None where there is nothing. No pickled code is run.
 
     Raises:
+        RefuError: the state's "identity" is another one: it is of another training.
         WeightsError: the file is damaged.
     """
-    if not path.exists():
+    if not os.path.lexists(path):
         return None
     try:
         state = torch.load(_as_saved(path), map_location="cpu", weights_only=True)
@@ -56,6 +61,9 @@ def load_checkpoint(path: Path) -> dict[str, Any] | None:
     if not isinstance(state, dict):
         msg = f"{path}: a checkpoint holds a dictionary, this one a {type(state).__name__}; delete it to start anew"
         raise WeightsError(msg)
+    if identity is not None and state["identity"] != identity:
+        msg = f"{path}: of a training with other settings or data; delete it to start anew"
+        raise RefuError(msg)
     return state
 
 
@@ -65,12 +73,16 @@ def _as_saved(path: Path) -> io.BytesIO:
     Torch's own reader takes room for whatever size a damaged record claims. So it gets an archive that was made here.
     """
     buffer = io.BytesIO()
-    with zipfile.ZipFile(path) as archive, zipfile.ZipFile(buffer, "w") as copy:
+    with (
+        open_file(path, most=_MAX_BYTES, error=WeightsError, wanted="a checkpoint of refu train") as file,
+        zipfile.ZipFile(file) as archive,
+        zipfile.ZipFile(buffer, "w") as copy,
+    ):
         entries = archive.infolist()
         if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
             msg = "it has compressed records"
             raise zipfile.BadZipFile(msg)
-        if sum(entry.file_size for entry in entries) > path.stat().st_size:
+        if sum(entry.file_size for entry in entries) > file.size:
             msg = "its records are larger than the file"
             raise zipfile.BadZipFile(msg)
         for entry in entries:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,17 +13,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from refu_core.backbones import BasisDecoder, style_shape
-from refu_core.body import SmplBody
+from refu_core.body import SmplBody, load_body
 from refu_core.errors import RefuError
-from refu_core.garments import GarmentTemplate
-from refu_core.simulation import GarmentDataset, GarmentSequences
+from refu_core.garments import GarmentTemplate, load_garment
+from refu_core.simulation import GarmentDataset, GarmentSequences, open_dataset
 from refu_core.training._mirror import Mirror, mirror_pose
-
-_CHUNK = 64
 
 
 @dataclass(frozen=True, eq=False)
-class Samples:
+class TrainingSamples:
     """N bodies and the displacement that their garment has on each."""
 
     pose: Tensor
@@ -46,19 +46,58 @@ class Samples:
         """(β, γ), shape (N, 14)."""
         return style_shape(self.betas, self.style)
 
-    def take(self, which: Tensor) -> Samples:
+    def take(self, which: Tensor) -> TrainingSamples:
         """The samples of these indices, or of this mask."""
-        return Samples(*(getattr(self, field.name)[which] for field in fields(self)))
+        return TrainingSamples(*(getattr(self, field.name)[which] for field in fields(self)))
 
-    def joined(self, other: Samples) -> Samples:
+    def joined(self, other: TrainingSamples) -> TrainingSamples:
         """These samples and those of `other`."""
         pairs = ((getattr(self, field.name), getattr(other, field.name)) for field in fields(self))
-        return Samples(*(torch.cat(pair) for pair in pairs))
+        return TrainingSamples(*(torch.cat(pair) for pair in pairs))
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingSet:
+    """A simulated set, what it is of, and the samples of its training split."""
+
+    garment: GarmentTemplate
+    body: SmplBody
+    rows: GarmentDataset | GarmentSequences
+    samples: TrainingSamples
+
+    @classmethod
+    def of(
+        cls,
+        garment: str | GarmentTemplate,
+        dataset: str | Path | GarmentDataset | GarmentSequences,
+        body: SmplBody | None,
+    ) -> TrainingSet:
+        """Opens a set; the body is the garment's own if not given. Raises `RefuError` as `read_samples`."""
+        template = load_garment(garment) if isinstance(garment, str) else garment
+        body = load_body(template.body) if body is None else body
+        rows = open_dataset(dataset) if isinstance(dataset, (str, Path)) else dataset
+        return cls(template, body, rows, read_samples(rows, body, template, split="train"))
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """Whose weights those are that are trained on it."""
+        return {"garment": self.garment.name, "body_fingerprint": self.body.fingerprint}
+
+    @property
+    def card(self) -> dict[str, Any]:
+        """What the card of the weights says of the set."""
+        return {key: self.rows.card.get(key) for key in ("garment_fingerprint", "motions_fingerprint", "plan")}
+
+
+def in_chunks(of: Callable[..., Tensor], *values: Any, size: int = 64) -> Tensor:
+    """`of` these arrays, some rows at a time, which bounds the memory; all have N rows, the result too."""
+    starts = range(0, max(len(values[0]), 1), size)
+    return torch.cat([of(*(value[start : start + size] for value in values)) for start in starts])
 
 
 def read_samples(
     dataset: GarmentDataset | GarmentSequences, body: SmplBody, garment: GarmentTemplate, *, split: str
-) -> Samples:
+) -> TrainingSamples:
     """The samples of one split, `train` or `test`, with the poses that were simulated; of sequences, the good frames.
 
     Raises:
@@ -72,17 +111,15 @@ def read_samples(
     stored = _frames(dataset, rows) if isinstance(dataset, GarmentSequences) else _columns(dataset, rows)
     vertices = stored.pop("vertices")
     column = {name: torch.as_tensor(values) for name, values in stored.items()}
-    displacement = torch.empty(len(vertices), garment.n_vertices, 3)
+
+    def displacement(units: NDArray[np.int16], pose: Tensor, betas: Tensor, style: Tensor) -> Tensor:
+        posed = torch.as_tensor(units.astype(np.float32) * float(dataset.card["quantum_m"]))
+        return garment.unpose(posed, body(pose, betas).transforms) - garment.rest(betas, style)
+
     with torch.no_grad():
-        for start in range(0, len(vertices), _CHUNK):
-            chunk = slice(start, start + _CHUNK)
-            posed = torch.as_tensor(vertices[chunk].astype(np.float32) * float(dataset.card["quantum_m"]))
-            betas = column["betas"][chunk]
-            transforms = body(column["pose"][chunk], betas).transforms
-            rest = garment.rest(betas, column["style"][chunk])
-            displacement[chunk] = garment.unpose(posed, transforms) - rest
-    return Samples(
-        column["pose"], column["asked"], column["betas"], column["style"], displacement, column["pair"].long()
+        found = in_chunks(displacement, vertices, column["pose"], column["betas"], column["style"])
+    return TrainingSamples(
+        column["pose"], column["asked"], column["betas"], column["style"], found, column["pair"].long()
     )
 
 
@@ -98,32 +135,33 @@ def _frames(dataset: GarmentSequences, rows: NDArray[np.intp]) -> dict[str, NDAr
     return found | {"pair": dataset.column("slot")[rows].repeat(kept.sum(1))}
 
 
-def with_asked_poses(samples: Samples) -> Samples:
+def with_asked_poses(samples: TrainingSamples) -> TrainingSamples:
     """The samples, and those whose limbs were held back once more: the same displacement at the pose that was asked.
 
     So that what live motion is full of, hanging arms, is among a network's inputs although no cloth can be simulated
-    there (docs/dataset.md, "Room for the cloth"). Sets that don't say what was asked give the samples as they are.
+    there (docs/guide/data.md, "Room for the cloth"). Sets that don't say what was asked give the samples as they are.
     """
     return samples.joined(asked_only(samples))
 
 
-def asked_only(samples: Samples) -> Samples:
+def asked_only(samples: TrainingSamples) -> TrainingSamples:
     """Those of the samples whose limbs were held back, at the pose that was asked."""
     held_back = (samples.asked - samples.pose).abs().amax((1, 2)) > 1e-3  # false for NaN
     return replace(samples, pose=samples.asked).take(held_back)
 
 
-def mirrored(samples: Samples, mirror: Mirror) -> Samples:
+def mirrored(samples: TrainingSamples, mirror: Mirror) -> TrainingSamples:
     """The samples as a mirror shows them."""
-    displacement = torch.empty_like(samples.displacement)
-    for start in range(0, len(samples), _CHUNK):
-        chunk = slice(start, start + _CHUNK)
-        displacement[chunk] = mirror.displacement(samples.displacement[chunk])
-    return replace(samples, pose=mirror_pose(samples.pose), asked=mirror_pose(samples.asked), displacement=displacement)
+    return replace(
+        samples,
+        pose=mirror_pose(samples.pose),
+        asked=mirror_pose(samples.asked),
+        displacement=in_chunks(mirror.displacement, samples.displacement),
+    )
 
 
-def split_validation(samples: Samples, *, share: float, seed: int) -> tuple[Samples, Samples]:
-    """Samples to learn from and samples to choose by; whole style-shape pairs go to one or the other.
+def split_validation(samples: TrainingSamples, *, share: float, seed: int) -> tuple[TrainingSamples, TrainingSamples]:
+    """TrainingSamples to learn from and samples to choose by; whole style-shape pairs go to one or the other.
 
     Pairs are drawn until `share` of the samples is reached; 0 gives an empty validation part.
     """

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
+from refu_core.backbones import Backbone, Prediction
 from refu_core.body import SmplBody
+from refu_core.contact import Blend
 from refu_core.garments import GarmentTemplate
-from refu_core.repulsion import Blend, Refu
-from refu_core.sdf import ApproxSdf, BandSdf, BodySdf, ExactSdf, Links, RestFaces, SdfSample
+from refu_core.realtime import Outfit, Wearable, Wearer, dress
+from refu_core.refu import Refu
+from refu_core.sdf import BAND, ApproxSdf, BodySdf, SdfSample, exact_sdf
 
 Sdf = Literal["accurate", "approx"]
 
@@ -25,7 +29,7 @@ class Dresser(nn.Module):
 
     def __init__(
         self,
-        backbone: nn.Module,
+        backbone: Backbone,
         refu: Refu | None,
         garment: GarmentTemplate,
         body: SmplBody,
@@ -37,7 +41,7 @@ class Dresser(nn.Module):
         """For one garment on one body model.
 
         Args:
-            backbone: a module that is a `Backbone`.
+            backbone: a module.
             refu: the layer; None for the raw garment.
             garment: the template.
             body: its body, on the garment's device.
@@ -46,10 +50,9 @@ class Dresser(nn.Module):
             is_blended: whether pushed vertices take their neighbourhood along.
         """
         super().__init__()
-        self.backbone, self.refu = backbone, refu
+        self.backbone, self.refu = backbone, refu  # modules, whose weights are this one's, too
         self._garment, self._body = garment, body
         self._blend = Blend.of_faces(garment.faces, garment.n_vertices) if is_blended else None
-        self._rest_faces = RestFaces(body) if "approx" in (in_refu, in_loss) else None
         made = {name: _Distances(name, garment, body) for name in {in_refu, in_loss}}
         self._in_refu, self._in_loss = made[in_refu], made[in_loss]
 
@@ -58,52 +61,63 @@ class Dresser(nn.Module):
 
         The fourth coordinate is the signed distance to the body [m], exact where that is less than the margin.
         """
-        prediction = self.backbone(betas, pose, style)
+        name, kind = self._garment.name, betas.device.type
+        network = _InPrecision(self.backbone, torch.is_autocast_enabled(kind), torch.get_autocast_dtype(kind))
+        outfit = Outfit(self._body, {name: Wearable(self._garment, network, self.refu, 0.0)})
         # Millimetres need float32, whatever precision the networks are run in.
-        with torch.autocast(betas.device.type, enabled=False):
-            with torch.no_grad():
-                posed = self._body(pose, betas)
-            rest = self._garment.rest(betas, None if self._garment.styledirs is None else style)
-            unposed = rest + prediction.displacement.float()
-            vertices = self._garment.pose(unposed, posed.transforms)
-            near = None
-            if self._rest_faces is not None:
-                near = self._rest_faces.under(unposed, betas, self._garment.shapedirs)
+        with torch.autocast(kind, enabled=False):
+            wearer = Wearer.of(outfit, betas, None if self._garment.styledirs is None else style)
+            dressed = dress(pose, wearer)
+            drape = dressed.drapes[name]
+            vertices = drape.vertices
             if self.refu is not None:
-                z = self.refu.feature(betas, pose, style, prediction.feature)
-                sample = self._in_refu(posed.vertices, vertices, near)
-                vertices = self.refu(vertices, sample, z, blend=self._blend)
-            distance = self._in_loss(posed.vertices, vertices, near).distance
-            return torch.cat((vertices, distance[..., None]), dim=-1)
+                sample = self._in_refu(dressed.body, vertices, drape.on_mean)
+                pushed = self.refu(vertices, sample, drape.feature)
+                if self._blend is not None:
+                    pushed = self._blend.follow(vertices, pushed, self.refu.margin - sample.distance)
+                vertices = pushed
+            distance = self._in_loss(dressed.body, vertices, drape.on_mean).distance
+            in_world = torch.stack([turn(one) for turn, one in zip(dressed.turns, vertices, strict=True)])
+            return torch.cat((in_world, distance[..., None]), dim=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class _InPrecision:
+    """A backbone in the precision that the training loop asks for, in the midst of what needs float32."""
+
+    backbone: Backbone
+    is_low: bool
+    dtype: torch.dtype
+
+    def wearer_code(self, betas: Tensor, style: Tensor | None) -> Tensor | None:
+        """As `Backbone.wearer_code`, in full precision."""
+        return self.backbone.wearer_code(betas, style)
+
+    def __call__(
+        self, betas: Tensor, pose: Tensor, style: Tensor | None, *, wearer_code: Tensor | None = None
+    ) -> Prediction:
+        """As `Backbone`."""
+        with torch.autocast(betas.device.type, self.dtype, enabled=self.is_low):
+            return self.backbone(betas, pose, style, wearer_code=wearer_code)
 
 
 class _Distances:
     """The distances of a batch of garments to their own bodies, with the derivative that `Dresser` speaks of."""
 
     def __init__(self, name: Sdf, garment: GarmentTemplate, body: SmplBody) -> None:
-        self._links = Links.of(garment.edges, garment.n_vertices)
-        self._sdf: BodySdf
-        if name == "approx":
-            self._sdf = ApproxSdf(body)
-        elif body.device.type == "cpu":
-            # Tells garment vertices near the skin, which are few, ten times as fast as the tree does.
-            self._sdf = BandSdf(body.faces)
-        else:
-            self._sdf = ExactSdf(body.faces, device=body.device)
+        self._sdf: BodySdf = ApproxSdf(body) if name == "approx" else exact_sdf(body)
+        self._ask = self._sdf.of_garment(garment)
 
-    def __call__(self, bodies: Tensor, garments: Tensor, near: Tensor | None) -> SdfSample:
-        """Distances (B, N), gradients (B, N, 3) of garments (B, N, 3) to bodies (B, V, 3); `near` faces are (B, N)."""
+    def __call__(self, bodies: Tensor, garments: Tensor, on_mean: Tensor) -> SdfSample:
+        """Distances (B, N), gradients (B, N, 3) of garments (B, N, 3) to bodies (B, V, 3) [m].
+
+        `on_mean` (B, N, 3) is where the vertices are on the unposed mean shape.
+        """
+        samples = []
         with torch.no_grad():
-            samples = [
-                self._of_one(body, points, None if near is None else near[i])
-                for i, (body, points) in enumerate(zip(bodies, garments.detach(), strict=True))
-            ]
+            for body, points, places in zip(bodies, garments, on_mean, strict=True):
+                self._sdf.update(body)
+                samples.append(self._ask(points, on_mean=places, reach=BAND))
         gradient = torch.stack([sample.gradient for sample in samples])
         moved = ((garments - garments.detach()) * gradient).sum(-1)
         return SdfSample(torch.stack([sample.distance for sample in samples]) + moved, gradient)
-
-    def _of_one(self, body: Tensor, points: Tensor, near: Tensor | None) -> SdfSample:
-        self._sdf.update(body)
-        if isinstance(self._sdf, BandSdf):
-            return self._sdf.clipped(points, self._links)
-        return self._sdf.query(points, near=near)

@@ -10,36 +10,36 @@ from torch import Tensor
 from refu_core.backbones import Backbone, BasisDecoder
 from refu_core.body import SmplBody
 from refu_core.garments import GarmentTemplate
-from refu_core.training._data import Samples, asked_only
+from refu_core.training._data import TrainingSamples, asked_only, in_chunks
 
 _CHUNK = 32
 
 
 @torch.no_grad()
-def displacements(backbone: Backbone, samples: Samples) -> Tensor:
+def displacements(backbone: Backbone, samples: TrainingSamples) -> Tensor:
     """What a backbone predicts for samples [m], shape (N, V, 3); zero for one without a network."""
-    parts = []
-    for start in range(0, len(samples), _CHUNK):
-        chunk = slice(start, start + _CHUNK)
-        predicted = backbone(samples.betas[chunk], samples.pose[chunk], samples.style[chunk]).displacement
-        parts.append(torch.zeros_like(samples.displacement[chunk]) if predicted is None else predicted)
-    return torch.cat(parts)
+
+    def predict(betas: Tensor, pose: Tensor, style: Tensor, truth: Tensor) -> Tensor:
+        predicted = backbone(betas, pose, style).displacement
+        return torch.zeros_like(truth) if predicted is None else predicted
+
+    return in_chunks(predict, samples.betas, samples.pose, samples.style, samples.displacement, size=_CHUNK)
 
 
 @torch.no_grad()
-def posed_errors(predicted: Tensor, samples: Samples, body: SmplBody, garment: GarmentTemplate) -> Tensor:
+def posed_errors(predicted: Tensor, samples: TrainingSamples, body: SmplBody, garment: GarmentTemplate) -> Tensor:
     """Distances of posed vertices [mm], shape (N, V), of predicted displacements (N, V, 3) [m] (the paper's MPVE)."""
-    parts = []
-    for start in range(0, len(samples), _CHUNK):
-        chunk = slice(start, start + _CHUNK)
-        transforms = garment.vertex_transforms(body(samples.pose[chunk], samples.betas[chunk]).transforms)
-        error = predicted[chunk] - samples.displacement[chunk]
-        parts.append(1e3 * (transforms.rotation @ error.unsqueeze(-1)).squeeze(-1).norm(dim=-1))
-    return torch.cat(parts)
+
+    def error(predicted: Tensor, truth: Tensor, pose: Tensor, betas: Tensor) -> Tensor:
+        rotation = garment.vertex_transforms(body(pose, betas).transforms).rotation
+        distance: Tensor = (rotation @ (predicted - truth).unsqueeze(-1)).squeeze(-1).norm(dim=-1)
+        return 1e3 * distance
+
+    return in_chunks(error, predicted, samples.displacement, samples.pose, samples.betas, size=_CHUNK)
 
 
 def backbone_figures(
-    backbone: Backbone, samples: Samples, body: SmplBody, garment: GarmentTemplate, *, mean: Tensor
+    backbone: Backbone, samples: TrainingSamples, body: SmplBody, garment: GarmentTemplate, *, mean: Tensor
 ) -> dict[str, Any]:
     """MPVE on the test split [mm], beside what it is to be measured against.
 
@@ -48,7 +48,7 @@ def backbone_figures(
     (`mean`, shape (V, 3)) the best constant, and `basis_mm` the least that the output basis allows.
     """
 
-    def mpve(predicted: Tensor, of: Samples) -> float:
+    def mpve(predicted: Tensor, of: TrainingSamples) -> float:
         return round(float(posed_errors(predicted, of, body, garment).mean()), 3)
 
     truth = samples.displacement

@@ -1,4 +1,4 @@
-"""Training with ReFU: of a pre-trained backbone (paper, Sec. 3.2), or from scratch (supplement)."""
+"""Training with ReFU: of a pre-trained backbone (paper, Sec. 3.2), or from scratch (supplement, Sec. C)."""
 
 from __future__ import annotations
 
@@ -11,19 +11,21 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from refu_core.backbones import backbone_config, build_backbone, read_backbone, save_backbone, uses_basis
-from refu_core.body import SmplBody, load_body
+from refu_core.backbones import backbone_config, backbone_from_weights, build_backbone, save_backbone, uses_basis
+from refu_core.body import SmplBody
 from refu_core.errors import RefuError
-from refu_core.garments import GarmentTemplate, load_garment
-from refu_core.repulsion import DEFAULT_MARGIN, SCALE_PRESETS, Refu, ScaleKind, refu_tensors
-from refu_core.simulation import GarmentDataset, GarmentSequences, open_dataset
-from refu_core.training._data import Samples, mirrored, read_samples, split_validation
+from refu_core.garments import GarmentTemplate
+from refu_core.modes import DEFAULT_MARGIN
+from refu_core.refu import SCALE_PRESETS, Refu, ScaleKind, refu_tensors
+from refu_core.simulation import GarmentDataset, GarmentSequences
+from refu_core.training._data import TrainingSamples, TrainingSet, mirrored, split_validation
 from refu_core.training._dresser import Dresser, Sdf
-from refu_core.training._loop import Loop, LoopSettings, Objective, Stage, start_parallel
+from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, start_parallel
 from refu_core.training._losses import COLLISION_WEIGHT, RECONSTRUCTION_WEIGHT, refu_loss
 from refu_core.training._mirror import Mirror
 from refu_core.training._pretrain import PretrainSettings, basis_of, pivots_of, stages
 from refu_core.training._progress import TrainingLog
+from refu_core.weights import load_weights
 
 _CHUNK = 64
 _UNIT = 1e3
@@ -62,7 +64,7 @@ class FinetuneSettings:
     scale: str | None = "realtime"
     """Preset of the scale networks; None fixes α at 1."""
     scale_kind: ScaleKind = "vertex"
-    """What α is predicted from: see `refu_core.repulsion.ScaleSettings`."""
+    """What α is predicted from: see `refu_core.refu.ScaleSettings`."""
     margin: float = DEFAULT_MARGIN
     """ε [m]."""
     learn_margin: bool = False
@@ -74,7 +76,7 @@ class FinetuneSettings:
 
     @classmethod
     def paper(cls) -> FinetuneSettings:
-        """The paper's own (Sec. Implementation): Adam with 1e-5, networks of 1024, ε = 0, no blending."""
+        """The paper's own (Sec. 4.2): Adam with 1e-5, networks of 1024, ε = 0, no blending."""
         loop = LoopSettings(batch_size=32, learning_rate=1e-5, weight_decay=0.0, check_every=1000)
         return cls(loop, steps=100_000, scale="paper", margin=0.0, is_blended=False, is_mirrored=False)
 
@@ -132,13 +134,10 @@ def finetune(
         raise RefuError(msg)
     if settings is None:
         settings = FinetuneSettings.of(backbone, preset)
-    template = load_garment(garment) if isinstance(garment, str) else garment
-    body = load_body(template.body) if body is None else body
+    opened = TrainingSet.of(garment, dataset, body)
+    template, body, samples, identity = opened.garment, opened.body, opened.samples, opened.identity
     is_writer, torch_device = start_parallel(torch.device(device))
     output = Path(output)
-    opened = open_dataset(dataset) if isinstance(dataset, (str, Path)) else dataset
-    identity = {"garment": template.name, "body_fingerprint": body.fingerprint}
-    samples = read_samples(opened, body, template, split="train")
     train, validation = split_validation(samples, share=settings.validation_share, seed=settings.loop.seed)
     if settings.is_mirrored:
         train = train.joined(mirrored(train, Mirror.of(template)))
@@ -146,16 +145,15 @@ def finetune(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.loop.seed)
         if weights is None:
-            config = backbone_config(backbone, template.name, preset=preset)
+            config = backbone_config(backbone, template, preset=preset)
             basis = None
             if uses_basis(config, preset):
-                rank = PretrainSettings().rank
-                basis = basis_of(output, samples, None, rank, identity, len(opened), is_writer=is_writer)
+                basis = basis_of(output, opened, None, PretrainSettings().rank, is_writer=is_writer)
             network = fresh = build_backbone(config, template, basis=basis, pivots=pivots_of(samples))
             # For the scale of inputs and outputs, which it sets; the stages themselves aren't run.
             stages(fresh, train, validation, template, PretrainSettings())
         else:
-            network = read_backbone(Path(weights) / f"{backbone}-none", template, expect=identity)
+            network = backbone_from_weights(load_weights(Path(weights) / f"{backbone}-none", expect=identity), template)
             _bring_basis(Path(weights), output, is_writer=is_writer)
         refu = _layer(mode, settings, template.n_vertices)
     described = {
@@ -186,14 +184,23 @@ def finetune(
         log=TrainingLog(output, name=name, quiet=quiet) if is_writer else None,
         device=torch_device,
     )
-    objective = Objective([dresser], dresser, _Loss(settings))
+
+    def loss(dressed: Tensor, truth: Tensor) -> Tensor:
+        """Of garments with their distance, (B, N, 4), and the true garments, (B, N, 3) [m]."""
+        first, second = settings.reconstruction_weight, settings.collision_weight
+        losses = refu_loss(
+            dressed[..., :3], truth, dressed[..., 3], reconstruction_weight=first, collision_weight=second
+        )
+        return _UNIT * losses.total
+
+    objective = Objective([dresser], dresser, loss)
     data = [_tensors(part, body, template) for part in (train, validation)]
-    loop.run(Stage("refu", objective, settings.steps, train=data[0], validation=data[1]))
+    loop.run(TrainingStage("refu", objective, settings.steps, train=data[0], validation=data[1]))
     dresser.to("cpu").eval()
     card = {
         **described,
         "refu": None if refu is None else refu.config,
-        "dataset": {key: opened.card.get(key) for key in ("garment_fingerprint", "motions_fingerprint", "plan")},
+        "dataset": opened.card,
     }
     if is_writer:
         others = None if refu is None else refu_tensors(refu, half=preset != "paper")
@@ -202,24 +209,7 @@ def finetune(
     return card
 
 
-class _Loss:
-    """The paper's loss of garments with their distance, (B, N, 4), and the true garments, (B, N, 3) [m]."""
-
-    def __init__(self, settings: FinetuneSettings) -> None:
-        self._settings = settings
-
-    def __call__(self, dressed: Tensor, truth: Tensor) -> Tensor:
-        losses = refu_loss(
-            dressed[..., :3],
-            truth,
-            dressed[..., 3],
-            reconstruction_weight=self._settings.reconstruction_weight,
-            collision_weight=self._settings.collision_weight,
-        )
-        return _UNIT * losses.total
-
-
-def _tensors(samples: Samples, body: SmplBody, garment: GarmentTemplate) -> tuple[Tensor, ...]:
+def _tensors(samples: TrainingSamples, body: SmplBody, garment: GarmentTemplate) -> tuple[Tensor, ...]:
     """What the loop draws from: β, θ, γ and the posed true garments [m], shape (N, V, 3)."""
     posed = torch.empty_like(samples.displacement)
     style = None if garment.styledirs is None else samples.style

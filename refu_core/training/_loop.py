@@ -50,7 +50,7 @@ class Objective(nn.Module):
 
 
 @dataclass(frozen=True)
-class Stage:
+class TrainingStage:
     """What is trained on what."""
 
     name: str
@@ -87,23 +87,20 @@ class Loop:
         self._identity = identity
         self._done: list[str] = []
         self._resumed: dict[str, Any] | None = None
-        saved = load_checkpoint(checkpoint)
+        saved = load_checkpoint(checkpoint, identity)
         if saved is not None:
-            if saved["identity"] != identity:
-                msg = f"{checkpoint}: of a training with other settings or data; delete it to start anew"
-                raise RefuError(msg)
             model.load_state_dict(saved["model"])
             self._done = list(saved["done"])
             self._resumed = saved["stage"]
 
-    def run(self, stage: Stage) -> None:
+    def run(self, stage: TrainingStage) -> None:
         """Trains a stage, or what is left of it.
 
         The model ends with the stage's best weights by validation, or with its last ones where none is held out.
         """
         if stage.name in self._done:
             return
-        rank, world = _ranks()
+        rank, world = ranks()
         cuda = [self._device] if self._device.type == "cuda" else []
         # The caller's random numbers stay as they were.
         with torch.random.fork_rng(devices=cuda):
@@ -112,7 +109,7 @@ class Loop:
         self._done.append(stage.name)
         self._save(None)
 
-    def _train(self, stage: Stage, rank: int, world: int) -> None:
+    def _train(self, stage: TrainingStage, rank: int, world: int) -> None:
         settings, objective = self._settings, stage.objective
         parameters = [p for p in objective.parameters() if p.requires_grad]
         optimiser = torch.optim.AdamW(parameters, lr=settings.learning_rate, weight_decay=settings.weight_decay)
@@ -178,7 +175,7 @@ class Loop:
             self._log.end()
 
     @torch.no_grad()
-    def _validate(self, stage: Stage) -> float | None:
+    def _validate(self, stage: TrainingStage) -> float | None:
         n = len(stage.validation[0])
         if n == 0:
             return None
@@ -192,7 +189,7 @@ class Loop:
     def _save(self, stage: dict[str, Any] | None) -> None:
         # One process' word is enough: after a step all have the same weights. Its random state is its own, though, so
         # a resumed parallel run is sound but not the same bit for bit.
-        if _ranks()[0] == 0:
+        if ranks()[0] == 0:
             state = {"identity": self._identity, "done": self._done, "stage": stage, "model": self._model.state_dict()}
             save_checkpoint(self._path, state)
 
@@ -210,7 +207,8 @@ def start_parallel(device: torch.device) -> tuple[bool, torch.device]:
     return dist.get_rank() == 0, device
 
 
-def _ranks() -> tuple[int, int]:
+def ranks() -> tuple[int, int]:
+    """Number of this process, and how many there are."""
     return (dist.get_rank(), dist.get_world_size()) if dist.is_available() and dist.is_initialized() else (0, 1)
 
 

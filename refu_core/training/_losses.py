@@ -1,4 +1,4 @@
-"""The losses that a backbone with ReFU is trained by (paper, Sec. Train Backbone with ReFU)."""
+"""The losses that a backbone with ReFU is trained by (paper, Sec. 3.2)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import NamedTuple
 from torch import Tensor
 
 RECONSTRUCTION_WEIGHT = 1.5
-"""λ₁ of the paper (Sec. Implementation)."""
+"""λ₁ of the paper (Sec. 4.2)."""
 COLLISION_WEIGHT = 0.5
 """λ₂ of the paper."""
 
@@ -28,7 +28,7 @@ def refu_loss(
     reconstruction_weight: float = RECONSTRUCTION_WEIGHT,
     collision_weight: float = COLLISION_WEIGHT,
 ) -> Losses:
-    """L = λ₁ L_r + λ₂ L_c of garments after ReFU.
+    """L = λ₁ L_r + λ₂ L_c of garments after ReFU (paper, Eq. 7).
 
     L_r is `reconstruction_loss`, L_c `collision_loss`. With positions in metres both are about 1e-4 for a good
     backbone, which is what the paper's weights balance.
@@ -46,14 +46,14 @@ def refu_loss(
 
 
 def reconstruction_loss(vertices: Tensor, truth: Tensor) -> Tensor:
-    """L_r: squared distance to the truth [m²], shape ().
+    """L_r: squared distance to the truth [m²], shape () (paper, Eq. 8).
 
-    The paper's sum over vertices is divided by their number, here and in L_c: Adam doesn't see a common factor, and the
-    figures of garments of different sizes can be compared.
+    The paper's sum over vertices is divided by their number, here and in L_c. Adam doesn't see a common factor, and
+    garments of different sizes can be compared.
     """
     return (vertices - truth).square().sum(dim=-1).mean()
 
 
 def collision_loss(distance: Tensor) -> Tensor:
-    """L_c: depth inside the body, max(-f, 0) (Eq. collisionloss), mean over vertices [m], shape ()."""
+    """L_c: depth inside the body, max(-f, 0) (paper, Eq. 9), mean over vertices [m], shape ()."""
     return (-distance).clamp_min(0).mean()

@@ -9,7 +9,7 @@ import torch
 import trimesh
 from torch import Tensor
 
-from refu_core.body import JOINT_NAMES
+from refu_core.body import MIRRORED_JOINTS
 from refu_core.errors import GarmentError
 from refu_core.garments import GarmentTemplate
 
@@ -17,18 +17,9 @@ MAX_ASYMMETRY = 3e-3
 """A template that is farther from its own mirror image anywhere has none [m]."""
 
 
-def _other_side(name: str) -> str:
-    sides = {"left": "right", "right": "left"}
-    side, _, rest = name.partition("_")
-    return f"{sides[side]}_{rest}" if side in sides else name
-
-
-_OTHER_JOINT: tuple[int, ...] = tuple(JOINT_NAMES.index(_other_side(name)) for name in JOINT_NAMES)
-
-
 def mirror_pose(pose: Tensor) -> Tensor:
     """The same pose in a mirror at x = 0: rotation vectors [rad], shape (B, 24, 3)."""
-    return pose[:, _OTHER_JOINT] * pose.new_tensor((1.0, -1.0, -1.0))
+    return pose[:, MIRRORED_JOINTS] * pose.new_tensor((1.0, -1.0, -1.0))
 
 
 @dataclass(frozen=True, eq=False)

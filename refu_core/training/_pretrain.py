@@ -24,12 +24,14 @@ from refu_core.backbones import (
     save_basis,
     uses_basis,
 )
-from refu_core.body import SmplBody, load_body
+from refu_core.body import SmplBody
 from refu_core.errors import RefuError
-from refu_core.garments import GarmentTemplate, load_garment
-from refu_core.simulation import GarmentDataset, GarmentSequences, open_dataset
+from refu_core.garments import GarmentTemplate
+from refu_core.simulation import GarmentDataset, GarmentSequences
 from refu_core.training._data import (
-    Samples,
+    TrainingSamples,
+    TrainingSet,
+    in_chunks,
     mirrored,
     output_basis,
     read_samples,
@@ -37,7 +39,7 @@ from refu_core.training._data import (
     with_asked_poses,
 )
 from refu_core.training._figures import backbone_figures
-from refu_core.training._loop import Loop, LoopSettings, Objective, Stage, start_parallel
+from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, start_parallel
 from refu_core.training._mirror import Mirror
 from refu_core.training._progress import TrainingLog
 
@@ -65,6 +67,11 @@ class PretrainSettings:
     asks: bool = True
     """Whether samples whose limbs were held back are shown at the pose that was asked, too."""
     validation_share: float = 0.08
+
+    def __post_init__(self) -> None:
+        if self.pivots not in PIVOT_TRAINING:
+            msg = f"pivots are trained {' or '.join(PIVOT_TRAINING)}, got {self.pivots!r}"
+            raise RefuError(msg)
 
     @classmethod
     def paper(cls) -> PretrainSettings:
@@ -118,19 +125,16 @@ def pretrain(
         RefuError: the set is of another garment or body or too small, or a checkpoint there is of another training.
         WeightsError: no such backbone or preset, or files in `output` are damaged or of another garment.
     """
-    template = load_garment(garment) if isinstance(garment, str) else garment
-    body = load_body(template.body) if body is None else body
-    settings = _checked(PretrainSettings.of(backbone, preset) if settings is None else settings)
-    config = backbone_config(backbone, template.name, preset=preset) if config is None else config
+    opened = TrainingSet.of(garment, dataset, body)
+    template, body, samples, identity = opened.garment, opened.body, opened.samples, opened.identity
+    settings = PretrainSettings.of(backbone, preset) if settings is None else settings
+    config = backbone_config(backbone, template, preset=preset) if config is None else config
     is_writer, torch_device = start_parallel(torch.device(device))
     output = Path(output)
-    opened = open_dataset(dataset) if isinstance(dataset, (str, Path)) else dataset
-    samples = read_samples(opened, body, template, split="train")
-    identity = {"garment": template.name, "body_fingerprint": body.fingerprint}
 
     basis, mirror = None, Mirror.of(template) if settings.is_mirrored else None
     if uses_basis(config, preset):
-        basis = basis_of(output, samples, mirror, settings.rank, identity, len(opened), is_writer=is_writer)
+        basis = basis_of(output, opened, mirror, settings.rank, is_writer=is_writer)
     # Which pairs are held out mustn't depend on what is made of the samples afterwards.
     train, validation = split_validation(samples, share=settings.validation_share, seed=settings.loop.seed)
     if settings.asks:
@@ -161,11 +165,11 @@ def pretrain(
     for stage in found:
         loop.run(stage)
     model.to("cpu").eval()
-    test = read_samples(opened, body, template, split="test")
+    test = read_samples(opened.rows, body, template, split="test")
     card = {
         **described,
         "mode": "none",
-        "dataset": {key: opened.card.get(key) for key in ("garment_fingerprint", "motions_fingerprint", "plan")},
+        "dataset": opened.card,
         "figures": backbone_figures(model, test, body, template, mean=mean),
     }
     if is_writer:
@@ -174,37 +178,21 @@ def pretrain(
     return card
 
 
-def _checked(settings: PretrainSettings) -> PretrainSettings:
-    if settings.pivots not in PIVOT_TRAINING:
-        msg = f"pivots are trained {' or '.join(PIVOT_TRAINING)}, got {settings.pivots!r}"
-        raise RefuError(msg)
-    return settings
-
-
-def basis_of(
-    folder: Path,
-    samples: Samples,
-    mirror: Mirror | None,
-    rank: int,
-    identity: dict[str, Any],
-    count: int,
-    *,
-    is_writer: bool,
-) -> BasisDecoder:
+def basis_of(folder: Path, opened: TrainingSet, mirror: Mirror | None, rank: int, *, is_writer: bool) -> BasisDecoder:
     """The folder's basis, made if it isn't there."""
     if (folder / "basis.json").exists():
-        return load_basis(folder, expect=identity)[0]
-    displacement = samples.displacement
+        return load_basis(folder, expect=opened.identity)[0]
+    displacement = opened.samples.displacement
     if mirror is not None:
-        displacement = torch.cat((displacement, mirrored(samples, mirror).displacement))
+        displacement = torch.cat((displacement, mirrored(opened.samples, mirror).displacement))
     basis = output_basis(displacement, rank=rank)
     if is_writer:
-        save_basis(folder, basis, {**identity, "samples": len(displacement), "set": count})
+        save_basis(folder, basis, {**opened.identity, "samples": len(displacement), "set": len(opened.rows)})
     return basis
 
 
-def pivots_of(samples: Samples) -> Tensor:
-    """(β, γ) of a set's pivots, its pairs below 20, shape (K, 14); of all pairs where it has none (docs/dataset.md)."""
+def pivots_of(samples: TrainingSamples) -> Tensor:
+    """(β, γ) of a set's pivots, its pairs below 20, shape (K, 14); of all pairs where it has none."""
     pairs = [k for k in torch.unique(samples.pair).tolist() if k < N_PIVOTS]
     pairs = pairs or torch.unique(samples.pair)[:N_PIVOTS].tolist()
     return torch.stack([samples.style_shape[samples.pair == k][0] for k in pairs])
@@ -212,11 +200,11 @@ def pivots_of(samples: Samples) -> Tensor:
 
 def stages(
     model: TailorNet | Mlp | Gcnn,
-    train: Samples,
-    validation: Samples,
+    train: TrainingSamples,
+    validation: TrainingSamples,
     garment: GarmentTemplate,
     settings: PretrainSettings,
-) -> list[Stage]:
+) -> list[TrainingStage]:
     """What is trained in which order."""
     if isinstance(model, Gcnn):
         mean = train.displacement.mean(0)
@@ -225,14 +213,14 @@ def stages(
         model.head.standardise(torch.cat((_features(model, train), train.style_shape), 1), model.features.groups)
         parts = [(s.betas, s.pose, s.style, s.displacement) for s in (train, validation)]
         objective = Objective([model], lambda *inputs: model(*inputs).displacement, _vertex_loss)
-        return [Stage("all", objective, settings.steps, *parts)]
+        return [TrainingStage("all", objective, settings.steps, *parts)]
     inputs = [(_features(model, s), s.style_shape) for s in (train, validation)]
     codes = [_encode(model, s) for s in (train, validation)]
     loss = _CodeLoss(model)
     both = [(x, s, code) for (x, s), code in zip(inputs, codes, strict=True)]
     if isinstance(model, Mlp):
         model.net.standardise(torch.cat(inputs[0], 1), model.features.groups)
-        return [Stage("all", Objective([model.net], model.code, loss), settings.steps, *both)]
+        return [TrainingStage("all", Objective([model.net], model.code, loss), settings.steps, *both)]
 
     model.low.standardise(torch.cat(inputs[0], 1), model.features.groups)
     model.high.standardise(inputs[0][0], model.features.groups[: model.features.size])
@@ -243,8 +231,8 @@ def stages(
     low = [(x, s, code) for (x, s, _), code in zip(both, coarse, strict=True)]
     shape_net = model.style_shape
     found = [
-        Stage("style-shape", Objective([shape_net], shape_net, loss), settings.style_shape_steps, *drape),
-        Stage("low", Objective([model.low], model.low_code, loss), settings.low_steps, *low),
+        TrainingStage("style-shape", Objective([shape_net], shape_net, loss), settings.style_shape_steps, *drape),
+        TrainingStage("low", Objective([model.low], model.low_code, loss), settings.low_steps, *low),
     ]
     if settings.pivots == "joint":
 
@@ -253,21 +241,21 @@ def stages(
             return code
 
         joint = Objective([model.low, model.high], whole, loss)
-        return [*found, Stage("joint", joint, settings.steps, *both, rate=settings.joint_rate)]
+        return [*found, TrainingStage("joint", joint, settings.steps, *both, rate=settings.joint_rate)]
     fine = []
     for (x, s, code), low_code in zip(both, coarse, strict=True):
         own = (s[:, None] == model.pivots).all(-1)  # (N, K): whose sample it is
         kept = own.any(1)
         fine.append((x[kept], own[kept].float(), (code - low_code)[kept]))
-    return [*found, Stage("high", Objective([model.high], model.high, loss), settings.steps, *fine)]
+    return [*found, TrainingStage("high", Objective([model.high], model.high, loss), settings.steps, *fine)]
 
 
 class _CodeLoss:
     """Distance of garments [mm].
 
     Dense codes are vertices: L1, as the original. In an orthonormal basis, distances between codes are root mean square
-    distances of vertices; trained on those instead of on L1 of vertices, networks are as good (docs/training.md) in a
-    quarter of the time.
+    distances of vertices; trained on those instead of on L1 of vertices, networks are as good in a quarter
+    of the time.
     """
 
     def __init__(self, model: TailorNet | Mlp) -> None:
@@ -286,31 +274,28 @@ def _vertex_loss(predicted: Tensor, target: Tensor) -> Tensor:
 
 
 def low_frequency_code(
-    model: TailorNet, smooth: LaplacianSmoothing, garment: GarmentTemplate, samples: Samples
+    model: TailorNet, smooth: LaplacianSmoothing, garment: GarmentTemplate, samples: TrainingSamples
 ) -> Tensor:
     """Code of D_LF, shape (N, C): the garment smoothed, less its template (Patel et al. 2020)."""
     decoder = model.decoder
-    parts: list[Tensor] = []
     if isinstance(decoder, BasisDecoder):
         smoothed = smooth.transposed(decoder.components)
-    for start in range(0, max(len(samples), 1), 64):
-        chunk = slice(start, start + 64)
-        rest = garment.rest(samples.betas[chunk], samples.style[chunk])
-        whole = rest + samples.displacement[chunk]
+
+    def code(betas: Tensor, style: Tensor, displacement: Tensor) -> Tensor:
+        rest = garment.rest(betas, style)
+        whole = rest + displacement
         if isinstance(decoder, BasisDecoder):
-            code = whole.flatten(1) @ smoothed.T - (rest.flatten(1) + decoder.mean) @ decoder.components.T
-        else:
-            code = decoder.encode(smooth(whole) - rest)
-        parts.append(code)
-    return torch.cat(parts)
+            return whole.flatten(1) @ smoothed.T - (rest.flatten(1) + decoder.mean) @ decoder.components.T
+        return decoder.encode(smooth(whole) - rest)
+
+    return in_chunks(code, samples.betas, samples.style, samples.displacement)
 
 
-def _features(model: TailorNet | Mlp | Gcnn, samples: Samples) -> Tensor:
+def _features(model: TailorNet | Mlp | Gcnn, samples: TrainingSamples) -> Tensor:
     features: Tensor = model.features(samples.pose)
     return features
 
 
-def _encode(model: TailorNet | Mlp, samples: Samples) -> Tensor:
+def _encode(model: TailorNet | Mlp, samples: TrainingSamples) -> Tensor:
     """Codes of the samples' displacements, shape (N, C)."""
-    starts = range(0, max(len(samples), 1), 256)
-    return torch.cat([model.decoder.encode(samples.displacement[i : i + 256]) for i in starts])
+    return in_chunks(model.decoder.encode, samples.displacement, size=256)

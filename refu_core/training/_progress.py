@@ -9,6 +9,9 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
+from refu_core._files import MAX_JSON_BYTES, read_file
+from refu_core.errors import RefuError
+
 
 class TrainingLog:
     """Loss curves of the stages of a training, as a JSON lines file and a picture.
@@ -25,8 +28,7 @@ class TrainingLog:
         self._bar: Any = None
         self._entries: list[dict[str, Any]] = []
         folder.mkdir(parents=True, exist_ok=True)
-        if self._lines.exists():
-            self._entries = _entries(self._lines)
+        self._entries = _entries(self._lines)
 
     def begin(self, stage: str, *, step: int, steps: int) -> None:
         """A stage of `steps` steps goes on at `step`; entries after it are of an interrupted run and dropped."""
@@ -85,7 +87,11 @@ class TrainingLog:
 def _entries(path: Path) -> list[dict[str, Any]]:
     """The entries of an earlier run; a log is no reason not to go on, so what isn't one is left out."""
     entries = []
-    for line in path.read_bytes().splitlines():
+    try:
+        text = read_file(path, most=MAX_JSON_BYTES, error=RefuError, wanted="the log of a training")
+    except RefuError:
+        return []
+    for line in text.splitlines():
         try:
             entry = json.loads(line)
         except (ValueError, RecursionError):

@@ -1,4 +1,4 @@
-"""Training of the paper's network for the body's signed distance (supplement, "SDF Network")."""
+"""Training of the paper's network for the body's signed distance (supplement, Sec. A)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import torch
-import torch.distributed as dist
 from torch import Tensor, nn
 
 from refu_core.body import SmplBody
@@ -20,7 +19,7 @@ from refu_core.garments import GarmentTemplate
 from refu_core.sdf import SDF_PRESETS, ExactSdf, SdfNetwork, body_frame, query_batch, save_sdf_network, with_gradient
 from refu_core.simulation import GarmentDataset
 from refu_core.training._checkpoint import load_checkpoint, save_checkpoint
-from refu_core.training._loop import cosine, start_parallel
+from refu_core.training._loop import cosine, ranks, start_parallel
 from refu_core.training._progress import TrainingLog
 
 VALUE_WEIGHT, NORMAL_WEIGHT, EIKONAL_WEIGHT = 2.0, 1.0, 0.1
@@ -216,7 +215,7 @@ def train_sdf(
     settings = settings or SdfSettings()
     name = f"sdf-{settings.preset}"
     is_writer, where = start_parallel(torch.device(device))
-    rank, world = (dist.get_rank(), dist.get_world_size()) if dist.is_initialized() else (0, 1)
+    rank, world = ranks()
     if settings.batch_size % world:
         msg = f"a batch of {settings.batch_size} bodies can't be shared evenly by {world} processes"
         raise RefuError(msg)
@@ -300,12 +299,9 @@ def _fixed_batch(sampler: SdfSampler, settings: SdfSettings) -> SdfBatch:
 
 
 def _resume(path: Path, identity: str, network: SdfNetwork, optimiser: torch.optim.Optimizer) -> int:
-    saved = load_checkpoint(path)
+    saved = load_checkpoint(path, identity)
     if saved is None:
         return 0
-    if saved["identity"] != identity:
-        msg = f"{path}: of a training with other settings or data; delete it to start anew"
-        raise RefuError(msg)
     network.load_state_dict(saved["network"])
     optimiser.load_state_dict(saved["optimiser"])
     return int(saved["step"])

@@ -6,4 +6,4 @@ from refu_core.weights._files import FORMAT as FORMAT
 from refu_core.weights._files import Weights as Weights
 from refu_core.weights._files import load_weights as load_weights
 from refu_core.weights._files import save_weights as save_weights
-from refu_core.weights._files import shipped_weights as shipped_weights
+from refu_core.weights._files import weights_folder as weights_folder

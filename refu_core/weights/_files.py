@@ -1,12 +1,19 @@
-"""Reading and writing of weights: what they are is checked before what they say is used."""
+"""Reading and writing of weights: what they are is checked before what they say is used.
+
+Weights may be stored as differences from others in the same folder, their base. A difference is a whole number of
+steps, -127 to 127, in one byte: a tenth of the weights in 8 bits is as exact as all of them in half precision. A tensor
+that isn't stored at all is the base's.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
+import struct
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -16,12 +23,21 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
+from refu_core._files import InputFile, open_file, parse_json
+from refu_core._npz import DAMAGE
 from refu_core.errors import WeightsError
 
 FORMAT = "refu-weights-1"
-MAX_BYTES = 8 << 30
-"""A larger file is refused before it is read; the paper's own networks take 2.5 GB."""
+MAX_BYTES = 3 << 30
+"""A larger file is refused before it is read; networks of the paper's sizes take 2.5 GB."""
 MAX_CARD_BYTES = 1 << 20
+LARGEST = 1e4
+"""No weight is larger: those that ship are below 30, and what overflowed in training is far above."""
+_DTYPES = {"F64": 8, "F32": 4, "F16": 2, "BF16": 2, "I64": 8, "I32": 4, "I8": 1, "BOOL": 1}
+_PIECE = 1 << 22
+_STEP = ".step"
+"""After a tensor's name: how much a step of its difference is, a number."""
+_STEPS = 127
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,30 +49,48 @@ class Weights:
     """Garment, body fingerprint, data set, training settings, measured figures, versions."""
     path: Path
     """File of the tensors."""
+    files: tuple[Path, ...]
+    """All files of tensors that were read: its own, and before it that of its base."""
 
 
-def shipped_weights(garment: str) -> Path:
-    """The folder of a built-in garment's weights; it needs not exist."""
-    return Path(__file__).parent / garment
+def weights_folder(garment: str, root: str | os.PathLike[str] | None = None) -> Path:
+    """The folder of a garment's weights below `root`, or of those that ship; it needs not exist."""
+    return (Path(__file__).parent if root is None else Path(root)) / garment
 
 
-def save_weights(stem: str | Path, tensors: Mapping[str, Tensor], card: Mapping[str, Any]) -> Path:
+def save_weights(
+    stem: str | Path, tensors: Mapping[str, Tensor], card: Mapping[str, Any], *, base: str | None = None
+) -> Path:
     """Writes `stem`.safetensors and its card `stem`.json; neither is ever left half written.
 
-    Returns the file of the tensors.
+    Args:
+        stem: path without suffix.
+        tensors: by name.
+        card: what is known of them.
+        base: name of weights in the same folder, not stored as differences themselves, that these are stored as
+            differences from. What the base has and `tensors` hasn't is read as the base's.
+
+    Returns:
+        The file of the tensors.
 
     Raises:
-        WeightsError: a tensor isn't finite, or the disk can't be written.
+        WeightsError: a tensor isn't finite, the base can't be read, or the disk can't be written.
     """
     stem = Path(stem)
-    bad = [name for name, t in tensors.items() if t.is_floating_point() and not bool(torch.isfinite(t).all())]
-    if bad:
-        msg = f"{stem}: wanted finite weights, got NaN or infinity in {', '.join(bad)}; nothing was written"
-        raise WeightsError(msg)
+    _require_sense(stem, tensors)
+    differs: dict[str, Any] = {}
+    if base is not None:
+        loaded = load_weights(stem.with_name(base))
+        if "base" in loaded.card:
+            msg = f"{stem}: wanted a base that is stored whole, got {base}; nothing was written"
+            raise WeightsError(msg)
+        differs = {"base": base, "base_sha256": loaded.card["sha256"]}
+        tensors = _differences(tensors, loaded.tensors)
     data = save({name: t.detach().cpu().contiguous() for name, t in tensors.items()})
     full = {
         "format": FORMAT,
         **card,
+        **differs,
         "sha256": hashlib.sha256(data).hexdigest(),
         "versions": {name: version(name) for name in ("refu-ros", "torch")},
     }
@@ -81,33 +115,115 @@ def load_weights(stem: str | Path, *, expect: Mapping[str, Any] | None = None) -
     Raises:
         WeightsError: a file is missing, damaged, of another format, or made for something other than `expect`.
     """
-    stem = Path(stem)
+    stored = _load_stored(Path(stem), expect=expect)
+    if "base" not in stored.card:
+        return stored
+    name = stored.card["base"]
+    if not isinstance(name, str) or not name or name != Path(name).name:
+        msg = f"{stored.path}: wanted a base in the same folder, got {str(name)[:80]!r}"
+        raise WeightsError(msg)
+    base = _load_stored(Path(stem).with_name(name))
+    if "base" in base.card or base.card["sha256"] != stored.card.get("base_sha256"):
+        msg = f"{stored.path}: made for another {name} than the one beside it; get both files again"
+        raise WeightsError(msg)
+    tensors = _sum(base, stored)
+    _require_sense(stored.path, tensors)
+    return replace(stored, tensors=tensors, files=(*base.files, *stored.files))
+
+
+def _load_stored(stem: Path, *, expect: Mapping[str, Any] | None = None) -> Weights:
     path = _with_suffix(stem, ".safetensors")
     card = _read_card(_with_suffix(stem, ".json"))
     for key, wanted in (expect or {}).items():
         if card.get(key) != wanted:
             msg = f"{path}: wanted weights whose {key} is {wanted}, got {card.get(key)}; train some with `refu train`"
             raise WeightsError(msg)
-    data = _read(path, MAX_BYTES)
-    if hashlib.sha256(data).hexdigest() != card.get("sha256"):
-        msg = f"{path}: damaged, or not the file that its card describes; get both files again"
-        raise WeightsError(msg)
-    try:
-        tensors = load(data)
-    except (SafetensorError, ValueError, KeyError, RuntimeError) as error:
-        msg = f"{path}: not a safetensors file: {error}"
-        raise WeightsError(msg) from error
+    tensors = _read_tensors(path, card.get("sha256"))
+    _require_sense(path, tensors)
+    return Weights(tensors, card, path, (path,))
+
+
+def _require_sense(path: Path, tensors: Mapping[str, Tensor]) -> None:
     bad = [name for name, t in tensors.items() if t.is_floating_point() and not bool(torch.isfinite(t).all())]
     if bad:
         msg = f"{path}: wanted finite weights, got NaN or infinity in {', '.join(bad)}"
         raise WeightsError(msg)
-    return Weights(tensors, card, path)
+    large = [name for name, t in tensors.items() if t.is_floating_point() and t.numel() and t.abs().max() > LARGEST]
+    if large:
+        msg = f"{path}: wanted weights of at most {LARGEST:g}, got larger ones in {', '.join(large)}; train it again"
+        raise WeightsError(msg)
+
+
+def _differences(tensors: Mapping[str, Tensor], base: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """What is stored of `tensors`; those that the base hasn't, or in another shape, are stored whole."""
+    stored = {}
+    for name, tensor in tensors.items():
+        if name not in base or base[name].shape != tensor.shape:
+            stored[name] = tensor
+            continue
+        difference = tensor.detach().cpu().float() - base[name].float()
+        step = difference.abs().max() / _STEPS
+        if step > 0:
+            stored[name], stored[name + _STEP] = (difference / step).round().to(torch.int8), step
+    return stored
+
+
+def _sum(base: Weights, stored: Weights) -> dict[str, Tensor]:
+    """The inverse of `_differences`."""
+    tensors = {**base.tensors, **{k: v for k, v in stored.tensors.items() if not k.endswith(_STEP)}}
+    for name, step in stored.tensors.items():
+        if not name.endswith(_STEP):
+            continue
+        name = name.removesuffix(_STEP)
+        whole, steps = base.tensors.get(name), stored.tensors.get(name)
+        if whole is None or steps is None or (steps.dtype, steps.shape, step.ndim) != (torch.int8, whole.shape, 0):
+            msg = f"{stored.path}: {name[:80]} isn't a difference from a tensor of {base.path.name}; get them again"
+            raise WeightsError(msg)
+        tensors[name] = whole.float() + step * steps
+    return tensors
+
+
+def _read_tensors(path: Path, sha256: Any) -> dict[str, Tensor]:
+    """The tensors of a file; nothing is taken of it before its header and its hash are known to be right."""
+    damaged = f"{path}: damaged, or not the file that its card describes"
+    try:
+        with _open(path, MAX_BYTES) as file:
+            _check_header(file)
+            file.seek(0)
+            digest = hashlib.sha256()
+            while step := file.read(_PIECE):
+                digest.update(step)
+            if digest.hexdigest() != sha256:
+                msg = f"{damaged}; get both files again"
+                raise WeightsError(msg)
+            file.seek(0)
+            return load(file.read())
+    except (SafetensorError, AttributeError, *DAMAGE) as error:
+        if isinstance(error, WeightsError):
+            raise
+        what = "larger than this machine's memory" if isinstance(error, MemoryError) else "not a safetensors file"
+        msg = f"{damaged}: {what} ({error}); get both files again"
+        raise WeightsError(msg) from error
+
+
+def _check_header(file: InputFile) -> None:
+    """Checks that a file is as long as its tensors, of plain types, are. Raises `ValueError` and the like."""
+    (n,) = struct.unpack("<Q", file.read(8))
+    if n > MAX_CARD_BYTES:
+        msg = f"a header of {n} bytes"
+        raise ValueError(msg)
+    entries = {key: value for key, value in parse_json(file.read(n)).items() if key != "__metadata__"}
+    size = sum(_DTYPES[entry["dtype"]] * math.prod(entry["shape"]) for entry in entries.values())
+    if size != file.size - 8 - n:
+        msg = f"{len(entries)} tensors of {size} bytes, the file has {file.size - 8 - n}"
+        raise ValueError(msg)
 
 
 def _read_card(path: Path) -> dict[str, Any]:
     try:
-        card = json.loads(_read(path, MAX_CARD_BYTES))
-    except (ValueError, RecursionError) as error:
+        with _open(path, MAX_CARD_BYTES) as file:
+            card = parse_json(file.read())
+    except (ValueError, RecursionError, OSError) as error:
         if isinstance(error, WeightsError):
             raise
         msg = f"{path}: not a card of weights: {error}"
@@ -119,19 +235,11 @@ def _read_card(path: Path) -> dict[str, Any]:
     return card
 
 
-def _read(path: Path, most: int) -> bytes:
-    try:
-        size = path.stat().st_size
-        if size > most:
-            msg = f"{path}: {size >> 20} MiB, at most {most >> 20} MiB are read"
-            raise WeightsError(msg)
-        return path.read_bytes()
-    except FileNotFoundError as error:
+def _open(path: Path, most: int) -> InputFile:
+    if not os.path.lexists(path):
         msg = f"{path}: no such weights; train some with `refu train`"
-        raise WeightsError(msg) from error
-    except OSError as error:
-        msg = f"{path}: can't be read: {error}"
-        raise WeightsError(msg) from error
+        raise WeightsError(msg)
+    return open_file(path, most=most, error=WeightsError, wanted="weights or their card, as `refu train` writes them")
 
 
 def _with_suffix(stem: Path, suffix: str) -> Path:

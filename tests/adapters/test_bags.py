@@ -127,12 +127,8 @@ def test_the_file_is_laid_out_as_rosbag2_lays_it_out(tmp_path: Path) -> None:
         assert len(summary.chunk_indexes) > 10
         (schema,) = summary.schemas.values()
         assert (schema.name, schema.encoding) == (INPUT_TYPES["joint_state"], "ros2msg")
-        (metadata,) = reader.iter_metadata()
-        assert metadata.name == "rosbag2"
         assert [m.log_time for _, _, m in reader.iter_messages()] == [frame(i).stamp_ns + 5 for i in range(40)]
-    text = (tmp_path / "bag" / "metadata.yaml").read_text()
-    assert metadata.metadata["serialized_metadata"] == text
-    information = yaml.safe_load(text)["rosbag2_bagfile_information"]
+    information = yaml.safe_load((tmp_path / "bag" / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
     assert (information["version"], information["storage_identifier"]) == (9, "mcap")
     assert information["relative_file_paths"] == ["bag_0.mcap"]
     assert information["duration"]["nanoseconds"] == 39 * STEP_NS
@@ -311,13 +307,13 @@ def make_odd_metadata(path: Path) -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda _: None, "no such file or directory"),
+        (lambda _: None, "No such file or directory; wanted a .mcap file"),
         (Path.touch, "an empty file"),
         (Path.mkdir, "no .mcap file in this directory"),
         (lambda path: path.write_text("hello, world"), "not an MCAP file; wanted a .mcap file, a rosbag2 directory"),
         (make_sqlite, "not an MCAP file; convert it with `ros2 bag convert`"),
         (make_sqlite_bag, "stored as sqlite3 .* only plain mcap is read; convert it"),
-        (make_missing_file_bag, "gone.mcap: can't be opened: No such file"),
+        (make_missing_file_bag, "gone.mcap: can.t be .*: No such file"),
         (make_odd_metadata, "not rosbag2 metadata"),
     ],
 )
@@ -414,7 +410,7 @@ def chunk_record(*, size: int, packed: bytes, compression: bytes = b"zstd") -> b
 @pytest.mark.parametrize(
     ("record", "message"),
     [
-        (chunk_record(size=2**60, packed=zstandard.compress(bytes(1000))), "at most 256 are read"),
+        (chunk_record(size=2**60, packed=zstandard.compress(bytes(1000))), "at most 128 are read"),
         (chunk_record(size=1000, packed=zstandard.compress(bytes(1 << 28))), "unpacks to 1001 bytes where 1000"),
         (chunk_record(size=1000, packed=b"no zstd"), "zstd can't unpack"),
         (chunk_record(size=7, packed=b"1234567", compression=b"rot13"), "unknown compression 'rot13'"),

@@ -17,8 +17,6 @@ from torch import Tensor
 
 from refu_core import WeightsError, load_body, load_garment
 from refu_core.backbones import (
-    BACKBONES,
-    GARMENT_JOINTS,
     TRAINABLE,
     BasisDecoder,
     DenseDecoder,
@@ -31,25 +29,24 @@ from refu_core.backbones import (
     TailorNet,
     TailorNetConfig,
     backbone_config,
+    backbone_from_weights,
     build_backbone,
     kernel_weights,
     load_backbone,
     load_basis,
-    non_negligible,
-    read_backbone,
     save_backbone,
     save_basis,
     style_shape,
     tilt_rotvec,
     up_in_root,
-    without_negligible,
 )
 from refu_core.backbones._gcnn import UpConv
 from refu_core.backbones._graph import MeshGraph
 from refu_core.backbones._perceptron import StackedPerceptrons
 from refu_core.body import rotvec_to_rotmat
 from refu_core.errors import RefuError
-from refu_core.garments import GarmentTemplate
+from refu_core.garments import BUILTIN_GARMENTS, GarmentTemplate
+from refu_core.modes import BackboneName
 from refu_core.weights import load_weights
 
 GARMENT = "short-pant-male"
@@ -93,7 +90,7 @@ def bodies(n: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def tailornet(garment: GarmentTemplate, basis: BasisDecoder | None, **changes: object) -> TailorNet:
-    config = TailorNetConfig(GARMENT_JOINTS[GARMENT], low=(32,), high=(16, 16), style_shape=(16,))
+    config = TailorNetConfig(load_garment(GARMENT).card.joints, low=(32,), high=(16, 16), style_shape=(16,))
     net = build_backbone(replace(config, **changes), garment, basis=basis, pivots=0.3 * torch.randn(20, 14))  # type: ignore[arg-type]
     assert isinstance(net, TailorNet)
     return net.eval()
@@ -106,7 +103,7 @@ def tailornet(garment: GarmentTemplate, basis: BasisDecoder | None, **changes: o
 def test_tailornet_is_the_sum_that_the_paper_writes(
     garment: GarmentTemplate, basis: BasisDecoder, low_rank: bool
 ) -> None:
-    net = tailornet(garment, basis if low_rank else None, sigma=0.5, skipped=0.0)
+    net = tailornet(garment, basis if low_rank else None, sigma=0.5)
     betas, pose, style = bodies(3)
     with torch.no_grad():
         got = net.train(False)(betas, pose, style).displacement
@@ -147,22 +144,8 @@ def test_kernel_weights_are_a_softmax(seed: int, sigma: float) -> None:
     torch.testing.assert_close(kernel_weights(distances, sigma), wanted, atol=1e-12, rtol=1e-9)
 
 
-@given(seed=seeds, skipped=st.floats(0.0, 0.5))
-def test_what_is_left_out_weighs_no_more_than_was_allowed(seed: int, skipped: float) -> None:
-    rng = np.random.default_rng(seed)
-    mixture = torch.as_tensor(rng.dirichlet(np.full(20, 0.1), size=rng.integers(1, 4)))
-    active = non_negligible(mixture, skipped)
-    assert len(active) > 0
-    left = without_negligible(mixture, skipped)
-    assert bool((1 - left.sum(1) <= skipped + 1e-12).all())
-    assert bool((left[:, active].amax(0) > 0).all())
-    assert torch.count_nonzero(left) == torch.count_nonzero(left[:, active])
-    for row, alone in zip(mixture, left, strict=True):
-        assert torch.equal(without_negligible(row[None], skipped)[0], alone)
-
-
 def test_a_person_wears_the_same_alone_and_in_a_crowd(garment: GarmentTemplate, basis: BasisDecoder) -> None:
-    net = tailornet(garment, basis, sigma=0.5, skipped=0.2)
+    net = tailornet(garment, basis, sigma=0.5)
     betas, pose, style = bodies(6)
     with torch.no_grad():
         together = net(betas, pose, style).displacement
@@ -172,7 +155,7 @@ def test_a_person_wears_the_same_alone_and_in_a_crowd(garment: GarmentTemplate, 
 
 
 def test_of_pivots_far_away_the_nearest_ones_are_known(garment: GarmentTemplate, basis: BasisDecoder) -> None:
-    net = tailornet(garment, basis, sigma=1.0, skipped=0.0)
+    net = tailornet(garment, basis, sigma=1.0)
     exact = copy.deepcopy(net).double()
     betas, pose, style = bodies(16)
     style = 50 * style
@@ -182,53 +165,13 @@ def test_of_pivots_far_away_the_nearest_ones_are_known(garment: GarmentTemplate,
     torch.testing.assert_close(got, wanted.float(), atol=1e-6, rtol=0)
 
 
-def test_leaving_pivots_out_moves_vertices_within_the_bound(garment: GarmentTemplate, basis: BasisDecoder) -> None:
-    skipped = 0.2
-    net = tailornet(garment, basis, sigma=0.5, skipped=skipped)
-    betas, pose, style = bodies(1)
-    s = style_shape(betas, style)
+def test_what_depends_on_the_wearer_may_be_computed_once(garment: GarmentTemplate, basis: BasisDecoder) -> None:
+    net = tailornet(garment, basis, sigma=0.5)
+    betas, pose, style = bodies(2)
     with torch.no_grad():
-        fast = net(betas, pose, style).displacement
-        x = net.features(pose)
-        whole = net.decoder(net.low_code(x, s) + net.high(x, net.mixture(s)))
-        alone = net.decoder(net.high(x.expand(20, -1), torch.eye(20))) - net.decoder.mean.view(-1, 3)
-        active = non_negligible(net.mixture(s), skipped)
-    assert 0 < len(active) < 20
-    left_out = torch.tensor([k for k in range(20) if k not in active.tolist()])
-    bound = skipped * alone[left_out].norm(dim=-1).amax(0)
-    moved = (fast - whole).norm(dim=-1)[0]
-    assert moved.max() > 1e-5
-    assert bool((moved <= bound + 1e-6).all())
-
-
-def test_what_is_kept_between_frames_follows_style_shape_and_weights(
-    garment: GarmentTemplate, basis: BasisDecoder
-) -> None:
-    net = tailornet(garment, basis, sigma=0.5, skipped=0.0)
-    betas, pose, style = bodies(1)
-
-    def fresh(betas: Tensor, pose: Tensor, style: Tensor | None) -> Tensor:
-        return net(betas, pose, style).displacement.detach()  # with gradients nothing is kept
-
-    def kept(*args: Tensor | None) -> Tensor:
-        with torch.no_grad():
-            return net(*args).displacement
-
-    other = bodies(1, seed=5)
-    first = kept(betas, pose, style)
-    for args in ((betas, other[1], style), (other[0], pose, style), (other[0], pose, other[2]), (other[0], pose, None)):
-        torch.testing.assert_close(kept(*args), fresh(*args), atol=1e-6, rtol=1e-5)
-    args = (betas, pose, style)
-    torch.testing.assert_close(kept(*args), first)
-    with torch.no_grad():
-        net.high.weights[0].mul_(1.5)
-    changed = kept(*args)
-    assert not torch.equal(changed, first)
-    torch.testing.assert_close(changed, fresh(*args), atol=1e-6, rtol=1e-5)
-    net.load_state_dict({k: v * 1.1 if k.startswith("style_shape.layers") else v for k, v in net.state_dict().items()})
-    torch.testing.assert_close(kept(*args), fresh(*args), atol=1e-6, rtol=1e-5)
-    net.double()
-    assert kept(*(t.double() for t in args)).dtype == torch.float64
+        anew = net(betas, pose, style).displacement
+        assert torch.equal(net(betas, pose, style, wearer_code=net.wearer_code(betas, style)).displacement, anew)
+        assert not torch.equal(net(betas, pose, style, wearer_code=net.wearer_code(-betas, style)).displacement, anew)
 
 
 def test_a_batch_is_its_rows(garment: GarmentTemplate, basis: BasisDecoder) -> None:
@@ -237,7 +180,7 @@ def test_a_batch_is_its_rows(garment: GarmentTemplate, basis: BasisDecoder) -> N
     with torch.no_grad():
         whole = net(betas, pose, style).displacement
         rows = [net(betas[i : i + 1], pose[i : i + 1], style[i : i + 1]).displacement[0] for i in range(4)]
-    torch.testing.assert_close(whole, torch.stack(rows), atol=2e-3, rtol=0)  # other pivots are left out
+    torch.testing.assert_close(whole, torch.stack(rows), atol=1e-6, rtol=0)
 
 
 def test_stacked_perceptrons_are_perceptrons() -> None:
@@ -248,14 +191,11 @@ def test_stacked_perceptrons_are_perceptrons() -> None:
         hidden = torch.relu(x @ stack.weights[0][k] + stack.biases[0][k])
         wanted += mixture[:, k : k + 1] * (hidden @ stack.weights[1][k] + stack.biases[1][k])
     torch.testing.assert_close(stack(x, mixture), wanted, atol=1e-5, rtol=1e-4)
-    some = torch.tensor([0, 2])
-    mixture[:, 1] = 0
-    torch.testing.assert_close(stack(x, mixture[:, some], stack.select(some)), stack(x, mixture), atol=1e-5, rtol=1e-4)
 
 
 def test_papers_preset_has_its_sizes_and_takes_a_step() -> None:
     garment = load_garment(GARMENT)
-    config = backbone_config("tailornet", GARMENT, preset="paper")
+    config = backbone_config("tailornet", garment, preset="paper")
     net = build_backbone(config, garment, pivots=torch.randn(3, 14))  # 20 of them take 2 GB
     assert isinstance(net, TailorNet)
     outputs = 3 * garment.n_vertices
@@ -274,7 +214,7 @@ def test_papers_preset_has_its_sizes_and_takes_a_step() -> None:
 
 @pytest.mark.parametrize("encoding", ["matrix", "rotvec"])
 def test_heading_changes_nothing_and_tilt_does(encoding: str) -> None:
-    features = PoseFeatures(GARMENT_JOINTS[GARMENT], encoding)
+    features = PoseFeatures(load_garment(GARMENT).card.joints, encoding)
     _, pose, _ = bodies(5)
     turned = pose.clone()
     heading = rotvec_to_rotmat(torch.tensor((0.0, 0.9, 0.0)))
@@ -296,16 +236,16 @@ def test_tilt_is_the_root_without_its_heading() -> None:
 
 
 @pytest.mark.parametrize("encoding", ["matrix", "rotvec"])
-@pytest.mark.parametrize("name", sorted(GARMENT_JOINTS))
+@pytest.mark.parametrize("name", sorted(BUILTIN_GARMENTS))
 def test_only_the_garments_joints_are_seen(name: str, encoding: str) -> None:
-    features = PoseFeatures(GARMENT_JOINTS[name], encoding)
+    features = PoseFeatures(load_garment(name).card.joints, encoding)
     _, pose, _ = bodies(1)
     before = features(pose)
     assert before.shape == (1, features.size)
     for joint in range(1, 24):
         moved = pose.clone()
         moved[:, joint] += 0.2
-        assert bool(torch.equal(features(moved), before)) == (joint not in GARMENT_JOINTS[name])
+        assert bool(torch.equal(features(moved), before)) == (joint not in load_garment(name).card.joints)
 
 
 def test_no_style_is_the_mean_style() -> None:
@@ -389,7 +329,7 @@ def test_smoothing_of_a_basis_is_smoothing(garment: GarmentTemplate) -> None:
 
 @pytest.mark.parametrize("stride", [2, 3])
 def test_sampled_graphs_cover_the_mesh(garment: GarmentTemplate, stride: int) -> None:
-    graph = MeshGraph.of(garment.faces.numpy(), garment.n_vertices, levels=2, stride=stride)
+    graph = MeshGraph.of(garment.mesh, levels=2, stride=stride)
     assert graph.sizes[0] == garment.n_vertices
     assert graph.sizes[0] > 3 * graph.sizes[1] > 9 * graph.sizes[2] > 0
     for fine, coarse, up in zip(graph.sizes[:-1], graph.sizes[1:], graph.ups, strict=True):
@@ -399,7 +339,7 @@ def test_sampled_graphs_cover_the_mesh(garment: GarmentTemplate, stride: int) ->
 
 
 def test_up_convolution_is_what_the_formula_says(garment: GarmentTemplate) -> None:
-    graph = MeshGraph.of(garment.faces.numpy(), garment.n_vertices, levels=3)
+    graph = MeshGraph.of(garment.mesh, levels=3)
     up = graph.ups[2]
     for inputs, outputs in ((3, 5), (5, 3), (4, 4)):
         layer = UpConv(up, inputs, outputs, bases=4, residual=0.3)
@@ -422,7 +362,7 @@ def test_up_convolution_is_what_the_formula_says(garment: GarmentTemplate) -> No
 @pytest.mark.parametrize("name", ["tshirt-male", "skirt-female"])
 def test_gcnn_learns_on_a_real_garment(name: str) -> None:
     garment = load_garment(name)
-    net = build_backbone(GcnnConfig(GARMENT_JOINTS[name], hidden=(32,), channels=(9, 8, 8), bases=4), garment)
+    net = build_backbone(GcnnConfig(load_garment(name).card.joints, hidden=(32,), channels=(9, 8, 8), bases=4), garment)
     assert isinstance(net, Gcnn)
     betas, pose, style = bodies(4)
     target = 0.03 * torch.sin(3 * garment.v_template + pose[:, 1:2])
@@ -442,7 +382,7 @@ def test_gcnn_learns_on_a_real_garment(name: str) -> None:
 
 def test_papers_gcnn_and_mlp_take_a_step(garment: GarmentTemplate) -> None:
     for name in ("gcnn", "mlp"):
-        net = build_backbone(backbone_config(name, GARMENT, preset="paper"), garment)
+        net = build_backbone(backbone_config(name, garment, preset="paper"), garment)
         net(*bodies(2)).displacement.abs().mean().backward()
         assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in net.parameters())
     assert isinstance(net, Mlp)
@@ -464,7 +404,7 @@ def _name(net: torch.nn.Module) -> str:
 
 @pytest.fixture
 def nets(garment: GarmentTemplate, basis: BasisDecoder) -> dict[str, torch.nn.Module]:
-    joints = GARMENT_JOINTS[GARMENT]
+    joints = load_garment(GARMENT).card.joints
     return {
         "tailornet": tailornet(garment, basis),
         "mlp": build_backbone(MlpConfig(joints, hidden=(16,)), garment, basis=basis).eval(),
@@ -523,26 +463,26 @@ def test_weights_of_another_network_are_refused(
     for change, message in (({"config": {"joints": [0], "depth": 3}}, "doesn't know"), ({"backbone": "fit"}, "'fit'")):
         path.with_suffix(".json").write_text(json.dumps({**card, **change}))
         with pytest.raises(WeightsError, match=message):
-            read_backbone(path.with_suffix(""), garment, expect={})
+            backbone_from_weights(load_weights(path.with_suffix("")), garment)
     config = {**card["config"], "hidden": [17]}
     path.with_suffix(".json").write_text(json.dumps({**card, "config": config}))
     with pytest.raises(WeightsError, match="doesn't fit short-pant-male"):
-        read_backbone(path.with_suffix(""), garment, expect={})
+        backbone_from_weights(load_weights(path.with_suffix("")), garment)
 
 
 def test_unknown_names_are_refused(garment: GarmentTemplate) -> None:
     assert load_backbone("skinned", GARMENT)(*bodies(1)) == (None, None)
     with pytest.raises(WeightsError, match="no backbone 'bert'"):
         load_backbone("bert", GARMENT)
-    with pytest.raises(WeightsError, match="no mode 'fast'"):
+    with pytest.raises(WeightsError, match="no mode of a backbone 'fast'"):
         load_backbone("mlp", GARMENT, mode="fast")
     with pytest.raises(WeightsError, match="could be trained"):
-        backbone_config("skinned", GARMENT)
+        backbone_config("skinned", garment)
     with pytest.raises(WeightsError, match="no preset 'tiny'"):
-        backbone_config("mlp", GARMENT, preset="tiny")
+        backbone_config("mlp", garment, preset="tiny")
     with pytest.raises(WeightsError, match="needs pivots"):
-        build_backbone(backbone_config("tailornet", GARMENT), garment)
-    assert set(TRAINABLE) | {"skinned"} == set(BACKBONES)
+        build_backbone(backbone_config("tailornet", garment), garment)
+    assert set(TRAINABLE) | {"skinned"} == set(BackboneName)
 
 
 def _rotvec(rotation: Tensor) -> Tensor:

@@ -21,7 +21,19 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from refu_core import BodyError, FrameError, load_body
-from refu_core.body import BUILTIN_BODIES, PARENTS, SmplBody, rotvec_to_rotmat
+from refu_core.body import (
+    ARMS,
+    BUILTIN_BODIES,
+    JOINT_NAMES,
+    LEGS,
+    MIRRORED_JOINTS,
+    PARENTS,
+    SEGMENTS,
+    SmplBody,
+    part_of_faces,
+    rotvec_to_rotmat,
+    weight_of_parts,
+)
 from refu_core.body._model import BodyArrays
 
 ASSETS = Path(__file__).parents[2] / "refu_core" / "assets"
@@ -338,3 +350,25 @@ def test_kernels_pose_as_the_differentiable_code_does(betas_of: int) -> None:
     assert not fast.vertices.requires_grad
     for got, wanted in zip((*fast[:2], *fast.transforms), (*slow[:2], *slow.transforms), strict=True):
         torch.testing.assert_close(got, wanted.detach(), atol=2e-6, rtol=0)
+
+
+def test_each_joint_is_of_one_segment() -> None:
+    assert sorted(joint for joints in SEGMENTS.values() for joint in joints) == list(range(24))
+    assert [JOINT_NAMES[joint] for joint in (*ARMS[0], *LEGS[0])] == [
+        *("left_shoulder", "left_elbow", "left_wrist", "left_hand"),
+        *("left_hip", "left_knee", "left_ankle", "left_foot"),
+    ]
+    assert tuple(MIRRORED_JOINTS[joint] for joint in ARMS[0] + LEGS[0]) == ARMS[1] + LEGS[1]
+    assert all(MIRRORED_JOINTS[MIRRORED_JOINTS[joint]] == joint for joint in range(24))
+
+
+def test_faces_are_of_the_segment_that_moves_them() -> None:
+    body = load_body("neutral")
+    parts = tuple(SEGMENTS.values())
+    middles = body.v_template[body.faces].mean(1)
+    part = part_of_faces(body.weights, body.faces, parts)
+    head, left_forearm = (middles[part == list(SEGMENTS).index(name)] for name in ("head", "left_forearm"))
+    joints = body.rest_joints(torch.zeros(1, 10))[0]
+    assert head[:, 1].min() > joints[3, 1]  # above the lowest vertebra
+    assert left_forearm[:, 0].min() > joints[16, 0]  # farther out than the shoulder
+    torch.testing.assert_close(weight_of_parts(body.weights, parts).sum(1), torch.ones(body.n_vertices))

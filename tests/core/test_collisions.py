@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from refu_core.body import load_body
 from refu_core.errors import MeshError
-from refu_core.evaluation import CollisionChecker, Collisions, SelfContactDetector
 from refu_core.garments import load_garment
+from refu_core.metrics import CollisionChecker, Collisions, SelfContactDetector
 
 Array = NDArray[np.float64]
 

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from importlib import resources
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +14,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from refu_core import GarmentError, load_body, load_garment
+from refu_core import GarmentError, GarmentPipeline, SmplFrame, WeightsError, load_body, load_garment
 from refu_core.body import apply_transforms, blend_transforms
 from refu_core.garments import BUILTIN_GARMENTS
 from refu_core.sdf import ExactSdf
@@ -95,6 +99,76 @@ def test_unknown_garments_and_styles_are_named() -> None:
     plain = replace(load_garment("tshirt-male"), styledirs=None)
     with pytest.raises(GarmentError, match="tshirt-male has one style only"):
         plain.rest(torch.zeros(1, 10), torch.zeros(1, 4))
+
+
+def write_garment(path: Path, **changes: Any) -> Path:
+    """The shorts in a file of one's own; a key that is None is left out, others of the card are changed."""
+    with (resources.files("refu_core") / "assets" / "garment_short-pant-male.npz").open("rb") as file:
+        arrays = dict(np.load(file))
+    card = json.loads(arrays["card"].item())
+    card |= {key: value for key, value in changes.items() if key in card}
+    arrays["card"] = np.array(json.dumps(card).encode())
+    arrays |= {key: value for key, value in changes.items() if key not in card}
+    np.savez(path, **{key: value for key, value in arrays.items() if value is not None})
+    return path
+
+
+def test_a_garment_is_one_file(tmp_path: Path) -> None:
+    path = write_garment(tmp_path / "garment_kilt.npz", layer=7, color=[0.5, 0.25, 1])
+    kilt, shorts = load_garment(path), load_garment("short-pant-male")
+    assert (kilt.name, kilt.card.layer, kilt.card.color) == ("kilt", 7, (0.5, 0.25, 1))
+    assert kilt.card.joints == shorts.card.joints
+    torch.testing.assert_close(kilt.shapedirs, shorts.shapedirs, atol=0, rtol=0)
+    assert load_garment(str(path)).name == "kilt"
+    frame = SmplFrame(np.zeros((24, 3)))
+    worn = GarmentPipeline.load([str(path), shorts], backbone="skinned", sdf="accurate")
+    alone = GarmentPipeline.load(shorts, backbone="skinned", sdf="accurate")
+    out = worn(frame)
+    assert list(out) == ["kilt", "short-pant-male"]
+    # The kilt's layer is the outer one: it is lifted off the shorts, which lie as they do alone.
+    np.testing.assert_array_equal(out["short-pant-male"].local, alone(frame)["short-pant-male"].local)
+    assert np.abs(out["kilt"].local - out["short-pant-male"].local).max() > 1e-3
+    with pytest.raises(WeightsError, match="kilt"):
+        GarmentPipeline.load(path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "wanted"),
+    [
+        ({"layer": -1}, "layer: wanted a whole number up to 99, got -1"),
+        ({"layer": True}, "layer: wanted a whole number"),
+        ({"color": [0.1, 0.2]}, "color: wanted three numbers"),
+        ({"color": [0.1, 0.2, "blue"]}, "color: wanted three numbers"),
+        ({"color": 3}, "a card of other types"),
+        ({"joints": [0, 24]}, "joints: wanted different numbers of joints, 0 to 23"),
+        ({"joints": [1, 1]}, "joints: wanted different"),
+        ({"held_at_waist": 1}, "held_at_waist: wanted true or false"),
+        ({"tailoring": [{"name": "length", "mean": 0, "std": 0.1}]}, "tailoring: wanted 4 parameters or none"),
+        ({"tailoring": [{"name": "length"}]}, "a card of other types"),
+        ({"card": None}, "it has no card"),
+        ({"card": np.array(b"{}")}, "wanted a card of layer, color"),
+        ({"card": np.array(3)}, "card: wanted a text"),
+        ({"card": np.array(b"[" * 4000)}, "not a garment"),
+        ({"body": np.array("robot")}, "cut for the body 'robot': wanted"),
+        ({"weights": np.zeros((2699, 24))}, "rows that sum to 1"),
+        ({"weights": np.zeros((2, 24))}, "weights: wanted finite numbers"),
+        ({"v_template": np.full((2699, 3), np.nan)}, "v_template: wanted finite numbers"),
+        ({"v_template": np.array("word")}, "v_template: wanted finite numbers"),
+        ({"f": np.array([[0, 1, 2699]])}, "faces must index vertices 0 to 2698"),
+    ],
+)
+def test_files_that_make_no_garment_are_refused(changes: dict[str, Any], wanted: str, tmp_path: Path) -> None:
+    with pytest.raises(GarmentError, match=wanted):
+        load_garment(write_garment(tmp_path / "kilt.npz", **changes))
+
+
+def test_paths_that_name_no_garment_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(GarmentError, match=r"kilt\.npz: can't be read"):
+        load_garment(tmp_path / "kilt.npz")
+    with pytest.raises(GarmentError, match="a garment has its file's name"):
+        load_garment(write_garment(tmp_path / "a kilt.npz"))
+    with pytest.raises(GarmentError, match=r"a garment is a name or the path of an \.npz, got int"):
+        load_garment(5)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("name", BUILTIN_GARMENTS)

@@ -27,8 +27,9 @@ from torch.utils._pytree import tree_flatten
 
 from refu_core import GarmentPipeline, SmplFrame
 from refu_core.errors import MeshError
+from refu_core.realtime import GarmentStats, Wearer
+from refu_core.realtime._frame import FrameStep
 from refu_core.realtime._graph import CudaCapture, StepGraphs
-from refu_core.realtime._step import Step
 from refu_core.sdf import ApproxSdf, ExactSdf, _mesh
 
 CPU = torch.device("cpu")
@@ -116,15 +117,19 @@ class Tape:
             act()
 
 
-def as_on_a_gpu(pipeline: GarmentPipeline) -> Step:
+def as_on_a_gpu(pipeline: GarmentPipeline) -> FrameStep:
     """The pipeline's step, with the launches that a GPU gets, and a tree that isn't built anew."""
-    if pipeline._collisions is not None:
-        if isinstance(pipeline._collisions._sdf, ExactSdf):
-            pipeline._collisions._sdf._rebuild_distance = math.inf
-        if isinstance(pipeline._collisions._sdf, ApproxSdf):
-            pipeline._collisions._sdf._is_serial = False
-        for fabric in pipeline._collisions._fabrics.values():
-            fabric.resolver._is_serial = False
+    contact = pipeline._step.contact
+    if contact is not None:
+        if isinstance(contact.sdf, ExactSdf):
+            contact.sdf._rebuild_distance = math.inf
+        if isinstance(contact.sdf, ApproxSdf):
+            contact.sdf._is_serial = False
+        for resolver in contact.resolvers.values():
+            resolver._is_serial = False
+        for layers in contact._below.values():
+            for layer in layers.values():
+                layer._is_serial = False
     return pipeline._step
 
 
@@ -153,8 +158,7 @@ LOADED = [
 def test_replayed_frames_are_those_of_the_pipeline(garments: list[str], sdf: str, backbone: str) -> None:
     """Other poses, figures and styles than when it was captured, and another number of persons in between."""
     replaying, usual = (
-        GarmentPipeline.load(garments, sdf=sdf, backbone=backbone, no_skip=["band", "unchanged", *skips])
-        for skips in ((), ("pivots",))
+        GarmentPipeline.load(garments, sdf=sdf, backbone=backbone, no_skip=["band", "unchanged"]) for _ in range(2)
     )
     tapes: list[Tape] = []
 
@@ -162,7 +166,7 @@ def test_replayed_frames_are_those_of_the_pipeline(garments: list[str], sdf: str
         tapes.append(Tape(run, device))
         return tapes[-1]
 
-    replaying._graphs = StepGraphs(as_on_a_gpu(replaying), CPU, capture=capture)
+    replaying._graphs = StepGraphs(as_on_a_gpu(replaying).packed, CPU, capture=capture)
     for seeds in ((0,), (1, 2), (1, 3), (4,), (5, 5), (0,)):
         given = frames(*seeds, style=seeds[0] == 4)
         for new, old in zip(replaying(given), usual(given), strict=True):
@@ -201,17 +205,19 @@ def test_what_waits_is_told_from_what_does_not() -> None:
 
 
 def test_the_step_of_a_cpu_waits() -> None:
-    """Lists as long as they are, and pivots left out, can't be captured."""
+    """Lists as long as they are can't be captured."""
     pipeline = GarmentPipeline.load(["tshirt-male"], sdf="hybrid")
-    step = pipeline._step
-    pose = torch.tensor(frames(0)[0].pose)[None]
-    inputs = step.inputs(pose, pipeline._figures_of(frames(0))[0])
-    without = {name: tensor for name, tensor in inputs.items() if not name.startswith("mixture")}
-    as_on_a_gpu(pipeline)
-    wanted = Tape(lambda: step(inputs, (0.004,)), CPU).output
+    inputs = step_inputs(pipeline, frames(0))
     with pytest.raises(RuntimeError, match="would wait for the device"):
-        Tape(lambda: step(without, (0.004,)), CPU)
-    torch.testing.assert_close(step(without, (0.004,)), wanted, atol=2e-3, rtol=0)
+        Tape(lambda: pipeline._step.packed(inputs, (0.004,)), CPU)
+    waited_for = pipeline._step.packed(inputs, (0.004,))
+    step = as_on_a_gpu(GarmentPipeline.load(["tshirt-male"], sdf="hybrid"))
+    torch.testing.assert_close(Tape(lambda: step.packed(inputs, (0.004,)), CPU).output, waited_for, atol=2e-3, rtol=0)
+
+
+def step_inputs(pipeline: GarmentPipeline, people: list[SmplFrame]) -> dict[str, Tensor]:
+    pose = torch.tensor(np.stack([frame.pose for frame in people]))
+    return {"pose": pose, **Wearer.together([pipeline._wearer(frame)[0] for frame in people]).tensors()}
 
 
 class Steps:
@@ -286,7 +292,7 @@ def test_what_cannot_be_captured_is_launched_with_one_warning() -> None:
 
 def test_a_refused_body_is_no_reason_to_do_without_graphs() -> None:
     pipeline = GarmentPipeline.load(["tshirt-male"], sdf="hybrid")
-    pipeline._graphs = StepGraphs(as_on_a_gpu(pipeline), CPU, capture=Tape)
+    pipeline._graphs = StepGraphs(as_on_a_gpu(pipeline).packed, CPU, capture=Tape)
     with pytest.raises(MeshError, match="negative volume"):
         pipeline(SmplFrame(pose=np.zeros((24, 3)), betas=np.full(10, -50.0)))
     assert not pipeline._graphs._has_failed
@@ -297,17 +303,16 @@ def test_packed_and_unpacked() -> None:
     """Without a copy, and refused where it isn't finite."""
     pipeline = GarmentPipeline.load(["tshirt-male", "short-pant-male"], backbone="skinned", sdf="none")
     people = frames(0, 1)
-    pose = torch.tensor(np.stack([frame.pose for frame in people]))
     step = pipeline._step
-    packed = step(step.inputs(pose, pipeline._figures_of(people)[0]), (0.0, 0.0)).numpy()
-    usual = pipeline(people)
-    for (body, worn), old in zip(step.unpacked(packed), usual, strict=True):
+    packed = step.packed(step_inputs(pipeline, people), (0.0, 0.0)).numpy()
+    for (body, *parts), old in zip(step.unpacked(packed), pipeline(people), strict=True):
         assert np.shares_memory(body, packed)
         np.testing.assert_array_equal(body, old.body)
-        for name, mesh in old.items():
-            np.testing.assert_array_equal(worn[name].local, mesh.local)
-            np.testing.assert_array_equal(worn[name].raw, mesh.raw)
-            assert worn[name].counts == replace(old.stats.garments[name], ms=0.0)
+        for i, (name, mesh) in enumerate(old.items()):
+            vertices, raw, numbers = parts[3 * i : 3 * i + 3]
+            np.testing.assert_array_equal(vertices, mesh.local)
+            np.testing.assert_array_equal(raw, mesh.raw)
+            assert GarmentStats.of(numbers.tolist()) == replace(old.stats.garments[name], ms=0.0)
     packed[1, 7] = np.inf
     with pytest.raises(MeshError, match="of 1 of 2 persons"):
         list(step.unpacked(packed))
@@ -364,7 +369,7 @@ def test_on_a_gpu(sdf: str) -> None:
     garments = ["tshirt-male", "short-pant-male"]
     replaying = GarmentPipeline.load(garments, sdf=sdf, device="cuda")
     launching, usual = (
-        GarmentPipeline.load(garments, sdf=sdf, device=device, graph=False, no_skip=["band", "pivots"])
+        GarmentPipeline.load(garments, sdf=sdf, device=device, graph=False, no_skip=["band"])
         for device in ("cuda", "cpu")
     )
     for seeds in ((0,), (1, 2), (1, 3), (0,)):

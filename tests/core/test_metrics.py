@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from refu_core.errors import MeshError
-from refu_core.evaluation import Collisions, GarmentMetrics
+from refu_core.metrics import Collisions, GarmentMetrics
 
 MESH = trimesh.creation.icosphere(subdivisions=1)
 N, G = len(MESH.vertices), len(MESH.faces)

@@ -15,8 +15,8 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from refu_core.body import rotvec_to_rotmat
 from refu_core.errors import MeshError, WeightsError
-from refu_core.repulsion import PAPER, REALTIME, Refu, ScaleNet, ScaleSettings
-from refu_core.repulsion._scale import scale_inputs
+from refu_core.refu import PAPER, REALTIME, Refu, ScaleNet, ScaleSettings
+from refu_core.refu._scale import scale_inputs
 from refu_core.sdf import ExactSdf, SdfSample
 
 N = 40

@@ -10,13 +10,16 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from slow_contact import resolve
 from torch import Tensor
 
 from refu_core.body import SmplBody, load_body
+from refu_core.contact import Blend
 from refu_core.errors import MeshError
-from refu_core.evaluation import CollisionChecker, SelfContactDetector
 from refu_core.garments import GarmentTemplate, load_garment
-from refu_core.repulsion import DEFAULT_MARGIN, Blend, repulse, resolve
+from refu_core.metrics import CollisionChecker, SelfContactDetector
+from refu_core.modes import DEFAULT_MARGIN
+from refu_core.refu import repulse
 from refu_core.sdf import ExactSdf, SdfSample
 
 
@@ -161,7 +164,7 @@ def test_nothing_to_do_costs_one_query() -> None:
     points = torch.zeros(4, 3)
     done = resolve(points, HalfSpaces(1.0), edges=torch.tensor([[0, 1], [2, 3]]))
     assert torch.equal(done.vertices, points)
-    assert (done.rounds, done.n_pushed, done.n_inside, done.max_depth) == (0, 0, 0, 0.0)
+    assert (done.n_pushed, done.n_inside, done.max_depth) == (0, 0, 0.0)
     assert resolve(torch.empty(0, 3), HalfSpaces(1.0)).vertices.shape == (0, 3)
 
 

@@ -8,10 +8,12 @@ import torch
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from slow_contact import resolve
 from torch import Tensor
 
+from refu_core.contact import Blend
 from refu_core.errors import MeshError
-from refu_core.repulsion import Blend, Refu, resolve
+from refu_core.refu import Refu
 from refu_core.sdf import ExactSdf, SdfSample
 
 
@@ -105,7 +107,7 @@ def test_gradcheck() -> None:
 
 def test_refuses_faces_of_other_vertices() -> None:
     _, faces = sheet(3)
-    with pytest.raises(MeshError, match="triangles of 8 vertices"):
+    with pytest.raises(MeshError, match="index vertices 0 to 7"):
         Blend.of_faces(faces, 8)
 
 
@@ -233,7 +235,8 @@ def test_the_layer_blends_batches_as_resolve_does(dented: tuple[Tensor, Tensor])
     both = torch.stack((points, lifted))
     samples = [Floor().query(garment) for garment in both]
     sample = SdfSample(torch.stack([s.distance for s in samples]), torch.stack([s.gradient for s in samples]))
-    pushed = Refu(len(points), least=1.0, scale=None)(both, sample, blend=blend)
+    layer = Refu(len(points), least=1.0, scale=None)
+    pushed = blend.follow(both, layer(both, sample), layer.margin - sample.distance)
     for garment, done in zip(both, pushed, strict=True):
         torch.testing.assert_close(done, resolve(garment, Floor(), blend=blend).vertices)
     assert np.isfinite(pushed.numpy()).all()

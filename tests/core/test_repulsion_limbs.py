@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from slow_contact import SlowLimbs, resolve
 
 from refu_core import GarmentTemplate, SmplBody, load_body, load_garment
-from refu_core.evaluation import CollisionChecker, SelfContactDetector
-from refu_core.repulsion import Limbs, resolve
+from refu_core.metrics import CollisionChecker, SelfContactDetector
 from refu_core.sdf import ExactSdf
 
 
-def dressed(lower: float, *, garment: str = "tshirt-male") -> tuple[torch.Tensor, ExactSdf, Limbs, torch.Tensor]:
+def dressed(lower: float, *, garment: str = "tshirt-male") -> tuple[torch.Tensor, ExactSdf, SlowLimbs, torch.Tensor]:
     """A garment that follows the skin, on a body whose arms are lowered by `lower` [rad]."""
     template = load_garment(garment)
     body = load_body(template.body)
@@ -27,11 +27,11 @@ def dressed(lower: float, *, garment: str = "tshirt-male") -> tuple[torch.Tensor
     return points, sdf, limbs_of(body, template), template.edges
 
 
-def limbs_of(body: SmplBody, template: GarmentTemplate) -> Limbs:
+def limbs_of(body: SmplBody, template: GarmentTemplate) -> SlowLimbs:
     rest = ExactSdf(body.faces)
     rest.update(body.v_template)
     clearance = rest.query(template.v_template).distance
-    return Limbs.of(body.weights, body.faces, template.weights, template.faces, clearance=clearance)
+    return SlowLimbs.of(body.weights, body.faces, template.weights, template.faces, clearance=clearance)
 
 
 def test_more_frames_are_free_of_collisions(motions: list[Path]) -> None:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 import trimesh
+from slow_contact import SlowLimbs, mend, resolve, turn_outward
 from torch import Tensor
 
-from refu_core.evaluation import CollisionChecker
-from refu_core.repulsion import Blend, Limbs, resolve
-from refu_core.repulsion._mend import mend, turn_outward
+from refu_core.contact import Blend
+from refu_core.metrics import CollisionChecker
 from refu_core.sdf import ExactSdf, SdfSample
 
 
@@ -21,10 +21,10 @@ def sheet(n: int, spacing: float) -> tuple[Tensor, Tensor]:
     return points * spacing, torch.cat((corner + torch.tensor([0, 1, n]), corner + torch.tensor([1, n + 1, n])))
 
 
-def one_limb(faces: Tensor, n_vertices: int, n_body_faces: int, *, foreign: bool = False) -> Limbs:
+def one_limb(faces: Tensor, n_vertices: int, n_body_faces: int, *, foreign: bool = False) -> SlowLimbs:
     own = torch.zeros(n_vertices, 4, dtype=torch.bool)
     own[:, 1 if foreign else 0] = True
-    return Limbs(torch.zeros(n_body_faces, dtype=torch.int64), own, faces, torch.full((n_vertices,), 0.01))
+    return SlowLimbs(torch.zeros(n_body_faces, dtype=torch.int64), own, faces, torch.full((n_vertices,), 0.01))
 
 
 def boxes() -> tuple[Tensor, Tensor]:

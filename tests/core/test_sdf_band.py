@@ -15,8 +15,9 @@ from torch import Tensor
 
 from refu_core.body import load_body
 from refu_core.errors import MeshError
-from refu_core.evaluation.self_contact import SelfContactDetector
 from refu_core.garments import BUILTIN_GARMENTS, load_garment
+from refu_core.mesh import Adjacency, Connectivity
+from refu_core.metrics._self_contact import SelfContactDetector
 from refu_core.sdf import ExactSdf
 from refu_core.sdf._band import BAND, BandSdf, Links
 from refu_core.sdf._box_tree import grouped
@@ -34,7 +35,7 @@ def posed_ball() -> tuple[BandSdf, ExactSdf]:
 
 
 def links_of(mesh: trimesh.Trimesh) -> Links:
-    return Links.of(torch.tensor(mesh.edges_unique), len(mesh.vertices))
+    return Links(Connectivity.of(mesh.faces, len(mesh.vertices)).ring)
 
 
 SHELL_LINKS = links_of(SHELL)
@@ -62,7 +63,7 @@ def test_clipped_is_exact_and_sees_all_that_is_inside(name: str, motions: list[P
     garment = load_garment(name)
     body = load_body(garment.body)
     band, exact = BandSdf(body.faces), ExactSdf(body.faces)
-    links = Links.of(garment.edges, garment.n_vertices)
+    links = Links(garment.mesh.ring)
     detector = SelfContactDetector(body.faces, body.v_template)
     generator = torch.Generator().manual_seed(1)
     clips = [clip for path in motions for clip in load_clips(path)]
@@ -130,7 +131,7 @@ def test_loose_pieces_are_judged_by_themselves() -> None:
     """A button in the body and one outside of it, beside a shell: no edge says anything of either."""
     band, exact = posed_ball()
     points = torch.cat((shell(0.302), torch.tensor([[0.0, 0, 0], [0.0, 0.9, 0]])))
-    links = Links.of(torch.tensor(SHELL.edges_unique), len(points))
+    links = Links(Connectivity.of(SHELL.faces, len(points)).ring)
     got = band.clipped(points, links).distance
     torch.testing.assert_close(got, exact.query(points).distance.clamp(max=BAND), atol=1e-6, rtol=0)
 
@@ -156,7 +157,7 @@ def test_what_a_limb_shuts_in_beside_the_skin_of_another_is_asked(reach: float) 
     wanted = exact.query(where).distance
     assert ((wanted > 0) & (wanted < BAND)).any()
     assert (wanted < -BAND).any()
-    got = band.clipped(where, Links.of(torch.tensor(sheet.edges_unique), len(points))).distance
+    got = band.clipped(where, Links(Connectivity.of(sheet.faces, len(points)).ring)).distance
     torch.testing.assert_close(got, wanted.clamp(max=BAND), atol=1e-6, rtol=0)
 
 
@@ -270,7 +271,8 @@ def test_a_face_without_area_hides_none() -> None:
 
 def test_no_points() -> None:
     band, _ = posed_ball()
-    assert band.clipped(torch.zeros(0, 3), Links.of(torch.zeros(0, 2, dtype=torch.long), 0)).distance.shape == (0,)
+    links = Links(Adjacency(np.zeros(1, np.int32), np.zeros(0, np.int32)))
+    assert band.clipped(torch.zeros(0, 3), links).distance.shape == (0,)
 
 
 def test_bad_input() -> None:

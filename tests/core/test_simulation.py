@@ -26,20 +26,19 @@ from PIL import Image
 import refu_core
 from refu_core.body import load_body
 from refu_core.errors import MeshError
-from refu_core.evaluation import CollisionChecker
 from refu_core.garments import load_garment
+from refu_core.metrics import CollisionChecker
 from refu_core.simulation import (
     CAUSES,
-    Drape,
     Draper,
     GarmentDataset,
     GarmentSample,
-    Plan,
     Progress,
+    SamplePlan,
+    SettledDrape,
     SimulationError,
     SimulationSettings,
     _produce,
-    contact_sheet,
     load_clips,
     simulate_dataset,
     split_clips,
@@ -50,7 +49,8 @@ from refu_core.simulation._plan import TEST, TRAIN
 from refu_core.simulation._poses import RoomMaker
 from refu_core.simulation._selection import Selector, SelfIntersection
 from refu_core.simulation._store import DONE, QUANTUM, TO_DO, Shard, dequantise, locked, quantise
-from refu_ros.cli import main
+from refu_lab.cli import main
+from refu_lab.contact_sheet import contact_sheet
 
 GARMENT = "short-pant-male"
 COUNT = 5
@@ -176,7 +176,7 @@ def test_selector_names_the_cause(samples: list[GarmentSample]) -> None:
 
     def cause(vertices: NDArray[Any], *, speed: float = 0.0, stretch: float = 1.0) -> str | None:
         vertices = vertices.astype(np.float32)
-        return selector.cause(vertices, posed, Drape(vertices, speed, stretch, 1))
+        return selector.cause(vertices, posed, SettledDrape(vertices, speed, stretch, 1))
 
     assert cause(sample.vertices) is None
     assert cause(sample.vertices + np.array((0.02, 0, 0))) == "body_collision"
@@ -306,12 +306,12 @@ def test_card_counts_what_is_there(simulated: Path, samples: list[GarmentSample]
     assert card["yield"]["simulated"] == COUNT + stored["dropped"][:, 1:].sum()
     assert card["figures"]["stretch_p999_largest"] == pytest.approx(stored["stretch"].max())
     assert card["clips"] == {"train": ["walk"], "test": ["wave"]}
-    assert card["plan"] == asdict(Plan(GARMENT, COUNT, test_share=TEST_SHARE))
+    assert card["plan"] == asdict(SamplePlan(GARMENT, COUNT, test_share=TEST_SHARE))
 
 
 def test_dataset_reads_what_was_written(dataset: GarmentDataset, samples: list[GarmentSample], simulated: Path) -> None:
     stored = columns(simulated)
-    plan = Plan(GARMENT, COUNT, test_share=TEST_SHARE)
+    plan = SamplePlan(GARMENT, COUNT, test_share=TEST_SHARE)
     assert len(dataset) == COUNT
     np.testing.assert_array_equal(dataset.test, ~dataset.train)
     np.testing.assert_array_equal(dataset.column("pose"), stored["pose"])
@@ -387,7 +387,7 @@ def test_slot_of_two_divisions_counts_once(simulated: Path, tmp_path: Path) -> N
 
 
 def test_asked_pose_is_the_one_that_was_drawn(samples: list[GarmentSample], simulated: Path, clips: Path) -> None:
-    plan, both = Plan(GARMENT, COUNT, test_share=TEST_SHARE), split_clips(load_clips(clips))
+    plan, both = SamplePlan(GARMENT, COUNT, test_share=TEST_SHARE), split_clips(load_clips(clips))
     stored = columns(simulated)
     for slot, sample in enumerate(samples):
         attempt = int(stored["dropped"][slot].sum())
@@ -415,7 +415,7 @@ def test_asked_pose_of_other_draws_is_refused(simulated: Path, clips: Path, tmp_
 
 def test_asked_and_simulated_differ_where_a_limb_was_held_back() -> None:
     """An arm through the flank comes back out; what was asked for stays known."""
-    plan = Plan("tshirt-male", 1)
+    plan = SamplePlan("tshirt-male", 1)
     pose = canonical_pose()
     pose[16, 2] = -1.45
     made = RoomMaker(load_garment("tshirt-male"), load_body("male")).make_room(pose, *plan.style_shape(0))
@@ -461,7 +461,7 @@ def test_contact_sheet_shows_each_sample_twice(dataset: GarmentDataset) -> None:
 # The plan and the files -----------------------------------------------------------------------------------------------
 
 plans = st.builds(
-    Plan,
+    SamplePlan,
     st.just(GARMENT),
     st.integers(1, 400),
     seed=st.integers(0, 5),
@@ -473,7 +473,7 @@ plans = st.builds(
 
 
 @given(plans, st.integers(1, 4))
-def test_blocks_of_all_shards_cover_each_slot_once(plan: Plan, n_shards: int) -> None:
+def test_blocks_of_all_shards_cover_each_slot_once(plan: SamplePlan, n_shards: int) -> None:
     blocks = [block for i in range(n_shards) for block in plan.blocks()[i::n_shards]]
     assert sorted(slot for block in blocks for slot in block) == list(range(plan.count))
     assert all(1 <= len(block) <= plan.block for block in blocks)
@@ -481,7 +481,7 @@ def test_blocks_of_all_shards_cover_each_slot_once(plan: Plan, n_shards: int) ->
 
 
 @given(plans)
-def test_train_and_test_share_no_pair(plan: Plan) -> None:
+def test_train_and_test_share_no_pair(plan: SamplePlan) -> None:
     pairs = {
         split: {plan.pair_of(s) for s in range(plan.count) if plan.split_of(s) == split} for split in (TRAIN, TEST)
     }
@@ -491,7 +491,7 @@ def test_train_and_test_share_no_pair(plan: Plan) -> None:
 
 
 @given(plans)
-def test_pivots_share_half_of_the_training(plan: Plan) -> None:
+def test_pivots_share_half_of_the_training(plan: SamplePlan) -> None:
     poses = np.bincount([plan.pair_of(slot) for slot in range(plan.n_pivot)], minlength=plan.pivots)
     assert poses.sum() == plan.n_pivot == (plan.count - plan.n_test) // 2
     assert len(poses) == plan.pivots
@@ -503,17 +503,17 @@ def test_pivots_share_half_of_the_training(plan: Plan) -> None:
 
 @settings(max_examples=20)
 @given(plans, st.integers(0, 60))
-def test_style_shapes_are_within_two_deviations(plan: Plan, pair: int) -> None:
+def test_style_shapes_are_within_two_deviations(plan: SamplePlan, pair: int) -> None:
     betas, style = plan.style_shape(pair)
     assert betas.shape == (10,)
     assert style.shape == (4,)
     assert np.abs(np.concatenate((betas, style))).max() <= 2
-    again = Plan(GARMENT, plan.count + 7, seed=plan.seed, pivots=plan.pivots).style_shape(pair)
+    again = SamplePlan(GARMENT, plan.count + 7, seed=plan.seed, pivots=plan.pivots).style_shape(pair)
     np.testing.assert_array_equal(np.concatenate(again), np.concatenate((betas, style)))
 
 
 def test_pivots_are_spread_over_each_coordinate() -> None:
-    plan = Plan(GARMENT, 100)
+    plan = SamplePlan(GARMENT, 100)
     values = np.stack([np.concatenate(plan.style_shape(pair)) for pair in range(plan.pivots)])
     ranks = values.argsort(0).argsort(0)
     assert all(len(set(column)) == plan.pivots for column in ranks.T)
@@ -524,7 +524,7 @@ def test_pivots_are_spread_over_each_coordinate() -> None:
 
 def test_recorded_and_drawn_poses_are_mixed(clips: Path) -> None:
     train, _ = split_clips(load_clips(clips))
-    plan = Plan(GARMENT, 400)
+    plan = SamplePlan(GARMENT, 400)
     recorded = np.mean([plan.pose(slot, 0, train)[1] >= 0 for slot in range(400)])
     assert recorded == pytest.approx(plan.recorded_share, abs=0.1)
     first, second = (plan.pose(3, attempt, train)[0] for attempt in (0, 1))
@@ -571,7 +571,7 @@ def test_set_without_motions_has_drawn_poses(tmp_path: Path) -> None:
     assert card["plan"]["recorded_share"] == 0
     assert card["clips"] == {"train": [], "test": []}
     assert card["counts"]["to_do"] == 7
-    plan = Plan(**card["plan"])
+    plan = SamplePlan(**card["plan"])
     assert {plan.pose(slot, 0, [])[1:] for slot in range(7)} == {(-1, -1)}
     assert plan.n_test == 1
 
@@ -643,7 +643,7 @@ def test_impossible_divisions_are_refused(options: dict[str, Any], clips: Path, 
 @pytest.mark.parametrize("numbers", [{"count": 0}, {"pivots": 0}, {"block": 0}, {"test_share": 1.0}, {"spread": 0.0}])
 def test_impossible_plans_are_refused(numbers: dict[str, Any]) -> None:
     with pytest.raises(SimulationError, match="got"):
-        Plan(GARMENT, **({"count": 10} | numbers))
+        SamplePlan(GARMENT, **({"count": 10} | numbers))
 
 
 def test_command_makes_a_set_and_its_picture(clips: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -39,7 +39,7 @@ from refu_core.simulation._poses import RoomMaker
 from refu_core.simulation._selection import Selector
 from refu_core.simulation._store import TO_DO, SequenceShard
 from refu_core.training import read_samples
-from refu_ros.cli import main
+from refu_lab.cli import main
 
 GARMENT = "short-pant-male"
 SECONDS = 0.3

@@ -13,21 +13,20 @@ from hypothesis import strategies as st
 from refu_core import FrameError, SmplFrame
 from refu_core.errors import MeshError
 from refu_core.frames import MAX_ANGLE, MAX_COEFFICIENT
-from refu_core.repulsion import DEFAULT_MARGIN
-from refu_core.stress import (
+from refu_core.modes import DEFAULT_MARGIN
+from refu_lab.stress import (
+    CHECKS,
     FRAMES,
     Check,
     Subject,
     Trial,
     Wardrobe,
-    all_checks,
     distance_to_mesh,
     load_trial,
     mirror_image,
     replay_trial,
 )
 
-CHECKS = all_checks()
 WORST = sorted((Path(__file__).parents[1] / "data" / "stress").glob("*.npz"))
 WARDROBES = {
     "skinned/accurate": Wardrobe(garments=("skirt-female",)),
@@ -44,14 +43,14 @@ def subject(request: pytest.FixtureRequest) -> Subject:
     return _subjects[mode]
 
 
-@pytest.mark.parametrize("check", CHECKS, ids=[check.name.replace(" ", "-") for check in CHECKS])
+@pytest.mark.parametrize("check", CHECKS.values(), ids=[name.replace(" ", "-") for name in CHECKS])
 def test_what_refu_stress_checks(check: Check, subject: Subject) -> None:
     if not check.holds_for(subject.wardrobe):
         pytest.skip("not promised in this mode")
     rng = np.random.default_rng(2)
     measured = check.run(subject, check.draw(rng))
     # A vertex at one of collision handling's thresholds may fall on either side of it by a bit of rounding, on one
-    # machine and not on another (docs/reliability.md has how often): that moves it by no more than the margin.
+    # machine and not on another: that moves it by no more than the margin.
     is_at_threshold = check.part == "invariance" and not measured.faults and measured.deviation < DEFAULT_MARGIN
     assert is_at_threshold or not measured.is_failure, measured
 
@@ -95,7 +94,7 @@ def test_turned_persons_wear_the_same_where_limbs_run_into_each_other(seed: int,
 
     What is left with a network is the rounding of gravity's direction, which may decide anew at a threshold.
     """
-    (check,) = (check for check in CHECKS if check.name == "invariance: the person turned")
+    check = CHECKS["invariance: the person turned"]
     frame = FRAMES["limbs through the trunk"](np.random.default_rng(seed))
     measured = check.run(subject, Trial((frame,), seed))
     limit = measured.limit if subject.wardrobe.backbone == "skinned" else DEFAULT_MARGIN
@@ -170,6 +169,6 @@ def test_the_reference_distance_to_faces_without_area() -> None:
 
 
 def test_an_empty_trial_is_a_refusal(subject: Subject) -> None:
-    (check,) = (check for check in CHECKS if check.name == "numbers: absurd")
+    check = CHECKS["numbers: absurd"]
     measured = check.run(subject, Trial((), refused=1))
     assert (measured.refused, measured.is_failure) == (1, False)

@@ -13,11 +13,12 @@ from small_set import write_set
 from torch import Tensor, nn
 
 from refu_core import load_body, load_garment
-from refu_core.backbones import MlpConfig, Prediction, read_backbone
+from refu_core.backbones import MlpConfig, Prediction, WithoutWearerCode, backbone_from_weights
 from refu_core.body import SmplBody
+from refu_core.contact import Blend
 from refu_core.errors import RefuError, WeightsError
 from refu_core.garments import GarmentTemplate
-from refu_core.repulsion import Blend, Refu, read_refu
+from refu_core.refu import Refu, trained_from_weights
 from refu_core.sdf import ApproxSdf, ExactSdf, RestFaces, SdfSample
 from refu_core.training import (
     FINETUNE_MODES,
@@ -67,7 +68,7 @@ def body(garment: GarmentTemplate) -> SmplBody:
     return load_body(garment.body)
 
 
-class Tight(nn.Module):
+class Tight(WithoutWearerCode, nn.Module):
     """A backbone whose garment is everywhere `depth` [m] nearer to the skin than the template."""
 
     def __init__(self, garment: GarmentTemplate, body: SmplBody, depth: float) -> None:
@@ -76,8 +77,10 @@ class Tight(nn.Module):
         sdf.update(body.v_template)
         self.inward = nn.Parameter(-depth * sdf.query(garment.v_template).gradient)
 
-    def forward(self, betas: Tensor, pose: Tensor, style: Tensor | None) -> Prediction:
-        del pose, style
+    def forward(
+        self, betas: Tensor, pose: Tensor, style: Tensor | None, *, wearer_code: Tensor | None = None
+    ) -> Prediction:
+        del pose, style, wearer_code
         return Prediction(self.inward.expand(len(betas), -1, -1), None)
 
 
@@ -113,12 +116,9 @@ def test_a_batch_is_dressed_as_the_parts_would_one_by_one(
         sample = (exact if in_refu == "accurate" else approx).query(raw[b].detach(), near=near)
         z = refu.feature(betas, pose, style)
         assert z is not None
-        wanted = refu(
-            raw[b : b + 1],
-            SdfSample(sample.distance[None], sample.gradient[None]),
-            z[b : b + 1],
-            blend=Blend.of_faces(garment.faces, garment.n_vertices),
-        )[0]
+        pushed = refu(raw[b : b + 1], SdfSample(sample.distance[None], sample.gradient[None]), z[b : b + 1])
+        blend = Blend.of_faces(garment.faces, garment.n_vertices)
+        wanted = blend.follow(raw[b : b + 1], pushed, refu.margin - sample.distance[None])[0]
         assert_nearly_all_close(dressed[b, :, :3], wanted, 1e-4)
         distance = exact.query(wanted.detach()).distance
         assert_nearly_all_close(dressed[b, :, 3].clamp_max(0.004), distance.clamp_max(0.004), 1e-4)
@@ -173,9 +173,9 @@ def test_every_mode_writes_what_can_be_read(
     card = finetune(GARMENT, dataset, pretrained, tmp_path, mode=mode, backbone="mlp", settings=QUICK, quiet=True)
     expect = {"garment": GARMENT, "body_fingerprint": body.fingerprint}
     stem = tmp_path / f"mlp-{mode}"
-    network, refu = read_backbone(stem, garment, expect=expect), read_refu(stem, expect=expect)
+    network, refu = trained_from_weights(load_weights(stem, expect=expect), garment)
     betas, pose, style = bodies(2)
-    before = read_backbone(pretrained / "mlp-none", garment, expect=expect)
+    before = backbone_from_weights(load_weights(pretrained / "mlp-none", expect=expect), garment)
     assert not torch.equal(network(betas, pose, style).displacement, before(betas, pose, style).displacement)
     assert card["mode"] == load_weights(stem).card["mode"] == mode
     assert (tmp_path / f"mlp-{mode}.png").exists()
@@ -228,7 +228,7 @@ def test_a_gcnn_is_trained_from_scratch(tmp_path: Path, dataset: Path, garment: 
     settings = replace(QUICK, steps=2, is_mirrored=False, loop=replace(QUICK.loop, batch_size=1))
     card = finetune(GARMENT, dataset, None, tmp_path, mode="approx", backbone="gcnn", settings=settings, quiet=True)
     assert card["from_scratch"]
-    network = read_backbone(tmp_path / "gcnn-approx", garment, expect={})
+    network = backbone_from_weights(load_weights(tmp_path / "gcnn-approx"), garment)
     assert torch.isfinite(network(*bodies(1)).displacement).all()
 
 

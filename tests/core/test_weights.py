@@ -12,7 +12,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from refu_core.errors import WeightsError
-from refu_core.weights import load_weights, save_weights
+from refu_core.garments import BUILTIN_GARMENTS
+from refu_core.weights import load_weights, save_weights, weights_folder
 
 TENSORS = {"low.0.weight": torch.arange(6.0).view(2, 3), "basis": torch.randn(4, 5).half(), "mask": torch.tensor([1])}
 CARD = {"garment": "tshirt-male", "body_fingerprint": "abc", "mode": "hybrid"}
@@ -102,3 +103,83 @@ def test_a_forged_sum_does_not_help_a_broken_file(stem: Path) -> None:
     (stem.parent / f"{stem.name}.json").write_text(json.dumps(card | {"sha256": hashlib.sha256(data).hexdigest()}))
     with pytest.raises(WeightsError, match="not a safetensors file"):
         load_weights(stem)
+
+
+# Weights stored as differences from others
+
+
+@pytest.fixture
+def base(tmp_path: Path) -> dict[str, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    tensors = {"w": torch.randn(40, 30, generator=generator).half(), "b": torch.randn(30, generator=generator).half()}
+    save_weights(tmp_path / "base", {**tensors, "pivots": torch.arange(3.0)}, CARD)
+    return tensors
+
+
+def test_differences_are_read_as_the_weights(tmp_path: Path, base: dict[str, torch.Tensor]) -> None:
+    fine = torch.randn(40, 30, generator=torch.Generator().manual_seed(1)) * 0.01
+    own = {"w": base["w"].float() + fine, "b": base["b"], "more": torch.ones(2)}
+    path = save_weights(tmp_path / "other", own, CARD, base="base")
+    read = load_weights(tmp_path / "other", expect=CARD)
+    assert read.tensors.keys() == {"w", "b", "more", "pivots"}
+    assert torch.equal(read.tensors["b"], base["b"])
+    assert torch.equal(read.tensors["more"], torch.ones(2))
+    assert torch.equal(read.tensors["pivots"], torch.arange(3.0))  # what isn't given is the base's
+    torch.testing.assert_close(read.tensors["w"], own["w"], rtol=0, atol=0.51 * float(fine.abs().max()) / 127 + 1e-7)
+    assert read.files == (tmp_path / "base.safetensors", path)
+    assert path.stat().st_size < 0.8 * (tmp_path / "base.safetensors").stat().st_size
+
+
+def test_differences_from_other_weights_are_refused(tmp_path: Path, base: dict[str, torch.Tensor]) -> None:
+    save_weights(tmp_path / "other", {"w": base["w"] + 1}, CARD, base="base")
+    with pytest.raises(WeightsError, match=r"wanted a base that is stored whole, got other; nothing was written"):
+        save_weights(tmp_path / "chain", {"w": base["w"]}, CARD, base="other")
+    digest = json.loads((tmp_path / "other.json").read_text())["sha256"]
+    save_weights(tmp_path / "chain", {}, {**CARD, "base": "other", "base_sha256": digest})
+    with pytest.raises(WeightsError, match=r"made for another other than the one beside it; get both files again"):
+        load_weights(tmp_path / "chain")
+    card = tmp_path / "other.json"
+    good = card.read_text()
+    for name in ("../base", "", "/etc/passwd", 3, ["base"]):
+        card.write_text(json.dumps({**json.loads(good), "base": name}))
+        with pytest.raises(WeightsError):
+            load_weights(tmp_path / "other")
+    card.write_text(good)
+    save_weights(tmp_path / "base", {"w": base["w"] * 2}, CARD)
+    with pytest.raises(WeightsError, match=r"made for another base than the one beside it; get both files again"):
+        load_weights(tmp_path / "other")
+    (tmp_path / "base.safetensors").unlink()
+    with pytest.raises(WeightsError, match=r"base.safetensors: no such weights"):
+        load_weights(tmp_path / "other")
+
+
+@pytest.mark.parametrize(
+    "tensors",
+    [
+        {"v": torch.ones(3, dtype=torch.int8), "v.step": torch.ones(())},
+        {"b.step": torch.ones(())},
+        {"b": torch.ones(2, dtype=torch.int8), "b.step": torch.ones(())},
+        {"b": torch.ones(30), "b.step": torch.ones(())},
+        {"b": torch.ones(30, dtype=torch.int8), "b.step": torch.ones(30)},
+    ],
+)
+def test_what_is_no_difference_is_refused(
+    tmp_path: Path, base: dict[str, torch.Tensor], tensors: dict[str, torch.Tensor]
+) -> None:
+    assert base
+    digest = json.loads((tmp_path / "base.json").read_text())["sha256"]
+    save_weights(tmp_path / "other", tensors, {**CARD, "base": "base", "base_sha256": digest})
+    with pytest.raises(WeightsError, match=r"isn't a difference from a tensor of base.safetensors"):
+        load_weights(tmp_path / "other")
+
+
+@pytest.mark.parametrize("garment", BUILTIN_GARMENTS)
+def test_what_ships_shares_the_defaults_backbone_where_it_can(garment: str) -> None:
+    """Fine-tuning brings T-shirt, shirt and skirt to the same backbone by either distance, the shorts it doesn't."""
+    folder = weights_folder(garment)
+    hybrid = load_weights(folder / "tailornet-hybrid")
+    for mode in ("approx", "accurate", "none"):
+        weights = load_weights(folder / f"tailornet-{mode}", expect={"garment": garment, "base": "tailornet-hybrid"})
+        same = all(torch.equal(t, hybrid.tensors[k]) for k, t in weights.tensors.items() if k.startswith("backbone."))
+        assert same == weights.card["shares_backbone"] == (mode != "none" and garment != "short-pant-male")
+        assert {"own_backbone", "hybrid_backbone"} == set(weights.card["measured"]["recorded motion"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import signal
 import subprocess
@@ -16,6 +17,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
+from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 from visualization_msgs.msg import MarkerArray
 
@@ -24,6 +26,7 @@ from refu_core import SmplFrame
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from types import ModuleType
 
 ROOT = Path(__file__).parents[2]
 GARMENTS = ("tshirt-male", "short-pant-male")
@@ -36,7 +39,14 @@ class NodeProcess:
         self._log = log
         command = [sys.executable, "-m", "refu_ros.garment_node", *ros_arguments(parameters)]
         with log.open("wb") as file:
-            self.process = subprocess.Popen(command, cwd=ROOT, stdout=file, stderr=file, preexec_fn=prepare)
+            self.process = subprocess.Popen(
+                command,
+                cwd=log.parent,  # relative paths that a test or a hostile peer names
+                env={**os.environ, "PYTHONPATH": f"{ROOT}:{os.environ.get('PYTHONPATH', '')}"},
+                stdout=file,
+                stderr=file,
+                preexec_fn=prepare,
+            )
 
     def __enter__(self) -> NodeProcess:
         return self
@@ -108,8 +118,8 @@ class Peer:
     def spin(self, seconds: float) -> None:
         """For so long."""
         end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            rclpy.spin_once(self.node, timeout_sec=0.02)
+        while (left := end - time.monotonic()) > 0:
+            rclpy.spin_once(self.node, timeout_sec=left)
 
     def wait_for_node(self) -> None:
         """Until it listens, and what it sends arrives."""
@@ -199,6 +209,29 @@ def frame(i: int, *, stamp_ns: int | None = None, transl: tuple[float, float, fl
     pose[1, 0], pose[2, 0] = 0.3 * np.sin(0.2 * i), -0.3 * np.sin(0.2 * i)
     stamp = 10**9 + i * 33_333_333 if stamp_ns is None else stamp_ns
     return SmplFrame(pose=pose, transl=np.array(transl), stamp_ns=stamp)
+
+
+def start(module: ModuleType) -> argparse.Namespace:
+    """The command line of a test that goes on for as long as one likes: hours, seed, and a new folder; starts rclpy."""
+    name = Path(str(module.__file__)).stem
+    parser = argparse.ArgumentParser(
+        prog=f"python -m tests.ros.{name}",
+        description=module.__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--hours", type=float, default=1 / 60, metavar="H", help="for how long (a minute)")
+    parser.add_argument("--seed", type=int, default=0, metavar="S", help="of all that is drawn (0)")
+    parser.add_argument(
+        "--output", type=Path, default=Path("out", name), metavar="DIR", help=f"for log and bags (out/{name})"
+    )
+    args = parser.parse_args()
+    args.output = args.output.absolute()
+    if args.output.exists():
+        parser.error(f"{args.output} is there already; name a new folder")
+    args.output.mkdir(parents=True)
+    isolate()
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    return args
 
 
 def isolate() -> None:

@@ -22,6 +22,7 @@ from visualization_msgs.msg import MarkerArray
 from msg_adapters import BagReader
 from refu_ros import garment_node
 from refu_ros._node import GarmentNode
+from refu_ros._program import make_executor
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -39,7 +40,7 @@ class Stage:
         self.peer.unwatch()
         self._executor = make_executor()
         self._executor.add_node(self.node)
-        assert garment_node._started(self.node)
+        assert garment_node.started(self.node)
 
     def until(self, condition: Callable[[], Any], what: str) -> None:
         """Fails with `what` when it doesn't come true."""
@@ -89,7 +90,7 @@ def stage(ros: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., 
     monkeypatch.setattr("refu_ros._node._GRACE_S", 0.0)
     made: list[Stage] = []
 
-    def make(make_executor: Callable[[], Any] = garment_node._executor, **parameters: Any) -> Stage:
+    def make(make_executor: Callable[[], Any] = make_executor, **parameters: Any) -> Stage:
         made.append(Stage(make_executor, **parameters))
         return made[-1]
 
@@ -98,7 +99,7 @@ def stage(ros: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., 
         one.close()
 
 
-@pytest.mark.parametrize("make_executor", [garment_node._executor, SingleThreadedExecutor], ids=["events", "single"])
+@pytest.mark.parametrize("make_executor", [make_executor, SingleThreadedExecutor], ids=["events", "single"])
 def test_viewers_come_and_go_and_leave_nothing_behind(
     stage: Callable[..., Stage], make_executor: Callable[[], Any]
 ) -> None:
@@ -203,7 +204,7 @@ def test_so_are_recordings(stage: Callable[..., Stage], tmp_path: Path) -> None:
         scene.until(recorded, "messages are recorded")
         switch(False)
         scene.rests()
-        scene.until(lambda: scene.reports(1) and not scene.node._closing, "the bag is closed")
+        scene.until(lambda: scene.reports(1) and not scene.node.recording._closing, "the bag is closed")
         with BagReader(tmp_path / bag) as reader:
             assert {"/smpl_params", "/garments"} <= {message.topic for message in reader.messages()}
         if bag == "bag":

@@ -1,0 +1,78 @@
+"""The joints of ROS4HRI's `human_description` (REP-155): 20 angles of a person, as `hri_body_detect` publishes them.
+
+Names are `<joint>_<id>` for each of `AXES`. The skeleton has no spine, no collars, wrists, ankles and no root: the
+waist's angle is spread over SMPL's three spine joints, the head's over neck and head, and the others stay at rest. The
+person stands upright where the frame `body_<id>` is, with the pelvis in its origin.
+"""
+
+from __future__ import annotations
+
+from functools import reduce
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from msg_adapters.axes import vertices_smpl_from_ros
+from msg_adapters.errors import DecodeError
+from msg_adapters.joints import SMPL_JOINTS
+from msg_adapters.rotations import quaternion_from_rotvec, quaternion_product, rotvec_from_quaternion
+from refu_core.frames import MAX_ANGLE
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+AXES = {
+    "waist": (0, 1, 0), "r_head": (1, 0, 0), "y_head": (0, 0, 1), "p_head": (0, -1, 0),
+    "l_y_shoulder": (0, 0, -1), "l_p_shoulder": (1, 0, 0), "l_r_shoulder": (0, 0, 1), "l_elbow": (0, -1, 0),
+    "r_y_shoulder": (0, 0, 1), "r_p_shoulder": (-1, 0, 0), "r_r_shoulder": (0, 0, -1), "r_elbow": (0, -1, 0),
+    "l_y_hip": (0, 0, -1), "l_p_hip": (1, 0, 0), "l_r_hip": (0, -1, 0), "l_knee": (0, -1, 0),
+    "r_y_hip": (0, 0, -1), "r_p_hip": (-1, 0, 0), "r_r_hip": (0, -1, 0), "r_knee": (0, -1, 0),
+}  # fmt: skip
+"""Axis of each joint in ROS axes, as the URDF has it; each limb from the trunk outwards."""
+
+PELVIS = np.array([0.0, -0.22, 0.02])
+"""SMPL's pelvis at rest [m], shape (3,): within 5 mm that of the built-in bodies, whatever the betas."""
+
+
+def _joints(*names: str) -> list[int]:
+    return [SMPL_JOINTS.index(name) for name in names]
+
+
+_AXES = vertices_smpl_from_ros(np.array([*AXES.values()], np.float64))
+_SPINE, _HEAD = _joints("spine1", "spine2", "spine3"), _joints("neck", "head")
+_BALLS = _joints("left_shoulder", "right_shoulder", "left_hip", "right_hip")
+_HINGES = _joints("left_elbow", "right_elbow", "left_knee", "right_knee")
+_LOWERED = np.array([[0, 0, -np.pi / 2], [0, 0, np.pi / 2], [0, 0, 0], [0, 0, 0]])
+_REST, _UNREST = quaternion_from_rotvec(_LOWERED), quaternion_from_rotvec(-_LOWERED)
+"""From SMPL's limbs at rest, where the arms point sideways, to ROS4HRI's, where they hang; and back."""
+
+
+def body_of(names: Sequence[str]) -> str | None:
+    """The id of the body whose joints these are, None for other names; raises `DecodeError` for several bodies."""
+    bodies = [name.removeprefix("waist_") for name in names if name.startswith("waist_")]
+    if len(bodies) > 1:
+        msg = f"wanted the joints of one body, got {len(bodies)} names that begin with waist_"
+        raise DecodeError(msg)
+    return bodies[0] if bodies else None
+
+
+def pose_of(angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rotation vectors of SMPL's joints [rad], shape (24, 3), of the angles of `AXES` [rad], shape (20,).
+
+    Raises `DecodeError` for an angle that isn't finite, or beyond all joints.
+    """
+    bad = np.flatnonzero(~(np.abs(angles) <= MAX_ANGLE))
+    if bad.size:
+        msg = f"{[*AXES][bad[0]]} has the angle {angles[bad[0]]:g}, wanted radians"
+        raise DecodeError(msg)
+    vectors = angles[:, None] * _AXES
+    turns = quaternion_from_rotvec(vectors)
+    limbs = turns[4:].reshape(4, 4, 4).swapaxes(0, 1)  # joint, limb, xyzw
+    pose = np.zeros((len(SMPL_JOINTS), 3))
+    pose[_SPINE] = vectors[0] / len(_SPINE)
+    pose[_HEAD] = rotvec_from_quaternion(reduce(quaternion_product, turns[1:4])) / len(_HEAD)
+    pose[_BALLS] = rotvec_from_quaternion(reduce(quaternion_product, [*limbs[:3], _REST]))
+    pose[_HINGES] = rotvec_from_quaternion(reduce(quaternion_product, [_UNREST, limbs[3], _REST]))
+    return pose

@@ -1,0 +1,121 @@
+"""The one place where input files are opened: regular ones alone, and no more of them than was asked for.
+
+A FIFO would keep its reader waiting for ever, a device has no end, and to open one may already do something.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import os
+import stat
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from refu_core.errors import RefuError
+
+MAX_JSON_BYTES = 4 << 20
+"""What a card or a table takes at most; parsed, it may take a hundred times as much."""
+_KINDS = {
+    stat.S_IFDIR: "a directory",
+    stat.S_IFIFO: "a FIFO",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+}
+
+
+class InputFile(io.BufferedReader):
+    """A file of `size` bytes: no more of it is read even if it grows, and no room is made for more than that."""
+
+    def __init__(self, raw: io.FileIO, size: int) -> None:
+        super().__init__(raw)
+        self.size = size
+        self.step = size
+        """The most that `read` gives at once [bytes]; what asks for more finds the file cut short."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """At most `size` bytes."""
+        most = max(0, min(self.size - self.tell(), self.step))
+        return super().read(most if size is None or size < 0 else min(size, most))
+
+
+def open_file(path: str | os.PathLike[str], *, most: int, error: type[RefuError], wanted: str) -> InputFile:
+    """Opens a regular file of 1 to `most` bytes to read.
+
+    Files of /proc say that they are empty, and are refused as such.
+
+    Args:
+        path: of the file, or of a link to it.
+        most: a larger file is refused [bytes].
+        error: what is raised.
+        wanted: what the file should be, for the message.
+
+    Raises:
+        error: there is no such file, it isn't a regular one, it is empty or too large, or it can't be opened.
+    """
+    try:
+        got = _fault(Path(path).stat(), most)
+        if not got:
+            # Another file may have taken its place by now: this one is looked at again, and opening it can't block.
+            raw = io.FileIO(path, opener=_without_waiting)
+            found = os.fstat(raw.fileno())
+            got = _fault(found, most)
+            if not got:
+                return InputFile(raw, found.st_size)
+            raw.close()
+    except (OSError, ValueError) as cause:  # ValueError: a name that no file system takes
+        got = getattr(cause, "strerror", None) or str(cause)
+    msg = f"{os.fspath(path)}: can't be read: {got}; wanted {wanted}"
+    raise error(msg)
+
+
+def read_file(path: str | os.PathLike[str], *, most: int, error: type[RefuError], wanted: str) -> bytes:
+    """The content of a regular file, as `open_file` opens it."""
+    with open_file(path, most=most, error=error, wanted=wanted) as file:
+        try:
+            return file.read()
+        except OSError as cause:
+            msg = f"{os.fspath(path)}: can't be read: {cause.strerror}; wanted {wanted}"
+            raise error(msg) from cause
+
+
+def read_json(path: str | os.PathLike[str], *, error: type[RefuError], wanted: str, most: int = MAX_JSON_BYTES) -> Any:
+    """The content of a JSON file of finite numbers. Raises `error` as `open_file`, and where it isn't one."""
+    try:
+        return parse_json(read_file(path, most=most, error=error, wanted=wanted))
+    except (ValueError, RecursionError) as cause:
+        if isinstance(cause, error):
+            raise
+        msg = f"{os.fspath(path)}: can't be read as JSON: {cause}; wanted {wanted}"
+        raise error(msg) from cause
+
+
+def parse_json(text: bytes) -> Any:
+    """Raises `ValueError` for anything but JSON of finite numbers, `RecursionError` where it is nested too deeply."""
+    return json.loads(text, parse_float=_finite, parse_constant=_finite)
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        msg = f"{text[:40]} where a finite number was expected"
+        raise ValueError(msg)
+    return number
+
+
+def _without_waiting(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NONBLOCK | os.O_NOCTTY)
+
+
+def _fault(found: os.stat_result, most: int) -> str:
+    """What is wrong with a file, empty if nothing is."""
+    if not stat.S_ISREG(found.st_mode):
+        return _KINDS.get(stat.S_IFMT(found.st_mode), "not a regular file")
+    if not found.st_size:
+        return "an empty file"
+    if found.st_size > most:
+        return f"{found.st_size >> 20} MiB, at most {most >> 20} MiB are read"
+    return ""

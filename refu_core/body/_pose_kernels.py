@@ -1,0 +1,82 @@
+"""What poses a body when no derivative is asked for: a few launches in place of two hundred small tensor operations."""
+
+from typing import TYPE_CHECKING
+
+import warp as wp
+
+from refu_core import _warp  # noqa: F401  (quiets Warp before it starts)
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def rotation_kernel(rotvec: wp.array[wp.vec3], rotation: wp.array[wp.mat33]) -> None:
+    """Rodrigues' formula, with the same series near zero as `rotvec_to_rotmat`."""
+    i = wp.tid()
+    r = rotvec[i]
+    angle2 = wp.dot(r, r)
+    a = float(1.0) - angle2 / 6.0 + angle2 * angle2 / 120.0
+    b = float(0.5) - angle2 / 24.0 + angle2 * angle2 / 720.0
+    if angle2 >= 1.0e-4:
+        angle = wp.sqrt(angle2)
+        half = wp.sin(0.5 * angle)
+        a = wp.sin(angle) / angle
+        b = 2.0 * half * half / angle2
+    one = wp.identity(n=3, dtype=float)
+    rotation[i] = one + a * wp.skew(r) + b * (wp.outer(r, r) - angle2 * one)
+
+
+@wp.kernel
+def chain_kernel(
+    local: wp.array2d[wp.mat33],
+    joints: wp.array2d[wp.vec3],
+    parents: wp.array[int],
+    # outputs
+    rotation: wp.array2d[wp.mat33],
+    translation: wp.array2d[wp.vec3],
+    posed: wp.array2d[wp.vec3],
+) -> None:
+    """Poses the joints of each body, parents first; joints of one shape do for all bodies."""
+    b = wp.tid()
+    shape = wp.min(b, joints.shape[0] - 1)
+    for j in range(parents.shape[0]):
+        parent = parents[j]
+        here = joints[shape, j]
+        turn = local[b, j]
+        place = here
+        if parent >= 0:
+            turn = rotation[b, parent] @ turn
+            place = posed[b, parent] + rotation[b, parent] @ (here - joints[shape, parent])
+        rotation[b, j] = turn
+        posed[b, j] = place
+        translation[b, j] = place - turn @ here
+
+
+if TYPE_CHECKING:
+    Transform = wp.Vector[float]
+else:
+    Transform = wp.types.vector(length=12, dtype=wp.float32)
+"""A joint's rotation, row by row, and its translation."""
+
+
+@wp.kernel
+def skin_kernel(
+    points: wp.array2d[wp.vec3],
+    start: wp.array[int],
+    joint: wp.array[int],
+    weight: wp.array[float],
+    transforms: wp.array2d[Transform],
+    # output
+    posed: wp.array2d[wp.vec3],
+) -> None:
+    """Moves point v by the joints number `start[v]` to `start[v + 1]`; points of one shape do for all bodies."""
+    b, v = wp.tid()
+    t = Transform()
+    for k in range(start[v], start[v + 1]):
+        t += weight[k] * transforms[b, joint[k]]
+    p = points[wp.min(b, points.shape[0] - 1), v]
+    posed[b, v] = wp.vec3(
+        t[0] * p[0] + t[1] * p[1] + t[2] * p[2] + t[9],
+        t[3] * p[0] + t[4] * p[1] + t[5] * p[2] + t[10],
+        t[6] * p[0] + t[7] * p[1] + t[8] * p[2] + t[11],
+    )

@@ -1,0 +1,9 @@
+"""The engineering around the paper's layer: a garment brought off the body, and off the garments below it."""
+
+from refu_core.contact._blend import Blend as Blend
+from refu_core.contact._layers import Layer as Layer
+from refu_core.contact._limbs import Limbs as Limbs
+from refu_core.contact._resolution import Resolution as Resolution
+from refu_core.contact._resolver import Resolver as Resolver
+from refu_core.contact._settings import DEFAULT_CONTACT as DEFAULT_CONTACT
+from refu_core.contact._settings import ContactSettings as ContactSettings

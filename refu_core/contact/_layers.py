@@ -1,0 +1,258 @@
+"""Garments worn together: the outer one leaves the inner one as it leaves the body, along the normal of its sheet."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from refu_core._warp import as_warp, torch_stream
+from refu_core.contact import _layers_kernels as kernels
+from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
+from refu_core.errors import MeshError
+from refu_core.mesh import Adjacency, Connectivity
+
+
+class Layer:
+    """Brings one garment to the outer side of another one that is worn below it.
+
+    The repulsion is ReFU's (paper, Eq. 2) with a sheet in the place of the body, which the paper doesn't treat. Where
+    the height f of a vertex over the sheet is less than the gap ε, x' = x - (f - ε) n. The sheet's normal n is
+    interpolated at the closest point. Neighbours give way as they do on the skin (`Blend.spread`). Unlike a body, a
+    sheet has no inside: only cloth that faces the way the sheet does belongs above it. Beyond an open rim the sheet is
+    felt less and less.
+
+    The closest point is searched downhill, from the nearest of a few places around what was closest at rest. Cloth
+    slides by a few edges only, so that takes half the time of a tree. On a folded sheet the search may end in the wrong
+    fold, and in another one in the next frame. So a vertex also looks at what its neighbours found; and one that ends
+    more than a centimetre below the sheet asks a tree.
+    """
+
+    def __init__(
+        self,
+        above_faces: Tensor,
+        above: Tensor,
+        below_faces: Tensor,
+        below: Tensor,
+        *,
+        settings: ContactSettings = DEFAULT_CONTACT,
+    ) -> None:
+        """For two garments, by faces (F, 3) and vertices in the rest pose (V, 3) [m], counter-clockwise from outside.
+
+        Raises:
+            MeshError: faces that aren't triangles of these vertices, or a gap that is negative or beyond the reach.
+        """
+        gap, farthest = settings.layer_gap, settings.layer_reach
+        if not 0 <= gap < farthest:
+            msg = f"the gap between garments must be at least 0 and less than {farthest} m, got {gap}"
+            raise MeshError(msg)
+        self._settings = settings
+        self.device = above.device
+        self._is_serial = self.device.type == "cpu"
+        self._above, self._below = _own(above), _own(below)
+        above_mesh = Connectivity.of(above_faces.cpu(), len(above))
+        below_mesh = Connectivity.of(below_faces.cpu(), len(below))
+        rest, rest_below = self._above.cpu().numpy(), self._below.cpu().numpy()
+        meets = np.flatnonzero(cKDTree(rest_below).query(rest)[0] < settings.layer_meets)
+        rows, ring_start, ring = _region(above_mesh.ring, meets, settings.layer_rounds)
+        self._n_candidates, self._n_region = len(meets), len(rows)
+        self._normals = torch.empty_like(self._below)
+        self._push = torch.zeros(len(meets), 3, device=self.device)
+        self._fields = torch.zeros(2, len(rows) + 1, 3, device=self.device)
+        self._count = torch.zeros(1, dtype=torch.int32, device=self.device)
+        self._n_doubtful = torch.zeros(1, dtype=torch.int32, device=self.device)
+        self._tree: Any = None
+        self._tree_is_late = True
+        self._commands: dict[str, Any] = {}
+        if len(meets):
+            cuts = [_cut(mesh, self.device) for mesh in (above_mesh, below_mesh)]
+            places = _starts(rest[meets], rest_below, settings)
+            lists = [_ints(values, self.device) for values in (*places, rows, ring_start, ring)]
+            rules, later = (
+                _rules(settings, reach, self._below, below_mesh) for reach in (farthest, settings.layer_later_reach)
+            )
+            self._record(rules, later, *cuts, *lists)
+
+    @torch.no_grad()
+    def __call__(self, above: Tensor, below: Tensor) -> tuple[Tensor, Tensor]:
+        """The outer garment, (V, 3) [m], off the inner one, (U, 3), and how many of its vertices were below the gap.
+
+        The number is an int32 of shape (1,), on the garments' device: a GPU isn't waited for, and makes the launches
+        for those below the gap where there are none, too. Not differentiable.
+
+        Raises `MeshError` for garments of other sizes than these were made for.
+        """
+        self._check(above, below)
+        if not self._n_candidates:
+            return above, torch.zeros_like(self._count)
+        with torch_stream(self.device):
+            self._take(above, below)
+            self._look("search")
+            n_low = self._count.clone()
+            if not self._may_move():
+                return above, n_low
+            self._move(self._settings.layer_rounds)
+            # What has left the sheet at one place may have come to another, and be too low there.
+            self._look("search again")
+            if self._may_move():
+                self._move(self._settings.layer_later_rounds)
+        return self._above.clone(), n_low
+
+    def _may_move(self) -> bool:
+        return not self._is_serial or int(self._count) > 0
+
+    def _check(self, above: Tensor, below: Tensor) -> None:
+        if above.shape != self._above.shape or below.shape != self._below.shape:
+            msg = (
+                f"wanted garments of {len(self._above)} and {len(self._below)} vertices, "
+                f"got the shapes {tuple(above.shape)} and {tuple(below.shape)}"
+            )
+            raise MeshError(msg)
+
+    def _take(self, above: Tensor, below: Tensor) -> None:
+        """Takes over a frame."""
+        self._above.copy_(above)
+        self._below.copy_(below)
+        self._commands["normals"].launch()
+        self._tree_is_late = True
+
+    def _look(self, search: str) -> None:
+        """What has to be pushed, and how many vertices that are; a device that isn't waited for asks about everyone."""
+        lift, ask = (search.replace("search", step) for step in ("lift", "ask"))
+        self._count.zero_()
+        self._n_doubtful.zero_()
+        self._commands[search].launch()
+        self._commands[lift].launch()
+        n = int(self._n_doubtful) if self._is_serial else self._n_candidates
+        if n:
+            if self._tree_is_late:
+                self._tree.refit()
+                self._tree_is_late = False
+            self._commands[ask].set_dim(n)
+            self._commands[ask].launch()
+
+    def _move(self, blend_rounds: int) -> None:
+        """Pushes those with their neighbourhood."""
+        self._fields[0].zero_()
+        self._fields[0, : self._n_candidates] = self._push
+        for round_ in range(blend_rounds):
+            self._commands[f"spread{round_ % 2}"].launch()
+        self._commands["move"].launch()
+
+    def _record(
+        self,
+        rules: Any,
+        later: Any,
+        above_cut: Any,
+        below_cut: Any,
+        near_start: Any,
+        near: Any,
+        rows: Any,
+        start: Any,
+        ring: Any,
+    ) -> None:
+        """Records the launches of a frame: each of them is shorter than what Python makes of its arguments."""
+        above, below, normals, push = (
+            as_warp(tensor, wp.vec3) for tensor in (self._above, self._below, self._normals, self._push)
+        )
+        fields = [as_warp(field, wp.vec3) for field in self._fields]
+        self._tree = wp.Mesh(below, below_cut.faces.flatten())
+        found, closest, doubtful = (
+            wp.zeros(self._n_candidates, dtype=wp.int32, device=str(self.device)) for _ in range(3)
+        )
+        itself = _ints(np.arange(self._n_candidates + 1), self.device)
+        search = [below, below_cut, above, rows]
+        garments = [below, normals, below_cut, above, above_cut, rows]
+        pushed = [closest, push, as_warp(self._count, wp.int32)]
+        doubts = [doubtful, as_warp(self._n_doubtful, wp.int32)]
+        blend = [push, self._n_candidates, start, ring]
+        again = [start, ring, found, later, *pushed, *doubts]
+        for name, kernel, size, arguments in (
+            ("normals", kernels.normals_kernel, len(self._below), [below, below_cut, normals]),
+            ("search", kernels.search_kernel, self._n_candidates, [*search, near_start, near, found]),
+            ("search again", kernels.search_kernel, self._n_candidates, [*search, itself, closest, found]),
+            ("lift", kernels.lift_kernel, self._n_candidates, [*garments, start, ring, found, rules, *pushed, *doubts]),
+            ("lift again", kernels.lift_kernel, self._n_candidates, [*garments, *again]),
+            ("ask again", kernels.tree_kernel, self._n_candidates, [self._tree.id, *garments, later, *doubts, *pushed]),
+            ("ask", kernels.tree_kernel, self._n_candidates, [self._tree.id, *garments, rules, *doubts, *pushed]),
+            ("spread0", kernels.spread_kernel, self._n_region, [*blend, fields[0], fields[1]]),
+            ("spread1", kernels.spread_kernel, self._n_region, [*blend, fields[1], fields[0]]),
+            ("move", kernels.move_kernel, self._n_region, [rows, fields[0], above]),
+        ):
+            self._commands[name] = wp.launch(kernel, size, arguments, device=str(self.device), record_cmd=True)
+
+
+def _own(vertices: Tensor) -> Tensor:
+    return vertices.detach().to(torch.float32, copy=True).contiguous()
+
+
+def _ints(values: NDArray[Any], device: torch.device) -> Any:
+    return wp.array(values.astype(np.int32), dtype=wp.int32, device=str(device))
+
+
+def _rules(settings: ContactSettings, reach: float, below: Tensor, mesh: Connectivity) -> Any:
+    start, end = mesh.edges.T
+    rest = below.cpu().numpy()
+    rules = kernels.LayerRules()
+    rules.gap, rules.reach, rules.fade = settings.layer_gap, reach, settings.layer_fade
+    rules.agreement, rules.doubt = settings.layer_agreement, settings.layer_doubt
+    rules.longest = settings.layer_stretch * float(np.linalg.norm(rest[start] - rest[end], axis=1).max())
+    return rules
+
+
+def _cut(mesh: Connectivity, device: torch.device) -> Any:
+    """A garment's mesh as the kernels read it."""
+    cut = kernels.Cut()
+    cut.faces, cut.rim = _ints(mesh.faces, device), _ints(_rim(mesh), device)
+    cut.fan_start, cut.fan_face = (_ints(array, device) for array in mesh.fan)
+    cut.ring_start, cut.ring = (_ints(array, device) for array in mesh.ring)
+    return cut
+
+
+def _starts(
+    above: NDArray[np.float32], below: NDArray[np.float32], settings: ContactSettings
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Vertices of the sheet below, (U, 3) [m], that each vertex above, (K, 3), looks from: starts (K + 1,) and them."""
+    tree, is_free, places = cKDTree(below), np.ones(len(below), np.bool_), []
+    for vertex in range(len(below)):
+        if is_free[vertex]:
+            places.append(vertex)
+            is_free[tree.query_ball_point(below[vertex], settings.layer_spacing)] = False
+    closest = np.asarray(tree.query(above)[1])
+    around = cKDTree(below[places]).query_ball_point(above, settings.layer_slides)
+    each = [np.append(first, np.array(places)[others]) for first, others in zip(closest, around, strict=True)]
+    return np.append(0, np.cumsum([len(one) for one in each])), np.concatenate(each).astype(np.int64)
+
+
+def _rim(mesh: Connectivity) -> NDArray[np.int64]:
+    """A bit for each feature (as `closest_on_triangle` numbers them) of each face, (F, 3), that is on an open rim."""
+    open_edge = (mesh.n_faces_of_edge == 1)[mesh.edge_of_corner]
+    open_vertex = np.isin(mesh.faces, mesh.boundary)
+    rim: NDArray[np.int64] = np.concatenate((open_vertex, open_edge), axis=1) @ (1 << np.arange(1, 7))
+    return rim
+
+
+def _region(
+    ring: Adjacency, candidates: NDArray[np.int64], reach: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """The vertices that pushes of the candidates reach, those first, (R,), and the ring of each by place in that list.
+
+    Starts (R + 1,) and places; a neighbour outside of the region, which no push reaches, is at place R.
+    """
+    vertex, neighbour = ring.owner, ring.items
+    reached = np.zeros(len(ring.start) - 1, np.bool_)
+    reached[candidates] = True
+    is_beside = ~reached
+    for _ in range(reach):
+        reached[neighbour[reached[vertex]]] = True
+    rows = np.concatenate((candidates, np.flatnonzero(reached & is_beside)))
+    place = np.full(len(reached), len(rows))
+    place[rows] = np.arange(len(rows))
+    n_neighbours = np.bincount(vertex, minlength=len(reached))[rows]
+    of_region = np.argsort(place[vertex], kind="stable")[: n_neighbours.sum()]
+    return rows, np.append(0, np.cumsum(n_neighbours)), place[neighbour[of_region]]

@@ -1,0 +1,312 @@
+"""How far one garment's vertices are from the outer side of another one's sheet: one code for CPU and CUDA."""
+
+import warp as wp
+
+from refu_core.sdf._closest_kernels import closest_on_face, mean_normal
+
+# Nothing is so far from where it was at rest; it is a limit to what a sheet crumpled into itself may take.
+MOST_STEPS = wp.constant(64)
+
+
+@wp.struct
+class Cut:
+    """A garment's mesh, which doesn't change."""
+
+    faces: wp.array2d[wp.int32]
+    fan_start: wp.array[wp.int32]
+    fan_face: wp.array[wp.int32]
+    """The faces around vertex v are `fan_face[fan_start[v]:fan_start[v + 1]]`."""
+    ring_start: wp.array[wp.int32]
+    ring: wp.array[wp.int32]
+    """Its neighbours, likewise."""
+    rim: wp.array[wp.int32]
+    """Bit k of a face's number is set where its feature k is on an open rim."""
+
+
+@wp.struct
+class LayerRules:
+    """Lengths in metres."""
+
+    gap: wp.float32
+    reach: wp.float32
+    longest: wp.float32
+    fade: wp.float32
+    agreement: wp.float32
+    doubt: wp.float32
+
+
+@wp.func
+def normal_at(v: int, points: wp.array[wp.vec3], cut: Cut) -> wp.vec3:
+    """Unit normal of a garment's vertex."""
+    return mean_normal(v, points, cut.faces, cut.fan_start, cut.fan_face)
+
+
+@wp.func
+def heaviest(w: wp.vec3) -> int:
+    """The corner of a face that weighs most."""
+    return wp.where(w[0] >= w[1] and w[0] >= w[2], 0, wp.where(w[1] >= w[2], 1, 2))
+
+
+@wp.func
+def nearest_vertex(p: wp.vec3, start: int, points: wp.array[wp.vec3], cut: Cut) -> int:
+    """The vertex downhill from `start`: none of its neighbours is nearer to p."""
+    v = int(start)
+    squared = wp.length_sq(points[v] - p)
+    for _step in range(MOST_STEPS):
+        best = int(v)
+        for r in range(cut.ring_start[v], cut.ring_start[v + 1]):
+            u = cut.ring[r]
+            other = wp.length_sq(points[u] - p)
+            if other < squared:
+                squared = other
+                best = u
+        if best == v:
+            break
+        v = best
+    return v
+
+
+@wp.func
+def nearest_face(p: wp.vec3, start: int, points: wp.array[wp.vec3], cut: Cut) -> tuple[int, int, wp.vec3, wp.vec3]:
+    """The face closest to p downhill from the fan of vertex `start`: feature, barycentrics, and p's offset from it."""
+    v = int(start)
+    squared = float(wp.inf)
+    face = int(-1)
+    feature = int(0)
+    w = wp.vec3(1.0, 0.0, 0.0)
+    offset = wp.vec3(0.0, 0.0, 0.0)
+    for _step in range(MOST_STEPS):
+        last = face
+        for k in range(cut.fan_start[v], cut.fan_start[v + 1]):
+            f = cut.fan_face[k]
+            f_w, f_feature, f_offset = closest_on_face(p, f, points, cut.faces)
+            other = wp.length_sq(f_offset)
+            if other < squared:
+                squared = other
+                face = f
+                feature = f_feature
+                w = f_w
+                offset = f_offset
+        # The closest vertex isn't always a corner of the closest face: on, at the corner that weighs most.
+        corner = heaviest(w)
+        if face == last or cut.faces[face, corner] == v:
+            break
+        v = cut.faces[face, corner]
+    return face, feature, w, offset
+
+
+@wp.kernel(enable_backward=False)
+def normals_kernel(
+    points: wp.array[wp.vec3],
+    cut: Cut,
+    # output
+    normals: wp.array[wp.vec3],
+) -> None:
+    """Unit normals of a garment's vertices."""
+    v = wp.tid()
+    normals[v] = normal_at(v, points, cut)
+
+
+@wp.kernel(enable_backward=False)
+def search_kernel(
+    below: wp.array[wp.vec3],
+    below_cut: Cut,
+    above: wp.array[wp.vec3],
+    candidates: wp.array[int],
+    near_start: wp.array[int],
+    near: wp.array[int],
+    # output, by candidate
+    found: wp.array[int],
+) -> None:
+    """Which vertex of the sheet below each candidate comes to, downhill.
+
+    From the nearest of those to look from, which are `near[near_start[k]:near_start[k + 1]]`; or -1, if they are -1.
+    """
+    k = wp.tid()
+    p = above[candidates[k]]
+    v = int(near[near_start[k]])
+    if v >= 0:  # else too far away the last time
+        squared = float(wp.inf)
+        for n in range(near_start[k], near_start[k + 1]):
+            other = wp.length_sq(below[near[n]] - p)
+            if other < squared:
+                squared = other
+                v = near[n]
+        v = nearest_vertex(p, v, below, below_cut)
+    found[k] = v
+
+
+@wp.func
+def normal_on(face: int, w: wp.vec3, normals: wp.array[wp.vec3], cut: Cut) -> wp.vec3:
+    """Unit normal of a garment at a place on a face, between those of its vertices."""
+    a = cut.faces[face, 0]
+    b = cut.faces[face, 1]
+    c = cut.faces[face, 2]
+    return wp.normalize(w[0] * normals[a] + w[1] * normals[b] + w[2] * normals[c])
+
+
+@wp.func
+def lift_off(
+    k: int,
+    i: int,
+    face: int,
+    feature: int,
+    offset: wp.vec3,
+    normal: wp.vec3,
+    below_cut: Cut,
+    above: wp.array[wp.vec3],
+    above_cut: Cut,
+    rules: LayerRules,
+    # outputs, by candidate
+    push: wp.array[wp.vec3],
+    count: wp.array[int],
+) -> None:
+    """What brings candidate k, vertex i, to the gap above the place on the sheet that it is off by `offset`."""
+    height = wp.dot(offset, normal)
+    far = wp.length(offset)
+    if height >= rules.gap or far > rules.reach:
+        return
+    share = wp.clamp(wp.dot(normal_at(i, above, above_cut), normal) / rules.agreement, 0.0, 1.0)
+    # Whatever ends does so gradually, or cloth would jump from frame to frame.
+    share *= wp.min(1.0, 4.0 * (1.0 - far / rules.reach))
+    if (below_cut.rim[face] >> feature) & 1 != 0:
+        share *= wp.max(0.0, 1.0 - wp.length(offset - height * normal) / rules.fade)
+    lift = share * (rules.gap - height) * normal
+    if wp.length_sq(lift) > 0.0:
+        push[k] = lift
+        wp.atomic_add(count, 0, 1)
+
+
+@wp.kernel(enable_backward=False)
+def lift_kernel(
+    # the garment below
+    below: wp.array[wp.vec3],
+    below_normals: wp.array[wp.vec3],
+    below_cut: Cut,
+    # the garment above
+    above: wp.array[wp.vec3],
+    above_cut: Cut,
+    candidates: wp.array[int],
+    ring_start: wp.array[int],
+    ring: wp.array[int],
+    found: wp.array[int],
+    rules: LayerRules,
+    # outputs, by candidate
+    closest: wp.array[int],
+    push: wp.array[wp.vec3],
+    count: wp.array[int],
+    doubtful: wp.array[int],
+    n_doubtful: wp.array[int],
+) -> None:
+    """What brings each candidate to the gap above the sheet, and how many they are that lack something.
+
+    A fold that one candidate's search ended in is seldom in the way of its neighbours': what these `found` is looked
+    at, too. Whoever is far below the sheet is `doubtful`, and only listed. `closest` is the vertex of the sheet that
+    each has come to, -1 where that is too far away.
+    """
+    k = wp.tid()
+    i = candidates[k]
+    p = above[i]
+    push[k] = wp.vec3(0.0, 0.0, 0.0)
+    v = int(found[k])
+    closest[k] = -1
+    if v < 0:
+        return
+    squared = wp.length_sq(below[v] - p)
+    # As near as that, it is the right fold.
+    if 4.0 * squared > rules.longest * rules.longest:
+        for r in range(ring_start[k], ring_start[k + 1]):
+            j = ring[r]
+            if j < found.shape[0] and found[j] >= 0 and found[j] != v:
+                other = wp.length_sq(below[found[j]] - p)
+                if other < squared:
+                    squared = other
+                    v = found[j]
+        if v != found[k]:
+            v = nearest_vertex(p, v, below, below_cut)
+    # No point of a face is farther than its longest edge from its closest corner.
+    if wp.length(below[v] - p) > rules.reach + rules.longest:
+        return
+    closest[k] = v
+    face, feature, w, offset = nearest_face(p, v, below, below_cut)
+    normal = normal_on(face, w, below_normals, below_cut)
+    if wp.dot(offset, normal) >= rules.gap:
+        return
+    if wp.length(offset) > rules.doubt:
+        doubtful[wp.atomic_add(n_doubtful, 0, 1)] = k
+        return
+    lift_off(k, i, face, feature, offset, normal, below_cut, above, above_cut, rules, push, count)
+
+
+@wp.kernel(enable_backward=False)
+def tree_kernel(
+    tree: wp.uint64,
+    # the garment below
+    below: wp.array[wp.vec3],
+    below_normals: wp.array[wp.vec3],
+    below_cut: Cut,
+    # the garment above
+    above: wp.array[wp.vec3],
+    above_cut: Cut,
+    candidates: wp.array[int],
+    rules: LayerRules,
+    doubtful: wp.array[int],
+    n_doubtful: wp.array[int],
+    # outputs, by candidate
+    closest: wp.array[int],
+    push: wp.array[wp.vec3],
+    count: wp.array[int],
+) -> None:
+    """The same of the doubtful, with the closest place of the whole sheet."""
+    n = wp.tid()
+    if n >= n_doubtful[0]:
+        return
+    k = doubtful[n]
+    i = candidates[k]
+    p = above[i]
+    found = wp.mesh_query_point_no_sign(tree, p, rules.reach)
+    if not found.result:
+        return
+    face = found.face
+    w, feature, offset = closest_on_face(p, face, below, below_cut.faces)
+    normal = normal_on(face, w, below_normals, below_cut)
+    closest[k] = below_cut.faces[face, heaviest(w)]
+    lift_off(k, i, face, feature, offset, normal, below_cut, above, above_cut, rules, push, count)
+
+
+@wp.kernel(enable_backward=False)
+def spread_kernel(
+    push: wp.array[wp.vec3],
+    n_pushed: int,
+    ring_start: wp.array[int],
+    ring: wp.array[int],
+    field: wp.array[wp.vec3],
+    # output
+    smoother: wp.array[wp.vec3],
+) -> None:
+    """One round of `Blend.spread`."""
+    k = wp.tid()
+    start = ring_start[k]
+    end = ring_start[k + 1]
+    total = wp.vec3(0.0, 0.0, 0.0)
+    for r in range(start, end):
+        total += field[ring[r]]
+    mean = total / float(wp.max(end - start, 1))
+    if k < n_pushed:
+        length = wp.length(push[k])
+        if length > 0.0:
+            way = push[k] / length
+            mean += wp.max(0.0, length - wp.dot(mean, way)) * way
+    smoother[k] = mean
+
+
+@wp.kernel(enable_backward=False)
+def move_kernel(
+    rows: wp.array[int],
+    field: wp.array[wp.vec3],
+    # output
+    points: wp.array[wp.vec3],
+) -> None:
+    """Moves the vertices of the region."""
+    k = wp.tid()
+    points[rows[k]] += field[k]

@@ -1,0 +1,292 @@
+"""Brings one garment off the body, in real time: each step is one launch over the vertices that it concerns."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+from torch import Tensor
+
+from refu_core._warp import as_warp, torch_stream
+from refu_core.contact import _edge_kernels, _resolver_kernels, _round_kernels, _spread_kernels, _state
+from refu_core.contact._limbs import Limbs
+from refu_core.contact._resolution import Resolution
+from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
+from refu_core.errors import MeshError
+from refu_core.modes import DEFAULT_MARGIN
+from refu_core.refu import VertexScale
+from refu_core.sdf import MeshSdf, SdfSample, require_tensor
+
+
+class Resolver:
+    """Brings one garment off posed bodies.
+
+    The steps: distances that contradict each other along an edge are mended; vertices leave limbs that they don't
+    belong to; those nearer than the margin are pushed along the gradient (ReFU, paper, Eq. 2); their neighbours give
+    way; edges that still run too low are raised.
+
+    Memory and launches are prepared once. Each step lists the vertices for the next one, so a step costs what the
+    vertices at the skin do. What depends on other vertices is finished for all of them by one launch before the next
+    begins, so their order plays no role.
+
+    On a CPU, steps that concern no vertex are left out. A GPU would have to be waited for to know, so it gets the same
+    launches in every frame, as a CUDA graph needs them. For the same reason the numbers of a `Resolution` stay on the
+    device until they are read.
+    """
+
+    def __init__(self, limbs: Limbs, *, settings: ContactSettings = DEFAULT_CONTACT) -> None:
+        """For the garment that `limbs` is of, on its device."""
+        self._limbs, self._settings = limbs, settings
+        self.device = limbs.faces.device
+        n, e = len(limbs.own), len(limbs.edges)
+        self._n_vertices = n
+        self._cloth = _cloth(limbs)
+        self._vectors = {name: torch.zeros(n, 3, device=self.device) for name in _VECTORS}
+        self._floats = {name: torch.zeros(n, device=self.device) for name in _FLOATS}
+        self._ints = {name: torch.zeros(n, dtype=torch.int32, device=self.device) for name in _INTS}
+        self._by_edge = torch.zeros(3, e, dtype=torch.int32, device=self.device)
+        self._deficit = torch.zeros(e, device=self.device)
+        self._rise = torch.zeros(e, 3, device=self.device)
+        self._counts = torch.zeros(_state.N_COUNTS + 2 * _N_LIMBS, dtype=torch.int32, device=self.device)
+        self._bounds = torch.full((2, _state.N_COUNTS), 2**31 - 1, dtype=torch.int32, device=self.device)
+        # On a CPU a kernel is one thread and can do several short steps, and reading a number costs nothing.
+        self._is_serial = self.device.type == "cpu"
+        self._read_counts = self._counts.numpy() if self._is_serial else None
+        self._state = self._bind_state()
+        self._commands: dict[str, Any] = {}
+        self._dims: dict[str, int] = {}
+        self._recorded_for: tuple[Any, ...] = ()
+
+    @torch.no_grad()
+    def __call__(
+        self,
+        points: Tensor,
+        sdf: MeshSdf,
+        start: SdfSample,
+        *,
+        margin: float = DEFAULT_MARGIN,
+        scale: float | VertexScale = 1.0,
+    ) -> Resolution:
+        """The garment with vertices [m], shape (N, 3), off the body last given to `sdf`; not differentiable.
+
+        Args:
+            points: Garment vertices [m], shape (N, 3).
+            sdf: The body's signed distance.
+            start: What it says of the points; what is beyond `margin` + 2 mm may be clipped from above.
+            margin: ε ≥ 0 [m].
+            scale: α of the first push: one number, or a function of vertices and their distances.
+
+        Raises:
+            MeshError: points of another number or type, or a distance that isn't one to faces.
+        """
+        require_tensor("points", points)
+        if points.shape != (self._n_vertices, 3) or start.distance.shape != (self._n_vertices,):
+            shapes = f"{tuple(points.shape)} and {tuple(start.distance.shape)}"
+            msg = f"wanted {self._n_vertices} points and their distances, got the shapes {shapes}"
+            raise MeshError(msg)
+        if start.face is None:
+            msg = "start must name the closest faces: ask an ExactSdf, BandSdf or ApproxSdf"
+            raise MeshError(msg)
+        with torch_stream(self.device):
+            self._take(points, start)
+            self._record(sdf, margin)
+            self._reconcile(can_miss=not sdf.is_exact)
+            self._run("list", self._n_vertices)
+            n = self._length(_state.NEAR)
+            if n:
+                self._push(n, scale)
+                self._raise_edges()
+                self._run("tally", n)
+        depth = -self._floats["first"].amin(0, keepdim=True)
+        counts = self._counts[_state.INSIDE : _state.STUCK + 1].float()
+        return Resolution(
+            self._vectors["place"].clone(),
+            self._floats["distance"].clone(),
+            torch.cat((counts, depth.clamp_min(0))),
+        )
+
+    def _take(self, points: Tensor, start: SdfSample) -> None:
+        """Takes over a frame."""
+        assert start.face is not None  # these distances are to faces
+        self._counts.zero_()
+        if not self._is_serial:
+            self._bounds.zero_()
+        self._vectors["origin"].copy_(points)
+        self._floats["first"].copy_(start.distance)
+        self._vectors["first_gradient"].copy_(start.gradient)
+        self._ints["first_face"].copy_(start.face)
+
+    def _reconcile(self, *, can_miss: bool) -> None:
+        """Makes the distances consistent along edges; some closest faces may have been missed."""
+        self._run("begin", self._n_vertices)
+        self._run("compare", self._n_vertices)
+        looks = self._settings.looks if can_miss else 0
+        for remedy, rounds in (("retry", looks), ("cut off", self._settings.cuts)):
+            for _ in range(rounds):
+                n = self._length(_state.SUSPECTS)
+                self._counts[_state.CHANGED].zero_()
+                self._run(remedy, n)
+                self._run("adopt", n)
+                if self._is_serial and not self._count(_state.CHANGED):
+                    break
+
+    def _push(self, n: int, scale: float | VertexScale) -> None:
+        """The `n` near vertices leave other limbs on the near side, then the body, and their neighbours follow."""
+        self._run("orient", n)
+        if not self._is_serial or self._counts[_state.N_COUNTS : _state.N_COUNTS + _N_LIMBS].any():
+            self._run("retreat", n)
+            self._run("fill", n)
+        self._run("aim", n)
+        n_pushed = self._length(_state.PUSHED)
+        if n_pushed:
+            alpha = self._floats["alpha"][:n_pushed]
+            if callable(scale):
+                rows = self._ints["pushed"][:n_pushed].long()
+                alpha.copy_(scale(rows, self._floats["depth"][rows]))
+            else:
+                alpha.fill_(scale)
+            self._run("scale", n_pushed)
+        self._blend()
+        self._run("settle", self._length(_state.REACHED))
+
+    def _blend(self) -> None:
+        """Neighbours of pushed vertices give way with them."""
+        if self._is_serial:
+            self._run("blend", 1)
+            return
+        for _ in range(self._settings.blend_reach):
+            self._run("reach", self._length(_state.REACHED))
+        n = self._length(_state.REACHED)
+        for sweep in range(2 * self._settings.blend_pairs):
+            self._run(f"spread{sweep % 2}", n)
+
+    def _raise_edges(self) -> None:
+        """Raises both ends of the edges that run too low."""
+        n = len(self._limbs.edges)
+        self._run("suspect", n)
+        if self._is_serial:
+            self._run("raise edges", int(self._count(_state.CUTTING) > 0))
+            return
+        self._close(_state.CUTTING)
+        for round_ in range(self._settings.max_pushes):
+            self._run("measure" if round_ == 0 else f"again{round_ % 2}", n, (4, round_))
+            self._close(_state.CUTTING + 1 + round_)
+            self._counts[_state.RAISED].zero_()
+            self._run(f"choose{round_ % 2}", n, (2, round_))
+            self._run("lift", self._length(_state.RAISED))
+
+    def _length(self, which: int) -> int:
+        """How long a launch over a list of vertices is: as long as the list; on a GPU, as long as it may become."""
+        if self._is_serial:
+            return self._count(which)
+        self._close(which)
+        return self._n_vertices
+
+    def _close(self, which: int) -> None:
+        self._run("close", 1, (1, which))
+
+    def _count(self, which: int) -> int:
+        assert self._read_counts is not None  # of a CPU
+        return int(self._read_counts[which])
+
+    def _run(self, name: str, n: int, parameter: tuple[int, int] | None = None) -> None:
+        """Launches a step for `n` of its list, with one of its parameters, by position, set anew."""
+        if not n:
+            return
+        command = self._commands[name]
+        if parameter is not None:
+            command.set_param_at_index(*parameter)
+        if self._dims.get(name) != n:
+            command.set_dim(n)
+            self._dims[name] = n
+        command.launch()
+
+    def _command(self, name: str, kernel: Any, inputs: list[Any]) -> None:
+        self._dims[name] = 1
+        self._commands[name] = wp.launch(kernel, dim=1, inputs=inputs, device=str(self.device), record_cmd=True)
+
+    def _record(self, sdf: MeshSdf, margin: float) -> None:
+        """Records the launches of a frame, unless they are the last frame's."""
+        skin = sdf.skin()
+        key = (skin, margin)
+        if key == self._recorded_for:
+            return
+        self._recorded_for = key
+        state, cloth, rules = self._state, self._cloth, self._rules(margin)
+        self._command("begin", _resolver_kernels.begin_kernel, [state])
+        self._command("compare", _resolver_kernels.compare_kernel, [state, cloth, rules])
+        self._command("retry", _resolver_kernels.retry_kernel, [state, cloth, skin, rules])
+        self._command("cut off", _resolver_kernels.cut_off_kernel, [state, cloth, rules])
+        self._command("adopt", _resolver_kernels.adopt_kernel, [state, cloth])
+        self._command("list", _resolver_kernels.list_near_kernel, [state, rules])
+        self._command("orient", _resolver_kernels.orient_kernel, [state, cloth, rules])
+        self._command("retreat", _resolver_kernels.retreat_kernel, [state, cloth, skin, rules])
+        self._command("fill", _resolver_kernels.fill_kernel, [state, cloth, skin, rules])
+        self._command("aim", _resolver_kernels.aim_kernel, [state, cloth, skin, rules])
+        self._command("scale", _resolver_kernels.scale_kernel, [state, rules])
+        self._command("settle", _resolver_kernels.settle_kernel, [state, skin, rules])
+        self._command("suspect", _edge_kernels.suspect_kernel, [state, cloth, rules])
+        self._command("tally", _resolver_kernels.tally_kernel, [state])
+        long_step, short_step = self._settings.blend_steps
+        if self._is_serial:
+            inputs = [state, cloth, self._settings.blend_reach, self._settings.blend_pairs, long_step, short_step]
+            self._command("blend", _spread_kernels.blend_kernel, inputs)
+            self._command("raise edges", _edge_kernels.raise_edges_kernel, [state, cloth, skin, rules])
+            return
+        suspects, low, lower = (as_warp(row, wp.int32) for row in self._by_edge)
+        self._command("close", _round_kernels.close_kernel, [state, 0])
+        self._command("reach", _round_kernels.reach_kernel, [state, cloth])
+        for name, step, fields in (
+            ("spread0", long_step, (state.field, state.smoother)),
+            ("spread1", short_step, (state.smoother, state.field)),
+        ):
+            self._command(name, _round_kernels.spread_kernel, [state, cloth, step, *fields])
+        for name, source, target in (("measure", suspects, low), ("again1", low, lower), ("again0", lower, low)):
+            self._command(name, _round_kernels.measure_kernel, [state, cloth, skin, rules, 0, source, target])
+        for name, source in (("choose0", low), ("choose1", lower)):
+            self._command(name, _round_kernels.choose_kernel, [state, cloth, 0, source])
+        self._command("lift", _round_kernels.lift_kernel, [state, skin, rules])
+
+    def _rules(self, margin: float) -> Any:
+        rules, given = _state.Rules(), self._settings
+        rules.margin = margin
+        for name in _state.RULES:
+            setattr(rules, name, getattr(given, name))
+        return rules
+
+    def _bind_state(self) -> Any:
+        state = _state.State()
+        for tensors, kind in ((self._vectors, wp.vec3), (self._floats, wp.float32), (self._ints, wp.int32)):
+            for name, tensor in tensors.items():
+                setattr(state, name, as_warp(tensor, kind))
+        state.suspects = as_warp(self._by_edge[0], wp.int32)
+        state.deficit, state.rise = as_warp(self._deficit, wp.float32), as_warp(self._rise, wp.vec3)
+        state.counts = as_warp(self._counts, wp.int32)
+        state.touched = as_warp(self._counts[_state.N_COUNTS :], wp.int32)
+        state.inward = as_warp(self._counts[_state.N_COUNTS + _N_LIMBS :], wp.int32)
+        state.begins, state.ends = (as_warp(bounds, wp.int32) for bounds in self._bounds)
+        return state
+
+
+_VECTORS = ("origin", "first_gradient", "place", "gradient", "outward", "heading", "field", "smoother")
+_FLOATS = ("first", "distance", "along", "way", "depth", "goal", "alpha", "largest")
+_INTS = ("first_face", "face", "guess", "role", "mark", "near", "pushed", "reached", "moved")
+_N_LIMBS = 4
+
+
+def _cloth(limbs: Limbs) -> Any:
+    """The garment as the kernels read it."""
+    mesh = limbs.mesh
+    ring_start, ring = mesh.ring
+    # The sums over neighbours are rounded in this order: those of a higher number first.
+    ring = ring[np.lexsort((ring < mesh.ring.owner, mesh.ring.owner))]
+    bits = (limbs.own.cpu().numpy() << np.arange(limbs.own.shape[1])).sum(axis=1)
+    cloth = _state.Cloth()
+    arrays = {"ring_start": ring_start, "ring": ring, "fan_start": mesh.fan.start, "fan": mesh.fan.items}
+    arrays |= {"faces": mesh.faces, "edges": mesh.edges, "own": bits, "limb": limbs.of_face.cpu().numpy()}
+    for name, array in arrays.items():
+        setattr(cloth, name, wp.array(array.astype(np.int32), dtype=wp.int32, device=str(limbs.faces.device)))
+    cloth.clearance = as_warp(limbs.clearance.float().contiguous(), wp.float32)
+    return cloth

@@ -1,0 +1,159 @@
+"""What is next to what in a triangle mesh."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from refu_core.errors import MeshError
+
+
+class Adjacency(NamedTuple):
+    """What is around each vertex of a mesh of V vertices: of vertex v `items[start[v]:start[v + 1]]`."""
+
+    start: NDArray[np.int32]
+    """Shape (V + 1,)."""
+    items: NDArray[np.int32]
+    """In ascending order around each vertex."""
+
+    @property
+    def owner(self) -> NDArray[np.int64]:
+        """The vertex that each of `items` is around, of the same shape."""
+        return np.repeat(np.arange(len(self.start) - 1), np.diff(self.start))
+
+
+@dataclass(frozen=True, eq=False)
+class Connectivity:
+    """Who is next to whom in a triangle mesh of V vertices and F faces; what is asked is computed once."""
+
+    faces: NDArray[np.int32]
+    """Vertices of each face, counter-clockwise seen from outside, shape (F, 3)."""
+    n_vertices: int
+    """V."""
+
+    @classmethod
+    def of(cls, faces: Any, n_vertices: int | None = None) -> Connectivity:
+        """Of `faces`, integers of shape (F, 3), and as many vertices as they name, if not told.
+
+        Raises:
+            MeshError: they aren't triangles of three different vertices each.
+        """
+        checked = check_faces(faces, n_vertices=n_vertices)
+        return cls(checked, int(checked.max()) + 1 if n_vertices is None else n_vertices)
+
+    @cached_property
+    def _edges(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """Lower end times V plus upper end of each edge, the edge of each corner, the number of faces of each edge."""
+        start, end = self.faces.astype(np.int64), np.roll(self.faces, -1, axis=1).astype(np.int64)
+        keys = np.minimum(start, end) * self.n_vertices + np.maximum(start, end)
+        edges, of_corner, n_faces = np.unique(keys.ravel(), return_inverse=True, return_counts=True)
+        return edges, of_corner.reshape(-1, 3), n_faces
+
+    @cached_property
+    def edges(self) -> NDArray[np.int32]:
+        """Each edge once, lower vertex first, in ascending order, shape (E, 2)."""
+        return np.stack(np.divmod(self._edges[0], self.n_vertices), axis=1).astype(np.int32)
+
+    @property
+    def edge_of_corner(self) -> NDArray[np.int64]:
+        """Number of the edges (0, 1), (1, 2), (2, 0) of each face, shape (F, 3)."""
+        return self._edges[1]
+
+    @property
+    def n_faces_of_edge(self) -> NDArray[np.int64]:
+        """How many faces each edge has, shape (E,): one on the boundary, two elsewhere, of a manifold."""
+        return self._edges[2]
+
+    @property
+    def boundary(self) -> NDArray[np.int32]:
+        """The edges of one face, shape (B, 2)."""
+        boundary: NDArray[np.int32] = self.edges[self.n_faces_of_edge == 1]
+        return boundary
+
+    @cached_property
+    def ring(self) -> Adjacency:
+        """The vertices that edges join to each vertex."""
+        pairs = np.concatenate((self.edges[:, ::-1], self.edges))  # stable: those of lower number first
+        return _grouped(pairs[:, 0], pairs[:, 1], self.n_vertices)
+
+    @cached_property
+    def fan(self) -> Adjacency:
+        """The faces around each vertex."""
+        return _grouped(self.faces.ravel(), np.repeat(np.arange(len(self.faces)), 3), self.n_vertices)
+
+    def require_closed(self) -> None:
+        """Nothing, where the mesh is a closed, consistently oriented surface.
+
+        Raises:
+            MeshError: it isn't.
+        """
+        start, end = self.faces.ravel(), np.roll(self.faces, -1, axis=1).ravel()
+        n_faces = self.n_faces_of_edge
+        n_open, n_crowded = int((n_faces == 1).sum()), int((n_faces > 2).sum())
+        one_way = np.bincount(self.edge_of_corner.ravel(), weights=np.where(end > start, 1.0, -1.0)) != 0
+        n_flipped = int(one_way[n_faces == 2].sum())
+        if n_open or n_crowded or n_flipped:
+            msg = (
+                f"a signed distance needs a watertight body: {n_open} open edges, {n_crowded} edges of more than two "
+                f"faces and {n_flipped} edges whose two faces face opposite ways; close the mesh and orient its faces "
+                "outward"
+            )
+            raise MeshError(msg)
+
+    @cached_property
+    def across(self) -> NDArray[np.int32]:
+        """The face on the other side of the edges (0, 1), (1, 2), (2, 0) of each face of a closed mesh, shape (F, 3).
+
+        Raises:
+            MeshError: as `require_closed`.
+        """
+        self.require_closed()
+        # Every edge has exactly two corners: sorting by edge puts partners side by side.
+        order = np.argsort(self.edge_of_corner.ravel(), kind="stable").reshape(-1, 2)
+        across = np.empty(self.faces.size, np.int32)
+        across[order[:, 0]], across[order[:, 1]] = order[:, 1] // 3, order[:, 0] // 3
+        return across.reshape(-1, 3)
+
+    def adjacency_matrix(self) -> sparse.csr_array:
+        """1 for each two vertices of an edge, shape (V, V)."""
+        shape = (self.n_vertices, self.n_vertices)
+        return sparse.csr_array((np.ones(len(self.ring.items)), self.ring.items, self.ring.start), shape=shape)
+
+    def uniform_laplacian(self) -> sparse.csr_array:
+        """The matrix that takes the mean of its neighbours from each vertex, shape (V, V)."""
+        adjacent = self.adjacency_matrix()
+        degree = np.maximum(adjacent.sum(axis=1), 1.0)
+        return sparse.csr_array(sparse.eye_array(self.n_vertices) - sparse.diags_array(1.0 / degree) @ adjacent)
+
+
+def check_faces(faces: Any, *, n_vertices: int | None = None) -> NDArray[np.int32]:
+    """`faces` as a contiguous int32 array of shape (F, 3).
+
+    Raises:
+        MeshError: not integers of that shape, or not three different vertices each, below `n_vertices`.
+    """
+    array = np.asarray(faces)
+    if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0 or array.dtype.kind not in "iu":
+        msg = f"faces must be integers of shape (F, 3), got {array.dtype} of shape {array.shape}"
+        raise MeshError(msg)
+    low, high = int(array.min()), int(array.max())
+    limit = n_vertices if n_vertices is not None else np.iinfo(np.int32).max
+    if low < 0 or high >= limit:
+        msg = f"faces must index vertices 0 to {limit - 1}, got {low} to {high}"
+        raise MeshError(msg)
+    repeated = (array == np.roll(array, 1, axis=1)).any(axis=1)
+    if repeated.any():
+        msg = f"every face needs three different vertices; {repeated.sum()} of {len(array)} repeat one"
+        raise MeshError(msg)
+    return np.ascontiguousarray(array, dtype=np.int32)
+
+
+def _grouped(owner: NDArray[Any], items: NDArray[Any], n: int) -> Adjacency:
+    order = np.argsort(owner, kind="stable")
+    start = np.concatenate(([0], np.cumsum(np.bincount(owner, minlength=n))))
+    return Adjacency(start.astype(np.int32), items[order].astype(np.int32))

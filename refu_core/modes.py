@@ -1,0 +1,59 @@
+"""What a user may ask for: garments and modes by name, and the margin."""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import TypeVar
+
+from refu_core.errors import RefuError
+
+BUILTIN_GARMENTS: tuple[str, ...] = ("shirt-male", "tshirt-male", "short-pant-male", "skirt-female")
+"""Garments that ship."""
+DEFAULT_GARMENTS: tuple[str, ...] = ("tshirt-male", "short-pant-male")
+"""What a person wears of whom nothing else is said."""
+
+DEFAULT_MARGIN = 0.004
+"""ε: how far off the skin the vertices are pushed [m]. A garment's edges cut the corners between its vertices: with
+vertices exactly on the skin (ε = 0, the paper's fixed scale) they run through it; a few mm clear nearly all of them."""
+MAX_MARGIN = 0.05
+"""The largest ε that makes sense [m]: a garment farther off the skin isn't worn."""
+
+Name = TypeVar("Name", bound="Choice")
+
+
+class Choice(str, Enum):
+    """A string that is one of a few; it prints as what it is."""
+
+    __str__ = str.__str__
+
+    @classmethod
+    def of(cls: type[Name], text: str, what: str, *, error: type[RefuError] = RefuError) -> Name:
+        """The one that `text` names. Raises `error` for one that there isn't."""
+        try:
+            return cls(text)
+        except ValueError:
+            msg = f"no {what} {text!r}: wanted {', '.join(cls)}"
+            raise error(msg) from None
+
+
+class SdfMode(Choice):
+    """How collisions are found, and what the weights were trained with (paper, Sec. 4.1)."""
+
+    HYBRID = "hybrid"
+    """With the approximate signed distance, by weights that were trained with the accurate one in the loss."""
+    APPROX = "approx"
+    """With the approximate one, in training and at run time."""
+    ACCURATE = "accurate"
+    """With the exact one, in training and at run time."""
+    NONE = "none"
+    """Not at all: the raw backbone."""
+
+
+class BackboneName(Choice):
+    """What predicts a garment."""
+
+    SKINNED = "skinned"
+    """No network: the template follows the skin."""
+    TAILORNET = "tailornet"
+    MLP = "mlp"
+    GCNN = "gcnn"

@@ -1,0 +1,123 @@
+"""Collision handling of a frame: garments off one posed body, and off each other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from refu_core.contact import DEFAULT_CONTACT, ContactSettings, Layer, Limbs, Resolver
+from refu_core.garments import inner_first
+from refu_core.modes import SdfMode
+from refu_core.realtime._wearer import Outfit
+from refu_core.refu import VertexScale
+from refu_core.sdf import ApproxSdf, ExactSdf, MeshSdf, Winding, exact_sdf
+
+_ASKED_FROM = 2e-3
+"""Vertices are asked exactly up to this far beyond the margin [m]."""
+
+
+class Worn(NamedTuple):
+    """One garment of one person, as the root sees it."""
+
+    vertices: Tensor
+    """[m], shape (V, 3)."""
+    raw: Tensor
+    """The same before collision handling [m], shape (V, 3)."""
+    numbers: Tensor
+    """As `Resolved.numbers`."""
+    n_clipped: Tensor
+    """As `Resolved.n_clipped`."""
+
+
+class Resolved(NamedTuple):
+    """A garment off the body and off the garments below it, and the numbers of a `GarmentStats`."""
+
+    vertices: Tensor
+    """[m], shape (V, 3)."""
+    numbers: Tensor
+    """`n_inside`, `n_pushed`, `n_unresolved`, `max_depth` and `n_layered`, float32, shape (5,)."""
+    n_clipped: Tensor
+    """Vertices that weren't asked for their distance, since they are far off, shape ()."""
+
+
+N_NUMBERS = 5
+_N_UNRESOLVED = 2
+
+
+class ContactStage:
+    """Brings the garments of one person off the body and each other, from the skin outwards."""
+
+    def __init__(
+        self,
+        outfit: Outfit,
+        *,
+        sdf: SdfMode,
+        uses_band: bool = True,
+        certify: bool = True,
+        settings: ContactSettings = DEFAULT_CONTACT,
+    ) -> None:
+        """With the exact distance, within a band of the skin or everywhere, or with the approximate one.
+
+        Where it is to `certify`, what is unresolved is counted by winding numbers.
+        """
+        body, garments = outfit.body, {name: one.template for name, one in outfit.wearables.items()}
+        self.sdf: MeshSdf = exact_sdf(body, uses_band=uses_band) if sdf is SdfMode.ACCURATE else ApproxSdf(body)
+        self.winding = Winding(body.faces) if certify else None
+        self.order = inner_first(garments)
+        """Names from the skin outwards."""
+        rest = ExactSdf(body.faces, device=body.device)
+        rest.update(body.v_template)
+        self._asked = {name: self.sdf.of_garment(one) for name, one in garments.items()}
+        self.resolvers = {}
+        for name, one in garments.items():
+            clearance = rest.query(one.v_template).distance
+            limbs = Limbs.of(body.weights, body.faces, one.weights, one.faces, clearance=clearance, settings=settings)
+            self.resolvers[name] = Resolver(limbs, settings=settings)
+        self._below = {
+            name: {
+                inner: Layer(
+                    garments[name].faces,
+                    garments[name].v_template,
+                    garments[inner].faces,
+                    garments[inner].v_template,
+                    settings=settings,
+                )
+                for inner in self.order[:i]
+            }
+            for i, name in enumerate(self.order)
+        }
+
+    def update(self, body: Tensor) -> None:
+        """Takes over the body's new pose, shape (V, 3) [m]. Raises `MeshError` for one that isn't finite."""
+        self.sdf.update(body)
+        if self.winding is not None:
+            self.winding.update(body)
+
+    def lift(self, name: str, vertices: Tensor, worn: Mapping[str, Worn]) -> tuple[Tensor, Tensor]:
+        """Vertices (V, 3) [m] off the `worn` inner garments, and how many were too near one of those, shape (1,)."""
+        n_layered = torch.zeros(1, dtype=torch.int32, device=vertices.device)
+        for inner, layer in self._below[name].items():
+            vertices, n_low = layer(vertices, worn[inner].vertices)
+            n_layered = n_layered + n_low
+        return vertices, n_layered
+
+    def resolve(
+        self,
+        name: str,
+        vertices: Tensor,
+        *,
+        on_mean: Tensor,
+        margin: float,
+        scale: float | VertexScale,
+        n_layered: Tensor,
+    ) -> Resolved:
+        """Vertices (V, 3) [m] off the body, which has the last word."""
+        start = self._asked[name](vertices, on_mean=on_mean, reach=margin + _ASKED_FROM)
+        assert start.face is not None  # these distances are to faces
+        done = self.resolvers[name](vertices, self.sdf, start, margin=margin, scale=scale)
+        if self.winding is not None:
+            done.numbers[_N_UNRESOLVED] = torch.count_nonzero(self.winding(done.vertices))
+        return Resolved(done.vertices, torch.cat((done.numbers, n_layered)), (start.face < 0).sum())

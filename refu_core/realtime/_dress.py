@@ -1,0 +1,81 @@
+"""The one forward pass: (θ, β, γ) to bodies and to garments on them, before anything is done about collisions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+from torch import Tensor
+
+from refu_core.backbones import MAX_OFFSET
+from refu_core.body import RigidTransforms
+from refu_core.realtime._turn import RootTurn
+from refu_core.realtime._wearer import UnposedGarment, Wearable, Wearer
+from refu_core.refu import VertexScale
+
+Lap = Callable[[str, str | None], None]
+"""Called at the end of a stage, with its name and the garment's, if it was for one."""
+
+
+def _no_lap(stage: str, garment: str | None) -> None:
+    """Nobody wants to know."""
+
+
+class Drape(NamedTuple):
+    """One garment on a batch of bodies."""
+
+    vertices: Tensor
+    """As the root sees them [m], shape (B, V, 3)."""
+    unposed: Tensor
+    """Before posing [m], shape (B, V, 3)."""
+    on_mean: Tensor
+    """The same on the mean shape [m], shape (B, V, 3): where `GarmentSdf` looks up what is near."""
+    feature: Tensor | None
+    """z = h(β, θ, γ), which the scale of ReFU is predicted from, shape (B, M); None where α is 1."""
+
+
+class Dressed(NamedTuple):
+    """A batch of bodies and what they wear, as the root sees them (`RootTurn`)."""
+
+    body: Tensor
+    """[m], shape (B, V, 3)."""
+    drapes: Mapping[str, Drape]
+    turns: list[RootTurn]
+    """Bring each person to the world's axes."""
+
+
+def dress(pose: Tensor, wearer: Wearer, *, lap: Lap = _no_lap) -> Dressed:
+    """Bodies in poses (B, 24, 3) [rad], dressed by the backbones: posed as g = T(θ, β)(t(β, γ) + D(θ, β, γ)).
+
+    Pipeline, CUDA graph, training, evaluation and benchmark all call this. It is a pure function of tensors and
+    differentiable: nothing is remembered, and no device is waited for. `lap` is called at the end of each stage.
+    """
+    turns, at_root = RootTurn.taken_off(pose, wearer.shape.joints)
+    posed = wearer.outfit.body.posed(at_root, wearer.shape)
+    lap("body", None)
+    drapes = {}
+    for name, garment in wearer.garments.items():
+        drapes[name] = _drape(pose, wearer, wearer.outfit.wearables[name], garment, posed.transforms)
+        lap("backbone", name)
+    return Dressed(posed.vertices, drapes, turns)
+
+
+def scale_of(wearable: Wearable, drape: Drape, person: int) -> float | VertexScale:
+    """α of one of the persons, as `refu_core.contact` takes it."""
+    if wearable.refu is None:
+        return 1.0
+    return wearable.refu.of_body(None if drape.feature is None else drape.feature[person])
+
+
+def _drape(
+    pose: Tensor, wearer: Wearer, wearable: Wearable, garment: UnposedGarment, transforms: RigidTransforms
+) -> Drape:
+    predicted = wearable.backbone(wearer.betas, pose, wearer.style, wearer_code=garment.code)
+    unposed, on_mean = garment.rest, garment.on_mean
+    if predicted.displacement is not None:
+        displacement = predicted.displacement.clamp(-MAX_OFFSET, MAX_OFFSET).to(unposed)
+        unposed, on_mean = unposed + displacement, on_mean + displacement
+    z = None
+    if wearable.refu is not None:
+        z = wearable.refu.feature(wearer.betas, pose, wearer.style, predicted.feature)
+    return Drape(wearable.template.pose(unposed, transforms), unposed, on_mean, z)

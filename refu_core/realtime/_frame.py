@@ -1,0 +1,138 @@
+"""A frame as one function of tensors: poses in, worn garments out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from refu_core.errors import MeshError
+from refu_core.realtime._contact import N_NUMBERS, ContactStage, Worn
+from refu_core.realtime._dress import dress, scale_of
+from refu_core.realtime._turn import RootTurn
+from refu_core.realtime._wearer import Outfit, Wearer
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+class Person(NamedTuple):
+    """One person of a frame."""
+
+    turn: RootTurn
+    """To the world's axes."""
+    body: Tensor
+    """As the root sees it [m], shape (V, 3)."""
+    garments: Mapping[str, Worn]
+
+
+class StageClock:
+    """Wall time by stage, and by garment [ms]."""
+
+    def __init__(self) -> None:
+        self.stages: dict[str, float] = {}
+        self.garments: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def start(self, shared: StageClock, *, share: float) -> None:
+        """Begins a lap, with a share of what another clock was told."""
+        for mine, others in ((self.stages, shared.stages), (self.garments, shared.garments)):
+            mine.update({name: share * ms for name, ms in others.items()})
+        self._last = time.perf_counter()
+
+    def lap(self, stage: str, garment: str | None = None) -> None:
+        """Adds the time since the last lap to a stage, and to a garment that it was for."""
+        now = time.perf_counter()
+        ms, self._last = 1e3 * (now - self._last), now
+        self.stages[stage] = self.stages.get(stage, 0.0) + ms
+        if garment is not None:
+            self.garments[garment] = self.garments.get(garment, 0.0) + ms
+
+
+class FrameStep:
+    """All that is computed for a batch of persons, from poses to worn garments.
+
+    On a GPU nothing in it depends on a number that the device would have to be asked for. So the same launches serve
+    any pose and any (β, γ), and can be captured (`StepGraphs`).
+    """
+
+    def __init__(self, outfit: Outfit, contact: ContactStage | None) -> None:
+        """Without `contact` nothing is done about collisions."""
+        self._outfit, self.contact = outfit, contact
+        self._order = list(outfit.wearables) if contact is None else contact.order
+        sizes = [outfit.body.n_vertices * 3]
+        for one in outfit.wearables.values():
+            sizes += [one.template.n_vertices * 3] * 2 + [N_NUMBERS]
+        self._ends = np.cumsum([0, *sizes]).tolist()
+
+    @torch.no_grad()
+    def __call__(
+        self, pose: Tensor, wearer: Wearer, margins: Sequence[float], clocks: Sequence[StageClock] = ()
+    ) -> list[Person]:
+        """Persons in poses (B, 24, 3) [rad]; `margins` [m] of the garments in the outfit's order.
+
+        `clocks`, one a person, are told how long the stages took; what is done for all at once is shared out.
+        """
+        shared = StageClock()
+        dressed = dress(pose, wearer, lap=shared.lap)
+        margin_of = dict(zip(self._outfit.wearables, margins, strict=True))
+        persons = []
+        for person, (body, turn) in enumerate(zip(dressed.body, dressed.turns, strict=True)):
+            clock = clocks[person] if clocks else StageClock()
+            clock.start(shared, share=1 / len(pose))
+            if self.contact is not None:
+                self.contact.update(body)
+            clock.lap("sdf")
+            garments: dict[str, Worn] = {}
+            for name in self._order:
+                drape = dressed.drapes[name]
+                raw = vertices = drape.vertices[person]
+                numbers, n_clipped = raw.new_zeros(N_NUMBERS), raw.new_zeros(())
+                if self.contact is not None:
+                    vertices, n_layered = self.contact.lift(name, raw, garments)
+                    if len(self._order) > 1:
+                        clock.lap("layers", name)
+                    vertices, numbers, n_clipped = self.contact.resolve(
+                        name,
+                        vertices,
+                        on_mean=drape.on_mean[person],
+                        margin=margin_of[name],
+                        scale=scale_of(self._outfit.wearables[name], drape, person),
+                        n_layered=n_layered,
+                    )
+                garments[name] = Worn(vertices, raw, numbers, n_clipped)
+                clock.lap("refu", name)
+            persons.append(Person(turn, body, garments))
+        return persons
+
+    def packed(self, inputs: Mapping[str, Tensor], margins: tuple[float, ...]) -> Tensor:
+        """The same of `pose` and a wearer's tensors: all results in one tensor (B, …), which `unpacked` reads."""
+        rows = []
+        for person in self(inputs["pose"], Wearer.of_tensors(self._outfit, inputs), margins):
+            parts = [person.turn(person.body)]
+            for name in self._outfit.wearables:
+                worn = person.garments[name]
+                parts += [person.turn(worn.vertices), person.turn(worn.raw), worn.numbers]
+            rows.append(torch.cat([part.flatten() for part in parts]))
+        return torch.stack(rows)
+
+    def unpacked(self, packed: NDArray[np.float32]) -> Iterator[list[NDArray[np.float32]]]:
+        """Of each person the body, then each garment's vertices, the same before collisions, and its numbers.
+
+        Vertices are [m], shape (V, 3), in the world's axes; nothing is copied.
+
+        Raises:
+            MeshError: they aren't finite. A graph can't be interrupted to say so earlier.
+        """
+        if not np.isfinite(packed.sum(dtype=np.float64)):
+            bad = int((~np.isfinite(packed)).any(axis=1).sum())
+            msg = f"vertices must be finite, got NaN or infinite ones of {bad} of {len(packed)} persons"
+            raise MeshError(msg)
+        for row in packed:
+            parts = [row[start:end] for start, end in pairwise(self._ends)]
+            yield [part if len(part) == N_NUMBERS else part.reshape(-1, 3) for part in parts]

@@ -1,0 +1,66 @@
+"""The poses and shapes that "nothing inside" is promised for, in one place."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from refu_core.body import JOINT_NAMES
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from refu_core.frames import SmplFrame
+
+PROMISED_SIZE = 3.0
+"""Components of β are promised up to this size, in standard deviations."""
+
+# Degrees about x, y and z: what 6,798 frames of recorded motion and their mirror images take up (walks, runs, jumps,
+# punches, climbing, bending, hanging by the arms), and 20 degrees more; up to what anatomy allows where those clips
+# don't reach it (collars, an arm overhead, a knee on the heel), and beyond for knees and elbows, whose axes estimators
+# often miss. Of the left side; the right side is its mirror image.
+_RANGES: dict[str, tuple[tuple[float, float], ...]] = {
+    "hip": ((-130, 45), (-50, 65), (-50, 50)),
+    "knee": ((-45, 150), (-45, 45), (-45, 45)),
+    "ankle": ((-65, 80), (-55, 65), (-30, 40)),
+    "foot": ((-90, 90), (-20, 20), (-20, 20)),
+    "spine1": ((-30, 70), (-35, 35), (-50, 50)),
+    "spine2": ((-25, 50), (-40, 40), (-35, 35)),
+    "spine3": ((-35, 40), (-30, 30), (-50, 50)),
+    "neck": ((-70, 40), (-50, 50), (-55, 55)),
+    "head": ((-90, 90), (-75, 75), (-75, 75)),
+    "collar": ((-30, 30), (-30, 30), (-30, 30)),
+    "shoulder": ((-100, 90), (-145, 65), (-135, 110)),
+    "elbow": ((-60, 60), (-150, 60), (-60, 90)),
+    "wrist": ((-80, 70), (-85, 90), (-40, 90)),
+    "hand": ((-30, 30), (-30, 30), (-30, 30)),
+}
+
+
+def _limits() -> NDArray[np.float64]:
+    """Least and largest components of all joints' rotation vectors [rad], shape (2, 24, 3)."""
+    limits: NDArray[np.float64] = np.full((2, len(JOINT_NAMES), 3), np.inf)
+    limits[0] *= -1  # the root turns freely
+    for joint, name in enumerate(JOINT_NAMES[1:], start=1):
+        low, high = np.radians(_RANGES[name.rpartition("_")[2]]).T
+        mirror = np.array((1, -1, -1) if name.startswith("right") else (1, 1, 1))
+        limits[:, joint] = np.sort(np.stack((low * mirror, high * mirror)), axis=0)
+    return limits
+
+
+PROMISED_POSES = _limits()
+"""Least and largest components of the joints' rotation vectors [rad], those of at most half a turn: (2, 24, 3)."""
+
+
+def within_promise(frame: SmplFrame) -> bool:
+    """Whether a frame is one of those that "nothing inside" is promised for: joints of people, β up to 3."""
+    low, high = PROMISED_POSES
+    pose = frame.pose
+    if ((pose < low) | (pose > high)).any():  # or it is the same rotation by another vector
+        angle = np.linalg.norm(pose.astype(np.float64), axis=1, keepdims=True)
+        turns = np.round(angle / (2 * np.pi))
+        pose = pose * (1 - 2 * np.pi * turns / np.maximum(angle, 1e-9))
+        if ((pose < low) | (pose > high)).any():
+            return False
+    return float(np.abs(frame.betas).max()) <= PROMISED_SIZE

@@ -1,0 +1,117 @@
+"""What is worn, and what of that depends on a person's (β, γ) only."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from refu_core.backbones import Backbone
+from refu_core.body import Shape, SmplBody
+from refu_core.frames import N_STYLES
+from refu_core.garments import GarmentTemplate
+from refu_core.refu import Refu
+
+
+@dataclass(frozen=True, eq=False)
+class Wearable:
+    """A garment and its networks."""
+
+    template: GarmentTemplate
+    backbone: Backbone
+    refu: Refu | None
+    """Predicts the scale α; None for α = 1."""
+    margin: float
+    """ε that the networks were trained with [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Outfit:
+    """A body model and what is worn on it, the same for all persons."""
+
+    body: SmplBody
+    wearables: Mapping[str, Wearable]
+    """By name."""
+
+    def to(self, dtype: torch.dtype) -> Outfit:
+        """The same in another precision; nothing is shared."""
+        return Outfit(self.body.to(dtype=dtype), {name: _cast(one, dtype) for name, one in self.wearables.items()})
+
+
+class UnposedGarment(NamedTuple):
+    """One garment on B persons before it is posed, without what a backbone adds."""
+
+    rest: Tensor
+    """t(β, γ) [m], shape (B, V, 3)."""
+    on_mean: Tensor
+    """t(0, γ), the same on the mean shape [m], shape (B, V, 3)."""
+    code: Tensor | None
+    """`Backbone.wearer_code`, shape (B, K)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Wearer:
+    """What depends on (β, γ) only, of a batch of B persons: computed once, for all of their poses."""
+
+    outfit: Outfit
+    betas: Tensor
+    """Shape (B, 10)."""
+    style: Tensor
+    """Shape (B, 4)."""
+    shape: Shape
+    garments: Mapping[str, UnposedGarment]
+
+    @classmethod
+    def of(cls, outfit: Outfit, betas: Tensor, style: Tensor | None = None) -> Wearer:
+        """Of betas (B, 10) and style (B, 4), the mean style if not given. Differentiable.
+
+        Raises:
+            GarmentError: a style for a garment that has one style only.
+        """
+        mean = betas.new_zeros(1, betas.shape[1])
+        garments = {}
+        for name, one in outfit.wearables.items():
+            rest = one.template.rest(betas, style)
+            on_mean = one.template.rest(mean, style).expand_as(rest)
+            garments[name] = UnposedGarment(rest, on_mean, one.backbone.wearer_code(betas, style))
+        given = betas.new_zeros(len(betas), N_STYLES) if style is None else style
+        return cls(outfit, betas, given, outfit.body.shape(betas), garments)
+
+    @classmethod
+    def of_tensors(cls, outfit: Outfit, tensors: Mapping[str, Tensor]) -> Wearer:
+        """The inverse of `tensors`."""
+        garments = {
+            name: UnposedGarment(*(tensors.get(f"{name}/{field}") for field in UnposedGarment._fields))  # type: ignore[arg-type]
+            for name in outfit.wearables
+        }
+        shape = Shape(tensors["vertices"], tensors["joints"])
+        return cls(outfit, tensors["betas"], tensors["style"], shape, garments)
+
+    @classmethod
+    def together(cls, wearers: Sequence[Wearer]) -> Wearer:
+        """The persons of several in the same outfit, one after another."""
+        if len(wearers) == 1:
+            return wearers[0]
+        each = [wearer.tensors() for wearer in wearers]
+        return cls.of_tensors(wearers[0].outfit, {name: torch.cat([one[name] for one in each]) for name in each[0]})
+
+    def tensors(self) -> dict[str, Tensor]:
+        """All that it holds but the outfit, by name; each tensor leads with B."""
+        found = {"betas": self.betas, "style": self.style}
+        found |= {"vertices": self.shape.vertices, "joints": self.shape.joints}
+        for name, garment in self.garments.items():
+            found |= {f"{name}/{field}": tensor for field, tensor in garment._asdict().items() if tensor is not None}
+        return found
+
+
+def _cast(wearable: Wearable, dtype: torch.dtype) -> Wearable:
+    network, refu = copy.deepcopy((wearable.backbone, wearable.refu))
+    if isinstance(network, nn.Module):
+        network.to(dtype)
+    if refu is not None:
+        refu.to(dtype)
+    return replace(wearable, template=wearable.template.to(dtype=dtype), backbone=network, refu=refu)

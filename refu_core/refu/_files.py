@@ -1,0 +1,75 @@
+"""The ReFU layer on disk: its tensors lie with the backbone's that it was trained with."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from refu_core.backbones import Backbone, Skinned, backbone_from_weights, backbone_weights
+from refu_core.errors import WeightsError
+from refu_core.garments import GarmentTemplate
+from refu_core.modes import MAX_MARGIN
+from refu_core.refu._layer import Refu
+from refu_core.weights import Weights, build_for
+
+_PREFIX = "refu."
+
+
+def refu_tensors(refu: Refu, *, half: bool = True) -> dict[str, Tensor]:
+    """The layer's tensors by the names they have on disk; beside them the card needs `refu.config` as `refu`."""
+    return {_PREFIX + name: t.half() if half else t for name, t in refu.state_dict().items()}
+
+
+class Trained(NamedTuple):
+    """What training made."""
+
+    backbone: Backbone
+    refu: Refu | None
+    """None where it was trained without."""
+
+
+def load_trained(
+    name: str,
+    garment: GarmentTemplate,
+    *,
+    mode: str,
+    body_fingerprint: str | None = None,
+    folder: Path | None = None,
+    device: str | torch.device = "cpu",
+) -> Trained:
+    """The backbone `name` of a garment and the layer that was trained with it, each file read once.
+
+    Arguments and errors are those of `refu_core.backbones.load_backbone`.
+    """
+    weights = backbone_weights(name, garment.name, mode=mode, body_fingerprint=body_fingerprint, folder=folder)
+    return Trained(Skinned(), None) if weights is None else trained_from_weights(weights, garment, device=device)
+
+
+def trained_from_weights(weights: Weights, garment: GarmentTemplate, *, device: str | torch.device = "cpu") -> Trained:
+    """The backbone and the layer in `weights`, ready for use.
+
+    Raises:
+        WeightsError: of another version or garment, or the basis beside them is missing, damaged or another one.
+    """
+    backbone: Backbone = backbone_from_weights(weights, garment, device=device).requires_grad_(False)
+    return Trained(backbone, _refu(weights, device))
+
+
+def _refu(weights: Weights, device: str | torch.device) -> Refu | None:
+    config = weights.card.get("refu")
+    if config is None:
+        return None
+    tensors = {k[len(_PREFIX) :]: v.float() for k, v in weights.tensors.items() if k.startswith(_PREFIX)}
+    try:
+        refu = build_for(tensors, lambda: Refu.from_config(config))
+        if not 0 <= float(refu.margin) <= MAX_MARGIN or not 0 <= refu.config["least"] <= 1:
+            got = f"{float(refu.margin):g} m and {refu.config['least']:g}"
+            msg = f"wanted a margin of 0 to {MAX_MARGIN} m and a least scale of 0 to 1, got {got}; train it again"
+            raise WeightsError(msg)
+    except WeightsError as error:
+        msg = f"{weights.path}: its ReFU layer doesn't fit its card: {error}"
+        raise WeightsError(msg) from error
+    return refu.to(device).eval().requires_grad_(False)

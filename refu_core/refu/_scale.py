@@ -1,0 +1,228 @@
+"""The learned moving offset: networks h, k and g that predict how far each pushed vertex goes (paper, Eq. 5, 6)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from refu_core.body import rotvec_to_rotmat
+from refu_core.errors import WeightsError
+
+ScaleKind = Literal["vertex", "shared", "distance"]
+VertexScale = Callable[[Tensor, Tensor], Tensor]
+"""α of some vertices of one body: (their numbers (R,), their signed distances [m] (R,)) to (R,)."""
+
+N_INPUTS = 10 + 69 + 3 + 4
+"""β, the pose without the root, the direction of up as the root sees it, γ."""
+_DISTANCE_UNIT = 0.01
+"""g reads distances in cm: so they are about as large as the latent vector that it reads beside them."""
+_SHARPNESS = 20.0
+"""Of the softplus that keeps α in its range: it starts at 1.03 (least 1) or 1.00 (least 0), with a steep derivative."""
+_MAX_SCALE = 100.0
+
+
+@dataclass(frozen=True)
+class ScaleSettings:
+    """Sizes of the networks; the presets `PAPER` and `REALTIME` are the two that are meant to be used."""
+
+    kind: ScaleKind = "vertex"
+    """`vertex` is α = g(k(z)_i, f), the paper's choice; `shared` g(k'(z), f) with as many weights ("Alt. 1" of the
+    supplement's Sec. E); `distance` g'(f) ("Alt. 2")."""
+    feature_size: int = 64
+    """M, size of the garment's global feature z."""
+    hidden_size: int = 128
+    """Width of h's two hidden layers."""
+    latent_size: int = 10
+    """D, size of a vertex's latent vector, and the width of g's hidden layer."""
+    is_compact: bool = True
+    """Whether k is a product of an embedding of the vertex (N, D) and a projection of z (D), instead of one dense layer
+    (M to N · D) of 10 million weights for a thousand vertices."""
+
+
+PAPER = ScaleSettings(feature_size=1024, hidden_size=1024, latent_size=10, is_compact=False)
+"""Exactly the paper's (Sec. 4.2): h of three layers of 1024, k of one of N × 10, g of two of 10; ReLU."""
+REALTIME = ScaleSettings()
+"""For a CPU in real time: about 115,000 weights for a T-shirt instead of 80 million."""
+SCALE_PRESETS: dict[str, ScaleSettings] = {"paper": PAPER, "realtime": REALTIME}
+
+
+class ScaleNet(nn.Module):
+    """α_i = g(k(z)_i, f(x_i)) for z = h(β, θ, γ), or for the feature z that a backbone gives (Eq. 5, 6).
+
+    k and g are evaluated for the vertices asked for, and no others: in a frame those are the pushed ones, a tenth of
+    the garment. A network that hasn't been trained answers α ≈ 1 everywhere, the paper's fixed scale.
+    """
+
+    def __init__(
+        self,
+        n_vertices: int,
+        *,
+        least: float,
+        settings: ScaleSettings = REALTIME,
+        feature_size: int | None = None,
+    ) -> None:
+        """Networks for garments of `n_vertices` N.
+
+        Args:
+            n_vertices: N.
+            least: lower end of α's range: 1 with an accurate distance, so that no pushed vertex stays inside; 0 with an
+                approximate one, which may have to be corrected downwards.
+            settings: sizes.
+            feature_size: M of a backbone that gives its own feature z; there is no h then.
+        """
+        super().__init__()
+        self.n_vertices, self.least, self.settings = n_vertices, least, settings
+        self.has_encoder = feature_size is None and settings.kind != "distance"
+        m, d = feature_size or settings.feature_size, settings.latent_size
+        if self.has_encoder:
+            self.h = nn.Sequential(
+                nn.Linear(N_INPUTS, settings.hidden_size),
+                nn.ReLU(),
+                nn.Linear(settings.hidden_size, settings.hidden_size),
+                nn.ReLU(),
+                nn.Linear(settings.hidden_size, m),
+                nn.ReLU(),
+            )
+        if settings.kind == "vertex":
+            latent = d
+            self.k: nn.Module = (
+                _CompactLatent(m, n_vertices, d) if settings.is_compact else _DenseLatent(m, n_vertices, d)
+            )
+        elif settings.kind == "shared":
+            latent = _shared_latent_size(m, n_vertices, settings)
+            self.k = nn.Linear(m, latent)
+        else:
+            latent = 0
+        last = nn.Linear(d, 1)
+        # It starts at nothing, so that training starts from the fixed scale and departs from it as far as it pays.
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+        self.g = nn.Sequential(nn.Linear(latent + 1, d), nn.ReLU(), last)
+
+    def feature(self, betas: Tensor, pose: Tensor, style: Tensor | None, given: Tensor | None = None) -> Tensor:
+        """z, shape (B, M), of betas (B, 10), pose (B, 24, 3) [rad] and style (B, 4); `given` where a backbone has one.
+
+        Raises:
+            WeightsError: the network was built for a backbone that gives its own feature, and it gave none.
+        """
+        if self.has_encoder:
+            z: Tensor = self.h(scale_inputs(betas, pose, style))
+            return z
+        if self.settings.kind == "distance":
+            return betas[:, :0]
+        if given is None:
+            msg = "these weights read the backbone's feature z, and the backbone gave none: load the one they belong to"
+            raise WeightsError(msg)
+        return given
+
+    def forward(self, z: Tensor, body: Tensor, vertex: Tensor, distance: Tensor) -> Tensor:
+        """α, shape (R,), of vertices number `vertex` (R,) of bodies number `body` (R,) with features z (B, M).
+
+        `distance` is their signed distance f [m], shape (R,). Differentiable with respect to z, f and the weights.
+        """
+        f = distance[:, None] / _DISTANCE_UNIT
+        if self.settings.kind == "vertex":
+            inputs = torch.cat((self.k(z, body, vertex), f), dim=1)
+        elif self.settings.kind == "shared":
+            inputs = torch.cat((self.k(z)[body], f), dim=1)
+        else:
+            inputs = f
+        return self._in_range(self.g(inputs)[:, 0])
+
+    def _in_range(self, raw: Tensor) -> Tensor:
+        """α of what g says, near 1 where that is near 0."""
+        # A pose far beyond training may overflow the networks; α = 1 is right to first order.
+        usual = 1 - self.least
+        bounded = torch.nan_to_num(raw + usual, nan=usual, posinf=_MAX_SCALE, neginf=-_MAX_SCALE)
+        alpha: Tensor = self.least + functional.softplus(bounded, beta=_SHARPNESS).clamp_max(_MAX_SCALE)
+        return alpha
+
+    def of_body(self, z: Tensor) -> VertexScale:
+        """α as `Resolver` asks for it, for the one body whose feature is z, shape (M,) or (1, M)."""
+        row = z.reshape(1, -1)
+        k = self.k if self.settings.kind == "vertex" else None
+        if isinstance(k, _CompactLatent):
+            return self._of_body_compact(k, row)
+
+        def scale(vertex: Tensor, distance: Tensor) -> Tensor:
+            alpha: Tensor = self(row, torch.zeros_like(vertex), vertex, distance)
+            return alpha
+
+        return scale
+
+    def _of_body_compact(self, k: _CompactLatent, z: Tensor) -> VertexScale:
+        """The same of a compact k, in half the time: z's factor of k goes into g's first layer, once a body."""
+        first, bias, last, last_bias = self.g.parameters()
+        inputs = torch.cat((k.projection(z), z.new_full((1, 1), 1 / _DISTANCE_UNIT)), dim=1)
+        weight = (first * inputs).T
+
+        def scale(vertex: Tensor, distance: Tensor) -> Tensor:
+            hidden = torch.addmm(bias, k.embedding[vertex], weight[:-1])
+            hidden = functional.relu(hidden + torch.outer(distance, weight[-1]))
+            return self._in_range(torch.addmv(last_bias, hidden, last[0]))
+
+        return scale
+
+
+def scale_inputs(betas: Tensor, pose: Tensor, style: Tensor | None) -> Tensor:
+    """What h reads, shape (B, 86), from betas (B, 10), pose (B, 24, 3) [rad] and style (B, 4) or None for the mean one.
+
+    The root's rotation enters as the direction of gravity, which is all of it that a garment can feel; the other
+    rotation vectors with angles up to π, as nobody promises to send them.
+    """
+    angle = torch.linalg.vector_norm(pose, dim=-1, keepdim=True)
+    wrapped = torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
+    joints = pose * (wrapped / angle.clamp_min(1e-6))
+    up = rotvec_to_rotmat(joints[:, 0])[:, 1]
+    gamma = betas.new_zeros(len(betas), 4) if style is None else style
+    return torch.cat((betas, joints[:, 1:].flatten(1), up, gamma), dim=1)
+
+
+class _DenseLatent(nn.Module):
+    """k(z)_i by one dense layer M to N · D, of which the rows of the vertices asked for are multiplied."""
+
+    def __init__(self, m: int, n: int, d: int) -> None:
+        super().__init__()
+        bound = 1 / math.sqrt(m)
+        self.weight = nn.Parameter(torch.empty(n, d, m).uniform_(-bound, bound))
+        self.bias = nn.Parameter(torch.empty(n, d).uniform_(-bound, bound))
+
+    def forward(self, z: Tensor, body: Tensor, vertex: Tensor) -> Tensor:
+        if len(z) == 1:
+            return functional.relu(self.weight[vertex] @ z[0] + self.bias[vertex])
+        # Of a batch, the vertices that any of the bodies asks for: one product, and each row is read once.
+        asked, where = torch.unique(vertex, return_inverse=True)
+        latent = torch.einsum("bm,udm->bud", z, self.weight[asked]) + self.bias[asked]
+        return functional.relu(latent[body, where])
+
+
+class _CompactLatent(nn.Module):
+    """k(z)_i as an embedding of the vertex times a small projection of z."""
+
+    def __init__(self, m: int, n: int, d: int) -> None:
+        super().__init__()
+        self.embedding = nn.Parameter(torch.empty(n, d))
+        self.projection = nn.Linear(m, d)
+        if self.embedding.is_meta:  # where only sizes are tried out, `normal_` makes torch import all of its compiler
+            return
+        nn.init.normal_(self.embedding)
+        # Starts at what all poses have in common.
+        nn.init.normal_(self.projection.weight, std=0.1 / math.sqrt(m))
+        nn.init.ones_(self.projection.bias)
+
+    def forward(self, z: Tensor, body: Tensor, vertex: Tensor) -> Tensor:
+        latent: Tensor = self.embedding[vertex] * self.projection(z)[body]
+        return latent
+
+
+def _shared_latent_size(m: int, n: int, settings: ScaleSettings) -> int:
+    """D' for which k' and g have as many weights as k and g of the kind `vertex`."""
+    d = settings.latent_size
+    k = n * d + (m + 1) * d if settings.is_compact else n * d * (m + 1)
+    return max(1, round((k + d * d) / (m + 1 + d)))

@@ -1,0 +1,71 @@
+"""A posed body as kernels of one's own ask it for distances: whichever way a `MeshSdf` finds the closest face."""
+
+import warp as wp
+
+from refu_core.sdf._box_kernels import Boxes, closest_in_boxes, guess, is_beyond
+from refu_core.sdf._closest_kernels import PosedMesh, distance_to_face, measured_to
+from refu_core.sdf._walk_kernels import Guides, walk_from
+
+_UNLIMITED = wp.constant(1e18)
+# A known face's distance is a limit to the closest one's; rounding must not cut that one off.
+_SLACK = wp.constant(1e-6)
+
+
+@wp.struct
+class Skin:
+    """One posed body: `MeshSdf.skin` gives it."""
+
+    tree: wp.uint64
+    """Warp's mesh where the closest face is looked for in its tree; 0 where not."""
+    boxes: Boxes
+    """Those where it is looked for; without faces where not."""
+    mesh: PosedMesh
+    guides: Guides
+    """Where it is walked to."""
+
+
+@wp.func
+def query_skin(skin: Skin, p: wp.vec3, near: int) -> tuple[float, wp.vec3, int]:
+    """Signed distance at p [m], its unit gradient, and the closest face; `near` is a face near by, or -1."""
+    face = int(near)
+    if skin.boxes.order.shape[0] > 0:
+        if near < 0:
+            face = guess(p, skin.boxes)
+        face = closest_in_boxes(p, face, skin.boxes, skin.mesh)
+    elif skin.tree != wp.uint64(0):
+        limit = float(_UNLIMITED)
+        if near >= 0:
+            known = distance_to_face(p, near, skin.mesh)
+            limit = known * (1.0 + _SLACK) + _SLACK
+        hit = wp.mesh_query_point_no_sign(skin.tree, p, limit)
+        if hit.result:
+            face = hit.face
+    else:
+        face, _feature, _w, _above = walk_from(p, near, skin.mesh, skin.guides)
+    distance, gradient = measured_to(p, face, skin.mesh)
+    if distance < 0.0 and skin.boxes.order.shape[0] > 0 and is_beyond(p, skin.boxes):
+        # A thousand kilometres off all faces are equally far, and rounding may have taken one of the other side.
+        distance = -distance
+        gradient = -gradient
+    return distance, gradient, face
+
+
+@wp.kernel(enable_backward=False)
+def query_skin_kernel(
+    skin: Skin,
+    queries: wp.array[wp.vec3],
+    near: wp.array[int],
+    rows: wp.array[int],
+    # outputs
+    out_face: wp.array[int],
+    out_distance: wp.array[float],
+    out_gradient: wp.array[wp.vec3],
+) -> None:
+    """`query_skin` at the queries numbered `rows`, or at all where there are no rows; `near` has a face of each."""
+    i = wp.tid()
+    if rows.shape[0] > 0:
+        i = rows[i]
+    distance, gradient, face = query_skin(skin, queries[i], near[i])
+    out_face[i] = face
+    out_distance[i] = distance
+    out_gradient[i] = gradient

@@ -1,0 +1,117 @@
+"""Winding numbers of points by the faces that lie straight before or behind them: one code for CPU and CUDA.
+
+The points are listed by the cells of a grid over x and y, those of the front half apart from those of the back half.
+A point in front looks along +z, one behind along -z, so that most see nothing. Which faces a line crosses is decided
+in double precision, where differences of float32 are exact, and each edge says the same to both of its faces: so no
+line slips between two faces, or crosses both.
+"""
+
+import warp as wp
+
+from refu_core.sdf._band_kernels import greater, lesser
+
+# Contracted multiply-adds would round a x b and b x a differently.
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+CELLS = wp.constant(64)
+"""Cells of the grid along x and along y."""
+_ZERO = wp.constant(wp.float64(0.0))
+
+
+@wp.func
+def cell_along(x: float, low: float, per_metre: float) -> int:
+    cell = int((x - low) * per_metre)
+    cell = wp.where(cell < CELLS, cell, CELLS - 1)
+    return wp.where(cell > 0, cell, 0)
+
+
+@wp.func
+def difference(p: wp.vec3, q: wp.vec3) -> wp.vec3d:
+    return wp.vec3d(
+        wp.float64(p[0]) - wp.float64(q[0]), wp.float64(p[1]) - wp.float64(q[1]), wp.float64(p[2]) - wp.float64(q[2])
+    )
+
+
+@wp.func
+def turns(a: wp.vec3d, b: wp.vec3d) -> int:
+    """How an edge from a to b goes around the z axis, as it passes on the side of -x or +x; each end counts once."""
+    rises = a[1] <= _ZERO
+    if rises == (b[1] <= _ZERO):
+        return 0
+    side = a[0] * b[1] - a[1] * b[0]
+    if rises:
+        return wp.where(side > _ZERO, 1, 0)
+    return wp.where(side < _ZERO, -1, 0)
+
+
+@wp.kernel
+def bin_kernel(
+    points: wp.array[wp.vec3],
+    grid: wp.array[wp.vec3],
+    # outputs
+    first: wp.array[int],
+    following: wp.array[int],
+    farthest_in: wp.array[float],
+) -> None:
+    """Lists the points by cell; `farthest_in` is the least distance of a cell's points before the middle plane."""
+    q = wp.tid()
+    p = points[q]
+    ahead = p[2] - grid[3][2]
+    cell = cell_along(p[1], grid[0][1], grid[2][1]) * CELLS + cell_along(p[0], grid[0][0], grid[2][0])
+    if ahead < 0.0:
+        cell += CELLS * CELLS
+    following[q] = wp.atomic_exch(first, cell, q)
+    wp.atomic_min(farthest_in, cell, wp.abs(ahead))
+
+
+@wp.kernel
+def crossings_kernel(
+    body: wp.array[wp.vec3],
+    faces: wp.array[wp.vec3i],
+    points: wp.array[wp.vec3],
+    grid: wp.array[wp.vec3],
+    first: wp.array[int],
+    following: wp.array[int],
+    farthest_in: wp.array[float],
+    # output
+    winding: wp.array[int],
+) -> None:
+    """Each face adds itself to the winding numbers of the points that look through it."""
+    corners = faces[wp.tid()]
+    a = body[corners[0]]
+    b = body[corners[1]]
+    c = body[corners[2]]
+    low = grid[0]
+    high = grid[1]
+    box_low = lesser(lesser(a, b), c)
+    box_high = greater(greater(a, b), c)
+    if box_low[1] > high[1] or box_high[1] < low[1] or box_low[0] > high[0] or box_high[0] < low[0]:
+        return
+    per_metre = grid[2]
+    middle = grid[3][2]
+    front = box_high[2] - middle
+    back = middle - box_low[2]
+    i0 = cell_along(box_low[0], low[0], per_metre[0])
+    i1 = cell_along(box_high[0], low[0], per_metre[0])
+    j0 = cell_along(box_low[1], low[1], per_metre[1])
+    j1 = cell_along(box_high[1], low[1], per_metre[1])
+    normal = wp.cross(difference(b, a), difference(c, a))
+    for half in range(2):
+        reach = wp.where(half == 0, front, back)
+        if reach >= 0.0:
+            for j in range(j0, j1 + 1):
+                row = (half * CELLS + j) * CELLS
+                for cell in range(row + i0, row + i1 + 1):
+                    if farthest_in[cell] <= reach:
+                        q = int(first[cell])
+                        while q >= 0:
+                            p = points[q]
+                            to_a = difference(a, p)
+                            ahead = wp.dot(normal, to_a) * normal[2]
+                            if (half == 0 and ahead > _ZERO) or (half == 1 and ahead < _ZERO):
+                                to_b = difference(b, p)
+                                to_c = difference(c, p)
+                                passes = turns(to_a, to_b) + turns(to_b, to_c) + turns(to_c, to_a)
+                                if passes != 0:
+                                    wp.atomic_add(winding, q, wp.where(half == 0, passes, -passes))
+                            q = following[q]

@@ -1,0 +1,70 @@
+"""Making a data set of samples."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from refu_core.simulation._plan import SamplePlan
+from refu_core.simulation._poses import Clip, load_clips, split_clips
+from refu_core.simulation._produce import Progress, produce
+from refu_core.simulation._summary import summarise, write_asked
+from refu_core.simulation._worker import SimulationSettings, SlotSimulator
+
+
+def simulate_dataset(
+    garment: str,
+    count: int,
+    output: str | Path,
+    *,
+    motions: str | Path | None = None,
+    body: str | Path | None = None,
+    seed: int = 0,
+    processes: int = 1,
+    shard: tuple[int, int] = (0, 1),
+    test_share: float = 1 / 6,
+    settings: SimulationSettings | None = None,
+    progress: Callable[[Progress], None] | None = None,
+) -> dict[str, Any]:
+    """Simulates a data set of `count` samples of a built-in garment, or goes on with one that was interrupted.
+
+    The same arguments give the same samples, whatever `processes` and `shard` are and however often the work was
+    interrupted. Finished samples are on disk at any time and can be read while others are made.
+
+    Args:
+        garment: `tshirt-male` or another built-in garment.
+        count: samples in the set, training and test together, over all shards.
+        output: directory of the set; it is made, or must hold the beginning of the same set.
+        motions: a folder of AMASS-style `.npz` files, two at least; None for drawn poses alone.
+        body: name or file of a body; None for the one the garment was cut for.
+        seed: of everything that is drawn.
+        processes: how many processes share the work, one thread each.
+        shard: (i, n): this run makes the i-th of n parts of the set, counted from 0.
+        test_share: share of the samples that is kept for the test.
+        settings: of simulation and selection.
+        progress: called in this process after each slot.
+
+    Returns:
+        The card of the set, as it stands in `card.json`.
+
+    Raises:
+        SimulationError: motions of another layout, a full disk, a directory that holds another set, a shard that
+            another run is writing, or a process that was killed (what is finished is kept; run again to go on).
+        MeshError: the body isn't watertight.
+        BodyError, GarmentError: no such body or garment.
+    """
+    output = Path(output)
+    clips: tuple[list[Clip], list[Clip]] = ([], [])
+    plan = SamplePlan(garment, count, seed=seed, test_share=test_share)
+    if motions is None:
+        plan = replace(plan, recorded_share=0.0)
+    else:
+        clips = split_clips(load_clips(motions))
+    make = partial(SlotSimulator, plan, clips, settings or SimulationSettings(), body)
+    produce(make, output, processes=processes, shard=shard, progress=progress)
+    card = summarise(output)
+    write_asked(output, plan, clips)
+    return card

@@ -1,0 +1,1 @@
+"""The commands of `refu`, and all that measures; imported by none of the other packages."""

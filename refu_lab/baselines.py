@@ -1,0 +1,106 @@
+"""The post-processes that the paper compares itself with: naive, and by optimisation. NumPy and SciPy, one garment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csr_array, eye_array, kron
+from scipy.sparse.linalg import cg
+from torch import Tensor
+
+from refu_core.mesh import Connectivity
+from refu_core.refu import repulse
+from refu_core.sdf import BodySdf
+
+DRAPE_ROUNDS: tuple[tuple[float, float], ...] = ((4.0, 0.8), (2.0, 0.6), (1.0, 0.4))
+"""(λ_s, λ_d) of each round of Guan et al. 2012."""
+_CLEARANCE = 0.001
+
+
+@torch.no_grad()
+def push_naively(points: Tensor, sdf: BodySdf, *, near: Tensor | None = None) -> Tensor:
+    """The naive post-process (paper, Sec. 4.5): x + |f(x)| ∇f/|∇f| for vertices inside, onto the skin exactly.
+
+    Args:
+        points: Garment vertices [m], shape (N, 3), in the frame of the body last given to `sdf`.
+        sdf: The body's signed distance.
+        near: A body face near each vertex, shape (N,), where `sdf` asks for such hints.
+    """
+    return repulse(points, sdf.query(points, near=near))
+
+
+@dataclass(frozen=True, eq=False)
+class PostProcess:
+    """Post-processes by least squares for garments of one mesh, whose Laplacian is built once."""
+
+    laplacian: csr_array
+    """Uniform: x_i minus the mean of its neighbours, shape (N, N)."""
+
+    @classmethod
+    def of_faces(cls, faces: Tensor | NDArray[np.int64], n_vertices: int) -> PostProcess:
+        """For garments of these `faces`, shape (G, 3), and `n_vertices` N.
+
+        Raises:
+            MeshError: A face that names a vertex there isn't.
+        """
+        mesh = Connectivity.of(faces.cpu() if isinstance(faces, Tensor) else faces, n_vertices)
+        return cls(mesh.uniform_laplacian())
+
+    @torch.no_grad()
+    def optimise(
+        self,
+        points: Tensor,
+        sdf: BodySdf,
+        *,
+        clearance: float = _CLEARANCE,
+        reach: float = 0.0,
+        near: Tensor | None = None,
+    ) -> Tensor:
+        """The optimisation of DRAPE (Guan et al. 2012), the paper's "Opt. Post-Process": garment vertices [m], (N, 3).
+
+        Each round minimises p + λ_s s + λ_d d over the garment y, with ỹ what the round before has left:
+        p = Σ (nᵢᵀ(yᵢ - bᵢ) - ε)² over the vertices inside, bᵢ the closest point of the skin and nᵢ its normal;
+        s = Σ |(yᵢ - ỹᵢ) - mean over neighbours of (y - ỹ)|²; d = Σ |yᵢ - ỹᵢ|². Pairs (i, bᵢ) are found anew each round.
+        DRAPE leaves ε open, and takes the closest vertex for bᵢ; the closest point is its better.
+
+        Args:
+            points: Garment vertices [m], shape (N, 3).
+            sdf: The body's signed distance.
+            clearance: ε, how far outside the vertices are to end [m].
+            reach: Vertices that are nearer to the skin than this are brought to `clearance`, too [m]. DRAPE's is 0:
+                only those inside are, and edges between others may still cut through the body.
+            near: As `push_naively`.
+        """
+        for smoothness, damping in DRAPE_ROUNDS:
+            sample = sdf.query(points, near=near)
+            rows = torch.nonzero(sample.distance < reach)[:, 0]
+            if not len(rows):
+                break
+            found = sample.rows(rows)
+            normal, distance = (x.double().cpu().numpy() for x in (found.gradient, found.distance))
+            deficit = clearance - distance
+            points = points + self._drape_round(rows.cpu().numpy(), normal, deficit, smoothness, damping).to(points)
+        return points
+
+    def _drape_round(
+        self,
+        inside: NDArray[np.int64],
+        normal: NDArray[np.float64],
+        deficit: NDArray[np.float64],
+        smoothness: float,
+        damping: float,
+    ) -> Tensor:
+        """Displacement y - ỹ that solves one round, shape (N, 3)."""
+        n = self.laplacian.shape[0]
+        # nᵀ(y - b) - ε = nᵀu - (ε - f) for the displacement u: one row for each vertex inside, three columns each.
+        columns = 3 * inside[:, None] + np.arange(3)
+        rows = np.repeat(np.arange(len(inside)), 3)
+        push = coo_array((normal.ravel(), (rows, columns.ravel())), shape=(len(inside), 3 * n)).tocsr()
+        smooth = self.laplacian.T @ self.laplacian * smoothness + damping * eye_array(n)
+        # Damping bounds the condition number by about 40: conjugate gradients need no factorisation.
+        solution, failed = cg(push.T @ push + kron(smooth, eye_array(3)), push.T @ deficit, rtol=1e-8, maxiter=1000)
+        assert not failed
+        return torch.from_numpy(solution.reshape(n, 3))

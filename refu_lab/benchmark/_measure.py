@@ -1,0 +1,145 @@
+"""Times that can be compared: contenders in turn, in one process, on one core, by the processor's clock."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import os
+import time
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from time import perf_counter, process_time
+from typing import TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from refu_core._device import one_thread
+
+Input = TypeVar("Input")
+
+
+@dataclass(frozen=True, eq=False)
+class Timing:
+    """How long one contender took, call by call."""
+
+    cpu_ms: NDArray[np.float64]
+    """The processor's time of each call, all threads of the process together [ms], shape (n,)."""
+    wall_ms: NDArray[np.float64]
+    """Wall time of each call [ms], shape (n,)."""
+    on_gpu: bool = False
+    """Whether the work was done elsewhere, so that the wall clock alone tells."""
+
+    @property
+    def ms(self) -> NDArray[np.float64]:
+        """The times to compare [ms], shape (n,): of the processor, which other processes don't disturb."""
+        return self.wall_ms if self.on_gpu else self.cpu_ms
+
+    @property
+    def median(self) -> float:
+        """[ms]."""
+        return float(np.median(self.ms))
+
+    @property
+    def quartiles(self) -> tuple[float, float]:
+        """Lower and upper [ms]."""
+        low, high = np.percentile(self.ms, (25, 75))
+        return float(low), float(high)
+
+    @property
+    def wall_median(self) -> float:
+        """[ms]."""
+        return float(np.median(self.wall_ms))
+
+
+@contextlib.contextmanager
+def one_core() -> Iterator[int | None]:
+    """One thread on one core, where the system lets a process choose; gives its number, None where it doesn't."""
+    allowed = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set()
+    core = max(allowed, default=None)
+    with one_thread():
+        try:
+            if core is not None:
+                os.sched_setaffinity(0, {core})
+            yield core
+        finally:
+            if core is not None:
+                os.sched_setaffinity(0, allowed)
+
+
+@contextlib.contextmanager
+def processor_clock() -> Iterator[None]:
+    """Inside, whatever reads `time.perf_counter` gets the processor's time.
+
+    A pipeline notes its stages by the wall clock, as its user wants to know them. On a machine that others use, too,
+    that says more about the others.
+    """
+    clock = time.perf_counter
+    vars(time)["perf_counter"] = time.process_time
+    try:
+        yield
+    finally:
+        vars(time)["perf_counter"] = clock
+
+
+def measure(
+    contenders: Mapping[str, Callable[[Input], object]],
+    windows: Sequence[Sequence[Input]],
+    *,
+    rounds: int,
+    slow: Collection[str] = (),
+    on_gpu: bool = False,
+    progress: Callable[[], object] = lambda: None,
+) -> dict[str, Timing]:
+    """Times contenders on the same inputs, in turn, so that a machine that gets slower gets slower for all of them.
+
+    Args:
+        contenders: What is timed, by name.
+        windows: Inputs that follow each other, two at least a window. The first of each is a jump for whoever
+            remembers the last one; it warms up and isn't counted.
+        rounds: How often every window is gone through. The order of the contenders moves on by one each time.
+        slow: Contenders that get one input of the first two windows alone, in the first round.
+        on_gpu: Wait for the GPU before and after each call.
+        progress: Called after every window of a contender.
+    """
+    times: dict[str, list[tuple[float, float]]] = {name: [] for name in contenders}
+    names = list(contenders)
+    with _no_collection():
+        for turn in range(rounds * len(windows)):
+            window = windows[turn % len(windows)]
+            start = turn % len(names)
+            for name in (*names[start:], *names[:start]):
+                if name in slow and turn >= min(2, len(windows)):
+                    continue
+                run = contenders[name]
+                if name not in slow:
+                    run(window[0])
+                for given in window[1:2] if name in slow else window[1:]:
+                    times[name].append(_timed(run, given, on_gpu=on_gpu))
+                progress()
+    found = {name: np.array(pairs) for name, pairs in times.items()}
+    return {name: Timing(pairs[:, 0], pairs[:, 1], on_gpu=on_gpu) for name, pairs in found.items()}
+
+
+def _timed(run: Callable[[Input], object], given: Input, *, on_gpu: bool) -> tuple[float, float]:
+    if on_gpu:
+        torch.cuda.synchronize()
+    wall, cpu = perf_counter(), process_time()
+    run(given)
+    if on_gpu:
+        torch.cuda.synchronize()
+    return 1e3 * (process_time() - cpu), 1e3 * (perf_counter() - wall)
+
+
+@contextlib.contextmanager
+def _no_collection() -> Iterator[None]:
+    """The collector would strike some contender for what all have left."""
+    was_enabled = gc.isenabled()
+    gc.collect()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()

@@ -1,0 +1,188 @@
+"""The signed distance of all of a garment's vertices to a body in a new pose: ours and others', on one thread."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+from numpy.typing import NDArray
+from torch import Tensor
+
+from refu_core.body import SmplBody
+from refu_core.garments import GarmentTemplate
+from refu_core.sdf import ApproxSdf, BandSdf, BodySdf, ExactSdf, Links, NeuralSdf, RestFaces, SdfNetwork
+
+Array = NDArray[np.float32]
+PLAIN_QUERY = "warp refit + query"
+"""What every time is a ratio to: a BVH of the rest pose, refitted to the body and asked for every vertex."""
+
+
+@wp.kernel(enable_backward=False)
+def plain_kernel(
+    mesh: wp.uint64,
+    points: wp.array[wp.vec3],
+    distance: wp.array[wp.float32],
+    gradient: wp.array[wp.vec3],
+) -> None:
+    """Warp's own query as its documentation has it: the signed distance [m] and its gradient at `points` [m]."""
+    i = wp.tid()
+    hit = wp.mesh_query_point_sign_normal(mesh, points[i], 10.0)
+    offset = points[i] - wp.mesh_eval_position(mesh, hit.face, hit.u, hit.v)
+    distance[i] = hit.sign * wp.length(offset)
+    gradient[i] = hit.sign * wp.normalize(offset)
+
+
+@dataclass(frozen=True, eq=False)
+class SdfFrame:
+    """A body and what it wears."""
+
+    body: Array
+    """Posed body [m], shape (V, 3)."""
+    garment: Array
+    """Posed garment [m], shape (N, 3)."""
+    unposed: Tensor
+    """The garment in the rest pose, β taken off [m], shape (N, 3)."""
+    pose: Tensor
+    """Shape (24, 3) [rad]."""
+    betas: Tensor
+    """Shape (10,)."""
+
+
+@dataclass(frozen=True, eq=False)
+class SdfMethod:
+    """One way to the distances."""
+
+    name: str
+    mode: str
+    """The pipeline's mode that works this way, or `other`."""
+    ask: Callable[[SdfFrame], Array]
+    """Signed distances [m], shape (N,), the preparation for the pose included."""
+    is_slow: bool = False
+    """Takes so long that few calls must do."""
+
+
+def sdf_methods(
+    body: SmplBody, garment: GarmentTemplate, *, network: bool = True, device: str = "cpu"
+) -> tuple[list[SdfMethod], dict[str, str]]:
+    """All methods whose library is installed, the plain query first; and what to install for the others, by name.
+
+    `network` asks for the paper's, which takes seconds a call on a CPU.
+    """
+    faces, rest = body.faces.cpu().numpy().astype(np.int32), body.v_template.cpu().numpy()
+    methods = [SdfMethod(PLAIN_QUERY, "plain", _plain(faces, rest, device))]
+    if device == "cpu":
+        methods.append(SdfMethod("band, exact (accurate)", "accurate", _band(body, garment)))
+    walk = _ours(ApproxSdf(body, device=device), body, device, rest_faces=RestFaces(body))
+    methods.append(SdfMethod("walk, approximate (hybrid, approx)", "hybrid", walk))
+    methods.append(SdfMethod("exact, unfiltered", "other", _ours(ExactSdf(faces, device=device), body, device)))
+    missing = {}
+    if device == "cpu":
+        winding = _ours(ExactSdf(faces, sign="winding", rebuild_distance=math.inf), body, device)
+        methods.append(SdfMethod("exact, sign by winding number", "other", winding, is_slow=True))
+        for name, module, package, make, is_slow in _OTHERS:
+            if importlib.util.find_spec(module) is None:
+                missing[name] = f"pip install {package}"
+            else:
+                methods.append(SdfMethod(name, "other", make(faces), is_slow=is_slow))
+    if network:  # as it is drawn: what it answers is nothing, what it costs is what it would cost trained
+        paper = NeuralSdf(SdfNetwork().to(body.device).eval().requires_grad_(False), body)
+        name = "paper's network, 9 x 1024, untrained"
+        methods.append(SdfMethod(name, "paper", _ours(paper, body, device), is_slow=True))
+    return methods, missing
+
+
+def _plain(faces: NDArray[np.int32], rest: Array, device: str) -> Callable[[SdfFrame], Array]:
+    mesh = wp.Mesh(wp.array(rest, dtype=wp.vec3, device=device), wp.array(faces.ravel(), dtype=wp.int32, device=device))
+
+    def ask(frame: SdfFrame) -> Array:
+        mesh.points.assign(frame.body)
+        mesh.refit()
+        n = len(frame.garment)
+        points = wp.array(frame.garment, dtype=wp.vec3, device=device, copy=False)
+        distance = wp.empty(n, dtype=float, device=device)
+        gradient = wp.empty(n, dtype=wp.vec3, device=device)
+        wp.launch(plain_kernel, n, [mesh.id, points], [distance, gradient], device=device)
+        answer: Array = distance.numpy()
+        return answer
+
+    return ask
+
+
+def _band(body: SmplBody, garment: GarmentTemplate) -> Callable[[SdfFrame], Array]:
+    sdf, links = BandSdf(body.faces), Links(garment.mesh.ring)
+
+    def ask(frame: SdfFrame) -> Array:
+        sdf.update(torch.from_numpy(frame.body))
+        answer: Array = sdf.clipped(torch.from_numpy(frame.garment), links).distance.numpy()
+        return answer
+
+    return ask
+
+
+def _ours(
+    sdf: BodySdf, body: SmplBody, device: str, *, rest_faces: RestFaces | None = None
+) -> Callable[[SdfFrame], Array]:
+    sdf.update(body.v_template.to(device), pose=torch.zeros(24, 3, device=device), betas=torch.zeros(10, device=device))
+
+    @torch.no_grad()
+    def ask(frame: SdfFrame) -> Array:
+        near = None if rest_faces is None else rest_faces(frame.unposed)
+        sdf.update(torch.from_numpy(frame.body).to(device), pose=frame.pose.to(device), betas=frame.betas.to(device))
+        answer: Array = sdf.query(torch.from_numpy(frame.garment).to(device), near=near).distance.cpu().numpy()
+        return answer
+
+    return ask
+
+
+def _libigl(faces: NDArray[np.int32]) -> Callable[[SdfFrame], Array]:
+    igl: Any = importlib.import_module("igl")
+    indices = faces.astype(np.int64)
+
+    def ask(frame: SdfFrame) -> Array:
+        sign = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
+        points, body = frame.garment.astype(np.float64), frame.body.astype(np.float64)
+        distance, *_ = igl.signed_distance(points, body, indices, sign_type=sign)
+        return np.asarray(distance, np.float32)
+
+    return ask
+
+
+def _open3d(faces: NDArray[np.int32]) -> Callable[[SdfFrame], Array]:
+    open3d: Any = importlib.import_module("open3d")
+    core = open3d.core
+
+    def ask(frame: SdfFrame) -> Array:
+        scene = open3d.t.geometry.RaycastingScene(nthreads=1)
+        scene.add_triangles(core.Tensor(frame.body), core.Tensor(faces.astype(np.uint32)))
+        answer: Array = scene.compute_signed_distance(core.Tensor(frame.garment), nthreads=1).numpy()
+        return answer
+
+    return ask
+
+
+def _trimesh(faces: NDArray[np.int32]) -> Callable[[SdfFrame], Array]:
+    trimesh: Any = importlib.import_module("trimesh")
+
+    def ask(frame: SdfFrame) -> Array:
+        mesh = trimesh.Trimesh(frame.body, faces, process=False)
+        closest, distance, face = trimesh.proximity.closest_point(mesh, frame.garment)
+        outward = ((frame.garment - closest) * mesh.face_normals[face]).sum(1)
+        return np.asarray(np.where(outward < 0, -distance, distance), np.float32)
+
+    return ask
+
+
+_Make = Callable[[NDArray[np.int32]], Callable[[SdfFrame], Array]]
+_OTHERS: tuple[tuple[str, str, str, _Make, bool], ...] = (
+    ("libigl signed_distance, pseudo-normal", "igl", "libigl", _libigl, False),
+    ("open3d RaycastingScene", "open3d", "open3d", _open3d, False),
+    ("trimesh closest_point", "rtree", "rtree", _trimesh, True),
+)
+"""Name, module that must be there, package that brings it, maker, whether it is slow."""

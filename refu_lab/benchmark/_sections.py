@@ -1,0 +1,213 @@
+"""The parts of a benchmark: each measures its contenders in turn with the plain query, and adds rows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from refu_core import GarmentPipeline, SmplFrame, load_body, load_garment
+from refu_core.realtime import FrameStats, GarmentMesh, PipelineOutput
+from refu_lab.benchmark._frames import FrameRunner
+from refu_lab.benchmark._inputs import Moment, Window
+from refu_lab.benchmark._measure import Timing, measure, processor_clock
+from refu_lab.benchmark._options import BenchmarkOptions
+from refu_lab.benchmark._paper import PaperSettings, PaperStructure
+from refu_lab.benchmark._rows import BenchmarkResult, BenchmarkRow
+from refu_lab.benchmark._sdfs import PLAIN_QUERY, SdfFrame, sdf_methods
+
+Pipelines = Mapping[tuple[str, str], GarmentPipeline]
+"""By backbone and mode, the default backbone, or the one that is there, first."""
+MAIN_MODES = ("hybrid", "accurate")
+"""Of which the stages and persons are measured."""
+GRAPH, LAUNCHES = "CUDA graph", "launch by launch"
+"""How a GPU is told what to do in a frame."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Section:
+    """What all sections of a garment share."""
+
+    garment: str
+    windows: Sequence[Window]
+    options: BenchmarkOptions
+    result: BenchmarkResult
+    progress: Callable[[], object]
+    device: str = "cpu"
+
+    def measure(
+        self, contenders: Mapping[str, Callable[[Any], object]], windows: Sequence[Sequence[Any]], **how: Any
+    ) -> dict[str, Timing]:
+        """`refu_lab.benchmark.measure` with this run's rounds."""
+        with nullcontext() if self.device == "cuda" else processor_clock():
+            return measure(
+                contenders,
+                windows,
+                rounds=self.options.sizes.rounds,
+                on_gpu=self.device == "cuda",
+                progress=self.progress,
+                **how,
+            )
+
+    def plain(self) -> Callable[[Moment], object]:
+        """The plain query on this section's device."""
+        garment = load_garment(self.garment)
+        methods, _ = sdf_methods(load_body(garment.body), garment, network=False, device=self.device)
+        return _of_sdf(methods[0].ask)
+
+    def add(self, stage: str, mode: str, timing: Timing, plain: Timing, **facts: Any) -> None:
+        """Adds a row."""
+        device = torch.cuda.get_device_name() if self.device == "cuda" else self.device
+        facts = {"garment": self.garment, "device": device, **facts}
+        self.result.rows.append(BenchmarkRow.of(timing, plain, stage=stage, mode=mode, **facts))
+
+
+def _of_sdf(ask: Callable[[SdfFrame], object]) -> Callable[[Moment], object]:
+    return lambda moment: ask(moment.sdf)
+
+
+def _of_frame(pipeline: GarmentPipeline) -> Callable[[Moment], object]:
+    return lambda moment: pipeline(moment.frame)
+
+
+def _always(run: Callable[[Moment], object], held: Moment) -> Callable[[Moment], object]:
+    return lambda _: run(held)
+
+
+def _backbone(pipelines: Pipelines) -> str:
+    return next(iter(pipelines))[0]
+
+
+def measure_sdfs(section: Section, *, network: bool) -> None:
+    """Every way to the distances, of the same vertices; the paper's `network`, too, where it is asked for."""
+    garment = load_garment(section.garment, device=section.device)
+    body = load_body(garment.body, device=section.device)
+    methods, missing = sdf_methods(body, garment, network=network, device=section.device)
+    section.result.missing.update(missing)
+    slow = {method.name for method in methods if method.is_slow}
+    times = section.measure({method.name: _of_sdf(method.ask) for method in methods}, section.windows, slow=slow)
+    for method in sorted(methods, key=lambda method: method.mode not in MAIN_MODES):
+        section.add(
+            "sdf", method.mode, times[method.name], times[PLAIN_QUERY], method=method.name, vertices=garment.n_vertices
+        )
+
+
+def measure_frames(
+    section: Section, pipelines: Pipelines, figures: Mapping[tuple[str, str], Mapping[str, float]]
+) -> None:
+    """Whole frames of every pipeline, and the stages of the main ones. `figures` are added to the rows."""
+    runners = frame_runners(section, pipelines)
+    names = {key: ", ".join(filter(None, key)) for key in runners}
+    contenders: dict[str, Callable[[Moment], object]] = {PLAIN_QUERY: section.plain()}
+    times = section.measure(contenders | {names[key]: runner for key, runner in runners.items()}, section.windows)
+    plain = times[PLAIN_QUERY]
+    n = load_garment(section.garment).n_vertices
+    for key, name in names.items():
+        backbone, mode, method = key
+        errors = {} if method == LAUNCHES else figures.get((backbone, mode), {})
+        facts = {"backbone": backbone, "vertices": n, "persons": 1, "method": method, "figures": errors}
+        section.add("frame", mode, times[name], plain, **facts)
+    for (backbone, mode, method), runner in runners.items():
+        if backbone == _backbone(pipelines) and mode in MAIN_MODES:
+            for stage, ms in runner.stage_times().items():
+                section.add(f"frame.{stage}", mode, Timing(ms, ms), plain, backbone=backbone, vertices=n, method=method)
+
+
+def frame_runners(section: Section, pipelines: Pipelines) -> dict[tuple[str, str, str | None], FrameRunner]:
+    """Of every pipeline, by backbone, mode and, of a GPU, method: the main ones are measured without graphs, too."""
+    on_gpu, backbone = section.device == "cuda", _backbone(pipelines)
+    runners = {(*key, GRAPH if on_gpu else None): FrameRunner.of(pipeline) for key, pipeline in pipelines.items()}
+    for mode in MAIN_MODES if on_gpu else ():
+        pipeline = section.options.load_pipeline(
+            section.garment, mode=mode, backbone=backbone, device=section.device, graph=False
+        )
+        runners[backbone, mode, LAUNCHES] = FrameRunner.of(pipeline)
+    return runners
+
+
+def measure_persons(section: Section, pipelines: Pipelines) -> None:
+    """One message a person in, one message of all out."""
+    counts, backbone = section.options.sizes.persons, _backbone(pipelines)
+    windows = section.windows
+    crowd = [
+        [tuple(windows[(i + person) % len(windows)][k] for person in range(max(counts))) for k in range(len(window))]
+        for i, window in enumerate(windows)
+    ]
+    plain = section.plain()
+    contenders: dict[str, Callable[[Any], object]] = {PLAIN_QUERY: lambda moments: plain(moments[0])}
+    for mode in MAIN_MODES:
+        contenders |= {f"{mode} {n}": FrameRunner.of(pipelines[backbone, mode], persons=n) for n in counts}
+    times = section.measure(contenders, crowd)
+    for mode in MAIN_MODES:
+        for n in counts:
+            timing = times[f"{mode} {n}"]
+            figures = {"ratio_to_one_person": timing.median / times[f"{mode} {counts[0]}"].median}
+            section.add("persons", mode, timing, times[PLAIN_QUERY], persons=n, backbone=backbone, figures=figures)
+
+
+def measure_still(section: Section, pipelines: Pipelines) -> None:
+    """The same pose again and again, beside one that moves: the whole frame, and the pipeline alone."""
+    contenders: dict[str, Callable[[Moment], object]] = {PLAIN_QUERY: section.plain()}
+    backbone, held = _backbone(pipelines), section.windows[0][1]
+    for mode in MAIN_MODES:
+        moving = pipelines[backbone, mode]
+        # A pipeline of its own: one that moves would make the other's pose a new one.
+        still = section.options.load_pipeline(section.garment, mode=mode, backbone=backbone, device=section.device)
+        contenders[f"{mode} moving"] = FrameRunner.of(moving)
+        contenders[f"{mode} still"] = _always(FrameRunner.of(still), held)
+        contenders[f"{mode} moving, pipeline"] = _of_frame(moving)
+        contenders[f"{mode} still, pipeline"] = _always(_of_frame(still), held)
+    times = section.measure(contenders, section.windows)
+    for mode in MAIN_MODES:
+        frame, pipeline = (
+            times[f"{mode} still{part}"].median / times[f"{mode} moving{part}"].median for part in ("", ", pipeline")
+        )
+        figures = {"share_of_frame": frame, "share_of_pipeline": pipeline}
+        section.add("unchanged", mode, times[f"{mode} still"], times[PLAIN_QUERY], backbone=backbone, figures=figures)
+
+
+def measure_paper(section: Section, pipelines: Pipelines) -> None:
+    """The paper's structure, frame by frame, on a GPU in half precision, too."""
+    full = section.options.sizes.has_network
+    types = (torch.float32, torch.bfloat16, torch.float16) if section.device == "cuda" else (torch.float32,)
+    for dtype in types:
+        settings = PaperSettings(dtype=dtype) if full else PaperSettings(pivots=2, width=64, dtype=dtype)
+        paper = PaperStructure(section.garment, settings=settings, device=section.device)
+        runner = FrameRunner(_dressing(paper, section.garment), {section.garment: load_garment(section.garment)})
+        contenders: dict[str, Callable[[Moment], object]] = {PLAIN_QUERY: section.plain(), "paper": runner}
+        contenders |= {mode: FrameRunner.of(pipelines[_backbone(pipelines), mode]) for mode in MAIN_MODES}
+        times = section.measure(contenders, section.windows[:2], slow={"paper"} if full else ())
+        plain = times[PLAIN_QUERY]
+        sizes = "dense, paper's sizes" if full else "dense, trial sizes"
+        facts = {"backbone": f"tailornet, {sizes}, {str(dtype).removeprefix('torch.')}", "persons": 1}
+        figures = {f"times_{mode}": times["paper"].median / times[mode].median for mode in MAIN_MODES}
+        figures["parameters"] = float(paper.n_parameters)
+        section.add("frame", "paper", times["paper"], plain, figures=figures, **facts)
+        for stage, ms in runner.stage_times().items():
+            section.add(f"frame.{stage}", "paper", Timing(ms, ms), plain, **facts)
+
+
+def _dressing(paper: PaperStructure, name: str) -> Callable[[Sequence[SmplFrame]], Sequence[PipelineOutput]]:
+    faces = load_garment(name).faces.numpy()
+
+    def dress(frames: Sequence[SmplFrame]) -> list[PipelineOutput]:
+        outputs = []
+        for frame in frames:
+            vertices = paper(frame)
+            mesh = GarmentMesh(np.nan_to_num(vertices), lambda: np.empty((0, 3), np.float32), faces, frame.transl)
+            outputs.append(PipelineOutput({name: mesh}, mesh.before, FrameStats(paper.stage_ms)))
+        return outputs
+
+    return dress
+
+
+OF_MAIN_GARMENT: Mapping[str, Callable[[Section, Pipelines], None]] = {
+    "persons": measure_persons,
+    "unchanged": measure_still,
+    "paper": measure_paper,
+}
+"""What is measured of the first garment alone, on every device."""

@@ -1,0 +1,75 @@
+"""Starts processes and says what they needed."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import suppress
+from pathlib import Path
+
+from refu_core import RefuError, WeightsError
+from refu_core.modes import DEFAULT_GARMENTS
+from refu_core.weights import load_weights, weights_folder
+from refu_lab.benchmark._options import BenchmarkOptions
+from refu_lab.benchmark._rows import BenchmarkRow
+
+TWO = DEFAULT_GARMENTS
+"""The garments that are loaded together."""
+
+
+def start_row(
+    options: BenchmarkOptions, *, mode: str, backbone: str, unit_ms: float, first_ever: bool = False
+) -> BenchmarkRow:
+    """A process that loads two garments and dresses one person: its seconds and its megabytes.
+
+    `first_ever` has it compile its kernels, as on a machine where nothing has run yet; `unit_ms` is the plain query's.
+    Without weights of both garments the skinned template is worn.
+
+    Raises:
+        RefuError: it failed.
+    """
+    sizes = _weights_mb(options, backbone, mode)
+    backbone = backbone if len(sizes) == len(TWO) else "skinned"
+    command = [sys.executable, str(Path(__file__).with_name("start.py"))]
+    command += ["--garments", ",".join(TWO), "--sdf", mode, "--backbone", backbone]
+    command += ["--weights", str(options.weights)] if options.weights is not None else []
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    with tempfile.TemporaryDirectory() as empty:
+        if first_ever:
+            environment["WARP_CACHE_PATH"] = empty
+        run = subprocess.run(
+            [*command, "--started", repr(time.time())], env=environment, capture_output=True, text=True, check=False
+        )
+    if run.returncode:
+        last = (run.stderr.strip().splitlines() or ["no word about it"])[-1]
+        msg = f"a process that was to dress one person failed: {last}"
+        raise RefuError(msg)
+    said = json.loads(run.stdout.strip().splitlines()[-1])
+    found = {key: float(value) for key, value in said.items() if value is not None}
+    ms = 1e3 * found.pop("first_mesh_cpu_s")
+    return BenchmarkRow(
+        stage="start",
+        mode=mode,
+        garment=",".join(TWO),
+        ms_median=ms,
+        ratio=ms / unit_ms,
+        wall_ms_median=1e3 * found.pop("first_mesh_s"),
+        method="first start ever" if first_ever else "again",
+        backbone=backbone,
+        figures={**found, **{f"weights_mb_{name}": size for name, size in sizes.items()}},
+    )
+
+
+def _weights_mb(options: BenchmarkOptions, backbone: str, mode: str) -> dict[str, float]:
+    """Size on disk of each garment's basis and networks [MB], by name; of those that there are."""
+    sizes = {}
+    for garment in TWO:
+        folder = weights_folder(garment, options.weights)
+        with suppress(WeightsError):
+            files = [*load_weights(folder / f"{backbone}-{mode}").files, *load_weights(folder / "basis").files]
+            sizes[garment] = sum(file.stat().st_size for file in files) / 1e6
+    return sizes

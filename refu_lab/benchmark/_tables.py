@@ -1,0 +1,138 @@
+"""The rows of a benchmark as tables, for a terminal and for a page."""
+
+from __future__ import annotations
+
+from refu_lab.benchmark._rows import BenchmarkResult, BenchmarkRow
+from refu_lab.reproduction import published_modes
+from refu_lab.tables import TextTable
+
+STAGES = ("decode", "body", "backbone", "sdf", "refu", "encode")
+_MODES = ("hybrid", "accurate")
+
+
+def tables(result: BenchmarkResult) -> list[TextTable]:
+    """All tables there are rows for."""
+    made = (frames, stages, sdfs, persons, unchanged, paper, starts)
+    return [table for table in (make(result) for make in made) if table.rows]
+
+
+def frames(result: BenchmarkResult) -> TextTable:
+    """Run time and error of every mode."""
+    rows: list[tuple[str, ...]] = []
+    for row in result.of("frame"):
+        if row.mode != "paper":
+            per_thousand = f"{1e3 * row.ms_median / row.vertices:.2f}" if row.vertices else "-"
+            errors = (_figure(row, "mpve_mm", 2), _figure(row, "vfcp_percent", 3), _figure(row, "cfmp_percent", 1))
+            name = ", ".join(filter(None, (row.garment, row.backbone, row.mode, row.method)))
+            rows.append((_where(row, name), *_times(row), per_thousand, *errors))
+    header = ("frame, bytes to bytes", *_TIMES, "ms / 1,000 vertices", "MPVE mm", "VFCP %", "CFMP %")
+    note = (
+        "Errors are those of the frames with ground truth in bags/eval_*: bodies and motion that were not trained on."
+    )
+    return TextTable("Every mode: run time and error", header, rows, note)
+
+
+def stages(result: BenchmarkResult) -> TextTable:
+    """Where the time goes."""
+    main = result.rows[0].garment
+    found = {
+        (row.stage, row.mode): f"{row.ms_median:.2f}"
+        for row in result.rows
+        if row.stage.startswith("frame.") and (row.garment, row.device) == (main, "cpu")
+    }
+    rows = [(stage, *(found.get((f"frame.{stage}", mode), "-") for mode in _MODES)) for stage in STAGES]
+    note = f"Of a {main}. sdf is taking over the pose, refu the distances and the pushes."
+    return TextTable("Stages of a frame", ("stage", *(f"{mode} ms" for mode in _MODES)), rows, note)
+
+
+def sdfs(result: BenchmarkResult) -> TextTable:
+    """Every way to the distances."""
+    rows = [(_where(row, f"{row.garment}: {row.method}"), *_times(row)) for row in result.of("sdf")]
+    note = "Of all vertices of a body's new pose, preparation included. The plain query is the unit of all ratios."
+    return TextTable("Every signed distance, of the same vertices", ("signed distance", *_TIMES), rows, note)
+
+
+def persons(result: BenchmarkResult) -> TextTable:
+    """Growth with persons."""
+    rows = [
+        (_where(row, f"{row.mode}, {row.persons}"), *_times(row), _figure(row, "ratio_to_one_person", 2))
+        for row in result.of("persons")
+    ]
+    return TextTable("Persons", ("mode, persons", *_TIMES, "to one person"), rows)
+
+
+def unchanged(result: BenchmarkResult) -> TextTable:
+    """The same pose again."""
+    rows = [
+        (
+            _where(row, row.mode),
+            *_times(row),
+            f"{100 * row.figures['share_of_frame']:.1f}",
+            f"{100 * row.figures['share_of_pipeline']:.1f}",
+        )
+        for row in result.of("unchanged")
+    ]
+    header = ("mode", *_TIMES, "% of a frame", "% of the pipeline")
+    note = "Bytes to bytes; the pipeline alone is without decoding and encoding."
+    return TextTable("Unchanged pose", header, rows, note)
+
+
+def paper(result: BenchmarkResult) -> TextTable:
+    """The paper's structure on the same core, and the paper's own figures."""
+    rows: list[tuple[str, ...]] = []
+    for row in result.of("frame", mode="paper"):
+        times = (_figure(row, "times_hybrid", 0), _figure(row, "times_accurate", 0))
+        rows.append((_where(row, f"here: {row.backbone}, whole frame"), *_times(row), *times))
+        own = (one for one in result.rows if one.stage.startswith("frame.") and one.mode == "paper")
+        same = (one for one in own if (one.backbone, one.device) == (row.backbone, row.device))
+        rows += [(_where(one, f"- {one.stage.partition('.')[2]}"), *_times(one), "", "") for one in same]
+    if rows:
+        for mode, one in published_modes().items():
+            rows.append((f"published, all garments: {mode}, on a V100", f"{one['ms']:.1f}", *[""] * 5))
+    header = ("the paper's structure", *_TIMES, "x hybrid", "x accurate")
+    note = (
+        "Untrained networks of the paper's sizes; their time doesn't depend on their weights. Published times are "
+        "of a server with NVIDIA V100s: other hardware, not to be compared with this machine's."
+    )
+    return TextTable("The paper's structure on the same core", header, rows, note)
+
+
+def starts(result: BenchmarkResult) -> TextTable:
+    """Load time and memory."""
+    rows = []
+    for row in result.of("start"):
+        sizes = [value for key, value in row.figures.items() if key.startswith("weights_mb_")]
+        figures = [_figure(row, key, digits) for key, digits in _START_FIGURES]
+        weights = f"{max(sizes):.1f}" if sizes else "-"
+        first = (f"{row.ms_median / 1e3:.2f}", f"{(row.wall_ms_median or 0) / 1e3:.2f}")
+        rows.append((f"{row.backbone}, {row.mode}, {row.method}", *first, *figures, weights))
+    header = ("process", "first mesh s", "wall s", "imports s", "loading s", "resident MB", "peak MB", "weights MB")
+    note = (
+        "A process of its own with two garments (T-shirt and shorts), from its start to the first mesh by the "
+        "processor's and by the wall's clock, parts of it by the wall's; memory after 30 frames more; the larger "
+        "garment's weights."
+    )
+    return TextTable("Start and memory", header, rows, note)
+
+
+_TIMES = ("ms", "quartiles", "wall ms", "ratio")
+_START_FIGURES = (("import_s", 2), ("load_s", 2), ("resident_mb", 0), ("peak_mb", 0))
+
+
+def _times(row: BenchmarkRow) -> tuple[str, str, str, str]:
+    spread = "" if row.ms_q1 is None else f"{_ms(row.ms_q1)} … {_ms(row.ms_q3 or 0.0)}"
+    wall = "" if row.wall_ms_median is None else _ms(row.wall_ms_median)
+    return _ms(row.ms_median), spread, wall, f"{row.ratio:.2f}" if row.ratio < 100 else f"{row.ratio:,.0f}"
+
+
+def _ms(value: float) -> str:
+    return f"{value:.2f}" if value < 100 else f"{value:,.0f}"
+
+
+def _figure(row: BenchmarkRow, name: str, digits: int) -> str:
+    value = row.figures.get(name)
+    return "-" if value is None else f"{value:,.{digits}f}"
+
+
+def _where(row: BenchmarkRow, name: str) -> str:
+    return name if row.device == "cpu" else f"{name} [{row.device}]"

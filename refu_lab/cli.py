@@ -1,0 +1,73 @@
+"""The command `refu`. Every subcommand has `--help` and `--json FILE`; bad input is one clear line and exit code 2."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import traceback
+from typing import TYPE_CHECKING
+
+from refu_core import RefuError, __version__
+from refu_core.errors import printable
+from refu_lab.commands import COMMANDS
+from refu_lab.commands._common import EXIT_BAD_INPUT, EXIT_BUG, EXIT_CHECK_FAILED, EXIT_INTERRUPTED, Parser
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from types import FrameType
+
+
+_OF_LAB = ("matplotlib", "PIL", "tqdm")
+"""Packages of the extra `lab`; others that may be missing are of `train`."""
+
+
+def _parser() -> Parser:
+    parser = Parser(prog="refu", description="Garments on SMPL bodies, free of body-garment collisions.")
+    parser.add_argument("--version", action="version", version=f"refu {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=Parser)
+    for command in COMMANDS:
+        command.add(commands)
+    return parser
+
+
+def _interrupt(_signal: int, _frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs the command line; returns the exit code."""
+    signal.signal(signal.SIGTERM, _interrupt)  # a terminated replay closes its bag like an interrupted one
+    try:
+        args = _parser().parse_args(arguments)
+        code: int = args.run(args)
+    except RefuError as error:
+        return _failed(f"error: {error}", EXIT_BAD_INPUT)
+    except (OSError, UnicodeError, MemoryError, RecursionError) as error:
+        return _failed(f"error: {str(error) or type(error).__name__}", EXIT_BAD_INPUT)
+    except ModuleNotFoundError as error:  # an extra's package; those of the core are imported by every command
+        extra = "lab" if str(error.name).partition(".")[0] in _OF_LAB else "train"
+        return _failed(f'error: {error.name} is not installed: pip install "refu-ros[{extra}]"', EXIT_BAD_INPUT)
+    except KeyboardInterrupt:
+        return _failed("interrupted", EXIT_INTERRUPTED)
+    except Exception as error:
+        from refu_core._device import is_device_loss
+
+        if is_device_loss(error):
+            reason = str(error).splitlines()[0]
+            return _failed(f"error: the device has failed: {reason}; run it again, or on the cpu", EXIT_CHECK_FAILED)
+        what = f"{type(error).__name__}: {error}"
+        return _failed(f"a bug of refu, please report it; REFU_DEBUG=1 shows where: {what}", EXIT_BUG)
+    return code
+
+
+def _failed(reason: str, code: int) -> int:
+    """Says why in one line; with REFU_DEBUG, also where."""
+    if os.environ.get("REFU_DEBUG") and code != EXIT_INTERRUPTED:
+        traceback.print_exc()
+    print(f"refu: {printable(reason)}", file=sys.stderr)
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

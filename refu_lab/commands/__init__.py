@@ -1,0 +1,11 @@
+"""The subcommands of `refu`, a module each: `add` makes the parser, `run` does the work.
+
+What a command needs is imported when it runs, so that `refu --help` doesn't wait for torch.
+"""
+
+from refu_lab.commands import benchmark, evaluate, info, replay, simulate, stress, train
+
+COMMANDS = (replay, simulate, train, evaluate, benchmark, stress, info)
+"""In the order of the help."""
+
+__all__ = ["COMMANDS"]

@@ -1,0 +1,185 @@
+"""What the commands share: types of arguments, common options, exit codes, the JSON file."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import re
+import stat
+from dataclasses import fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
+
+from refu_core import RefuError
+from refu_core.errors import printable
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+Number = TypeVar("Number", int, float)
+
+EXIT_CHECK_FAILED = 1
+EXIT_BAD_INPUT = 2
+EXIT_BUG = 70
+EXIT_INTERRUPTED = 130
+_MOST = 10**9
+
+
+class Parser(argparse.ArgumentParser):
+    """Whose errors are one line, as for every other kind of bad input, and whose numbers may be negative."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self._negative_number_matcher = re.compile(r"-[\d.]")  # argparse's own takes -1,0 for an option
+
+    def error(self, message: str) -> NoReturn:
+        """Ends the program."""
+        self.exit(EXIT_BAD_INPUT, f"{self.prog}: error: {printable(message)} (see {self.prog} --help)\n")
+
+
+def names(text: str) -> tuple[str, ...]:
+    """`A,B`: one name at least."""
+    found = tuple(name.strip() for name in text.split(",") if name.strip())
+    if not found:
+        msg = "wanted one name or several with commas between them"
+        raise argparse.ArgumentTypeError(msg)
+    return found
+
+
+def numbers(count: int) -> Callable[[str], tuple[float, ...]]:
+    """`X,Y,...`: up to `count` of them; the rest are zero."""
+
+    def parse(text: str) -> tuple[float, ...]:
+        try:
+            found = tuple(float(number) for number in text.split(","))
+        except ValueError:
+            found = ()
+        if not 1 <= len(found) <= count or not all(map(math.isfinite, found)):
+            msg = f"wanted up to {count} finite numbers with commas between them, got {text!r}"
+            raise argparse.ArgumentTypeError(msg)
+        return found + (0.0,) * (count - len(found))
+
+    return parse
+
+
+def positive(text: str) -> int:
+    """A whole number above zero."""
+    return _number(int, text, 1, _MOST)
+
+
+def seed(text: str) -> int:
+    """A whole number that random numbers may start from."""
+    return _number(int, text, 0, _MOST)
+
+
+def between(low: float, high: float) -> Callable[[str], float]:
+    """A number from `low` to `high`."""
+    return lambda text: _number(float, text, low, high)
+
+
+def _number(kind: type[Number], text: str, low: float, high: float) -> Number:
+    try:
+        number = kind(text)
+    except ValueError:
+        number = None
+    if number is None or not low <= number <= high:
+        bounds = f"above zero, at most {high:g}" if (kind, low) == (int, 1) else f"from {low:g} to {high:g}"
+        msg = f"wanted a {'whole ' if kind is int else ''}number {bounds}, got {printable(repr(text))}"
+        raise argparse.ArgumentTypeError(msg)
+    return number
+
+
+def in_path(text: str) -> Path:
+    """The path of something that is read: whether it's there, its reader says."""
+    try:
+        os.fsencode(text)
+    except UnicodeError:
+        text = ""
+    if not text or "\0" in text:
+        msg = "wanted a path, got nothing, or a name that no file has"
+        raise argparse.ArgumentTypeError(msg)
+    return Path(text)
+
+
+def out_file(text: str) -> Path:
+    """The path of a file that is written: what is there already is a file."""
+    return _output(text, "a file", stat.S_ISREG)
+
+
+def out_folder(text: str) -> Path:
+    """The path of a folder that is written to: what is there already is a folder."""
+    return _output(text, "a folder", stat.S_ISDIR)
+
+
+def out_bag(text: str) -> Path:
+    """The path of a bag that is written, a file or a folder."""
+    return _output(text, "a file or a folder", lambda mode: stat.S_ISREG(mode) or stat.S_ISDIR(mode))
+
+
+def _output(text: str, wanted: str, is_wanted: Callable[[int], bool]) -> Path:
+    found = in_path(text)
+    try:
+        is_right = is_wanted(found.stat().st_mode)
+    except FileNotFoundError:
+        is_right = True
+    except OSError as error:
+        msg = f"{printable(text)} can't be written: {error.strerror}"
+        raise argparse.ArgumentTypeError(msg) from error
+    if not is_right or not found.name:
+        msg = f"wanted {wanted} to write, or a new one; {printable(text)} is something else"
+        raise argparse.ArgumentTypeError(msg)
+    return found
+
+
+def word(text: str) -> str:
+    """Text that a message may hold."""
+    try:
+        text.encode()
+    except UnicodeError:
+        text = ""
+    if not text.isprintable() or not text:
+        msg = "wanted text without control characters"
+        raise argparse.ArgumentTypeError(msg)
+    return text
+
+
+def shard(text: str) -> tuple[int, int]:
+    """`I/N`: the I-th of N parts, from 0."""
+    index, _, count = text.partition("/")
+    if not (index.isdigit() and count.isdigit() and int(index) < int(count)):
+        msg = f"wanted I/N with 0 <= I < N, such as 0/4, got {text!r}"
+        raise argparse.ArgumentTypeError(msg)
+    return int(index), int(count)
+
+
+def add_common(parser: argparse.ArgumentParser) -> None:
+    """What every command has."""
+    parser.add_argument("--json", type=out_file, metavar="FILE", help="write the results as JSON")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def given(args: argparse.Namespace, options: type) -> dict[str, Any]:
+    """The arguments that are fields of a dataclass of options, by name."""
+    names_of_fields = {field.name for field in fields(options)}
+    return {name: value for name, value in vars(args).items() if name in names_of_fields}
+
+
+def check_writable(path: Path | None) -> None:
+    """Raises `RefuError` before the work is done where its result couldn't be written."""
+    if path is None:
+        return
+    existing = path.absolute()
+    while not existing.exists():
+        existing = existing.parent
+    if not os.access(existing, os.W_OK) or (existing != path.absolute() and not existing.is_dir()):
+        msg = f"{path}: can't be written, {existing} is not a writable folder"
+        raise RefuError(msg)
+
+
+def write_json(path: Path | None, content: dict[str, Any]) -> None:
+    """Writes it where a path was given."""
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")

@@ -1,0 +1,88 @@
+"""`refu stress`: attempts to break the pipeline."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from refu_core.modes import BUILTIN_GARMENTS
+from refu_lab.commands._common import (
+    EXIT_CHECK_FAILED,
+    add_common,
+    between,
+    check_writable,
+    given,
+    in_path,
+    names,
+    out_folder,
+    positive,
+    seed,
+    write_json,
+)
+
+if TYPE_CHECKING:
+    import argparse
+
+
+def add(commands: Any) -> None:
+    """The command's parser."""
+    parser = commands.add_parser(
+        "stress",
+        help="try to break the pipeline: numbers, guarantees, invariance, endurance",
+        description="Run random and adversarial frames through the pipeline and hold the results against float64 and "
+        "against what is promised; the worst trial of each check is kept as a file. Exits with 1 where one failed.",
+    )
+    parser.add_argument(
+        "--parts",
+        type=names,
+        default=("numbers", "guarantees", "invariance", "soak"),
+        metavar="A,B",
+        help="numbers, guarantees, invariance, soak (default: all)",
+    )
+    parser.add_argument(
+        "--garments",
+        type=names,
+        default=BUILTIN_GARMENTS,
+        metavar="A,B",
+        help="garments of any body (default: all four)",
+    )
+    parser.add_argument("--backbone", metavar="NAME", help="one mode (default: skinned accurate and tailornet hybrid)")
+    parser.add_argument("--sdf", metavar="MODE", help="accurate, hybrid, approx or none, with --backbone")
+    parser.add_argument(
+        "--weights", type=in_path, metavar="DIR", help="folder with a folder a garment of weights of one's own"
+    )
+    length = parser.add_mutually_exclusive_group()
+    length.add_argument("--quick", action="store_true", help="each check once: for CI")
+    length.add_argument(
+        "--hours", type=between(0, 10_000), metavar="H", help="go on for so long (default: some minutes)"
+    )
+    parser.add_argument("--rounds", type=positive, metavar="N", help="turns of each check (3)")
+    parser.add_argument("--frames", type=positive, metavar="N", help="frames of each soak (3000)")
+    parser.add_argument(
+        "--persons", type=positive, default=1, metavar="P", help="persons of a soak, each one's frame counting (1)"
+    )
+    parser.add_argument("--seed", type=seed, default=0, metavar="S", help="of everything that is drawn (0)")
+    parser.add_argument(
+        "--output", type=out_folder, default=Path("stress"), metavar="DIR", help="where the worst trials go (stress)"
+    )
+    parser.add_argument("--replay", type=in_path, metavar="FILE", help="try one of them again, and nothing else")
+    add_common(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Does what was asked; returns the exit code."""
+    from refu_lab.stress import StressOptions, StressResult, replay_trial, run_stress, stress_table
+
+    for path in (args.json, args.output):
+        check_writable(path)
+    options = StressOptions(**given(args, StressOptions))
+    if args.replay is not None:
+        result = StressResult(tallies=[replay_trial(args.replay, weights=options.weights)])
+    else:
+        result = run_stress(
+            options, progress=not args.quiet, report=lambda so_far: write_json(args.json, so_far.as_dict())
+        )
+    print(stress_table(result))
+    write_json(args.json, result.as_dict())
+    return EXIT_CHECK_FAILED if result.failures else 0

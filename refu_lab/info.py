@@ -1,0 +1,63 @@
+"""What `refu info` shows."""
+
+from __future__ import annotations
+
+import platform
+from importlib import metadata
+from importlib.util import find_spec
+from typing import Any
+
+from refu_core import MeshError, __version__
+from refu_core.body import BUILTIN_BODIES, load_body
+from refu_core.garments import BUILTIN_GARMENTS, load_garment
+from refu_core.mesh import Connectivity
+from refu_core.modes import BackboneName, SdfMode
+
+
+def _version(distribution: str) -> str:
+    try:
+        return metadata.version(distribution)
+    except metadata.PackageNotFoundError:
+        return "not installed"
+
+
+def describe_body(source: str) -> dict[str, Any]:
+    """What a body model file holds, and whether it can be used. Raises `BodyError`."""
+    body = load_body(source)
+    try:
+        Connectivity.of(body.faces).require_closed()
+        closed = "yes"
+    except MeshError as error:
+        closed = f"no, its signed distance can't be used: {error}"
+    low, high = body.v_template[:, 1].min(), body.v_template[:, 1].max()
+    return {
+        "body": source,
+        "fingerprint": body.fingerprint,
+        "vertices": body.n_vertices,
+        "faces": len(body.faces),
+        "height": f"{float(high - low):.2f} m",
+        "watertight": closed,
+    }
+
+
+def collect() -> dict[str, Any]:
+    """Versions, bodies, garments, modes and devices; plain values, ready for JSON."""
+    import torch
+
+    cuda = (
+        [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())] if torch.cuda.is_available() else []
+    )
+    bodies = (load_body(name) for name in BUILTIN_BODIES)
+    garments = (load_garment(name) for name in BUILTIN_GARMENTS)
+    return {
+        "refu": __version__,
+        "python": platform.python_version(),
+        "machine": f"{platform.system()} {platform.machine()}",
+        **{name: _version(name) for name in ("torch", "warp-lang", "numpy", "mcap")},
+        "rclpy": "importable" if find_spec("rclpy") else "not found (needed by the node only)",
+        "devices": ["cpu", *(f"cuda: {name}" for name in cuda)],
+        "bodies": {body.name: f"{body.n_vertices} vertices, {body.fingerprint}" for body in bodies},
+        "garments": {g.name: f"{g.n_vertices} vertices, {len(g.faces)} faces, for {g.body}" for g in garments},
+        "backbones": list(BackboneName),
+        "sdf modes": list(SdfMode),
+    }

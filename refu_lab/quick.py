@@ -1,0 +1,201 @@
+"""What `refu evaluate --quick` does: a few bags in a few minutes, held against figures that are kept beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msg_adapters as adapters
+from refu_core import RefuError
+from refu_core._files import read_json
+from refu_core.metrics import MetricsSummary
+from refu_core.modes import DEFAULT_GARMENTS
+from refu_lab.replay import ReplayOptions, replay
+from refu_lab.reproduction import METRICS, format_value, label_of
+from refu_lab.tables import format_table, write_json
+from refu_lab.truth import TOPIC
+
+BAGS = Path("bags")
+REFERENCE = Path("docs/results/quick.json")
+TOLERANCES: dict[str, float] = {"mpve_mm": 0.3, "vfcp_percent": 0.02, "cfmp_percent": 7.0, "max_depth_mm": 1.0}
+"""How much worse a figure may be than its reference: what other processors and releases of torch make of the same
+weights, far less than what a worse method does. Those of a reference file are in the file."""
+_FRAMES = 30
+"""Frames of a bag, at most."""
+_MODES = (("skinned", "accurate"), ("tailornet", "hybrid"))
+"""(backbone, sdf) of the pipelines that are measured; what isn't trained is left out."""
+"""Worn in bags without ground truth."""
+
+
+class FigureKey(NamedTuple):
+    """Names a figure of a bag."""
+
+    bag: str
+    garment: str
+    method: str
+    metric: str
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A figure beside its reference."""
+
+    key: FigureKey
+    value: float | None
+    """None for a figure that is gone."""
+    reference: float | None
+    """None for a figure that the reference doesn't have."""
+    tolerance: float
+
+    @property
+    def is_passed(self) -> bool:
+        """Not worse than the reference by more than the tolerance; a figure that is gone has fallen."""
+        if self.reference is None:
+            return True
+        if self.value is None:
+            return False
+        loss = self.value - self.reference
+        return (-loss if METRICS[self.key.metric].higher_is_better else loss) <= self.tolerance
+
+
+@dataclass(eq=False)
+class QuickResult:
+    """What was measured, and how it compares."""
+
+    comparisons: list[Comparison]
+    reference: Path
+    is_renewed: bool = False
+    """Whether the reference was written instead of compared with."""
+
+    @property
+    def is_passed(self) -> bool:
+        """No figure has fallen."""
+        return all(comparison.is_passed for comparison in self.comparisons)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The machine-readable result (`--json`)."""
+        rows = [
+            {"table": "quick", **c.key._asdict(), "value": c.value, "paper": None}
+            | {"reference": c.reference, "tolerance": c.tolerance, "passed": c.is_passed}
+            for c in self.comparisons
+        ]
+        return {"passed": self.is_passed, "reference": str(self.reference), "rows": rows}
+
+
+def quick_check(
+    data: Sequence[Path], *, reference: Path | None = None, renew: bool = False, progress: bool = False
+) -> QuickResult:
+    """Replays bags by every pipeline there are weights for, and compares with the reference or writes it.
+
+    Args:
+        data: Bags, or folders of bags; `bags` if empty.
+        reference: File of figures that were measured before; `docs/results/quick.json` by default.
+        renew: Write that file instead.
+        progress: Show a bar for each replay.
+
+    Raises:
+        RefuError: no bag, a bad one, or no reference.
+    """
+    file = reference or REFERENCE
+    bags = _find_bags(data or [BAGS])
+    known, tolerances = ({}, TOLERANCES) if renew else _read(file)
+    found = {key: value for bag in bags for key, value in _measure(bag, progress=progress)}
+    if renew:
+        _write(file, found)
+        known = found
+    keys = dict.fromkeys([*known, *found])
+    compared = [Comparison(key, found.get(key), known.get(key), tolerances[key.metric]) for key in keys]
+    return QuickResult(compared, file, is_renewed=renew)
+
+
+def quick_table(result: QuickResult) -> str:
+    """What `refu evaluate --quick` prints."""
+    rows = []
+    for c in result.comparisons:
+        verdict = "new" if c.reference is None else "ok" if c.is_passed else "FALLEN"
+        values = (format_value(c.key.metric, c.value), format_value(c.key.metric, c.reference))
+        rows.append((*c.key[:3], label_of(c.key.metric), *values, f"{c.tolerance:g}", verdict))
+    table = format_table(("bag", "garment", "method", "figure", "now", "reference", "tolerance", ""), rows)
+    if result.is_renewed:
+        return f"{table}\n\nwrote {result.reference}"
+    fallen = sum(not c.is_passed for c in result.comparisons)
+    verdict = f"{fallen} of {len(rows)} figures have fallen" if fallen else f"none of {len(rows)} figures has fallen"
+    return f"{table}\n\n{verdict} (reference: {result.reference})"
+
+
+def _measure(bag: Path, *, progress: bool) -> Iterator[tuple[FigureKey, float]]:
+    true = _true_garments(bag)
+    for backbone, sdf in _MODES:
+        options = ReplayOptions(
+            input=bag, garments=true or DEFAULT_GARMENTS, backbone=backbone, sdf=sdf, max_frames=_FRAMES
+        )
+        try:
+            options.load_pipeline()
+        except RefuError:  # no weights for one of the garments
+            continue
+        result = replay(options, progress=progress)
+        for garment in options.garments:
+            yield from _rows(bag.stem, garment, backbone, result.before[garment])
+            yield from _rows(bag.stem, garment, f"node, {backbone}, {sdf}", result.after[garment])
+
+
+def _rows(bag: str, garment: str, method: str, summary: MetricsSummary) -> Iterator[tuple[FigureKey, float]]:
+    for metric in TOLERANCES:
+        value = getattr(summary.all, metric)
+        if value is not None:
+            yield FigureKey(bag, garment, method, metric), value
+        away = getattr(summary.contact_free_vertices, metric)
+        if away is not None and summary.n_contact_frames:
+            yield FigureKey(bag, garment, f"{method}, away from self-contact", metric), away
+
+
+def _true_garments(bag: Path) -> tuple[str, ...]:
+    """The garments that a bag has ground truth of."""
+    with adapters.BagReader(bag) as reader:
+        if TOPIC not in {topic.name for topic in reader.topics}:
+            return ()
+        names = {m.ns: None for message in reader.messages([TOPIC]) for m in adapters.decode_marker_array(message.data)}
+    return tuple(names)
+
+
+def _find_bags(data: Sequence[Path]) -> list[Path]:
+    bags: list[Path] = []
+    for path in data:
+        if path.suffix == ".mcap" or (path / "metadata.yaml").exists():
+            bags.append(path)
+        else:
+            bags += sorted(file.parent for file in path.glob("*/metadata.yaml")) + sorted(path.glob("*.mcap"))
+    if not bags:
+        msg = f"{', '.join(map(str, data))}: no bag in it; wanted .mcap files or rosbag2 folders, as in the repository"
+        raise RefuError(msg)
+    return bags
+
+
+def _read(file: Path) -> tuple[dict[FigureKey, float], dict[str, float]]:
+    """The reference's figures, and its tolerances."""
+    try:
+        content = read_json(file, error=RefuError, wanted="a reference, as --set-reference writes it")
+        tolerances = {**TOLERANCES, **{str(k): float(v) for k, v in content["tolerances"].items()}}
+        figures = {FigureKey(*(str(r[name]) for name in FigureKey._fields)): float(r["value"]) for r in content["rows"]}
+    except (RefuError, ValueError, KeyError, TypeError, AttributeError) as error:
+        if not file.exists():
+            msg = f"{file}: no reference there; write one with --set-reference, or name another with --reference"
+            raise RefuError(msg) from error
+        msg = f"{file}: not a reference of refu evaluate --quick ({error!r}); write one with --set-reference"
+        raise RefuError(msg) from error
+    unknown = sorted({metric for *_, metric in figures} - set(TOLERANCES))
+    if unknown:
+        msg = f"{file}: unknown figures {', '.join(unknown)}; write the file anew with --set-reference"
+        raise RefuError(msg)
+    return figures, tolerances
+
+
+def _write(file: Path, figures: Mapping[FigureKey, float]) -> None:
+    content = {
+        "about": "refu evaluate --quick holds its figures against these; written by --set-reference",
+        "tolerances": TOLERANCES,
+        "rows": [{**key._asdict(), "value": value} for key, value in figures.items()],
+    }
+    write_json(file, content)

@@ -1,0 +1,370 @@
+"""Replays recorded motion through the garment pipeline without ROS: bytes in, garments out, measured frame by frame."""
+
+from __future__ import annotations
+
+import itertools
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from tqdm import tqdm
+
+import msg_adapters as adapters
+from refu_core import FrameError, GarmentPipeline, SmplFrame
+from refu_core._device import one_thread
+from refu_core.metrics import CollisionChecker, GarmentMetrics, MetricsSummary
+from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN
+from refu_lab.body_contact import BodyContact
+from refu_lab.truth import GroundTruth
+
+if TYPE_CHECKING:
+    from msg_adapters import FrameRecord
+    from refu_core.realtime import PipelineOutput
+
+GARMENTS_TOPIC = "/garments"
+INPUT_TOPIC = "/smpl_params"
+_MAX_REASONS = 20
+_LONGEST_PAUSE_S = 60.0
+"""Reasons of skips that are counted apart."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayOptions:
+    """What to replay and how; the fields are the options of `refu replay`."""
+
+    input: Path
+    garments: tuple[str, ...] = DEFAULT_GARMENTS
+    output: Path | None = None
+    backbone: str = "tailornet"
+    sdf: str = "hybrid"
+    weights: Path | None = None
+    margin: float = DEFAULT_MARGIN
+    betas: tuple[float, ...] | None = None
+    style: tuple[float, ...] | None = None
+    speed: Literal["max", "real"] = "max"
+    topic: str | None = None
+    input_type: str | None = None
+    input_axes: Literal["smpl", "frame"] = "smpl"
+    frame_id: str = "map"
+    device: str = "cpu"
+    max_frames: int | None = None
+    overwrite: bool = False
+
+    def load_pipeline(self) -> GarmentPipeline:
+        """The pipeline that these options ask for. Raises `RefuError` for options that make none."""
+        return GarmentPipeline.load(
+            self.garments,
+            sdf=self.sdf,
+            backbone=self.backbone,
+            style=self.style,
+            margin=self.margin,
+            weights=self.weights,
+            device=self.device,
+        )
+
+
+@dataclass(frozen=True)
+class GarmentRecord:
+    """One garment in one frame, before (`raw`) and after collision handling."""
+
+    latency_ms: float
+    n_inside_before: int
+    n_inside: int
+    n_pairs_before: int
+    n_pairs: int
+    max_depth_before: float
+    """[m]."""
+    max_depth: float
+    """[m]."""
+    near_self_contact: bool
+
+
+@dataclass(frozen=True)
+class FrameResult:
+    """One replayed frame; enough to find it again and to plot it."""
+
+    frame: SmplFrame
+    latency_ms: float
+    """From input bytes to output bytes."""
+    stage_ms: Mapping[str, float]
+    garments: Mapping[str, GarmentRecord]
+
+    @property
+    def badness(self) -> tuple[int, float, int, float]:
+        """Orders frames from best to worst: what is left first, what there was to do second."""
+        g = self.garments.values()
+        return (
+            sum(r.n_pairs + r.n_inside for r in g),
+            max((r.max_depth for r in g), default=0.0),
+            sum(r.n_pairs_before for r in g),
+            max((r.max_depth_before for r in g), default=0.0),
+        )
+
+
+@dataclass(eq=False)
+class ReplayResult:
+    """Everything a table, a JSON file or a report needs."""
+
+    options: ReplayOptions
+    source: str
+    """What was read: a topic and its type, or a motion file."""
+    frames: list[FrameResult] = field(default_factory=list)
+    skips: Counter[str] = field(default_factory=Counter)
+    """Messages that were not replayed, by reason."""
+    warnings: list[str] = field(default_factory=list)
+    before: dict[str, MetricsSummary] = field(default_factory=dict)
+    after: dict[str, MetricsSummary] = field(default_factory=dict)
+    interrupted: bool = False
+
+    def latency_ms(self, garment: str | None = None) -> dict[str, float]:
+        """Percentiles of the latency of a garment (the frame without the others' own stages), or of the frame [ms]."""
+        values = [f.latency_ms if garment is None else f.garments[garment].latency_ms for f in self.frames]
+        p50, p95, p99 = np.percentile(values, (50, 95, 99)) if values else (0.0, 0.0, 0.0)
+        return {"p50": float(p50), "p95": float(p95), "p99": float(p99)}
+
+    def as_dict(self) -> dict[str, Any]:
+        """The machine-readable result (`--json`)."""
+        garments: dict[str, Any] = {}
+        for name, after in self.after.items():
+            figures = after.all.as_dict()
+            garments[name] = {
+                "latency_ms": self.latency_ms(name),
+                **figures,
+                "self_contact_frames": after.n_contact_frames,
+                "before": self.before[name].all.as_dict(),
+                "before_without_self_contact_frames": self.before[name].contact_free_frames.as_dict(),
+                "before_without_self_contact_vertices": self.before[name].contact_free_vertices.as_dict(),
+                "without_self_contact_frames": after.contact_free_frames.as_dict(),
+                "without_self_contact_vertices": after.contact_free_vertices.as_dict(),
+            }
+        return {
+            "input": str(self.options.input),
+            "source": self.source,
+            "output": None if self.options.output is None else str(self.options.output),
+            "backbone": self.options.backbone,
+            "sdf": self.options.sdf,
+            "margin_m": self.options.margin,
+            "device": self.options.device,
+            "frames": len(self.frames),
+            "skipped": dict(self.skips),
+            "warnings": self.warnings,
+            "interrupted": self.interrupted,
+            "self_contact_frames": sum(any(g.near_self_contact for g in f.garments.values()) for f in self.frames),
+            "latency_ms": self.latency_ms(),
+            "garments": garments,
+        }
+
+
+@dataclass(eq=False)
+class Source:
+    """Frames of a bag or of a motion file, as records of one kind."""
+
+    description: str
+    """A topic and its type, or a motion file."""
+    topic: str
+    message_type: str
+    decoder: adapters.Decoder
+    records: Iterator[FrameRecord]
+    count: int | None
+    """Records, where the file says how many there are."""
+    bag: adapters.SmplBag | None = None
+    """What is read; None for a motion file."""
+
+    @property
+    def warnings(self) -> list[str]:
+        """What was wrong with the file as a whole; complete after the last record."""
+        return list(self.bag.reader.warnings) if self.bag else []
+
+
+@contextmanager
+def open_source(options: ReplayOptions) -> Iterator[Source]:
+    """Opens the input. Raises `RefuError` for one that can't be read."""
+    if options.input.suffix == ".npz":
+        motion = adapters.read_motion(options.input)
+        description = f"{options.input.name}, {len(motion)} frames at {motion.fps:g} Hz"
+        records, decoder = _motion_records(motion, INPUT_TOPIC), adapters.decoder_for("multiarray")
+        yield Source(description, INPUT_TOPIC, adapters.INPUT_TYPES["multiarray"], decoder, records, len(motion))
+        return
+    with adapters.open_smpl_bag(options.input, topic=options.topic, input_type=options.input_type) as bag:
+        topic, kind = bag.topic.name, bag.topic.message_type
+        yield Source(f"{topic} ({kind})", topic, kind, bag.decoder, iter(bag), bag.message_count, bag)
+
+
+def _motion_records(motion: adapters.Motion, topic: str) -> Iterator[FrameRecord]:
+    encode = adapters.encoder_for("multiarray")
+    for i in range(len(motion)):
+        stamp_ns = round(1e9 * i / motion.fps)
+        frame, error, raw = None, None, b""
+        try:
+            frame = motion.frame(i)
+            raw = encode(frame)
+        except FrameError as cause:  # one bad frame of a clip is skipped like one bad message of a bag
+            error = adapters.DecodeError(str(cause))
+        yield adapters.FrameRecord(
+            frame=frame, error=error, stamp_ns=stamp_ns, log_time_ns=stamp_ns, topic=topic, raw=raw
+        )
+
+
+class Evaluator:
+    """Exact metrics of every frame, before and after collision handling."""
+
+    def __init__(self, pipeline: GarmentPipeline, truth: GroundTruth | None = None) -> None:
+        self._checker = CollisionChecker(pipeline.body.faces.cpu().numpy())
+        self._contact = BodyContact(pipeline.body)
+        faces = {name: garment.faces.cpu().numpy() for name, garment in pipeline.garments.items()}
+        self._faces = faces
+        self.truth = truth or GroundTruth()
+        self.before = {name: GarmentMetrics(f) for name, f in faces.items()}
+        self.after = {name: GarmentMetrics(f) for name, f in faces.items()}
+
+    def add(self, frame: SmplFrame, output: PipelineOutput, latency_ms: float) -> dict[str, GarmentRecord]:
+        """Measures one frame."""
+        contact = self._contact.detect(frame.betas, output.body)
+        self._checker.update(output.body)
+        own_ms = {name: output.stats.garments[name].ms for name in output}
+        records = {}
+        for name, mesh in output.items():
+            near = contact.near(mesh.local)
+            raw = self._checker.check(mesh.raw, self._faces[name])
+            done = self._checker.check(mesh.local, self._faces[name])
+            truth = self.truth.of(name, frame)
+            self.before[name].add(mesh.raw, raw, truth=truth, near_contact=near)
+            self.after[name].add(mesh.local, done, truth=truth, near_contact=near)
+            records[name] = GarmentRecord(
+                latency_ms=latency_ms - sum(own_ms.values()) + own_ms[name],
+                n_inside_before=raw.n_inside,
+                n_inside=done.n_inside,
+                n_pairs_before=raw.n_pairs,
+                n_pairs=done.n_pairs,
+                max_depth_before=raw.max_depth,
+                max_depth=done.max_depth,
+                near_self_contact=bool(near.any()),
+            )
+        return records
+
+
+class _Replayer:
+    """The loop's parts, so that one frame is one call."""
+
+    def __init__(self, options: ReplayOptions, pipeline: GarmentPipeline, source: Source, result: ReplayResult) -> None:
+        self._options = options
+        self._pipeline = pipeline
+        self._source = source
+        self._result = result
+        faces = {name: garment.faces.cpu().numpy() for name, garment in pipeline.garments.items()}
+        truth = GroundTruth.of_bag(options.input, faces, axes=options.input_axes) if source.bag is not None else None
+        self._evaluator = Evaluator(pipeline, truth)
+        self._betas = None if options.betas is None else np.asarray(options.betas, np.float32)
+        meshes = [
+            adapters.MarkerMesh(
+                ns=adapters.garment_namespace(name),
+                faces=garment.faces.cpu().numpy(),
+                n_vertices=garment.n_vertices,
+                color=(*garment.card.color, 1.0),
+            )
+            for name, garment in pipeline.garments.items()
+        ]
+        self._encoder = adapters.MarkerArrayEncoder(meshes, frame_id=options.frame_id, axes=options.input_axes)
+
+    def open_writer(self) -> adapters.BagWriter | None:
+        """The output bag with its topics, None where no output was asked for."""
+        if self._options.output is None:
+            return None
+        writer = adapters.BagWriter(self._options.output, overwrite=self._options.overwrite)
+        given = self._source.bag.topic if self._source.bag is not None else None
+        own = {} if given is None else {"definition": given.definition, "type_hash": given.type_hash}
+        writer.add_topic(self._source.topic, self._source.message_type, **own)
+        writer.add_topic(GARMENTS_TOPIC, adapters.MARKER_ARRAY)
+        return writer
+
+    def run(self, record: FrameRecord, writer: adapters.BagWriter | None) -> None:
+        """Bytes to bytes (timed), then the bag and the metrics (not timed)."""
+        if writer is not None and (record.raw or self._source.bag is not None):
+            writer.write(self._source.topic, record.raw, log_time_ns=record.log_time_ns)
+        if record.error is not None:
+            self._skip(str(record.error))
+            return
+        start = time.perf_counter()
+        try:
+            frame = replace(self._source.decoder.from_bytes(record.raw), stamp_ns=record.stamp_ns)
+            if self._betas is not None:
+                frame = replace(frame, betas=self._betas)
+            output = self._pipeline(frame)
+            data = self._encoder.encode(
+                [mesh.local for mesh in output.values()], stamp_ns=frame.stamp_ns, transl=frame.transl
+            )
+        except adapters.EncodeError as error:
+            self._skip(str(error))
+            return
+        latency_ms = 1e3 * (time.perf_counter() - start)
+        if writer is not None:
+            writer.write(GARMENTS_TOPIC, data, log_time_ns=record.log_time_ns)
+        garments = self._evaluator.add(frame, output, latency_ms)
+        self._result.frames.append(FrameResult(frame, latency_ms, output.stats.stage_ms, garments))
+
+    def _skip(self, reason: str) -> None:
+        skips = self._result.skips
+        skips[reason if reason in skips or len(skips) < _MAX_REASONS else "other reasons"] += 1
+
+    def summarise(self) -> None:
+        """Completes the result."""
+        self._result.before = {name: metrics.summary() for name, metrics in self._evaluator.before.items()}
+        self._result.after = {name: metrics.summary() for name, metrics in self._evaluator.after.items()}
+
+
+@one_thread()
+def replay(options: ReplayOptions, *, progress: bool = False) -> ReplayResult:
+    """Runs every frame of the input through the pipeline, writes the output bag, measures.
+
+    An interrupt (Ctrl-C) ends the replay early: the bag is closed and the result so far is returned.
+
+    Raises:
+        RefuError: a bad input file, an unknown garment, an output that can't be written, or no frame that could be
+            replayed.
+    """
+    pipeline = options.load_pipeline()
+    pipeline(
+        SmplFrame(pose=np.zeros((24, 3), np.float32))
+    )  # compiles kernels, so that the first frame's latency is a frame's
+    with ExitStack() as stack:
+        source = stack.enter_context(open_source(options))
+        result = ReplayResult(options, source.description)
+        replayer = _Replayer(options, pipeline, source, result)
+        writer = replayer.open_writer()
+        if writer is not None:
+            stack.enter_context(writer)
+        records = itertools.islice(source.records, options.max_frames)
+        total = source.count if options.max_frames is None else min(source.count or sys.maxsize, options.max_frames)
+        try:
+            for record in tqdm(
+                _paced(records, options.speed), total=total, unit="frame", disable=None if progress else True
+            ):
+                replayer.run(record, writer)
+        except KeyboardInterrupt:
+            result.interrupted = True
+        result.warnings += source.warnings
+    replayer.summarise()
+    if not result.frames and not result.interrupted:
+        reasons = "; ".join(f"{count} x {reason}" for reason, count in result.skips.most_common(3))
+        msg = f"{options.input}: no frame could be replayed: {reasons or 'the input is empty'}"
+        raise adapters.BagError(msg)
+    return result
+
+
+def _paced(records: Iterable[FrameRecord], speed: Literal["max", "real"]) -> Iterator[FrameRecord]:
+    """The records, as fast as they are taken or at the pace of their log times, without pauses above a minute."""
+    origin: tuple[float, int] | None = None
+    for record in records:
+        if speed == "real":
+            origin = origin or (time.monotonic(), record.log_time_ns)
+            pause = origin[0] + 1e-9 * (record.log_time_ns - origin[1]) - time.monotonic()
+            if pause > _LONGEST_PAUSE_S:
+                origin, pause = (time.monotonic(), record.log_time_ns), 0.0
+            time.sleep(max(0.0, pause))
+        yield record

@@ -1,0 +1,206 @@
+"""The HTML report of a replay: latency, penetration over time, pictures of the worst, a median and the best frame."""
+
+from __future__ import annotations
+
+import html
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from tqdm import tqdm
+
+from refu_core import RefuError
+from refu_core.metrics import CollisionChecker
+from refu_lab.plots import new_axes, save_svg
+from refu_lab.render import Camera, RenderMesh, collision_mesh, render, save_png
+from refu_lab.replay import FrameResult, ReplayResult
+from refu_lab.tables import REPLAY_HEADER, replay_rows
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from matplotlib.axes import Axes
+    from numpy.typing import NDArray
+
+    from refu_core import GarmentPipeline
+
+_PICTURE = (420, 640)
+_STYLE = """
+:root { color-scheme: light dark; --line: color-mix(in srgb, currentColor 18%, transparent); }
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 1080px; margin: 2rem auto; padding: 0 1rem; }
+h1 { font-size: 1.5rem; margin-bottom: .2rem; } h2 { font-size: 1.1rem; margin-top: 2.2rem; }
+p.note, figcaption { opacity: .75; font-size: .9rem; }
+table { border-collapse: collapse; width: 100%; } th, td { padding: .3rem .6rem; border-bottom: 1px solid var(--line); }
+td, th { text-align: right; font-variant-numeric: tabular-nums; } td:first-child, th:first-child { text-align: left; }
+tr.sub td { opacity: .75; border-bottom-style: dotted; }
+img { max-width: 100%; border-radius: 6px; } img.plot { background: #fff; width: 100%; }
+.pictures { display: grid; grid-template-columns: repeat(auto-fit, minmax(300px, 1fr)); gap: 1rem; }
+figure { margin: 0; } .warn { border-left: 4px solid #d33; padding-left: .8rem; }
+"""
+
+
+@dataclass(frozen=True)
+class _Pictured:
+    """A frame that is shown."""
+
+    title: str
+    index: int
+    file: str
+    caption: str
+
+
+def write_report(result: ReplayResult, folder: Path, *, progress: bool = False) -> Path:
+    """Writes `index.html` and its plots and pictures into `folder`, which is made if it isn't there.
+
+    Returns:
+        The path of the page. It refers to files of its own folder only.
+
+    Raises:
+        RefuError: the folder can't be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        pipeline = result.options.load_pipeline()
+        _plot(result, pipeline, folder)
+        pictures = _draw_frames(result, pipeline, folder, progress=progress)
+        page = folder / "index.html"
+        page.write_text(_page(result, pictures), encoding="utf-8")
+    except OSError as error:
+        msg = f"{folder}: the report can't be written: {error.strerror or error}"
+        raise RefuError(msg) from error
+    return page
+
+
+def _plot(result: ReplayResult, pipeline: GarmentPipeline, folder: Path) -> None:
+    start = result.frames[0].frame.stamp_ns
+    times = np.array([1e-9 * (f.frame.stamp_ns - start) for f in result.frames])
+    contact = np.array([any(g.near_self_contact for g in f.garments.values()) for f in result.frames])
+    drawn, axes = new_axes(3, size=(10.8, 7.5), sharex=True)
+    for ax in axes:
+        _shade(ax, times, contact)
+    axes[-1].set_xlabel("time [s]")
+    inside, pairs, depth = axes
+    for name in result.after:
+        records = [f.garments[name] for f in result.frames]
+        colour = pipeline.garments[name].card.color
+        for ax, before, after in (
+            (inside, [r.n_inside_before for r in records], [r.n_inside for r in records]),
+            (pairs, [r.n_pairs_before for r in records], [r.n_pairs for r in records]),
+            (depth, [1e3 * r.max_depth_before for r in records], [1e3 * r.max_depth for r in records]),
+        ):
+            ax.plot(times, before, color=colour, alpha=0.45, lw=1.2, label=f"{name}, before")
+            ax.plot(times, after, color=colour, lw=1.8, label=f"{name}, after")
+    inside.set_ylabel("vertices inside")
+    pairs.set_ylabel("intersecting pairs")
+    depth.set_ylabel("deepest [mm]")
+    for ax in (inside, pairs):
+        ax.set_yscale("symlog", linthresh=1)
+        ax.set_ylim(bottom=0)
+    inside.legend(loc="upper right", fontsize=8, ncols=len(result.after))
+    save_svg(drawn, folder / "penetration.svg")
+
+    drawn, (latency,) = new_axes(size=(10.8, 2.5))
+    _shade(latency, times, contact)
+    stages = list(result.frames[0].stage_ms)
+    values = [[f.stage_ms[stage] for f in result.frames] for stage in stages]
+    rest = [f.latency_ms - sum(f.stage_ms.values()) for f in result.frames]
+    latency.stackplot(times, [*values, rest], labels=[*stages, "decode and encode"], alpha=0.75, lw=0)
+    latency.set(xlabel="time [s]", ylabel="latency [ms]")
+    latency.set_ylim(0, 1.3 * float(np.percentile([f.latency_ms for f in result.frames], 99)))
+    latency.legend(loc="upper right", fontsize=8, ncols=len(stages) + 1)
+    save_svg(drawn, folder / "latency.svg")
+
+
+def _shade(ax: Axes, times: NDArray[np.float64], contact: NDArray[np.bool_]) -> None:
+    """Marks the frames in which the body touches itself near a garment."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], contact, [False])).astype(int)))
+    for first, end in edges.reshape(-1, 2):
+        ax.axvspan(times[first], times[min(end, len(times) - 1)], color="0.5", alpha=0.12, lw=0)
+
+
+def _draw_frames(result: ReplayResult, pipeline: GarmentPipeline, folder: Path, *, progress: bool) -> list[_Pictured]:
+    """Renders the worst, a median and the best frame, before and after, from their parameters."""
+    order = sorted(range(len(result.frames)), key=lambda i: result.frames[i].badness)
+    chosen = {"worst": order[-1], "median": order[len(order) // 2], "best": order[0]}
+    body_faces = pipeline.body.faces.cpu().numpy()
+    checker = CollisionChecker(body_faces)
+    pictures = []
+    with tqdm(total=2 * len(chosen), desc="pictures", unit="picture", disable=None if progress else True) as bar:
+        for title, index in chosen.items():
+            frame = result.frames[index]
+            output = pipeline(frame.frame)
+            checker.update(output.body)
+            camera = Camera.framing(output.body, size=_PICTURE, yaw=_front(frame))
+            for when in ("before", "after"):
+                meshes = [RenderMesh(output.body, body_faces)]
+                for name, mesh in output.items():
+                    vertices = mesh.raw if when == "before" else mesh.local
+                    found = checker.check(vertices, mesh.faces)
+                    colour = pipeline.garments[name].card.color
+                    meshes.append(collision_mesh(vertices, mesh.faces, found, colour=colour))
+                file = f"{title}_{when}.png"
+                save_png(render(meshes, camera=camera, size=_PICTURE), folder / file)
+                pictures.append(_Pictured(f"{title} frame, {when}", index, file, _caption(frame, when)))
+                bar.update()
+    return pictures
+
+
+def _front(frame: FrameResult) -> float:
+    """Yaw of the camera that looks at the person's front, a little from the side [degrees]."""
+    forward = Rotation.from_rotvec(frame.frame.pose[0]).apply([0.0, 0.0, 1.0])
+    return float(np.degrees(np.arctan2(forward[0], forward[2]))) + 25.0
+
+
+def _caption(frame: FrameResult, when: str) -> str:
+    parts = []
+    for name, r in frame.garments.items():
+        n_inside, n_pairs = (r.n_inside_before, r.n_pairs_before) if when == "before" else (r.n_inside, r.n_pairs)
+        parts.append(f"{name}: {n_inside} vertices inside, {n_pairs} intersecting pairs")
+        if r.near_self_contact:
+            parts[-1] += " (the body touches itself here)"
+    return "; ".join(parts)
+
+
+def _page(result: ReplayResult, pictures: Sequence[_Pictured]) -> str:
+    data = result.as_dict()
+    start = result.frames[0].frame.stamp_ns
+    notes = [f"{count} messages skipped: {reason}" for reason, count in result.skips.most_common()]
+    notes += result.warnings + (["The replay was interrupted."] if result.interrupted else [])
+    warning = "".join(f'<p class="warn">{html.escape(note)}</p>' for note in notes)
+    figures = "".join(
+        f'<figure><img src="{p.file}" alt="{html.escape(p.caption)}"><figcaption><b>{html.escape(p.title)}</b>, '
+        f"number {p.index}, {1e-9 * (result.frames[p.index].frame.stamp_ns - start):.2f} s: {html.escape(p.caption)}"
+        "</figcaption></figure>"
+        for p in pictures
+    )
+    frame = data["latency_ms"]
+    return f"""<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<title>Replay of {html.escape(result.options.input.name)}</title><style>{_STYLE}</style></head><body>
+<h1>Replay of {html.escape(result.options.input.name)}</h1>
+<p class="note">{html.escape(result.source)}; backbone {html.escape(data["backbone"])}, signed distance
+{html.escape(data["sdf"])}, margin {1e3 * data["margin_m"]:g} mm, {html.escape(data["device"])}.
+{data["frames"]} frames, {data["self_contact_frames"]} with self-contact of the body near a garment.
+A whole frame, bytes to bytes: p50 {frame["p50"]:.1f}, p95 {frame["p95"]:.1f}, p99 {frame["p99"]:.1f} ms.</p>{warning}
+<h2>Figures</h2>{_table(data)}
+<p class="note">VFCP: vertices inside the body. CFMP: frames without any collision, vertices and triangles.
+Both by exact checks. Where the body intersects itself (an arm in the flank, the crease of an armpit, thighs in a squat)
+no garment can be free of it: the rows below a garment leave out the vertices near such places, or all frames that
+have one.</p>
+<h2>Penetration over time</h2><img class="plot" src="penetration.svg" alt="penetration over time">
+<p class="note">Grey: the body touches itself near a garment.</p>
+<h2>Latency</h2><img class="plot" src="latency.svg" alt="latency over time">
+<h2>Worst, median and best frame</h2><div class="pictures">{figures}</div>
+<p class="note">Red: colliding triangles and vertices inside the body.</p>
+</body></html>
+"""
+
+
+def _table(data: dict[str, Any]) -> str:
+    lines = ["<tr>" + "".join(f"<th>{name}</th>" for name in REPLAY_HEADER) + "</tr>"]
+    for row in replay_rows(data["garments"]):
+        kind = ' class="sub"' if row[0].startswith(" ") else ""
+        lines.append(f"<tr{kind}>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>")
+    return f"<table>{''.join(lines)}</table>"

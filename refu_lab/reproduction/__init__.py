@@ -1,0 +1,31 @@
+"""The paper's tables and figures on our own data, each figure beside the paper's; `refu evaluate` is made of this."""
+
+from refu_lab.reproduction._build import SAMPLE_TABLES as SAMPLE_TABLES
+from refu_lab.reproduction._build import TIMED_METHODS as TIMED_METHODS
+from refu_lab.reproduction._build import sample_table as sample_table
+from refu_lab.reproduction._build import time_table as time_table
+from refu_lab.reproduction._load import Library as Library
+from refu_lab.reproduction._methods import METHODS as METHODS
+from refu_lab.reproduction._methods import SEQUENCE_SHAPES as SEQUENCE_SHAPES
+from refu_lab.reproduction._methods import Method as Method
+from refu_lab.reproduction._motion import motion_table as motion_table
+from refu_lab.reproduction._paper import PAPER as PAPER
+from refu_lab.reproduction._paper import paper_figure as paper_figure
+from refu_lab.reproduction._paper import published_modes as published_modes
+from refu_lab.reproduction._pictures import picture_garments as picture_garments
+from refu_lab.reproduction._plots import PLOTS as PLOTS
+from refu_lab.reproduction._runs import MethodRun as MethodRun
+from refu_lab.reproduction._runs import Study as Study
+from refu_lab.reproduction._runs import run_methods as run_methods
+from refu_lab.reproduction._samples import Sample as Sample
+from refu_lab.reproduction._samples import SampleSet as SampleSet
+from refu_lab.reproduction._sdf import sdf_table as sdf_table
+from refu_lab.reproduction._tables import ALL as ALL
+from refu_lab.reproduction._tables import METRICS as METRICS
+from refu_lab.reproduction._tables import Missing as Missing
+from refu_lab.reproduction._tables import ResultRow as ResultRow
+from refu_lab.reproduction._tables import ResultTable as ResultTable
+from refu_lab.reproduction._tables import format_value as format_value
+from refu_lab.reproduction._tables import label_of as label_of
+from refu_lab.reproduction._tables import read_table as read_table
+from refu_lab.reproduction._tables import write_summary as write_summary

@@ -1,0 +1,261 @@
+"""The tables over test samples, made of the runs."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from refu_lab.reproduction._methods import SEQUENCE_SHAPES
+from refu_lab.reproduction._runs import RATIO_EDGES, MethodRun, Study
+from refu_lab.reproduction._tables import ALL, Missing, ResultRow, ResultTable, weighted
+
+ENERGY_ZOOM = 2.5e-3
+"""Upper end of the paper's zoomed histogram [m²]."""
+UNSEEN_GROUPS = 5
+"""Groups of equally many samples, by distance to the training set."""
+
+Values = Mapping[str, float | None]
+_MAIN = ("mpve_mm", "vfcp_percent", "cfmp_percent")
+
+
+@dataclass(frozen=True)
+class SampleTable:
+    """A table over test samples."""
+
+    title: str
+    about: str
+    methods: tuple[str, ...]
+    """In the order of the rows."""
+    metrics: tuple[str, ...] = _MAIN
+    """Those that a method has without a run, too: there, they are None."""
+    values: Callable[[MethodRun], Values] | None = None
+    """What a run gives by metric; by default the fields of `Figures`."""
+    is_summed: bool = True
+    """Whether there are rows of all garments."""
+
+    def of(self, run: MethodRun | None) -> Values:
+        """The figures of one method on one garment's samples."""
+        if run is None:
+            return dict.fromkeys(self.metrics)
+        return self.values(run) if self.values else {metric: getattr(run.figures, metric) for metric in self.metrics}
+
+
+def sample_table(study: Study, name: str) -> ResultTable:
+    """A table of `SAMPLE_TABLES`, garment by garment and, where there are several, over all of them."""
+    spec = SAMPLE_TABLES[name]
+    table = ResultTable(name, spec.title, spec.about)
+    for garment in study.n_samples:
+        for method in spec.methods:
+            values = spec.of(study.runs.get((garment, method)))
+            table.rows += [ResultRow.of(name, garment, method, metric, value) for metric, value in values.items()]
+    if spec.is_summed:
+        table.rows += _over_all(study, table, spec.methods, spec.metrics)
+    if name == "comparison":
+        table.rows += list(_trends(table))
+    table.missing = [missing for missing in study.missing.values() if missing.method in spec.methods]
+    if name == "sequence":
+        table.missing += _missing_sets(study)
+    return table
+
+
+def _missing_sets(study: Study) -> Iterator[Missing]:
+    """The methods that there was no set of sequences for."""
+    for garment, shapes in itertools.product(study.n_samples, SEQUENCE_SHAPES):
+        command = f"refu simulate {garment} --sequences --shapes {shapes} --count N --output DIR"
+        for method in (f"mlp-{shapes}", f"mlp-{shapes}-refu-approx"):
+            if (garment, method) not in study.runs and (garment, method) not in study.missing:
+                yield Missing(garment, method, f"no set of {shapes} shapes was given", command)
+
+
+def time_table(study: Study) -> ResultTable:
+    """The supplement's run times, by component and garment."""
+    table = ResultTable(
+        "time",
+        "Run time by component",
+        "Median wall time of one garment in one frame on one thread of the CPU that this ran on; of the signed "
+        "distances, taking over the pose and asking for all vertices. The paper's are of a GPU, but for its accurate "
+        "distance and its optimisation. The optimisation includes its distances.",
+        labels={name: label for name, (label, *_) in _COMPONENTS.items()},
+    )
+    for garment in study.n_samples:
+        for name, (_, method, *parts) in _COMPONENTS.items():
+            run = study.runs.get((garment, method))
+            ms = None if run is None else run.median_ms(*parts)
+            table.rows.append(ResultRow.of("time", garment, name, "ms", ms))
+    table.rows += _over_all(study, table, tuple(_COMPONENTS), ("ms",))
+    table.missing = list(study.missing.values())
+    return table
+
+
+def _over_all(study: Study, table: ResultTable, methods: Sequence[str], metrics: Sequence[str]) -> Iterator[ResultRow]:
+    """The means of several garments, weighted by their samples."""
+    if len(study.n_samples) > 1:
+        for method, metric in itertools.product(methods, metrics):
+            mean = weighted((table.value(g, method, metric), n) for g, n in study.n_samples.items())
+            yield ResultRow.of(table.name, ALL, method, metric, mean)
+
+
+def _trends(table: ResultTable) -> Iterator[ResultRow]:
+    """The changes against the backbone alone [%], of all methods that handle collisions."""
+    for row in list(table.rows):
+        base = table.value(row.garment, "tailornet", row.metric)
+        if row.method not in ("skinned", "tailornet"):
+            change = None if row.value is None or not base else 100.0 * (row.value - base) / base
+            yield ResultRow.of(table.name, row.garment, row.method, f"{row.metric}_trend", change)
+
+
+def _alpha_values(run: MethodRun) -> Values:
+    """The main figures, and of ReFU its mean α by how wrong the distance is that it sees."""
+    values = {metric: getattr(run.figures, metric) for metric in _MAIN}
+    groups = zip(itertools.pairwise(RATIO_EDGES), run.scales.count, run.scales.total, strict=True)
+    for (low, high), count, total in groups if run.method == "refu-approx" else ():
+        if count:
+            values[f"mean α at a ratio of {low:g} to {high:g}"] = float(total / count)
+    return values
+
+
+_ENERGY: Mapping[str, Callable[[np.ndarray], float]] = {
+    "mean_energy": lambda e: float(e.mean()),
+    "median_energy": lambda e: float(np.median(e)),
+    "zero_energy_percent": lambda e: 100.0 * float((e == 0).mean()),
+    "low_energy_percent": lambda e: 100.0 * float((e < ENERGY_ZOOM).mean()),
+}
+
+
+def _energy_values(run: MethodRun) -> Values:
+    energy = run.values("energy")
+    return {metric: of(energy) for metric, of in _ENERGY.items()}
+
+
+def _unseen_values(run: MethodRun) -> Values:
+    groups = unseen_groups([run])
+    return {f"error [mm] at {d.min():.2f} to {d.max():.2f}": float(error.mean()) for d, error in groups}
+
+
+def unseen_groups(runs: Sequence[MethodRun]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """(distances, collision errors [mm]) of equally many samples each, by distance; none for unknown distances."""
+    distance = np.array([d for run in runs for d in run.unseen])
+    if not len(distance) or not np.isfinite(distance).all():
+        return []
+    error = np.concatenate([run.values("collision_error_mm") for run in runs])
+    groups = np.array_split(np.argsort(distance, kind="stable"), min(UNSEEN_GROUPS, len(distance)))
+    return [(distance[rows], error[rows]) for rows in groups]
+
+
+_SDFS = ("approx", "accurate")
+_MODES = (*_SDFS, "hybrid")
+_OPTIMISATIONS = (
+    *(f"optimisation-{sdf}{margin}" for margin in ("", "-margin") for sdf in _SDFS),
+    "optimisation-on-hybrid",
+    "optimisation-kept-on-hybrid",
+)
+
+SAMPLE_TABLES: Mapping[str, SampleTable] = {
+    "comparison": SampleTable(
+        "Comparison: ways to handle collisions",
+        "Test samples of each garment's set, each way of collision handling with the approximate and the "
+        'accurate signed distance of the body, as in the paper\'s Table 2. The rows "the node" are what `garment_node` '
+        "and `refu replay` publish: ReFU and a second look at what it moved.",
+        (
+            *("skinned", "tailornet", "naive-approx", "naive-accurate", *_OPTIMISATIONS),
+            *("collision-loss-approx", "collision-loss-accurate", *(f"refu-{mode}" for mode in _MODES)),
+            *("node-skinned", *(f"node-{mode}" for mode in _MODES)),
+        ),
+    ),
+    "ablation": SampleTable(
+        "Ablation: predicted scale, margin, blending",
+        "α fixed at 1 against α predicted, each trained so. Ours has two things that the paper's layer lacks: a "
+        "margin (a vertex is pushed to ε from the skin instead of onto it) and blending (a push takes its "
+        'neighbourhood along). The rows "not blended" and "ε = 0" leave them out at run time, without training anew; '
+        "with neither, it is exactly the paper's layer, which is also shown trained that way.",
+        (
+            "tailornet",
+            *(f"fixed-bare-{sdf}" for sdf in _SDFS),
+            *(f"bare-{mode}" for mode in _MODES),
+            *(f"fixed-{sdf}{kind}" for kind in ("-bare", "-unblended", "") for sdf in _SDFS),
+            *(f"refu-{mode}{kind}" for kind in ("-bare", "-unblended", "") for mode in _MODES),
+        ),
+        (*_MAIN, "avg_vf", "avg_ee"),
+    ),
+    "alpha": SampleTable(
+        "Networks that predict the scale α",
+        "Alt. 1: one latent vector for all vertices, as many weights. Alt. 2: from the vertex's distance alone. "
+        "ReFU: a latent vector for each vertex. All with the approximate distance.",
+        ("tailornet", "alt1-approx", "alt2-approx", "refu-approx"),
+        values=_alpha_values,
+    ),
+    "gcnn": SampleTable(
+        "Graph convolution as the backbone, trained from scratch",
+        "The same graph convolution network with and without ReFU in it, from scratch. The paper doesn't say for "
+        "which garment its figures are; they stand beside each of ours.",
+        ("gcnn", *(f"gcnn-refu-{mode}" for mode in _MODES)),
+    ),
+    "laplacian": SampleTable(
+        "Local Laplacian error where collisions were resolved",
+        "Mean length of the difference between a vertex's uniform Laplacian on its 1-ring and the true one, over "
+        "the vertices that are inside the body in what the backbone alone predicts: the same vertices for every method "
+        "of that backbone.",
+        (
+            *("tailornet", "skinned-naive", "skinned-optimisation", *_OPTIMISATIONS),
+            *(f"refu-{mode}" for mode in _MODES),
+            "node-hybrid",
+        ),
+        ("laplacian_mm", "mpve_mm"),
+    ),
+    "unseen": SampleTable(
+        "Collision error far from the training set",
+        "Mean collision error Σ max(0, -f) [mm] of test samples in groups of equal size, by their distance to the "
+        "nearest training sample in (θ, β, γ). The paper prints no figures, only a plot.",
+        ("tailornet", "collision-loss-approx", "collision-loss-accurate", "refu-approx", "refu-hybrid"),
+        metrics=(),
+        values=_unseen_values,
+        is_summed=False,
+    ),
+    "energy": SampleTable(
+        "Penetration energy",
+        "E = Σ max(0, -f)² over a garment's vertices, with the exact distance f. The paper takes its energy from "
+        "another work without giving the formula; this one is ours, so only the shape of the histograms compares.",
+        ("skinned", "tailornet", *(f"refu-{mode}" for mode in _MODES)),
+        metrics=tuple(_ENERGY),
+        values=_energy_values,
+        is_summed=False,
+    ),
+    "sequence": SampleTable(
+        "Continuous motion with a perceptron",
+        "Every frame of test sequences with motions of their own: simulated with dynamics, where the networks see the "
+        "pose of that frame alone. The paper's figures are of another data set (VTO).",
+        ("mlp-5", "mlp-5-refu-approx", "mlp-17", "mlp-17-refu-approx"),
+        is_summed=False,
+    ),
+}
+"""The tables over test samples, but for that of times."""
+
+_COMPONENTS: Mapping[str, tuple[str, ...]] = {
+    "sdf-approx": ("approximate SDF", "refu-hybrid", "sdf"),
+    "sdf-accurate": ("accurate SDF", "refu-accurate", "sdf"),
+    "refu": ("ReFU", "refu-hybrid", "refu"),
+    "backbone": ("backbone alone (TailorNet)", "tailornet", "backbone"),
+    "node": ("the node, hybrid: a whole frame", "node-hybrid", "node"),
+    "node, backbone": ("of this, the backbone", "node-hybrid", "node backbone"),
+    "node, collisions": ("of this, distance and ReFU", "node-hybrid", "node sdf", "node refu"),
+    "optimisation": ("optimisation post-process, approximate", "optimisation-approx", "post-process"),
+    "optimisation, accurate": ("optimisation post-process, accurate", "optimisation-accurate", "post-process"),
+    "optimisation, kept": (
+        "optimisation post-process, approximate, ReFU's margin kept everywhere",
+        "optimisation-kept-on-hybrid",
+        "post-process",
+    ),
+    "skinned backbone": ("skinned template", "skinned", "backbone"),
+    "skinned, naive": ("skinned, naive post-process, accurate", "skinned-naive", "post-process"),
+    "skinned, optimisation": (
+        "skinned, optimisation post-process, accurate",
+        "skinned-optimisation",
+        "post-process",
+    ),
+}
+"""Component: its label, the method that has it, parts of that method's time."""
+TIMED_METHODS = tuple(dict.fromkeys(method for _, method, *_ in _COMPONENTS.values()))
+"""What must be run for the table of times."""

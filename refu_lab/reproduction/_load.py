@@ -1,0 +1,63 @@
+"""Finding and loading what training made."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from refu_core._files import read_json
+from refu_core.body import SmplBody
+from refu_core.errors import WeightsError
+from refu_core.garments import GarmentTemplate
+from refu_core.realtime import GarmentPipeline
+from refu_core.refu import Trained, trained_from_weights
+from refu_core.sdf import BodySdf, NeuralSdf, load_sdf_network
+from refu_core.weights import load_weights, weights_folder
+from refu_lab.reproduction._methods import Method
+
+
+class Library:
+    """Trained weights: those of some folders, `<folder>/<garment>/<weights>`, before those that ship."""
+
+    def __init__(self, folders: Sequence[Path] = ()) -> None:
+        """Looks into `folders` first, in their order."""
+        self._folders = tuple(folders)
+
+    def find(self, method: Method, garment: str) -> Path:
+        """The weights' files without suffix. Raises `WeightsError` where there are none."""
+        assert method.weights is not None
+        return self._find(method.weights, garment)
+
+    def key(self, method: Method, garment: str) -> str:
+        """What tells these weights from others of the same name; empty where there are none."""
+        if method.weights is None:
+            return ""
+        try:
+            card = read_json(self.find(method, garment).with_suffix(".json"), error=WeightsError, wanted="a card")
+            return str(card.get("sha256", "")) if isinstance(card, dict) else ""
+        except WeightsError:
+            return ""
+
+    def load(self, method: Method, garment: GarmentTemplate, body: SmplBody) -> Trained:
+        """A method's networks. Raises `WeightsError` where they are missing, damaged or of another body."""
+        stem = self.find(method, garment.name)
+        expect = {"garment": garment.name, "body_fingerprint": body.fingerprint}
+        return trained_from_weights(load_weights(stem, expect=expect), garment)
+
+    def pipeline(self, method: Method, garment: str) -> GarmentPipeline:
+        """What the node runs, in the method's mode; `none` without handling of collisions. Raises `RefuError`."""
+        weights = None if method.weights is None else self.find(method, garment).parent.parent
+        sdf = method.mode if method.handling == "node" else "none"
+        return GarmentPipeline.load([garment], sdf=sdf, backbone=method.backbone, weights=weights)
+
+    def load_neural_sdf(self, preset: str, garment: str, body: SmplBody) -> BodySdf:
+        """A distance network trained on a garment's set, `sdf-<preset>`. Raises `WeightsError` where there is none."""
+        stem = self._find(f"sdf-{preset}", garment)
+        return NeuralSdf(load_sdf_network(stem, body).eval().requires_grad_(False), body)
+
+    def _find(self, name: str, garment: str) -> Path:
+        for folder in (weights_folder(garment, root) for root in (*self._folders, None)):
+            if (folder / f"{name}.json").exists():
+                return folder / name
+        msg = "not trained"
+        raise WeightsError(msg)

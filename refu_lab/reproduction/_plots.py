@@ -1,0 +1,89 @@
+"""The supplement's plots: energy histograms, scale against distance ratio, collisions far from the training set."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+
+from refu_lab.plots import COLOURS, new_axes, save_svg
+from refu_lab.reproduction._build import ENERGY_ZOOM, unseen_groups
+from refu_lab.reproduction._methods import METHODS
+from refu_lab.reproduction._runs import RATIO_EDGES, MethodRun, Study
+
+_SIZE = (8.4, 3.6)
+
+
+def plot_energy(study: Study, folder: Path) -> list[tuple[str, str]]:
+    """`energy.svg` and `energy_zoom.svg`: samples by penetration energy, all garments together.
+
+    Returns (file, caption) of what there was data for, as the other plots do.
+    """
+    shown = _shown(study, ("tailornet", "refu-hybrid"))
+    if len(shown) < 2:
+        return []
+    energies = [np.concatenate([run.values("energy") for run in runs]) for runs in shown.values()]
+    top = max(float(energy.max()) for energy in energies)
+    plots = []
+    for file, end in (("energy.svg", max(top, ENERGY_ZOOM)), ("energy_zoom.svg", ENERGY_ZOOM)):
+        figure, (ax,) = new_axes(size=_SIZE)
+        bins = np.linspace(0, end, 31).tolist()
+        ax.hist([e[e <= end] for e in energies], bins=bins, label=list(shown), color=COLOURS[:2])
+        ax.set(xlabel="penetration energy [m²]", ylabel="test samples", yscale="symlog")
+        ax.legend(frameon=False)
+        save_svg(figure, folder / file)
+        plots.append((file, f"Test samples by penetration energy up to {end:.2g} m², all garments together"))
+    return plots
+
+
+def plot_scale(study: Study, folder: Path) -> list[tuple[str, str]]:
+    """`scale.svg`: mean α by the ratio of approximate to accurate distance."""
+    shown = _shown(study, ("refu-approx", "refu-hybrid"))
+    shown = {label: runs for label, runs in shown.items() if sum(run.scales.count.sum() for run in runs)}
+    if not shown:
+        return []
+    figure, (ax,) = new_axes(size=_SIZE)
+    places = np.arange(len(RATIO_EDGES) - 1)
+    for k, (label, runs) in enumerate(shown.items()):
+        count = np.sum([run.scales.count for run in runs], axis=0)
+        total = np.sum([run.scales.total for run in runs], axis=0)
+        mean = np.divide(total, count, out=np.zeros_like(total), where=count > 0)
+        bars = ax.bar(places + 0.4 * k, mean, 0.38, color=COLOURS[k], label=label, align="edge")
+        ax.bar_label(bars, [f"{n:,}" if n else "" for n in count], fontsize=7, rotation=90, padding=3)
+    names = [f"({low:g}, {high:g}]" for low, high in itertools.pairwise(RATIO_EDGES)]
+    ax.set_xticks(places + 0.4, names, rotation=30, fontsize=8)
+    ax.set(xlabel="approximate / accurate distance", ylabel="mean α")
+    ax.margins(y=0.25)
+    ax.legend(frameon=False)
+    save_svg(figure, folder / "scale.svg")
+    return [
+        ("scale.svg", "Mean predicted scale of vertices inside the body, by how wrong their distance is; with counts")
+    ]
+
+
+def plot_unseen(study: Study, folder: Path) -> list[tuple[str, str]]:
+    """`unseen.svg`: collision error against the distance to the training set."""
+    methods = ("tailornet", "collision-loss-accurate", "collision-loss-approx", "refu-approx", "refu-hybrid")
+    figure, (ax,) = new_axes(size=_SIZE)
+    for method, colour in zip(methods, COLOURS, strict=True):
+        groups = unseen_groups(study.pooled(method))
+        if groups:
+            x, y = ([values.mean() for values in column] for column in zip(*groups, strict=True))
+            ax.plot(x, y, "o-", color=colour, label=METHODS[method].label)
+    if not ax.lines:
+        return []
+    ax.set(xlabel="distance to the nearest training sample", ylabel="mean collision error [mm]")
+    ax.set_ylim(bottom=0)
+    ax.legend(frameon=False)
+    save_svg(figure, folder / "unseen.svg")
+    return [("unseen.svg", "Mean collision error Σ max(0, -f) against the distance to the training set, all garments")]
+
+
+PLOTS = {"energy": plot_energy, "alpha": plot_scale, "unseen": plot_unseen}
+"""What draws the plots of a table."""
+
+
+def _shown(study: Study, methods: tuple[str, ...]) -> dict[str, list[MethodRun]]:
+    """The runs of those methods that were run on all garments, by label."""
+    return {METHODS[name].label: runs for name in methods if (runs := study.pooled(name))}

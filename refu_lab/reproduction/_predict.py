@@ -1,0 +1,218 @@
+"""A method at work: one sample's body in, the garment that the method makes of it out, each stage timed."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from refu_core.backbones import Skinned
+from refu_core.body import RigidTransforms, SmplBody, load_body
+from refu_core.contact import Blend
+from refu_core.errors import WeightsError
+from refu_core.frames import SmplFrame
+from refu_core.garments import GarmentTemplate, load_garment
+from refu_core.realtime import GarmentPipeline, Outfit, Wearable, Wearer, dress
+from refu_core.refu import Refu, Trained
+from refu_core.sdf import ApproxSdf, BodySdf, ExactSdf, RestFaces, SdfSample
+from refu_lab.baselines import PostProcess, push_naively
+from refu_lab.reproduction._load import Library
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from refu_lab.reproduction._methods import Method
+
+
+@dataclass(eq=False)
+class GarmentSetup:
+    """What all methods share for one garment: template, body, distances, and the hints that the fast one asks for."""
+
+    template: GarmentTemplate
+    body: SmplBody
+    exact: ExactSdf
+    approx: ApproxSdf
+    rest_faces: RestFaces
+    post_process: PostProcess
+    blend: Blend
+
+    @classmethod
+    def of(cls, garment: str) -> GarmentSetup:
+        """Prepares a built-in garment on its body."""
+        template = load_garment(garment)
+        body = load_body(template.body)
+        return cls(
+            template,
+            body,
+            ExactSdf(body.faces),
+            ApproxSdf(body),
+            RestFaces(body),
+            PostProcess.of_faces(template.faces, template.n_vertices),
+            Blend.of_faces(template.faces, template.n_vertices),
+        )
+
+    def near(self, unposed: Tensor, betas: Tensor) -> Tensor:
+        """A body face near each vertex of an unposed garment [m], shape (N, 3), for betas (1, 10); shape (N,)."""
+        return self.rest_faces.under(unposed[None], betas, self.template.shapedirs)[0]
+
+
+@dataclass(eq=False)
+class SampleScene:
+    """One sample's body, posed; the distances to it are made ready when the first method asks."""
+
+    setup: GarmentSetup
+    pose: Tensor
+    """θ [rad], shape (1, 24, 3)."""
+    betas: Tensor
+    """β, shape (1, 10)."""
+    style: Tensor
+    """γ, shape (1, 4)."""
+    vertices: Tensor = field(init=False)
+    """Body [m], shape (V, 3)."""
+    transforms: RigidTransforms = field(init=False)
+    _update_ms: dict[str, float] = field(default_factory=dict, init=False)
+
+    def __post_init__(self) -> None:
+        posed = self.setup.body(self.pose, self.betas)
+        self.vertices, self.transforms = posed.vertices[0], posed.transforms
+
+    @classmethod
+    def of(cls, setup: GarmentSetup, pose: ArrayLike, betas: ArrayLike, style: ArrayLike) -> SampleScene:
+        """A scene of a pose (24, 3) [rad], betas (10,) and style (4,)."""
+        values = (torch.from_numpy(np.asarray(value, np.float32))[None] for value in (pose, betas, style))
+        return cls(setup, *values)
+
+    def sdf(self, name: str) -> tuple[BodySdf, float]:
+        """The distance of that name to this body, and how long it took to take over the body [ms]."""
+        sdf: BodySdf = self.setup.exact if name == "accurate" else self.setup.approx
+        if name not in self._update_ms:
+            start = time.perf_counter()
+            sdf.update(self.vertices, pose=self.pose[0], betas=self.betas[0])
+            self._update_ms[name] = 1e3 * (time.perf_counter() - start)
+        return sdf, self._update_ms[name]
+
+
+class MethodOutput(NamedTuple):
+    """What a method made of a scene."""
+
+    vertices: Tensor
+    """Garment [m], shape (N, 3)."""
+    ms: Mapping[str, float]
+    """Wall time by component: backbone (with posing), sdf, refu, post-process; node and its stages [ms]."""
+    scale: Tensor
+    """α of the vertices that ReFU pushed, shape (R,); empty for other methods."""
+    approx: Tensor
+    """Their signed distance as ReFU saw it [m], shape (R,)."""
+    accurate: Tensor
+    """And the accurate one [m], shape (R,)."""
+
+
+class Predictor:
+    """One method for one garment."""
+
+    def __init__(self, method: Method, setup: GarmentSetup, library: Library) -> None:
+        """Loads what the method needs. Raises `WeightsError` for networks that aren't trained."""
+        self._method = method
+        self._setup = setup
+        self._pipeline: GarmentPipeline | None = None
+        network = Trained(Skinned(), None)
+        if method.handling == "node":
+            self._pipeline = library.pipeline(method, setup.template.name)
+        elif method.backbone != "skinned":
+            network = library.load(method, setup.template, setup.body)
+        self._refu: Refu | None = None
+        if method.handling == "refu":
+            if network.refu is None:
+                msg = f"{method.weights}: weights of a backbone alone, wanted those of one with ReFU"
+                raise WeightsError(msg)
+            self._refu = _with_margin(network.refu, method.margin)
+        self._name = setup.template.name
+        wearable = Wearable(setup.template, network.backbone, self._refu, margin=0.0)
+        self._outfit = Outfit(setup.body, {self._name: wearable})
+
+    @torch.no_grad()
+    def __call__(self, scene: SampleScene) -> MethodOutput:
+        """The garment in a scene."""
+        if self._pipeline is not None:
+            return self._of_node(self._pipeline, scene)
+        ended: dict[str, float] = {}
+        dressed = dress(
+            scene.pose,
+            Wearer.of(self._outfit, scene.betas, scene.style),
+            lap=lambda stage, _: ended.update({stage: time.perf_counter()}),
+        )
+        drape = dressed.drapes[self._name]
+        points = dressed.turns[0](drape.vertices[0])
+        ms = {"backbone": 1e3 * (ended["backbone"] - ended["body"])}
+        if self._method.handling == "none" or self._method.sdf is None:
+            return _outcome(points, ms)
+        sdf, update_ms = scene.sdf(self._method.sdf)
+        start = time.perf_counter()
+        near = self._setup.rest_faces(drape.on_mean[0]) if self._method.sdf == "approx" else None
+        if self._refu is not None:
+            sample = sdf.query(points, near=near)
+            ms["sdf"] = update_ms + 1e3 * (time.perf_counter() - start)
+            return self._push(self._refu, scene, points, sample, drape.feature, ms)
+        if self._method.handling == "naive":
+            done = push_naively(points, sdf, near=near)
+        else:
+            margin = self._method.margin
+            kept = {} if margin is None else {"clearance": margin, "reach": margin if self._method.is_kept else 0.0}
+            done = self._setup.post_process.optimise(points, sdf, near=near, **kept)
+        ms["post-process"] = update_ms + 1e3 * (time.perf_counter() - start)
+        return _outcome(done, ms)
+
+    def _push(
+        self,
+        refu: Refu,
+        scene: SampleScene,
+        points: Tensor,
+        sample: SdfSample,
+        z: Tensor | None,
+        ms: dict[str, float],
+    ) -> MethodOutput:
+        """ReFU as in training: one push, no second look."""
+        start = time.perf_counter()
+        batch = SdfSample(sample.distance[None], sample.gradient[None])
+        pushed = refu(points[None], batch, z)
+        if self._method.is_blended:
+            pushed = self._setup.blend.follow(points[None], pushed, refu.margin - batch.distance)
+        done = pushed[0]
+        ms["refu"] = 1e3 * (time.perf_counter() - start)
+        rows = torch.nonzero(sample.distance < float(refu.margin))[:, 0]
+        scale, f = refu.of_body(z), sample.distance[rows]
+        exact, _ = scene.sdf("accurate")
+        return MethodOutput(
+            done,
+            ms,
+            torch.full_like(f, scale) if isinstance(scale, float) else scale(rows, f),
+            f,
+            exact.query(points[rows]).distance,
+        )
+
+    def _of_node(self, pipeline: GarmentPipeline, scene: SampleScene) -> MethodOutput:
+        frame = SmplFrame(pose=scene.pose[0].numpy(), betas=scene.betas[0].numpy(), style=scene.style[0].numpy())
+        start = time.perf_counter()
+        output = pipeline(frame)
+        ms = {"node": 1e3 * (time.perf_counter() - start)}
+        ms |= {f"node {stage}": spent for stage, spent in output.stats.stage_ms.items()}
+        return _outcome(torch.from_numpy(output[self._setup.template.name].local), ms)
+
+
+def _with_margin(refu: Refu, margin: float | None) -> Refu:
+    """The layer with another ε; itself for None."""
+    if margin is None:
+        return refu
+    other = Refu.from_config({**refu.config, "margin": margin, "learn_margin": False})
+    other.load_state_dict({name: t for name, t in refu.state_dict().items() if name != "log_margin"})
+    return other.eval()
+
+
+def _outcome(vertices: Tensor, ms: Mapping[str, float]) -> MethodOutput:
+    none = vertices.new_zeros(0)
+    return MethodOutput(vertices, ms, none, none, none)

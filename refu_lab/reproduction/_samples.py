@@ -1,0 +1,99 @@
+"""Test samples that methods are run on: those of a set of poses, or the frames of a set of sequences."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from refu_core.errors import RefuError
+from refu_core.simulation import GarmentDataset, GarmentSequences, open_dataset
+
+
+class Sample(NamedTuple):
+    """One body and the garment that was simulated on it."""
+
+    vertices: NDArray[np.float32]
+    """The true garment [m], shape (N, 3)."""
+    pose: NDArray[np.float32]
+    """θ [rad], shape (24, 3)."""
+    betas: NDArray[np.float32]
+    """β, shape (10,)."""
+    style: NDArray[np.float32]
+    """γ, shape (4,)."""
+    unseen: float
+    """Distance to the nearest training sample in (θ, β, γ); NaN where it isn't known."""
+
+
+@dataclass(frozen=True, eq=False)
+class SampleSet:
+    """The test samples of one garment, read one at a time."""
+
+    garment: str
+    count: int
+    key: str
+    """What tells these samples from others."""
+    shapes: int | None
+    """Body shapes of a set of sequences; None for a set of poses."""
+    read: Callable[[int], Sample]
+    """The sample of a number from 0 to `count` - 1."""
+
+    def __len__(self) -> int:
+        return self.count
+
+    def thinned(self, most: int) -> SampleSet:
+        """At most so many of these samples, evenly spread."""
+        rows = np.unique(np.linspace(0, self.count - 1, min(most, self.count)).round().astype(int))
+        return replace(
+            self, count=len(rows), key=f"{self.key} {most}", read=lambda number: self.read(int(rows[number]))
+        )
+
+    @classmethod
+    def open(cls, path: Path, *, every: int = 1) -> SampleSet:
+        """Every `every`-th test sample of the set in the folder `path`, finished so far.
+
+        Raises:
+            RefuError: no such set, a damaged one, or one without a finished test sample.
+        """
+        dataset = open_dataset(path)
+        samples = _of_sequences(dataset, every) if isinstance(dataset, GarmentSequences) else _of_poses(dataset, every)
+        if not samples.count:
+            msg = f"{path}: no test sample in it is finished yet"
+            raise RefuError(msg)
+        return samples
+
+
+def _of_poses(dataset: GarmentDataset, every: int) -> SampleSet:
+    rows = np.flatnonzero(dataset.test)[::every]
+
+    def read(number: int) -> Sample:
+        sample = dataset.sample(int(rows[number]))
+        return Sample(sample.vertices, sample.pose, sample.betas, sample.style, sample.unseen)
+
+    key = _key(dataset.column("slot")[rows], dataset.column("pose")[rows])
+    return SampleSet(str(dataset.card["garment"]), len(rows), key, None, read)
+
+
+def _of_sequences(dataset: GarmentSequences, every: int) -> SampleSet:
+    sequences = [dataset.sequence(int(row)) for row in np.flatnonzero(dataset.test)]
+    frames = [(k, int(t)) for k, sequence in enumerate(sequences) for t in np.flatnonzero(sequence.kept)][::every]
+
+    def read(number: int) -> Sample:
+        sequence, t = sequences[frames[number][0]], frames[number][1]
+        return Sample(sequence.vertices(t), sequence.pose[t], sequence.betas, sequence.style, float("nan"))
+
+    key = _key(np.array(frames), np.array([sequence.number for sequence in sequences]))
+    plan = dataset.card["plan"]
+    return SampleSet(str(plan["garment"]), len(frames), key, int(plan["shapes"]), read)
+
+
+def _key(*arrays: NDArray[np.generic]) -> str:
+    digest = hashlib.sha256()
+    for array in arrays:
+        digest.update(array.tobytes())
+    return digest.hexdigest()

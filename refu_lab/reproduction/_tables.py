@@ -1,0 +1,283 @@
+"""Tables of the reproduction: figures of ours, each beside the paper's, as pages and JSON."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from refu_core._files import read_json
+from refu_core.errors import RefuError
+from refu_lab.reproduction._methods import METHODS
+from refu_lab.reproduction._paper import paper_figure
+from refu_lab.tables import RESULT_TABLES, TextTable, picture_markdown, write_json, write_page
+
+ALL = "all"
+"""Stands for all garments, weighted by their numbers of test samples."""
+_NO_VALUE = "–"
+_PAPER_NOTE = (
+    "*Figures of the paper, in italics, were measured on other data (TailorNet's, of which the authors selected "
+    "samples) and other hardware (a server with V100 GPUs): compare orders and ratios, not absolute figures.*"
+)
+
+
+class Metric(NamedTuple):
+    """How a metric is written."""
+
+    label: str
+    digits: int
+    higher_is_better: bool = False
+
+
+METRICS: Mapping[str, Metric] = {
+    "mpve_mm": Metric("MPVE [mm]", 2),
+    "vfcp_percent": Metric("VFCP [%]", 3),
+    "cfmp_percent": Metric("CFMP [%]", 2, higher_is_better=True),
+    "avg_vf": Metric("Avg. VF", 2),
+    "avg_ee": Metric("Avg. EE", 2),
+    "laplacian_mm": Metric("local Laplacian error [mm]", 2),
+    "max_depth_mm": Metric("deepest [mm]", 1),
+    "mean_energy": Metric("mean energy [m²]", 6),
+    "median_energy": Metric("median energy [m²]", 6),
+    "low_energy_percent": Metric("energy below 2.5e-3 [%]", 1, higher_is_better=True),
+    "zero_energy_percent": Metric("energy zero [%]", 1, higher_is_better=True),
+    "mean_absolute_mm": Metric("mean absolute error [mm]", 2),
+    "mean_relative_percent": Metric("mean relative error [%]", 2),
+    "p99_mm": Metric("99th percentile [mm]", 2),
+    "missed_percent": Metric("wrong by over 2 mm [%]", 3),
+    "hidden_percent": Metric("over 2 mm inside, taken for outside [%]", 4),
+    "ms": Metric("median time [ms]", 2),
+    "jitter_mm": Metric("jitter [mm/frame²]", 3),
+    "mpve_mm_trend": Metric("MPVE, change [%]", 1),
+    "vfcp_percent_trend": Metric("VFCP, change [%]", 1),
+    "cfmp_percent_trend": Metric("CFMP, change [%]", 1, higher_is_better=True),
+}
+"""The metrics by the names they have in JSON. Those of a group that a table makes up (`error @ 1.5`) aren't here."""
+
+
+class ResultRow(NamedTuple):
+    """One figure, and the paper's; its fields are the keys of a row in JSON."""
+
+    table: str
+    garment: str
+    method: str
+    metric: str
+    value: float | None
+    """None where nothing was measured: not trained, or no sample that the metric is about."""
+    paper: float | None
+
+    @classmethod
+    def of(cls, table: str, garment: str, method: str, metric: str, value: float | None) -> ResultRow:
+        """A row with the paper's figure looked up."""
+        return cls(table, garment, method, metric, value, paper_figure(table, garment, method, metric))
+
+
+@dataclass(frozen=True)
+class Missing:
+    """Why a method has no figures for a garment, and what to do about that."""
+
+    garment: str
+    method: str
+    reason: str
+    command: str
+    """The command that makes what is missing."""
+
+
+@dataclass(eq=False)
+class ResultTable:
+    """One table: its figures, what it lacks, what it is about."""
+
+    name: str
+    title: str
+    about: str
+    """What was measured and how, as Markdown."""
+    rows: list[ResultRow] = field(default_factory=list)
+    missing: list[Missing] = field(default_factory=list)
+    plots: list[tuple[str, str]] = field(default_factory=list)
+    """(file name, caption)."""
+    labels: Mapping[str, str] = field(default_factory=dict)
+    """Names for people of rows that aren't methods."""
+
+    def value(self, garment: str, method: str, metric: str) -> float | None:
+        """The figure measured; None where there is none."""
+        found = (row.value for row in self.rows if row[1:4] == (garment, method, metric))
+        return next(found, None)
+
+    def label(self, method: str) -> str:
+        """A row's name for people."""
+        return self.labels.get(method) or (METHODS[method].label if method in METHODS else method)
+
+    def markdown(self, *, source: str) -> list[str]:
+        """The parts of a page; `source` says how to make the table again."""
+        has_paper = any(row.paper is not None for row in self.rows)
+        parts = [f"# {self.title}", self.about, f"{_PAPER_NOTE} {source}" if has_paper else source]
+        for garment in _unique(row.garment for row in self.rows):
+            parts += [f"## {garment}", *(grid.markdown() for grid in self.of_garment(garment))]
+        if self.missing:
+            parts += ["## Not measured", "\n".join(self._reasons())]
+        return parts + [picture_markdown(*plot) for plot in self.plots]
+
+    def in_short(self) -> list[TextTable]:
+        """The figures of all garments or clips together, or of each where there are none of all."""
+        garments = _unique(row.garment for row in self.rows)
+        summed = [garment for garment in garments if garment == ALL or garment.endswith("all clips")]
+        return [grid for garment in summed or garments for grid in self.of_garment(garment)]
+
+    def of_garment(self, garment: str) -> list[TextTable]:
+        """A garment's figures, metrics of one kind side by side."""
+        rows = [row for row in self.rows if row.garment == garment]
+        kinds = _unique(_kind(row.metric) for row in rows)
+        return [self._grid(garment, [row for row in rows if _kind(row.metric) == kind]) for kind in kinds]
+
+    def _grid(self, garment: str, rows: Sequence[ResultRow]) -> TextTable:
+        """Methods down, metrics across; the paper's beside those of which it has any."""
+        metrics = _unique(row.metric for row in rows)
+        in_paper = {row.metric for row in rows if row.paper is not None}
+        found = {(row.method, row.metric): row for row in rows}
+        absent = {m.method for m in self.missing if m.garment in (garment, ALL)}
+        header = ["method"]
+        for metric in metrics:
+            header += [label_of(metric), "*paper*"] if metric in in_paper else [label_of(metric)]
+        lines = []
+        for method in _unique(row.method for row in rows):
+            of_method = [found.get((method, metric)) for metric in metrics]
+            is_empty = all(row is None or row.value is None for row in of_method)
+            cells = [self.label(method) + (" (not measured)" if method in absent and is_empty else "")]
+            for metric, row in zip(metrics, of_method, strict=True):
+                cells.append(format_value(metric, row.value if row else None))
+                cells += [f"*{format_value(metric, row.paper if row else None)}*"] if metric in in_paper else []
+            lines.append(cells)
+        return TextTable(f"{self.title}, {garment}", header, lines)
+
+    def _reasons(self) -> list[str]:
+        """What is missing, why, and how to make it; methods that lack the same thing in one line."""
+        lacking: dict[tuple[str, str], list[str]] = {}
+        for m in self.missing:
+            lacking.setdefault((f"{m.garment}, {m.reason}", m.command), []).append(self.label(m.method))
+        return [
+            f"- {reason}: {'; '.join(names)}." + (f" `{command}`" if command else "")
+            for (reason, command), names in lacking.items()
+        ]
+
+    def write(self, folder: Path, *, command: str, n_samples: Mapping[str, int]) -> Path:
+        """Writes `<name>.md` and `<name>.json`; returns the page.
+
+        `command` makes the table again, `n_samples` are the test samples it is of.
+
+        Raises:
+            RefuError: the folder can't be written.
+        """
+        counted = ", ".join(f"{name} {count}" for name, count in n_samples.items())
+        of_samples = f" over these numbers of test samples: {counted}" if counted else ""
+        facts = {
+            "samples": dict(n_samples),
+            "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
+            "versions": {name: version(name) for name in ("refu-ros", "torch", "warp-lang")},
+        }
+        content = {
+            "table": self.name,
+            "title": self.title,
+            "rows": [row._asdict() for row in self.rows],
+            "missing": [asdict(missing) for missing in self.missing],
+            "about": self.about,
+            "plots": self.plots,
+            "command": command,
+            "facts": facts,
+        }
+        path = folder / f"{self.name}.md"
+        write_page(path, self.markdown(source=f"*Made by `{command}`{of_samples}.*"))
+        write_json(path.with_suffix(".json"), content)
+        return path
+
+
+def read_table(folder: Path, name: str) -> ResultTable | None:
+    """A table that was written; None where there is none.
+
+    Raises:
+        RefuError: a file that isn't such a table.
+    """
+    path = folder / f"{name}.json"
+    if not path.exists():
+        return None
+    try:
+        data = read_json(path, error=RefuError, wanted="results of refu evaluate")
+        rows = [ResultRow(**row) for row in data["rows"]]
+        plots = [(file, caption) for file, caption in data["plots"]]
+        missing = [Missing(**one) for one in data["missing"]]
+        return ResultTable(data["table"], data["title"], data["about"], rows, missing, plots)
+    except (ValueError, KeyError, TypeError) as error:
+        msg = f"{path}: not results of refu evaluate ({error!r}): remove it, or make it again"
+        raise RefuError(msg) from error
+
+
+def write_summary(folder: Path) -> Path:
+    """Writes `README.md`: all tables that are in the folder, the main one's figures, the pictures.
+
+    Raises:
+        RefuError: a file that isn't a table, or a folder that can't be written.
+    """
+    tables: dict[str, Any] = {name: read_table(folder, name) for name in RESULT_TABLES}
+    links = [
+        f"- not made yet: `refu evaluate --table {name}`" if table is None else f"- [{table.title}]({name}.md)"
+        for name, table in tables.items()
+    ]
+    if (folder / "performance.md").exists():
+        links.append("- [Run time: `refu benchmark`](performance.md)")
+    parts = [
+        "# Results",
+        "Every table and figure of the paper, on simulated data of this project. `refu evaluate` writes these pages.",
+        "\n".join(links),
+        _PAPER_NOTE,
+    ]
+    main: ResultTable | None = tables["comparison"]
+    if main is not None:
+        grids = main.in_short()
+        parts += [f"## {grids[0].title}", *(grid.markdown() for grid in grids)]
+    pictures = [plot for table in tables.values() if table is not None for plot in table.plots]
+    parts += [picture_markdown(*plot) for plot in pictures if plot[0].endswith(".png")]
+    write_page(folder / "README.md", parts)
+    return folder / "README.md"
+
+
+def label_of(metric: str) -> str:
+    """A metric's name for people."""
+    return METRICS[metric].label if metric in METRICS else metric
+
+
+def format_value(metric: str, value: float | None) -> str:
+    """A figure for people; a dash where there is none."""
+    if value is None:
+        return _NO_VALUE
+    signed = "+" if metric.endswith("_trend") else ""
+    return f"{value:{signed}.{METRICS[metric].digits if metric in METRICS else 3}f}"
+
+
+def weighted(values: Iterable[tuple[float | None, int]]) -> float | None:
+    """Mean of (value, number of samples), weighted by the numbers ("All Garments" of the paper).
+
+    None if one is missing: a mean over the others would be of other garments than the rows beside it.
+    """
+    pairs = list(values)
+    total = sum(count for _, count in pairs)
+    if not total:
+        return None
+    result = 0.0
+    for value, count in pairs:
+        if value is None:
+            return None
+        result += value * count / total
+    return result
+
+
+def _kind(metric: str) -> str:
+    if metric.endswith("_trend"):
+        return "trend"
+    return "" if metric in METRICS else metric.split(" at ")[0]
+
+
+def _unique(values: Iterable[str]) -> list[str]:
+    return list(dict.fromkeys(values))

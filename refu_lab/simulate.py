@@ -1,0 +1,69 @@
+"""What `refu simulate` does: a data set of simulated garments, with progress, and a summary of its card."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Any
+
+from tqdm import tqdm
+
+from refu_core.simulation import GarmentDataset, Progress, simulate_dataset, simulate_sequences
+from refu_lab.contact_sheet import contact_sheet
+from refu_lab.render import save_png
+from refu_lab.tables import format_table
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+SHEET = "samples.png"
+"""Random samples of a finished set, to look at before anything is trained on it."""
+
+
+def simulate(
+    garment: str,
+    count: int,
+    output: Path,
+    *,
+    motions: Path | None,
+    body: str | None,
+    seed: int,
+    processes: int,
+    shard: tuple[int, int],
+    sequences: bool,
+    shapes: int,
+    seconds: float,
+    progress: bool,
+) -> dict[str, Any]:
+    """Simulates with a progress bar that shows what was dropped; returns the set's card.
+
+    A finished set of samples gets its picture, `samples.png`.
+
+    Raises `RefuError`.
+    """
+    with ExitStack() as stack:
+        unit = "sequence" if sequences else "sample"
+        bar = stack.enter_context(tqdm(total=None, unit=unit, disable=None if progress else True))
+
+        def show(state: Progress) -> None:
+            bar.total = state.total
+            bar.set_postfix(state.dropped, refresh=False)
+            bar.update(state.done - bar.n)
+
+        options: dict[str, Any] = {"motions": motions, "body": body, "seed": seed, "progress": show}
+        options |= {"processes": processes, "shard": shard}
+        if sequences:
+            return simulate_sequences(garment, count, output, shapes=shapes, seconds=seconds, **options)
+        card = simulate_dataset(garment, count, output, **options)
+    if not card["counts"]["to_do"]:
+        save_png(contact_sheet(GarmentDataset(output), body=body), output / SHEET)
+    return card
+
+
+def simulation_table(card: dict[str, Any], output: Path) -> str:
+    """What `refu simulate` prints."""
+    counts, share, figures = card["counts"], card["yield"], card.get("figures", {})
+    rows = [(name.replace("_", " "), str(number)) for name, number in counts.items()]
+    rows += [("yield", f"{100 * share['kept_share']:.1f} %")]
+    rows += [(f"  dropped: {cause.replace('_', ' ')}", str(n)) for cause, n in share["dropped"].items() if n]
+    rows += [(name.replace("_", " "), f"{value:.3f}") for name, value in figures.items()]
+    return format_table((f"{card['garment']} on {card['body']}", str(output)), rows)

@@ -1,0 +1,128 @@
+"""The table of checks: what is drawn, what is measured of it, how often, and in which modes it is promised."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from refu_core.errors import FrameError
+from refu_core.frames import N_BETAS, N_STYLES
+from refu_lab.stress import _guarantees as guarantees
+from refu_lab.stress import _invariance as invariance
+from refu_lab.stress import _numbers as numbers
+from refu_lab.stress._frames import FRAMES, Draw, between, everyday, everyday_pose, frame_of, promised
+from refu_lab.stress._trial import Check, Trial
+
+DrawTrial = Callable[[np.random.Generator], Trial]
+
+_FRAMES = 64
+"""Frames of a trial of numbers, and persons of a batch."""
+_STEPS = 24
+"""Frames of a motion."""
+
+
+def _many(draw: Draw) -> DrawTrial:
+    """64 frames; what the frame itself refuses, the pipeline never sees."""
+
+    def trial(rng: np.random.Generator) -> Trial:
+        frames = []
+        for _ in range(_FRAMES):
+            with contextlib.suppress(FrameError):
+                frames.append(draw(rng))
+        return Trial(tuple(frames), refused=_FRAMES - len(frames))
+
+    return trial
+
+
+def _calm(share: float, *, in_room: bool = False) -> DrawTrial:
+    """A share of an everyday pose, in which most bodies don't touch themselves; anywhere in a room or at its origin."""
+
+    def trial(rng: np.random.Generator) -> Trial:
+        pose, betas = share * everyday_pose(rng), rng.normal(0, 1, N_BETAS)
+        transl = rng.normal(0, 3, 3) if in_room else np.zeros(3)
+        return Trial((frame_of(pose, betas, transl),), int(rng.integers(2**31)))
+
+    return trial
+
+
+_calm_day = _calm(0.6, in_room=True)
+
+
+def _any_day(rng: np.random.Generator) -> Trial:
+    return Trial((everyday(rng),)) if rng.random() < 0.5 else _calm_day(rng)
+
+
+def _promised(rng: np.random.Generator) -> Trial:
+    return Trial((promised(rng),))
+
+
+def _any_frame(rng: np.random.Generator) -> Trial:
+    names = [name for name in FRAMES if name != "absurd"]
+    return Trial((FRAMES[names[rng.integers(len(names))]](rng),))
+
+
+def _wide(rng: np.random.Generator) -> Trial:
+    """Half within the promised range, half anywhere."""
+    return _promised(rng) if rng.random() < 0.5 else _any_frame(rng)
+
+
+def _motion(rng: np.random.Generator) -> Trial:
+    betas, style = rng.normal(0, 1, N_BETAS), rng.normal(0, 1, N_STYLES)
+    poses = [0.7 * everyday_pose(rng) for _ in range(2)]
+    return Trial(tuple(frame_of(pose, betas, style=style) for pose in between(poses, _STEPS)))
+
+
+def _folding(rng: np.random.Generator) -> Trial:
+    """From an everyday pose to one with limbs through the trunk."""
+    last = FRAMES["limbs through the trunk"](rng)
+    poses: list[NDArray[np.floating]] = [0.7 * everyday_pose(rng), last.pose]
+    return Trial(tuple(frame_of(pose, last.betas) for pose in between(poses, _STEPS)))
+
+
+def _teleport(rng: np.random.Generator) -> Trial:
+    """Frames of which each is far from the last one."""
+    names = ("everyday", "any rotation of any joint", "limbs through the trunk", "betas of 5", "angles beyond a turn")
+    return Trial((*(FRAMES[name](rng) for name in rng.permutation(names)), everyday(rng)))
+
+
+def _crowd(rng: np.random.Generator) -> Trial:
+    return Trial(tuple(_calm(0.6)(rng).frames[0] for _ in range(_FRAMES)))
+
+
+_EXACT = ("accurate",)
+CHECKS: dict[str, Check] = {
+    check.name: check
+    for check in (
+        *(Check(f"numbers: {name}", _many(draw), numbers.against_float64) for name, draw in FRAMES.items()),
+        *(
+            Check(f"numbers: distance, {name}", _calm(0.5), numbers.distances(place))
+            for name, place in numbers.POINTS.items()
+        ),
+        Check("guarantees: nothing inside", _any_day, guarantees.nothing_inside, trials=4, sdf_modes=_EXACT),
+        Check("guarantees: nothing inside, garment buried in the body", _calm_day, guarantees.buried, sdf_modes=_EXACT),
+        Check(
+            "guarantees: nothing inside, promised poses and shapes",
+            _promised,
+            guarantees.nothing_inside,
+            trials=8,
+            sdf_modes=_EXACT,
+        ),
+        Check("guarantees: whatever is inside is counted", _wide, guarantees.counted, trials=8),
+        Check("guarantees: no vertex thrown out", _any_day, guarantees.not_thrown, trials=2),
+        Check("guarantees: displacement bounded in any pose", _any_frame, guarantees.bounded, trials=4),
+        Check("guarantees: no jumps in smooth motion", _motion, guarantees.no_jumps),
+        Check("guarantees: no jumps in smooth motion, worn together", _motion, guarantees.no_jumps_together),
+        Check("guarantees: bounded jumps through self-contact", _folding, guarantees.bounded_jumps),
+        Check("invariance: the person turned", _calm(0.6), invariance.turned, trials=2, repeats=1),
+        Check("invariance: the person 100 km away", _calm(0.6), invariance.moved, trials=2, repeats=1),
+        Check("invariance: left and right exchanged", _calm(0.6), invariance.mirrored, repeats=1),
+        Check("invariance: what came before", _teleport, invariance.history, repeats=2),
+        Check("invariance: a batch of 64, predicted", _crowd, invariance.batch, repeats=invariance.ALONE),
+        Check("invariance: a batch of 64, resolved", _crowd, invariance.batch_resolved, repeats=invariance.ALONE),
+    )
+}
+"""By name; each round has all of them in this order."""
+PARTS = (*dict.fromkeys(check.part for check in CHECKS.values()), "soak")

@@ -1,0 +1,241 @@
+"""Guarantees: nothing inside, nothing thrown out, nothing that jumps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from refu_core.backbones import Skinned
+from refu_core.contact import DEFAULT_CONTACT
+from refu_core.garments import inner_first
+from refu_core.modes import DEFAULT_MARGIN
+from refu_core.realtime import Outfit, Wearer, dress
+from refu_core.refu import MAX_DISPLACEMENT
+from refu_lab.stress._closest_kernels import closest_on_sheet
+from refu_lab.stress._numbers import n_not_finite
+from refu_lab.stress._trial import Measurement, Trial
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    from refu_core.metrics import SelfContact
+    from refu_core.realtime import GarmentMesh, GarmentPipeline, PipelineOutput
+    from refu_lab.stress._subject import Subject
+
+DEPTH = 1e-4
+"""No vertex is deeper inside than this [m], away from where the body touches itself."""
+MULTIPLE = 2.0
+"""No vertex is moved farther than this multiple of what the deepest one near it lacks to the margin."""
+REACH = 8
+"""How near [edges]: as far as pushed vertices and, after them, raised edges take others along."""
+PACE = 2.0
+"""From frame to frame, no vertex moves by more than this multiple of the body's fastest vertex, plus `PACE_SLACK`."""
+PACE_SLACK = 1e-3
+"""[m]."""
+_BOUND_SLACK = 1e-5  # [m]; rounding of a displacement that is drawn back to its bound
+_ON_SKIN = 1e-5  # [m]
+_BURIED = 0.02  # [m]
+
+
+def nothing_inside(subject: Subject, trial: Trial) -> Iterator[Measurement]:
+    """The depth of the deepest vertex, by winding number, away from where the body touches itself."""
+    (out,) = subject.pipeline(trial.frames)
+    contact = subject.contacts.detect(out.body)
+    subject.checker.update(out.body)
+    for mesh in out.values():
+        depth = subject.checker.check(mesh.local, mesh.faces).depth[~_in_contact(contact, mesh)]
+        yield Measurement(nan=n_not_finite(mesh.vertices), deviation=float(depth.max(initial=0.0)), limit=DEPTH)
+
+
+def counted(subject: Subject, trial: Trial) -> Iterator[Measurement]:
+    """The certificate (`n_unresolved`) against the winding numbers of every vertex that came out, by garment."""
+    (out,) = subject.pipeline(trial.frames)
+    subject.checker.update(out.body)
+    for name, mesh in out.items():
+        found = subject.checker.check(mesh.local, mesh.faces)
+        # As the certificate is of the person unturned, what is on the skin itself may round to the other side.
+        n_sure, n_said = int((found.depth > _ON_SKIN).sum()), out.stats.garments[name].n_unresolved
+        fault = f"{name}: {n_sure} vertices are inside, {n_said} are said to be"
+        yield Measurement(nan=n_not_finite(mesh.vertices), faults=(fault,) if n_said < n_sure else ())
+
+
+def buried(subject: Subject, trial: Trial) -> Iterator[Measurement]:
+    """The same, of garments whose every vertex starts 2 cm inside the body."""
+    frame, stage = trial.frames[0], subject.contact_stage
+    skinned = {name: replace(one, backbone=Skinned()) for name, one in subject.pipeline.outfit.wearables.items()}
+    pose, betas = torch.tensor(frame.pose)[None], torch.tensor(frame.betas)[None]
+    with torch.no_grad():
+        dressed = dress(pose, Wearer.of(Outfit(subject.pipeline.body, skinned), betas))
+        body, sdf = dressed.body[0], subject.distances["exact"]
+        sdf.update(body)
+        stage.update(body)
+        touching = subject.contacts.detect(body.numpy())
+        subject.checker.update(body.numpy())
+        for name, drape in dressed.drapes.items():
+            points = drape.vertices[0]
+            sample = sdf.query(points)
+            points = points - (sample.distance + _BURIED)[:, None] * sample.gradient
+            done = stage.resolve(
+                name,
+                points,
+                on_mean=drape.on_mean[0],
+                margin=skinned[name].margin,
+                scale=1.0,
+                n_layered=torch.zeros(1, dtype=torch.int32),
+            ).vertices.numpy()
+            depth = subject.checker.check(done, skinned[name].template.faces.numpy()).depth
+            away = ~(touching.near(points.numpy()) | touching.near(done))
+            yield Measurement(nan=n_not_finite(done), deviation=float(depth[away].max(initial=0.0)), limit=DEPTH)
+
+
+def not_thrown(subject: Subject, trial: Trial) -> Iterator[Measurement]:
+    """How far vertices are moved off the body, against how far the deepest one near each is from the margin.
+
+    Where the body touches itself the way out of it may be longer: there it is bounded by `MAX_DISPLACEMENT` alone.
+    """
+    for name, pipeline in subject.one_by_one.items():
+        (out,) = pipeline(trial.frames)
+        mesh = out[name]
+        sdf = subject.distances["exact"]
+        sdf.update(torch.from_numpy(out.body))
+        moved = np.linalg.norm(mesh.local - mesh.raw, axis=1)
+        limit = np.full_like(moved, MAX_DISPLACEMENT)
+        if subject.contacts.detect(out.body).is_free:
+            lack = np.maximum(DEFAULT_MARGIN - sdf.query(torch.from_numpy(mesh.raw)).distance.numpy(), 0)
+            near = _largest_near(lack, pipeline.garments[name].edges.numpy())
+            limit = np.minimum(limit, MULTIPLE * (near + DEFAULT_MARGIN))
+        yield _finite(out)
+        yield _farthest(moved, limit + _BOUND_SLACK)
+
+
+def bounded(subject: Subject, trial: Trial) -> Iterator[Measurement]:
+    """The largest displacement against `MAX_DISPLACEMENT`, whatever the frame."""
+    for name, pipeline in subject.one_by_one.items():
+        (out,) = pipeline(trial.frames)
+        moved = np.linalg.norm(out[name].local - out[name].raw, axis=1)
+        yield _finite(out)
+        yield _farthest(moved, np.full(len(moved), MAX_DISPLACEMENT + _BOUND_SLACK))
+
+
+def no_jumps(subject: Subject, trial: Trial) -> Iterator[Measurement]:
+    """How far vertices go from frame to frame, each garment worn alone, against the body's fastest vertex.
+
+    What is pushed goes to the closest skin. That leaps where another way out becomes the shortest, from one side of a
+    limb's medial axis to the other, and no projection that remembers nothing can follow it smoothly: so vertices may go
+    as far, in addition, as the closest skin does of what is pushed near them. Where the body touches itself, the way
+    out may change sides at any depth; cloth around is taken along, and left out here.
+    """
+    for pipeline in subject.one_by_one.values():
+        yield from _jumps(subject, pipeline, trial)
+
+
+def no_jumps_together(subject: Subject, trial: Trial) -> Iterator[Measurement]:
+    """The same of garments worn over each other, where the closest place of the sheet below may leap, too."""
+    return _jumps(subject, subject.pipeline, trial)
+
+
+def _jumps(subject: Subject, pipeline: GarmentPipeline, trial: Trial) -> Iterator[Measurement]:
+    before: dict[str, _Aims] = {}
+    for last, out in _pairs(pipeline, trial):
+        yield _finite(out)
+        aims = _aims(subject, pipeline, out)
+        for name, mesh in out.items() if last is not None else ():
+            pace = PACE * float(np.linalg.norm(out.body - last.body, axis=1).max()) + PACE_SLACK
+            limit = pace + _leap(before[name], aims[name], pipeline.garments[name].edges.numpy())
+            way = np.linalg.norm(mesh.local - last[name].local, axis=1)
+            way[before[name].is_left_out | aims[name].is_left_out] = 0
+            yield _farthest(way, limit)
+        before = aims
+
+
+def bounded_jumps(subject: Subject, trial: Trial) -> Iterator[Measurement]:
+    """All vertices, through self-contact: from one bound of the displacement to the other, and no farther."""
+    for last, out in _pairs(subject.pipeline, trial):
+        yield _finite(out)
+        for name, mesh in out.items() if last is not None else ():
+            limit = PACE * float(np.linalg.norm(out.body - last.body, axis=1).max()) + 2 * MAX_DISPLACEMENT
+            way = np.linalg.norm(mesh.local - last[name].local, axis=1)
+            yield _farthest(way, np.full(len(way), limit))
+
+
+def _pairs(pipeline: GarmentPipeline, trial: Trial) -> Iterator[tuple[Any, PipelineOutput]]:
+    """Each frame's output after that of the frame before it, which is None for the first."""
+    last = None
+    for frame in trial.frames:
+        out = pipeline(frame)
+        yield last, out
+        last = out
+
+
+def _farthest(way: NDArray[np.floating], limit: NDArray[np.floating]) -> Measurement:
+    """Of the vertex that goes farthest on its way (N,) for its limit (N,) [m]."""
+    i = int(np.argmax(way / limit))
+    return Measurement(deviation=float(way[i]), limit=float(limit[i]))
+
+
+def _finite(out: PipelineOutput) -> Measurement:
+    return Measurement(nan=n_not_finite(*(mesh.vertices for mesh in out.values())))
+
+
+@dataclass(frozen=True, eq=False)
+class _Aims:
+    """Where collision handling takes the N vertices of a garment: to the skin, and to the sheets worn below."""
+
+    places: list[NDArray[np.float32]]
+    """The closest point of each surface to each vertex before collision handling [m], (N, 3)."""
+    is_pushed: list[NDArray[np.bool_]]
+    """Whether a vertex is nearer to that surface than it may be, (N,)."""
+    is_left_out: NDArray[np.bool_]
+    """The vertices with a self-contact of the body near, (N,)."""
+
+
+def _aims(subject: Subject, pipeline: GarmentPipeline, out: PipelineOutput) -> dict[str, _Aims]:
+    contact, skin = subject.contacts.detect(out.body), subject.distances["exact"]
+    skin.update(torch.from_numpy(out.body))
+    aims: dict[str, _Aims] = {}
+    worn: list[GarmentMesh] = []
+    for name in inner_first(pipeline.garments):
+        mesh = out[name]
+        sample = skin.query(torch.from_numpy(mesh.raw))
+        places = [mesh.raw - (sample.distance[:, None] * sample.gradient).numpy()]
+        is_pushed = [(sample.distance < DEFAULT_MARGIN).numpy()]
+        for below in worn:
+            closest, height = closest_on_sheet(mesh.raw, below.local, below.faces)
+            places.append(closest)
+            is_felt = np.linalg.norm(mesh.raw - closest, axis=1) < DEFAULT_CONTACT.layer_reach
+            is_pushed.append((height < DEFAULT_CONTACT.layer_gap) & is_felt)
+        is_near = np.zeros(len(mesh.raw), np.bool_)
+        if not contact.is_free:
+            is_near = _largest_near(_in_contact(contact, mesh), pipeline.garments[name].edges.numpy())
+        aims[name] = _Aims(places, is_pushed, is_near)
+        worn.append(mesh)
+    return aims
+
+
+def _leap(before: _Aims, now: _Aims, edges: NDArray[np.int64]) -> NDArray[np.floating]:
+    """How far, at most, the places go that vertices near each vertex are pushed to [m], (N,)."""
+    leap = np.zeros(len(now.is_left_out), np.float32)
+    for i, place in enumerate(now.places):
+        way = np.linalg.norm(place - before.places[i], axis=1)
+        leap += _largest_near(np.where(before.is_pushed[i] | now.is_pushed[i], way, 0), edges)
+    return leap
+
+
+def _in_contact(contact: SelfContact, mesh: GarmentMesh) -> NDArray[np.bool_]:
+    """The vertices (N,) that were, or have come, where the body touches itself."""
+    return contact.near(mesh.raw) | contact.near(mesh.local)
+
+
+def _largest_near(values: NDArray[Any], edges: NDArray[np.int64]) -> NDArray[Any]:
+    """The largest value within `REACH` edges of each vertex, (N,)."""
+    for _ in range(REACH):
+        larger = values.copy()
+        np.maximum.at(larger, edges[:, 0], values[edges[:, 1]])
+        np.maximum.at(larger, edges[:, 1], values[edges[:, 0]])
+        values = larger
+    return values

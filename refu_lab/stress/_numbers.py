@@ -1,0 +1,155 @@
+"""Numbers: float32 against float64, over frames and points that people and senders make."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from refu_core.sdf import ExactSdf
+from refu_lab.stress._subject import Subject, distance_to_mesh
+from refu_lab.stress._trial import Measurement, Trial
+
+ROUNDING = 5e-6
+"""What float32 may cost a body of a metre or two [m]: fifty times its resolution there."""
+PIVOTS = 2e-3
+"""Share of the largest displacement that pivots which weigh 0.1 % may make: they may point the other way."""
+_DISTANCE_ROUNDING = 2e-6
+_POINTS = 24
+_UNIT = 1e-3
+"""How far from one the length of a gradient may be."""
+_COLLAPSED = 40
+"""Faces whose corners are put in one place."""
+
+
+def against_float64(subject: Subject, trial: Trial) -> Iterator[Measurement]:
+    """Bodies and garments before collision handling, in float32 and in float64; and the whole pipeline for the first.
+
+    The limit grows with the size of what is computed, and with the angles: float32 holds 1,000 rad to 6e-5. What
+    TailorNet leaves out of its mixture in a pipeline, a thousandth of a displacement, is no matter of precision.
+    """
+    out = subject.pipeline(trial.frames[0])
+    first = [out.body, *(mesh.raw for mesh in out.values())]
+    ours, wanted = subject.in_float32(trial.frames), subject.in_float64(trial.frames)
+    left_out = PIVOTS * subject.in_float64.largest_displacement
+    turn = 1 + np.array([np.linalg.norm(frame.pose, axis=1).max() for frame in trial.frames]) / np.pi
+    deviation = np.zeros(len(trial.frames))
+    limit = np.zeros_like(deviation)
+    for got, whole, right in zip(ours, first, wanted, strict=True):
+        error = np.abs(got - right).max((1, 2))
+        error[0] = max(error[0], np.abs(whole - right[0]).max() - left_out)
+        limit = np.maximum(limit, ROUNDING * turn * np.abs(right).max((1, 2), initial=1.0))
+        deviation = np.maximum(deviation, error)
+    for i in range(len(trial.frames)):
+        yield Measurement(deviation=float(deviation[i]), limit=float(limit[i]), culprit=i)
+    yield Measurement(nan=n_not_finite(*first, *(mesh.vertices for mesh in out.values()), *ours))
+
+
+def n_not_finite(*arrays: NDArray[np.floating]) -> int:
+    """How many numbers of all arrays are NaN or infinite."""
+    return sum(int(np.count_nonzero(~np.isfinite(array))) for array in arrays)
+
+
+Place = Callable[[NDArray[np.float32], NDArray[np.int64], np.random.Generator], NDArray[np.float64]]
+"""Points to ask for, (N, 3), around a body's vertices (V, 3) and faces (F, 3); it may move the vertices."""
+
+
+def _on_faces(vertices: NDArray[np.float32], faces: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.float64]:
+    weights = rng.dirichlet((0.3, 0.3, 0.3), _POINTS)
+    return _mixed(vertices, faces[rng.integers(len(faces), size=_POINTS)], weights)
+
+
+def _on_edges(vertices: NDArray[np.float32], faces: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.float64]:
+    share = rng.random(_POINTS)
+    weights = np.stack([share, 1 - share, np.zeros(_POINTS)], 1)
+    weights[: _POINTS // 2] = (1, 0, 0)  # half of them on vertices, to the bit
+    return _mixed(vertices, faces[rng.integers(len(faces), size=_POINTS)], weights)
+
+
+def _mixed(
+    vertices: NDArray[np.float32], faces: NDArray[np.int64], weights: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    mixed: NDArray[np.float64] = (vertices[faces].astype(np.float64) * weights[..., None]).sum(1)
+    return mixed
+
+
+def _medial(vertices: NDArray[np.float32], faces: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.float64]:
+    """Half-way between the skin and the skin across, where the gradient turns round."""
+    chosen = faces[rng.integers(len(faces), size=_POINTS)]
+    a, b, c = vertices[chosen].astype(np.float64).transpose(1, 0, 2)
+    inward = -np.cross(b - a, c - a)
+    inward /= np.maximum(np.linalg.norm(inward, axis=1, keepdims=True), 1e-300)
+    start = (a + b + c) / 3
+    sdf = ExactSdf(faces)
+    sdf.update(torch.from_numpy(vertices))
+    # Bisect for the depth at which another part of the skin becomes as near as the one overhead.
+    low, high = np.zeros(_POINTS), np.full(_POINTS, 0.3)
+    for _ in range(20):
+        middle = (low + high) / 2
+        points = torch.from_numpy((start + middle[:, None] * inward).astype(np.float32))
+        is_under = sdf.query(points).distance.abs().numpy() >= middle - 1e-6
+        low, high = np.where(is_under, middle, low), np.where(is_under, high, middle)
+    halfway: NDArray[np.float64] = start + ((low + high) / 2)[:, None] * inward
+    return halfway
+
+
+def _hair(vertices: NDArray[np.float32], faces: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.float64]:
+    """A hair's breadth off the skin, on either side, down to less than float32 resolves."""
+    return _on_faces(vertices, faces, rng) + rng.normal(size=(_POINTS, 3)) * 10.0 ** rng.uniform(-40, -4, (_POINTS, 1))
+
+
+def _far(vertices: NDArray[np.float32], faces: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.float64]:
+    return _on_faces(vertices, faces, rng) + rng.normal(size=(_POINTS, 3)) * 10.0 ** rng.uniform(-1, 5, (_POINTS, 1))
+
+
+def _without_area(
+    vertices: NDArray[np.float32], faces: NDArray[np.int64], rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Around faces whose corners are in one place, or in one line."""
+    chosen = faces[rng.integers(len(faces), size=_COLLAPSED)]
+    vertices[chosen[::2, 1]] = vertices[chosen[::2, 0]]
+    vertices[chosen[::2, 2]] = vertices[chosen[::2, 0]]
+    vertices[chosen[1::2, 2]] = (vertices[chosen[1::2, 0]] + vertices[chosen[1::2, 1]]) / 2
+    return _mixed(vertices, chosen[:_POINTS], rng.dirichlet((1, 1, 1), _POINTS)) + rng.normal(0, 3e-3, (_POINTS, 3))
+
+
+POINTS: dict[str, Place] = {
+    "on faces": _on_faces,
+    "on edges and vertices": _on_edges,
+    "on the medial axis": _medial,
+    "a hair's breadth off": _hair,
+    "far away": _far,
+    "faces without area": _without_area,
+}
+"""Kinds of points to ask for, by name."""
+
+
+def distances(place: Place) -> Callable[[Subject, Trial], Iterator[Measurement]]:
+    """Measures all signed distances at such points."""
+
+    def measure(subject: Subject, trial: Trial) -> Iterator[Measurement]:
+        """Against every triangle in float64; the approximate one must not be less than that."""
+        rng = np.random.default_rng(trial.seed)
+        body, frame = subject.pipeline.body, trial.frames[0]
+        with torch.no_grad():
+            vertices = body(frame.pose[None], frame.betas[None]).vertices[0].numpy()
+        faces = body.faces.numpy()
+        points = place(vertices, faces, rng).astype(np.float32)
+        wanted = distance_to_mesh(points, vertices, faces)
+        for name, sdf in subject.distances.items():
+            sdf.update(torch.from_numpy(vertices))
+            sample = sdf.query(torch.from_numpy(points))
+            distance, gradient = sample.distance.double().abs().numpy(), sample.gradient.double().numpy()
+            error = wanted - distance
+            error = np.maximum(error, 0) if name == "approx" else np.abs(error)
+            is_unit = np.abs(np.linalg.norm(gradient, axis=1) - 1) <= _UNIT
+            yield Measurement(
+                nan=n_not_finite(distance, gradient),
+                deviation=float((error / np.maximum(1, wanted)).max()),
+                limit=_DISTANCE_ROUNDING,
+                faults=() if is_unit.all() else (f"{name}: a gradient isn't of unit length",),
+            )
+
+    return measure

@@ -1,0 +1,216 @@
+"""What `refu stress` does: all checks, round after round, until there have been enough of them; then the soaks."""
+
+from __future__ import annotations
+
+import math
+import time
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from refu_core._device import one_thread
+from refu_core.garments import BUILTIN_GARMENTS, load_garment
+from refu_core.weights import weights_folder
+from refu_lab.stress._checks import CHECKS, PARTS
+from refu_lab.stress._soak import SoakResult, soak
+from refu_lab.stress._subject import Subject, Wardrobe
+from refu_lab.stress._trial import Check, StressError, Tally, load_trial, save_trial
+
+MODES: tuple[tuple[str, str], ...] = (("skinned", "accurate"), ("tailornet", "hybrid"))
+"""Backbone and signed distance of the modes that are tried if none is named."""
+_SOAK_SHARE = 0.3
+"""Of the time of a long run."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StressOptions:
+    """What to try; the fields are options of `refu stress`."""
+
+    parts: tuple[str, ...] = PARTS
+    garments: tuple[str, ...] = BUILTIN_GARMENTS
+    backbone: str | None = None
+    sdf: str | None = None
+    weights: Path | None = None
+    frames: int | None = None
+    persons: int = 1
+    rounds: int | None = None
+    hours: float | None = None
+    quick: bool = False
+    seed: int = 0
+    output: Path | None = None
+
+    def __post_init__(self) -> None:
+        unknown = [part for part in self.parts if part not in PARTS]
+        if unknown:
+            msg = f"no part {unknown[0]!r}: wanted {', '.join(PARTS)}"
+            raise StressError(msg)
+        if self.hours is not None and not 0 < self.hours < math.inf:
+            msg = f"hours must be above zero, got {self.hours:g}"
+            raise StressError(msg)
+
+    @property
+    def modes(self) -> Sequence[tuple[str, str]]:
+        """Backbone and signed distance of each mode."""
+        if self.backbone is None and self.sdf is None:
+            return MODES
+        backbone = self.backbone or "skinned"
+        return [(backbone, self.sdf or ("accurate" if backbone == "skinned" else "hybrid"))]
+
+    @property
+    def n_rounds(self) -> int:
+        """How often each check has its turn, at least."""
+        return self.rounds or (1 if self.quick or self.hours is not None else 3)
+
+    @property
+    def n_frames(self) -> int:
+        """Of each soak, at most."""
+        return self.frames or (10_000_000 if self.hours is not None else 200 if self.quick else 3_000)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StressResult:
+    """What came of it."""
+
+    tallies: list[Tally] = field(default_factory=list)
+    soaks: list[SoakResult] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)
+    """What could not be tried, and why."""
+    files: list[Path] = field(default_factory=list)
+    """The worst cases."""
+
+    @property
+    def _all(self) -> list[Tally | SoakResult]:
+        return [*self.tallies, *self.soaks]
+
+    @property
+    def failures(self) -> int:
+        """Trials, and tenths of soaks, that were beyond their limits."""
+        return sum(row.failures for row in self._all)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Ready for JSON."""
+        return {"rows": [row.as_dict() for row in self._all], "left_out": self.left_out, "failures": self.failures}
+
+
+def run_stress(
+    options: StressOptions, *, progress: bool, report: Callable[[StressResult], object] = id
+) -> StressResult:
+    """Tries all that was asked for; `report` gets what there is so far, every minute of a soak.
+
+    Raises:
+        StressError: there is nothing to try: no such part, or no weights of any garment.
+        RefuError: as `GarmentPipeline.load`.
+    """
+    wardrobes, left_out = _wardrobes(options)
+    result = StressResult(left_out=left_out)
+    seconds = 0.0 if options.hours is None else 3600 * options.hours
+    checks = [check for check in CHECKS.values() if check.part in options.parts]
+    has_soak = "soak" in options.parts
+    with one_thread():
+        subjects = {wardrobe: Subject(wardrobe, weights=options.weights) for wardrobe in wardrobes}
+        pairs = [
+            (check, subject) for check in checks for subject in subjects.values() if check.holds_for(subject.wardrobe)
+        ]
+        result.tallies.extend(_run_checks(options, pairs, seconds * (1 - _SOAK_SHARE * has_soak), progress=progress))
+        for wardrobe, subject in subjects.items() if has_soak else ():
+            share = _SOAK_SHARE if checks else 1.0
+            with tqdm(total=options.n_frames, unit="frame", disable=not progress, leave=False, mininterval=1) as bar:
+                done = soak(
+                    subject.pipeline,
+                    mode=f"{wardrobe.mode} {', '.join(wardrobe.garments)}",
+                    frames=options.n_frames,
+                    persons=options.persons,
+                    seconds=share * seconds / len(wardrobes) if options.hours is not None else math.inf,
+                    seed=options.seed,
+                    tick=bar.update,
+                    report=lambda so_far: report(replace(result, soaks=[*result.soaks, so_far])),
+                )
+            result.soaks.append(done)
+    if options.output is not None:
+        result.files.extend(_save_worst(result.tallies, options.output))
+    return result
+
+
+def _wardrobes(options: StressOptions) -> tuple[list[Wardrobe], list[str]]:
+    """What is worn in each mode, a wardrobe a body; and what isn't, for want of weights."""
+    worn: dict[tuple[str, str, str], list[str]] = {}
+    left_out = []
+    for backbone, sdf in options.modes:
+        for name in dict.fromkeys(options.garments):
+            body, weights = load_garment(name).body, weights_folder(name, options.weights)
+            if backbone == "skinned" or (weights / f"{backbone}-{sdf}.safetensors").exists():
+                worn.setdefault((backbone, sdf, body), []).append(name)
+            else:
+                left_out.append(f"{name}: no weights of {backbone} {sdf}")
+    if not worn:
+        msg = f"nothing to try: {'; '.join(left_out) or 'no garment was named'}"
+        raise StressError(msg)
+    found = [Wardrobe(garments=tuple(names), backbone=b, sdf=sdf) for (b, sdf, _), names in worn.items()]
+    return found, left_out
+
+
+def _run_checks(
+    options: StressOptions, pairs: Sequence[tuple[Check, Subject]], seconds: float, *, progress: bool
+) -> list[Tally]:
+    """Tries all, round after round; what is drawn depends on the seed, the check and the round alone.
+
+    One tally a check and mode, in the checks' order.
+    """
+    tallies: dict[tuple[str, str], Tally] = {}
+    total = options.n_rounds * len(pairs) if options.hours is None else None
+    with tqdm(total=total, unit="check", disable=not progress, leave=False) as bar:
+        for round_, (check, subject) in _turns(pairs, options.n_rounds, seconds):
+            wardrobe = subject.wardrobe
+            tally = tallies.setdefault((check.name, wardrobe.mode), Tally(check.name, wardrobe.mode))
+            key = zlib.crc32(f"{check.name} {wardrobe.garments}".encode())
+            rng = np.random.default_rng((options.seed, key, round_))
+            for _ in range(check.trials):
+                trial = check.draw(rng)
+                tally.add(wardrobe, trial, check.run(subject, trial))
+            bar.update()
+    return list(tallies.values())
+
+
+def _turns(
+    pairs: Sequence[tuple[Check, Subject]], rounds: int, seconds: float
+) -> Iterator[tuple[int, tuple[Check, Subject]]]:
+    """Whose turn it is, with the number of the round; whole rounds first, then until the time is over."""
+    start = time.monotonic()
+    for round_ in count() if pairs else ():
+        for pair in pairs:
+            if round_ >= rounds and time.monotonic() - start >= seconds:
+                return
+            yield round_, pair
+
+
+def _save_worst(tallies: Sequence[Tally], folder: Path) -> list[Path]:
+    """Writes the worst trial of each tally as `folder`/<check>-<mode>.npz."""
+    written = []
+    for tally in tallies:
+        if tally.worst_trial is not None and tally.worst_trial[1].frames:
+            name = "".join(c if c.isalnum() else "-" for c in f"{tally.case} {tally.mode}".replace(": ", "-"))
+            written.append(save_trial(folder / f"{name}.npz", tally.case, *tally.worst_trial))
+    return written
+
+
+def replay_trial(path: Path, *, weights: Path | None = None) -> Tally:
+    """Tries again what `refu stress` has written.
+
+    Raises:
+        StressError: the file can't be read, or is of a check that there isn't.
+        RefuError: as `GarmentPipeline.load`.
+    """
+    name, wardrobe, trial = load_trial(path)
+    if name not in CHECKS:
+        msg = f"{path}: of the check {name!r}, which this version doesn't have"
+        raise StressError(msg)
+    tally = Tally(name, wardrobe.mode)
+    with one_thread():
+        tally.add(wardrobe, trial, CHECKS[name].run(Subject(wardrobe, weights=weights), trial))
+    return tally

@@ -1,0 +1,235 @@
+"""Soak: whether the pipeline grows or slows down as frames go by."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from refu_core.frames import SmplFrame
+from refu_core.realtime import GarmentPipeline
+from refu_lab.stress._frames import between, everyday_pose, frame_of
+from refu_lab.stress._numbers import n_not_finite
+from refu_lab.stress._trial import StressError
+
+TOLERANCE = 0.05
+"""By how much the last tenth may exceed the first one."""
+JUDGED_FROM = 20_000
+"""Calls from which the 99th percentiles of a tenth are judged: of less they are the luck of a few frames."""
+_POSES = 8
+_STEPS = 25
+_FEWEST = 10
+_REPORT_S = 60.0
+_YARDSTICK = 192
+"""Size of the matrix that the yardstick multiplies: a fifth of a millisecond."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SoakResult:
+    """The first tenth of many frames against the last one."""
+
+    mode: str
+    frames: int
+    """Persons dressed."""
+    persons: int
+    """In one call."""
+    nan: int
+    """Numbers that came out and aren't finite."""
+    seconds: float
+    tenths_mb: tuple[float, ...]
+    """Largest resident memory of each tenth."""
+    tenths_ms: tuple[float, ...]
+    """99th percentile of a call's processor time in each tenth [ms]."""
+    tenths_wall_ms: tuple[float, ...]
+    """The same of its wall time, which other processes lengthen [ms]."""
+    tenths_yardstick_ms: tuple[float, ...]
+    """The same of the processor time of work that is always the same [ms]."""
+
+    @property
+    def growth(self) -> float:
+        """Of the memory, as a share of the first tenth's."""
+        return _growth(self.tenths_mb)
+
+    @property
+    def slowdown(self) -> float:
+        """Of the processor time's 99th percentile, as a share of the first tenth's."""
+        return _growth(self.tenths_ms)
+
+    @property
+    def machine_slowdown(self) -> float:
+        """Of the yardstick: how much slower the machine itself has become."""
+        return _growth(self.tenths_yardstick_ms)
+
+    @property
+    def is_slower(self) -> bool:
+        """Whether calls take longer, by the clock and by the yardstick, too; few calls aren't judged."""
+        times = 1 + self.slowdown
+        return is_slower(times, times, 1 + self.machine_slowdown) and self.frames >= JUDGED_FROM * self.persons
+
+    @property
+    def failures(self) -> int:
+        """How many of these have failed: memory, latency, finite numbers."""
+        return (self.growth > TOLERANCE) + self.is_slower + (self.nan > 0)
+
+    def as_dict(self) -> dict[str, Any]:
+        """A row of the results, ready for JSON."""
+        row = {name: getattr(self, name) for name in self.__dataclass_fields__ if name != "frames"}
+        judged = ("growth", "slowdown", "machine_slowdown", "failures")
+        return (
+            {"case": "soak: pipeline", "runs": self.frames, "max_deviation_m": 0.0}
+            | row
+            | {name: getattr(self, name) for name in judged}
+        )
+
+
+def soak_frames(rng: np.random.Generator) -> list[SmplFrame]:
+    """A motion of 200 frames whose end joins its beginning, on one body."""
+    poses: list[NDArray[np.floating]] = [everyday_pose(rng) for _ in range(_POSES)]
+    betas = rng.normal(0, 1, 10)
+    return [frame_of(pose, betas=betas) for pose in between([*poses, poses[0]], _STEPS)]
+
+
+def soak(
+    pipeline: GarmentPipeline,
+    *,
+    mode: str,
+    frames: int,
+    persons: int = 1,
+    seconds: float = math.inf,
+    seed: int = 0,
+    tick: Callable[[int], object] = int,
+    report: Callable[[SoakResult], object] = id,
+) -> SoakResult:
+    """Runs the same motions over and over, until `frames` or `seconds` are over, and compares the tenths.
+
+    Args:
+        pipeline: What is to endure.
+        mode: Its name.
+        frames: How many to run, at most; each person of a call is one.
+        persons: In one call, each with a motion of their own.
+        seconds: For how long, at most.
+        seed: Of the motions.
+        tick: Called with a number of frames that are done.
+        report: Called every minute with what has come of it so far.
+
+    Returns:
+        The tenths; those so far after an interrupt (Ctrl-C).
+
+    Raises:
+        StressError: fewer than ten calls, which have no tenths.
+    """
+    calls = -(-frames // persons)
+    if calls < _FEWEST:
+        msg = f"a soak needs {_FEWEST} frames or more of each person, got {calls}"
+        raise StressError(msg)
+    motions = [soak_frames(np.random.default_rng(seed + i)) for i in range(persons)]
+    steps = list(zip(*motions, strict=True))
+    for step in steps:  # what is made in the first frames of all is no growth
+        pipeline(step)
+    log = _Log(calls)
+    start = last = time.perf_counter()
+
+    def result() -> SoakResult:
+        return log.result(mode=mode, persons=persons, seconds=time.perf_counter() - start)
+
+    with contextlib.suppress(KeyboardInterrupt):
+        while log.n < calls and (log.n < _FEWEST or time.perf_counter() - start < seconds):
+            log.take(pipeline, steps[log.n % len(steps)])
+            tick(persons)
+            if time.perf_counter() - last > _REPORT_S and log.n >= _FEWEST:
+                last = time.perf_counter()
+                report(result())
+    return result()
+
+
+class Yardstick:
+    """Work that is always the same: it takes longer when the machine does, and not when something leaks."""
+
+    def __init__(self) -> None:
+        rng = np.random.default_rng(0)
+        self._matrix = rng.normal(size=(_YARDSTICK, _YARDSTICK)).astype(np.float32)
+        self._rows = rng.integers(_YARDSTICK, size=8 * _YARDSTICK)
+
+    def measure(self) -> float:
+        """Its processor time now [ms]."""
+        before = time.thread_time()
+        (self._matrix @ self._matrix)[self._rows].sum()
+        return 1e3 * (time.thread_time() - before)
+
+
+class _Log:
+    """The figures of all calls so far."""
+
+    def __init__(self, calls: int) -> None:
+        # Room for all of them, touched now: it mustn't look like the pipeline's growth.
+        self._cpu, self._wall, self._memory, self._same = np.zeros((4, calls), np.float32) + 1
+        self._yardstick = Yardstick()
+        self._nan = 0
+        self.n = 0
+
+    def take(self, pipeline: GarmentPipeline, step: Sequence[SmplFrame]) -> None:
+        """One call, and the yardstick."""
+        cpu, wall = time.thread_time(), time.perf_counter()
+        outs = pipeline(step)
+        self._wall[self.n] = 1e3 * (time.perf_counter() - wall)
+        self._cpu[self.n] = 1e3 * (time.thread_time() - cpu)
+        self._same[self.n] = self._yardstick.measure()
+        self._nan += n_not_finite(*(mesh.local for out in outs for mesh in out.values()))
+        self._memory[self.n] = resident_mb()
+        self.n += 1
+
+    def result(self, *, mode: str, persons: int, seconds: float) -> SoakResult:
+        """What has come of it so far."""
+        cpu, wall, memory, same = (
+            np.array_split(log[: self.n], 10) for log in (self._cpu, self._wall, self._memory, self._same)
+        )
+        return SoakResult(
+            mode=mode,
+            frames=self.n * persons,
+            persons=persons,
+            nan=self._nan,
+            seconds=seconds,
+            tenths_mb=tuple(float(tenth.max()) for tenth in memory),
+            tenths_ms=_p99(cpu),
+            tenths_wall_ms=_p99(wall),
+            tenths_yardstick_ms=_p99(same),
+        )
+
+
+def resident_mb(process: int | str = "self") -> float:
+    """Resident memory of a process [MB]; raises `OSError` where there is none of that number."""
+    pages = int(Path(f"/proc/{process}/statm").read_text(encoding="ascii").split()[1])
+    return pages * _PAGE_MB
+
+
+def _page_mb() -> float:
+    import resource
+
+    return resource.getpagesize() / 1e6
+
+
+_PAGE_MB = _page_mb()
+
+
+def _p99(tenths: Sequence[NDArray[np.float32]]) -> tuple[float, ...]:
+    return tuple(float(np.percentile(tenth, 99)) for tenth in tenths)
+
+
+def is_slower(later: float, longer: float, machine: float) -> bool:
+    """Whether answers come `later` times as late, and take `longer` times as long to compute, than may be.
+
+    `machine` is how many times as long the yardstick takes: what the machine has slowed down itself isn't held against
+    anybody. Lateness alone is what any other process does that wants the processor.
+    """
+    return min(later, longer / machine) > 1 + TOLERANCE
+
+
+def _growth(tenths: Sequence[float]) -> float:
+    return tenths[-1] / tenths[0] - 1

@@ -1,0 +1,170 @@
+"""The pipeline under test, and all that its results are held against."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from refu_core.errors import RefuError
+from refu_core.frames import N_STYLES, SmplFrame
+from refu_core.garments import BUILTIN_GARMENTS
+from refu_core.metrics import CollisionChecker, SelfContactDetector
+from refu_core.modes import SdfMode
+from refu_core.realtime import ContactStage, GarmentPipeline, Outfit, Wearer, dress
+from refu_core.sdf import ApproxSdf, BandSdf, BodySdf, ExactSdf
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wardrobe:
+    """Garments of one body, and how they are predicted."""
+
+    garments: tuple[str, ...]
+    backbone: str = "skinned"
+    sdf: str = "accurate"
+
+    @property
+    def mode(self) -> str:
+        """`<backbone>/<sdf>`."""
+        return f"{self.backbone}/{self.sdf}"
+
+
+class Subject:
+    """One wardrobe's pipeline and its references, each made when it is first asked for."""
+
+    def __init__(self, wardrobe: Wardrobe, *, weights: Path | None = None) -> None:
+        """Loads the pipeline; raises as `GarmentPipeline.load`."""
+        unknown = [name for name in wardrobe.garments if name not in BUILTIN_GARMENTS]
+        if unknown:
+            msg = f"no garment {unknown[0]!r}: wanted {', '.join(BUILTIN_GARMENTS)}"
+            raise RefuError(msg)
+        self.wardrobe = wardrobe
+        self._weights = weights
+        self.pipeline = self.load()
+
+    def load(self, *garments: str) -> GarmentPipeline:
+        """A pipeline that has never seen a frame, of these garments or all."""
+        return GarmentPipeline.load(
+            garments or self.wardrobe.garments,
+            backbone=self.wardrobe.backbone,
+            sdf=self.wardrobe.sdf,
+            weights=self._weights,
+        )
+
+    @property
+    def one_by_one(self) -> dict[str, GarmentPipeline]:
+        """A pipeline for each garment: worn together, they are lifted off each other, too."""
+        names = self.wardrobe.garments
+        return self._alone if len(names) > 1 else {names[0]: self.pipeline}
+
+    @cached_property
+    def _alone(self) -> dict[str, GarmentPipeline]:
+        return {name: self.load(name) for name in self.wardrobe.garments}
+
+    @cached_property
+    def checker(self) -> CollisionChecker:
+        """Exact collisions, by winding number."""
+        return CollisionChecker(self.pipeline.body.faces)
+
+    @cached_property
+    def contacts(self) -> SelfContactDetector:
+        """Where the body touches itself."""
+        return SelfContactDetector(self.pipeline.body.faces, self.pipeline.body.v_template)
+
+    @cached_property
+    def distances(self) -> dict[str, BodySdf]:
+        """The exact signed distance by tree and by cells, and the approximate one."""
+        body = self.pipeline.body
+        return {"exact": ExactSdf(body.faces), "band": BandSdf(body.faces), "approx": ApproxSdf(body)}
+
+    @cached_property
+    def contact_stage(self) -> ContactStage:
+        """Collision handling as the pipeline does it; by the exact distance where the pipeline does nothing."""
+        mode = SdfMode(self.wardrobe.sdf)
+        return ContactStage(self.pipeline.outfit, sdf=SdfMode.ACCURATE if mode is SdfMode.NONE else mode)
+
+    @cached_property
+    def in_float32(self) -> Prediction:
+        """Bodies and garments as the pipeline computes them, without collision handling."""
+        return Prediction(self.pipeline.outfit, torch.float32)
+
+    @cached_property
+    def in_float64(self) -> Prediction:
+        """The same in float64: what float32 is held against."""
+        return Prediction(self.pipeline.outfit, torch.float64)
+
+
+class Prediction:
+    """Body, backbone and posed garment in one precision."""
+
+    def __init__(self, outfit: Outfit, dtype: torch.dtype) -> None:
+        """Of the bodies and garments of `outfit`, with networks of its own."""
+        self._outfit, self._dtype = outfit.to(dtype), dtype
+        self.largest_displacement = 0.0
+        """Largest coordinate of a backbone's displacement in the last call [m]."""
+
+    @torch.no_grad()
+    def __call__(self, frames: Sequence[SmplFrame]) -> list[NDArray[np.floating]]:
+        """Bodies, and each garment before collision handling [m], shapes (B, V, 3), of B frames."""
+        none = np.zeros(N_STYLES, np.float32)
+        pose, betas, style = (
+            torch.as_tensor(np.stack(values)).to(self._dtype)
+            for values in (
+                [frame.pose for frame in frames],
+                [frame.betas for frame in frames],
+                [none if frame.style is None else frame.style for frame in frames],
+            )
+        )
+        wearer = Wearer.of(self._outfit, betas, style if any(frame.style is not None for frame in frames) else None)
+        dressed = dress(pose, wearer)
+        drapes = dressed.drapes
+        added = [drapes[name].unposed - garment.rest for name, garment in wearer.garments.items()]
+        self.largest_displacement = max(float(one.abs().max()) for one in added)
+        return [
+            torch.stack([turn(one) for turn, one in zip(dressed.turns, found, strict=True)]).numpy()
+            for found in (dressed.body, *(drape.vertices for drape in drapes.values()))
+        ]
+
+
+def distance_to_mesh(
+    points: NDArray[np.floating], vertices: NDArray[np.floating], faces: NDArray[np.integer]
+) -> NDArray[np.float64]:
+    """Distance of `points` [m], shape (N, 3), to a mesh, shape (N,): every triangle is asked, in float64.
+
+    A triangle without area is its edges.
+    """
+    corners = torch.as_tensor(np.asarray(vertices, np.float64)[faces])
+    best = []
+    for chunk in torch.split(torch.as_tensor(np.asarray(points, np.float64)), 16):  # bounds memory: N × F × 3 numbers
+        squared = torch.full((len(chunk),), torch.inf, dtype=torch.float64)
+        for k in range(3):
+            squared = torch.minimum(squared, _to_segments(chunk, corners[:, k], corners[:, (k + 1) % 3]))
+        best.append(torch.minimum(squared, _to_planes(chunk, corners)).sqrt())
+    return torch.cat(best).numpy() if best else np.zeros(0)
+
+
+def _to_segments(points: torch.Tensor, start: torch.Tensor, end: torch.Tensor) -> torch.Tensor:
+    """Squared distance of each point (N, 3) to the closest of F segments."""
+    along = end - start
+    length2 = along.square().sum(-1)
+    away = points[:, None] - start
+    t = ((away * along).sum(-1) / length2.clamp_min(1e-300)).clamp(0, 1)
+    return (away - t[..., None] * along).square().sum(-1).amin(1)
+
+
+def _to_planes(points: torch.Tensor, corners: torch.Tensor) -> torch.Tensor:
+    """Squared distance of each point (N, 3) to the closest of F triangles (F, 3, 3) that it is straight above."""
+    a, b, c = corners.unbind(1)
+    normal = torch.linalg.cross(b - a, c - a)
+    area = torch.linalg.vector_norm(normal, dim=-1)
+    unit = normal / area.clamp_min(1e-300)[:, None]
+    above = torch.ones(len(points), len(a), dtype=torch.bool)
+    for p, q in ((a, b), (b, c), (c, a)):
+        above &= ((points[:, None] - p) * torch.linalg.cross(unit, q - p)).sum(-1) >= 0
+    height2 = ((points[:, None] - a) * unit).sum(-1).square()
+    return torch.where(above & (area > 0), height2, torch.inf).amin(1)

@@ -1,0 +1,214 @@
+"""What is tried, what came of it, and how a worst case is kept so that it can be tried again."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from refu_core._npz import read_npz
+from refu_core.errors import RefuError
+from refu_core.frames import N_STYLES, SmplFrame
+
+if TYPE_CHECKING:
+    from refu_lab.stress._subject import Subject, Wardrobe
+
+_KEYS = ("check", "garments", "backbone", "sdf", "pose", "betas", "transl", "style", "has_style", "seed")
+
+
+class StressError(RefuError, ValueError):
+    """Nothing to try, or a file of a trial that can't be read."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """All that a check needs to be repeated."""
+
+    frames: tuple[SmplFrame, ...]
+    seed: int = 0
+    """Of whatever else the check draws."""
+    refused: int = 0
+    """Frames that were drawn, and that `SmplFrame` itself refused."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measurement:
+    """What one trial showed, or a part of it."""
+
+    runs: int = 1
+    """Frames tried."""
+    refused: int = 0
+    """Of these, refused with an error that says why."""
+    nan: int = 0
+    """Numbers that came out and aren't finite."""
+    deviation: float = 0.0
+    """From what should have come out [m]."""
+    limit: float = math.inf
+    """The largest deviation that is right [m], above zero."""
+    faults: tuple[str, ...] = ()
+    """What else went wrong."""
+    culprit: int | None = None
+    """The frame that all this is of, where one alone would show it."""
+
+    @property
+    def badness(self) -> float:
+        """How near this is to failing: 1 is at the limit."""
+        if self.faults or self.nan or math.isnan(self.deviation):
+            return math.inf
+        return self.deviation / self.limit
+
+    @property
+    def is_failure(self) -> bool:
+        """Whether anything is wrong."""
+        return self.badness > 1
+
+
+@dataclass(frozen=True)
+class Check:
+    """One way in which something may go wrong, and how that would be noticed."""
+
+    name: str
+    """`<part>: <what is tried>`."""
+    draw: Callable[[np.random.Generator], Trial]
+    measure: Callable[[Subject, Trial], Iterator[Measurement]]
+    """Yields what it finds, part by part: the worst of it counts."""
+    trials: int = 1
+    """In one round."""
+    repeats: int = 0
+    """Frames that a trial runs besides those that were drawn."""
+    sdf_modes: tuple[str, ...] = ()
+    """The modes that promise it; empty for all."""
+
+    @property
+    def part(self) -> str:
+        """Numbers, guarantees or invariance."""
+        return self.name.partition(":")[0]
+
+    def holds_for(self, wardrobe: Wardrobe) -> bool:
+        """Whether this mode promises it."""
+        return not self.sdf_modes or wardrobe.sdf in self.sdf_modes
+
+    def run(self, subject: Subject, trial: Trial) -> Measurement:
+        """Measures; a refusal is counted, any other error is a failure."""
+        n = len(trial.frames) + trial.refused
+        try:
+            found = list(self.measure(subject, trial)) if trial.frames else []
+        except RefuError as error:
+            return Measurement(runs=n, refused=n) if str(error) else Measurement(runs=n, faults=("refused in silence",))
+        except Exception as error:  # whatever it is, it should have been a RefuError
+            return Measurement(runs=n, faults=(f"{type(error).__name__}: {error}",))
+        if not found:
+            return Measurement(runs=n, refused=n)
+        return replace(
+            max(found, key=lambda one: replace(one, nan=0).badness),
+            runs=n + self.repeats,
+            refused=trial.refused,
+            nan=sum(one.nan for one in found),
+            faults=tuple(fault for one in found for fault in one.faults),
+        )
+
+
+@dataclass(eq=False)
+class Tally:
+    """What all trials of a check in one mode showed together."""
+
+    case: str
+    mode: str
+    runs: int = 0
+    refused: int = 0
+    failures: int = 0
+    nan: int = 0
+    max_deviation: float = 0.0
+    """Of all trials [m]: where the limit depends on the frame, not always that of the worst one."""
+    faults: list[str] = field(default_factory=list)
+    """The first few."""
+    worst: Measurement | None = None
+    """Of the worst trial,"""
+    worst_trial: tuple[Wardrobe, Trial] | None = None
+    """and this trial."""
+
+    def add(self, wardrobe: Wardrobe, trial: Trial, measured: Measurement) -> None:
+        """Counts a trial."""
+        self.runs += measured.runs
+        self.refused += measured.refused
+        self.failures += measured.is_failure
+        self.nan += measured.nan
+        if math.isfinite(measured.deviation):
+            self.max_deviation = max(self.max_deviation, measured.deviation)
+        if len(self.faults) < 3:
+            self.faults += [fault for fault in measured.faults if fault not in self.faults]
+        if self.worst is None or measured.badness > self.worst.badness:
+            if measured.culprit is not None:
+                trial = replace(trial, frames=(trial.frames[measured.culprit],))
+            self.worst, self.worst_trial = measured, (wardrobe, trial)
+
+    def as_dict(self) -> dict[str, Any]:
+        """A row of the results, ready for JSON; lengths in metres, None for those that aren't finite."""
+        worst = self.worst or Measurement()
+        figures = {"deviation_m": worst.deviation, "limit_m": worst.limit, "worst_share_of_limit": worst.badness}
+        return {
+            "case": self.case,
+            "mode": self.mode,
+            "runs": self.runs,
+            "failures": self.failures,
+            "nan": self.nan,
+            "refused": self.refused,
+            "max_deviation_m": self.max_deviation,
+            **{name: value if math.isfinite(value) else None for name, value in figures.items()},
+            "faults": self.faults,
+        }
+
+
+def save_trial(path: Path, check: str, wardrobe: Wardrobe, trial: Trial) -> Path:
+    """Writes a trial as `path`, an npz that `load_trial` reads."""
+    frames = trial.frames
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(
+        path,
+        check=np.array(check),
+        garments=np.array(wardrobe.garments),
+        backbone=np.array(wardrobe.backbone),
+        sdf=np.array(wardrobe.sdf),
+        pose=np.stack([frame.pose for frame in frames]),
+        betas=np.stack([frame.betas for frame in frames]),
+        transl=np.stack([frame.transl for frame in frames]),
+        style=np.stack([np.zeros(N_STYLES, np.float32) if f.style is None else f.style for f in frames]),
+        has_style=np.array([frame.style is not None for frame in frames]),
+        seed=np.array(trial.seed, np.int64),
+    )
+    return path
+
+
+def load_trial(path: Path) -> tuple[str, Wardrobe, Trial]:
+    """The check's name, the mode and the trial of a file that `save_trial` wrote.
+
+    Raises:
+        StressError: the file is missing, damaged or something else.
+    """
+    from refu_lab.stress._subject import Wardrobe
+
+    data = read_npz(path, keys=_KEYS, error=StressError, wanted="a trial that refu stress has written")
+    missing = [key for key in _KEYS if key not in data]
+    if missing:
+        msg = f"{path}: not a trial that refu stress has written, it lacks {', '.join(missing)}"
+        raise StressError(msg)
+    wardrobe = Wardrobe(
+        garments=tuple(str(name) for name in np.atleast_1d(data["garments"])),
+        backbone=str(data["backbone"]),
+        sdf=str(data["sdf"]),
+    )
+    try:
+        frames = tuple(
+            SmplFrame(pose=pose, betas=betas, transl=transl, style=style if has_style else None)
+            for pose, betas, transl, style, has_style in zip(
+                *(data[key] for key in ("pose", "betas", "transl", "style", "has_style")), strict=True
+            )
+        )
+        return str(data["check"]), wardrobe, Trial(frames, int(data["seed"]))
+    except (RefuError, TypeError, ValueError) as error:
+        msg = f"{path}: its frames can't be used: {error}"
+        raise StressError(msg) from error

@@ -1,0 +1,122 @@
+"""Results as tables of text, for a terminal and for a page, and as JSON."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from refu_core.errors import RefuError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from refu_lab.replay import ReplayResult
+
+
+RESULT_TABLES = (
+    *("comparison", "ablation", "gcnn", "sequence", "alpha", "sdf", "time", "laplacian", "unseen", "energy", "motion"),
+)
+"""What `refu evaluate` makes, in the order of its summary; here, where a command line finds it without torch."""
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """Cells as they are read."""
+
+    title: str
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    note: str = ""
+    """What must be known to read it."""
+
+    def text(self) -> str:
+        """For a terminal, under its title."""
+        return f"{self.title}\n{format_table(self.header, self.rows)}"
+
+    def markdown(self) -> str:
+        """For a page, without its title."""
+        rule = ["---", *["---:"] * (len(self.header) - 1)]
+        lines = [f"| {' | '.join(row)} |" for row in (self.header, rule, *self.rows)]
+        return "\n".join([*([self.note, ""] if self.note else []), *lines])
+
+
+def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A plain table: the first column left-aligned, the others right-aligned."""
+    widths = [max(len(row[i]) for row in (header, *rows)) for i in range(len(header))]
+    lines = []
+    for row in (header, tuple("-" * width for width in widths), *rows):
+        cells = [row[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True))]
+        lines.append("  ".join(cells).rstrip())
+    return "\n".join(lines)
+
+
+def picture_markdown(file: str, caption: str) -> str:
+    """A picture and its caption."""
+    return f"![{caption}]({file})\n\n*{caption}*"
+
+
+def write_page(path: Path, parts: Sequence[str]) -> None:
+    """Writes the parts of a page. Raises `RefuError` where it can't be written."""
+    _write(path, "\n\n".join(parts))
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Writes plain values. Raises `RefuError` where the file can't be written."""
+    _write(path, json.dumps(content, indent=1, allow_nan=False))
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text + "\n", encoding="utf-8")
+    except OSError as error:
+        msg = f"{path.parent}: the results can't be written: {error.strerror or error}"
+        raise RefuError(msg) from error
+
+
+def replay_table(result: ReplayResult) -> str:
+    """What `refu replay` prints."""
+    rows = replay_rows(result.as_dict()["garments"])
+    lines = [f"{result.options.input}: {result.source}", "", format_table(REPLAY_HEADER, rows), ""]
+    whole = result.latency_ms()
+    lines.append(
+        f"frame, bytes to bytes: p50 {whole['p50']:.1f} ms, p95 {whole['p95']:.1f} ms, p99 {whole['p99']:.1f} ms"
+        f" ({result.options.backbone} backbone, {result.options.sdf} signed distance, {result.options.device})"
+    )
+    lines += [f"skipped {count} x {reason}" for reason, count in result.skips.most_common()]
+    lines += [f"warning: {text}" for text in result.warnings]
+    if result.interrupted:
+        lines.append("interrupted: the figures are those of the frames so far")
+    if result.options.output is not None:
+        lines.append(f"wrote {result.options.output}")
+    return "\n".join(lines)
+
+
+REPLAY_HEADER = ("garment", "frames", "p50 ms", "p95 ms", "p99 ms", "VFCP %", "CFMP %", "depth mm", "MPVE mm")
+_FIGURES = (("vfcp_percent", 3), ("cfmp_percent", 1), ("max_depth_mm", 1), ("mpve_mm", 2))
+_SUBROWS = (
+    ("away from self-contact", "without_self_contact_vertices"),
+    ("frames without any", "without_self_contact_frames"),
+)
+
+
+def replay_rows(garments: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, ...]]:
+    """A row a garment of a replay's JSON, and indented rows without the body's self-contact where there is any."""
+    rows = []
+    for name, after in garments.items():
+        latency = [f"{after['latency_ms'][p]:.2f}" for p in ("p50", "p95", "p99")]
+        rows.append((name, str(after["n_frames"]), *latency, *_changes(after["before"], after)))
+        for label, key in _SUBROWS if after["self_contact_frames"] else ():
+            if (n := after[key]["n_frames"]) > 0:
+                rows.append((f"  {label}", str(n), "", "", "", *_changes(after[f"before_{key}"], after[key])))
+    return rows
+
+
+def _changes(before: Mapping[str, float | None], after: Mapping[str, float | None]) -> list[str]:
+    cells = []
+    for key, digits in _FIGURES:
+        a, b = before[key], after[key]
+        cells.append("-" if a is None or b is None else f"{a:.{digits}f} → {b:.{digits}f}")
+    return cells

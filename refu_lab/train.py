@@ -1,0 +1,145 @@
+"""What `refu train` does: a backbone, then the backbone with ReFU; or the paper's network for the body's distance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+from refu_core import GarmentError, RefuError, load_body, load_garment
+from refu_core._device import checked_device
+from refu_core.backbones import PRESETS
+from refu_core.garments import BUILTIN_GARMENTS
+from refu_core.modes import MAX_MARGIN
+from refu_core.sdf import SDF_PRESETS
+from refu_core.simulation import GarmentDataset, open_dataset
+from refu_core.training import (
+    FINETUNE_MODES,
+    FinetuneSettings,
+    PretrainSettings,
+    SdfSettings,
+    finetune,
+    pretrain,
+    train_sdf,
+)
+from refu_lab.tables import format_table
+
+if TYPE_CHECKING:
+    from refu_core.refu import ScaleKind
+
+TRAIN_MODES: tuple[str, ...] = ("none", *FINETUNE_MODES)
+NETWORKS: tuple[str, ...] = ("garment", "sdf")
+SCALES: tuple[str, ...] = ("vertex", "shared", "distance", "fixed")
+"""What α is predicted from: the paper's choice, its alternatives 1 and 2, or nothing."""
+
+
+@dataclass(frozen=True)
+class TrainOptions:
+    """What is trained on what."""
+
+    garment: str
+    data: Path
+    network: str = "garment"
+    mode: str = "hybrid"
+    backbone: str = "tailornet"
+    preset: str = "realtime"
+    output: Path | None = None
+    """Folder of the weights; weights/GARMENT by default, where `GarmentPipeline.load(weights="weights")` finds them."""
+    scale: str = "vertex"
+    margin: float | None = None
+    unblended: bool = False
+    body: str | None = None
+    seed: int = 0
+    steps: int | None = None
+    device: str = "cpu"
+
+    @property
+    def folder(self) -> Path:
+        """Where the weights are written."""
+        return Path("weights") / self.garment if self.output is None else self.output
+
+
+def train(options: TrainOptions, *, progress: bool) -> dict[str, Any]:
+    """Trains; returns the card of what was trained last.
+
+    A mode with ReFU starts from the backbone alone, which is trained first where the output folder has none; the gcnn
+    starts from scratch in every mode, as in the paper's supplement.
+
+    Raises `RefuError` for options that name nothing, and where training does.
+    """
+    _check(options)
+    template = load_garment(options.garment)
+    body = load_body(options.body or template.body)
+    common: dict[str, Any] = {"device": options.device, "quiet": not progress}
+    if options.network == "sdf":
+        return train_sdf(
+            GarmentDataset(options.data), body, template, options.folder, settings=_sdf_training(options), **common
+        )
+    dataset = open_dataset(options.data)
+    common |= {"backbone": options.backbone, "preset": options.preset, "body": body}
+    source: Path | None = options.folder
+    if options.mode == "none":
+        return pretrain(template, dataset, options.folder, settings=_pretraining(options), **common)
+    if options.backbone == "gcnn":
+        source = None
+    elif not (options.folder / f"{options.backbone}-none.json").exists():
+        pretrain(template, dataset, options.folder, settings=_pretraining(replace(options, steps=None)), **common)
+    settings = _finetuning(options)
+    return finetune(template, dataset, source, options.folder, mode=options.mode, settings=settings, **common)
+
+
+def _check(options: TrainOptions) -> None:
+    checked_device(options.device)
+    if options.margin is not None and not 0 <= options.margin <= MAX_MARGIN:
+        msg = f"the margin must be between 0 and {MAX_MARGIN} m, got {options.margin}"
+        raise RefuError(msg)
+    if options.garment not in BUILTIN_GARMENTS:
+        msg = f"no garment {options.garment!r}: wanted one of {', '.join(BUILTIN_GARMENTS)}"
+        raise GarmentError(msg)
+    for name, value, choices in (
+        ("network", options.network, NETWORKS),
+        ("mode", options.mode, TRAIN_MODES),
+        ("scale", options.scale, SCALES),
+        ("preset", options.preset, SDF_PRESETS if options.network == "sdf" else PRESETS),
+    ):
+        if value not in choices:
+            msg = f"no {name} {value!r} of training: wanted {', '.join(choices)}"
+            raise RefuError(msg)
+
+
+def _sdf_training(options: TrainOptions) -> SdfSettings:
+    settings = replace(SdfSettings.of(options.preset), seed=options.seed)
+    return settings if options.steps is None else replace(settings, steps=options.steps)
+
+
+def _pretraining(options: TrainOptions) -> PretrainSettings:
+    settings = PretrainSettings.of(options.backbone, options.preset)
+    settings = replace(settings, loop=replace(settings.loop, seed=options.seed))
+    if options.steps is None:
+        return settings
+    return replace(settings, style_shape_steps=options.steps, low_steps=options.steps, steps=options.steps)
+
+
+def _finetuning(options: TrainOptions) -> FinetuneSettings:
+    settings = FinetuneSettings.of(options.backbone, options.preset)
+    settings = replace(settings, loop=replace(settings.loop, seed=options.seed))
+    if options.scale == "fixed":
+        settings = replace(settings, scale=None)
+    else:
+        settings = replace(settings, scale_kind=cast("ScaleKind", options.scale))
+    if options.margin is not None:
+        settings = replace(settings, margin=options.margin)
+    if options.unblended:
+        settings = replace(settings, is_blended=False)
+    return settings if options.steps is None else replace(settings, steps=options.steps)
+
+
+def training_table(card: dict[str, Any], options: TrainOptions) -> str:
+    """What `refu train` prints."""
+    rows = [(name, str(card[name])) for name in ("backbone", "mode", "preset", "samples") if name in card]
+    rows += [
+        (name.replace("_", " "), f"{value:.3f}")
+        for name, value in card.get("figures", {}).items()
+        if isinstance(value, (int, float))
+    ]
+    return format_table((options.garment, str(options.folder)), rows)

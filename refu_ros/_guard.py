@@ -1,0 +1,139 @@
+"""A node that no peer can end: what a callback raises is counted, logged, and over."""
+
+from __future__ import annotations
+
+import functools
+import time
+from typing import TYPE_CHECKING, Any
+
+from rclpy.exceptions import InvalidHandle
+from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.node import Node, SetParametersResult
+
+from refu_core import RefuError
+from refu_core.errors import printable
+from refu_ros._scene import check_stamp
+from refu_ros._statistics import Statistics
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+_CLOCK = "/clock"
+_MOST_ITEMS = 1000
+"""Entries of a list in a request to rclpy's own services: it works through them one by one, and nobody else is served
+meanwhile."""
+_LOG_PERIOD_S = 5.0
+
+
+class GuardedNode(Node):  # type: ignore[misc]
+    """Every callback that rclpy has made or is given here goes through `guarded`.
+
+    Executors end at the first exception, and the C++ one forgets requests that came with the one that failed, so that
+    a guard around the executor alone isn't enough.
+    """
+
+    def __init__(self, name: str, **options: Any) -> None:
+        self.statistics = Statistics()
+        self._said: dict[str, float] = {}
+        super().__init__(name, **options)
+        for service in self.services:  # rclpy's own: parameters, lifecycle, type description
+            what = service.srv_name.rsplit("/", 1)[-1]
+            service.callback = self.guarded(what, _bounded(service.callback), answer_no)
+
+    def fault(self, what: str, error: Exception) -> None:
+        """Counts and logs what has gone wrong in a callback, and not only there."""
+        text = printable(f"{what}: {_reason(error)}")
+        self.statistics.fault(what, text)
+        now = time.monotonic()
+        if now > self._said.get(what, -_LOG_PERIOD_S) + _LOG_PERIOD_S:  # one kind's flood doesn't hide another
+            self._said[what] = now
+            self.get_logger().warning(text)
+
+    def guarded(
+        self, what: str, callback: Callable[..., Any], otherwise: Callable[..., Any] = lambda *_, **__: None
+    ) -> Callable[..., Any]:
+        """The callback, and where it raises, what `otherwise` makes of the error and the callback's arguments."""
+
+        @functools.wraps(callback)
+        def call(*arguments: Any, **options: Any) -> Any:
+            try:
+                return callback(*arguments, **options)
+            except Exception as error:
+                self.fault(what, error)
+                return otherwise(error, *arguments, **options)
+
+        return call
+
+    def create_subscription(
+        self, msg_type: Any, topic: str, callback: Callable[..., Any], *arguments: Any, **options: Any
+    ) -> Any:
+        """As rclpy's, also for the clock, which rclpy subscribes to itself."""
+        checked = _checked_clock(callback) if topic == _CLOCK else callback
+        return super().create_subscription(msg_type, topic, self.guarded(topic, checked), *arguments, **options)
+
+    def add_waitable(self, waitable: Any) -> None:
+        """As rclpy's, for the events of publishers and subscriptions.
+
+        An event may be queued when its publisher or subscription is destroyed: then there is nothing to take any more,
+        which the C++ executor would raise.
+        """
+        waitable.callback = self.guarded("event", waitable.callback)
+        take = waitable.take_data
+
+        def take_data() -> Any:
+            try:
+                return take()
+            except InvalidHandle:
+                return None
+
+        waitable.take_data = self.guarded("event", take_data)
+        super().add_waitable(waitable)
+
+
+def transition(method: Callable[..., TransitionCallbackReturn]) -> Callable[..., TransitionCallbackReturn]:
+    """A lifecycle callback that reports what rclpy would swallow; the lifecycle goes on with `on_error`."""
+
+    @functools.wraps(method)
+    def call(node: GuardedNode, state: Any) -> TransitionCallbackReturn:
+        try:
+            return method(node, state)
+        except Exception as error:
+            node.fault(method.__name__, error)
+            return TransitionCallbackReturn.ERROR
+
+    return call
+
+
+def _reason(error: Exception) -> str:
+    return str(error) if isinstance(error, RefuError) else f"{type(error).__name__}: {error}"
+
+
+def _bounded(callback: Callable[..., Any]) -> Callable[..., Any]:
+    def call(request: Any, response: Any) -> Any:
+        for name, kind in request.get_fields_and_field_types().items():
+            if kind.startswith("sequence") and len(getattr(request, name)) > _MOST_ITEMS:
+                msg = f"wanted up to {_MOST_ITEMS} {name} in a request, got {len(getattr(request, name))}"
+                raise RefuError(msg)
+        return callback(request, response)
+
+    return call
+
+
+def answer_no(error: Exception, request: Any, response: Any) -> Any:
+    """The answer to a request that can't be met: as it is made, `success` is false; parameters get the reason, too."""
+    refused = SetParametersResult(successful=False, reason=printable(_reason(error)))
+    if hasattr(response, "results"):
+        response.results = [*response.results, *[refused] * (len(request.parameters) - len(response.results))]
+    elif isinstance(getattr(response, "result", None), SetParametersResult):
+        response.result = refused
+    return response
+
+
+def _checked_clock(callback: Callable[..., Any]) -> Callable[..., Any]:
+    """A time that no message can carry would raise wherever a stamp is made, in rclpy itself, too."""
+
+    def call(message: Any) -> None:
+        check_stamp(message.clock.sec * 10**9 + message.clock.nanosec)
+        callback(message)
+
+    return call

@@ -1,0 +1,93 @@
+"""What the programs share: their command line, signals, the executor, and errors as one line."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+import time
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+EXIT_BAD_INPUT = 2
+_LOOK_UP_S = 0.25
+"""How often the main thread looks for a signal when nothing happens."""
+_BREATH_S = 0.05
+"""Pause after the executor has failed: one that always does mustn't take a whole core."""
+
+
+def run(
+    program: str,
+    arguments: Sequence[str] | None,
+    *,
+    description: str | None,
+    listing: Callable[[], str],
+    live: Callable[[], int],
+) -> int:
+    """Answers --help with a `listing` of parameters and topics, or starts rclpy and lives; returns the exit status."""
+    _on_signals(signal.SIG_DFL)  # while it loads, nothing is open that would have to be closed
+    try:
+        import rclpy
+        from rclpy.signals import SignalHandlerOptions
+        from rclpy.utilities import remove_ros_args
+    except ImportError as error:
+        return _refuse(program, f'source a ROS 2 installation, or pip install "refu-ros[ros]" ({error})')
+    given = sys.argv if arguments is None else [program, *arguments]
+    try:
+        own = remove_ros_args(given)[1:]
+        if own:
+            argparse.ArgumentParser(
+                prog=program,
+                usage=f"{program} [--help] [--ros-args -p NAME:=VALUE ... --params-file FILE -r FROM:=TO ...]",
+                description=description,
+                epilog=listing(),
+                formatter_class=argparse.RawDescriptionHelpFormatter,
+            ).parse_args(own)
+        # rclpy's handlers raise in the middle of whatever runs, a second SIGINT even in the middle of closing a file.
+        rclpy.init(args=given, signal_handler_options=SignalHandlerOptions.NO)
+        return live()
+    except Exception as error:
+        return _refuse(program, str(error))
+    finally:
+        rclpy.try_shutdown()
+        _on_signals(signal.SIG_IGN)  # the second Ctrl-C of who was in a hurry: the status is that of the first
+
+
+def _refuse(program: str, text: str) -> int:
+    sys.stderr.write(f"{program}: error: {' '.join(text.split())}\n")
+    return EXIT_BAD_INPUT
+
+
+def on_signals(told: Callable[[], object]) -> None:
+    """From now on SIGINT and SIGTERM are answered by `told`."""
+    _on_signals(lambda *_: told())
+
+
+def _on_signals(handler: Any) -> None:
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, handler)
+
+
+def make_executor() -> Any:
+    """What waits for messages, requests and timers."""
+    try:
+        # Waits in C++ for events: the other one tells the middleware anew, in Python, what it waits for after each.
+        from rclpy.experimental import EventsExecutor
+    except ImportError:  # an older rclpy
+        from rclpy.executors import SingleThreadedExecutor
+
+        return SingleThreadedExecutor()
+    return EventsExecutor()
+
+
+def spin(executor: Any, node: Any, *, until: Callable[[], bool]) -> None:
+    """The last resort: callbacks are guarded, but what rclpy itself raises mustn't end the node either."""
+
+    def pause(*_: Any, **__: Any) -> None:
+        time.sleep(_BREATH_S)
+
+    spin_once = node.guarded("executor", executor.spin_once, pause)
+    while not until():
+        spin_once(timeout_sec=_LOOK_UP_S)

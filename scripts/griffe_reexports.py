@@ -1,0 +1,16 @@
+"""For the API reference: what a package imports from its own private modules is public, with or without `__all__`."""
+
+from __future__ import annotations
+
+import griffe
+
+
+class Reexports(griffe.Extension):
+    """`from refu_core.sdf._exact import ExactSdf as ExactSdf` in `refu_core/sdf/__init__.py` is part of its face."""
+
+    def on_package(self, *, pkg: griffe.Module, **_: object) -> None:
+        """Marks such names, in all packages below `pkg`."""
+        for module in [pkg, *(one for one in pkg.modules.values() if not one.is_alias)]:
+            for member in module.members.values():
+                if isinstance(member, griffe.Alias) and member.target_path.startswith(f"{module.path}._"):
+                    member.public = True

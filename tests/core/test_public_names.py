@@ -1,0 +1,95 @@
+"""What a stranger sees first: the names of `refu_core`, and what it says to a wrong type."""
+
+from __future__ import annotations
+
+import pydoc
+import re
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import refu_core
+from refu_core import ExactSdf, GarmentPipeline, Limbs, RefuError, Resolver, SmplFrame, load_body
+from refu_core.refu import Refu, repulse
+from refu_core.sdf import SdfSample
+
+
+def test_dir_and_star_show_all_public_names() -> None:
+    assert set(refu_core.__all__) <= set(dir(refu_core))
+    assert refu_core.__all__ == sorted(refu_core.__all__)
+    names: dict[str, Any] = {}
+    exec("from refu_core import *", names)
+    assert set(refu_core.__all__) <= set(names)
+
+
+def test_help_shows_all_public_names() -> None:
+    text = pydoc.render_doc(refu_core, renderer=pydoc.plaintext)
+    assert "GarmentPipeline.load" in text
+    for name in refu_core.__all__:
+        assert re.search(rf"^    (class )?{name}\b", text, flags=re.MULTILINE), name
+
+
+def test_a_name_is_where_its_package_has_it() -> None:
+    for name, package in refu_core._LAZY.items():
+        assert getattr(refu_core, name).__module__.startswith(f"refu_core.{package}")
+    with pytest.raises(AttributeError, match="no attribute 'Garment'"):
+        refu_core.Garment  # noqa: B018
+
+
+TETRAHEDRON = torch.tensor([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+CORNERS = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+
+
+def posed() -> ExactSdf:
+    sdf = ExactSdf(TETRAHEDRON)
+    sdf.update(CORNERS)
+    return sdf
+
+
+def pipeline() -> GarmentPipeline:
+    return GarmentPipeline.load(["short-pant-male"], backbone="skinned", sdf="none")
+
+
+def resolver() -> Resolver:
+    return Resolver(Limbs.one(TETRAHEDRON, torch.tensor([[0, 1, 2]]), n_vertices=3))
+
+
+FRAME = SmplFrame(pose=np.zeros(72))
+SAMPLE = SdfSample(torch.zeros(3), torch.zeros(3, 3))
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda: pipeline()("x"), "wanted a SmplFrame in every place of the sequence, got str"),
+        (lambda: pipeline()(np.zeros((24, 3))), "wanted a SmplFrame or a sequence of them, got ndarray"),
+        (lambda: pipeline()([FRAME, np.zeros(72)]), "wanted a SmplFrame in every place .*, got ndarray"),
+        (lambda: pipeline()({"pose": 0}), "wanted a SmplFrame or a sequence of them, got dict"),
+        (lambda: GarmentPipeline.load(5), "wanted names of garments, got int"),
+        (
+            lambda: GarmentPipeline.load(["short-pant-male"], margin="4 mm"),
+            "wanted a margin in metres, or None, got str",
+        ),
+        (lambda: GarmentPipeline.load(["short-pant-male"], style="slim"), "style must be 4 finite numbers, got 'slim'"),
+        (lambda: setattr(pipeline(), "margin", -1.0), "the margin must be between 0 and 0.05 m, got -1.0"),
+        (lambda: load_body(5), "wanted a body's name or path, got int"),
+        (lambda: load_body("male")(pose="standing"), "pose must be an array or tensor of numbers, got str"),
+        (lambda: SmplFrame(pose="standing"), "pose must be .* numbers, got str"),
+        (lambda: SmplFrame(pose=np.zeros(72), stamp_ns="now"), "stamp_ns must be a whole number .*, got 'now'"),
+        (lambda: posed().query(np.zeros((1, 3))), "points must be a floating-point torch.Tensor, got ndarray"),
+        (lambda: posed().query(torch.zeros(1, 3, dtype=torch.long)), "floating-point torch.Tensor, got torch.int64"),
+        (lambda: posed().query(torch.zeros(1, 3), near=[0]), "near must be integers .* got list"),
+        (lambda: posed().update(CORNERS.numpy()), "the body's vertices must be a .*torch.Tensor, got ndarray"),
+        (lambda: repulse(np.zeros((3, 3)), SAMPLE), "points must be a floating-point torch.Tensor, got ndarray"),
+        (lambda: Refu(3, least=1.0)(np.zeros((1, 3, 3)), SAMPLE), "points must be .*torch.Tensor, got ndarray"),
+        (lambda: resolver()(np.zeros((3, 3)), posed(), SAMPLE), "points must be .*torch.Tensor, got ndarray"),
+        (lambda: resolver()(torch.zeros(1, 3), posed(), SAMPLE), r"wanted 3 points .* shapes \(1, 3\)"),
+        (lambda: resolver()(torch.zeros(3, 3), posed(), SAMPLE), "start must name the closest faces"),
+    ],
+)
+def test_a_wrong_type_gets_a_sentence(call: Callable[[], object], said: str) -> None:
+    with pytest.raises(RefuError, match=said):
+        call()

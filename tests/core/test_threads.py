@@ -1,0 +1,122 @@
+"""A pipeline in several threads and tasks gives what it gives in one."""
+
+from __future__ import annotations
+
+import asyncio
+import copy
+import pickle
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import torch
+
+from refu_core import GarmentPipeline, RefuError, SmplFrame
+from refu_core.realtime import PipelineOutput
+from refu_lab.stress import everyday
+
+_GARMENTS = ("tshirt-male", "short-pant-male")
+
+
+@pytest.fixture(scope="module")
+def pipeline() -> GarmentPipeline:
+    return GarmentPipeline.load(_GARMENTS)
+
+
+def _frames(n: int, seed: int = 0) -> list[SmplFrame]:
+    rng = np.random.default_rng(seed)
+    return [everyday(rng) for _ in range(n)]
+
+
+def _arrays(out: PipelineOutput) -> list[np.ndarray]:
+    return [out.body, *(array for mesh in out.values() for array in (mesh.local, mesh.raw))]
+
+
+def _are_equal(first: PipelineOutput, second: PipelineOutput) -> bool:
+    return all(np.array_equal(a, b) for a, b in zip(_arrays(first), _arrays(second), strict=True))
+
+
+def _threads(n: int) -> ThreadPoolExecutor:
+    # How many threads torch takes for a product, and so how it is rounded, is each thread's own setting.
+    return ThreadPoolExecutor(n, initializer=lambda: torch.set_num_threads(1))
+
+
+def _in_threads(call: Callable[[SmplFrame], PipelineOutput], frames: list[SmplFrame]) -> list[PipelineOutput]:
+    with _threads(8) as threads:
+        return list(threads.map(call, frames))
+
+
+@pytest.mark.parametrize("sdf", ["hybrid", "accurate"])
+def test_eight_threads_give_what_one_gives(pipeline: GarmentPipeline, sdf: str) -> None:
+    if sdf == "accurate":
+        pipeline = GarmentPipeline.load(_GARMENTS[0], sdf=sdf)
+    frames = _frames(16)
+    one_by_one = [pipeline(frame) for frame in frames]
+    # What is made when it is first asked for (raw, body) is asked for after all frames, by another thread.
+    for out, alone in zip(_in_threads(pipeline, frames), one_by_one, strict=True):
+        assert _are_equal(out, alone)
+
+
+def test_bodies_and_garments_hold_nothing_of_a_call(pipeline: GarmentPipeline) -> None:
+    body, garment = pipeline.body, pipeline.garments[_GARMENTS[0]]
+
+    def pose(frame: SmplFrame) -> tuple[np.ndarray, ...]:
+        posed = body(frame.pose[None], frame.betas[None])
+        worn = garment.pose(garment.rest(torch.tensor(frame.betas)[None]), posed.transforms)
+        return posed.vertices.numpy(), worn.numpy()
+
+    frames = _frames(64)
+    with _threads(8) as threads:
+        for found, expected in zip(threads.map(pose, frames), map(pose, frames), strict=True):
+            assert all(map(np.array_equal, found, expected))
+
+
+def test_tasks_and_batches_give_what_one_thread_gives(pipeline: GarmentPipeline) -> None:
+    batches = [_frames(2, seed) for seed in range(4)]
+    alone = [pipeline(batch) for batch in batches]
+
+    async def together() -> list[list[PipelineOutput]]:
+        asyncio.get_running_loop().set_default_executor(_threads(4))
+        return await asyncio.gather(*(asyncio.to_thread(pipeline, batch) for batch in batches))
+
+    for outs, expected in zip(asyncio.run(together()), alone, strict=True):
+        assert all(map(_are_equal, outs, expected))
+
+
+def test_a_margin_that_another_thread_sets_holds_for_whole_frames(pipeline: GarmentPipeline) -> None:
+    frames, margins = _frames(4), (0.002, 0.006)
+    expected: list[list[PipelineOutput]] = []
+    for margin in margins:
+        pipeline.margin = margin
+        expected.append([pipeline(frame) for frame in frames])
+
+    def call(i: int) -> PipelineOutput:
+        pipeline.margin = margins[i % 3 % 2]
+        return pipeline(frames[i % len(frames)])
+
+    with _threads(8) as threads:
+        for i, out in enumerate(threads.map(call, range(16))):
+            assert any(_are_equal(out, of_margin[i % len(frames)]) for of_margin in expected)
+    pipeline.margin = None
+
+
+def test_pipelines_of_their_own_run_beside_each_other(pipeline: GarmentPipeline) -> None:
+    frames = _frames(6)
+    alone = [pipeline(frame) for frame in frames]
+
+    def load_and_dress(_: int) -> list[PipelineOutput]:
+        own = GarmentPipeline.load(_GARMENTS)
+        return [own(frame) for frame in frames]
+
+    with _threads(2) as threads:
+        for outs in threads.map(load_and_dress, range(2)):
+            assert all(map(_are_equal, outs, alone))
+
+
+@pytest.mark.parametrize("take", [pickle.dumps, copy.deepcopy])
+def test_a_pipeline_that_is_pickled_says_what_to_do_instead(
+    pipeline: GarmentPipeline, take: Callable[[object], object]
+) -> None:
+    with pytest.raises(RefuError, match="load one in each process"):
+        take(pipeline)

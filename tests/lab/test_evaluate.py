@@ -1,0 +1,239 @@
+"""`refu evaluate`: tables of a data set from files alone, the quick check of bags, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import msg_adapters as adapters
+from refu_core import SmplFrame, load_body, load_garment
+from refu_lab import quick
+from refu_lab.cli import main
+from refu_lab.reproduction import _pictures
+from refu_lab.truth import TOPIC
+
+BAGS = Path(__file__).parents[2] / "bags"
+GARMENT = "short-pant-male"
+QUANTUM = 2.0**-14
+
+
+def run(*arguments: object) -> int:
+    return main([str(argument) for argument in ("evaluate", *arguments, "--quiet")])
+
+
+def frames(n: int = 4) -> list[SmplFrame]:
+    made = []
+    for k in range(n):
+        pose = np.zeros((24, 3), np.float32)
+        pose[1, 0], pose[2, 0], pose[2, 2] = -0.9 + 0.2 * k, 0.1 * k, 0.12
+        betas = np.full(10, 0.2 * k, np.float32)
+        made.append(SmplFrame(pose, betas, style=np.zeros(4, np.float32), stamp_ns=10**18 + k * 10**9))
+    return made
+
+
+def truth_of(frame: SmplFrame) -> np.ndarray[Any, Any]:
+    """Where the skinned template is, 3 mm up."""
+    garment, body = load_garment(GARMENT), load_body("male")
+    betas = torch.tensor(frame.betas)[None]
+    posed = body(torch.tensor(frame.pose)[None], betas)
+    vertices: np.ndarray[Any, Any] = garment.pose(garment.rest(betas), posed.transforms)[0].numpy()
+    return vertices + np.array([0, 0.003, 0], np.float32)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A set as docs/guide/data.md describes its files, written without the code that reads it: one in two is a test."""
+    path = tmp_path_factory.mktemp("set")
+    shard = path / "shard-0-of-1"
+    shard.mkdir()
+    made = frames()
+    n = len(made)
+    columns: dict[str, Any] = {
+        "slot": np.arange(n, dtype=np.int32),
+        "state": np.ones(n, np.uint8),
+        "vertices": np.round(np.stack([truth_of(f) for f in made]) / QUANTUM).astype(np.int16),
+        "pose": np.stack([f.pose for f in made]),
+        "betas": np.stack([f.betas for f in made]),
+        "style": np.zeros((n, 4), np.float32),
+        "pair": np.arange(n, dtype=np.int32),
+        "clip": np.full(n, -1, np.int32),
+        "frame": np.full(n, -1, np.int32),
+        "split": (np.arange(n) % 2).astype(np.uint8),
+        "dropped": np.zeros((n, 5), np.uint8),
+        **{name: np.ones(n, np.float32) for name in ("share", "stretch", "speed", "seconds")},
+    }
+    for name, values in columns.items():
+        np.save(shard / f"{name}.npy", values)
+    np.save(path / "unseen.npy", np.where(np.arange(n) % 2, 1.5, np.nan).astype(np.float32))
+    body = load_body("male")
+    card = {
+        "format": "refu-garments-1",
+        "garment": GARMENT,
+        "body": "male",
+        "body_fingerprint": body.fingerprint,
+        "quantum_m": QUANTUM,
+        "plan": {"count": n},
+        "clips": {"train": [], "test": []},
+    }
+    (path / "card.json").write_text(json.dumps(card), encoding="utf-8")
+    return path
+
+
+def test_tables_of_a_data_set(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_pictures, "_SIZE", (60, 80))
+    out, file, cache = tmp_path / "results", tmp_path / "rows.json", tmp_path / "cache"
+    assert run("--data", dataset, "--table", "comparison", "--output", out, "--json", file, "--cache", cache) == 0
+    printed = capsys.readouterr().out
+    assert "skinned template" in printed
+    data = json.loads(file.read_text(encoding="utf-8"))
+    rows = {(r["garment"], r["method"], r["metric"]): r for r in data["rows"]}
+    assert {tuple(row) for row in data["rows"]} == {("table", "garment", "method", "metric", "value", "paper")}
+    # The truth is the template, 3 mm off, rounded to the file's unit.
+    assert rows[GARMENT, "skinned", "mpve_mm"]["value"] == pytest.approx(3, abs=0.05)
+    assert rows[GARMENT, "node-skinned", "vfcp_percent"]["value"] == 0
+    assert rows[GARMENT, "refu-hybrid", "cfmp_percent"]["paper"] == 76.89
+    page = (out / "comparison.md").read_text(encoding="utf-8")
+    assert f"over these numbers of test samples: {GARMENT} 2." in page
+    assert {path.name for path in out.iterdir()} >= {"comparison.md", "comparison.json", "README.md", f"{GARMENT}.png"}
+    assert len(list(cache.iterdir())) >= 2
+
+
+def test_motion_of_a_folder(tmp_path: Path) -> None:
+    poses = np.zeros((5, 72))
+    poses[:, 3] = np.linspace(0, 0.3, 5)
+    np.savez(tmp_path / "swing.npz", poses=poses, trans=np.zeros((5, 3)), betas=np.zeros(10), mocap_framerate=30.0)
+    file = tmp_path / "rows.json"
+    arguments = ("--motions", tmp_path, "--table", "motion", "--motion-every", 2, "--output", tmp_path / "out")
+    assert run(*arguments, "--json", file) == 0
+    rows = json.loads(file.read_text(encoding="utf-8"))["rows"]
+    assert {f"{GARMENT}, swing", "skirt-female, all clips"} <= {row["garment"] for row in rows}
+    assert "jitter_mm" in {row["metric"] for row in rows}
+
+
+# ---- the quick check -------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bag with ground truth."""
+    path = tmp_path_factory.mktemp("bags") / "small.mcap"
+    faces = load_garment(GARMENT).faces.numpy()
+    mesh = adapters.MarkerMesh(ns=GARMENT, faces=faces, n_vertices=faces.max() + 1, color=(1.0, 1.0, 1.0, 1.0))
+    encoder = adapters.MarkerArrayEncoder([mesh], frame_id="map", axes="smpl")
+    encode = adapters.encoder_for("multiarray")
+    with adapters.BagWriter(path) as writer:
+        writer.add_topic("/smpl_params", adapters.INPUT_TYPES["multiarray"])
+        writer.add_topic(TOPIC, adapters.MARKER_ARRAY)
+        for frame in frames():
+            writer.write("/smpl_params", encode(frame), log_time_ns=frame.stamp_ns)
+            truth = encoder.encode([truth_of(frame)], stamp_ns=frame.stamp_ns, transl=frame.transl)
+            writer.write(TOPIC, truth, log_time_ns=frame.stamp_ns)
+    return path
+
+
+def test_quick_check_passes_on_its_own_reference_and_fails_below_it(
+    bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    reference, file = tmp_path / "quick.json", tmp_path / "rows.json"
+    arguments = ("--quick", "--data", bag, "--reference", reference)
+    assert run(*arguments, "--set-reference") == 0
+    assert run(*arguments, "--json", file) == 0
+    assert "none of" in capsys.readouterr().out
+    result = json.loads(file.read_text(encoding="utf-8"))
+    assert result["passed"]
+    found = {(row["method"], row["metric"]): row["value"] for row in result["rows"]}
+    assert found["skinned", "mpve_mm"] == pytest.approx(3, abs=0.01)
+
+    kept = json.loads(reference.read_text(encoding="utf-8"))
+    for row in kept["rows"]:
+        if (row["method"], row["metric"]) == ("skinned", "mpve_mm"):
+            row["value"] -= 0.5  # it was better once
+    reference.write_text(json.dumps(kept), encoding="utf-8")
+    assert run(*arguments) == 1
+    printed = capsys.readouterr().out
+    assert "1 of" in printed
+    (fallen,) = [line for line in printed.splitlines() if line.endswith("FALLEN")]
+    assert fallen.split()[:4] == ["small", GARMENT, "skinned", "MPVE"]
+
+    kept["rows"] = [{**row, "method": "gone"} for row in kept["rows"][:1]]
+    reference.write_text(json.dumps(kept), encoding="utf-8")
+    assert run(*arguments) == 1  # a figure that isn't there any more has fallen, too
+    assert "gone" in capsys.readouterr().out
+
+
+def test_no_figure_of_the_shipped_bags_and_weights_has_fallen(capsys: pytest.CaptureFixture[str]) -> None:
+    reference = BAGS.parent / "docs" / "results" / "quick.json"
+    passed = run("--quick", "--data", BAGS, "--reference", reference) == 0
+    assert passed, capsys.readouterr().out
+    rows = json.loads(reference.read_text(encoding="utf-8"))["rows"]
+    assert {row["bag"] for row in rows} == {path.parent.name for path in BAGS.glob("*/metadata.yaml")}
+    assert {row["method"] for row in rows} >= {"tailornet", "node, tailornet, hybrid", "node, skinned, accurate"}
+
+
+def test_tolerances_are_one_sided() -> None:
+    def is_passed(value: float, reference: float | None, tolerance: float, metric: str = "cfmp_percent") -> bool:
+        key = quick.FigureKey("bag", GARMENT, "skinned", metric)
+        return quick.Comparison(key, value, reference, tolerance).is_passed
+
+    assert is_passed(90.0, 93.0, 3.0)
+    assert not is_passed(90.0, 93.1, 3.0)
+    assert is_passed(90.0, 50.0, 0.0)
+    assert not is_passed(90.0, 89.0, 0.5, "mpve_mm")
+    assert is_passed(90.0, 99.0, 0.0, "mpve_mm")
+    assert is_passed(90.0, None, 0.0)
+
+
+# ---- what it refuses -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "the table all needs --data DIR"),
+        (["--table", "motion"], "needs --motions DIR"),
+        (["--table", "sdf", "--motions", "."], "needs --data DIR"),
+        (["--data", "nowhere"], "nowhere"),
+        (["--table", "beauty"], "invalid choice"),
+        (["--data", "x", "--every", "0"], "above zero"),
+        (["--quick", "--data", "nowhere"], "no bag in it"),
+        (["--quick", "--data", str(BAGS), "--reference", "nowhere.json"], "no reference there"),
+    ],
+)
+def test_bad_input_is_one_line(
+    arguments: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    try:
+        code = run(*arguments)
+    except SystemExit as stop:
+        code = int(stop.code or 0)
+    assert code == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert len(error.splitlines()) == 1
+
+
+def test_a_damaged_reference_is_one_line(bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    reference = tmp_path / "quick.json"
+    for content in ("{", "[]", '{"tolerances": {}, "rows": [{"bag": 1}]}'):
+        reference.write_text(content, encoding="utf-8")
+        assert run("--quick", "--data", bag, "--reference", reference) == 2
+        assert "not a reference" in capsys.readouterr().err
+
+
+def test_two_sets_of_one_garment_are_refused(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("--data", dataset, dataset, "--output", tmp_path / "out") == 2
+    assert "one data set a garment" in capsys.readouterr().err
+    assert run("--data", dataset, "--table", "sequence", "--output", tmp_path / "out") == 2
+    assert "needs a data set of sequences" in capsys.readouterr().err

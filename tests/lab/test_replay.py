@@ -1,0 +1,425 @@
+"""`refu replay`, whole: bags and motion files in; bags, figures and reports out; and what it refuses."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import igl
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+
+import msg_adapters as adapters
+from refu_core import GarmentPipeline, SmplFrame, load_body, load_garment
+from refu_core.garments import BUILTIN_GARMENTS
+from refu_core.metrics import SelfContactDetector
+from refu_lab.cli import main
+
+BAGS = Path(__file__).parents[2] / "bags"
+SHIPPED = [BAGS / "walk", BAGS / "reach_squat"]
+
+
+def motion(n: int = 6) -> list[SmplFrame]:
+    """A short motion with the arms down, so that something is in the way."""
+    frames = []
+    for i in range(n):
+        pose = np.zeros((24, 3), np.float32)
+        pose[16, 2], pose[17, 2] = -1.1, 1.1
+        pose[1, 0] = 0.1 * i
+        frames.append(
+            SmplFrame(pose, np.full(10, 0.3, np.float32), np.array([0.1 * i, 0.9, 0]), stamp_ns=10**18 + i * 33_333_333)
+        )
+    return frames
+
+
+def write_bag(
+    path: Path, frames: list[SmplFrame], kind: str = "joint_state", extra: dict[int, bytes] | None = None
+) -> Path:
+    """A bag of `frames`, with other bytes in the place of some of them."""
+    encode = adapters.encoder_for(kind)
+    with adapters.BagWriter(path) as writer:
+        writer.add_topic("/smpl_params", adapters.INPUT_TYPES[kind])
+        for i, frame in enumerate(frames):
+            data = (extra or {}).get(i, encode(frame))
+            writer.write("/smpl_params", data, log_time_ns=frame.stamp_ns + 5)
+    return path
+
+
+@pytest.fixture(scope="module")
+def small_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_bag(tmp_path_factory.mktemp("bag") / "small.mcap", motion())
+
+
+def run(*arguments: object) -> int:
+    return main([str(argument) for argument in ("replay", *arguments, "--quiet")])
+
+
+# ---- what comes out --------------------------------------------------------------------------------------------------
+
+
+def decoded(path: Path) -> list[tuple[str, int, Any]]:
+    """Topic, log time and message of everything in an .mcap, read by another decoder than ours."""
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        return [(channel.topic, m.log_time, ros) for _, channel, m, ros in reader.iter_decoded_messages()]
+
+
+def test_as_many_garments_as_frames_and_stamps_kept(small_bag: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.mcap"
+    assert run(small_bag, "--output", out, "--garments", "tshirt-male,short-pant-male") == 0
+    messages = decoded(out)
+    arrays = [ros for topic, _, ros in messages if topic == "/garments"]
+    inputs = [ros for topic, _, ros in messages if topic == "/smpl_params"]
+    assert len(arrays) == len(inputs) == len(motion())
+    for array, frame in zip(arrays, motion(), strict=True):
+        assert [m.ns for m in array.markers] == ["tshirt-male", "short-pant-male"]
+        for marker in array.markers:
+            stamp = marker.header.stamp
+            assert stamp.sec * 10**9 + stamp.nanosec == frame.stamp_ns
+            assert marker.header.frame_id == "map"
+            assert (marker.type, marker.action, marker.id) == (11, 0, 0)
+            assert len(marker.points) == 3 * len(load_garment(marker.ns).faces)
+            assert all(np.isfinite((p.x, p.y, p.z)).all() for p in marker.points[::97])
+
+
+def test_the_output_is_what_the_pipeline_says_in_ros_axes(small_bag: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.mcap"
+    assert run(small_bag, "--output", out, "--garments", "short-pant-male") == 0
+    pipeline = GarmentPipeline.load(["short-pant-male"])
+    with adapters.BagReader(out) as reader:
+        arrays = list(reader.messages(["/garments"]))
+    for message, frame in zip(arrays, motion(), strict=True):
+        (marker,) = adapters.decode_marker_array(message.data)
+        mesh = pipeline(frame)["short-pant-male"]
+        wanted = mesh.vertices[:, [2, 0, 1]]  # REP 103: x forward, y left, z up
+        found = adapters.vertices_from_points(marker.points, mesh.faces, n_vertices=len(wanted))
+        np.testing.assert_allclose(found, wanted, atol=1e-6)
+
+
+@pytest.mark.parametrize("bag", SHIPPED, ids=lambda path: path.name)
+def test_shipped_bags_replay_and_open_as_rosbag2(bag: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert run(bag, "--output", out, "--json", tmp_path / "r.json", "--max-frames", 12) == 0
+    assert (out / "metadata.yaml").exists()
+    with AnyReader([out]) as reader:
+        assert {c.topic: c.msgcount for c in reader.connections}["/garments"] == 12
+    result = json.loads((tmp_path / "r.json").read_text())
+    assert result["frames"] == 12
+    for figures in result["garments"].values():
+        assert set(figures["latency_ms"]) == {"p50", "p95", "p99"}
+        assert figures["mpve_mm"] is None
+        assert {"vfcp_percent", "cfmp_percent", "max_depth_mm"} <= set(figures)
+
+
+def test_motion_files_replay(motions: list[Path], tmp_path: Path) -> None:
+    out = tmp_path / "out.mcap"
+    assert run(motions[0], "--output", out, "--max-frames", 3, "--garments", "skirt-female") == 0
+    assert [topic for topic, _, _ in decoded(out)] == ["/smpl_params", "/garments"] * 3
+
+
+@pytest.mark.parametrize("backbone", ["skinned", "tailornet"])
+@pytest.mark.parametrize("garment", BUILTIN_GARMENTS)
+def test_nothing_is_inside_the_body_where_it_does_not_touch_itself(
+    garment: str, backbone: str, motions: list[Path]
+) -> None:
+    """Judged by libigl's signed distance, on frames of every motion and shipped bag."""
+    pipeline = GarmentPipeline.load([garment], sdf="accurate", backbone=backbone)
+    faces = pipeline.body.faces.numpy().astype(np.int64)
+    detector = SelfContactDetector(faces, load_body(pipeline.body.name)(np.zeros((1, 72))).vertices[0].numpy())
+    checked = 0
+    for frame in sampled_frames(motions):
+        out = pipeline(frame)
+        mesh = out[garment]
+        contact = detector.detect(out.body)
+        away = ~(contact.near(mesh.raw) | contact.near(mesh.local))
+        distance = igl.signed_distance(
+            mesh.local[away].astype(np.float64),
+            out.body.astype(np.float64),
+            faces,
+            igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL,
+        )[0]
+        assert distance.min() > 0, f"{(distance <= 0).sum()} vertices inside, {-1e3 * distance.min():.2f} mm deep"
+        checked += int(away.sum())
+    assert checked > 10_000
+
+
+def sampled_frames(motions: list[Path]) -> list[SmplFrame]:
+    frames = []
+    for path in motions:
+        clip = adapters.read_motion(path)
+        frames += [clip.frame(i) for i in np.linspace(0, len(clip) - 1, 4).astype(int)]
+    for bag in SHIPPED:
+        records = list(adapters.iter_smpl_frames(bag))
+        frames += [f for r in records[:: len(records) // 4] if (f := r.frame) is not None]
+    return frames
+
+
+def test_report_is_complete_in_its_folder(small_bag: Path, tmp_path: Path) -> None:
+    assert run(small_bag, "--report", tmp_path / "report", "--garments", "short-pant-male") == 0
+    page = (tmp_path / "report" / "index.html").read_text(encoding="utf-8")
+    files = re.findall(r'(?:src|href)="([^"]+)"', page)
+    assert len(files) == 8, "two plots, three frames before and after"
+    for file in files:
+        assert (tmp_path / "report" / file).stat().st_size > 1000
+    assert "short-pant-male" in page
+
+
+def test_betas_can_be_given(small_bag: Path, tmp_path: Path) -> None:
+    depths = []
+    for betas in ("0", "0,2"):
+        out = tmp_path / f"{betas}.mcap"
+        assert run(small_bag, "--betas", betas, "--output", out, "--garments", "short-pant-male") == 0
+        (marker,) = adapters.decode_marker_array(raw_messages(out)[1][2])
+        depths.append(np.ptp(marker.points[:, 0]))
+    assert depths[1] > depths[0] + 0.02, "the second component is girth"
+
+
+def test_real_speed_keeps_the_pace(small_bag: Path) -> None:
+    start = time.monotonic()
+    assert run(small_bag, "--speed", "real", "--garments", "short-pant-male") == 0
+    assert time.monotonic() - start > 5 * 0.0333
+
+
+# ---- what goes wrong -------------------------------------------------------------------------------------------------
+
+
+def nan_frame() -> bytes:
+    data = bytearray(adapters.encoder_for("multiarray")(motion(1)[0]))
+    data[-40:-36] = np.float32(np.nan).tobytes()
+    return bytes(data)
+
+
+def test_bad_messages_are_counted_and_skipped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bad = {1: b"", 2: b"\x00\x01\x00\x00" + b"\xff" * 64, 4: nan_frame()}
+    bag = write_bag(tmp_path / "mixed.mcap", motion(), "multiarray", bad)
+    out, report = tmp_path / "out.mcap", tmp_path / "r.json"
+    assert run(bag, "--output", out, "--json", report, "--garments", "short-pant-male") == 0
+    result = json.loads(report.read_text())
+    assert result["frames"] == 3
+    assert sum(result["skipped"].values()) == 3
+    assert any("NaN" in reason for reason in result["skipped"])
+    assert "skipped 1 x" in capsys.readouterr().out
+    topics = [topic for topic, _, _ in raw_messages(out)]
+    assert topics.count("/smpl_params") == 6
+    assert topics.count("/garments") == 3
+
+
+def raw_messages(path: Path) -> list[tuple[str, int, bytes]]:
+    with adapters.BagReader(path) as reader:
+        return [(m.topic, m.log_time_ns, m.data) for m in reader.messages()]
+
+
+def test_a_truncated_bag_is_replayed_up_to_the_damage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag = write_bag(tmp_path / "whole.mcap", motion(60))
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(bag.read_bytes()[:-3000])
+    report = tmp_path / "r.json"
+    code = run(cut, "--json", report, "--garments", "short-pant-male", "--sdf", "none")
+    printed = capsys.readouterr()
+    if code == 0:
+        result = json.loads(report.read_text())
+        assert 0 < result["frames"] <= 60
+        assert result["warnings"], printed.out
+    else:
+        assert_one_line(code, printed.err, "cut.mcap")
+
+
+def assert_one_line(code: int, err: str, *wanted: str) -> None:
+    lines = [line for line in err.splitlines() if line.strip()]
+    assert code == 2
+    assert len(lines) == 1, err
+    assert lines[0].startswith("refu")
+    for text in wanted:
+        assert text in lines[0]
+
+
+def empty_bag(path: Path) -> Path:
+    with adapters.BagWriter(path):
+        pass
+    return path
+
+
+def bag_of_something_else(path: Path) -> Path:
+    with adapters.BagWriter(path) as writer:
+        writer.add_topic("/markers", adapters.MARKER_ARRAY)
+        writer.write("/markers", adapters.encode_delete_all(stamp_ns=0), log_time_ns=0)
+    return path
+
+
+def file_of(content: bytes) -> Callable[[Path], Path]:
+    def make(path: Path) -> Path:
+        path.write_bytes(content)
+        return path
+
+    return make
+
+
+def npz_of(**arrays: Any) -> Callable[[Path], Path]:
+    def make(path: Path) -> Path:
+        np.savez(path, **arrays)
+        return path
+
+    return make
+
+
+def all_bad_bag(path: Path) -> Path:
+    return write_bag(path, motion(2), "multiarray", {0: b"", 1: nan_frame()})
+
+
+@pytest.mark.parametrize(
+    ("name", "make", "options", "wanted"),
+    [
+        ("missing.mcap", lambda path: path, (), ("missing.mcap",)),
+        ("noise.mcap", file_of(os.urandom(4096)), (), ("noise.mcap",)),
+        ("nothing.mcap", file_of(b""), (), ("nothing.mcap",)),
+        ("empty.mcap", empty_bag, (), ("empty.mcap", "empty")),
+        ("other.mcap", bag_of_something_else, (), ("other.mcap", "/markers", "Float32MultiArray")),
+        ("bad.mcap", all_bad_bag, (), ("bad.mcap", "no frame could be replayed")),
+        ("good.mcap", lambda path: write_bag(path, motion(1)), ("--garments", "kilt"), ("kilt", "tshirt-male")),
+        ("good.mcap", lambda path: write_bag(path, motion(1)), ("--garments", ","), ("--garments",)),
+        ("good.mcap", lambda path: write_bag(path, motion(1)), ("--topic", "/nope"), ("/nope", "/smpl_params")),
+        ("good.mcap", lambda path: write_bag(path, motion(1)), ("--output", "/proc/nope/out.mcap"), ("/proc/nope",)),
+        ("good.mcap", lambda path: write_bag(path, motion(1)), ("--json", "/proc/nope/r.json"), ("/proc/nope",)),
+        ("good.mcap", lambda path: write_bag(path, motion(1)), ("--betas", "1,nan"), ("--betas",)),
+        ("good.mcap", lambda path: write_bag(path, motion(1)), ("--style", "1,2,3,4,5"), ("--style",)),
+        ("good.mcap", lambda path: write_bag(path, motion(1)), ("--margin", "7"), ("margin",)),
+        ("good.mcap", lambda path: write_bag(path, motion(1)), ("--backbone", "resnet"), ("resnet", "skinned")),
+        ("good.mcap", lambda path: write_bag(path, motion(1)), ("--nonsense",), ("--nonsense",)),
+        ("short.npz", npz_of(poses=np.zeros((3, 71)), trans=np.zeros((3, 3))), (), ("short.npz", "71")),
+        (
+            "nan.npz",
+            npz_of(poses=np.full((3, 72), np.nan), trans=np.zeros((3, 3)), mocap_framerate=30),
+            (),
+            ("nan.npz",),
+        ),
+        ("none.npz", npz_of(poses=np.zeros((0, 72)), trans=np.zeros((0, 3)), mocap_framerate=30), (), ("none.npz",)),
+        ("keys.npz", npz_of(angles=np.zeros((3, 72))), (), ("keys.npz", "poses")),
+        ("objects.npz", npz_of(poses=np.array([{}], object)), (), ("objects.npz",)),
+        ("evil.npz", file_of(pickle.dumps(print)), (), ("evil.npz",)),
+    ],
+)
+def test_bad_input_is_one_clear_line(
+    name: str,
+    make: Callable[[Path], Path],
+    options: tuple[str, ...],
+    wanted: tuple[str, ...],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = make(tmp_path / name)
+    try:
+        code = run(path, "--sdf", "none", *options)
+    except SystemExit as stop:
+        code = int(stop.code or 0)
+    assert_one_line(code, capsys.readouterr().err, *wanted)
+
+
+def test_an_output_that_is_there_is_not_overwritten_unasked(
+    small_bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out.mcap"
+    out.write_bytes(b"precious")
+    assert_one_line(run(small_bag, "--output", out), capsys.readouterr().err, "out.mcap")
+    assert out.read_bytes() == b"precious"
+    assert run(small_bag, "--output", out, "--overwrite", "--garments", "short-pant-male") == 0
+    assert len(raw_messages(out)) == 2 * len(motion())
+
+
+@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_replay_leaves_a_readable_bag(kind: signal.Signals, tmp_path: Path) -> None:
+    bag, out = write_bag(tmp_path / "long.mcap", motion(300)), tmp_path / "out.mcap"
+    command = [sys.executable, "-m", "refu_lab.cli", "replay", bag, "--output", out, "--speed", "real", "--quiet"]
+    process = subprocess.Popen(
+        [*map(str, command), "--garments", "short-pant-male", "--sdf", "none"],
+        stdout=subprocess.PIPE,
+        text=True,
+        # A shell's background jobs, and what they start, ignore SIGINT: so might this test run.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    deadline = time.monotonic() + 60
+    while (not out.exists() or out.stat().st_size < 20_000) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.send_signal(kind)
+    printed, _ = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert "interrupted" in printed
+    with out.open("rb") as stream:
+        statistics = make_reader(stream).get_summary()
+        assert statistics is not None, "the file was closed properly"
+    topics = [topic for topic, _, _ in raw_messages(out)]
+    assert 0 < topics.count("/garments") < 300
+
+
+def test_info_names_what_is_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info", "--json", str(tmp_path / "info.json")]) == 0
+    facts = json.loads((tmp_path / "info.json").read_text())
+    assert set(facts["garments"]) == set(BUILTIN_GARMENTS)
+    assert "tshirt-male" in capsys.readouterr().out
+
+
+def test_info_describes_a_body(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info", "--body", "female", "--json", str(tmp_path / "body.json")]) == 0
+    facts = json.loads((tmp_path / "body.json").read_text())
+    assert facts["watertight"] == "yes"
+    assert facts["fingerprint"] == load_body("female").fingerprint
+    assert "6909" in capsys.readouterr().out
+
+
+class Evil:
+    def __reduce__(self) -> tuple[Callable[[str], int], tuple[str]]:
+        return os.system, ("echo owned",)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "wanted"),
+    [
+        ("evil.pkl", pickle.dumps({"v_template": Evil()}), "nothing was executed"),
+        ("noise.pkl", os.urandom(200), "can't be read"),
+        ("noise.npz", os.urandom(200), "can't be read"),
+        ("model.fbx", b"", "must be an .npz or an official .pkl"),
+    ],
+    ids=["evil.pkl", "noise.pkl", "noise.npz", "model.fbx"],
+)
+def test_an_unreadable_body_is_one_clear_line(
+    name: str, content: bytes, wanted: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / name).write_bytes(content)
+    code = main(["info", "--body", str(tmp_path / name)])
+    printed = capfd.readouterr()
+    assert_one_line(code, printed.err, name, wanted)
+    assert "owned" not in printed.out
+
+
+def test_ground_truth_in_the_bag_gives_mpve(tmp_path: Path) -> None:
+    """A bag whose truth is what comes out, 3 mm to the side: MPVE after is 3 mm."""
+    pipeline = GarmentPipeline.load(["short-pant-male"])
+    mesh = adapters.MarkerMesh(
+        ns="short-pant-male",
+        faces=pipeline.garments["short-pant-male"].faces.numpy(),
+        n_vertices=pipeline.garments["short-pant-male"].n_vertices,
+    )
+    encoder, encode = adapters.MarkerArrayEncoder([mesh]), adapters.encoder_for("multiarray")
+    bag = tmp_path / "truth.mcap"
+    with adapters.BagWriter(bag) as writer:
+        writer.add_topic("/smpl_params", adapters.INPUT_TYPES["multiarray"])
+        writer.add_topic("/ground_truth", adapters.MARKER_ARRAY)
+        for frame in motion():
+            true = pipeline(frame)["short-pant-male"].local + np.array([0.003, 0, 0], np.float32)
+            data = encoder.encode([true], stamp_ns=frame.stamp_ns, transl=frame.transl)
+            writer.write("/smpl_params", encode(frame), log_time_ns=frame.stamp_ns)
+            writer.write("/ground_truth", data, log_time_ns=frame.stamp_ns)
+    assert run(bag, "--garments", "short-pant-male", "--json", tmp_path / "r.json") == 0
+    figures = json.loads((tmp_path / "r.json").read_text())["garments"]["short-pant-male"]
+    assert figures["mpve_mm"] == pytest.approx(3.0, abs=1e-3)

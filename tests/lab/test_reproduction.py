@@ -1,0 +1,394 @@
+"""The tables of the reproduction, made from emulated networks on made-up samples, against loops written anew."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import fcl
+import igl
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from torch import Tensor
+
+from refu_core import SmplFrame
+from refu_core.backbones import Prediction, WithoutWearerCode
+from refu_core.body import SmplBody, load_body
+from refu_core.errors import RefuError, WeightsError
+from refu_core.garments import GarmentTemplate, load_garment
+from refu_core.refu import SCALE_PRESETS, Refu, Trained
+from refu_lab import reproduction as rp
+from refu_lab.reproduction import _build, _pictures, _runs, _tables
+from refu_lab.tables import RESULT_TABLES
+
+GARMENT = "short-pant-male"
+TEST_COUNTS = {"shirt-male": 3197, "tshirt-male": 2688, "short-pant-male": 2691, "skirt-female": 3525}
+"""The paper's test samples a garment (Table 1)."""
+N_SAMPLES = 3
+
+
+# ---- the paper's figures ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("metric", ["mpve_mm", "vfcp_percent", "cfmp_percent"])
+def test_the_papers_means_follow_from_its_garments(metric: str) -> None:
+    """Guards the transcription: the paper's "All Garments" are means weighted by its test counts."""
+    methods = {key[2] for key in rp.PAPER if key[0] == "comparison"}
+    assert len(methods) == 10
+    for method in methods:
+        total = 0.0
+        for garment, count in TEST_COUNTS.items():
+            total += rp.PAPER["comparison", garment, method, metric] * count / sum(TEST_COUNTS.values())
+        assert rp.PAPER["comparison", "all", method, metric] == pytest.approx(total, abs=0.02), method
+
+
+def test_the_papers_trend_is_computed_anew() -> None:
+    assert rp.paper_figure("comparison", "all", "refu-hybrid", "vfcp_percent_trend") == pytest.approx(-60)
+    assert rp.paper_figure("comparison", "all", "refu-hybrid", "cfmp_percent_trend") == pytest.approx(39.97, abs=0.01)
+    assert rp.paper_figure("comparison", "all", "node-hybrid", "cfmp_percent_trend") is None
+    assert rp.paper_figure("gcnn", "skirt-female", "gcnn", "mpve_mm") == 14.05  # garment not named by the paper
+    assert rp.paper_figure("laplacian", "tshirt-male", "refu-hybrid", "laplacian_mm") is None
+
+
+def test_every_figure_of_the_paper_stands_beside_a_method_of_ours() -> None:
+    built = {name: set(spec.methods) for name, spec in rp.SAMPLE_TABLES.items()}
+    assert set().union(*built.values(), rp.TIMED_METHODS) <= set(rp.METHODS)
+    built["time"] = set(_build._COMPONENTS)
+    built["sdf"] = {"neural"}
+    for table, _, method, metric in rp.PAPER:
+        assert method in built[table], (table, method)
+        assert metric in _tables.METRICS
+    assert set(rp.SAMPLE_TABLES) | {"time", "sdf", "motion"} == set(RESULT_TABLES)
+
+
+# ---- emulated networks -----------------------------------------------------------------------------------------------
+
+
+class Noisy(WithoutWearerCode):
+    """A backbone that is wrong by a smooth wave that depends on the pose, into the body in places."""
+
+    def __init__(self, garment: GarmentTemplate, amplitude: float) -> None:
+        self.garment, self.amplitude = garment, amplitude
+
+    def __call__(
+        self,
+        betas: Tensor,  # noqa: ARG002
+        pose: Tensor,
+        style: Tensor | None,  # noqa: ARG002
+        *,
+        wearer_code: Tensor | None = None,  # noqa: ARG002
+    ) -> Prediction:
+        x = self.garment.v_template
+        wave = torch.sin(25 * x.sum(-1) + 3 * pose.sum())
+        return Prediction(self.amplitude * wave[None, :, None] * torch.tensor([1.0, 0.0, 1.0]), None)
+
+
+class Emulated(rp.Library):
+    """Weights of the T-shirt's place that were never trained; some are missing."""
+
+    def __init__(self, *, without: tuple[str, ...] = (), version: str = "1") -> None:
+        super().__init__()
+        self.without, self.version, self.loaded = without, version, 0
+
+    def key(self, method: rp.Method, garment: str) -> str:
+        return f"{method.weights} {garment} {self.version}"
+
+    def load(self, method: rp.Method, garment: GarmentTemplate, body: SmplBody) -> Trained:  # noqa: ARG002
+        if method.name in self.without:
+            msg = "not trained"
+            raise WeightsError(msg)
+        self.loaded += 1
+        torch.manual_seed(0)
+        amplitude = 0.006 if method.mode == "none" else 0.005
+        scale = None if method.folder == "fixed" else SCALE_PRESETS["realtime"]
+        least = 1.0 if method.sdf == "accurate" else 0.0
+        refu = Refu(garment.n_vertices, least=least, scale=scale).eval().requires_grad_(False)
+        return Trained(Noisy(garment, amplitude), refu if method.handling == "refu" else None)
+
+
+@pytest.fixture(scope="module")
+def samples() -> rp.SampleSet:
+    """Bodies that sit and lean, in garments that are the skinned template, moved a little."""
+    garment, body = load_garment(GARMENT), load_body("male")
+    rng = np.random.default_rng(3)
+    made = []
+    for k in range(N_SAMPLES):
+        pose = np.zeros((24, 3), np.float32)
+        pose[1, 0], pose[2, 0], pose[1, 2] = -0.3 * k, 0.2 * k, 0.15
+        betas, style = rng.normal(size=10).astype(np.float32), (0.3 * rng.normal(size=4)).astype(np.float32)
+        posed = body(pose[None], betas[None])
+        rest = garment.rest(torch.from_numpy(betas)[None], torch.from_numpy(style)[None])
+        truth = garment.pose(rest + 0.003, posed.transforms)[0].numpy()
+        made.append(rp.Sample(truth, pose, betas, style, 1.0 + k))
+    return rp.SampleSet(GARMENT, N_SAMPLES, "made up", None, made.__getitem__)
+
+
+METHODS = (
+    "tailornet",
+    "naive-accurate",
+    "optimisation-accurate",
+    "refu-accurate",
+    "refu-hybrid",
+    "fixed-accurate-bare",
+)
+
+
+@pytest.fixture(scope="module")
+def study(samples: rp.SampleSet) -> rp.Study:
+    study = rp.Study()
+    rp.run_methods(
+        study, samples, (*METHODS, "collision-loss-approx"), library=Emulated(without=("collision-loss-approx",))
+    )
+    return study
+
+
+def fcl_pairs(garment: NDArray[Any], faces: NDArray[Any], body: NDArray[Any], body_faces: NDArray[Any]) -> int:
+    def model(vertices: NDArray[Any], triangles: NDArray[Any]) -> fcl.CollisionObject:
+        bvh = fcl.BVHModel()
+        bvh.beginModel(len(vertices), len(triangles))
+        bvh.addSubModel(vertices.astype(np.float64), triangles.astype(np.int64))
+        bvh.endModel()
+        return fcl.CollisionObject(bvh, fcl.Transform())
+
+    request = fcl.CollisionRequest(num_max_contacts=1_000_000, enable_contact=True)
+    return int(fcl.collide(model(garment, faces), model(body, body_faces), request, fcl.CollisionResult()))
+
+
+def test_figures_of_the_baseline_against_a_loop_of_other_libraries(study: rp.Study, samples: rp.SampleSet) -> None:
+    """MPVE, VFCP and CFMP of the emulated backbone, from its definition, libigl and fcl alone."""
+    garment, body = load_garment(GARMENT), load_body("male")
+    backbone = Noisy(garment, 0.006)
+    errors, inside, free = [], [], []
+    for k in range(N_SAMPLES):
+        sample = samples.read(k)
+        pose, betas, style = (torch.from_numpy(a)[None] for a in (sample.pose, sample.betas, sample.style))
+        posed = body(pose, betas)
+        unposed = garment.rest(betas, style) + backbone(betas, pose, style).displacement
+        mine = garment.pose(unposed, posed.transforms)[0].numpy().astype(float)
+        skin, skin_faces = posed.vertices[0].numpy().astype(float), body.faces.numpy().astype(np.int64)
+        errors.append(
+            np.mean([np.linalg.norm(a - b) for a, b in zip(mine, sample.vertices.astype(float), strict=True)])
+        )
+        inside.append(np.mean(igl.fast_winding_number(skin, skin_faces, mine) > 0.5))
+        free.append(not inside[-1] and not fcl_pairs(mine, garment.faces.numpy(), skin, skin_faces))
+    figures = study.runs[GARMENT, "tailornet"].figures
+    assert figures.n_frames == N_SAMPLES
+    assert figures.mpve_mm == pytest.approx(1000 * np.mean(errors), rel=1e-4)
+    assert figures.vfcp_percent == pytest.approx(100 * np.mean(inside), rel=1e-6)
+    assert figures.cfmp_percent == pytest.approx(100 * np.mean(free))
+    assert figures.vfcp_percent > 0
+
+
+def test_methods_do_what_their_names_say(study: rp.Study) -> None:
+    figures = {method: study.runs[GARMENT, method].figures for method in METHODS}
+    for method in ("naive-accurate", "refu-accurate", "optimisation-accurate"):
+        assert figures[method].vfcp_percent < 0.2 * figures["tailornet"].vfcp_percent, method
+    # α >= 1 and a margin: no vertex stays inside, and no edge cuts a corner that ε = 0 leaves.
+    assert figures["refu-accurate"].vfcp_percent == 0
+    assert figures["refu-accurate"].avg_ee < figures["fixed-accurate-bare"].avg_ee
+    assert set(study.runs[GARMENT, "refu-hybrid"].ms) == {"backbone", "sdf", "refu"}
+    assert study.runs[GARMENT, "optimisation-accurate"].median_ms("post-process") > 0
+    assert study.runs[GARMENT, "tailornet"].median_ms("refu") is None
+    # Only vertices that the backbone left inside are in the Laplacian error.
+    assert figures["tailornet"].laplacian_mm is not None
+
+
+def test_what_is_not_trained_says_so_in_its_row(study: rp.Study, tmp_path: Path) -> None:
+    table = rp.sample_table(study, "comparison")
+    assert table.value(GARMENT, "collision-loss-approx", "mpve_mm") is None
+    assert table.value(GARMENT, "refu-hybrid", "vfcp_percent") is not None
+    page = "\n".join(table.markdown(source=""))
+    assert "| collision loss, approx (not measured) | – | *6.79* |" in page
+    command = "refu train short-pant-male --data DIR --backbone tailornet --mode collision-approx"
+    assert f"`{command} --output weights/short-pant-male`" in page
+    assert "| ReFU, hybrid | " in page
+    change = table.value(GARMENT, "refu-hybrid", "mpve_mm_trend")
+    a, b = (table.value(GARMENT, m, "mpve_mm") for m in ("refu-hybrid", "tailornet"))
+    assert change == pytest.approx(100 * (a / b - 1))
+    path = table.write(tmp_path, command="refu evaluate", n_samples=study.n_samples)
+    assert path.read_text(encoding="utf-8").startswith("# Comparison")
+    rows = json.loads((tmp_path / "comparison.json").read_text(encoding="utf-8"))["rows"]
+    assert {tuple(row) for row in rows} == {("table", "garment", "method", "metric", "value", "paper")}
+    again = rp.read_table(tmp_path, "comparison")
+    assert again is not None
+    assert (again.rows, again.missing) == (table.rows, table.missing)
+    summary = rp.write_summary(tmp_path).read_text(encoding="utf-8")
+    assert "](comparison.md)" in summary
+    assert "not made yet: `refu evaluate --table sdf`" in summary
+    assert "| ReFU, accurate | " in summary
+    (tmp_path / "comparison.json").write_text("[]", encoding="utf-8")
+    with pytest.raises(RefuError, match="not results of refu evaluate"):
+        rp.read_table(tmp_path, "comparison")
+
+
+def test_all_tables_and_plots_of_a_study(study: rp.Study, tmp_path: Path) -> None:
+    for name in (*rp.SAMPLE_TABLES, "time"):
+        table = rp.time_table(study) if name == "time" else rp.sample_table(study, name)
+        assert table.rows, name
+        assert all(row.table == name for row in table.rows)
+        table.write(tmp_path, command="refu evaluate", n_samples=study.n_samples)
+        for file, _ in rp.PLOTS[name](study, tmp_path) if name in rp.PLOTS else []:
+            assert (tmp_path / file).read_bytes().startswith(b"<?xml")
+    assert {path.name for path in tmp_path.iterdir()} >= {"energy.svg", "energy_zoom.svg", "scale.svg"}
+
+
+def test_plots_of_the_same_figures_are_the_same_files(study: rp.Study, tmp_path: Path) -> None:
+    contents = []
+    for _ in range(2):
+        rp.PLOTS["energy"](study, tmp_path)
+        contents.append((tmp_path / "energy.svg").read_bytes())
+    assert contents[0] == contents[1]
+
+
+def test_pictures(study: rp.Study, samples: rp.SampleSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_pictures, "_SIZE", (60, 80))
+    ((file, caption),) = rp.picture_garments(study, [samples], tmp_path, library=Emulated())
+    assert (tmp_path / file).read_bytes().startswith(b"\x89PNG")
+    assert "ReFU, hybrid" in caption
+
+
+# ---- cache -----------------------------------------------------------------------------------------------------------
+
+
+def test_known_runs_are_taken_from_the_cache_until_the_weights_change(samples: rp.SampleSet, tmp_path: Path) -> None:
+    def run(library: Emulated) -> rp.MethodRun:
+        study = rp.Study()
+        rp.run_methods(study, samples, ("fixed-accurate",), library=library, cache_folder=tmp_path)
+        return study.runs[GARMENT, "fixed-accurate"]
+
+    first, again, changed = Emulated(), Emulated(), Emulated(version="2")
+    a, b, c = run(first), run(again), run(changed)
+    assert (first.loaded, again.loaded, changed.loaded) == (2, 0, 2)  # the method and its base
+    assert a.as_dict() == b.as_dict()
+    assert c.figures == a.figures
+    (tmp_path / next(path.name for path in tmp_path.iterdir())).write_text("damaged", encoding="utf-8")
+    assert run(Emulated()).figures == a.figures
+
+
+def test_the_cache_looks_at_files_that_are_there() -> None:
+    root = Path(_runs.__file__).parents[2]
+    assert all(any(root.glob(pattern)) for pattern in _runs._CODE)
+
+
+# ---- sums ------------------------------------------------------------------------------------------------------------
+
+
+@given(
+    st.lists(st.tuples(st.floats(-1e3, 1e3) | st.none(), st.integers(0, 500)), max_size=6),
+)
+def test_weighted_mean_equals_the_mean_over_single_samples(pairs: list[tuple[float | None, int]]) -> None:
+    single = [value for value, count in pairs for _ in range(count)]
+    found = _tables.weighted(pairs)
+    if not single or any(value is None for value, _ in pairs):
+        assert found is None
+    else:
+        assert found == pytest.approx(np.mean(single), abs=1e-6)
+
+
+@given(seed=st.integers(0, 2**31))
+def test_scales_by_ratio_equal_a_loop(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    accurate, approx, alpha = rng.normal(-0.005, 0.01, 60), rng.normal(-0.005, 0.01, 60), rng.uniform(0, 3, 60)
+    scales = _runs.ScaleByRatio()
+    tensors = [torch.from_numpy(a) for a in (alpha, approx, accurate)]
+    scales.add(_runs.MethodOutput(torch.zeros(0, 3), {}, *tensors))
+    edges = _runs.RATIO_EDGES
+    for k in range(len(edges) - 1):
+        members = [
+            a for a, f, s in zip(alpha, approx, accurate, strict=True) if f < 0 > s and edges[k] <= f / s < edges[k + 1]
+        ]
+        assert scales.count[k] == len(members)
+        assert scales.total[k] == pytest.approx(sum(members))
+
+
+def test_unseen_groups_are_as_large_as_each_other_and_sorted(study: rp.Study) -> None:
+    run = study.runs[GARMENT, "tailornet"]
+    assert [[float(d) for d in distance] for distance, _ in _build.unseen_groups([run])] == [[1.0], [2.0], [3.0]]
+    values = rp.SAMPLE_TABLES["unseen"].of(run)
+    assert list(values) == [f"error [mm] at {d:.2f} to {d:.2f}" for d in (1, 2, 3)]
+    assert list(values.values()) == pytest.approx([s.collision_error_mm for s in run.samples])
+    unknown = rp.MethodRun(run.garment, run.method, run.samples, [float("nan")] * N_SAMPLES)
+    assert _build.unseen_groups([unknown]) == []
+
+
+# ---- the other tables ------------------------------------------------------------------------------------------------
+
+
+def test_distance_table(samples: rp.SampleSet) -> None:
+    table = rp.sdf_table([samples], library=rp.Library())
+    assert table.value(GARMENT, "approx", "mean_absolute_mm") < 2
+    assert table.value(GARMENT, "approx, within 2 cm", "missed_percent") < 2
+    assert table.value(GARMENT, "approx, within 2 cm, away from self-contact", "p99_mm") < 1
+    assert table.value(GARMENT, "approx, within 2 cm, away from self-contact", "hidden_percent") == 0
+    for pose in ("squat", "crossed arms", "hands on hips"):
+        assert 0 < table.value(GARMENT, f"approx, {pose}", "mean_absolute_mm") < 2
+    assert table.value(GARMENT, "neural", "mean_absolute_mm") is None
+    assert [(m.method, m.reason) for m in table.missing] == [("neural", "not trained")]
+    assert next(row.paper for row in table.rows if row.method == "neural") == 2.46
+
+
+def test_sequence_table_has_both_numbers_of_shapes(samples: rp.SampleSet) -> None:
+    study = rp.Study()
+    rp.run_methods(study, samples, ("mlp-5", "mlp-5-refu-approx"), library=Emulated())
+    table = rp.sample_table(study, "sequence")
+    assert [row.paper for row in table.rows if row.metric == "cfmp_percent"] == [18.69, 52.53, 13.30, 38.39]
+    assert table.value(GARMENT, "mlp-5", "mpve_mm") == study.runs[GARMENT, "mlp-5"].figures.mpve_mm
+    assert {m.method: m.reason for m in table.missing} == dict.fromkeys(
+        ("mlp-17", "mlp-17-refu-approx"), "no set of 17 shapes was given"
+    )
+
+
+def test_two_garments_are_weighted_by_their_samples(study: rp.Study) -> None:
+    both = rp.Study(dict(study.runs), dict(study.missing), {GARMENT: N_SAMPLES, "shirt-male": 2 * N_SAMPLES})
+    for method in METHODS:
+        run = study.runs[GARMENT, method]
+        both.runs["shirt-male", method] = rp.MethodRun(
+            "shirt-male", method, run.samples[:1] * (2 * N_SAMPLES), [1.0] * 6
+        )
+    table = rp.sample_table(both, "comparison")
+    for method in METHODS[:5]:
+        every = [s.mpve_mm for g in (GARMENT, "shirt-male") for s in both.runs[g, method].samples]
+        assert table.value(rp.ALL, method, "mpve_mm") == pytest.approx(np.mean(every))
+    assert table.value(rp.ALL, "collision-loss-approx", "mpve_mm") is None
+
+
+def test_motion_table(clip: Callable[[int], list[SmplFrame]]) -> None:
+    table = rp.motion_table({"clip 9": clip(9), "clip 3": clip(3)}, [GARMENT], library=rp.Library(), every=3)
+    groups = list(dict.fromkeys(row.garment for row in table.rows))
+    assert groups == [f"{GARMENT}, all clips", f"{GARMENT}, clip 9", f"{GARMENT}, clip 3"]
+    for method in ("skinned", "node-skinned"):
+        for metric, of in (("vfcp_percent", np.average), ("jitter_mm", np.average)):
+            parts = [table.value(group, method, metric) for group in groups[1:]]
+            assert table.value(groups[0], method, metric) == pytest.approx(of(parts, weights=[3, 1]))
+    # The clip swings evenly, and the template is skinned to it.
+    assert 0 < table.value(groups[1], "skinned", "jitter_mm") < 5
+    assert not table.missing  # the weights of what it shows ship
+
+
+@pytest.fixture
+def clip() -> Callable[[int], list[SmplFrame]]:
+    def make(n: int) -> list[SmplFrame]:
+        poses = np.zeros((n, 24, 3), np.float32)
+        poses[:, 1, 0] = 0.4 * np.sin(0.3 * np.arange(n))
+        return [SmplFrame(pose) for pose in poses]
+
+    return make
+
+
+def test_shipped_weights_are_found_by_name(tmp_path: Path) -> None:
+    library = rp.Library([tmp_path])
+    with pytest.raises(WeightsError, match="not trained"):
+        library.find(rp.METHODS["alt1-approx"], "tshirt-male")
+    (tmp_path / "tshirt-male" / "alt1").mkdir(parents=True)
+    (tmp_path / "tshirt-male" / "alt1" / "tailornet-approx.json").write_text('{"sha256": "abc"}', encoding="utf-8")
+    assert (
+        library.find(rp.METHODS["alt1-approx"], "tshirt-male") == tmp_path / "tshirt-male" / "alt1" / "tailornet-approx"
+    )
+    assert library.key(rp.METHODS["alt1-approx"], "tshirt-male") == "abc"
+    assert library.key(rp.METHODS["skinned"], "tshirt-male") == ""

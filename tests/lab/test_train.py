@@ -1,0 +1,116 @@
+"""`refu train`: from a data set to weights that the pipeline loads."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_set import write_set
+
+from refu_core import GarmentPipeline, SmplFrame, load_body, load_garment
+from refu_lab.cli import main
+
+GARMENT = "short-pant-male"
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_set(
+        tmp_path_factory.mktemp("data") / GARMENT, load_garment(GARMENT), load_body("male"), pairs=20, poses=6
+    )
+
+
+@pytest.fixture(scope="module")
+def weights(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A backbone and three modes of it, hardly trained."""
+    folder = tmp_path_factory.mktemp("weights")
+    common = ["train", GARMENT, "--data", str(data), "--output", str(folder / GARMENT), "--quiet"]
+    assert main([*common, "--mode", "none", "--steps", "20", "--json", str(folder / "none.json")]) == 0
+    for mode in ("hybrid", "approx", "accurate"):
+        assert main([*common, "--mode", mode, "--steps", "1", "--json", str(folder / f"{mode}.json")]) == 0
+    return folder
+
+
+def test_what_is_trained_is_loaded(weights: Path) -> None:
+    frame = SmplFrame(pose=np.random.default_rng(0).normal(0, 0.1, (24, 3)))
+    skinned = GarmentPipeline.load([GARMENT], sdf="none", backbone="skinned")(frame)[GARMENT]
+    for mode in ("none", "hybrid", "approx", "accurate"):
+        card = json.loads((weights / f"{mode}.json").read_text())
+        assert (card["mode"], card["garment"]) == (mode, GARMENT)
+        out = GarmentPipeline.load([GARMENT], sdf=mode, backbone="tailornet", weights=weights)(frame)
+        assert np.isfinite(out[GARMENT].local).all()
+        assert np.abs(out[GARMENT].raw - skinned.local).max() > 1e-5, "the backbone says something"
+        assert out.stats.garments[GARMENT].n_unresolved == 0
+
+
+def test_the_figures_are_printed(weights: Path, data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["train", GARMENT, "--data", str(data), "--output", str(weights / "again"), "--mode", "none"]
+    assert main([*arguments, "--backbone", "mlp", "--steps", "2", "--quiet"]) == 0
+    out = capsys.readouterr().out
+    assert "mpve mm" in out
+    assert "backbone" in out
+
+
+def test_variants(data: Path, weights: Path) -> None:
+    common = ["train", GARMENT, "--data", str(data), "--output", str(weights / GARMENT), "--quiet", "--steps", "1"]
+    for k, extra in enumerate((["--scale", "fixed"], ["--scale", "shared"], ["--margin", "0", "--unblended"])):
+        folder = weights / f"variant{k}"
+        assert main([*common[:5], str(folder), *common[6:], "--mode", "none"]) == 0
+        assert main([*common[:5], str(folder), *common[6:], "--mode", "approx", *extra]) == 0
+    cards = [json.loads((weights / f"variant{k}" / "tailornet-approx.json").read_text())["refu"] for k in range(3)]
+    assert cards[0]["scale"] is None
+    assert cards[1]["scale"]["kind"] == "shared"
+    assert cards[2]["margin"] == 0
+
+
+def test_a_garment_of_another_body_is_refused(weights: Path, tmp_path: Path) -> None:
+    """Weights say which body they were trained on."""
+    from refu_core import WeightsError
+    from refu_core.backbones import load_backbone
+
+    with pytest.raises(WeightsError, match="refu train"):
+        load_backbone("tailornet", GARMENT, mode="hybrid", body_fingerprint="other", folder=weights / GARMENT)
+    with pytest.raises(WeightsError, match=r"no such weights.*refu train"):
+        GarmentPipeline.load([GARMENT], sdf="hybrid", backbone="tailornet", weights=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "wanted"),
+    [
+        (["kilt"], "no garment 'kilt'"),
+        (["tshirt-male"], "wanted a set whose garment is tshirt-male"),
+        ([GARMENT, "--mode", "best"], "no mode 'best' of training: wanted none, approx"),
+        ([GARMENT, "--preset", "huge"], "no preset 'huge'"),
+        ([GARMENT, "--scale", "huge"], "no scale 'huge'"),
+        ([GARMENT, "--network", "gan"], "no network 'gan'"),
+        ([GARMENT, "--backbone", "resnet"], "resnet"),
+        ([GARMENT, "--margin", "-1"], "margin"),
+        ([GARMENT, "--steps", "0"], "above zero"),
+        ([GARMENT, "--device", "quantum"], "quantum"),
+    ],
+)
+def test_bad_options_are_one_line(
+    arguments: list[str], wanted: str, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = ["--output", str(tmp_path), "--quiet"]
+    try:
+        code = main(["train", *arguments, "--data", str(data), *output])
+    except SystemExit as stop:  # argparse's own
+        code = int(stop.code or 0)
+    assert code == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert wanted in error
+
+
+def test_a_folder_without_a_set(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["train", GARMENT, "--data", str(tmp_path), "--quiet"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_the_distance_network(data: Path, tmp_path: Path) -> None:
+    arguments = ["train", GARMENT, "--data", str(data), "--network", "sdf", "--preset", "tiny", "--steps", "1"]
+    assert main([*arguments, "--output", str(tmp_path), "--quiet"]) == 0
+    assert (tmp_path / "sdf-tiny.safetensors").exists()

@@ -1,0 +1,84 @@
+"""The node from its first line to its last: what a bad start says, what a good one says, and who may end it."""
+
+from __future__ import annotations
+
+import signal
+import time
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+pytest.importorskip("rclpy", reason="rclpy isn't installed (extra ros): the node isn't tested")
+
+from harness import NodeProcess, Peer, frame
+
+from tests.ros.peers import CHEAP, HostilePeers
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")
+
+
+def test_hostile_peers_do_not_end_it(ros: None, tmp_path: Path) -> None:  # noqa: ARG001
+    with NodeProcess(tmp_path / "log.txt", **CHEAP, use_sim_time=True) as node:
+        peers = HostilePeers(tmp_path, seed=0)
+        peers.wait()
+        peers.attack(15.0, alive=lambda: node.process.poll() is None)
+        peers.recover(alive=lambda: node.process.poll() is None)
+        peers.close()
+        assert not peers.result.problems, (peers.result, node.log)
+        assert not sum(peers.result.unanswered.values()), peers.result
+        assert node.stop(signal.SIGINT, signal.SIGINT) == 0, node.log
+        assert "Traceback" not in node.log
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"record": "/"}, "record: wanted the path of a folder"),
+        ({"betas": "[1.0,2]"}, "betas:=[1.0,2]"),
+        ({"margin": "abc"}, "margin: wanted a number, got 'abc'"),
+    ],
+    ids=["record", "betas", "margin"],
+)
+def test_a_bad_parameter_is_named_in_one_line(
+    ros: None,  # noqa: ARG001
+    tmp_path: Path,
+    arguments: dict[str, Any],
+    words: str,
+) -> None:
+    with NodeProcess(tmp_path / "log.txt", **arguments) as node:
+        assert node.process.wait(timeout=60) == 2
+        (line,) = node.log.splitlines()
+        assert line.startswith("garment_node: error: ")
+        assert words in line
+
+
+def test_a_signal_ends_it_while_it_loads(ros: None, tmp_path: Path) -> None:  # noqa: ARG001
+    with NodeProcess(tmp_path / "log.txt") as node:
+        time.sleep(1.5)
+        start = time.monotonic()
+        node.stop(signal.SIGINT)
+        assert time.monotonic() - start < 1.5
+        assert "Traceback" not in node.log
+
+
+def test_its_frame_is_compared_with_the_senders(ros: None, tmp_path: Path) -> None:  # noqa: ARG001
+    with NodeProcess(tmp_path / "log.txt", **CHEAP, frame_id="odom") as node:
+        peer = Peer()
+        peer.wait_for_node()
+        marker = peer.dress(frame(1))
+        assert marker.lifetime_ns == 2 * 10**9
+        peer.spin_until(lambda: peer.status("input")[2].get("frame") == "map, shown as odom", "both frames are named")
+        assert node.log.count("is in the frame map") == 1
+        for line in (
+            "configured with tshirt-male",
+            "listening to /smpl_params",
+            "active",
+            "the first garments are out",
+        ):
+            assert line in node.log
+        hardware = {status.hardware_id for array in peer.diagnostics for status in array.status}
+        assert hardware - {""}
+        peer.close()

@@ -1,0 +1,147 @@
+"""What ends a node that isn't told to end: nothing that a peer asks, says, or does."""
+
+from __future__ import annotations
+
+import random
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+rclpy = pytest.importorskip("rclpy", reason="rclpy isn't installed (extra ros): the node isn't tested")
+
+from harness import GARMENTS, NodeProcess, Peer, frame  # noqa: E402
+from lifecycle_msgs.msg import Transition  # noqa: E402
+from lifecycle_msgs.srv import ChangeState  # noqa: E402
+from rcl_interfaces.msg import Parameter, ParameterValue  # noqa: E402
+from rcl_interfaces.srv import GetParameters, SetParameters  # noqa: E402
+from rosgraph_msgs.msg import Clock  # noqa: E402
+from visualization_msgs.msg import MarkerArray  # noqa: E402
+
+from msg_adapters import BagReader  # noqa: E402
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")
+CHEAP = {"input_type": "joint_state", "garments": [GARMENTS[0]], "backbone": "skinned", "sdf": "none"}
+CYCLE = (
+    Transition.TRANSITION_DEACTIVATE,
+    Transition.TRANSITION_CLEANUP,
+    Transition.TRANSITION_CONFIGURE,
+    Transition.TRANSITION_ACTIVATE,
+)
+
+
+@pytest.fixture(scope="module")
+def scene(ros: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Peer, NodeProcess]]:  # noqa: ARG001
+    """A node, of simulated time, that has to be there at the end; and its peer."""
+    with NodeProcess(tmp_path_factory.mktemp("node") / "log.txt", **CHEAP, use_sim_time=True) as node:
+        peer = Peer()
+        peer.wait_for_node()
+        yield peer, node
+        peer.dress(frame(12345))
+        assert node.process.poll() is None, node.log
+        assert "Traceback" not in node.log
+        peer.close()
+
+
+def change(peer: Peer, number: int, label: str = "") -> bool:
+    request = ChangeState.Request(transition=Transition(id=number, label=label))
+    return bool(peer.call(ChangeState, "garment_node/change_state", request).success)
+
+
+def count(peer: Peer, what: str) -> int:
+    return peer.count("node", f"faults: {what}")
+
+
+def test_it_is_brought_up_and_torn_down_while_viewers_come_and_go(scene: tuple[Peer, NodeProcess]) -> None:
+    """A viewer's coming and going is queued while its publisher is taken down: rclpy raised InvalidHandle."""
+    peer, _ = scene
+    draw, viewers = random.Random(0), []
+    for i in range(50):
+        for transition in CYCLE:
+            if viewers and draw.random() < 0.5:
+                peer.node.destroy_subscription(viewers.pop())
+            else:
+                viewers.append(peer.node.create_subscription(MarkerArray, "garments", lambda _: None, 5, raw=True))
+            assert change(peer, transition), (i, transition)
+    for viewer in viewers:
+        peer.node.destroy_subscription(viewer)
+
+
+def test_requests_that_are_not_valid_now_are_answered_in_the_negative(scene: tuple[Peer, NodeProcess]) -> None:
+    peer, _ = scene
+    for number in (Transition.TRANSITION_ACTIVATE, Transition.TRANSITION_CLEANUP, 0, 8, 10, 77, 255):
+        assert not change(peer, number)
+    assert not change(peer, 0, "nonsense")
+    unknown = ParameterValue(type=77)
+    request = SetParameters.Request(parameters=[Parameter(name="margin", value=unknown)] * 3)
+    answer = peer.call(SetParameters, "garment_node/set_parameters", request)
+    assert [result.successful for result in answer.results] == [False] * 3
+    assert "77" in answer.results[0].reason
+    many = GetParameters.Request(names=["margin"] * 20_000)
+    assert not peer.call(GetParameters, "garment_node/get_parameters", many).values
+    peer.spin_until(lambda: count(peer, "change_state") >= 7, "the requests are counted")
+    peer.spin_until(lambda: count(peer, "set_parameters") and count(peer, "get_parameters"), "these, too")
+
+
+def test_no_clock_ends_it(scene: tuple[Peer, NodeProcess]) -> None:
+    peer, node = scene
+    clock = peer.node.create_publisher(Clock, "/clock", 10)
+    peer.spin_until(lambda: clock.get_subscription_count(), "the clock is listened to")
+    for seconds, nanoseconds in (
+        (2**31 - 1, 2**32 - 1),
+        (-1, 0),
+        (-(2**31), 0),
+        (2**31 - 1, 0),
+        (5, 2**32 - 1),
+        (0, 0),
+    ):
+        message = Clock()
+        message.clock.sec, message.clock.nanosec = seconds, nanoseconds
+        clock.publish(message)
+        peer.diagnostics.clear()
+        peer.spin_until(lambda: peer.diagnostics, f"it lives at {seconds} s")
+    peer.spin_until(lambda: count(peer, "/clock") >= 2, "clocks without sense are counted")
+    assert "wanted a stamp that fits a ROS time" in node.log
+
+
+def test_a_refused_recording_leaves_the_running_one_alone(scene: tuple[Peer, NodeProcess], tmp_path: Path) -> None:
+    peer, _ = scene
+    (result,) = peer.set(record=str(tmp_path / "bag"))
+    assert result.successful, result.reason
+    for value in ("/", "~nosuchuser/x", "/proc/nope", "x" * 300, "log.txt/bag"):
+        (result,) = peer.set(record=value)
+        assert not result.successful, value
+        assert result.reason
+    peer.dress(frame(1))
+    kept = peer.call(GetParameters, "garment_node/get_parameters", GetParameters.Request(names=["record"]))
+    assert kept.values[0].string_value == str(tmp_path / "bag")
+    (result,) = peer.set(record="")
+    assert result.successful
+    peer.spin_until(lambda: (tmp_path / "bag" / "metadata.yaml").exists(), "the bag is closed")
+    with BagReader(tmp_path / "bag") as bag:
+        assert "/garments" in {message.topic for message in bag.messages()}
+
+
+@pytest.mark.parametrize(
+    ("values", "reason"),
+    [
+        ({"device": "tpu"}, "cpu or cuda"),
+        ({"backbone": "gcnn"}, "no weights of gcnn"),
+        ({"weights": "/nonexistent", "backbone": "tailornet"}, "no weights"),
+        ({"frame_id": "/map"}, "leading slash"),
+        ({"frame_id": "my frame"}, "spaces"),
+        ({"max_rate": 1e-300}, "max_rate"),
+        ({"betas": None}, "write all as decimals"),
+    ],
+    ids=lambda value: str(value),
+)
+def test_what_cannot_be_used_is_refused(values: dict[str, Any], reason: str) -> None:
+    """Whether by the settings, or by what they need."""
+    from refu_core import RefuError
+    from refu_ros._settings import NodeSettings
+
+    with pytest.raises(RefuError, match=reason):
+        NodeSettings().changed(values).pipeline.check()

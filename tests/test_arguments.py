@@ -1,0 +1,178 @@
+"""Arguments of `refu`: what no command takes is one line and 2, before any work is done."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from refu_core import RefuError
+from refu_core._device import checked_device
+from refu_lab import cli
+from refu_lab.cli import main
+from refu_lab.commands._common import numbers
+from refu_lab.replay import _paced
+from tests.core.test_files import SPECIAL
+
+BAG = str(Path(__file__).parents[1] / "bags" / "walk")
+NEEDED = {
+    "replay": ["replay", BAG],
+    "simulate": ["simulate", "tshirt-male", "--count", "1"],
+    "train": ["train", "tshirt-male", "--data", "x"],
+    "evaluate": ["evaluate"],
+    "benchmark": ["benchmark"],
+    "stress": ["stress"],
+    "info": ["info"],
+}
+PATHS = [
+    ("replay", "--output"),
+    ("replay", "--report"),
+    ("replay", "--json"),
+    ("simulate", "--output"),
+    ("train", "--output"),
+    ("evaluate", "--output"),
+    ("evaluate", "--cache"),
+    ("benchmark", "--output"),
+    ("stress", "--output"),
+    ("info", "--json"),
+]
+
+
+def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """The line that a command ends with."""
+    try:
+        code = main(arguments)
+    except SystemExit as stop:
+        code = int(stop.code or 0)
+    line = capsys.readouterr().err
+    assert (code, line.count("\n")) == (2, 1), line
+    assert line.rstrip("\n").isprintable()
+    assert len(line) < 500
+    return line
+
+
+@pytest.mark.parametrize(("command", "option"), [*PATHS, ("replay", "--weights"), ("evaluate", "--data")])
+@pytest.mark.parametrize("name", ["a\0b", "a\ud800b", ""])
+def test_names_that_no_file_has(command: str, option: str, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert f"argument {option}: wanted a path" in refused([*NEEDED[command], option, name], capsys)
+
+
+@pytest.mark.parametrize(("command", "option"), PATHS)
+def test_outputs_that_are_something_else(
+    command: str, option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    for path in (tmp_path / "fifo", Path("/dev/null"), Path("/dev/full")):
+        assert f"argument {option}: wanted a f" in refused([*NEEDED[command], option, str(path)], capsys)
+    assert option in refused([*NEEDED[command], option, "x" * 5000], capsys)
+    if option == "--json":
+        assert "wanted a file" in refused([*NEEDED[command], option, str(tmp_path)], capsys)
+
+
+@pytest.mark.parametrize(
+    ("lay", "said"), [case for case in SPECIAL if "directory" not in case[1] and "loop" not in case[1]]
+)
+def test_bodies_and_inputs_that_are_no_files(
+    lay: Callable[[Path], object], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    del said
+    for name, arguments in (
+        ("x.npz", ["info", "--body"]),
+        ("x.pkl", ["info", "--body"]),
+        ("x.npz", ["stress", "--replay"]),
+    ):
+        folder = tmp_path / f"{arguments[0]}-{name}"
+        folder.mkdir()
+        lay(folder / name)
+        assert "can't be read" in refused([*arguments, str(folder / name)], capsys)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["replay", BAG, "--device", "meta"],
+        ["replay", BAG, "--device", "vulkan"],
+        ["replay", BAG, "--device", "cpu\0"],
+        ["replay", BAG, "--device", "\ud800"],
+        ["replay", BAG, "--device", "\x1b[2J" * 1000],
+        ["replay", BAG, "--frame-id", "\ud800"],
+        ["replay", BAG, "--topic", "a\x1bb"],
+        ["replay", BAG, "--margin", "nan"],
+        ["replay", BAG, "--max-frames", "9" * 5000],
+        ["replay", BAG, "--betas", "1,nan"],
+        ["stress", "--seed", "-1"],
+        ["stress", "--hours", "inf"],
+        ["simulate", "tshirt-male", "--count", "1", "--output", "x", "--seconds", "1e300"],
+        ["simulate", "\ud800", "--count", "1", "--output", "x"],
+        ["info", "--body", "\ud800.npz"],
+        ["info", "--body", "a\0b.pkl"],
+        ["\x1b]0;x\x07" * 1000],
+    ],
+)
+def test_values_that_no_command_takes(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    refused(arguments, capsys)
+
+
+@pytest.mark.parametrize(
+    ("package", "extra", "arguments"),
+    [
+        ("tqdm", "lab", ["replay", BAG]),
+        ("matplotlib", "lab", ["replay", BAG, "--report", "report"]),
+        ("numba", "train", ["simulate", "tshirt-male", "--count", "1", "--output", "set"]),
+    ],
+)
+def test_an_extra_that_is_missing_is_named(package: str, extra: str, arguments: list[str], tmp_path: Path) -> None:
+    """In an interpreter of its own, which can't import the package."""
+    code = f"import sys; sys.modules[{package!r}] = None; from refu_lab.cli import main; sys.exit(main(sys.argv[1:]))"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    command = [sys.executable, "-c", code, *arguments]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr == f'refu: error: {package} is not installed: pip install "refu-ros[{extra}]"\n'
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("device", ["meta", "mps", "cpu:x", "cuda:99", "xla", "", "cpu\0"])
+def test_devices_that_there_are_not(device: str) -> None:
+    with pytest.raises(RefuError, match="no device"):
+        checked_device(device)
+
+
+@pytest.mark.parametrize("text", ["-1,0,2.5", "-.5,1", "-1"])
+@pytest.mark.parametrize("form", [["--betas={}"], ["--betas", "{}"]])
+def test_numbers_may_be_negative(form: list[str], text: str) -> None:
+    arguments = [part.format(text) for part in form]
+    assert cli._parser().parse_args(["replay", BAG, *arguments, "--quiet"]).betas == numbers(10)(text)
+
+
+def test_a_bug_is_one_line_and_shows_where_it_is_when_asked(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def collect() -> None:
+        raise KeyError("it\x1b[2J")  # noqa: EM101
+
+    monkeypatch.setattr("refu_lab.info.collect", collect)
+    assert main(["info"]) == cli.EXIT_BUG
+    said = capsys.readouterr().err
+    assert said == r"refu: a bug of refu, please report it; REFU_DEBUG=1 shows where: KeyError: 'it\x1b[2J'" + "\n"
+    monkeypatch.setenv("REFU_DEBUG", "1")
+    assert main(["info"]) == cli.EXIT_BUG
+    assert "in collect" in capsys.readouterr().err
+
+
+@dataclass
+class Record:
+    log_time_ns: int
+
+
+def test_a_gap_of_centuries_isnt_waited_for() -> None:
+    started = time.monotonic()
+    times = (0, 2**63 - 1, 5, 10_000_000)
+    assert [r.log_time_ns for r in _paced([Record(t) for t in times], "real")] == list(times)  # type: ignore[arg-type]
+    assert time.monotonic() - started < 5
