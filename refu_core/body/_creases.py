@@ -1,0 +1,156 @@
+"""Where a body folds at its joints: seams between what a joint moves and what it doesn't, and the skin beside them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from refu_core.body._kinematics import PARENTS
+
+SPACING = 0.015
+"""Stations along a seam are about this far apart [m]: as far as the vertices of a body."""
+_WIDTH = 0.03
+"""How far along a seam its stations are averaged for a vertex [m]: wider than the steps of a mesh, narrower than a limb."""
+_ASIDE = 0.03
+"""Skin up to this far on both sides of a seam says which way it parts them [m]."""
+_N_STATIONS = 6
+"""Stations that a vertex sees."""
+
+
+class Creases(NamedTuple):
+    """Half spaces that keep skin on its own side of a joint's seam, R in all, in the order of the vertices.
+
+    A seam is the line on the skin where half of the skinning weight is that of the joint and of what hangs on it. It is
+    sampled at S stations. Where the joint bends, skin of both sides stays apart by a plane through the posed seam, which
+    turns half as far as the joint does.
+    """
+
+    station_start: NDArray[np.int32]
+    """Station s is the mean of the vertices number `station_start[s]` to `station_start[s + 1]` of the next two,
+    shape (S + 1,)."""
+    station_vertex: NDArray[np.int32]
+    station_weight: NDArray[np.float64]
+    vertex: NDArray[np.int32]
+    """Shape (R,)."""
+    joint: NDArray[np.int32]
+    """Shape (R,)."""
+    side: NDArray[np.float64]
+    """1 for what the joint moves, -1 for what it doesn't, shape (R,)."""
+    normal: NDArray[np.float64]
+    """Of the plane in the rest pose, towards what the joint moves, shape (R, 3)."""
+    height: NDArray[np.float64]
+    """Distance from the plane in the rest pose [m], positive, shape (R,)."""
+    along: NDArray[np.float64]
+    """Distance from the seam in the rest pose [m], shape (R,)."""
+    stations: NDArray[np.int32]
+    """What the plane goes through is the mean of these, shape (R, 6) …"""
+    weights: NDArray[np.float64]
+    """… by these weights, shape (R, 6)."""
+
+
+def find_creases(
+    rest: NDArray[np.float64], edges: NDArray[np.int32], weights: NDArray[np.float64], *, reach: float
+) -> Creases:
+    """The creases of a body: rest pose (V, 3) [m], edges (E, 2), skinning weights (V, 24).
+
+    Skin farther than `reach` [m] from a seam isn't held by it.
+    """
+    moved_by = _moved_by(weights)
+    tree = cKDTree(rest)
+    station_rows: list[tuple[NDArray[np.int64], NDArray[np.float64]]] = []
+    rows: list[list[NDArray[np.generic]]] = []
+    for joint in range(1, weights.shape[1]):
+        moved = moved_by[:, joint]
+        start, end = edges[(moved[edges[:, 0]] > 0.5) != (moved[edges[:, 1]] > 0.5)].T
+        if not len(start):
+            continue
+        share = (0.5 - moved[start]) / (moved[end] - moved[start])
+        seam = rest[start] * (1 - share)[:, None] + rest[end] * share[:, None]
+        picked = _spread_out(seam)
+        near = _falloff(np.linalg.norm(seam[picked][:, None] - seam[None], axis=2), SPACING)
+        first = len(station_rows)
+        for one in near:
+            on = np.flatnonzero(one)
+            pairs = np.concatenate([start[on], end[on]]), np.concatenate([one[on] * (1 - share[on]), one[on] * share[on]])
+            vertices, inverse = np.unique(pairs[0], return_inverse=True)
+            station_rows.append((vertices, np.bincount(inverse, pairs[1])))
+        places = np.stack([w @ rest[v] for v, w in station_rows[first:]])
+        normals = _parting(places, rest, moved > 0.5, tree)
+        # What is near the seam, on either side of it
+        along, _ = cKDTree(seam).query(rest, distance_upper_bound=reach)
+        vertex = np.flatnonzero(np.isfinite(along))
+        distance = np.linalg.norm(rest[vertex][:, None] - places[None], axis=2)
+        chosen = np.argsort(distance, axis=1, kind="stable")[:, :_N_STATIONS]
+        chosen = np.pad(chosen, ((0, 0), (0, _N_STATIONS - chosen.shape[1])), mode="edge")
+        weight = _falloff(np.take_along_axis(distance, chosen, axis=1), _WIDTH)
+        normal = _unit(np.einsum("rk,rkc->rc", weight, normals[chosen]))
+        side = np.where(moved[vertex] > 0.5, 1.0, -1.0)
+        through = np.einsum("rk,rkc->rc", weight, places[chosen])
+        height = side * np.einsum("rc,rc->r", rest[vertex] - through, normal)
+        ahead = height > 0
+        fields = (vertex, np.full(len(vertex), joint), side, normal, height, along[vertex], chosen + first, weight)
+        rows.append([field[ahead] for field in fields])
+    merged = [np.concatenate(field) for field in zip(*rows, strict=True)]
+    order = np.argsort(merged[0], kind="stable")
+    vertex, joint_, side, normal, height, along, stations, weight = (field[order] for field in merged)
+    return Creases(
+        np.cumsum([0, *(len(v) for v, _ in station_rows)]).astype(np.int32),
+        np.concatenate([v for v, _ in station_rows]).astype(np.int32),
+        np.concatenate([w for _, w in station_rows]),
+        vertex.astype(np.int32),
+        joint_.astype(np.int32),
+        side.astype(np.float64),
+        normal.astype(np.float64),
+        height.astype(np.float64),
+        along.astype(np.float64),
+        stations.astype(np.int32),
+        weight.astype(np.float64),
+    )
+
+
+def _moved_by(weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The share of each vertex that a joint moves, with all that hangs on it, shape (V, 24)."""
+    total = weights.copy()
+    for joint in range(weights.shape[1] - 1, 0, -1):
+        total[:, PARENTS[joint]] += total[:, joint]
+    return total
+
+
+def _spread_out(points: NDArray[np.float64]) -> list[int]:
+    """Indices of some of the points, `SPACING` apart: the farthest from those picked, again and again."""
+    picked = [0]
+    distance = np.linalg.norm(points - points[0], axis=1)
+    while distance.max() > SPACING:
+        picked.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(points - points[picked[-1]], axis=1))
+    return picked
+
+
+def _falloff(distance: NDArray[np.float64], width: float) -> NDArray[np.float64]:
+    """Weights of rows of distances [m], which fall off over `width` [m] beyond the least one; each row sums to one."""
+    beyond = distance**2 - distance.min(axis=1, keepdims=True) ** 2
+    weight: NDArray[np.float64] = np.exp(-beyond / (2 * width**2))
+    weight[weight < 1e-3] = 0.0
+    return weight / weight.sum(axis=1, keepdims=True)
+
+
+def _parting(
+    places: NDArray[np.float64], rest: NDArray[np.float64], is_moved: NDArray[np.bool_], tree: cKDTree
+) -> NDArray[np.float64]:
+    """At places on a seam (S, 3), the unit vectors from the skin near by that isn't moved to that which is."""
+    normals = np.zeros_like(places)
+    for i, (place, near) in enumerate(zip(places, tree.query_ball_point(places, _ASIDE), strict=True)):
+        weight = np.maximum(_ASIDE - np.linalg.norm(rest[near] - place, axis=1), 1e-9)
+        moved = is_moved[near]
+        if moved.any() and not moved.all():
+            means = [np.average(rest[near][on], axis=0, weights=weight[on]) for on in (moved, ~moved)]
+            normals[i] = means[0] - means[1]
+    return _unit(normals)
+
+
+def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    unit: NDArray[np.float64] = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
+    return unit
