@@ -9,6 +9,28 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from refu_core.body._parts import joints_of
+
+
+SOFTNESS: tuple[tuple[tuple[int, ...], float], ...] = (
+    (joints_of("trunk"), 1.0),
+    (joints_of("head"), 0.5),
+    (joints_of("left_upper_arm"), 1.0),
+    (joints_of("right_upper_arm"), 1.0),
+    ((18,), 0.7),
+    ((19,), 0.7),
+    ((20, 22), 0.25),
+    ((21, 23), 0.25),
+    (joints_of("left_thigh"), 1.0),
+    (joints_of("right_thigh"), 1.0),
+    ((4,), 0.7),
+    ((5,), 0.7),
+    ((7, 10), 0.25),
+    ((8, 11), 0.25),
+)
+"""Joints of the segments that give way to each other, and how easily each does: of two, each gives way by its share of
+both. Flanks and thighs are flesh; forearms and shins have bone below the skin; hands, feet and heads hardly give way."""
+
 
 class Solids(NamedTuple):
     """K segments of a body, each closed by a fan to the middle of every loop that it was cut along.
