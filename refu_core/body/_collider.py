@@ -11,7 +11,7 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from refu_core._warp import argument, as_warp, is_plain, torch_stream
+from refu_core._warp import as_warp, torch_stream
 from refu_core.body import _collider_kernels as kernels
 from refu_core.body._creases import LEVELS, find_creases
 from refu_core.body._kinematics import PARENTS, RigidTransforms
@@ -21,6 +21,10 @@ from refu_core.mesh import Connectivity
 
 DEFAULT_GAP = 0.012
 """Room that is left between two parts of a body [m]: two layers of cloth, each 4 mm off the skin, and some to spare."""
+
+
+FADE = 0.035
+"""Beyond the reach of a crease its planes let skin go by a metre a metre; so far out nothing would be held [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,22 +85,17 @@ class Collider:
         """
         self.settings = ColliderSettings(gap=gap) if settings is None else settings
         self.device = body.device
+        self._is_serial = body.device.type == "cpu"
         rest = body.v_template.double().cpu().numpy()
         weights = body.weights.double().cpu().numpy()
         mesh = Connectivity.of(body.faces.cpu(), len(rest))
         mesh.require_closed()
-        self._n_vertices, self._n_edges = len(rest), len(mesh.edges)
-        self._ring = [self._ints(mesh.ring.start), self._ints(mesh.ring.items)]
-        ends = mesh.edges.ravel()
-        by_vertex = np.argsort(ends, kind="stable")
-        self._edges = wp.array(mesh.edges, dtype=wp.vec2i, device=str(self.device))
-        self._edges_of = [
-            self._ints(np.searchsorted(ends[by_vertex], np.arange(len(rest) + 1))),
-            self._ints(by_vertex // 2),
-        ]
-        self._seams, self._stations = self._bind_seams(rest, mesh, weights)
+        self._tensors = _Tensors(len(rest), len(mesh.edges), self.device)
+        self._rings = self._bind_rings(mesh)
         self._bones = self._bind_bones(rest, mesh, weights)
-        self._segments, self._caps = self._bind_segments(body, mesh, weights)
+        self._seams, self._held, self._stations = self._bind_seams(rest, mesh, weights)
+        self._segments = self._bind_segments(rest, mesh, weights)
+        self._commands = self._record()
 
     def __call__(self, skin: Tensor, transforms: RigidTransforms) -> Tensor:
         """The bodies `skin` [m], shape (B, V, 3), pulled apart, in the same axes.
@@ -107,122 +106,159 @@ class Collider:
 
     @torch.no_grad()
     def _part(self, skin: Tensor, rotation: Tensor) -> Tensor:
-        how, n = self.settings, self._n_vertices
-        self._skin.copy_(skin)
-        self._rotation.copy_(rotation)
+        how, work, run = self.settings, self._tensors, self._run
+        n = len(skin)
+        work.skin.copy_(skin)
+        work.here.copy_(skin)
+        work.there.copy_(skin)
+        work.rotation.copy_(rotation)
+        work.ints.zero_()
         with torch_stream(self.device):
-            self._crease()
-            if self.device.type == "cpu" and not self._moved[0]:
-                self._points[:n] = self._skin
-            self._launch(kernels.mean_kernel, len(self._points) - n, [self._points_wp, *self._caps], [self._points_wp[n:]])
-            self._low.fill_(torch.inf)
-            self._high.fill_(-torch.inf)
-            segments, bones = self._segments, self._bones
-            self._launch(kernels.box_kernel, n, [self._points_wp, segments.own], [segments.low, segments.high])
+            run("between")
+            run("stations")
+            run("crease")
+            at = self._smooth(work.here, work.there, how.smooth_first)
+            work.points[:n] = at
+            run("caps")
+            work.low.fill_(torch.inf)
+            work.high.fill_(-torch.inf)
+            run("box")
+            run("meet")
             for tree in self._trees:
                 tree.refit()
-            touched, outside = self._touched
-            self._launch(kernels.touch_kernel, n, [self._points_wp, segments, how.gap], [touched, outside])
+            run("touch")
             for _ in range(how.deepen_rounds):
-                self._launch(kernels.deepen_kernel, n, [self._points_wp, segments, *self._ring], [touched, outside])
-            a, b = self._buffers_wp
-            self._launch(kernels.part_kernel, n, [self._points_wp, touched, segments, bones, how.part_rounds], [a])
-            a, b = self._smooth(a, b, how.smooth_last)
+                work.counts[kernels.FOUND] = 0
+                run("deepen", kernels.NEAR)
+                if self._is_serial and not work.counts[kernels.FOUND]:
+                    break
+            work.here.copy_(at)
+            work.there.copy_(at)
+            run("part", kernels.NEAR)
+            at = self._smooth(work.here, work.there, how.smooth_last)
+            which = "here" if at is work.here else "there"
             for _ in range(how.edge_rounds):
-                inputs = [self._points_wp, self._edges, touched, a, how.steep, segments, bones]
-                self._launch(kernels.edge_kernel, self._n_edges, inputs, [self._steps])
-                self._launch(kernels.follow_kernel, n, [*self._edges_of, self._steps], [a])
-        return self._buffers[0 if a is self._buffers_wp[0] else 1].clone()
+                run(f"edge {which}", kernels.HOT)
+                run(f"follow {which}", kernels.ENDS)
+        return at.clone()
 
-    def _crease(self) -> None:
-        how, n = self.settings, self._n_vertices
-        bones = self._bones
-        self._moved.zero_()
-        self._launch(kernels.between_kernel, len(PARENTS), [bones.rotation, self._parent, self._levels], [bones.between])
-        self._launch(kernels.mean_kernel, len(self._station), [self._skin_wp, *self._stations], [self._station_wp])
-        a, b = self._buffers_wp
-        inputs = [self._skin_wp, self._station_wp, bones, self._seams, how.crease_rounds]
-        self._launch(kernels.crease_kernel, n, inputs, [a, self._moved_wp])
-        a, b = self._smooth(a, b, how.smooth_first)
-        self._points[:n] = self._buffers[0 if a is self._buffers_wp[0] else 1]
+    def _smooth(self, source: Tensor, target: Tensor, sweeps: int) -> Tensor:
+        self._run("share", kernels.MOVED)
+        for i in range(sweeps):
+            self._run("smooth" if i % 2 == 0 else "smooth back", kernels.MOVED)
+            source, target = target, source
+        return source
 
-    def _smooth(self, a: Any, b: Any, sweeps: int) -> tuple[Any, Any]:
-        how, n = self.settings, self._n_vertices
-        wp.copy(self._at_wp, a)
-        for _ in range(sweeps):
-            inputs = [self._skin_wp, self._at_wp, *self._ring, how.smooth_full, how.smooth_step, a]
-            self._launch(kernels.smooth_kernel, n, inputs, [b])
-            a, b = b, a
-        return a, b
+    def _run(self, name: str, which: int | None = None) -> None:
+        """Launches a step: on a CPU for as many as its list has, on a GPU for as many as it could have."""
+        command, most = self._commands[name]
+        if which is not None and self._is_serial:
+            n = int(self._tensors.counts[which])
+            if n == 0:
+                return
+            command.set_dim(n)
+        command.launch()
 
-    def _launch(self, kernel: Any, n: int, inputs: list[Any], outputs: list[Any]) -> None:
-        wp.launch(kernel, n, inputs, outputs, device=str(self.device))
+    def _record(self) -> dict[str, Any]:
+        how, work, bones, segments, rings = self.settings, self._work, self._bones, self._segments, self._rings
+        n, n_edges = len(work.skin), len(work.steps)
+        commands = {}
+
+        def record(name: str, kernel: Any, most: int, inputs: list[Any]) -> None:
+            commands[name] = wp.launch(kernel, most, inputs, device=str(self.device), record_cmd=True), most
+
+        record("between", kernels.between_kernel, len(PARENTS), [bones.rotation, *self._chain, bones.between])
+        record("stations", kernels.mean_kernel, len(self._stations[-1]), [work.skin, *self._stations])
+        inputs = [work, self._held, self._stations[-1], bones, self._seams, how.crease_rounds]
+        record("crease", kernels.crease_kernel, len(self._held), inputs)
+        record("share", kernels.share_kernel, n, [work, how.smooth_full, how.smooth_step])
+        record("smooth", kernels.smooth_kernel, n, [work, rings, work.here, work.there])
+        record("smooth back", kernels.smooth_kernel, n, [work, rings, work.there, work.here])
+        record("caps", kernels.mean_kernel, len(self._caps[-1]), [work.points, *self._caps])
+        record("box", kernels.box_kernel, n, [work.points, segments.own, segments.low, segments.high])
+        record("meet", kernels.meet_kernel, len(self._trees), [segments, how.gap, work.meets])
+        record("touch", kernels.touch_kernel, n, [work, segments, how.gap])
+        record("deepen", kernels.deepen_kernel, n, [work, segments, rings])
+        record("part", kernels.part_kernel, n, [work, segments, bones, rings, how.part_rounds])
+        for which, moved in (("here", work.here), ("there", work.there)):
+            record(f"edge {which}", kernels.edge_kernel, n_edges, [work, moved, rings, segments, bones, how.steep])
+            record(f"follow {which}", kernels.follow_kernel, n, [work, moved, rings])
+        return commands
+
+    def _bind_rings(self, mesh: Connectivity) -> Any:
+        ring = mesh.ring
+        low, high = np.minimum(ring.owner, ring.items), np.maximum(ring.owner, ring.items)
+        keys = mesh.edges[:, 0].astype(np.int64) * mesh.n_vertices + mesh.edges[:, 1]
+        rings = kernels.Rings()
+        rings.start, rings.vertex = self._ints(ring.start), self._ints(ring.items)
+        rings.edge = self._ints(np.searchsorted(keys, low * mesh.n_vertices + high))
+        rings.ends = wp.array(mesh.edges, dtype=wp.vec2i, device=str(self.device))
+        return rings
+
+    def _bind_bones(self, rest: NDArray[np.float64], mesh: Connectivity, weights: NDArray[np.float64]) -> Any:
+        vertex, joint = np.nonzero(weights)
+        bones = kernels.Bones()
+        work = self._tensors
+        bones.rotation, bones.between = as_warp(work.rotation, wp.mat33), as_warp(work.between, wp.mat33)
+        bones.start = self._ints(np.searchsorted(vertex, np.arange(len(rest) + 1)))
+        bones.joint, bones.weight = self._ints(joint), self._floats(weights[vertex, joint])
+        bones.normal = self._vectors(_smooth_normals(rest, mesh))
+        self._chain = [self._ints([max(parent, 0) for parent in PARENTS]), self._floats(LEVELS)]
+        return bones
 
     def _bind_seams(self, rest: NDArray[np.float64], mesh: Connectivity, weights: NDArray[np.float64]) -> Any:
         how = self.settings
-        found = find_creases(rest, mesh.edges, weights, reach=how.crease_reach + 0.035)
+        found = find_creases(rest, mesh.edges, weights, reach=how.crease_reach + FADE)
         beyond = np.clip(found.along - how.crease_reach, 0.0, None)
+        held, first = np.unique(found.vertex, return_index=True)
         seams = kernels.Seams()
-        seams.start = self._ints(np.searchsorted(found.vertex, np.arange(len(rest) + 1)))
+        seams.start = self._ints([*first, len(found.vertex)])
         seams.rotation = self._ints(found.rotation)
         seams.normal = self._vectors(found.normal)
         seams.least = self._floats(np.minimum(how.gap / 2, how.crease_share * found.height) - beyond)
         seams.stations = wp.array(found.stations, dtype=kernels.Stations, device=str(self.device))
         seams.weights = wp.array(found.weights.astype(np.float32), dtype=kernels.StationWeights, device=str(self.device))
         n_stations = len(found.station_start) - 1
-        self._station = torch.zeros(n_stations, 3, device=self.device)
-        self._station_wp = as_warp(self._station, wp.vec3)
-        self._parent = self._ints([max(parent, 0) for parent in PARENTS])
-        self._levels = self._floats(LEVELS)
-        self._moved = torch.zeros(1, dtype=torch.int32, device=self.device)
-        self._moved_wp = as_warp(self._moved, wp.int32)
-        stations = [self._ints(found.station_start), self._ints(found.station_vertex), self._floats(found.station_weight)]
-        return seams, stations
+        stations = [
+            self._ints(found.station_start),
+            self._ints(found.station_vertex),
+            self._floats(found.station_weight),
+            wp.zeros(n_stations, dtype=wp.vec3, device=str(self.device)),
+        ]
+        return seams, self._ints(held), stations
 
-    def _bind_bones(self, rest: NDArray[np.float64], mesh: Connectivity, weights: NDArray[np.float64]) -> Any:
-        n = len(rest)
-        self._buffers = [torch.zeros(n, 3, device=self.device) for _ in range(2)]
-        self._buffers_wp = [as_warp(one, wp.vec3) for one in self._buffers]
-        self._skin, self._at = (torch.zeros(n, 3, device=self.device) for _ in range(2))
-        self._skin_wp, self._at_wp = as_warp(self._skin, wp.vec3), as_warp(self._at, wp.vec3)
-        self._rotation = torch.zeros(len(PARENTS), 3, 3, device=self.device)
-        self._between = torch.zeros(len(PARENTS) * len(LEVELS), 3, 3, device=self.device)
-        self._steps = wp.zeros(self._n_edges, dtype=wp.vec3, device=str(self.device))
-        self._touched = [wp.zeros(n, dtype=wp.int32, device=str(self.device)) for _ in range(2)]
-        vertex, joint = np.nonzero(weights)
-        bones = kernels.Bones()
-        bones.rotation, bones.between = as_warp(self._rotation, wp.mat33), as_warp(self._between, wp.mat33)
-        bones.start = self._ints(np.searchsorted(vertex, np.arange(n + 1)))
-        bones.joint, bones.weight = self._ints(joint), self._floats(weights[vertex, joint])
-        bones.normal = self._vectors(_smooth_normals(rest, mesh))
-        return bones
-
-    def _bind_segments(self, body: SmplBody, mesh: Connectivity, weights: NDArray[np.float64]) -> Any:
-        how, n, device = self.settings, self._n_vertices, str(self.device)
+    def _bind_segments(self, rest: NDArray[np.float64], mesh: Connectivity, weights: NDArray[np.float64]) -> Any:
+        how, n, device = self.settings, len(rest), str(self.device)
         share = np.stack([weights[:, list(joints)].sum(axis=1) for joints, _ in SOFTNESS], axis=1)
         solids = cut(mesh.faces, share)
-        sizes = np.diff(solids.middle_start)
-        caps = [self._ints(solids.middle_start), self._ints(solids.middle_vertex), self._floats(np.repeat(1 / sizes, sizes))]
-        n_segments = len(solids.faces)
-        self._points = torch.zeros(n + len(sizes), 3, device=self.device)
-        self._points[:n] = body.v_template
-        self._points_wp = as_warp(self._points, wp.vec3)
-        self._launch(kernels.mean_kernel, len(sizes), [self._points_wp, *caps], [self._points_wp[n:]])
-        self._trees = [wp.Mesh(self._points_wp, self._ints(faces.ravel())) for faces in solids.faces]
-        self._low, self._high = (torch.zeros(n_segments, 3, device=self.device) for _ in range(2))
+        n_segments, sizes = len(solids.faces), np.diff(solids.middle_start)
+        work = self._tensors
+        work.add_points(len(sizes), n_segments)
+        work.points[:n] = torch.as_tensor(rest)
+        points = as_warp(work.points, wp.vec3)
+        self._caps = [
+            self._ints(solids.middle_start),
+            self._ints(solids.middle_vertex),
+            self._floats(np.repeat(1 / np.maximum(sizes, 1), sizes)),
+            points[n:],
+        ]
+        if len(sizes):
+            wp.launch(kernels.mean_kernel, len(sizes), [points, *self._caps], device=device)
+        self._trees = [wp.Mesh(points, self._ints(faces.ravel())) for faces in solids.faces]
         segments = kernels.Segments()
         segments.trees = wp.array([tree.id for tree in self._trees], dtype=wp.uint64, device=device)
         segments.own = self._ints(solids.of_vertex)
-        segments.low, segments.high = as_warp(self._low, wp.vec3), as_warp(self._high, wp.vec3)
+        segments.low, segments.high = as_warp(work.low, wp.vec3), as_warp(work.high, wp.vec3)
         segments.faces = wp.array(np.concatenate(solids.faces), dtype=wp.vec3i, device=device)
         segments.first_face = self._ints(np.cumsum([0, *map(len, solids.faces)]))
         softness = np.array([one for _, one in SOFTNESS])
         segments.ratio = self._floats(softness[None] / softness[:, None])
         clearance = wp.zeros((n, n_segments), dtype=wp.float32, device=device)
         segments.gap = clearance
-        wp.launch(kernels.clearance_kernel, (n, n_segments), [self._points_wp, segments], [clearance], device=device)
+        wp.launch(kernels.clearance_kernel, (n, n_segments), [points, segments, clearance], device=device)
         segments.gap = self._floats(np.minimum(how.gap, how.segment_share * clearance.numpy()))
-        return segments, caps
+        self._work = work.bound()
+        return segments
 
     def _ints(self, values: ArrayLike) -> Any:
         return wp.array(np.ascontiguousarray(values, np.int32), dtype=wp.int32, device=str(self.device))
@@ -232,6 +268,40 @@ class Collider:
 
     def _vectors(self, values: ArrayLike) -> Any:
         return wp.array(np.ascontiguousarray(values, np.float32), dtype=wp.vec3, device=str(self.device))
+
+
+class _Tensors:
+    """The memory of `kernels.Work`, as torch sees it."""
+
+    def __init__(self, n_vertices: int, n_edges: int, device: torch.device) -> None:
+        self._device, self._sizes = device, (n_vertices, n_edges)
+        self.skin, self.here, self.there = (torch.zeros(n_vertices, 3, device=device) for _ in range(3))
+        self.rotation = torch.zeros(len(PARENTS), 3, 3, device=device)
+        self.between = torch.zeros(len(PARENTS) * len(LEVELS), 3, 3, device=device)
+        # What every call begins with as zeros.
+        self.ints = torch.zeros(2 * n_vertices + kernels.N_COUNTS, dtype=torch.int32, device=device)
+        self.counts = self.ints[2 * n_vertices :]
+
+    def add_points(self, n_middles: int, n_segments: int) -> None:
+        """Makes what depends on how the body is cut."""
+        self.points = torch.zeros(self._sizes[0] + n_middles, 3, device=self._device)
+        self.low, self.high = (torch.zeros(n_segments, 3, device=self._device) for _ in range(2))
+
+    def bound(self) -> Any:
+        """As the kernels take it."""
+        n, n_edges = self._sizes
+        work = kernels.Work()
+        for name in ("skin", "points", "here", "there"):
+            setattr(work, name, as_warp(getattr(self, name), wp.vec3))
+        for name in ("moved", "near", "ends", "touched", "outside"):
+            setattr(work, name, wp.zeros(n, dtype=wp.int32, device=str(self._device)))
+        work.share = wp.zeros(n, dtype=wp.float32, device=str(self._device))
+        work.hot = wp.zeros(n_edges, dtype=wp.int32, device=str(self._device))
+        work.steps = wp.zeros(n_edges, dtype=wp.vec3, device=str(self._device))
+        work.meets = wp.zeros(len(self.low), dtype=wp.int32, device=str(self._device))
+        work.is_moved, work.is_end = as_warp(self.ints[:n], wp.int32), as_warp(self.ints[n : 2 * n], wp.int32)
+        work.counts = as_warp(self.counts, wp.int32)
+        return work
 
 
 def _smooth_normals(vertices: NDArray[np.float64], mesh: Connectivity) -> NDArray[np.float64]:

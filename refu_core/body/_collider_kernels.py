@@ -11,12 +11,13 @@ from refu_core import _warp  # noqa: F401  (quiets Warp before it starts)
 
 wp.set_module_options({"enable_backward": False})
 
+N_STATIONS = 6
 if TYPE_CHECKING:
     Stations = wp.Vector[int]
     StationWeights = wp.Vector[float]
 else:
-    Stations = wp.types.vector(length=6, dtype=wp.int32)
-    StationWeights = wp.types.vector(length=6, dtype=wp.float32)
+    Stations = wp.types.vector(length=N_STATIONS, dtype=wp.int32)
+    StationWeights = wp.types.vector(length=N_STATIONS, dtype=wp.float32)
 
 DEEPEST = wp.constant(0.1)
 """Deeper than this no vertex is in another segment [m]: the trunk's half."""
@@ -42,7 +43,7 @@ class Bones:
 
 @wp.struct
 class Seams:
-    """The rows of `Creases`, those of vertex v from `start[v]` on."""
+    """The rows of `Creases`, those of the i-th vertex that has any from `start[i]` on."""
 
     start: wp.array[int]
     rotation: wp.array[int]
@@ -68,6 +69,56 @@ class Segments:
     """What vertex v keeps from segment k [m]."""
     ratio: wp.array2d[float]
     """How many times as soft segment k is as segment i."""
+
+
+@wp.struct
+class Work:
+    """Memory that a call works in; lists are as long as `counts` says."""
+
+    skin: wp.array[wp.vec3]
+    points: wp.array[wp.vec3]
+    """Skin without creases, then the middles of caps."""
+    here: wp.array[wp.vec3]
+    there: wp.array[wp.vec3]
+    """What sweeps go to and fro between."""
+    share: wp.array[float]
+    """How much of a sweep each vertex of `moved` takes."""
+    moved: wp.array[int]
+    near: wp.array[int]
+    """Vertices in another segment's box."""
+    hot: wp.array[int]
+    """Edges with an end in `touched`."""
+    ends: wp.array[int]
+    """Vertices of those edges."""
+    is_moved: wp.array[int]
+    is_end: wp.array[int]
+    touched: wp.array[int]
+    outside: wp.array[int]
+    meets: wp.array[int]
+    """Segments whose boxes meet that of each segment."""
+    steps: wp.array[wp.vec3]
+    """Of each edge."""
+    counts: wp.array[int]
+    """How many are in `moved`, `near`, `hot` and `ends`, and how many vertices a round found inside."""
+
+
+MOVED = wp.constant(0)
+NEAR = wp.constant(1)
+HOT = wp.constant(2)
+ENDS = wp.constant(3)
+FOUND = wp.constant(4)
+N_COUNTS = 5
+
+
+@wp.struct
+class Rings:
+    """What is around each vertex: vertices, and edges with their ends."""
+
+    start: wp.array[int]
+    vertex: wp.array[int]
+    edge: wp.array[int]
+    """The edge to each of them."""
+    ends: wp.array[wp.vec2i]
 
 
 @wp.kernel
@@ -98,27 +149,20 @@ def mean_kernel(
 
 
 @wp.kernel
-def crease_kernel(
-    skin: wp.array[wp.vec3],
-    stations: wp.array[wp.vec3],
-    bones: Bones,
-    seams: Seams,
-    rounds: int,
-    # outputs
-    out: wp.array[wp.vec3],
-    moved: wp.array[int],
-) -> None:
+def crease_kernel(work: Work, held: wp.array[int], stations: wp.array[wp.vec3], bones: Bones, seams: Seams, rounds: int) -> None:
     """Brings skin back to its own side of the seams near by, from the one that it is farthest beyond."""
-    v = wp.tid()
-    p = skin[v]
+    i = wp.tid()
+    v = held[i]
+    p = work.skin[v]
+    is_held = int(0)
     for _ in range(rounds):
         most = float(0.0)
         step = wp.vec3()
-        for r in range(seams.start[v], seams.start[v + 1]):
+        for r in range(seams.start[i], seams.start[i + 1]):
             through = wp.vec3()
             which = seams.stations[r]
             weights = seams.weights[r]
-            for k in range(wp.static(6)):
+            for k in range(wp.static(N_STATIONS)):
                 through += weights[k] * stations[which[k]]
             normal = bones.between[seams.rotation[r]] @ seams.normal[r]
             lacks = seams.least[r] - wp.dot(p - through, normal)
@@ -128,32 +172,34 @@ def crease_kernel(
         if most == 0.0:
             break
         p += step
-        moved[0] = 1
-    out[v] = p
+        is_held = 1
+    if is_held == 1:
+        work.here[v] = p
+        work.there[v] = p
+        work.is_moved[v] = 1
+        work.moved[wp.atomic_add(work.counts, MOVED, 1)] = v
 
 
 @wp.kernel
-def smooth_kernel(
-    skin: wp.array[wp.vec3],
-    moved: wp.array[wp.vec3],
-    start: wp.array[int],
-    ring: wp.array[int],
-    full: float,
-    step: float,
-    source: wp.array[wp.vec3],
-    # output
-    target: wp.array[wp.vec3],
-) -> None:
-    """Levels skin that was moved, in full where it was moved by `full` [m] or farther; what wasn't stays."""
-    v = wp.tid()
-    p = source[v]
-    share = wp.min(wp.length(moved[v] - skin[v]) / full, 1.0) * step
-    if share > 0.0:
+def share_kernel(work: Work, full: float, step: float) -> None:
+    """How much of a sweep a vertex takes: all of `step` where it was moved by `full` [m] or farther."""
+    i = wp.tid()
+    if i < work.counts[MOVED]:
+        v = work.moved[i]
+        work.share[v] = wp.min(wp.length(work.here[v] - work.skin[v]) / full, 1.0) * step
+
+
+@wp.kernel
+def smooth_kernel(work: Work, rings: Rings, source: wp.array[wp.vec3], target: wp.array[wp.vec3]) -> None:
+    """Levels what was moved."""
+    i = wp.tid()
+    if i < work.counts[MOVED]:
+        v = work.moved[i]
         total = wp.vec3()
-        for k in range(start[v], start[v + 1]):
-            total += source[ring[k]]
-        p += share * (total / float(start[v + 1] - start[v]) - p)
-    target[v] = p
+        for k in range(rings.start[v], rings.start[v + 1]):
+            total += source[rings.vertex[k]]
+        mean = total / float(rings.start[v + 1] - rings.start[v])
+        target[v] = source[v] + work.share[v] * (mean - source[v])
 
 
 @wp.kernel
@@ -161,6 +207,28 @@ def box_kernel(points: wp.array[wp.vec3], own: wp.array[int], low: wp.array[wp.v
     v = wp.tid()
     wp.atomic_min(low, own[v], points[v])
     wp.atomic_max(high, own[v], points[v])
+
+
+@wp.func
+def do_meet(low: wp.vec3, high: wp.vec3, other_low: wp.vec3, other_high: wp.vec3, gap: float) -> bool:
+    return (
+        low[0] - gap < other_high[0]
+        and low[1] - gap < other_high[1]
+        and low[2] - gap < other_high[2]
+        and other_low[0] < high[0] + gap
+        and other_low[1] < high[1] + gap
+        and other_low[2] < high[2] + gap
+    )
+
+
+@wp.kernel
+def meet_kernel(segments: Segments, gap: float, meets: wp.array[int]) -> None:
+    i = wp.tid()
+    found = int(0)
+    for k in range(segments.trees.shape[0]):
+        if k != i and do_meet(segments.low[i], segments.high[i], segments.low[k], segments.high[k], gap):
+            found |= 1 << k
+    meets[i] = found
 
 
 @wp.func
@@ -173,60 +241,54 @@ def distance_of(tree: wp.uint64, p: wp.vec3, hit: wp.MeshQueryPoint) -> float:
 
 
 @wp.kernel
-def touch_kernel(
-    points: wp.array[wp.vec3], segments: Segments, gap: float, touched: wp.array[int], outside: wp.array[int]
-) -> None:
+def touch_kernel(work: Work, segments: Segments, gap: float) -> None:
     """Which segments each vertex is nearer to than it may be, of those whose surface is that near."""
     v = wp.tid()
-    p = points[v]
+    p = work.points[v]
     mine = int(0)
     seen = int(0)
-    for k in range(segments.trees.shape[0]):
-        low = segments.low[k]
-        high = segments.high[k]
-        if (
-            p[0] > low[0] - gap
-            and p[1] > low[1] - gap
-            and p[2] > low[2] - gap
-            and p[0] < high[0] + gap
-            and p[1] < high[1] + gap
-            and p[2] < high[2] + gap
-        ):
+    is_near = int(0)
+    meets = work.meets[segments.own[v]]
+    k = int(0)
+    while meets != 0:
+        if meets & 1 == 1 and do_meet(p, p, segments.low[k], segments.high[k], gap):
             keeps = segments.gap[v, k]
-            if keeps > 0.0 and k != segments.own[v]:
+            is_near = 1
+            if keeps > 0.0:
                 hit = wp.mesh_query_point_no_sign(segments.trees[k], p, keeps)
                 if hit.result:
                     mine |= 1 << k
                     if distance_of(segments.trees[k], p, hit) > 0.0:
                         seen |= 1 << k
-    touched[v] = mine
-    outside[v] = seen
+        meets = meets >> 1
+        k += 1
+    work.touched[v] = mine
+    work.outside[v] = seen
+    if is_near == 1:
+        work.near[wp.atomic_add(work.counts, NEAR, 1)] = v
 
 
 @wp.kernel
-def deepen_kernel(
-    points: wp.array[wp.vec3],
-    segments: Segments,
-    start: wp.array[int],
-    ring: wp.array[int],
-    touched: wp.array[int],
-    outside: wp.array[int],
-) -> None:
+def deepen_kernel(work: Work, segments: Segments, rings: Rings) -> None:
     """A vertex next to one that is inside a segment is inside it, too, unless the surface runs between them."""
-    v = wp.tid()
-    near = int(0)
-    for k in range(start[v], start[v + 1]):
-        w = ring[k]
-        near |= touched[w] & ~outside[w]
-    near &= ~(touched[v] | outside[v] | (1 << segments.own[v]))
-    if near == 0:
+    i = wp.tid()
+    if i >= work.counts[NEAR]:
         return
+    v = work.near[i]
+    around = int(0)
+    for k in range(rings.start[v], rings.start[v + 1]):
+        w = rings.vertex[k]
+        around |= work.touched[w] & ~work.outside[w]
+    around &= ~(work.touched[v] | work.outside[v] | (1 << segments.own[v]))
+    if around == 0:
+        return
+    work.counts[FOUND] = 1
     for k in range(segments.trees.shape[0]):
-        if (near >> k) & 1 == 1:
-            if wp.mesh_query_ray_count_intersections(segments.trees[k], points[v], _RAY) % 2 == 1:
-                touched[v] = touched[v] | (1 << k)
+        if (around >> k) & 1 == 1:
+            if wp.mesh_query_ray_count_intersections(segments.trees[k], work.points[v], _RAY) % 2 == 1:
+                work.touched[v] = work.touched[v] | (1 << k)
             else:
-                outside[v] = outside[v] | (1 << k)
+                work.outside[v] = work.outside[v] | (1 << k)
 
 
 @wp.func
@@ -262,84 +324,89 @@ def way_out(
 
 
 @wp.kernel
-def part_kernel(
-    points: wp.array[wp.vec3],
-    touched: wp.array[int],
-    segments: Segments,
-    bones: Bones,
-    rounds: int,
-    # output
-    out: wp.array[wp.vec3],
-) -> None:
+def part_kernel(work: Work, segments: Segments, bones: Bones, rings: Rings, rounds: int) -> None:
     """Moves each vertex to its own side of the surface between its segment and another one, in Newton's steps."""
-    v = wp.tid()
-    start = points[v]
+    i = wp.tid()
+    if i >= work.counts[NEAR]:
+        return
+    v = work.near[i]
+    touched = work.touched[v]
+    if touched == 0:
+        return
+    start = work.points[v]
     p = start
-    if touched[v] != 0:
-        own = segments.own[v]
-        normal = normal_at(bones, v)
-        for _ in range(rounds):
-            step = wp.vec3()
-            sunk = wp.dot(start - p, normal)
-            for k in range(segments.trees.shape[0]):
-                if (touched[v] >> k) & 1 == 1:
-                    found = way_out(p, normal, sunk, k, segments.ratio[own, k], segments.gap[v, k], segments, bones)
-                    if wp.length_sq(found) > wp.length_sq(step):
-                        step = found
-            if wp.length_sq(step) == 0.0:
-                break
-            p += step
-    out[v] = p
+    own = segments.own[v]
+    normal = normal_at(bones, v)
+    for _ in range(rounds):
+        step = wp.vec3()
+        sunk = wp.dot(start - p, normal)
+        for k in range(segments.trees.shape[0]):
+            if (touched >> k) & 1 == 1:
+                found = way_out(p, normal, sunk, k, segments.ratio[own, k], segments.gap[v, k], segments, bones)
+                if wp.length_sq(found) > wp.length_sq(step):
+                    step = found
+        if wp.length_sq(step) == 0.0:
+            break
+        p += step
+    if wp.length_sq(p - start) > 0.0:
+        work.here[v] = p
+        work.there[v] = p
+        if work.is_moved[v] == 0:
+            work.is_moved[v] = 1
+            work.moved[wp.atomic_add(work.counts, MOVED, 1)] = v
+    for r in range(rings.start[v], rings.start[v + 1]):
+        e = rings.edge[r]
+        w = rings.vertex[r]
+        if v < w or work.touched[w] == 0:  # once an edge
+            work.hot[wp.atomic_add(work.counts, HOT, 1)] = e
+            for c in range(2):
+                end = rings.ends[e][c]
+                if wp.atomic_exch(work.is_end, end, 1) == 0:
+                    work.ends[wp.atomic_add(work.counts, ENDS, 1)] = end
 
 
 @wp.kernel
-def edge_kernel(
-    points: wp.array[wp.vec3],
-    edges: wp.array[wp.vec2i],
-    touched: wp.array[int],
-    moved: wp.array[wp.vec3],
-    steep: float,
-    segments: Segments,
-    bones: Bones,
-    # output
-    steps: wp.array[wp.vec3],
-) -> None:
-    """How the middle of each edge gives way, where its ends were moved by more than `steep` [m] apart from each other."""
-    e = wp.tid()
-    v = edges[e][0]
-    w = edges[e][1]
+def edge_kernel(work: Work, moved: wp.array[wp.vec3], rings: Rings, segments: Segments, bones: Bones, steep: float) -> None:
+    """How the middle of a hot edge gives way, if its ends were moved by more than `steep` [m] apart from each other."""
+    i = wp.tid()
+    if i >= work.counts[HOT]:
+        return
+    e = work.hot[i]
+    v = rings.ends[e][0]
+    w = rings.ends[e][1]
     step = wp.vec3()
-    either = touched[v] | touched[w]
-    if either != 0:
-        gone_v = points[v] - moved[v]
-        gone_w = points[w] - moved[w]
-        if wp.length(gone_v - gone_w) > steep:
-            normal_v = normal_at(bones, v)
-            normal_w = normal_at(bones, w)
-            normal = wp.normalize(normal_v + normal_w)
-            sunk = 0.5 * (wp.dot(gone_v, normal_v) + wp.dot(gone_w, normal_w))
-            middle = 0.5 * (moved[v] + moved[w])
-            for k in range(segments.trees.shape[0]):
-                if (either >> k) & 1 == 1 and k != segments.own[v] and k != segments.own[w]:
-                    keeps = wp.min(segments.gap[v, k], segments.gap[w, k])
-                    ratio = segments.ratio[segments.own[v], k]
-                    found = way_out(middle, normal, sunk, k, ratio, keeps, segments, bones)
-                    if wp.length_sq(found) > wp.length_sq(step):
-                        step = found
-    steps[e] = step
+    gone_v = work.points[v] - moved[v]
+    gone_w = work.points[w] - moved[w]
+    if wp.length(gone_v - gone_w) > steep:
+        either = work.touched[v] | work.touched[w]
+        normal_v = normal_at(bones, v)
+        normal_w = normal_at(bones, w)
+        normal = wp.normalize(normal_v + normal_w)
+        sunk = 0.5 * (wp.dot(gone_v, normal_v) + wp.dot(gone_w, normal_w))
+        middle = 0.5 * (moved[v] + moved[w])
+        for k in range(segments.trees.shape[0]):
+            if (either >> k) & 1 == 1 and k != segments.own[v] and k != segments.own[w]:
+                keeps = wp.min(segments.gap[v, k], segments.gap[w, k])
+                ratio = segments.ratio[segments.own[v], k]
+                found = way_out(middle, normal, sunk, k, ratio, keeps, segments, bones)
+                if wp.length_sq(found) > wp.length_sq(step):
+                    step = found
+    work.steps[e] = step
 
 
 @wp.kernel
-def follow_kernel(
-    start: wp.array[int], of_edge: wp.array[int], steps: wp.array[wp.vec3], moved: wp.array[wp.vec3]
-) -> None:
+def follow_kernel(work: Work, moved: wp.array[wp.vec3], rings: Rings) -> None:
     """Vertices go with that of their edges that has farthest to go."""
-    v = wp.tid()
+    i = wp.tid()
+    if i >= work.counts[ENDS]:
+        return
+    v = work.ends[i]
     step = wp.vec3()
-    for k in range(start[v], start[v + 1]):
-        found = steps[of_edge[k]]
-        if wp.length_sq(found) > wp.length_sq(step):
-            step = found
+    for r in range(rings.start[v], rings.start[v + 1]):
+        if (work.touched[v] | work.touched[rings.vertex[r]]) != 0:
+            found = work.steps[rings.edge[r]]
+            if wp.length_sq(found) > wp.length_sq(step):
+                step = found
     moved[v] += step
 
 
