@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,8 +12,9 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from refu_core._warp import as_warp, torch_stream
+from refu_core._warp import as_warp, is_plain, torch_stream
 from refu_core.body import _collider_kernels as kernels
+from refu_core.body._collider_gradient import Closest, part_with_gradient
 from refu_core.body._creases import LEVELS, find_creases
 from refu_core.body._kinematics import PARENTS, RigidTransforms
 from refu_core.body._model import SmplBody
@@ -90,6 +92,7 @@ class Collider:
         weights = body.weights.double().cpu().numpy()
         mesh = Connectivity.of(body.faces.cpu(), len(rest))
         mesh.require_closed()
+        self.mesh = mesh
         self._tensors = _Tensors(len(rest), len(mesh.edges), self.device)
         self._rings = self._bind_rings(mesh)
         self._bones = self._bind_bones(rest, mesh, weights)
@@ -102,7 +105,11 @@ class Collider:
 
         `transforms` are those that they were posed with, leading shape (B, 24).
         """
-        return torch.stack([self._part(one, turn) for one, turn in zip(skin, transforms.rotation, strict=True)])
+        rotation = transforms.rotation
+        part = self._part if is_plain(skin, rotation) else partial(part_with_gradient, self)
+        if not len(skin):
+            return torch.zeros_like(skin)
+        return torch.stack([part(one, turn) for one, turn in zip(skin, rotation, strict=True)])
 
     @torch.no_grad()
     def _part(self, skin: Tensor, rotation: Tensor) -> Tensor:
@@ -118,20 +125,7 @@ class Collider:
             run("stations")
             run("crease")
             at = self._smooth(work.here, work.there, how.smooth_first)
-            work.points[:n] = at
-            run("caps")
-            work.low.fill_(torch.inf)
-            work.high.fill_(-torch.inf)
-            run("box")
-            run("meet")
-            for tree in self._trees:
-                tree.refit()
-            run("touch")
-            for _ in range(how.deepen_rounds):
-                work.counts[kernels.FOUND] = 0
-                run("deepen", kernels.NEAR)
-                if self._is_serial and not work.counts[kernels.FOUND]:
-                    break
+            self._touch(at)
             work.here.copy_(at)
             work.there.copy_(at)
             run("part", kernels.NEAR)
@@ -141,6 +135,27 @@ class Collider:
                 run(f"edge {which}", kernels.HOT)
                 run(f"follow {which}", kernels.ENDS)
         return at.clone()
+
+    def _touch(self, at: Tensor) -> None:
+        """Which segments each vertex has to give way to, for the points (V, 3) [m]."""
+        work, run = self._tensors, self._run
+        work.points[: len(at)] = at
+        run("caps")
+        work.low.fill_(torch.inf)
+        work.high.fill_(-torch.inf)
+        run("box")
+        run("meet")
+        run("near")
+        wanted = int(work.counts[kernels.WANTED]) if self._is_serial else -1
+        for k, tree in enumerate(self._trees):
+            if (wanted >> k) & 1:
+                tree.refit()
+        run("touch", kernels.NEAR)
+        for _ in range(self.settings.deepen_rounds):
+            work.counts[kernels.FOUND] = 0
+            run("deepen", kernels.NEAR)
+            if self._is_serial and not work.counts[kernels.FOUND]:
+                break
 
     def _smooth(self, source: Tensor, target: Tensor, sweeps: int) -> Tensor:
         self._run("share", kernels.MOVED)
@@ -177,7 +192,8 @@ class Collider:
         record("caps", kernels.mean_kernel, len(self._caps[-1]), [work.points, *self._caps])
         record("box", kernels.box_kernel, n, [work.points, segments.own, segments.low, segments.high])
         record("meet", kernels.meet_kernel, len(self._trees), [segments, how.gap, work.meets])
-        record("touch", kernels.touch_kernel, n, [work, segments, how.gap])
+        record("near", kernels.near_kernel, n, [work, segments])
+        record("touch", kernels.touch_kernel, n, [work, segments])
         record("deepen", kernels.deepen_kernel, n, [work, segments, rings])
         record("part", kernels.part_kernel, n, [work, segments, bones, rings, how.part_rounds])
         for which, moved in (("here", work.here), ("there", work.there)):
@@ -202,7 +218,9 @@ class Collider:
         bones.rotation, bones.between = as_warp(work.rotation, wp.mat33), as_warp(work.between, wp.mat33)
         bones.start = self._ints(np.searchsorted(vertex, np.arange(len(rest) + 1)))
         bones.joint, bones.weight = self._ints(joint), self._floats(weights[vertex, joint])
-        bones.normal = self._vectors(_smooth_normals(rest, mesh))
+        normals = _smooth_normals(rest, mesh)
+        bones.normal = self._vectors(normals)
+        self.normals, self.weights = torch.as_tensor(normals, device=self.device), torch.as_tensor(weights, device=self.device)
         self._chain = [self._ints([max(parent, 0) for parent in PARENTS]), self._floats(LEVELS)]
         return bones
 
@@ -215,7 +233,9 @@ class Collider:
         seams.start = self._ints([*first, len(found.vertex)])
         seams.rotation = self._ints(found.rotation)
         seams.normal = self._vectors(found.normal)
-        seams.least = self._floats(np.minimum(how.gap / 2, how.crease_share * found.height) - beyond)
+        least = np.minimum(how.gap / 2, how.crease_share * found.height) - beyond
+        seams.least = self._floats(least)
+        self.creases, self.least = found, torch.as_tensor(least, device=self.device)
         seams.stations = wp.array(found.stations, dtype=kernels.Stations, device=str(self.device))
         seams.weights = wp.array(found.weights.astype(np.float32), dtype=kernels.StationWeights, device=str(self.device))
         n_stations = len(found.station_start) - 1
@@ -257,8 +277,40 @@ class Collider:
         segments.gap = clearance
         wp.launch(kernels.clearance_kernel, (n, n_segments), [points, segments, clearance], device=device)
         segments.gap = self._floats(np.minimum(how.gap, how.segment_share * clearance.numpy()))
+        self.own, self.faces = torch.as_tensor(solids.of_vertex).long().to(self.device), torch.as_tensor(np.concatenate(solids.faces)).long().to(self.device)
+        self.kept, self.ratio = wp.to_torch(segments.gap), wp.to_torch(segments.ratio)
+        self.edges = torch.as_tensor(mesh.edges).long().to(self.device)
         self._work = work.bound()
         return segments
+
+    @torch.no_grad()
+    def touched(self, skin: Tensor) -> Tensor:
+        """Which segments each vertex of `skin` (V, 3) [m] has to give way to, bool, shape (V, K)."""
+        self._tensors.ints.zero_()
+        with torch_stream(self.device):
+            self._touch(skin.float())
+        bits = wp.to_torch(self._work.touched)
+        return ((bits[:, None] >> torch.arange(len(self._trees), device=bits.device)) & 1).bool()
+
+    @torch.no_grad()
+    def closest(self, points: Tensor, segment: Tensor) -> Closest:
+        """What points (N, 3) [m] are closest to of a segment each (N,), in the pose that `touched` was asked for."""
+        n = len(points)
+        face = torch.zeros(n, dtype=torch.int32, device=self.device)
+        weights, sign = torch.zeros(n, 3, device=self.device), torch.zeros(n, device=self.device)
+        inputs = [as_warp(points.float().contiguous(), wp.vec3), as_warp(segment.int(), wp.int32), self._segments]
+        outputs = [as_warp(face, wp.int32), as_warp(weights, wp.vec3), as_warp(sign, wp.float32)]
+        if n:
+            with torch_stream(self.device):
+                wp.launch(kernels.closest_kernel, n, inputs, outputs, device=str(self.device))
+        return Closest(face.long(), weights, sign)
+
+    def with_caps(self, skin: Tensor) -> Tensor:
+        """`skin` (V, 3) [m] and the middles of the caps after it. Differentiable."""
+        start, vertex, weight, _ = (wp.to_torch(one) for one in self._caps)
+        of_middle = torch.repeat_interleave(torch.arange(len(start) - 1, device=skin.device), start.long().diff())
+        middles = skin.new_zeros(len(start) - 1, 3)
+        return torch.cat((skin, middles.index_add(0, of_middle, skin[vertex.long()] * weight.to(skin)[:, None])))
 
     def _ints(self, values: ArrayLike) -> Any:
         return wp.array(np.ascontiguousarray(values, np.int32), dtype=wp.int32, device=str(self.device))
@@ -293,7 +345,7 @@ class _Tensors:
         work = kernels.Work()
         for name in ("skin", "points", "here", "there"):
             setattr(work, name, as_warp(getattr(self, name), wp.vec3))
-        for name in ("moved", "near", "ends", "touched", "outside"):
+        for name in ("moved", "near", "boxed", "ends", "touched", "outside"):
             setattr(work, name, wp.zeros(n, dtype=wp.int32, device=str(self._device)))
         work.share = wp.zeros(n, dtype=wp.float32, device=str(self._device))
         work.hot = wp.zeros(n_edges, dtype=wp.int32, device=str(self._device))

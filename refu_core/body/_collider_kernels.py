@@ -24,6 +24,7 @@ DEEPEST = wp.constant(0.1)
 # A ray along no axis of a mesh.
 _RAY = wp.constant(wp.vec3(0.5418, 0.6389, 0.5461))
 _LEAST_STEP = wp.constant(1e-5)
+_WITHIN = wp.constant(1e-4)
 
 
 @wp.struct
@@ -88,6 +89,8 @@ class Work:
     """Vertices in another segment's box."""
     hot: wp.array[int]
     """Edges with an end in `touched`."""
+    boxed: wp.array[int]
+    """Segments in whose boxes each of `near` is."""
     ends: wp.array[int]
     """Vertices of those edges."""
     is_moved: wp.array[int]
@@ -99,7 +102,8 @@ class Work:
     steps: wp.array[wp.vec3]
     """Of each edge."""
     counts: wp.array[int]
-    """How many are in `moved`, `near`, `hot` and `ends`, and how many vertices a round found inside."""
+    """How many are in `moved`, `near`, `hot` and `ends`, whether a round found a vertex that may be
+    inside, and the segments that are asked for distances."""
 
 
 MOVED = wp.constant(0)
@@ -107,7 +111,8 @@ NEAR = wp.constant(1)
 HOT = wp.constant(2)
 ENDS = wp.constant(3)
 FOUND = wp.constant(4)
-N_COUNTS = 5
+WANTED = wp.constant(5)
+N_COUNTS = 6
 
 
 @wp.struct
@@ -233,39 +238,63 @@ def meet_kernel(segments: Segments, gap: float, meets: wp.array[int]) -> None:
 
 @wp.func
 def distance_of(tree: wp.uint64, p: wp.vec3, hit: wp.MeshQueryPoint) -> float:
-    """Signed by how many faces a ray meets: caps have edges where a normal's sign is wrong."""
-    distance = wp.length(p - wp.mesh_eval_position(tree, hit.face, hit.u, hit.v))
+    """Signed by the face's normal where the closest point is within a face, else by how many faces a ray meets: at an
+    edge of a cap the sign of a normal is wrong."""
+    away = p - wp.mesh_eval_position(tree, hit.face, hit.u, hit.v)
+    distance = wp.length(away)
+    if wp.min(wp.min(hit.u, hit.v), 1.0 - hit.u - hit.v) > _WITHIN:
+        return wp.where(wp.dot(away, wp.mesh_eval_face_normal(tree, hit.face)) < 0.0, -distance, distance)
     if wp.mesh_query_ray_count_intersections(tree, p, _RAY) % 2 == 1:
         return -distance
     return distance
 
 
 @wp.kernel
-def touch_kernel(work: Work, segments: Segments, gap: float) -> None:
-    """Which segments each vertex is nearer to than it may be, of those whose surface is that near."""
+def near_kernel(work: Work, segments: Segments) -> None:
+    """Which vertices may touch which segments, by their boxes."""
     v = wp.tid()
     p = work.points[v]
-    mine = int(0)
-    seen = int(0)
-    is_near = int(0)
+    found = int(0)
     meets = work.meets[segments.own[v]]
     k = int(0)
     while meets != 0:
-        if meets & 1 == 1 and do_meet(p, p, segments.low[k], segments.high[k], gap):
+        if meets & 1 == 1:
             keeps = segments.gap[v, k]
-            is_near = 1
-            if keeps > 0.0:
-                hit = wp.mesh_query_point_no_sign(segments.trees[k], p, keeps)
-                if hit.result:
-                    mine |= 1 << k
-                    if distance_of(segments.trees[k], p, hit) > 0.0:
-                        seen |= 1 << k
+            if keeps > 0.0 and do_meet(p, p, segments.low[k], segments.high[k], keeps):
+                found |= 1 << k
         meets = meets >> 1
+        k += 1
+    work.touched[v] = 0
+    work.outside[v] = 0
+    if found != 0:
+        work.counts[WANTED] = work.counts[WANTED] | found
+        work.boxed[v] = found
+        work.near[wp.atomic_add(work.counts, NEAR, 1)] = v
+
+
+@wp.kernel
+def touch_kernel(work: Work, segments: Segments) -> None:
+    """Which segments each vertex is nearer to than it may be, of those whose surface is that near."""
+    i = wp.tid()
+    if i >= work.counts[NEAR]:
+        return
+    v = work.near[i]
+    p = work.points[v]
+    mine = int(0)
+    seen = int(0)
+    boxed = work.boxed[v]
+    k = int(0)
+    while boxed != 0:
+        if boxed & 1 == 1:
+            hit = wp.mesh_query_point_no_sign(segments.trees[k], p, segments.gap[v, k])
+            if hit.result:
+                mine |= 1 << k
+                if distance_of(segments.trees[k], p, hit) > 0.0:
+                    seen |= 1 << k
+        boxed = boxed >> 1
         k += 1
     work.touched[v] = mine
     work.outside[v] = seen
-    if is_near == 1:
-        work.near[wp.atomic_add(work.counts, NEAR, 1)] = v
 
 
 @wp.kernel
@@ -302,10 +331,18 @@ def normal_at(bones: Bones, v: int) -> wp.vec3:
 
 @wp.func
 def way_out(
-    p: wp.vec3, normal: wp.vec3, sunk: float, k: int, ratio: float, keeps: float, segments: Segments, bones: Bones
+    p: wp.vec3,
+    normal: wp.vec3,
+    sunk: float,
+    k: int,
+    ratio: float,
+    keeps: float,
+    farthest: float,
+    segments: Segments,
+    bones: Bones,
 ) -> wp.vec3:
-    """How p, with its skin's `normal` and `sunk` below its own skin [m], gives way to segment k."""
-    hit = wp.mesh_query_point_no_sign(segments.trees[k], p, DEEPEST)
+    """How p, with its skin's `normal` and `sunk` below its own skin [m], gives way to segment k, `farthest` [m] away."""
+    hit = wp.mesh_query_point_no_sign(segments.trees[k], p, farthest)
     if not hit.result:
         return wp.vec3()
     lacks = keeps - distance_of(segments.trees[k], p, hit) - ratio * sunk
@@ -333,6 +370,7 @@ def part_kernel(work: Work, segments: Segments, bones: Bones, rings: Rings, roun
     touched = work.touched[v]
     if touched == 0:
         return
+    outside = work.outside[v]
     start = work.points[v]
     p = start
     own = segments.own[v]
@@ -342,7 +380,8 @@ def part_kernel(work: Work, segments: Segments, bones: Bones, rings: Rings, roun
         sunk = wp.dot(start - p, normal)
         for k in range(segments.trees.shape[0]):
             if (touched >> k) & 1 == 1:
-                found = way_out(p, normal, sunk, k, segments.ratio[own, k], segments.gap[v, k], segments, bones)
+                far = wp.where((outside >> k) & 1 == 1, segments.gap[v, k] + sunk, DEEPEST)
+                found = way_out(p, normal, sunk, k, segments.ratio[own, k], segments.gap[v, k], far, segments, bones)
                 if wp.length_sq(found) > wp.length_sq(step):
                     step = found
         if wp.length_sq(step) == 0.0:
@@ -388,7 +427,7 @@ def edge_kernel(work: Work, moved: wp.array[wp.vec3], rings: Rings, segments: Se
             if (either >> k) & 1 == 1 and k != segments.own[v] and k != segments.own[w]:
                 keeps = wp.min(segments.gap[v, k], segments.gap[w, k])
                 ratio = segments.ratio[segments.own[v], k]
-                found = way_out(middle, normal, sunk, k, ratio, keeps, segments, bones)
+                found = way_out(middle, normal, sunk, k, ratio, keeps, DEEPEST, segments, bones)
                 if wp.length_sq(found) > wp.length_sq(step):
                     step = found
     work.steps[e] = step
@@ -408,6 +447,27 @@ def follow_kernel(work: Work, moved: wp.array[wp.vec3], rings: Rings) -> None:
             if wp.length_sq(found) > wp.length_sq(step):
                 step = found
     moved[v] += step
+
+
+@wp.kernel
+def closest_kernel(
+    points: wp.array[wp.vec3],
+    which: wp.array[int],
+    segments: Segments,
+    # outputs
+    face: wp.array[int],
+    corners: wp.array[wp.vec3],
+    sign: wp.array[float],
+) -> None:
+    """The closest face of segment `which`, the weights of its corners there, and on which side of it each point is."""
+    i = wp.tid()
+    k = which[i]
+    hit = wp.mesh_query_point_no_sign(segments.trees[k], points[i], DEEPEST)
+    face[i] = -1
+    if hit.result:
+        face[i] = segments.first_face[k] + hit.face
+        corners[i] = wp.vec3(hit.u, hit.v, 1.0 - hit.u - hit.v)
+        sign[i] = wp.sign(distance_of(segments.trees[k], points[i], hit))
 
 
 @wp.kernel
