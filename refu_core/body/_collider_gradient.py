@@ -1,4 +1,4 @@
-"""The collider in torch, with its derivative: what is closest to what is found by the kernels, all else computed anew."""
+"""The collider in torch, with its derivative: kernels find what is closest to what, all else is computed anew."""
 
 from __future__ import annotations
 
@@ -42,16 +42,18 @@ def part_with_gradient(collider: Collider, skin: Tensor, rotation: Tensor) -> Te
     p = _smooth(collider, skin, p, is_moved, how.smooth_first)
     points = collider.with_caps(p)
     touched = collider.touched(p)
-    normals = _unit(torch.einsum("vj,jab,vb->va", collider.weights.to(p), rotation, collider.normals.to(p)))
-    start, own = p, collider.own
+    normals = _unit(
+        torch.einsum("vj,jab,vb->va", collider.anatomy.weights.to(p), rotation, collider.anatomy.normals.to(p))
+    )
+    start, own = p, collider.anatomy.own
     vertex, segment = torch.nonzero(touched, as_tuple=True)
     for _ in range(how.part_rounds):
         sunk = ((start - p) * normals).sum(1)
-        ratio, keeps = collider.ratio[own[vertex], segment].to(p), collider.kept[vertex, segment].to(p)
+        ratio, keeps = collider.anatomy.ratio[own[vertex], segment].to(p), collider.anatomy.kept[vertex, segment].to(p)
         step = _ways_out(
             collider, points, normals, p[vertex], normals[vertex], sunk[vertex], segment, ratio=ratio, keeps=keeps
         )
-        step = _longest(step, vertex, len(p))
+        step = _together(step, vertex, len(p))
         is_moved = is_moved | (step.detach() != 0).any(1)
         p = p + step
     p = _smooth(collider, skin, p, is_moved, how.smooth_last)
@@ -81,7 +83,7 @@ def _between(rotation: Tensor) -> Tensor:
 
 
 def _crease_step(collider: Collider, skin: Tensor, p: Tensor, between: Tensor) -> Tensor:
-    seams = collider.creases
+    seams = collider.anatomy.creases
     n_stations = len(seams.station_start) - 1
     of_station = torch.repeat_interleave(torch.arange(n_stations), torch.as_tensor(seams.station_start).long().diff())
     weighted = skin[torch.as_tensor(seams.station_vertex).long()] * torch.as_tensor(seams.station_weight).to(p)[:, None]
@@ -91,8 +93,8 @@ def _crease_step(collider: Collider, skin: Tensor, p: Tensor, between: Tensor) -
     rotated = between[torch.as_tensor(seams.rotation).long()]
     normal = (rotated @ torch.as_tensor(seams.normal).to(p)[..., None])[..., 0]
     vertex = torch.as_tensor(seams.vertex).long().to(p.device)
-    lacks = collider.least.to(p) - ((p[vertex] - through) * normal).sum(1)
-    return _longest(lacks.clamp_min(0)[:, None] * normal, vertex, len(p))
+    lacks = collider.anatomy.least.to(p) - ((p[vertex] - through) * normal).sum(1)
+    return _together(lacks.clamp_min(0)[:, None] * normal, vertex, len(p))
 
 
 def _smooth(collider: Collider, skin: Tensor, p: Tensor, is_moved: Tensor, sweeps: int) -> Tensor:
@@ -101,8 +103,8 @@ def _smooth(collider: Collider, skin: Tensor, p: Tensor, is_moved: Tensor, sweep
     # Where nothing was moved the length's derivative has no direction.
     length = torch.where(is_moved, (away * away).sum(1), 1.0).sqrt()
     share = torch.where(is_moved, (length / how.smooth_full).clamp_max(1) * how.smooth_step, 0.0)[:, None]
-    start, ring = collider.mesh.ring
-    owner = torch.as_tensor(collider.mesh.ring.owner).to(p.device)
+    start, ring = collider.anatomy.mesh.ring
+    owner = torch.as_tensor(collider.anatomy.mesh.ring.owner).to(p.device)
     degree = torch.as_tensor(start).diff().to(p)[:, None]
     for _ in range(sweeps):
         mean = torch.zeros_like(p).index_add(0, owner, p[torch.as_tensor(ring).long()]) / degree
@@ -124,7 +126,7 @@ def _ways_out(
 ) -> Tensor:
     """How points (N, 3) [m] give way to a segment each, shape (N, 3); zeros where they needn't."""
     found = collider.closest(p, segment)
-    corners = collider.faces[found.face.clamp_min(0)]
+    corners = collider.anatomy.faces[found.face.clamp_min(0)]
     weights = _weights(p, points[corners], found.weights.to(p))
     away = p - (weights[..., None] * points[corners]).sum(1)
     squared = (away * away).sum(1)
@@ -142,36 +144,42 @@ def _ways_out(
 def _edge_step(
     collider: Collider, points: Tensor, normals: Tensor, start: Tensor, p: Tensor, touched: Tensor
 ) -> Tensor:
-    own = collider.own
-    v, w = collider.edges.T
+    own = collider.anatomy.own
+    v, w = collider.anatomy.edges.T
     gone = start - p
-    is_steep = (gone[v] - gone[w]).norm(dim=1) > collider.settings.steep
+    squared = ((gone[v] - gone[w]) ** 2).sum(1)
+    steep = collider.settings.steep
+    share = (torch.where(squared > steep**2, squared, 1.0).sqrt() / steep - 1).clamp_max(1)
+    is_steep = squared > steep**2
     either = (touched[v] | touched[w]) & is_steep[:, None]
     edge, segment = torch.nonzero(either, as_tuple=True)
     v, w = v[edge], w[edge]
     is_other = (segment != own[v]) & (segment != own[w])
     edge, segment, v, w = edge[is_other], segment[is_other], v[is_other], w[is_other]
     sunk = 0.5 * ((gone[v] * normals[v]).sum(1) + (gone[w] * normals[w]).sum(1))
-    keeps = torch.minimum(collider.kept[v, segment], collider.kept[w, segment]).to(p)
-    ratio = collider.ratio[own[v], segment].to(p)
+    keeps = torch.minimum(collider.anatomy.kept[v, segment], collider.anatomy.kept[w, segment]).to(p)
+    ratio = collider.anatomy.ratio[own[v], segment].to(p)
     normal = _unit(normals[v] + normals[w])
     middle = 0.5 * (p[v] + p[w])
     step = _ways_out(collider, points, normals, middle, normal, sunk, segment, ratio=ratio, keeps=keeps)
-    return _longest(torch.cat((step, step)), torch.cat((v, w)), len(p))
+    one_an_edge = _together(step, edge, len(collider.anatomy.edges)) * (share * is_steep)[:, None]
+    v, w = collider.anatomy.edges.T
+    return _together(torch.cat((one_an_edge, one_an_edge)), torch.cat((v, w)), len(p))
 
 
-def _longest(steps: Tensor, owner: Tensor, n: int) -> Tensor:
-    """Of the steps (N, 3) of each owner the longest one, shape (n, 3); zeros for who has none."""
-    length = (steps.detach() ** 2).sum(1)
-    order = torch.argsort(length, stable=True)
-    last = torch.full((n,), -1, dtype=torch.int64, device=steps.device)
-    last = last.scatter_reduce(0, owner[order], torch.arange(len(order), device=steps.device), "amax")
-    has = last >= 0
-    return steps.new_zeros(n, 3).index_put((torch.nonzero(has)[:, 0],), steps[order[last[has]]])
+def _together(steps: Tensor, owner: Tensor, n: int) -> Tensor:
+    """The steps (N, 3) of each owner as one, shape (n, 3): their mean by the square of their lengths.
+
+    With the longest one alone the way would leap to another side where two are equally long.
+    """
+    squared = (steps * steps).sum(1, keepdim=True)
+    total = steps.new_zeros(n, 1).index_add(0, owner, squared)
+    mean = steps.new_zeros(n, 3).index_add(0, owner, squared * steps)
+    return mean / torch.where(total > 0, total, 1.0)
 
 
 def _weights(p: Tensor, corners: Tensor, about: Tensor) -> Tensor:
-    """Weights of the triangle's corners at the closest point, shape (N, 3), on the corner, edge or face it is `about` on."""
+    """Weights of a triangle's corners at its point closest to p, shape (N, 3), which is on what it is `about` on."""
     a, b, c = corners.unbind(1)
     is_on = about > _ON
     ab, ac, ap = b - a, c - a, p - a
