@@ -193,7 +193,9 @@ def share_kernel(work: Work, full: float, step: float) -> None:
 
 
 @wp.kernel
-def smooth_kernel(work: Work, rings: Rings, source: wp.array[wp.vec3], target: wp.array[wp.vec3], farthest: float) -> None:
+def smooth_kernel(
+    work: Work, rings: Rings, source: wp.array[wp.vec3], target: wp.array[wp.vec3], farthest: float
+) -> None:
     """Levels what was moved."""
     i = wp.tid()
     if i < work.counts[MOVED]:
