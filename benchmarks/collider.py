@@ -139,8 +139,8 @@ def _page(report: dict[str, Any]) -> str:
     lines = [
         "# The collider: cost, and what its numbers do",
         "",
-        f"`python benchmarks/collider.py`, {report['frames']} frames of recorded motion, male body, mean shape. *Free*:",
-        "no intersection within 2 cm of a garment that the rest pose doesn't have. *Leap*: the farthest that skin moves",
+        f"`python benchmarks/collider.py`, {report['frames']} frames of recorded motion, male body. *Free*: no",
+        "intersection within 2 cm of a garment that the rest pose lacks. *Leap*: the farthest that skin moves",
         "from a frame at 60 Hz to the next, beyond 1.5 times what it moves without the collider.",
         "",
         f"Cost by the plain query of a T-shirt: {report['cost']['motion']:.3f} in motion, "
