@@ -28,6 +28,14 @@ class ContactSettings:
     looks: int = 3
     """How far a search goes from the rim of a patch of wrong closest faces into it [edges]."""
 
+    # Other limbs beside loose cloth
+    own_weight: float = 0.02
+    """A vertex lies on every limb that has more than this of its skinning weight: at the armpit, on trunk and arm."""
+    press_room: float = 0.006
+    """How far before a limb cloth stays, on the side of the skin it lies on; half way where there is less room [m]."""
+    press_pairs: int = 4
+    """Pairs of sweeps by which neighbours follow, as `blend_pairs`."""
+
     # Neighbours
     blend_reach: int = 2
     """How far the neighbourhood reaches that gives way with a pushed vertex [edges]. Farther out nothing collides, and

@@ -127,6 +127,8 @@ def as_on_a_gpu(pipeline: GarmentPipeline) -> FrameStep:
             contact.sdf._rebuild_distance = math.inf
         if isinstance(contact.sdf, ApproxSdf):
             contact.sdf._is_serial = False
+        for press in contact._press.values():
+            press._is_serial = False
         for resolver in contact.resolvers.values():
             resolver._is_serial = False
         for layers in contact._below.values():
