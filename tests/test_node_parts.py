@@ -516,3 +516,15 @@ def test_without_room_everything_stays_as_it_is(
 
     monkeypatch.setattr("shutil.disk_usage", usage)
     assert not make_room()
+
+
+@pytest.mark.parametrize("collider", [True, False])
+def test_the_collider_is_a_parameter_that_needs_another_pipeline(collider: bool) -> None:
+    plain = NodeSettings().changed({"garments": ["short-pant-male"], "backbone": "skinned", "sdf": "none"})
+    asked = plain.changed({"collider": collider})
+    assert plain.collider
+    assert (asked.pipeline == plain.pipeline) is collider
+    assert ("no collider" in str(asked.pipeline)) is not collider
+    assert (asked.pipeline.load().outfit.collider is not None) is collider
+    with pytest.raises(SettingsError, match="true or false"):
+        plain.changed({"collider": "yes"})

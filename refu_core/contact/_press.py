@@ -42,8 +42,8 @@ class Press:
         self._body = torch.zeros_like(body.v_template).copy_(body.v_template)
         mesh = Connectivity.of(garment.faces.cpu(), n)
         ring, self._ends = mesh.ring, np.ascontiguousarray(mesh.edges.T)
-        self._all = wp.array(np.arange(n, dtype=np.int32), dtype=wp.int32, device=device)
-        self._ring = [wp.array(one.astype(np.int32), dtype=wp.int32, device=device) for one in (ring.start, ring.items)]
+        self._rows = torch.arange(n, dtype=torch.int32, device=self.device)
+        rings = [wp.array(one.astype(np.int32), dtype=wp.int32, device=device) for one in (ring.start, ring.items)]
         self._meshes: list[Any] = []
         self._limbs: list[Any] = []
         for k in range(len(_LIMBS)):
@@ -59,6 +59,22 @@ class Press:
         self._skin, self._points, self._push = (torch.zeros(n, 3, device=self.device) for _ in range(3))
         self._fields = torch.zeros(2, n, 3, device=self.device)
         self._count = torch.zeros(1, dtype=torch.int32, device=self.device)
+        skin, points, push, *fields = (
+            as_warp(one, wp.vec3) for one in (self._skin, self._points, self._push, *self._fields)
+        )
+        count, rows = as_warp(self._count, wp.int32), as_warp(self._rows, wp.int32)
+        self._looks = [
+            self._command(
+                kernels.press_kernel, len(limb.foreign), [limb, skin, points, settings.press_room, push, count]
+            )
+            for limb in self._limbs
+        ]
+        self._sweeps = [
+            self._command(
+                kernels.spread_press_kernel, n, [rows, *rings, push, settings.blend_steps[k], fields[k], fields[1 - k]]
+            )
+            for k in range(2)
+        ]
 
     @torch.no_grad()
     def __call__(self, points: Tensor, skin: Tensor, body: Tensor) -> Tensor:
@@ -72,32 +88,30 @@ class Press:
         self._push.zero_()
         self._count.zero_()
         with torch_stream(self.device):
-            for mesh, limb in zip(self._meshes, self._limbs, strict=True):
+            for mesh, look in zip(self._meshes, self._looks, strict=True):
                 mesh.refit()
-                inputs = [limb, as_warp(self._skin, wp.vec3), as_warp(self._points, wp.vec3), self._settings.press_room]
-                outputs = [as_warp(self._push, wp.vec3), as_warp(self._count, wp.int32)]
-                wp.launch(kernels.press_kernel, len(limb.foreign), inputs, outputs, device=str(self.device))
-            if self._is_serial and not self._count:
-                return points
-            return points + self._spread(self._reached() if self._is_serial else self._all)
+                look.launch()
+            if self._is_serial:
+                if not self._count:
+                    return points
+                self._list_reached()
+            self._fields.zero_()
+            self._fields[0].copy_(self._push)
+            for sweep in range(2 * self._settings.press_pairs):
+                self._sweeps[sweep % 2].launch()
+        return points + self._fields[0]
 
-    def _reached(self) -> Any:
-        """What is pressed, and as far as sweeps reach; a GPU isn't waited for to know."""
+    def _list_reached(self) -> None:
+        """What is pressed, and as far as sweeps reach; a GPU isn't waited for to know, and goes through all."""
         first, second = self._ends
         reached = self._push.any(dim=1).numpy()
         for _ in range(2 * self._settings.press_pairs):
             beside = reached[first] | reached[second]
             reached[first[beside]] = reached[second[beside]] = True
-        return wp.array(np.flatnonzero(reached).astype(np.int32), dtype=wp.int32, device="cpu")
+        rows = np.flatnonzero(reached)
+        self._rows[: len(rows)] = torch.from_numpy(rows)
+        for sweep in self._sweeps:
+            sweep.set_dim(len(rows))
 
-    def _spread(self, rows: Any) -> Tensor:
-        """How far the vertices `rows` go, shape (N, 3): neighbours follow what is pressed."""
-        self._fields.zero_()
-        self._fields[0].copy_(self._push)
-        fields = [as_warp(one, wp.vec3) for one in self._fields]
-        for sweep in range(2 * self._settings.press_pairs):
-            step = self._settings.blend_steps[sweep % 2]
-            inputs = [rows, *self._ring, as_warp(self._push, wp.vec3), step, fields[sweep % 2]]
-            outputs = [fields[1 - sweep % 2]]
-            wp.launch(kernels.spread_press_kernel, len(rows), inputs, outputs, device=str(self.device))
-        return self._fields[0]
+    def _command(self, kernel: Any, dim: int, inputs: list[Any]) -> Any:
+        return wp.launch(kernel, dim, inputs, device=str(self.device), record_cmd=True)
