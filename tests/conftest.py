@@ -25,6 +25,35 @@ if importlib.util.find_spec("torch"):  # the adapters' tests run without it
     torch.set_num_threads(1)  # as the node runs; and the figures of two test runs agree to the bit
 
 
+LONGEST = (
+    "core/test_simulation.py",
+    "ros/test_node_recording.py",
+    "lab/test_evaluate.py",
+    "core/test_training_backbone.py",
+    "ros/test_node_lazy.py",
+    "core/test_stability.py",
+    "ros/test_node.py",
+    "ros/test_node_life.py",
+    "core/test_kernel_bounds.py",
+    "test_faults.py",
+)
+"""Files of tests, the one that takes longest first: begun last, one of them would keep a single process busy while all
+others have nothing left to do."""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """pytest-xdist begins with the files of most tests unless it is told otherwise."""
+    if hasattr(config.option, "loadscopereorder"):
+        config.option.loadscopereorder = False
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files that take long come first; the others, and the tests in each, stay in their order."""
+    tests = Path(__file__).parent
+    place = {tests / name: i for i, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get(item.path, len(place)))
+
+
 class Unable(pytest.Module):
     """A file of tests that isn't imported."""
 
