@@ -12,6 +12,7 @@ from refu_core import RefuError
 from refu_core._files import read_json
 from refu_core.metrics import MetricsSummary
 from refu_core.modes import DEFAULT_GARMENTS
+from refu_lab.body_contact import BodyContact
 from refu_lab.replay import ReplayOptions, replay
 from refu_lab.reproduction import METRICS, format_value, label_of
 from refu_lab.tables import format_table, write_json
@@ -26,7 +27,6 @@ _FRAMES = 30
 """Frames of a bag, at most."""
 _MODES = (("skinned", "accurate"), ("tailornet", "hybrid"))
 """(backbone, sdf) of the pipelines that are measured; what isn't trained is left out."""
-"""Worn in bags without ground truth."""
 
 
 class FigureKey(NamedTuple):
@@ -127,15 +127,17 @@ def quick_table(result: QuickResult) -> str:
 
 def _measure(bag: Path, *, progress: bool) -> Iterator[tuple[FigureKey, float]]:
     true = _true_garments(bag)
+    contact: BodyContact | None = None
     for backbone, sdf in _MODES:
         options = ReplayOptions(
             input=bag, garments=true or DEFAULT_GARMENTS, backbone=backbone, sdf=sdf, max_frames=_FRAMES
         )
         try:
-            options.load_pipeline()
+            pipeline = options.load_pipeline()
         except RefuError:  # no weights for one of the garments
             continue
-        result = replay(options, progress=progress)
+        contact = contact or BodyContact(pipeline.body)
+        result = replay(options, pipeline=pipeline, contact=contact, progress=progress)
         for garment in options.garments:
             yield from _rows(bag.stem, garment, backbone, result.before[garment])
             yield from _rows(bag.stem, garment, f"node, {backbone}, {sdf}", result.after[garment])

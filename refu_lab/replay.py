@@ -214,9 +214,11 @@ def _motion_records(motion: adapters.Motion, topic: str) -> Iterator[FrameRecord
 class Evaluator:
     """Exact metrics of every frame, before and after collision handling."""
 
-    def __init__(self, pipeline: GarmentPipeline, truth: GroundTruth | None = None) -> None:
+    def __init__(
+        self, pipeline: GarmentPipeline, truth: GroundTruth | None = None, contact: BodyContact | None = None
+    ) -> None:
         self._checker = CollisionChecker(pipeline.body.faces.cpu().numpy())
-        self._contact = BodyContact(pipeline.body)
+        self._contact = contact or BodyContact(pipeline.body)
         faces = {name: garment.faces.cpu().numpy() for name, garment in pipeline.garments.items()}
         self._faces = faces
         self.truth = truth or GroundTruth()
@@ -252,14 +254,21 @@ class Evaluator:
 class _Replayer:
     """The loop's parts, so that one frame is one call."""
 
-    def __init__(self, options: ReplayOptions, pipeline: GarmentPipeline, source: Source, result: ReplayResult) -> None:
+    def __init__(
+        self,
+        options: ReplayOptions,
+        pipeline: GarmentPipeline,
+        source: Source,
+        result: ReplayResult,
+        contact: BodyContact | None,
+    ) -> None:
         self._options = options
         self._pipeline = pipeline
         self._source = source
         self._result = result
         faces = {name: garment.faces.cpu().numpy() for name, garment in pipeline.garments.items()}
         truth = GroundTruth.of_bag(options.input, faces, axes=options.input_axes) if source.bag is not None else None
-        self._evaluator = Evaluator(pipeline, truth)
+        self._evaluator = Evaluator(pipeline, truth, contact)
         self._betas = None if options.betas is None else np.asarray(options.betas, np.float32)
         meshes = [
             adapters.MarkerMesh(
@@ -319,23 +328,35 @@ class _Replayer:
 
 
 @one_thread()
-def replay(options: ReplayOptions, *, progress: bool = False) -> ReplayResult:
+def replay(
+    options: ReplayOptions,
+    *,
+    pipeline: GarmentPipeline | None = None,
+    contact: BodyContact | None = None,
+    progress: bool = False,
+) -> ReplayResult:
     """Runs every frame of the input through the pipeline, writes the output bag, measures.
 
     An interrupt (Ctrl-C) ends the replay early: the bag is closed and the result so far is returned.
+
+    Args:
+        options: What to replay and how.
+        pipeline: That of the options, where it is loaded already.
+        contact: Of the pipeline's body: whoever replays the same motion again gives the same one.
+        progress: Show a bar.
 
     Raises:
         RefuError: a bad input file, an unknown garment, an output that can't be written, or no frame that could be
             replayed.
     """
-    pipeline = options.load_pipeline()
+    pipeline = pipeline or options.load_pipeline()
     pipeline(
         SmplFrame(pose=np.zeros((24, 3), np.float32))
     )  # compiles kernels, so that the first frame's latency is a frame's
     with ExitStack() as stack:
         source = stack.enter_context(open_source(options))
         result = ReplayResult(options, source.description)
-        replayer = _Replayer(options, pipeline, source, result)
+        replayer = _Replayer(options, pipeline, source, result, contact)
         writer = replayer.open_writer()
         if writer is not None:
             stack.enter_context(writer)
