@@ -5,15 +5,16 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from refu_core.backbones import Backbone
-from refu_core.body import Shape, SmplBody
+from refu_core.body import Collider, Shape, SmplBody
 from refu_core.frames import N_STYLES
-from refu_core.garments import GarmentTemplate
+from refu_core.garments import GarmentTemplate, SkinBelow
 from refu_core.refu import Refu
 
 
@@ -36,10 +37,19 @@ class Outfit:
     body: SmplBody
     wearables: Mapping[str, Wearable]
     """By name."""
+    collider: Collider | None = None
+    """What of the posed body garments are brought off; None for the posed body as it is, which runs through itself."""
+
+    @cached_property
+    def below(self) -> Mapping[str, SkinBelow]:
+        """The skin that each garment lies on, by name."""
+        return {name: SkinBelow.of(one.template, self.body) for name, one in self.wearables.items()}
 
     def to(self, dtype: torch.dtype) -> Outfit:
         """The same in another precision; nothing is shared."""
-        return Outfit(self.body.to(dtype=dtype), {name: _cast(one, dtype) for name, one in self.wearables.items()})
+        body = self.body.to(dtype=dtype)
+        collider = None if self.collider is None else Collider(body, gap=self.collider.gap)
+        return Outfit(body, {name: _cast(one, dtype) for name, one in self.wearables.items()}, collider)
 
 
 class UnposedGarment(NamedTuple):

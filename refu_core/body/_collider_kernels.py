@@ -1,0 +1,207 @@
+"""What pulls a posed body apart when no derivative is asked for: memory, creases and levelling, a vertex a thread.
+
+Segments are told apart by the bits of an integer. `touched` has the segments that a vertex has to give way to.
+"""
+
+from typing import TYPE_CHECKING
+
+import warp as wp
+
+from refu_core import _warp  # noqa: F401  (quiets Warp before it starts)
+
+wp.set_module_options({"enable_backward": False})
+
+N_STATIONS = 6
+if TYPE_CHECKING:
+    Stations = wp.Vector[int]
+    StationWeights = wp.Vector[float]
+else:
+    Stations = wp.types.vector(length=N_STATIONS, dtype=wp.int32)
+    StationWeights = wp.types.vector(length=N_STATIONS, dtype=wp.float32)
+
+
+@wp.struct
+class Bones:
+    """A posed body's joints, and how skin hangs on them."""
+
+    rotation: wp.array[wp.mat33]
+    """Of each joint."""
+    between: wp.array[wp.mat33]
+    """Of each joint's seams, between the parent's rotation and the joint's."""
+    start: wp.array[int]
+    joint: wp.array[int]
+    weight: wp.array[float]
+    normal: wp.array[wp.vec3]
+    """Of the skin in the rest pose, smoothed."""
+
+
+@wp.struct
+class Seams:
+    """The rows of `Creases`, those of the i-th vertex that has any from `start[i]` on."""
+
+    start: wp.array[int]
+    rotation: wp.array[int]
+    normal: wp.array[wp.vec3]
+    least: wp.array[float]
+    """Height over the plane that skin keeps [m]."""
+    stations: wp.array[Stations]
+    weights: wp.array[StationWeights]
+
+
+@wp.struct
+class Work:
+    """Memory that a call works in; lists are as long as `counts` says."""
+
+    skin: wp.array[wp.vec3]
+    points: wp.array[wp.vec3]
+    """Skin without creases, then the middles of caps."""
+    here: wp.array[wp.vec3]
+    there: wp.array[wp.vec3]
+    """What sweeps go to and fro between."""
+    share: wp.array[float]
+    """How much of a sweep each vertex of `moved` takes."""
+    moved: wp.array[int]
+    near: wp.array[int]
+    """Vertices in another segment's box."""
+    hot: wp.array[int]
+    """Edges with an end in `touched`."""
+    boxed: wp.array[int]
+    """Segments in whose boxes each of `near` is."""
+    ends: wp.array[int]
+    """Vertices of those edges."""
+    is_moved: wp.array[int]
+    is_end: wp.array[int]
+    touched: wp.array[int]
+    outside: wp.array[int]
+    meets: wp.array[int]
+    """Segments whose boxes meet that of each segment."""
+    steps: wp.array[wp.vec3]
+    """Of each edge."""
+    counts: wp.array[int]
+    """How many are in `moved`, `near`, `hot` and `ends`, whether a round found a vertex that may be
+    inside, and the segments that are asked for distances."""
+
+
+MOVED = wp.constant(0)
+NEAR = wp.constant(1)
+HOT = wp.constant(2)
+ENDS = wp.constant(3)
+FOUND = wp.constant(4)
+WANTED = wp.constant(5)
+N_COUNTS = 6
+
+
+@wp.struct
+class Rings:
+    """What is around each vertex: vertices, and edges with their ends."""
+
+    start: wp.array[int]
+    vertex: wp.array[int]
+    edge: wp.array[int]
+    """The edge to each of them."""
+    ends: wp.array[wp.vec2i]
+
+
+@wp.kernel
+def between_kernel(
+    rotation: wp.array[wp.mat33], parent: wp.array[int], levels: wp.array[float], between: wp.array[wp.mat33]
+) -> None:
+    """The rotations on the way from each joint's parent to the joint, one a seam."""
+    j = wp.tid()
+    above = rotation[parent[j]]
+    turn = wp.transpose(above) @ rotation[j]
+    w = 0.5 * wp.sqrt(wp.max(1.0 + wp.trace(turn), 1.0e-6))
+    axis = wp.vec3(turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]) / (4.0 * w)
+    for i in range(levels.shape[0]):
+        t = levels[i]
+        q = wp.normalize(wp.quat(t * axis[0], t * axis[1], t * axis[2], t * w + 1.0 - t))
+        between[j * levels.shape[0] + i] = above @ wp.quat_to_matrix(q)
+
+
+@wp.kernel
+def mean_kernel(
+    points: wp.array[wp.vec3],
+    start: wp.array[int],
+    vertex: wp.array[int],
+    weight: wp.array[float],
+    mean: wp.array[wp.vec3],
+) -> None:
+    i = wp.tid()
+    total = wp.vec3()
+    for k in range(start[i], start[i + 1]):
+        total += weight[k] * points[vertex[k]]
+    mean[i] = total
+
+
+@wp.func
+def within(p: wp.vec3, skin: wp.vec3, farthest: float) -> wp.vec3:
+    """p, or what is `farthest` [m] from the skin on the way to it."""
+    away = wp.length(p - skin)
+    if away > farthest:
+        return skin + farthest / away * (p - skin)
+    return p
+
+
+@wp.kernel
+def crease_kernel(
+    work: Work,
+    held: wp.array[int],
+    stations: wp.array[wp.vec3],
+    bones: Bones,
+    seams: Seams,
+    rounds: int,
+    farthest: float,
+) -> None:
+    """Brings skin back to its own side of the seams near by, most of all of those that it is far beyond."""
+    i = wp.tid()
+    v = held[i]
+    p = work.skin[v]
+    is_held = int(0)
+    for _ in range(rounds):
+        total = float(0.0)
+        step = wp.vec3()
+        for r in range(seams.start[i], seams.start[i + 1]):
+            through = wp.vec3()
+            which = seams.stations[r]
+            weights = seams.weights[r]
+            for k in range(wp.static(N_STATIONS)):
+                through += weights[k] * stations[which[k]]
+            normal = bones.between[seams.rotation[r]] @ seams.normal[r]
+            lacks = seams.least[r] - wp.dot(p - through, normal)
+            if lacks > 0.0:
+                step += lacks * lacks * lacks * normal
+                total += lacks * lacks
+        if total == 0.0:
+            break
+        p += step / total
+        is_held = 1
+    if is_held == 1:
+        p = within(p, work.skin[v], farthest)
+        work.here[v] = p
+        work.there[v] = p
+        work.is_moved[v] = 1
+        work.moved[wp.atomic_add(work.counts, MOVED, 1)] = v
+
+
+@wp.kernel
+def share_kernel(work: Work, full: float, step: float) -> None:
+    """How much of a sweep a vertex takes: all of `step` where it was moved by `full` [m] or farther."""
+    i = wp.tid()
+    if i < work.counts[MOVED]:
+        v = work.moved[i]
+        work.share[v] = wp.min(wp.length(work.here[v] - work.skin[v]) / full, 1.0) * step
+
+
+@wp.kernel
+def smooth_kernel(
+    work: Work, rings: Rings, source: wp.array[wp.vec3], target: wp.array[wp.vec3], farthest: float
+) -> None:
+    """Levels what was moved."""
+    i = wp.tid()
+    if i < work.counts[MOVED]:
+        v = work.moved[i]
+        total = wp.vec3()
+        for k in range(rings.start[v], rings.start[v + 1]):
+            total += source[rings.vertex[k]]
+        mean = total / float(rings.start[v + 1] - rings.start[v])
+        target[v] = within(source[v] + work.share[v] * (mean - source[v]), work.skin[v], farthest)
