@@ -1,5 +1,6 @@
 """SMPL-layout body models: linear blend skinning, loaders, and the built-in CC0 bodies."""
 
+from refu_core.body._collider import DEFAULT_GAP, Collider
 from refu_core.body._io import BUILTIN_BODIES, load_body
 from refu_core.body._kinematics import (
     JOINT_NAMES,
@@ -15,12 +16,14 @@ from refu_core.body._skinning import Skinning, apply_transforms, blend_transform
 __all__ = [
     "ARMS",
     "BUILTIN_BODIES",
+    "DEFAULT_GAP",
     "JOINT_NAMES",
     "LEGS",
     "MIRRORED_JOINTS",
     "PARENTS",
     "SEGMENTS",
     "BodyOutput",
+    "Collider",
     "RigidTransforms",
     "Shape",
     "Skinning",

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from refu_core.simulation._cloth import F32
     from refu_core.simulation._drape import SettledDrape
 
-CAUSES = ("no_room", "body_collision", "self_intersection", "stretch", "unsettled")
-"""Why a sample isn't taken, in the order of the checks; `no_room` is decided before anything is simulated."""
+CAUSES = ("body_collision", "self_intersection", "stretch", "unsettled")
+"""Why a sample isn't taken, in the order of the checks."""
 
 
 class SelfIntersection:
@@ -71,7 +71,7 @@ class Selector:
 
         Args:
             vertices: the garment as it will be read back [m], shape (N, 3).
-            body: the body's vertices [m], shape (V, 3).
+            body: the vertices of what it lies on [m], shape (V, 3).
             drape: how it settled; without it only collisions are looked for.
         """
         self._body.update(body)

@@ -64,15 +64,15 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "clip": np.full(n, -1, np.int32),
         "frame": np.full(n, -1, np.int32),
         "split": (np.arange(n) % 2).astype(np.uint8),
-        "dropped": np.zeros((n, 5), np.uint8),
-        **{name: np.ones(n, np.float32) for name in ("share", "stretch", "speed", "seconds")},
+        "dropped": np.zeros((n, 4), np.uint8),
+        **{name: np.ones(n, np.float32) for name in ("stretch", "speed", "seconds")},
     }
     for name, values in columns.items():
         np.save(shard / f"{name}.npy", values)
     np.save(path / "unseen.npy", np.where(np.arange(n) % 2, 1.5, np.nan).astype(np.float32))
     body = load_body("male")
     card = {
-        "format": "refu-garments-1",
+        "format": "refu-garments-2",
         "garment": GARMENT,
         "body": "male",
         "body_fingerprint": body.fingerprint,
