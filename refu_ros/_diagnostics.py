@@ -167,6 +167,7 @@ def _output(
         "penetrating vertices found": str(found),
         "penetrating vertices resolved": str(max(found - unresolved, 0)),
         "penetrating vertices unresolved": str(unresolved),
+        "skin moved by the collider, at most [mm]": f"{1e3 * report.largest_shift:.1f}",
         "frames beyond the promised poses and shapes": str(report.total["beyond_promise"]),
     }
     if in_use is not None:
@@ -176,6 +177,7 @@ def _output(
             "sdf": in_use.sdf,
             "weights": in_use.weights or "those that ship",
             "device": in_use.device,
+            "collider": "yes" if in_use.collider else "no",
         }
         if in_use != settings.pipeline:
             values["asked for"] = str(settings.pipeline)

@@ -57,10 +57,12 @@ class PipelineKey:
     backbone: str
     weights: str
     device: str
+    collider: bool
 
     def __str__(self) -> str:
         weights = f", weights {self.weights}" if self.weights else ""
-        return f"{', '.join(self.garments)} ({self.backbone}, {self.sdf}, {self.device}{weights})"
+        raw = "" if self.collider else ", no collider"
+        return f"{', '.join(self.garments)} ({self.backbone}, {self.sdf}, {self.device}{weights}{raw})"
 
     def check(self) -> None:
         """Raises `RefuError` for what can't be loaded, as far as that shows without loading it."""
@@ -83,6 +85,7 @@ class PipelineKey:
             backbone=self.backbone,
             weights=self.weights or None,
             device=self.device,
+            collider=self.collider,
         )
         pipeline(SmplFrame(np.zeros((N_JOINTS, 3), np.float32)))
         return pipeline
@@ -104,6 +107,9 @@ class NodeSettings:
     )
     sdf: str = _parameter("hybrid", "How collisions are found.", choices=tuple(SdfMode))
     margin: float = _parameter(DEFAULT_MARGIN, "Clearance that is kept from the skin [m].", low=0.0, high=MAX_MARGIN)
+    collider: bool = _parameter(
+        True, "Bring garments off a body whose overlaps are pulled apart, which topic body shows; else off the raw one."
+    )
     device: str = _parameter("cpu", "Torch device: cpu or cuda.")
     on_device_loss: str = _parameter(
         "cpu", "When the device fails: go on on the cpu, with an ERROR, or stop the node.", choices=("cpu", "stop")
@@ -213,7 +219,12 @@ class NodeSettings:
     def pipeline(self) -> PipelineKey:
         """What the pipeline depends on."""
         return PipelineKey(
-            garments=self.garments, sdf=self.sdf, backbone=self.backbone, weights=self.weights, device=self.device
+            garments=self.garments,
+            sdf=self.sdf,
+            backbone=self.backbone,
+            weights=self.weights,
+            device=self.device,
+            collider=self.collider,
         )
 
     @property

@@ -29,6 +29,8 @@ class Report:
     """Time since the last report."""
     latency_ms: tuple[float, float, float]
     """p50, p95, p99 of the last frames, from receipt to publish."""
+    largest_shift: float
+    """How far the collider left the skin at most, since the last report [m]."""
     last_error: str
     silent_for: float | None
     """Since the last input of anybody [s]; None if there was none."""
@@ -58,6 +60,7 @@ class Statistics:
         self._reported: Counter[str] = Counter()
         self._reported_at = clock()
         self._received_at: float | None = None
+        self._largest_shift = 0.0
         self._latencies: deque[float] = deque(maxlen=_WINDOW)
         self._reasons: dict[str, str] = {}
         self._error = ""
@@ -96,6 +99,11 @@ class Statistics:
         with self._lock:
             self._total[f"skip.{kind}"] += 1
 
+    def shift(self, largest: float) -> None:
+        """In a frame the collider left the skin by so much [m]."""
+        with self._lock:
+            self._largest_shift = max(self._largest_shift, largest)
+
     def publish(self, latencies_ms: list[float], *, found: int, unresolved: int) -> None:
         """A message went out with the frames of so many persons."""
         with self._lock:
@@ -117,12 +125,14 @@ class Statistics:
             recent = self._total - self._reported
             seconds, self._reported_at = now - self._reported_at, now
             self._reported = self._total.copy()
+            largest_shift, self._largest_shift = self._largest_shift, 0.0
             p50, p95, p99 = np.percentile(self._latencies, (50, 95, 99)) if self._latencies else (0.0, 0.0, 0.0)
             return Report(
                 total=self._total.copy(),
                 recent=recent,
                 seconds=seconds,
                 latency_ms=(float(p50), float(p95), float(p99)),
+                largest_shift=largest_shift,
                 last_error=self._error,
                 silent_for=None if self._received_at is None else now - self._received_at,
                 reasons=dict(self._reasons),

@@ -172,6 +172,7 @@ class Worker:
             self._dressed[person] = _Dressed(_inputs(todo[person]), output)
             found += sum(stats.n_inside for stats in output.stats.garments.values())
             unresolved += sum(stats.n_unresolved for stats in output.stats.garments.values())
+            self._statistics.shift(output.stats.shift.largest)
             if not output.stats.within_promise:
                 self._statistics.beyond_promise()
         return found, unresolved

@@ -438,6 +438,11 @@ def test_levels_mean_something(tmp_path: Path) -> None:
     fine = report_of(statistics)
     assert [fine[part].level for part in ("input", "garments", "recording")] == [0, 0, 0]
     assert fine["garments"].values["penetrating vertices resolved"] == "3"
+    for largest in (0.001, 0.0123, 0.002):
+        statistics.shift(largest)
+    shift = "skin moved by the collider, at most [mm]"
+    assert report_of(statistics)["garments"].values[shift] == "12.3"
+    assert report_of(statistics)["garments"].values[shift] == "0.0", "since the last report"
     statistics.receive()
     statistics.drop("invalid", "no pose in it")
     only_bad = report_of(statistics)["input"]

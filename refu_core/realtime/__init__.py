@@ -2,7 +2,7 @@
 
 from refu_core.realtime._contact import ContactStage
 from refu_core.realtime._dress import Drape, Dressed, dress
-from refu_core.realtime._outputs import SKIPS, FrameStats, GarmentMesh, GarmentStats, PipelineOutput
+from refu_core.realtime._outputs import SKIPS, FrameStats, GarmentMesh, GarmentStats, PipelineOutput, SkinShift
 from refu_core.realtime._pipeline import GarmentPipeline
 from refu_core.realtime._promise import PROMISED_POSES, PROMISED_SIZE, within_promise
 from refu_core.realtime._wearer import Outfit, Wearable, Wearer
@@ -20,6 +20,7 @@ __all__ = [
     "GarmentStats",
     "Outfit",
     "PipelineOutput",
+    "SkinShift",
     "Wearable",
     "Wearer",
     "dress",

@@ -38,7 +38,9 @@ class Dressed(NamedTuple):
     """A batch of bodies and what they wear, as the root sees them (`RootTurn`)."""
 
     body: Tensor
-    """[m], shape (B, V, 3)."""
+    """The collider: `skin` with its overlaps pulled apart; the same where the outfit has none [m], shape (B, V, 3)."""
+    skin: Tensor
+    """The posed body, which runs through itself where limbs meet [m], shape (B, V, 3)."""
     drapes: Mapping[str, Drape]
     turns: list[RootTurn]
     """Bring each person to the world's axes."""
@@ -53,11 +55,15 @@ def dress(pose: Tensor, wearer: Wearer, *, lap: Lap = _no_lap) -> Dressed:
     turns, at_root = RootTurn.taken_off(pose, wearer.shape.joints)
     posed = wearer.outfit.body.posed(at_root, wearer.shape)
     lap("body", None)
+    body, collider = posed.vertices, wearer.outfit.collider
+    if collider is not None:
+        body = collider(posed.vertices, posed.transforms)
+        lap("collider", None)
     drapes = {}
     for name, garment in wearer.garments.items():
         drapes[name] = _drape(pose, wearer, wearer.outfit.wearables[name], garment, posed.transforms)
         lap("backbone", name)
-    return Dressed(posed.vertices, drapes, turns)
+    return Dressed(body, posed.vertices, drapes, turns)
 
 
 def scale_of(wearable: Wearable, drape: Drape, person: int) -> float | VertexScale:

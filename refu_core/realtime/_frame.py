@@ -13,12 +13,16 @@ from torch import Tensor
 
 from refu_core.errors import MeshError
 from refu_core.realtime._contact import N_NUMBERS, ContactStage, Worn
-from refu_core.realtime._dress import dress, scale_of
+from refu_core.realtime._dress import Dressed, dress, scale_of
 from refu_core.realtime._turn import RootTurn
 from refu_core.realtime._wearer import Outfit, Wearer
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+N_SHIFT = 3
+_MOVED = 1e-4
+"""Skin that was moved by more than this counts as moved [m]."""
 
 
 class Person(NamedTuple):
@@ -27,7 +31,11 @@ class Person(NamedTuple):
     turn: RootTurn
     """To the world's axes."""
     body: Tensor
-    """As the root sees it [m], shape (V, 3)."""
+    """The collider as the root sees it [m], shape (V, 3)."""
+    skin: Tensor
+    """The posed body before its overlaps were pulled apart [m], shape (V, 3)."""
+    shift: Tensor
+    """`n_moved`, `largest` and `mean` of a `SkinShift`, shape (3,)."""
     garments: Mapping[str, Worn]
 
 
@@ -65,7 +73,7 @@ class FrameStep:
         """Without `contact` nothing is done about collisions."""
         self._outfit, self.contact = outfit, contact
         self._order = list(outfit.wearables) if contact is None else contact.order
-        sizes = [outfit.body.n_vertices * 3]
+        sizes = [outfit.body.n_vertices * 3] * 2 + [N_SHIFT]
         for one in outfit.wearables.values():
             sizes += [one.template.n_vertices * 3] * 2 + [N_NUMBERS]
         self._ends = np.cumsum([0, *sizes]).tolist()
@@ -82,7 +90,8 @@ class FrameStep:
         dressed = dress(pose, wearer, lap=shared.lap)
         margin_of = dict(zip(self._outfit.wearables, margins, strict=True))
         persons = []
-        for person, (body, turn) in enumerate(zip(dressed.body, dressed.turns, strict=True)):
+        shifts = _shift(dressed)
+        for person, (body, skin, turn) in enumerate(zip(dressed.body, dressed.skin, dressed.turns, strict=True)):
             clock = clocks[person] if clocks else StageClock()
             clock.start(shared, share=1 / len(pose))
             if self.contact is not None:
@@ -107,14 +116,14 @@ class FrameStep:
                     )
                 garments[name] = Worn(vertices, raw, numbers, n_clipped)
                 clock.lap("refu", name)
-            persons.append(Person(turn, body, garments))
+            persons.append(Person(turn, body, skin, shifts[person], garments))
         return persons
 
     def packed(self, inputs: Mapping[str, Tensor], margins: tuple[float, ...]) -> Tensor:
         """The same of `pose` and a wearer's tensors: all results in one tensor (B, …), which `unpacked` reads."""
         rows = []
         for person in self(inputs["pose"], Wearer.of_tensors(self._outfit, inputs), margins):
-            parts = [person.turn(person.body)]
+            parts = [person.turn(person.body), person.turn(person.skin), person.shift]
             for name in self._outfit.wearables:
                 worn = person.garments[name]
                 parts += [person.turn(worn.vertices), person.turn(worn.raw), worn.numbers]
@@ -122,7 +131,7 @@ class FrameStep:
         return torch.stack(rows)
 
     def unpacked(self, packed: NDArray[np.float32]) -> Iterator[list[NDArray[np.float32]]]:
-        """Of each person the body, then each garment's vertices, the same before collisions, and its numbers.
+        """Of each person the collider, the skin, the shift, then of each garment its vertices, raw ones and numbers.
 
         Vertices are [m], shape (V, 3), in the world's axes; nothing is copied.
 
@@ -135,4 +144,10 @@ class FrameStep:
             raise MeshError(msg)
         for row in packed:
             parts = [row[start:end] for start, end in pairwise(self._ends)]
-            yield [part if len(part) == N_NUMBERS else part.reshape(-1, 3) for part in parts]
+            yield [part if len(part) in (N_SHIFT, N_NUMBERS) else part.reshape(-1, 3) for part in parts]
+
+
+def _shift(dressed: Dressed) -> Tensor:
+    """The numbers of each person's `SkinShift`, shape (B, 3)."""
+    way = torch.linalg.vector_norm(dressed.body - dressed.skin, dim=-1)
+    return torch.stack(((way > _MOVED).sum(1).to(way), way.amax(1), way.mean(1)), 1)

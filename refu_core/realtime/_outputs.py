@@ -19,6 +19,24 @@ SKIPS: Mapping[str, str] = {
 
 
 @dataclass(frozen=True)
+class SkinShift:
+    """How far the collider has left the skin, to be free of itself: where nothing overlaps, nothing has moved."""
+
+    n_moved: int = 0
+    """Vertices of the body that were moved by more than 0.1 mm."""
+    largest: float = 0.0
+    """The longest way of any vertex [m]."""
+    mean: float = 0.0
+    """The mean of all vertices' ways, those that stayed among them [m]."""
+
+    @classmethod
+    def of(cls, numbers: Sequence[float]) -> SkinShift:
+        """Of the three, in this order."""
+        n_moved, largest, mean = numbers
+        return cls(int(n_moved), float(largest), float(mean))
+
+
+@dataclass(frozen=True)
 class GarmentStats:
     """What collision handling found and did for one garment in one frame."""
 
@@ -48,8 +66,8 @@ class FrameStats:
     """How long the stages of one frame took, and what they did."""
 
     stage_ms: Mapping[str, float]
-    """Wall time of each stage, all garments together [ms]: body, backbone, sdf (new pose), refu (distances, pushes),
-    and layers where garments are worn over each other; on CUDA, where a graph makes one of them, step."""
+    """Wall time of each stage, all garments together [ms]: body, collider, backbone, sdf (new pose), refu (distances,
+    pushes), and layers where garments are worn over each other; on CUDA, where a graph makes one of them, step."""
     garments: Mapping[str, GarmentStats] = field(default_factory=dict)
     is_certified: bool = False
     """Whether `n_unresolved` counts every vertex inside, whatever the frame."""
@@ -57,6 +75,8 @@ class FrameStats:
     """Whether joints and β are within the range that "nothing inside" is promised for (docs/reliability.md)."""
     skipped: Mapping[str, int] = field(default_factory=dict)
     """How much of what `SKIPS` names was left out: vertices, networks, meshes and persons."""
+    shift: SkinShift = field(default_factory=SkinShift)
+    """How far the collider is from the skin; zeros without one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,12 +110,20 @@ class PipelineOutput(Mapping[str, GarmentMesh]):
     garments: Mapping[str, GarmentMesh]
     posed_body: Callable[[], NDArray[np.float32]]
     """Makes `body` when it is asked for."""
+    posed_skin: Callable[[], NDArray[np.float32]]
+    """Makes `skin` when it is asked for."""
     stats: FrameStats
 
     @property
     def body(self) -> NDArray[np.float32]:
-        """Vertices of the posed body without the translation, SMPL axes [m], shape (V, 3)."""
+        """The collider, which garments were brought off: the skin with its overlaps pulled apart, the skin itself with
+        `collider=False`. Vertices without the translation, SMPL axes [m], shape (V, 3)."""
         return self.posed_body()
+
+    @property
+    def skin(self) -> NDArray[np.float32]:
+        """Vertices of the posed body without the translation, SMPL axes [m], shape (V, 3)."""
+        return self.posed_skin()
 
     def __getitem__(self, name: str) -> GarmentMesh:
         return self.garments[name]

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from refu_core._device import checked_device
-from refu_core.body import SmplBody, load_body
+from refu_core.body import Collider, SmplBody, load_body
 from refu_core.errors import FrameError, GarmentError, RefuError, require_type
 from refu_core.frames import SmplFrame
 from refu_core.garments import N_STYLES, GarmentTemplate, load_garment
@@ -25,7 +25,7 @@ from refu_core.modes import DEFAULT_MARGIN, MAX_MARGIN, SdfMode
 from refu_core.realtime._contact import ContactStage
 from refu_core.realtime._frame import FrameStep, StageClock
 from refu_core.realtime._graph import StepGraphs
-from refu_core.realtime._outputs import SKIPS, FrameStats, GarmentMesh, GarmentStats, PipelineOutput
+from refu_core.realtime._outputs import SKIPS, FrameStats, GarmentMesh, GarmentStats, PipelineOutput, SkinShift
 from refu_core.realtime._promise import within_promise
 from refu_core.realtime._wearer import Outfit, Wearable, Wearer
 from refu_core.refu import load_trained
@@ -122,6 +122,7 @@ class GarmentPipeline:
         no_skip: Collection[str] = (),
         graph: bool = True,
         certify: bool = True,
+        collider: bool = True,
     ) -> GarmentPipeline:
         """Loads garments and what they need.
 
@@ -137,6 +138,8 @@ class GarmentPipeline:
             graph: on CUDA, capture the whole of a frame as a CUDA graph; without, it is launched stage by stage.
             certify: count what is still inside (`n_unresolved`) by winding numbers, which nothing escapes, for an
                 eighth of a frame's time; without, by the distances that pushed it, which may be wrong.
+            collider: bring garments off a body whose overlaps were pulled apart (`PipelineOutput.body`); without, off
+                the posed body itself as in the paper, in which there is no room where limbs run through each other.
 
         Raises:
             GarmentError: no garment, an unknown one, garments of two bodies, or a bad style.
@@ -178,7 +181,7 @@ class GarmentPipeline:
             )
             kept = DEFAULT_MARGIN if refu is None else float(refu.margin)
             wearables[name] = Wearable(template, network, refu, kept)
-        outfit = Outfit(body, wearables)
+        outfit = Outfit(body, wearables, Collider(body) if collider else None)
         gamma = None if style is None else _style(style, torch_device)
         if gamma is not None:
             for template in templates.values():
@@ -282,17 +285,18 @@ class GarmentPipeline:
             )
             stats[name] = GarmentStats.of(worn.numbers.tolist(), ms=clock.garments[name])
             n_clipped += int(worn.n_clipped)
-        took = self._stats(frame, clock.stages, stats, {**skipped, "band": n_clipped})
-        return PipelineOutput(meshes, person.turn.later(person.body), took)
+        took = self._stats(frame, clock.stages, stats, {**skipped, "band": n_clipped}, person.shift.tolist())
+        return PipelineOutput(meshes, person.turn.later(person.body), person.turn.later(person.skin), took)
 
     def _unpacked(self, frame: SmplFrame, parts: list[NDArray[np.float32]]) -> PipelineOutput:
-        body, *rest = parts
+        body, skin, shift, *rest = parts
         meshes, stats = {}, {}
         for i, name in enumerate(self.outfit.wearables):
             vertices, raw, numbers = rest[3 * i : 3 * i + 3]
             meshes[name] = GarmentMesh(vertices, partial(_itself, raw), self._faces[name], frame.transl)
             stats[name] = GarmentStats.of(numbers.tolist())
-        return PipelineOutput(meshes, partial(_itself, body), self._stats(frame, {}, stats, {}))
+        took = self._stats(frame, {}, stats, {}, shift.tolist())
+        return PipelineOutput(meshes, partial(_itself, body), partial(_itself, skin), took)
 
     def _stats(
         self,
@@ -300,8 +304,10 @@ class GarmentPipeline:
         stage_ms: Mapping[str, float],
         garments: Mapping[str, GarmentStats],
         skipped: Mapping[str, int],
+        shift: Sequence[float],
     ) -> FrameStats:
-        return FrameStats(stage_ms, garments, self._is_certified, within_promise(frame), skipped)
+        promised = within_promise(frame)
+        return FrameStats(stage_ms, garments, self._is_certified, promised, skipped, SkinShift.of(shift))
 
 
 def _key(frame: SmplFrame, *, of_pose: bool = True) -> bytes:
@@ -316,7 +322,7 @@ def _moved(output: PipelineOutput, frame: SmplFrame) -> PipelineOutput:
     counts = {name: replace(one, ms=0.0) for name, one in output.stats.garments.items()}
     stage_ms = dict.fromkeys(output.stats.stage_ms, 0.0)
     took = replace(output.stats, stage_ms=stage_ms, garments=counts, skipped={"unchanged": 1})
-    return PipelineOutput(garments, output.posed_body, took)
+    return PipelineOutput(garments, output.posed_body, output.posed_skin, took)
 
 
 def _check_margin(margin: float | None) -> None:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from refu_core.backbones import Backbone
-from refu_core.body import Shape, SmplBody
+from refu_core.body import Collider, Shape, SmplBody
 from refu_core.frames import N_STYLES
 from refu_core.garments import GarmentTemplate
 from refu_core.refu import Refu
@@ -36,10 +36,14 @@ class Outfit:
     body: SmplBody
     wearables: Mapping[str, Wearable]
     """By name."""
+    collider: Collider | None = None
+    """What of the posed body garments are brought off; None for the posed body as it is, which runs through itself."""
 
     def to(self, dtype: torch.dtype) -> Outfit:
         """The same in another precision; nothing is shared."""
-        return Outfit(self.body.to(dtype=dtype), {name: _cast(one, dtype) for name, one in self.wearables.items()})
+        body = self.body.to(dtype=dtype)
+        collider = None if self.collider is None else Collider(body, gap=self.collider.gap)
+        return Outfit(body, {name: _cast(one, dtype) for name, one in self.wearables.items()}, collider)
 
 
 class UnposedGarment(NamedTuple):

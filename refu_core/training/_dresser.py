@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from refu_core.backbones import Backbone, Prediction
-from refu_core.body import SmplBody
+from refu_core.body import Collider, SmplBody
 from refu_core.contact import Blend
 from refu_core.garments import GarmentTemplate
 from refu_core.realtime import Outfit, Wearable, Wearer, dress
@@ -37,6 +37,7 @@ class Dresser(nn.Module):
         in_refu: Sdf,
         in_loss: Sdf,
         is_blended: bool = True,
+        collider: bool = True,
     ) -> None:
         """For one garment on one body model.
 
@@ -48,10 +49,12 @@ class Dresser(nn.Module):
             in_refu: the distance that ReFU sees.
             in_loss: the distance that is returned.
             is_blended: whether pushed vertices take their neighbourhood along.
+            collider: whether distances are to the body with its overlaps pulled apart, or to the posed body.
         """
         super().__init__()
         self.backbone, self.refu = backbone, refu  # modules, whose weights are this one's, too
         self._garment, self._body = garment, body
+        self._collider = Collider(body) if collider else None
         self._blend = Blend.of_faces(garment.faces, garment.n_vertices) if is_blended else None
         made = {name: _Distances(name, garment, body) for name in {in_refu, in_loss}}
         self._in_refu, self._in_loss = made[in_refu], made[in_loss]
@@ -63,7 +66,7 @@ class Dresser(nn.Module):
         """
         name, kind = self._garment.name, betas.device.type
         network = _InPrecision(self.backbone, torch.is_autocast_enabled(kind), torch.get_autocast_dtype(kind))
-        outfit = Outfit(self._body, {name: Wearable(self._garment, network, self.refu, 0.0)})
+        outfit = Outfit(self._body, {name: Wearable(self._garment, network, self.refu, 0.0)}, self._collider)
         # Millimetres need float32, whatever precision the networks are run in.
         with torch.autocast(kind, enabled=False):
             wearer = Wearer.of(outfit, betas, None if self._garment.styledirs is None else style)

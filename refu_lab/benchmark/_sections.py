@@ -199,7 +199,7 @@ def _dressing(paper: PaperStructure, name: str) -> Callable[[Sequence[SmplFrame]
         for frame in frames:
             vertices = paper(frame)
             mesh = GarmentMesh(np.nan_to_num(vertices), lambda: np.empty((0, 3), np.float32), faces, frame.transl)
-            outputs.append(PipelineOutput({name: mesh}, mesh.before, FrameStats(paper.stage_ms)))
+            outputs.append(PipelineOutput({name: mesh}, mesh.before, mesh.before, FrameStats(paper.stage_ms)))
         return outputs
 
     return dress

@@ -171,6 +171,11 @@ def test_replayed_frames_are_those_of_the_pipeline(garments: list[str], sdf: str
         given = frames(*seeds, style=seeds[0] == 4)
         for new, old in zip(replaying(given), usual(given), strict=True):
             np.testing.assert_allclose(new.body, old.body, atol=1e-6)
+            np.testing.assert_allclose(new.skin, old.skin, atol=1e-6)
+            assert new.stats.shift.n_moved > 0
+            assert abs(new.stats.shift.n_moved - old.stats.shift.n_moved) <= 5
+            assert new.stats.shift.largest == pytest.approx(old.stats.shift.largest, abs=1e-6)
+            assert new.stats.shift.mean == pytest.approx(old.stats.shift.mean, abs=1e-6)
             assert list(new) == list(old) == garments
             for name, mesh in new.items():
                 np.testing.assert_allclose(mesh.raw, old[name].raw, atol=2e-5)

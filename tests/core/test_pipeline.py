@@ -20,8 +20,8 @@ from refu_core import (
     load_garment,
 )
 from refu_core.errors import MeshError
-from refu_core.realtime import SKIPS
-from refu_core.sdf import ExactSdf
+from refu_core.realtime import SKIPS, SkinShift
+from refu_core.sdf import ExactSdf, Winding
 
 
 def frame(seed: int = 0, *, spread: float = 0.25, transl: tuple[float, float, float] = (0, 0, 0)) -> SmplFrame:
@@ -48,7 +48,7 @@ def test_what_comes_out(pipeline: GarmentPipeline) -> None:
         assert np.isfinite(mesh.vertices).all()
         np.testing.assert_allclose(mesh.vertices - [1, 2, 3], mesh.local, atol=1e-12)
         assert out.stats.garments[name].ms > 0
-    assert set(out.stats.stage_ms) == {"body", "backbone", "sdf", "layers", "refu"}
+    assert set(out.stats.stage_ms) == {"body", "collider", "backbone", "sdf", "layers", "refu"}
 
 
 def test_garments_are_pushed_to_the_margin_and_no_farther(pipeline: GarmentPipeline) -> None:
@@ -68,6 +68,45 @@ def test_garments_are_pushed_to_the_margin_and_no_farther(pipeline: GarmentPipel
             continue
         assert stats.n_inside == (before < 0).sum()
         assert moved.max() < 0.004 + 2 * max(0.0, -before.min()) + 0.01, "no vertex is thrown far out"
+
+
+def crossed_arms() -> SmplFrame:
+    """Forearms before the chest, one through the other."""
+    pose = np.zeros((24, 3), np.float32)
+    pose[16], pose[17] = (0, -0.9, -1.0), (0, 0.9, 1.0)
+    pose[18], pose[19] = (0, -1.2, 0), (0, 1.2, 0)
+    return SmplFrame(pose=pose, transl=np.array((1.0, 2.0, 3.0)))
+
+
+@pytest.mark.parametrize("sdf", ["hybrid", "accurate", "none"])
+def test_garments_are_brought_off_the_collider(sdf: str) -> None:
+    """With a collider, what limbs have in common is room; without, garments are brought off the posed body as it is."""
+    with_one = GarmentPipeline.load(["tshirt-male"], sdf=sdf)
+    without = GarmentPipeline.load(["tshirt-male"], sdf=sdf, collider=False)
+    assert with_one.outfit.collider is not None
+    assert without.outfit.collider is None
+    apart, through = with_one(crossed_arms()), without(crossed_arms())
+    posed = with_one.body(pose=crossed_arms().pose[None]).vertices[0].numpy()
+    np.testing.assert_allclose(apart.skin, posed, atol=2e-6)
+    np.testing.assert_array_equal(through.body, through.skin)
+    np.testing.assert_array_equal(through.skin, apart.skin)
+    assert through.stats.shift == SkinShift(0, 0.0, 0.0)
+    assert "collider" in apart.stats.stage_ms
+    assert "collider" not in through.stats.stage_ms
+
+    way = np.linalg.norm(apart.body - apart.skin, axis=1)
+    shift = apart.stats.shift
+    assert 0 < shift.n_moved < len(way) / 2, "limbs that touch give way, and nothing else"
+    assert abs(shift.n_moved - (way > 1e-4).sum()) <= 5, "but for rounding"
+    assert shift.largest == pytest.approx(way.max(), abs=2e-6)
+    assert shift.mean == pytest.approx(way.mean(), abs=2e-6)
+    np.testing.assert_array_equal(apart["tshirt-male"].raw, through["tshirt-male"].raw)
+    if sdf != "none":
+        inside = Winding(with_one.body.faces)
+        inside.update(torch.as_tensor(apart.body))
+        found = inside(torch.as_tensor(apart["tshirt-male"].local)).count_nonzero()
+        assert apart.stats.garments["tshirt-male"].n_unresolved == found, "certified by the collider"
+        assert found == 0
 
 
 def test_without_signed_distance_the_raw_backbone_comes_out() -> None:
