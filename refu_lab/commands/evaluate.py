@@ -45,7 +45,13 @@ def add(commands: Any) -> None:
     parser.add_argument("--cache", type=out_folder, metavar="DIR", help="keep what was measured, and use it again")
     parser.add_argument("--every", type=positive, default=1, metavar="N", help="every N-th test sample (1)")
     parser.add_argument(
-        "--motion-every", type=positive, default=10, metavar="N", help="every N-th frame of a motion (10)"
+        "--motion-every", type=positive, default=1, metavar="N", help="every N-th frame of a motion (1)"
+    )
+    parser.add_argument(
+        "--no-collider",
+        dest="collider",
+        action="store_false",
+        help="bring garments off the posed body as it is, which runs through itself",
     )
     parser.add_argument(
         "--quick",
@@ -86,6 +92,7 @@ def run(args: argparse.Namespace) -> int:
         cache=args.cache,
         every=args.every,
         motion_every=args.motion_every,
+        collider=args.collider,
     )
     tables = evaluate(options, progress=not args.quiet)
     print(results_text(tables, output))

@@ -82,6 +82,12 @@ def add(commands: Any) -> None:
     parser.add_argument("--frame-id", type=word, default="map", metavar="ID", help="frame_id of the markers (map)")
     parser.add_argument("--device", default="cpu", metavar="DEVICE", help="cpu (default) or cuda")
     parser.add_argument("--max-frames", type=positive, metavar="N", help="stop after N frames")
+    parser.add_argument(
+        "--no-collider",
+        dest="collider",
+        action="store_false",
+        help="bring garments off the posed body as it is, which runs through itself",
+    )
     parser.add_argument("--overwrite", action="store_true", help="replace an output that is there already")
     add_common(parser)
     parser.set_defaults(run=run)

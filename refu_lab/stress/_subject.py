@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from refu_core.errors import RefuError
 from refu_core.frames import N_STYLES, SmplFrame
 from refu_core.garments import BUILTIN_GARMENTS
-from refu_core.metrics import CollisionChecker, SelfContactDetector
+from refu_core.metrics import CollisionChecker
 from refu_core.modes import SdfMode
 from refu_core.realtime import ContactStage, GarmentPipeline, Outfit, Wearer, dress
 from refu_core.sdf import ApproxSdf, BandSdf, BodySdf, ExactSdf
@@ -70,11 +70,6 @@ class Subject:
     def checker(self) -> CollisionChecker:
         """Exact collisions, by winding number."""
         return CollisionChecker(self.pipeline.body.faces)
-
-    @cached_property
-    def contacts(self) -> SelfContactDetector:
-        """Where the body touches itself."""
-        return SelfContactDetector(self.pipeline.body.faces, self.pipeline.body.v_template)
 
     @cached_property
     def distances(self) -> dict[str, BodySdf]:

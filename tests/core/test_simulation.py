@@ -28,7 +28,7 @@ import refu_core
 from refu_core.body import Collider, SmplBody, load_body
 from refu_core.errors import MeshError
 from refu_core.garments import load_garment
-from refu_core.metrics import CollisionChecker
+from refu_core.metrics import CollisionChecker, SheetChecker
 from refu_core.simulation import (
     CAUSES,
     Draper,
@@ -48,7 +48,7 @@ from refu_core.simulation import (
 )
 from refu_core.simulation._drape import canonical_pose, comfort_poses
 from refu_core.simulation._plan import TEST, TRAIN
-from refu_core.simulation._selection import Selector, SelfIntersection
+from refu_core.simulation._selection import Selector
 from refu_core.simulation._store import DONE, QUANTUM, TO_DO, Shard, dequantise, locked, quantise
 from refu_lab.cli import main
 from refu_lab.contact_sheet import contact_sheet
@@ -263,7 +263,9 @@ def test_self_intersection_is_that_of_fcl(samples: list[GarmentSample]) -> None:
     pairs = fcl_pairs(rough, faces, rough, faces)
     apart = ~(faces[pairs[:, 0]][:, :, None] == faces[pairs[:, 1]][:, None]).any((1, 2))
     wanted = {(min(pair), max(pair)) for pair in pairs[apart].tolist()}
-    found = SelfIntersection(faces).pairs(rough)
+    checker = SheetChecker(faces)
+    checker.update(rough)
+    found = checker.with_itself()
     mine = ~(faces[found[:, 0]][:, :, None] == faces[found[:, 1]][:, None]).any((1, 2))
     assert len(wanted) > 20
     assert {(min(pair), max(pair)) for pair in found[mine].tolist()} == wanted

@@ -114,7 +114,8 @@ def test_motion_of_a_folder(tmp_path: Path) -> None:
     assert run(*arguments, "--json", file) == 0
     rows = json.loads(file.read_text(encoding="utf-8"))["rows"]
     assert {f"{GARMENT}, swing", "skirt-female, all clips"} <= {row["garment"] for row in rows}
-    assert "jitter_mm" in {row["metric"] for row in rows}
+    assert {"skin_cfmp_percent", "jump_20_percent", "shift_max_mm"} <= {row["metric"] for row in rows}
+    assert "skin to collider" in (tmp_path / "out" / "motion.md").read_text(encoding="utf-8")
 
 
 # ---- the quick check -------------------------------------------------------------------------------------------------
