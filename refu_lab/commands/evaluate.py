@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from refu_lab.commands._common import (
     EXIT_CHECK_FAILED,
+    add_collider,
     add_common,
     check_writable,
     in_path,
@@ -47,12 +48,7 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--motion-every", type=positive, default=1, metavar="N", help="every N-th frame of a motion (1)"
     )
-    parser.add_argument(
-        "--no-collider",
-        dest="collider",
-        action="store_false",
-        help="bring garments off the posed body as it is, which runs through itself",
-    )
+    add_collider(parser)
     parser.add_argument(
         "--quick",
         action="store_true",

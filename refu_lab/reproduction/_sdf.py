@@ -16,17 +16,14 @@ from refu_lab.reproduction._predict import GarmentSetup, SampleScene
 from refu_lab.reproduction._samples import Sample, SampleSet
 from refu_lab.reproduction._tables import Missing, ResultRow, ResultTable
 from refu_lab.sdf_errors import SdfErrors
+from refu_lab.touching_poses import touching_pose
 
 DISTURBANCE = 0.01
 """Standard deviation of the Gaussian disturbance of every other point, each axis [m]."""
 NEAR_SKIN = 0.02
 """Within this of the skin [m] the distance decides what ReFU does."""
-FOLDED_POSES: Mapping[str, Mapping[int, tuple[float, float, float]]] = {
-    "squat": {1: (-1.5, 0, 0.2), 2: (-1.5, 0, -0.2), 4: (1.8, 0, 0), 5: (1.8, 0, 0)},
-    "crossed arms": {16: (0, -0.6, -1.1), 17: (0, 0.6, 1.1), 18: (0, -2.0, 0), 19: (0, 2.0, 0)},
-    "hands on hips": {16: (0.3, 0.5, -0.9), 17: (0.3, -0.5, 0.9), 18: (0, -1.7, 0), 19: (0, 1.7, 0)},
-}
-"""Poses in which limbs press on each other: rotation vectors of joints [rad], zero for those that aren't named."""
+FOLDED_POSES = ("squat", "crossed arms", "hands on hips")
+"""Of `TOUCHING_POSES`."""
 _FOLDED_SHAPES = 8
 """Body shapes that each of them is taken with."""
 _POINTS_ASKED = 8
@@ -96,10 +93,8 @@ def sdf_table(
         for name, asked in questions.answers().items():
             table.rows += _rows(garment, name, asked)
             table.rows += _rows(garment, name + _CLOSE, asked, is_close=True)
-        for title, folded in FOLDED_POSES.items():
-            pose = np.zeros((24, 3), np.float32)
-            for joint, rotation in folded.items():
-                pose[joint] = rotation
+        for title in FOLDED_POSES:
+            pose = touching_pose(title)
             for sample in list(bodies.values())[:_FOLDED_SHAPES]:
                 scene = SampleScene.of(setup, pose, sample.betas, sample.style)
                 unposed = setup.template.rest(scene.betas, scene.style)

@@ -37,14 +37,14 @@ class Wardrobe:
 class Subject:
     """One wardrobe's pipeline and its references, each made when it is first asked for."""
 
-    def __init__(self, wardrobe: Wardrobe, *, weights: Path | None = None) -> None:
+    def __init__(self, wardrobe: Wardrobe, *, weights: Path | None = None, collider: bool = True) -> None:
         """Loads the pipeline; raises as `GarmentPipeline.load`."""
         unknown = [name for name in wardrobe.garments if name not in BUILTIN_GARMENTS]
         if unknown:
             msg = f"no garment {unknown[0]!r}: wanted {', '.join(BUILTIN_GARMENTS)}"
             raise RefuError(msg)
         self.wardrobe = wardrobe
-        self._weights = weights
+        self._weights, self._collider = weights, collider
         self.pipeline = self.load()
 
     def load(self, *garments: str) -> GarmentPipeline:
@@ -54,6 +54,7 @@ class Subject:
             backbone=self.wardrobe.backbone,
             sdf=self.wardrobe.sdf,
             weights=self._weights,
+            collider=self._collider,
         )
 
     @property
