@@ -12,7 +12,7 @@ import torch
 import trimesh
 
 from refu_core import load_body
-from refu_core.contact import Limbs, Resolver
+from refu_core.contact import Resolver
 from refu_core.metrics import CollisionChecker
 from refu_core.sdf import ExactSdf
 
@@ -38,7 +38,7 @@ def main(path: str | None = None) -> tuple[int, int]:
 
     sdf = ExactSdf(body.faces)
     sdf.update(skin)
-    resolver = Resolver(Limbs.one(body.faces, faces, n_vertices=len(vertices)))  # once a garment
+    resolver = Resolver(faces, len(vertices))  # once a garment
     done = resolver(vertices, sdf, sdf.query(vertices), margin=0.004)  # every frame
 
     checker = CollisionChecker(body.faces)

@@ -18,7 +18,7 @@ from refu_core.modes import BackboneName, SdfMode
 
 if TYPE_CHECKING:
     from refu_core.body import SmplBody, load_body
-    from refu_core.contact import Limbs, Resolver
+    from refu_core.contact import Resolver
     from refu_core.garments import GarmentTemplate, load_garment
     from refu_core.realtime import GarmentPipeline, PipelineOutput, Wearer, dress
     from refu_core.refu import Refu
@@ -36,7 +36,6 @@ __all__ = [
     "GarmentError",
     "GarmentPipeline",
     "GarmentTemplate",
-    "Limbs",
     "MeshError",
     "PipelineOutput",
     "Refu",
@@ -60,7 +59,6 @@ _LAZY = {
     "ExactSdf": "sdf",
     "GarmentPipeline": "realtime",
     "GarmentTemplate": "garments",
-    "Limbs": "contact",
     "PipelineOutput": "realtime",
     "Refu": "refu",
     "Resolver": "contact",

@@ -15,7 +15,7 @@ def middle_deficit(edge: int, state: State, cloth: Cloth, skin: Skin, rules: Rul
     near = wp.where(state.distance[a] <= state.distance[b] + rules.tolerance, state.face[a], state.face[b])
     distance, gradient, _face = query_skin(skin, 0.5 * (state.place[a] + state.place[b]), near)
     lack = 0.5 * rules.margin - distance
-    # What runs through a limb hasn't cut a corner, and isn't to be raised.
+    # What runs through a hand hasn't cut a corner, and isn't to be raised.
     return lack * wp.clamp(2.0 - lack / rules.through, 0.0, 1.0), gradient
 
 
@@ -61,7 +61,7 @@ def measure(
     a = cloth.edges[edge, 0]
     b = cloth.edges[edge, 1]
     if rounds > 0 and state.moved[a] == 0 and state.moved[b] == 0:
-        return  # between two limbs, and stays there
+        return  # has no room, and stays there
     lack, up = middle_deficit(edge, state, cloth, skin, rules)
     if lack > 0.0:
         k = wp.atomic_add(state.counts, CUTTING + 1 + rounds, 1)

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from refu_core._warp import as_warp, torch_stream
 from refu_core.contact import _edge_kernels, _resolver_kernels, _round_kernels, _spread_kernels, _state
-from refu_core.contact._limbs import Limbs
 from refu_core.contact._resolution import Resolution
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
 from refu_core.errors import MeshError
+from refu_core.mesh import Connectivity
 from refu_core.modes import DEFAULT_MARGIN
 from refu_core.refu import VertexScale
 from refu_core.sdf import MeshSdf, SdfSample, require_tensor
@@ -23,9 +23,9 @@ from refu_core.sdf import MeshSdf, SdfSample, require_tensor
 class Resolver:
     """Brings one garment off posed bodies.
 
-    The steps: distances that contradict each other along an edge are mended; vertices leave limbs that they don't
-    belong to; those nearer than the margin are pushed along the gradient (ReFU, paper, Eq. 2); their neighbours give
-    way; edges that still run too low are raised.
+    The steps: where an approximate distance has missed the closest face, a neighbour names it; vertices nearer than the
+    margin are pushed along the gradient (ReFU, paper, Eq. 2); their neighbours give way; edges that still run too low
+    are raised. Nothing in it knows of limbs: a body that doesn't run through itself (`Collider`) has room around each.
 
     Memory and launches are prepared once. Each step lists the vertices for the next one, so a step costs what the
     vertices at the skin do. What depends on other vertices is finished for all of them by one launch before the next
@@ -36,20 +36,24 @@ class Resolver:
     device until they are read.
     """
 
-    def __init__(self, limbs: Limbs, *, settings: ContactSettings = DEFAULT_CONTACT) -> None:
-        """For the garment that `limbs` is of, on its device."""
-        self._limbs, self._settings = limbs, settings
-        self.device = limbs.faces.device
-        n, e = len(limbs.own), len(limbs.edges)
-        self._n_vertices = n
-        self._cloth = _cloth(limbs)
+    def __init__(self, faces: Tensor, n_vertices: int, *, settings: ContactSettings = DEFAULT_CONTACT) -> None:
+        """For garments of these `faces`, shape (G, 3), and `n_vertices` N, on the device of the faces.
+
+        Raises:
+            MeshError: a face that names a vertex there isn't.
+        """
+        self._settings, self.device = settings, faces.device
+        mesh = Connectivity.of(faces.cpu(), n_vertices)
+        n, e = n_vertices, len(mesh.edges)
+        self._n_vertices, self._n_edges = n, e
+        self._cloth = _cloth(mesh, str(self.device))
         self._vectors = {name: torch.zeros(n, 3, device=self.device) for name in _VECTORS}
         self._floats = {name: torch.zeros(n, device=self.device) for name in _FLOATS}
         self._ints = {name: torch.zeros(n, dtype=torch.int32, device=self.device) for name in _INTS}
         self._by_edge = torch.zeros(3, e, dtype=torch.int32, device=self.device)
         self._deficit = torch.zeros(e, device=self.device)
         self._rise = torch.zeros(e, 3, device=self.device)
-        self._counts = torch.zeros(_state.N_COUNTS + 2 * _N_LIMBS, dtype=torch.int32, device=self.device)
+        self._counts = torch.zeros(_state.N_COUNTS, dtype=torch.int32, device=self.device)
         self._bounds = torch.full((2, _state.N_COUNTS), 2**31 - 1, dtype=torch.int32, device=self.device)
         # On a CPU a kernel is one thread and can do several short steps, and reading a number costs nothing.
         self._is_serial = self.device.type == "cpu"
@@ -92,7 +96,9 @@ class Resolver:
         with torch_stream(self.device):
             self._take(points, start)
             self._record(sdf, margin)
-            self._reconcile(can_miss=not sdf.is_exact)
+            self._run("begin", self._n_vertices)
+            if not sdf.is_exact:
+                self._reconcile()
             self._run("list", self._n_vertices)
             n = self._length(_state.NEAR)
             if n:
@@ -118,36 +124,26 @@ class Resolver:
         self._vectors["first_gradient"].copy_(start.gradient)
         self._ints["first_face"].copy_(start.face)
 
-    def _reconcile(self, *, can_miss: bool) -> None:
-        """Makes the distances consistent along edges; some closest faces may have been missed."""
-        self._run("begin", self._n_vertices)
+    def _reconcile(self) -> None:
+        """Where distances contradict each other along an edge, a closest face was missed."""
         self._run("compare", self._n_vertices)
-        looks = self._settings.looks if can_miss else 0
-        for remedy, rounds in (("retry", looks), ("cut off", self._settings.cuts)):
-            for _ in range(rounds):
-                n = self._length(_state.SUSPECTS)
-                self._counts[_state.CHANGED].zero_()
-                self._run(remedy, n)
-                self._run("adopt", n)
-                if self._is_serial and not self._count(_state.CHANGED):
-                    break
+        for _ in range(self._settings.looks):
+            n = self._length(_state.SUSPECTS)
+            self._counts[_state.CHANGED].zero_()
+            self._run("retry", n)
+            self._run("adopt", n)
+            if self._is_serial and not self._count(_state.CHANGED):
+                break
 
     def _push(self, n: int, scale: float | VertexScale) -> None:
-        """The `n` near vertices leave other limbs on the near side, then the body, and their neighbours follow."""
-        self._run("orient", n)
-        if not self._is_serial or self._counts[_state.N_COUNTS : _state.N_COUNTS + _N_LIMBS].any():
-            self._run("retreat", n)
-            self._run("fill", n)
-        self._run("aim", n)
-        n_pushed = self._length(_state.PUSHED)
-        if n_pushed:
-            alpha = self._floats["alpha"][:n_pushed]
-            if callable(scale):
-                rows = self._ints["pushed"][:n_pushed].long()
-                alpha.copy_(scale(rows, self._floats["depth"][rows]))
-            else:
-                alpha.fill_(scale)
-            self._run("scale", n_pushed)
+        """The `n` near vertices leave the body, and their neighbours follow."""
+        alpha = self._floats["alpha"][:n]
+        if callable(scale):
+            rows = self._ints["near"][:n].long()
+            alpha.copy_(scale(rows, self._floats["distance"][rows]))
+        else:
+            alpha.fill_(scale)
+        self._run("scale", n)
         self._blend()
         self._run("settle", self._length(_state.REACHED))
 
@@ -164,7 +160,7 @@ class Resolver:
 
     def _raise_edges(self) -> None:
         """Raises both ends of the edges that run too low."""
-        n = len(self._limbs.edges)
+        n = self._n_edges
         self._run("suspect", n)
         if self._is_serial:
             self._run("raise edges", int(self._count(_state.CUTTING) > 0))
@@ -218,13 +214,8 @@ class Resolver:
         self._command("begin", _resolver_kernels.begin_kernel, [state])
         self._command("compare", _resolver_kernels.compare_kernel, [state, cloth, rules])
         self._command("retry", _resolver_kernels.retry_kernel, [state, cloth, skin, rules])
-        self._command("cut off", _resolver_kernels.cut_off_kernel, [state, cloth, rules])
         self._command("adopt", _resolver_kernels.adopt_kernel, [state, cloth])
         self._command("list", _resolver_kernels.list_near_kernel, [state, rules])
-        self._command("orient", _resolver_kernels.orient_kernel, [state, cloth, rules])
-        self._command("retreat", _resolver_kernels.retreat_kernel, [state, cloth, skin, rules])
-        self._command("fill", _resolver_kernels.fill_kernel, [state, cloth, skin, rules])
-        self._command("aim", _resolver_kernels.aim_kernel, [state, cloth, skin, rules])
         self._command("scale", _resolver_kernels.scale_kernel, [state, rules])
         self._command("settle", _resolver_kernels.settle_kernel, [state, skin, rules])
         self._command("suspect", _edge_kernels.suspect_kernel, [state, cloth, rules])
@@ -264,29 +255,21 @@ class Resolver:
         state.suspects = as_warp(self._by_edge[0], wp.int32)
         state.deficit, state.rise = as_warp(self._deficit, wp.float32), as_warp(self._rise, wp.vec3)
         state.counts = as_warp(self._counts, wp.int32)
-        state.touched = as_warp(self._counts[_state.N_COUNTS :], wp.int32)
-        state.inward = as_warp(self._counts[_state.N_COUNTS + _N_LIMBS :], wp.int32)
         state.begins, state.ends = (as_warp(bounds, wp.int32) for bounds in self._bounds)
         return state
 
 
-_VECTORS = ("origin", "first_gradient", "place", "gradient", "outward", "heading", "field", "smoother")
-_FLOATS = ("first", "distance", "along", "way", "depth", "goal", "alpha", "largest")
-_INTS = ("first_face", "face", "guess", "role", "mark", "near", "pushed", "reached", "moved")
-_N_LIMBS = 4
+_VECTORS = ("origin", "first_gradient", "place", "gradient", "field", "smoother")
+_FLOATS = ("first", "distance", "way", "goal", "alpha", "largest")
+_INTS = ("first_face", "face", "mark", "near", "reached", "moved")
 
 
-def _cloth(limbs: Limbs) -> Any:
+def _cloth(mesh: Connectivity, device: str) -> Any:
     """The garment as the kernels read it."""
-    mesh = limbs.mesh
     ring_start, ring = mesh.ring
     # The sums over neighbours are rounded in this order: those of a higher number first.
     ring = ring[np.lexsort((ring < mesh.ring.owner, mesh.ring.owner))]
-    bits = (limbs.own.cpu().numpy() << np.arange(limbs.own.shape[1])).sum(axis=1)
     cloth = _state.Cloth()
-    arrays = {"ring_start": ring_start, "ring": ring, "fan_start": mesh.fan.start, "fan": mesh.fan.items}
-    arrays |= {"faces": mesh.faces, "edges": mesh.edges, "own": bits, "limb": limbs.of_face.cpu().numpy()}
-    for name, array in arrays.items():
-        setattr(cloth, name, wp.array(array.astype(np.int32), dtype=wp.int32, device=str(limbs.faces.device)))
-    cloth.clearance = as_warp(limbs.clearance.float().contiguous(), wp.float32)
+    for name, array in (("ring_start", ring_start), ("ring", ring), ("edges", mesh.edges)):
+        setattr(cloth, name, wp.array(array.astype(np.int32), dtype=wp.int32, device=device))
     return cloth

@@ -22,39 +22,11 @@ class ContactSettings:
     tolerance: float = 2e-4
     """What may be missing to the margin [m]."""
 
-    # Distances that contradict each other along an edge
+    # Closest faces that an approximate distance missed
     contradiction: float = 1e-3
-    """Disagreement that is tolerated [m]: an approximate distance is never quite consistent."""
+    """By how much more than their edge is long distances at its ends may differ [m]: none is quite consistent."""
     looks: int = 3
     """How far a search goes from the rim of a patch of wrong closest faces into it [edges]."""
-    cuts: int = 8
-    """How far a search goes from the rim of a patch of wrong sides into it [edges]."""
-
-    # Vertices in the middle of a limb
-    deep: float = 0.008
-    """From this depth on, the shortest way out may be through the other side of the limb [m]."""
-    turns: int = 8
-    """Steps of a search along the cloth's own normal."""
-    step_on: float = 1e-3
-    """Added to each step of a search or a retreat, so that they end [m]."""
-    farthest: float = 0.08
-    """A way out along the cloth's normal is no longer than this [m]."""
-    detour: float = 2.0
-    """Nor is it longer than this multiple of the depth. Such cloth has been folded, and its normal would lead a single
-    vertex through a whole thigh, centimetres past all others."""
-    turning: float = 0.5
-    """This many depths before the longest detour, the way begins to turn from the normal to the shortest one.
-    It turns by degrees: with a hard limit vertices leapt from frame to frame."""
-
-    # Limbs that a vertex doesn't lie on
-    own_weight: float = 0.02
-    """A vertex lies on every limb that has more than this of its skinning weight: at the armpit, on trunk and arm."""
-    sideways: float = -0.3
-    """Cosine of push and outward normal above which a push leads around a limb, and no longer back from it."""
-    inward: float = 0.15
-    """A limb that pushes a smaller share of the vertices at it inwards lies under the cloth."""
-    retreats: int = 8
-    """Steps of a retreat from a limb."""
 
     # Neighbours
     blend_reach: int = 2
@@ -65,9 +37,6 @@ class ContactSettings:
     short one the ripples that the long one overdoes (Richardson). A pair leaves at most 0.6 of any ripple."""
     blend_pairs: int = 3
     """Pairs of sweeps. Three do what twelve plain means do."""
-    sure: float = 4e-3
-    """How far beyond the margin a distance is trusted [m]. Where a body runs into itself the distance jumps: a vertex
-    within an arm may seem to be 2 cm outside of the flank that the arm is in."""
 
     # Edges
     bulge: float = 0.375

@@ -29,8 +29,8 @@ def spread(
     here = field[i]
     here += step * (mean - here)
     if state.mark[i] == SOURCE:
-        lack = state.way[i] - wp.dot(here, state.heading[i])
-        here += wp.max(lack, 0.0) * state.heading[i]
+        lack = state.way[i] - wp.dot(here, state.gradient[i])
+        here += wp.max(lack, 0.0) * state.gradient[i]
     smoother[i] = here
 
 

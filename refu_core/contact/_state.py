@@ -8,24 +8,16 @@ waited for: there a launch is as long as any list can be, and what is beyond its
 import warp as wp
 
 # What a kernel counts.
-NEAR = wp.constant(0)  # vertices nearer than the margin
-PUSHED = wp.constant(1)  # those of them that are pushed along the gradient
-REACHED = wp.constant(2)  # vertices that a push reaches by way of its neighbours
-SUSPECTS = wp.constant(3)  # vertices at the ends of edges along which distances contradict each other
-INSIDE = wp.constant(4)
-MOVED = wp.constant(5)  # of those nearer than the margin
-STUCK = wp.constant(6)  # inside after all
-RAISED = wp.constant(7)  # ends of edges that cut the skin
-CHANGED = wp.constant(8)  # distances that were replaced
-CUTTING = wp.constant(9)  # such edges; a number for each round follows
+NEAR = wp.constant(0)  # vertices nearer than the margin, which are pushed
+REACHED = wp.constant(1)  # vertices that a push reaches by way of its neighbours
+SUSPECTS = wp.constant(2)  # vertices at the ends of edges along which distances contradict each other
+INSIDE = wp.constant(3)
+MOVED = wp.constant(4)  # of those nearer than the margin
+STUCK = wp.constant(5)  # inside after all
+RAISED = wp.constant(6)  # ends of edges that cut the skin
+CHANGED = wp.constant(7)  # distances that were replaced
+CUTTING = wp.constant(8)  # such edges; a number for each round follows
 N_COUNTS = 16
-
-# A vertex's role: pushed along the gradient, or out of another limb on the near side.
-FREE = wp.constant(0)
-LEFT = wp.constant(1)
-MISSED = wp.constant(2)  # found no room on its own
-FILLED = wp.constant(3)  # found it where its neighbours are
-BACK = wp.constant(4)  # found none, so is pushed
 
 # A vertex reached by pushes, or pushed itself.
 BESIDE = wp.constant(1)
@@ -34,22 +26,12 @@ SOURCE = wp.constant(2)
 
 @wp.struct
 class Cloth:
-    """What doesn't change of a garment and the body's limbs."""
+    """What doesn't change of a garment."""
 
     ring_start: wp.array[wp.int32]
     ring: wp.array[wp.int32]
     """The neighbours of vertex i are `ring[ring_start[i]:ring_start[i + 1]]`."""
-    fan_start: wp.array[wp.int32]
-    fan: wp.array[wp.int32]
-    """The faces around it, likewise."""
-    faces: wp.array2d[wp.int32]
     edges: wp.array2d[wp.int32]
-    own: wp.array[wp.int32]
-    """A bit for each limb that a vertex lies on."""
-    clearance: wp.array[wp.float32]
-    """How far off the skin it is cut [m]."""
-    limb: wp.array[wp.int32]
-    """Limb of each body face."""
 
 
 @wp.struct
@@ -61,18 +43,8 @@ class Rules:
     max_displacement: wp.float32
     max_pushes: wp.int32
     contradiction: wp.float32
-    step_on: wp.float32
-    deep: wp.float32
-    sideways: wp.float32
-    inward: wp.float32
-    farthest: wp.float32
-    detour: wp.float32
-    turning: wp.float32
-    sure: wp.float32
     bulge: wp.float32
     through: wp.float32
-    retreats: wp.int32
-    turns: wp.int32
 
 
 RULES = tuple(name for name in Rules.vars if name != "margin")  # type: ignore[attr-defined]  # Warp's own
@@ -94,36 +66,20 @@ class State:
     gradient: wp.array[wp.vec3]
     face: wp.array[wp.int32]
     """Distance there."""
-    outward: wp.array[wp.vec3]
-    """Unit normal, where a limb is near that may not pull the cloth through itself."""
-    along: wp.array[wp.float32]
-    """Cosine of gradient and normal."""
     way: wp.array[wp.float32]
-    """How far a vertex has to go."""
-    heading: wp.array[wp.vec3]
-    """Unit direction of it."""
-    depth: wp.array[wp.float32]
-    """Distance that the push starts from."""
+    """How far a vertex has to go along the gradient."""
     goal: wp.array[wp.float32]
-    """Distance that it leads to."""
-    guess: wp.array[wp.int32]
-    """A face that may be closer."""
-    role: wp.array[wp.int32]
+    """Distance that this leads to."""
     mark: wp.array[wp.int32]
     counts: wp.array[wp.int32]
-    touched: wp.array[wp.int32]
-    """Vertices at each limb that they don't lie on."""
-    inward: wp.array[wp.int32]
-    """Those of them that it pushes inwards."""
     begins: wp.array[wp.int32]
     ends: wp.array[wp.int32]
     """Where launches begin and end to go through each list, on a GPU; `_round_kernels.close_kernel` says so."""
     near: wp.array[wp.int32]
-    pushed: wp.array[wp.int32]
     reached: wp.array[wp.int32]
     """The lists; `reached` serves as that of suspects before, and of raised ends after."""
     alpha: wp.array[wp.float32]
-    """Scale of each of those pushed."""
+    """Scale of each of the near ones."""
     field: wp.array[wp.vec3]
     smoother: wp.array[wp.vec3]
     """How far vertices are taken along, and the same a sweep later; zero in between frames."""

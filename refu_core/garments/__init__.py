@@ -1,6 +1,7 @@
 """Garments: their files, how they follow shape and style, how they are posed and unposed."""
 
 from refu_core.frames import N_STYLES
+from refu_core.garments._below import SkinBelow
 from refu_core.garments._card import GarmentCard, Tailoring, card_to_json
 from refu_core.garments._file import load_garment
 from refu_core.garments._template import GarmentTemplate, inner_first
@@ -12,6 +13,7 @@ __all__ = [
     "N_STYLES",
     "GarmentCard",
     "GarmentTemplate",
+    "SkinBelow",
     "Tailoring",
     "card_to_json",
     "inner_first",

@@ -8,12 +8,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from refu_core.contact import DEFAULT_CONTACT, ContactSettings, Layer, Limbs, Resolver
+from refu_core.contact import DEFAULT_CONTACT, ContactSettings, Layer, Resolver
 from refu_core.garments import inner_first
 from refu_core.modes import SdfMode
 from refu_core.realtime._wearer import Outfit
 from refu_core.refu import VertexScale
-from refu_core.sdf import ApproxSdf, ExactSdf, MeshSdf, Winding, exact_sdf
+from refu_core.sdf import ApproxSdf, MeshSdf, Winding, exact_sdf
 
 _ASKED_FROM = 2e-3
 """Vertices are asked exactly up to this far beyond the margin [m]."""
@@ -68,14 +68,10 @@ class ContactStage:
         self.winding = Winding(body.faces) if certify else None
         self.order = inner_first(garments)
         """Names from the skin outwards."""
-        rest = ExactSdf(body.faces, device=body.device)
-        rest.update(body.v_template)
         self._asked = {name: self.sdf.of_garment(one) for name, one in garments.items()}
-        self.resolvers = {}
-        for name, one in garments.items():
-            clearance = rest.query(one.v_template).distance
-            limbs = Limbs.of(body.weights, body.faces, one.weights, one.faces, clearance=clearance, settings=settings)
-            self.resolvers[name] = Resolver(limbs, settings=settings)
+        self.resolvers = {
+            name: Resolver(one.faces, one.n_vertices, settings=settings) for name, one in garments.items()
+        }
         self._below = {
             name: {
                 inner: Layer(

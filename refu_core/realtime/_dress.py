@@ -25,7 +25,7 @@ class Drape(NamedTuple):
     """One garment on a batch of bodies."""
 
     vertices: Tensor
-    """As the root sees them [m], shape (B, V, 3)."""
+    """As the root sees them, where skin gives way taken along by it [m], shape (B, V, 3)."""
     unposed: Tensor
     """Before posing [m], shape (B, V, 3)."""
     on_mean: Tensor
@@ -49,19 +49,23 @@ class Dressed(NamedTuple):
 def dress(pose: Tensor, wearer: Wearer, *, lap: Lap = _no_lap) -> Dressed:
     """Bodies in poses (B, 24, 3) [rad], dressed by the backbones: posed as g = T(θ, β)(t(β, γ) + D(θ, β, γ)).
 
+    Where a collider pulls the skin apart, the cloth that lies on it goes along (`SkinBelow`).
     Pipeline, CUDA graph, training, evaluation and benchmark all call this. It is a pure function of tensors and
     differentiable: nothing is remembered, and no device is waited for. `lap` is called at the end of each stage.
     """
     turns, at_root = RootTurn.taken_off(pose, wearer.shape.joints)
     posed = wearer.outfit.body.posed(at_root, wearer.shape)
     lap("body", None)
-    body, collider = posed.vertices, wearer.outfit.collider
-    if collider is not None:
-        body = collider(posed.vertices, posed.transforms)
+    outfit, body = wearer.outfit, posed.vertices
+    if outfit.collider is not None:
+        body = outfit.collider(posed.vertices, posed.transforms)
         lap("collider", None)
     drapes = {}
     for name, garment in wearer.garments.items():
-        drapes[name] = _drape(pose, wearer, wearer.outfit.wearables[name], garment, posed.transforms)
+        drape = _drape(pose, wearer, outfit.wearables[name], garment, posed.transforms)
+        if outfit.collider is not None:
+            drape = drape._replace(vertices=drape.vertices + outfit.below[name](body - posed.vertices))
+        drapes[name] = drape
         lap("backbone", name)
     return Dressed(body, posed.vertices, drapes, turns)
 

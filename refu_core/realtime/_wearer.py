@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -13,7 +14,7 @@ from torch import Tensor, nn
 from refu_core.backbones import Backbone
 from refu_core.body import Collider, Shape, SmplBody
 from refu_core.frames import N_STYLES
-from refu_core.garments import GarmentTemplate
+from refu_core.garments import GarmentTemplate, SkinBelow
 from refu_core.refu import Refu
 
 
@@ -38,6 +39,11 @@ class Outfit:
     """By name."""
     collider: Collider | None = None
     """What of the posed body garments are brought off; None for the posed body as it is, which runs through itself."""
+
+    @cached_property
+    def below(self) -> Mapping[str, SkinBelow]:
+        """The skin that each garment lies on, by name."""
+        return {name: SkinBelow.of(one.template, self.body) for name, one in self.wearables.items()}
 
     def to(self, dtype: torch.dtype) -> Outfit:
         """The same in another precision; nothing is shared."""

@@ -53,8 +53,10 @@ class Dresser(nn.Module):
         """
         super().__init__()
         self.backbone, self.refu = backbone, refu  # modules, whose weights are this one's, too
-        self._garment, self._body = garment, body
-        self._collider = Collider(body) if collider else None
+        self._garment = garment
+        self._network = _InPrecision(backbone)
+        wearable = Wearable(garment, self._network, refu, 0.0)
+        self._outfit = Outfit(body, {garment.name: wearable}, Collider(body) if collider else None)
         self._blend = Blend.of_faces(garment.faces, garment.n_vertices) if is_blended else None
         made = {name: _Distances(name, garment, body) for name in {in_refu, in_loss}}
         self._in_refu, self._in_loss = made[in_refu], made[in_loss]
@@ -65,11 +67,10 @@ class Dresser(nn.Module):
         The fourth coordinate is the signed distance to the body [m], exact where that is less than the margin.
         """
         name, kind = self._garment.name, betas.device.type
-        network = _InPrecision(self.backbone, torch.is_autocast_enabled(kind), torch.get_autocast_dtype(kind))
-        outfit = Outfit(self._body, {name: Wearable(self._garment, network, self.refu, 0.0)}, self._collider)
+        self._network.is_low, self._network.dtype = torch.is_autocast_enabled(kind), torch.get_autocast_dtype(kind)
         # Millimetres need float32, whatever precision the networks are run in.
         with torch.autocast(kind, enabled=False):
-            wearer = Wearer.of(outfit, betas, None if self._garment.styledirs is None else style)
+            wearer = Wearer.of(self._outfit, betas, None if self._garment.styledirs is None else style)
             dressed = dress(pose, wearer)
             drape = dressed.drapes[name]
             vertices = drape.vertices
@@ -84,13 +85,13 @@ class Dresser(nn.Module):
             return torch.cat((in_world, distance[..., None]), dim=-1)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class _InPrecision:
     """A backbone in the precision that the training loop asks for, in the midst of what needs float32."""
 
     backbone: Backbone
-    is_low: bool
-    dtype: torch.dtype
+    is_low: bool = False
+    dtype: torch.dtype = torch.float32
 
     def wearer_code(self, betas: Tensor, style: Tensor | None) -> Tensor | None:
         """As `Backbone.wearer_code`, in full precision."""

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from refu_core import GarmentError, GarmentPipeline, SmplFrame, WeightsError, load_body, load_garment
 from refu_core.body import apply_transforms, blend_transforms
-from refu_core.garments import BUILTIN_GARMENTS
+from refu_core.garments import BUILTIN_GARMENTS, SkinBelow
 from refu_core.sdf import ExactSdf
 
 PAPER_VERTICES = {"shirt-male": 9723, "tshirt-male": 7702, "short-pant-male": 2710, "skirt-female": 7130}
@@ -188,3 +188,29 @@ def test_styles_change_the_cut_and_stay_outside(name: str) -> None:
             cut = garment.rest(betas, style)
             assert (cut - mean).norm(dim=-1).max() > 0.003
             assert float(sdf.query(cut[0]).distance.min()) > 0
+
+
+@pytest.mark.parametrize("name", ["tshirt-male", "skirt-female"])
+def test_cloth_goes_with_the_skin_that_it_lies_on(name: str) -> None:
+    garment = load_garment(name)
+    body = load_body(garment.body)
+    below = SkinBelow.of(garment, body)
+    together = torch.tensor([0.01, -0.02, 0.03])
+    as_one = below(together.expand(2, body.n_vertices, 3))
+    torch.testing.assert_close(as_one, together.expand(2, garment.n_vertices, 3))
+    shift = torch.randn(2, body.n_vertices, 3, generator=torch.Generator().manual_seed(0))
+    moved = below(shift)
+    for i in range(0, garment.n_vertices, 500):
+        distance = (body.v_template - garment.v_template[i]).norm(dim=1)
+        nearest = distance.argsort()[:8]
+        weight = torch.exp(-(distance[nearest] ** 2 - distance.min() ** 2) / (2 * 0.01**2))
+        wanted = (weight[:, None] * shift[:, nearest]).sum(1) / weight.sum()
+        torch.testing.assert_close(moved[:, i], wanted, atol=1e-4, rtol=1e-4)
+
+
+def test_gradcheck_of_cloth_that_goes_with_the_skin() -> None:
+    garment, body = load_garment("short-pant-male"), load_body("male").to(dtype=torch.float64)
+    below = SkinBelow.of(garment, body)
+    few = SkinBelow(below.vertex[:20] % 30, below.weight[:20])
+    shift = torch.randn(2, 30, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0), requires_grad=True)
+    assert torch.autograd.gradcheck(few, shift)

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import refu_core
-from refu_core import ExactSdf, GarmentPipeline, Limbs, RefuError, Resolver, SmplFrame, load_body
+from refu_core import ExactSdf, GarmentPipeline, RefuError, Resolver, SmplFrame, load_body
 from refu_core.refu import Refu, repulse
 from refu_core.sdf import SdfSample
 
@@ -54,7 +54,7 @@ def pipeline() -> GarmentPipeline:
 
 
 def resolver() -> Resolver:
-    return Resolver(Limbs.one(TETRAHEDRON, torch.tensor([[0, 1, 2]]), n_vertices=3))
+    return Resolver(torch.tensor([[0, 1, 2]]), 3)
 
 
 FRAME = SmplFrame(pose=np.zeros(72))

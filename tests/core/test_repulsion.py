@@ -14,7 +14,6 @@ from slow_contact import resolve
 from torch import Tensor
 
 from refu_core.body import SmplBody, load_body
-from refu_core.contact import Blend
 from refu_core.errors import MeshError
 from refu_core.garments import GarmentTemplate, load_garment
 from refu_core.metrics import CollisionChecker, SelfContactDetector
@@ -130,34 +129,6 @@ def test_displacement_of_all_pushes_is_bounded() -> None:
     done = resolve(points, HalfSpaces(0.01), max_displacement=0.05)
     assert (done.vertices - points).norm() <= 0.05 + 1e-6
     assert done.n_unresolved == 1
-
-
-class Floor:
-    """The floor y = 0; around it, where y < -0.01, the space within a limb that runs through it.
-
-    There a distance to the closest skin says "2 cm outside", and a step up "1 cm inside".
-    """
-
-    def update(self, vertices: Tensor) -> None:
-        raise NotImplementedError
-
-    def query(self, points: Tensor) -> SdfSample:
-        around = torch.where(points[:, 1] < -0.01, 0.02, -0.01)
-        is_around = points[:, [0, 2]].norm(dim=1) > 0.025
-        up = torch.tensor([0.0, 1.0, 0.0]).expand_as(points)
-        return SdfSample(torch.where(is_around, around, points[:, 1]), up)
-
-
-def test_cloth_that_is_taken_along_is_not_believed_to_be_clear() -> None:
-    x, z = torch.meshgrid(torch.arange(15), torch.arange(15), indexing="ij")
-    points = 0.01 * torch.stack((x - 7.0, torch.full(x.shape, -1.5), z - 7.0), dim=-1).view(-1, 3)
-    corner = (15 * x + z)[:-1, :-1].reshape(-1, 1)
-    faces = torch.cat((corner + torch.tensor([0, 1, 15]), corner + torch.tensor([1, 16, 15])))
-    done = resolve(points, Floor(), margin=0.004, blend=Blend.of_faces(faces, len(points)))
-    pushed = points[:, [0, 2]].norm(dim=1) < 0.025
-    assert (Floor().query(done.vertices).distance >= 0).all()
-    torch.testing.assert_close(done.vertices[pushed, 1], torch.full((int(pushed.sum()),), 0.004), atol=2e-4, rtol=0)
-    assert (done.vertices[~pushed] != points[~pushed]).any()
 
 
 def test_nothing_to_do_costs_one_query() -> None:

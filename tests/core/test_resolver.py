@@ -7,7 +7,7 @@ import math
 
 import pytest
 import torch
-from slow_contact import SlowLimbs, resolve
+from slow_contact import resolve
 from torch import Tensor
 
 from refu_core import GarmentTemplate, SmplBody, load_body, load_garment
@@ -18,14 +18,13 @@ KINDS = ("exact", "band", "approx")
 
 
 @functools.cache
-def worn(garment: str) -> tuple[SmplBody, GarmentTemplate, SlowLimbs, Resolver]:
+def worn(garment: str) -> tuple[SmplBody, GarmentTemplate, Resolver]:
     template = load_garment(garment)
-    body = load_body(template.body)
-    rest = ExactSdf(body.faces)
-    rest.update(body.v_template)
-    clearance = rest.query(template.v_template).distance
-    limbs = SlowLimbs.of(body.weights, body.faces, template.weights, template.faces, clearance=clearance)
-    return body, template, limbs, Resolver(limbs)
+    return load_body(template.body), template, resolver_of(template)
+
+
+def resolver_of(template: GarmentTemplate) -> Resolver:
+    return Resolver(template.faces, template.n_vertices)
 
 
 @functools.cache
@@ -38,7 +37,7 @@ def distance(garment: str, kind: str) -> ExactSdf | BandSdf | ApproxSdf:
 
 def dressed(garment: str, bend: float, ripple: float) -> tuple[Tensor, Tensor, Tensor]:
     """Posed body and unposed and posed garment: arms lowered and elbows and hips bent by `bend`, waves of `ripple`."""
-    body, template, _, _ = worn(garment)
+    body, template, _ = worn(garment)
     pose = torch.zeros(1, 24, 3)
     pose[0, 16, 2], pose[0, 17, 2] = -bend, bend
     pose[0, 18, 1], pose[0, 1, 0] = -bend, -0.5 * bend
@@ -49,7 +48,7 @@ def dressed(garment: str, bend: float, ripple: float) -> tuple[Tensor, Tensor, T
 
 
 def both(garment: str, kind: str, body: Tensor, unposed: Tensor, points: Tensor) -> tuple[Resolution, Resolution]:
-    _, template, limbs, resolver = worn(garment)
+    _, template, resolver = worn(garment)
     sdf = distance(garment, kind)
     sdf.update(body)
     near = RestFaces(worn(garment)[0])(unposed[0]) if kind == "approx" else None
@@ -61,9 +60,7 @@ def both(garment: str, kind: str, body: Tensor, unposed: Tensor, points: Tensor)
     blend = Blend.of_faces(template.faces, template.n_vertices)
     reference = ApproxSdf(worn(garment)[0], exact_from=math.inf) if kind == "approx" else sdf  # pushes walk
     reference.update(body)
-    slow = resolve(
-        points, reference, scale=scale, start=start, near=near, blend=blend, edges=template.edges, limbs=limbs
-    )
+    slow = resolve(points, reference, scale=scale, start=start, near=near, blend=blend, edges=template.edges)
     return slow, resolver(points, sdf, start, scale=scale)
 
 
@@ -98,11 +95,11 @@ def test_frames_leave_nothing_behind() -> None:
 def test_one_thread_does_what_the_same_launches_in_every_frame_do(kind: str, bend: float) -> None:
     """On a CPU launches are as long as lists, or left out, or one; on a GPU, which isn't waited for, they aren't."""
     body, unposed, points = dressed("shirt-male", bend, 0.02)
-    person, _, limbs, resolver = worn("shirt-male")
+    person, template, resolver = worn("shirt-male")
     sdf = distance("shirt-male", kind)
     sdf.update(body)
     start = sdf.query(points, near=RestFaces(person)(unposed[0]) if kind == "approx" else None)
-    by_rounds = Resolver(limbs)
+    by_rounds = resolver_of(template)
     by_rounds._is_serial = False
     by_rounds(points + 0.01, sdf, sdf.query(points + 0.01))  # leaves nothing behind
     one, other = resolver(points, sdf, start), by_rounds(points, sdf, start)
@@ -117,10 +114,10 @@ def test_another_margin_is_another_launch() -> None:
     sdf = distance("tshirt-male", "exact")
     sdf.update(body)
     start = sdf.query(points)
-    _, _, limbs, resolver = worn("tshirt-male")
+    _, template, resolver = worn("tshirt-male")
     narrow, wide = (resolver(points, sdf, start, margin=margin).vertices for margin in (0.001, 0.004))
-    assert torch.equal(narrow, Resolver(limbs)(points, sdf, start, margin=0.001).vertices)
-    assert torch.equal(wide, Resolver(limbs)(points, sdf, start).vertices)
+    assert torch.equal(narrow, resolver_of(template)(points, sdf, start, margin=0.001).vertices)
+    assert torch.equal(wide, resolver_of(template)(points, sdf, start).vertices)
     assert not torch.equal(narrow, wide)
 
 
@@ -130,14 +127,14 @@ def test_what_is_far_from_the_body_stays() -> None:
     sdf.update(body)
     away = points + torch.tensor([3.0, 0.0, 0.0])
     sample = sdf.query(away)
-    done = worn("tshirt-male")[3](away, sdf, sample)
+    done = worn("tshirt-male")[2](away, sdf, sample)
     assert torch.equal(done.vertices, away)
     assert (done.n_inside, done.n_pushed, done.n_unresolved, done.max_depth) == (0, 0, 0, 0.0)
-    by_rounds = Resolver(worn("tshirt-male")[2])
+    by_rounds = resolver_of(worn("tshirt-male")[1])
     by_rounds._is_serial = False
     unasked = by_rounds(away, sdf, sample)
     assert torch.equal(unasked.vertices, away)
     assert not unasked.numbers.any()
     no_face = torch.full((len(away),), -1, dtype=torch.int32)
     clipped = SdfSample(sample.distance.clamp_max(0.008), sample.gradient, no_face)
-    assert torch.equal(worn("tshirt-male")[3](away, sdf, clipped).vertices, away)
+    assert torch.equal(worn("tshirt-male")[2](away, sdf, clipped).vertices, away)

@@ -1,6 +1,4 @@
 """What `refu_core.contact` computes, slowly and plainly: one algorithm, so one reference to hold it against."""
 
-from slow_contact._limbs import SlowLimbs as SlowLimbs
 from slow_contact._mend import mend as mend
-from slow_contact._mend import turn_outward as turn_outward
 from slow_contact._resolve import resolve as resolve

@@ -11,8 +11,7 @@ from refu_core.contact import DEFAULT_CONTACT, Blend, Resolution
 from refu_core.modes import DEFAULT_MARGIN
 from refu_core.refu import MAX_DISPLACEMENT, VertexScale, repulse
 from refu_core.sdf import BodySdf, SdfSample
-from slow_contact._limbs import SlowLimbs
-from slow_contact._mend import mend, turn_outward
+from slow_contact._mend import mend
 
 _SETTINGS = DEFAULT_CONTACT
 
@@ -31,7 +30,6 @@ def resolve(
     tolerance: float = 2e-4,
     max_displacement: float = MAX_DISPLACEMENT,
     edges: Tensor | None = None,
-    limbs: SlowLimbs | None = None,
 ) -> Resolution:
     """Pushes garment vertices to f ≥ `margin`, and looks again at those it pushed. Not differentiable.
 
@@ -57,14 +55,11 @@ def resolve(
         edges: Pairs of vertices, shape (E, 2), such as a garment template's `edges`: where given, the middles of edges
             near the skin are checked, too, and both ends of those too close are raised. That clears the edges which cut
             a corner.
-        limbs: Where given, a vertex that the gradient would take out on the far side of a limb it doesn't lie on is
-            moved towards its own skin instead, so that an arm in the flank dents a shirt and doesn't tear it.
     """
     if start is None:
         start = sdf.query(points) if near is None else sdf.query(points, near=near)
-    if limbs is not None:
-        look = None if near is None else lambda here, faces: sdf.query(here, near=faces)
-        start = mend(points, start, limbs, margin=margin, look=look)
+    if near is not None and edges is not None and start.face is not None:
+        start = mend(points, start, edges, margin=margin, look=lambda here, faces: sdf.query(here, near=faces))
     state = _State(
         vertices=points.clone(),
         distance=start.distance.clone(),
@@ -80,8 +75,6 @@ def resolve(
     rows = torch.nonzero(start.distance < margin)[:, 0]
     first = start.rows(rows)
     rounds = 0
-    if limbs is not None and first.face is not None:
-        rows, first, rounds = _keep_sides(state, rows, first, limbs, max_pushes)
     alpha = state.first_scale(scale, rows, first.distance)
     if blend is not None and len(rows):
         rows, first, alpha = _push_blended(state, rows, first, alpha, blend)
@@ -152,31 +145,6 @@ class _State:
         return torch.maximum(alpha, (min(self.tolerance, self.margin) - distance) / deficit)
 
 
-def _keep_sides(
-    state: _State, rows: Tensor, sample: SdfSample, limbs: SlowLimbs, max_pushes: int
-) -> tuple[Tensor, SdfSample, int]:
-    """Sees to it that cloth stays on its side of a limb; returns what is to be pushed, its distances, and the rounds.
-
-    What the gradient would take around another limb has left that on the near side then, and isn't to be pushed.
-    """
-    assert sample.face is not None  # the caller has seen to it
-    is_foreign = limbs.is_foreign(rows, sample.face)
-    if not bool((is_foreign | (sample.distance < -_SETTINGS.deep)).any()):
-        return rows, sample, 0
-    outward = limbs.outward(state.origin)
-    crossing = limbs.crosses(rows, sample.face, sample.gradient, outward)
-    rounds = _retreat(state, rows[crossing], outward, limbs, max_pushes)
-    # Those without any room: out on the far side after all.
-    others = torch.nonzero(~crossing | (state.distance[rows] < 0))[:, 0]
-    rows, sample = rows[others], sample.rows(others)
-    state.vertices[rows], state.distance[rows] = state.origin[rows], sample.distance
-    # Out of another limb the way against the cloth's normal, towards its own skin, is the right one.
-    assert sample.face is not None
-    side = torch.where(limbs.is_sole(rows, sample.face)[:, None], outward[rows], sample.gradient)
-    sample, looks = turn_outward(state.origin[rows], sample, side, lambda x, at: state.query(x, rows[at]))
-    return rows, sample, rounds + looks
-
-
 def _push_blended(
     state: _State, rows: Tensor, sample: SdfSample, scale: Tensor, blend: Blend
 ) -> tuple[Tensor, SdfSample, Tensor]:
@@ -185,9 +153,7 @@ def _push_blended(
     goal[rows] = (sample.distance + scale * (state.margin - sample.distance)).clamp_max(state.margin)
     is_pushed = torch.zeros_like(goal, dtype=torch.bool)
     is_pushed[rows] = True
-    push = state.vertices - state.origin
-    # What has left another limb on its near side stays there; its neighbours follow.
-    has_left = (push != 0).any(dim=-1)
+    push = torch.zeros_like(state.origin)
     moved = repulse(
         state.vertices[rows], sample, scale=scale, margin=state.margin, max_displacement=state.max_displacement
     )
@@ -195,11 +161,11 @@ def _push_blended(
     least = torch.full_like(goal, torch.inf)
     least[rows] = state.margin - sample.distance
     field = blend.spread(push[:, None], least=least[:, None])[:, 0]
-    everyone = torch.nonzero((field != 0).any(dim=-1) & ~has_left)[:, 0]
+    everyone = torch.nonzero((field != 0).any(dim=-1))[:, 0]
     moved = state.bounded(state.origin[everyone] + field[everyone], everyone)
     # No vertex gets nearer by more than it moves: those that stay beyond the margin needn't be asked.
     way = torch.linalg.vector_norm(moved - state.origin[everyone], dim=-1)
-    floor = state.distance[everyone].clamp_max(state.margin + _SETTINGS.sure) - way
+    floor = state.distance[everyone] - way
     is_near = is_pushed[everyone] | (floor < state.margin + state.tolerance)
     far = everyone[~is_near]
     state.vertices[far], state.distance[far] = moved[~is_near], floor[~is_near]
@@ -238,35 +204,6 @@ def _push(state: _State, rows: Tensor, sample: SdfSample, scale: Tensor, max_pus
         sample = sample.rows(unclear)
         push = torch.where((last * sample.gradient).sum(-1) < 0, 0.5, 1.0)
     return max_pushes
-
-
-def _retreat(state: _State, rows: Tensor, outward: Tensor, limbs: SlowLimbs, max_pushes: int) -> int:
-    """Moves `rows` against `outward` (N, 3) out of a limb, as far as there is room; returns the rounds it took."""
-    if not len(rows):
-        return 0
-    walker, here = rows, state.vertices[rows]
-    distance, way = state.distance[rows], torch.zeros_like(state.distance[rows])
-    rounds = 0
-    while len(walker) and rounds < _SETTINGS.retreats:
-        rounds += 1
-        # No surface is nearer than |f|: a step of |f| can't jump over the room that is sought, however narrow it is.
-        # Farther in than the garment is cut off the skin there is only flesh.
-        step = torch.minimum(-distance + _SETTINGS.step_on, limbs.clearance[walker] + _SETTINGS.step_on - way)
-        here = state.bounded(here - step[:, None] * outward[walker], walker)
-        way = way + step
-        sample = state.query(here, walker)
-        state.keep_better(walker, here, sample)
-        distance = sample.distance
-        going = torch.nonzero((distance <= 0) & (way < limbs.clearance[walker]))[:, 0]
-        walker, here, distance, way = walker[going], here[going], distance[going], way[going]
-    # The few that missed it go where their neighbours went.
-    missed = rows[state.distance[rows] < 0]
-    filled = state.bounded(limbs.mean_of_neighbours(state.vertices, missed), missed)
-    state.keep_better(missed, filled, state.query(filled, missed))
-    # In the room between limb and skin the gradient keeps to the middle, or at the margin where that is wide enough.
-    found = rows[state.distance[rows] > 0]
-    again = state.query(state.vertices[found], found)
-    return rounds + _push(state, found, again, torch.ones_like(again.distance), max_pushes)
 
 
 def _raise_edges(state: _State, edges: Tensor, max_rounds: int) -> int:
