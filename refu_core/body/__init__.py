@@ -1,6 +1,7 @@
 """SMPL-layout body models: linear blend skinning, loaders, and the built-in CC0 bodies."""
 
-from refu_core.body._collider import DEFAULT_GAP, Collider
+from refu_core.body._anatomy import DEFAULT_GAP, ColliderSettings
+from refu_core.body._collider import Collider
 from refu_core.body._io import BUILTIN_BODIES, load_body
 from refu_core.body._kinematics import (
     JOINT_NAMES,
@@ -24,6 +25,7 @@ __all__ = [
     "SEGMENTS",
     "BodyOutput",
     "Collider",
+    "ColliderSettings",
     "RigidTransforms",
     "Shape",
     "Skinning",

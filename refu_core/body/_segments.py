@@ -9,6 +9,27 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from refu_core.body._parts import joints_of
+
+SOFTNESS: tuple[tuple[tuple[int, ...], float], ...] = (
+    (joints_of("trunk"), 1.0),
+    (joints_of("head"), 0.5),
+    (joints_of("left_upper_arm"), 1.0),
+    (joints_of("right_upper_arm"), 1.0),
+    ((18,), 0.7),
+    ((19,), 0.7),
+    ((20, 22), 0.25),
+    ((21, 23), 0.25),
+    (joints_of("left_thigh"), 1.0),
+    (joints_of("right_thigh"), 1.0),
+    ((4,), 0.7),
+    ((5,), 0.7),
+    ((7, 10), 0.25),
+    ((8, 11), 0.25),
+)
+"""Joints of the segments that give way to each other, and how softly: of two, each gives way by its share of both.
+Flanks and thighs are flesh; forearms and shins have bone below the skin; hands, feet and heads hardly give way."""
+
 
 class Solids(NamedTuple):
     """K segments of a body, each closed by a fan to the middle of every loop that it was cut along.
@@ -21,7 +42,7 @@ class Solids(NamedTuple):
     faces: list[NDArray[np.int32]]
     """Of each segment, into V + M vertices, shape (F_k, 3)."""
     middle_start: NDArray[np.int32]
-    """Middle m is the mean of the vertices number `middle_start[m]` to `middle_start[m + 1]` of the next, shape (M + 1,)."""
+    """Where in the next the vertices begin that each middle is the mean of, shape (M + 1,)."""
     middle_vertex: NDArray[np.int32]
 
 
@@ -44,7 +65,9 @@ def cut(faces: NDArray[np.int32], share: NDArray[np.float64]) -> Solids:
             n_points += 1
         closed.append(np.concatenate([own, *caps]).astype(np.int32))
     sizes = [len(loop) for loop in loops]
-    return Solids(of_vertex, closed, np.cumsum([0, *sizes]).astype(np.int32), np.concatenate(loops).astype(np.int32))
+    return Solids(
+        of_vertex, closed, np.cumsum([0, *sizes]).astype(np.int32), np.concatenate([*loops, []]).astype(np.int32)
+    )
 
 
 def _rim(faces: NDArray[np.int32], n_vertices: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

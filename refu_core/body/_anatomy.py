@@ -1,0 +1,233 @@
+"""What `Collider` knows of a body, prepared once from its file: as its kernels and as its derivative take it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+from numpy.typing import ArrayLike, NDArray
+
+from refu_core._warp import as_warp
+from refu_core.body import _collider_kernels as kernels
+from refu_core.body import _part_kernels as parting
+from refu_core.body._creases import LEVELS, find_creases
+from refu_core.body._kinematics import PARENTS
+from refu_core.body._model import SmplBody
+from refu_core.body._segments import SOFTNESS, cut
+from refu_core.mesh import Connectivity
+
+DEFAULT_GAP = 0.012
+"""Room between two parts of a body [m]: for two layers of cloth, each 4 mm off the skin, and some to spare."""
+
+
+FADE = 0.035
+"""Beyond the reach of a crease its planes let skin go by a metre a metre; so far out nothing would be held [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColliderSettings:
+    """How a body is pulled apart. `benchmarks/collider.py` measures what half and twice of each number do."""
+
+    gap: float = DEFAULT_GAP
+    """Room that is left between two parts [m]."""
+    crease_share: float = 0.25
+    """Share of its height over a seam in the rest pose that skin keeps, at most half of the gap: nothing moves until a
+    fold has squeezed skin to a quarter."""
+    crease_reach: float = 0.045
+    """Skin up to this far from a seam keeps to its side [m], and skin beyond it less and less. Farther out segments
+    find each other by their distance, and share what is to be given way in halves, which a plane doesn't."""
+    segment_share: float = 0.3
+    """Share of its distance from another segment in the rest pose that skin keeps, at most the gap: at a joint
+    segments begin where they are 0 apart."""
+    crease_rounds: int = 2
+    """How often skin is brought to its side: at the groin several seams meet."""
+    part_rounds: int = 4
+    """Newton's steps to the surface between two segments."""
+    deepen_rounds: int = 4
+    """How far inside another segment skin is looked for [edges], from where its surface is within the gap."""
+    smooth_first: int = 3
+    """Sweeps over creases before segments are parted."""
+    smooth_last: int = 1
+    """Sweeps over all that was moved after it."""
+    smooth_full: float = 0.004
+    """Skin that was moved this far is levelled in full [m], and the less the less it was moved."""
+    smooth_step: float = 0.5
+    """How far a sweep goes towards the mean of the neighbours."""
+    edge_rounds: int = 2
+    """How often the middles of edges are brought out: a triangle cuts the corner between its vertices."""
+    steep: float = 0.004
+    """Edges whose ends were moved by this much apart from each other are looked at [m], in full from twice that on."""
+
+
+class Anatomy:
+    """The rings, bones, seams and segments of a body of V vertices and K segments, and memory to part them in."""
+
+    def __init__(self, body: SmplBody, settings: ColliderSettings) -> None:
+        """Raises `MeshError` for a body that isn't a closed, consistently oriented surface."""
+        self.settings, self.device = settings, body.device
+        rest = body.v_template.double().cpu().numpy()
+        weights = body.weights.double().cpu().numpy()
+        mesh = Connectivity.of(body.faces.cpu(), len(rest))
+        mesh.require_closed()
+        self.mesh = mesh
+        """What is next to what on the body."""
+        self.edges = torch.as_tensor(mesh.edges.astype(np.int64), device=self.device)
+        """Shape (E, 2)."""
+        self.weights = torch.as_tensor(weights, device=self.device)
+        """Skinning weights, shape (V, 24)."""
+        self.tensors = Tensors(len(rest), len(mesh.edges), self.device)
+        self.rings = self._bind_rings(mesh)
+        self.bones = self._bind_bones(rest, mesh, weights)
+        self.seams = self._bind_seams(rest, mesh, weights)
+        self.segments = self._bind_segments(rest, mesh, weights)
+        self.work = self.tensors.bound()
+
+    def _bind_rings(self, mesh: Connectivity) -> Any:
+        ring = mesh.ring
+        low, high = np.minimum(ring.owner, ring.items), np.maximum(ring.owner, ring.items)
+        keys = mesh.edges[:, 0].astype(np.int64) * mesh.n_vertices + mesh.edges[:, 1]
+        rings = kernels.Rings()
+        rings.start, rings.vertex = self._ints(ring.start), self._ints(ring.items)
+        rings.edge = self._ints(np.searchsorted(keys, low * mesh.n_vertices + high))
+        rings.ends = wp.array(mesh.edges, dtype=wp.vec2i, device=str(self.device))
+        return rings
+
+    def _bind_bones(self, rest: NDArray[np.float64], mesh: Connectivity, weights: NDArray[np.float64]) -> Any:
+        vertex, joint = np.nonzero(weights)
+        bones = kernels.Bones()
+        work = self.tensors
+        bones.rotation, bones.between = as_warp(work.rotation, wp.mat33), as_warp(work.between, wp.mat33)
+        bones.start = self._ints(np.searchsorted(vertex, np.arange(len(rest) + 1)))
+        bones.joint, bones.weight = self._ints(joint), self._floats(weights[vertex, joint])
+        normals = _smooth_normals(rest, mesh)
+        bones.normal = self._vectors(normals)
+        self.normals = torch.as_tensor(normals, device=self.device)
+        """Unit normals of the skin in the rest pose, levelled, shape (V, 3)."""
+        self.chain = [self._ints([max(parent, 0) for parent in PARENTS]), self._floats(LEVELS)]
+        return bones
+
+    def _bind_seams(self, rest: NDArray[np.float64], mesh: Connectivity, weights: NDArray[np.float64]) -> Any:
+        how = self.settings
+        found = find_creases(rest, mesh.edges, weights, reach=how.crease_reach + FADE)
+        beyond = np.clip(found.along - how.crease_reach, 0.0, None)
+        held, first = np.unique(found.vertex, return_index=True)
+        seams = kernels.Seams()
+        seams.start = self._ints([*first, len(found.vertex)])
+        seams.rotation = self._ints(found.rotation)
+        seams.normal = self._vectors(found.normal)
+        least = np.minimum(how.gap / 2, how.crease_share * found.height) - beyond
+        seams.least = self._floats(least)
+        self.creases, self.least = found, torch.as_tensor(least, device=self.device)
+        """What is held by which seam, and the height over its plane that is kept [m], shape (R,)."""
+        seams.stations = wp.array(found.stations, dtype=kernels.Stations, device=str(self.device))
+        seams.weights = wp.array(
+            found.weights.astype(np.float32), dtype=kernels.StationWeights, device=str(self.device)
+        )
+        n_stations = len(found.station_start) - 1
+        stations = [
+            self._ints(found.station_start),
+            self._ints(found.station_vertex),
+            self._floats(found.station_weight),
+            wp.zeros(n_stations, dtype=wp.vec3, device=str(self.device)),
+        ]
+        self.held, self.stations = self._ints(held), stations
+        return seams
+
+    def _bind_segments(self, rest: NDArray[np.float64], mesh: Connectivity, weights: NDArray[np.float64]) -> Any:
+        how, n, device = self.settings, len(rest), str(self.device)
+        share = np.stack([weights[:, list(joints)].sum(axis=1) for joints, _ in SOFTNESS], axis=1)
+        solids = cut(mesh.faces, share)
+        n_segments, sizes = len(solids.faces), np.diff(solids.middle_start)
+        work = self.tensors
+        work.add_points(len(sizes), n_segments)
+        work.points[:n] = torch.as_tensor(rest)
+        points = as_warp(work.points, wp.vec3)
+        self.caps = [
+            self._ints(solids.middle_start),
+            self._ints(solids.middle_vertex),
+            self._floats(np.repeat(1 / np.maximum(sizes, 1), sizes)),
+            points[n:],
+        ]
+        if len(sizes):
+            wp.launch(kernels.mean_kernel, len(sizes), [points, *self.caps], device=device)
+        self.trees = [wp.Mesh(points, self._ints(faces.ravel())) for faces in solids.faces]
+        segments = parting.Segments()
+        segments.trees = wp.array([tree.id for tree in self.trees], dtype=wp.uint64, device=device)
+        segments.own = self._ints(solids.of_vertex)
+        segments.low, segments.high = as_warp(work.low, wp.vec3), as_warp(work.high, wp.vec3)
+        segments.faces = wp.array(np.concatenate(solids.faces), dtype=wp.vec3i, device=device)
+        segments.first_face = self._ints(np.cumsum([0, *map(len, solids.faces)]))
+        softness = np.array([one for _, one in SOFTNESS])
+        segments.ratio = self._floats(softness[None] / softness[:, None])
+        clearance = wp.zeros((n, n_segments), dtype=wp.float32, device=device)
+        segments.gap = clearance
+        wp.launch(parting.clearance_kernel, (n, n_segments), [points, segments, clearance], device=device)
+        segments.gap = self._floats(np.minimum(how.gap, how.segment_share * clearance.numpy()))
+        self.own = torch.as_tensor(solids.of_vertex.astype(np.int64), device=self.device)
+        """The segment of each vertex, shape (V,)."""
+        self.faces = torch.as_tensor(np.concatenate(solids.faces).astype(np.int64), device=self.device)
+        """Of all segments, one after another, into vertices and the middles of caps, shape (F, 3)."""
+        self.kept, self.ratio = wp.to_torch(segments.gap), wp.to_torch(segments.ratio)
+        """What vertices keep from segments [m], shape (V, K), and how many times as soft segment k is as i, (K, K)."""
+        return segments
+
+    def _ints(self, values: ArrayLike) -> Any:
+        return wp.array(np.ascontiguousarray(values, np.int32), dtype=wp.int32, device=str(self.device))
+
+    def _floats(self, values: ArrayLike) -> Any:
+        return wp.array(np.ascontiguousarray(values, np.float32), dtype=wp.float32, device=str(self.device))
+
+    def _vectors(self, values: ArrayLike) -> Any:
+        return wp.array(np.ascontiguousarray(values, np.float32), dtype=wp.vec3, device=str(self.device))
+
+
+class Tensors:
+    """The memory of `kernels.Work`, as torch sees it."""
+
+    def __init__(self, n_vertices: int, n_edges: int, device: torch.device) -> None:
+        self._device, self._sizes = device, (n_vertices, n_edges)
+        self.skin, self.here, self.there = (torch.zeros(n_vertices, 3, device=device) for _ in range(3))
+        self.rotation = torch.zeros(len(PARENTS), 3, 3, device=device)
+        self.between = torch.zeros(len(PARENTS) * len(LEVELS), 3, 3, device=device)
+        # What every call begins with as zeros.
+        self.ints = torch.zeros(2 * n_vertices + kernels.N_COUNTS, dtype=torch.int32, device=device)
+        self.counts = self.ints[2 * n_vertices :]
+
+    def add_points(self, n_middles: int, n_segments: int) -> None:
+        """Makes what depends on how the body is cut."""
+        self.points = torch.zeros(self._sizes[0] + n_middles, 3, device=self._device)
+        self.low, self.high = (torch.zeros(n_segments, 3, device=self._device) for _ in range(2))
+
+    def bound(self) -> Any:
+        """As the kernels take it."""
+        n, n_edges = self._sizes
+        work = kernels.Work()
+        for name in ("skin", "points", "here", "there"):
+            setattr(work, name, as_warp(getattr(self, name), wp.vec3))
+        for name in ("moved", "near", "boxed", "ends", "touched", "outside"):
+            setattr(work, name, wp.zeros(n, dtype=wp.int32, device=str(self._device)))
+        work.share = wp.zeros(n, dtype=wp.float32, device=str(self._device))
+        work.hot = wp.zeros(n_edges, dtype=wp.int32, device=str(self._device))
+        work.steps = wp.zeros(n_edges, dtype=wp.vec3, device=str(self._device))
+        work.meets = wp.zeros(len(self.low), dtype=wp.int32, device=str(self._device))
+        work.is_moved, work.is_end = as_warp(self.ints[:n], wp.int32), as_warp(self.ints[n : 2 * n], wp.int32)
+        work.counts = as_warp(self.counts, wp.int32)
+        return work
+
+
+def _smooth_normals(vertices: NDArray[np.float64], mesh: Connectivity) -> NDArray[np.float64]:
+    """Unit normals at the vertices (V, 3) [m], levelled over two rings."""
+    a, b, c = vertices[mesh.faces].transpose(1, 0, 2)
+    normals = np.zeros_like(vertices)
+    np.add.at(normals, mesh.faces, np.cross(b - a, c - a)[:, None])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
+    ring = mesh.ring
+    for _ in range(2):
+        means = np.zeros_like(normals)
+        np.add.at(means, ring.owner, normals[ring.items])
+        normals = 0.5 * (normals + means / np.diff(ring.start)[:, None])
+    unit: NDArray[np.float64] = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    return unit

@@ -1,0 +1,318 @@
+"""What parts the segments of a posed body: who touches whom, and the way to the surface between them."""
+
+import warp as wp
+
+from refu_core.body._collider_kernels import ENDS, FOUND, HOT, MOVED, NEAR, WANTED, Bones, Rings, Work
+
+wp.set_module_options({"enable_backward": False})
+
+DEEPEST = wp.constant(0.1)
+"""Deeper than this no vertex is in another segment [m]: the trunk's half."""
+# A ray along no axis of a mesh.
+_RAY = wp.constant(wp.vec3(0.5418, 0.6389, 0.5461))
+# Ways shorter than this aren't gone [m].
+_LEAST_STEP = wp.constant(1e-5)
+# A closest point with less than this of a corner lies on the edge across.
+_WITHIN = wp.constant(1e-4)
+
+
+@wp.struct
+class Segments:
+    """The segments of `Solids` in one pose: K trees over the same points."""
+
+    trees: wp.array[wp.uint64]
+    own: wp.array[int]
+    """The segment of each vertex."""
+    low: wp.array[wp.vec3]
+    high: wp.array[wp.vec3]
+    faces: wp.array[wp.vec3i]
+    first_face: wp.array[int]
+    gap: wp.array2d[float]
+    """What vertex v keeps from segment k [m]."""
+    ratio: wp.array2d[float]
+    """How many times as soft segment k is as segment i."""
+
+
+@wp.kernel
+def box_kernel(points: wp.array[wp.vec3], own: wp.array[int], low: wp.array[wp.vec3], high: wp.array[wp.vec3]) -> None:
+    v = wp.tid()
+    wp.atomic_min(low, own[v], points[v])
+    wp.atomic_max(high, own[v], points[v])
+
+
+@wp.func
+def do_meet(low: wp.vec3, high: wp.vec3, other_low: wp.vec3, other_high: wp.vec3, gap: float) -> bool:
+    return (
+        low[0] - gap < other_high[0]
+        and low[1] - gap < other_high[1]
+        and low[2] - gap < other_high[2]
+        and other_low[0] < high[0] + gap
+        and other_low[1] < high[1] + gap
+        and other_low[2] < high[2] + gap
+    )
+
+
+@wp.kernel
+def meet_kernel(segments: Segments, gap: float, meets: wp.array[int]) -> None:
+    i = wp.tid()
+    found = int(0)
+    for k in range(segments.trees.shape[0]):
+        if k != i and do_meet(segments.low[i], segments.high[i], segments.low[k], segments.high[k], gap):
+            found |= 1 << k
+    meets[i] = found
+
+
+@wp.func
+def distance_of(tree: wp.uint64, p: wp.vec3, hit: wp.MeshQueryPoint) -> float:
+    """Signed by the face's normal where the closest point is within a face, else by how many faces a ray meets: at an
+    edge of a cap the sign of a normal is wrong."""
+    away = p - wp.mesh_eval_position(tree, hit.face, hit.u, hit.v)
+    distance = wp.length(away)
+    if wp.min(wp.min(hit.u, hit.v), 1.0 - hit.u - hit.v) > _WITHIN:
+        return wp.where(wp.dot(away, wp.mesh_eval_face_normal(tree, hit.face)) < 0.0, -distance, distance)
+    if wp.mesh_query_ray_count_intersections(tree, p, _RAY) % 2 == 1:
+        return -distance
+    return distance
+
+
+@wp.kernel
+def near_kernel(work: Work, segments: Segments) -> None:
+    """Which vertices may touch which segments, by their boxes."""
+    v = wp.tid()
+    p = work.points[v]
+    found = int(0)
+    meets = work.meets[segments.own[v]]
+    k = int(0)
+    while meets != 0:
+        if meets & 1 == 1:
+            keeps = segments.gap[v, k]
+            if keeps > 0.0 and do_meet(p, p, segments.low[k], segments.high[k], keeps):
+                found |= 1 << k
+        meets = meets >> 1
+        k += 1
+    work.touched[v] = 0
+    work.outside[v] = 0
+    if found != 0:
+        work.counts[WANTED] = work.counts[WANTED] | found
+        work.boxed[v] = found
+        work.near[wp.atomic_add(work.counts, NEAR, 1)] = v
+
+
+@wp.kernel
+def touch_kernel(work: Work, segments: Segments) -> None:
+    """Which segments each vertex is nearer to than it may be, of those whose surface is that near."""
+    i = wp.tid()
+    if i >= work.counts[NEAR]:
+        return
+    v = work.near[i]
+    p = work.points[v]
+    mine = int(0)
+    seen = int(0)
+    boxed = work.boxed[v]
+    k = int(0)
+    while boxed != 0:
+        if boxed & 1 == 1:
+            hit = wp.mesh_query_point_no_sign(segments.trees[k], p, segments.gap[v, k])
+            if hit.result:
+                mine |= 1 << k
+                if distance_of(segments.trees[k], p, hit) > 0.0:
+                    seen |= 1 << k
+        boxed = boxed >> 1
+        k += 1
+    work.touched[v] = mine
+    work.outside[v] = seen
+
+
+@wp.kernel
+def deepen_kernel(work: Work, segments: Segments, rings: Rings) -> None:
+    """A vertex next to one that is inside a segment is inside it, too, unless the surface runs between them."""
+    i = wp.tid()
+    if i >= work.counts[NEAR]:
+        return
+    v = work.near[i]
+    around = int(0)
+    for k in range(rings.start[v], rings.start[v + 1]):
+        w = rings.vertex[k]
+        around |= work.touched[w] & ~work.outside[w]
+    around &= ~(work.touched[v] | work.outside[v] | (1 << segments.own[v]))
+    if around == 0:
+        return
+    work.counts[FOUND] = 1
+    for k in range(segments.trees.shape[0]):
+        if (around >> k) & 1 == 1:
+            if wp.mesh_query_ray_count_intersections(segments.trees[k], work.points[v], _RAY) % 2 == 1:
+                work.touched[v] = work.touched[v] | (1 << k)
+            else:
+                work.outside[v] = work.outside[v] | (1 << k)
+
+
+@wp.func
+def normal_at(bones: Bones, v: int) -> wp.vec3:
+    """The smoothed normal that the bones give vertex v: a fold doesn't turn it over."""
+    normal = wp.vec3()
+    for k in range(bones.start[v], bones.start[v + 1]):
+        normal += bones.weight[k] * (bones.rotation[bones.joint[k]] @ bones.normal[v])
+    return wp.normalize(normal)
+
+
+@wp.func
+def way_out(
+    p: wp.vec3,
+    normal: wp.vec3,
+    sunk: float,
+    k: int,
+    ratio: float,
+    keeps: float,
+    farthest: float,
+    segments: Segments,
+    bones: Bones,
+) -> wp.vec3:
+    """How p, with its skin's `normal` and `sunk` below that skin [m], gives way to segment k within `farthest` [m]."""
+    hit = wp.mesh_query_point_no_sign(segments.trees[k], p, farthest)
+    if not hit.result:
+        return wp.vec3()
+    lacks = keeps - distance_of(segments.trees[k], p, hit) - ratio * sunk
+    if lacks < _LEAST_STEP:
+        return wp.vec3()
+    corners = segments.faces[segments.first_face[k] + hit.face]
+    other = wp.vec3()
+    for c in range(3):
+        if corners[c] < segments.own.shape[0]:  # not the middle of a cap
+            weight = wp.where(c == 0, hit.u, wp.where(c == 1, hit.v, 1.0 - hit.u - hit.v))
+            other += weight * normal_at(bones, corners[c])
+    other = wp.normalize(other)
+    way = wp.normalize(other - wp.max(wp.dot(other, normal), 0.0) * normal - normal)
+    rate = wp.dot(way, other) - ratio * wp.dot(way, normal)
+    return lacks / wp.clamp(rate, 0.5 + 0.5 * ratio, 1.0 + ratio) * way
+
+
+@wp.kernel
+def part_kernel(work: Work, segments: Segments, bones: Bones, rings: Rings, rounds: int) -> None:
+    """Moves each vertex to its own side of the surface between its segment and another one, in Newton's steps."""
+    i = wp.tid()
+    if i >= work.counts[NEAR]:
+        return
+    v = work.near[i]
+    touched = work.touched[v]
+    if touched == 0:
+        return
+    outside = work.outside[v]
+    start = work.points[v]
+    p = start
+    own = segments.own[v]
+    normal = normal_at(bones, v)
+    for _ in range(rounds):
+        step = wp.vec3()
+        total = float(0.0)
+        sunk = wp.dot(start - p, normal)
+        for k in range(segments.trees.shape[0]):
+            if (touched >> k) & 1 == 1:
+                far = wp.where((outside >> k) & 1 == 1, segments.gap[v, k] + sunk, DEEPEST)
+                found = way_out(p, normal, sunk, k, segments.ratio[own, k], segments.gap[v, k], far, segments, bones)
+                step += wp.length_sq(found) * found
+                total += wp.length_sq(found)
+        if total == 0.0:
+            break
+        p += step / total
+    if wp.length_sq(p - start) > 0.0:
+        work.here[v] = p
+        work.there[v] = p
+        if work.is_moved[v] == 0:
+            work.is_moved[v] = 1
+            work.moved[wp.atomic_add(work.counts, MOVED, 1)] = v
+    for r in range(rings.start[v], rings.start[v + 1]):
+        e = rings.edge[r]
+        w = rings.vertex[r]
+        if v < w or work.touched[w] == 0:  # once an edge
+            work.hot[wp.atomic_add(work.counts, HOT, 1)] = e
+            for c in range(2):
+                end = rings.ends[e][c]
+                if wp.atomic_exch(work.is_end, end, 1) == 0:
+                    work.ends[wp.atomic_add(work.counts, ENDS, 1)] = end
+
+
+@wp.kernel
+def edge_kernel(
+    work: Work, moved: wp.array[wp.vec3], rings: Rings, segments: Segments, bones: Bones, steep: float
+) -> None:
+    """How the middle of a hot edge gives way, if its ends were moved by more than `steep` [m] apart from each other;
+    in full from twice that on."""
+    i = wp.tid()
+    if i >= work.counts[HOT]:
+        return
+    e = work.hot[i]
+    v = rings.ends[e][0]
+    w = rings.ends[e][1]
+    step = wp.vec3()
+    total = float(0.0)
+    gone_v = work.points[v] - moved[v]
+    gone_w = work.points[w] - moved[w]
+    apart = wp.length(gone_v - gone_w)
+    if apart > steep:
+        either = work.touched[v] | work.touched[w]
+        normal_v = normal_at(bones, v)
+        normal_w = normal_at(bones, w)
+        normal = wp.normalize(normal_v + normal_w)
+        sunk = 0.5 * (wp.dot(gone_v, normal_v) + wp.dot(gone_w, normal_w))
+        middle = 0.5 * (moved[v] + moved[w])
+        for k in range(segments.trees.shape[0]):
+            if (either >> k) & 1 == 1 and k != segments.own[v] and k != segments.own[w]:
+                keeps = wp.min(segments.gap[v, k], segments.gap[w, k])
+                ratio = segments.ratio[segments.own[v], k]
+                found = way_out(middle, normal, sunk, k, ratio, keeps, DEEPEST, segments, bones)
+                step += wp.length_sq(found) * found
+                total += wp.length_sq(found)
+    if total > 0.0:
+        step *= wp.min(apart / steep - 1.0, 1.0) / total
+    work.steps[e] = step
+
+
+@wp.kernel
+def follow_kernel(work: Work, moved: wp.array[wp.vec3], rings: Rings) -> None:
+    """Vertices go with their edges, most of all with those that have far to go."""
+    i = wp.tid()
+    if i >= work.counts[ENDS]:
+        return
+    v = work.ends[i]
+    step = wp.vec3()
+    total = float(0.0)
+    for r in range(rings.start[v], rings.start[v + 1]):
+        if (work.touched[v] | work.touched[rings.vertex[r]]) != 0:
+            found = work.steps[rings.edge[r]]
+            step += wp.length_sq(found) * found
+            total += wp.length_sq(found)
+    if total > 0.0:
+        moved[v] += step / total
+
+
+@wp.kernel
+def closest_kernel(
+    points: wp.array[wp.vec3],
+    which: wp.array[int],
+    segments: Segments,
+    # outputs
+    face: wp.array[int],
+    corners: wp.array[wp.vec3],
+    sign: wp.array[float],
+) -> None:
+    """The closest face of segment `which`, the weights of its corners there, and on which side of it each point is."""
+    i = wp.tid()
+    k = which[i]
+    hit = wp.mesh_query_point_no_sign(segments.trees[k], points[i], DEEPEST)
+    face[i] = -1
+    if hit.result:
+        face[i] = segments.first_face[k] + hit.face
+        corners[i] = wp.vec3(hit.u, hit.v, 1.0 - hit.u - hit.v)
+        sign[i] = wp.sign(distance_of(segments.trees[k], points[i], hit))
+
+
+@wp.kernel
+def clearance_kernel(points: wp.array[wp.vec3], segments: Segments, clearance: wp.array2d[float]) -> None:
+    """The signed distance of each vertex from each segment but its own [m]."""
+    v, k = wp.tid()
+    distance = float(0.0)
+    if segments.own[v] != k:
+        hit = wp.mesh_query_point_no_sign(segments.trees[k], points[v], 1.0e3)
+        if hit.result:
+            distance = distance_of(segments.trees[k], points[v], hit)
+    clearance[v, k] = distance

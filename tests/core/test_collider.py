@@ -1,0 +1,220 @@
+"""The collider: a posed body with its overlaps pulled apart."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from refu_core import load_body
+from refu_core.body import Collider, SmplBody
+from refu_core.errors import MeshError
+from refu_core.metrics import SelfContactDetector
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+MM = 1e-3  # [m]
+JOINT = {"left_hip": 1, "right_hip": 2, "left_knee": 4, "spine1": 3, "left_shoulder": 16, "right_shoulder": 17}
+JOINT |= {"left_elbow": 18, "right_elbow": 19}
+POSES = {
+    "hanging arms": {"left_shoulder": (0, 0, -1.35), "right_shoulder": (0, 0, 1.35)},
+    "bent elbows": {"left_elbow": (0, -2.2, 0), "right_elbow": (0, 2.2, 0)},
+    "sitting": {"left_hip": (-1.5, 0, 0.1), "right_hip": (-1.5, 0, -0.1), "left_knee": (1.5, 0, 0)},
+    "bent forward": {"left_hip": (-1.0, 0, 0), "right_hip": (-1.0, 0, 0), "spine1": (0.6, 0, 0)},
+}
+
+
+def posed(body: SmplBody, turns: dict[str, tuple[float, float, float]]) -> torch.Tensor:
+    pose = torch.zeros(1, 24, 3, dtype=body.dtype)
+    for joint, turn in turns.items():
+        pose[0, JOINT[joint]] = torch.tensor(turn, dtype=body.dtype)
+    return pose
+
+
+@pytest.fixture(scope="module")
+def body() -> SmplBody:
+    return load_body("male")
+
+
+@pytest.fixture(scope="module")
+def collider(body: SmplBody) -> Collider:
+    return Collider(body)
+
+
+@pytest.fixture(scope="module")
+def detector(body: SmplBody) -> SelfContactDetector:
+    return SelfContactDetector(body.faces, body.v_template)
+
+
+def test_nothing_moves_where_nothing_is_near(body: SmplBody, collider: Collider) -> None:
+    apart = {"left_shoulder": (0.0, 0.2, 0.0), "left_elbow": (0.0, -0.5, 0.0), "left_knee": (0.4, 0.0, 0.0)}
+    for turns in ({}, apart):
+        skin = body(pose=posed(body, turns))
+        assert torch.equal(collider(skin.vertices, skin.transforms), skin.vertices)
+
+
+@pytest.mark.parametrize("name", POSES)
+def test_a_pose_that_runs_through_itself_is_pulled_apart(
+    name: str, body: SmplBody, collider: Collider, detector: SelfContactDetector
+) -> None:
+    skin = body(pose=posed(body, POSES[name]))
+    apart = collider(skin.vertices, skin.transforms)
+    before, after = (detector.detect(one[0]) for one in (skin.vertices, apart))
+    assert len(before.pairs) > 10
+    assert len(after.pairs) == 0
+    assert (apart - skin.vertices).norm(dim=2).max() < 40 * MM
+
+
+def test_what_is_far_from_an_overlap_stays(body: SmplBody, collider: Collider) -> None:
+    skin = body(pose=posed(body, POSES["bent elbows"]))
+    apart = collider(skin.vertices, skin.transforms)
+    is_arm = body.weights[:, [13, 14, 16, 17, 18, 19, 20, 21, 22, 23]].sum(1) > 0
+    assert torch.equal(apart[0, ~is_arm], skin.vertices[0, ~is_arm])
+
+
+def test_it_sees_the_pose_alone(body: SmplBody, collider: Collider) -> None:
+    skins = [body(pose=posed(body, turns)) for turns in POSES.values()]
+    alone = [collider(skin.vertices, skin.transforms) for skin in skins]
+    for skin, one in zip(reversed(skins), reversed(alone), strict=True):
+        assert torch.equal(collider(skin.vertices, skin.transforms), one)
+    together = body(pose=torch.cat([posed(body, turns) for turns in POSES.values()]))
+    torch.testing.assert_close(collider(together.vertices, together.transforms), torch.cat(alone), rtol=0, atol=1e-5)
+
+
+@given(st.sampled_from(sorted(POSES)), st.floats(0.2, 1.0))
+def test_it_follows_the_pose_without_jumps(name: str, share: float) -> None:
+    body, collider = _the_same()
+    poses = torch.cat([s * posed(body, POSES[name]) for s in (share, share - 0.005)])
+    skin = body(pose=poses)
+    apart = collider(skin.vertices, skin.transforms)
+    (a, b), (skin_a, skin_b) = apart, skin.vertices
+    assert ((a - b).norm(dim=1) <= 1.5 * (skin_a - skin_b).norm(dim=1).max() + 3 * MM).all()
+
+
+@pytest.mark.parametrize("name", POSES)
+def test_in_double_precision_it_is_the_same_to_a_micrometre(name: str, body: SmplBody, collider: Collider) -> None:
+    double = body.to(dtype=torch.float64)
+    skin, exact = (one(pose=posed(one, POSES[name])) for one in (body, double))
+    fast, slow = collider(skin.vertices, skin.transforms), collider(exact.vertices, exact.transforms)
+    assert slow.dtype == torch.float64
+    torch.testing.assert_close(fast.double(), slow, rtol=0, atol=2e-6)
+
+
+@pytest.mark.parametrize("name", POSES)
+def test_its_derivative_is_that_of_finite_differences(name: str, body: SmplBody, collider: Collider) -> None:
+    double = body.to(dtype=torch.float64)
+    random = torch.Generator().manual_seed(1)
+    pose = posed(double, POSES[name]).requires_grad_()
+    way, weight = (torch.randn(shape, generator=random, dtype=torch.float64) for shape in ((1, 24, 3), (6909, 3)))
+
+    def seen(at: torch.Tensor) -> torch.Tensor:
+        skin = double(pose=at)
+        return (collider(skin.vertices, skin.transforms)[0] * weight).sum()
+
+    (gradient,) = torch.autograd.grad(seen(pose), pose)
+    step = 1e-7
+    with torch.no_grad():
+        slope = (seen(pose + step * way) - seen(pose - step * way)) / (2 * step)
+    torch.testing.assert_close((gradient * way).sum(), slope, rtol=2e-2, atol=1e-2)
+
+
+def test_a_gap_is_kept_between_an_arm_and_a_flank(body: SmplBody) -> None:
+    skin = body(pose=posed(body, POSES["hanging arms"]))
+    of_arm = body.weights[:, [16, 18]].sum(1) > 0.95
+    of_trunk = body.weights[:, [0, 3, 6]].sum(1) > 0.95
+    apart = {gap: Collider(body, gap=gap)(skin.vertices, skin.transforms)[0] for gap in (0.004, 0.02)}
+    least = {gap: float(torch.cdist(one[of_arm], one[of_trunk]).min()) for gap, one in apart.items()}
+    assert least[0.02] > least[0.004] + 10 * MM
+
+
+def test_no_body_at_all(body: SmplBody, collider: Collider) -> None:
+    skin = body(pose=torch.zeros(0, 24, 3))
+    assert collider(skin.vertices, skin.transforms).shape == (0, body.n_vertices, 3)
+
+
+def test_a_body_of_another_topology(body: SmplBody, detector: SelfContactDetector) -> None:
+    """One edge collapsed after another, until it has the number of vertices that SMPL's own body has."""
+    coarse = _with_fewer_vertices(body, 6890)
+    assert coarse.n_vertices == 6890
+    skin = coarse(pose=posed(coarse, POSES["hanging arms"]))
+    apart = Collider(coarse)(skin.vertices, skin.transforms)
+    seen = SelfContactDetector(coarse.faces, coarse.v_template)
+    assert len(seen.detect(skin.vertices[0]).pairs) > 10 > len(seen.detect(apart[0]).pairs)
+
+
+def test_an_open_body_is_refused(body: SmplBody) -> None:
+    open_body = _replaced(body, f=body.faces.numpy()[1:])
+    with pytest.raises(MeshError, match="watertight"):
+        Collider(open_body)
+
+
+@pytest.mark.skipif("REFU_MOTIONS" not in os.environ, reason="no folder of recorded motion (REFU_MOTIONS)")
+def test_recorded_motion(body: SmplBody, collider: Collider, detector: SelfContactDetector) -> None:
+    free, shift = [], []
+    for path in sorted(Path(os.environ["REFU_MOTIONS"]).glob("*.npz")):
+        poses = np.load(path)["poses"][::120, :72].reshape(-1, 24, 3)
+        skin = body(pose=poses)
+        for one, apart in zip(skin.vertices, collider(skin.vertices, skin.transforms), strict=True):
+            free.append(len(detector.detect(apart).pairs) == 0)
+            shift.append(float((apart - one).norm(dim=1).max()))
+    assert np.mean(free) > 0.6  # of the whole body: hands and faces, too
+    assert np.median(shift) < 35 * MM
+    assert max(shift) < 70 * MM
+
+
+_ONE: list[tuple[SmplBody, Collider]] = []
+
+
+def _the_same() -> tuple[SmplBody, Collider]:
+    if not _ONE:
+        body = load_body("male")
+        _ONE.append((body, Collider(body)))
+    return _ONE[0]
+
+
+def _replaced(body: SmplBody, **arrays: NDArray[np.generic]) -> SmplBody:
+    from refu_core.body._model import BodyArrays
+
+    known = body._arrays
+    given_ = {
+        "v_template": known.v_template,
+        "f": known.faces,
+        "weights": known.weights,
+        "J_regressor": known.joint_regressor,
+        "shapedirs": known.shapedirs,
+        "kintree_table": np.stack([[-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, *range(16, 22)], range(24)]),
+    }
+    return SmplBody(BodyArrays.from_mapping({**given_, **arrays}, source="test"), name="test")
+
+
+def _with_fewer_vertices(body: SmplBody, n: int) -> SmplBody:
+    faces, known = body.faces.numpy().copy(), body._arrays
+    gone = np.zeros(body.n_vertices, bool)
+    locked = np.zeros(body.n_vertices, bool)
+    for a, b, _ in faces[::40]:
+        if body.n_vertices - gone.sum() == n:
+            break
+        around = [np.unique(faces[(faces == v).any(1)]) for v in (a, b)]
+        if locked[np.concatenate(around)].any() or len(np.intersect1d(*around)) != 4:
+            continue
+        faces[faces == b] = a
+        faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
+        gone[b] = True
+        locked[np.concatenate(around)] = True
+    number = np.cumsum(~gone) - 1
+    regressor = known.joint_regressor[:, ~gone]
+    return _replaced(
+        body,
+        v_template=known.v_template[~gone],
+        f=number[faces],
+        weights=known.weights[~gone],
+        J_regressor=regressor / regressor.sum(1, keepdims=True),
+        shapedirs=known.shapedirs[~gone],
+    )
