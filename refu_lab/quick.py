@@ -10,9 +10,8 @@ from typing import Any, NamedTuple
 import msg_adapters as adapters
 from refu_core import RefuError
 from refu_core._files import read_json
-from refu_core.metrics import MetricsSummary
+from refu_core.metrics import Figures
 from refu_core.modes import DEFAULT_GARMENTS
-from refu_lab.body_contact import BodyContact
 from refu_lab.replay import ReplayOptions, replay
 from refu_lab.reproduction import METRICS, format_value, label_of
 from refu_lab.tables import format_table, write_json
@@ -127,7 +126,6 @@ def quick_table(result: QuickResult) -> str:
 
 def _measure(bag: Path, *, progress: bool) -> Iterator[tuple[FigureKey, float]]:
     true = _true_garments(bag)
-    contact: BodyContact | None = None
     for backbone, sdf in _MODES:
         options = ReplayOptions(
             input=bag, garments=true or DEFAULT_GARMENTS, backbone=backbone, sdf=sdf, max_frames=_FRAMES
@@ -136,21 +134,17 @@ def _measure(bag: Path, *, progress: bool) -> Iterator[tuple[FigureKey, float]]:
             pipeline = options.load_pipeline()
         except RefuError:  # no weights for one of the garments
             continue
-        contact = contact or BodyContact(pipeline.body)
-        result = replay(options, pipeline=pipeline, contact=contact, progress=progress)
+        result = replay(options, pipeline=pipeline, progress=progress)
         for garment in options.garments:
             yield from _rows(bag.stem, garment, backbone, result.before[garment])
             yield from _rows(bag.stem, garment, f"node, {backbone}, {sdf}", result.after[garment])
 
 
-def _rows(bag: str, garment: str, method: str, summary: MetricsSummary) -> Iterator[tuple[FigureKey, float]]:
+def _rows(bag: str, garment: str, method: str, figures: Figures) -> Iterator[tuple[FigureKey, float]]:
     for metric in TOLERANCES:
-        value = getattr(summary.all, metric)
+        value = getattr(figures, metric)
         if value is not None:
             yield FigureKey(bag, garment, method, metric), value
-        away = getattr(summary.contact_free_vertices, metric)
-        if away is not None and summary.n_contact_frames:
-            yield FigureKey(bag, garment, f"{method}, away from self-contact", metric), away
 
 
 def _true_garments(bag: Path) -> tuple[str, ...]:
