@@ -324,9 +324,7 @@ class _Replayer:
 
 
 @one_thread()
-def replay(
-    options: ReplayOptions, *, pipeline: GarmentPipeline | None = None, progress: bool = False
-) -> ReplayResult:
+def replay(options: ReplayOptions, *, pipeline: GarmentPipeline | None = None, progress: bool = False) -> ReplayResult:
     """Runs every frame of the input through the pipeline, writes the output bag, measures.
 
     `pipeline` is what `options.load_pipeline()` has given, if that was called already.
