@@ -44,7 +44,7 @@ class ContactSettings:
     the normals below its ends: three times as far as a circle does."""
     through: float = 0.005
     """An edge whose middle lacks up to this is raised in full, and one that lacks twice as much not at all [m]. An edge
-    that lacks more runs through a limb, and raising it would throw its ends into another one."""
+    that lacks more runs through a hand, and raising it would throw its ends centimetres away."""
 
     # Garments over each other
     layer_gap: float = 0.003
