@@ -103,6 +103,7 @@ class Anatomy:
         bones = kernels.Bones()
         work = self.tensors
         bones.rotation, bones.between = as_warp(work.rotation, wp.mat33), as_warp(work.between, wp.mat33)
+        bones.bent = wp.zeros(len(PARENTS), dtype=wp.float32, device=str(self.device))
         bones.start = self._ints(np.searchsorted(vertex, np.arange(len(rest) + 1)))
         bones.joint, bones.weight = self._ints(joint), self._floats(weights[vertex, joint])
         normals = _smooth_normals(rest, mesh)
