@@ -109,7 +109,7 @@ def main() -> None:
         card = json.loads((directory / "card.json").read_text())
         garment = card["garment"]
         path = arguments.output / f"eval_{garment.replace('-', '_')}"
-        if card["format"] == "refu-sequences-1":
+        if card["format"] == "refu-sequences-2":
             path = path.with_name(path.name + "_sequence")
             moments = sequence_moments(GarmentSequences(directory))
         else:

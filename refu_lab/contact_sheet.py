@@ -5,12 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from refu_core.body import load_body
+from refu_core.body import Collider, load_body
 from refu_core.garments import load_garment
-from refu_core.simulation import SimulationError
+from refu_core.simulation import SimulationError, colliders
 from refu_lab.render import Backdrop, Camera, RenderMesh, render
 
 if TYPE_CHECKING:
@@ -49,6 +48,7 @@ def contact_sheet(
     if model.fingerprint != dataset.card["body_fingerprint"]:
         msg = f"the set was made for the body {dataset.card['body']!r}, got {model.name!r}: name its file as `body`"
         raise SimulationError(msg)
+    collider = Collider(model, gap=dataset.card["settings"]["drape"]["gap"])
     chosen = np.random.default_rng(seed).permutation(len(dataset))[:count]
     width, height = _TILE
     columns = min(columns, len(chosen))
@@ -56,7 +56,7 @@ def contact_sheet(
     sheet = np.full((rows * height, columns * 2 * width, 3), 255, np.uint8)
     for k, index in enumerate(chosen):
         sample = dataset.sample(int(index))
-        posed = model(sample.pose[None], torch.from_numpy(sample.betas)[None]).vertices[0].numpy()
+        (posed,) = colliders(model, collider, sample.pose[None], sample.betas)
         meshes = [
             RenderMesh(posed, model.faces),
             RenderMesh(sample.vertices, garment.faces, colour=_CLOTH[sample.pair % len(_CLOTH)]),

@@ -13,9 +13,8 @@ from typing import Any
 from tqdm import tqdm
 
 import msg_adapters as adapters
-from refu_core import RefuError, SmplFrame
+from refu_core import RefuError
 from refu_core._device import one_thread
-from refu_core.garments import BUILTIN_GARMENTS
 from refu_lab import reproduction as rp
 from refu_lab.tables import RESULT_TABLES
 
@@ -35,16 +34,19 @@ class EvaluateOptions:
     output: Path = OUTPUT
     cache: Path | None = None
     every: int = 1
-    motion_every: int = 10
+    motion_every: int = 1
+    collider: bool = True
 
     def command(self, table: str) -> str:
         """The command that makes a table again, with the names of folders alone."""
         parts = ["refu evaluate", f"--table {table}"]
         if table == "motion":
-            parts += ["--motions motions/", f"--motion-every {self.motion_every}"]
+            parts += ["--motions motions/"]
+            parts += [f"--motion-every {self.motion_every}"] if self.motion_every > 1 else []
         else:
             parts += [f"--data {' '.join(f'data/{path.resolve().name}' for path in self.data)}"]
             parts += [f"--every {self.every}"] if self.every > 1 else []
+        parts += [] if self.collider else ["--no-collider"]
         parts += [f"--weights {path.resolve().name}" for path in self.weights]
         return " ".join(parts)
 
@@ -76,7 +78,7 @@ class _Maker:
         _check_sets(sets)
         self._posed = [samples for samples in sets if samples.shapes is None]
         self._moving = [samples for samples in sets if samples.shapes is not None]
-        self._library = rp.Library(options.weights)
+        self._library = rp.Library(options.weights, collider=options.collider)
         self.wanted = [name for name in RESULT_TABLES if options.table in ("all", name) and self._has_data_for(name)]
         if not self.wanted:
             kind = "sequences (refu simulate --sequences)" if options.table == "sequence" else "poses"
@@ -137,10 +139,8 @@ class _Maker:
 
     def _motion(self) -> rp.ResultTable:
         clips = read_clips(self._options.motions or Path())
-        worn = [samples.garment for samples in self._posed] or BUILTIN_GARMENTS
-        every = self._options.motion_every
         with _bar("motion", self._progress) as advance:
-            return rp.motion_table(clips, worn, library=self._library, every=every, progress=advance)
+            return rp.motion_table(clips, library=self._library, every=self._options.motion_every, progress=advance)
 
     def _time_study(self) -> rp.Study:
         """Measured now, never taken from a cache, with nothing else in the same run."""
@@ -182,17 +182,17 @@ def results_dict(tables: Sequence[rp.ResultTable]) -> dict[str, Any]:
     }
 
 
-def read_clips(folder: Path) -> dict[str, list[SmplFrame]]:
-    """The frames of a folder's AMASS-style motions, by name.
+def read_clips(folder: Path) -> dict[str, adapters.Motion]:
+    """A folder's AMASS-style motions, by name.
 
     Raises:
-        RefuError: there is none, or one can't be read, or isn't finite.
+        RefuError: there is none, or one can't be read.
     """
     paths = sorted(folder.glob("*.npz"))
     if not paths:
         msg = f"{folder}: no motion in it, wanted AMASS-style .npz files"
         raise RefuError(msg)
-    return {path.stem: list(adapters.read_motion(path).frames()) for path in paths}
+    return {path.stem: adapters.read_motion(path) for path in paths}
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import msg_adapters as adapters
 from refu_core import RefuError
 from refu_core._files import read_json
-from refu_core.metrics import MetricsSummary
+from refu_core.metrics import Figures
 from refu_core.modes import DEFAULT_GARMENTS
 from refu_lab.replay import ReplayOptions, replay
 from refu_lab.reproduction import METRICS, format_value, label_of
@@ -26,7 +26,6 @@ _FRAMES = 30
 """Frames of a bag, at most."""
 _MODES = (("skinned", "accurate"), ("tailornet", "hybrid"))
 """(backbone, sdf) of the pipelines that are measured; what isn't trained is left out."""
-"""Worn in bags without ground truth."""
 
 
 class FigureKey(NamedTuple):
@@ -132,23 +131,20 @@ def _measure(bag: Path, *, progress: bool) -> Iterator[tuple[FigureKey, float]]:
             input=bag, garments=true or DEFAULT_GARMENTS, backbone=backbone, sdf=sdf, max_frames=_FRAMES
         )
         try:
-            options.load_pipeline()
+            pipeline = options.load_pipeline()
         except RefuError:  # no weights for one of the garments
             continue
-        result = replay(options, progress=progress)
+        result = replay(options, pipeline=pipeline, progress=progress)
         for garment in options.garments:
             yield from _rows(bag.stem, garment, backbone, result.before[garment])
             yield from _rows(bag.stem, garment, f"node, {backbone}, {sdf}", result.after[garment])
 
 
-def _rows(bag: str, garment: str, method: str, summary: MetricsSummary) -> Iterator[tuple[FigureKey, float]]:
+def _rows(bag: str, garment: str, method: str, figures: Figures) -> Iterator[tuple[FigureKey, float]]:
     for metric in TOLERANCES:
-        value = getattr(summary.all, metric)
+        value = getattr(figures, metric)
         if value is not None:
             yield FigureKey(bag, garment, method, metric), value
-        away = getattr(summary.contact_free_vertices, metric)
-        if away is not None and summary.n_contact_frames:
-            yield FigureKey(bag, garment, f"{method}, away from self-contact", metric), away
 
 
 def _true_garments(bag: Path) -> tuple[str, ...]:

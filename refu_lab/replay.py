@@ -18,14 +18,13 @@ from tqdm import tqdm
 import msg_adapters as adapters
 from refu_core import FrameError, GarmentPipeline, SmplFrame
 from refu_core._device import one_thread
-from refu_core.metrics import CollisionChecker, GarmentMetrics, MetricsSummary
+from refu_core.metrics import CollisionChecker, Figures, GarmentMetrics
 from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN
-from refu_lab.body_contact import BodyContact
 from refu_lab.truth import GroundTruth
 
 if TYPE_CHECKING:
     from msg_adapters import FrameRecord
-    from refu_core.realtime import PipelineOutput
+    from refu_core.realtime import PipelineOutput, SkinShift
 
 GARMENTS_TOPIC = "/garments"
 INPUT_TOPIC = "/smpl_params"
@@ -55,6 +54,7 @@ class ReplayOptions:
     device: str = "cpu"
     max_frames: int | None = None
     overwrite: bool = False
+    collider: bool = True
 
     def load_pipeline(self) -> GarmentPipeline:
         """The pipeline that these options ask for. Raises `RefuError` for options that make none."""
@@ -66,6 +66,7 @@ class ReplayOptions:
             margin=self.margin,
             weights=self.weights,
             device=self.device,
+            collider=self.collider,
         )
 
 
@@ -82,7 +83,6 @@ class GarmentRecord:
     """[m]."""
     max_depth: float
     """[m]."""
-    near_self_contact: bool
 
 
 @dataclass(frozen=True)
@@ -93,6 +93,7 @@ class FrameResult:
     latency_ms: float
     """From input bytes to output bytes."""
     stage_ms: Mapping[str, float]
+    shift: SkinShift
     garments: Mapping[str, GarmentRecord]
 
     @property
@@ -118,8 +119,10 @@ class ReplayResult:
     skips: Counter[str] = field(default_factory=Counter)
     """Messages that were not replayed, by reason."""
     warnings: list[str] = field(default_factory=list)
-    before: dict[str, MetricsSummary] = field(default_factory=dict)
-    after: dict[str, MetricsSummary] = field(default_factory=dict)
+    before: dict[str, Figures] = field(default_factory=dict)
+    after: dict[str, Figures] = field(default_factory=dict)
+    on_skin: dict[str, Figures] = field(default_factory=dict)
+    """As `after`, held against the skin in place of the collider."""
     interrupted: bool = False
 
     def latency_ms(self, garment: str | None = None) -> dict[str, float]:
@@ -128,20 +131,21 @@ class ReplayResult:
         p50, p95, p99 = np.percentile(values, (50, 95, 99)) if values else (0.0, 0.0, 0.0)
         return {"p50": float(p50), "p95": float(p95), "p99": float(p99)}
 
+    def skin_shift_mm(self) -> dict[str, float]:
+        """How far the collider is from the skin, over all frames: the mean of all vertices' ways, the longest [mm]."""
+        shifts = [frame.shift for frame in self.frames]
+        mean = 1e3 * float(np.mean([one.mean for one in shifts])) if shifts else 0.0
+        return {"mean": mean, "largest": 1e3 * max((one.largest for one in shifts), default=0.0)}
+
     def as_dict(self) -> dict[str, Any]:
         """The machine-readable result (`--json`)."""
         garments: dict[str, Any] = {}
         for name, after in self.after.items():
-            figures = after.all.as_dict()
             garments[name] = {
                 "latency_ms": self.latency_ms(name),
-                **figures,
-                "self_contact_frames": after.n_contact_frames,
-                "before": self.before[name].all.as_dict(),
-                "before_without_self_contact_frames": self.before[name].contact_free_frames.as_dict(),
-                "before_without_self_contact_vertices": self.before[name].contact_free_vertices.as_dict(),
-                "without_self_contact_frames": after.contact_free_frames.as_dict(),
-                "without_self_contact_vertices": after.contact_free_vertices.as_dict(),
+                **after.as_dict(),
+                "skin_cfmp_percent": self.on_skin[name].cfmp_percent,
+                "before": self.before[name].as_dict(),
             }
         return {
             "input": str(self.options.input),
@@ -155,7 +159,8 @@ class ReplayResult:
             "skipped": dict(self.skips),
             "warnings": self.warnings,
             "interrupted": self.interrupted,
-            "self_contact_frames": sum(any(g.near_self_contact for g in f.garments.values()) for f in self.frames),
+            "collider": self.options.collider,
+            "skin_shift_mm": self.skin_shift_mm(),
             "latency_ms": self.latency_ms(),
             "garments": garments,
         }
@@ -212,30 +217,30 @@ def _motion_records(motion: adapters.Motion, topic: str) -> Iterator[FrameRecord
 
 
 class Evaluator:
-    """Exact metrics of every frame, before and after collision handling."""
+    """Exact metrics of every frame, before and after collision handling, against the collider and against the skin."""
 
     def __init__(self, pipeline: GarmentPipeline, truth: GroundTruth | None = None) -> None:
-        self._checker = CollisionChecker(pipeline.body.faces.cpu().numpy())
-        self._contact = BodyContact(pipeline.body)
+        self._checker, self._skin = (CollisionChecker(pipeline.body.faces.cpu().numpy()) for _ in range(2))
         faces = {name: garment.faces.cpu().numpy() for name, garment in pipeline.garments.items()}
         self._faces = faces
         self.truth = truth or GroundTruth()
         self.before = {name: GarmentMetrics(f) for name, f in faces.items()}
         self.after = {name: GarmentMetrics(f) for name, f in faces.items()}
+        self.on_skin = {name: GarmentMetrics(f) for name, f in faces.items()}
 
     def add(self, frame: SmplFrame, output: PipelineOutput, latency_ms: float) -> dict[str, GarmentRecord]:
         """Measures one frame."""
-        contact = self._contact.detect(frame.betas, output.body)
         self._checker.update(output.body)
+        self._skin.update(output.skin)
         own_ms = {name: output.stats.garments[name].ms for name in output}
         records = {}
         for name, mesh in output.items():
-            near = contact.near(mesh.local)
             raw = self._checker.check(mesh.raw, self._faces[name])
             done = self._checker.check(mesh.local, self._faces[name])
             truth = self.truth.of(name, frame)
-            self.before[name].add(mesh.raw, raw, truth=truth, near_contact=near)
-            self.after[name].add(mesh.local, done, truth=truth, near_contact=near)
+            self.before[name].add(mesh.raw, raw, truth=truth)
+            self.after[name].add(mesh.local, done, truth=truth)
+            self.on_skin[name].add(mesh.local, self._skin.check(mesh.local, self._faces[name]))
             records[name] = GarmentRecord(
                 latency_ms=latency_ms - sum(own_ms.values()) + own_ms[name],
                 n_inside_before=raw.n_inside,
@@ -244,7 +249,6 @@ class Evaluator:
                 n_pairs=done.n_pairs,
                 max_depth_before=raw.max_depth,
                 max_depth=done.max_depth,
-                near_self_contact=bool(near.any()),
             )
         return records
 
@@ -306,7 +310,7 @@ class _Replayer:
         if writer is not None:
             writer.write(GARMENTS_TOPIC, data, log_time_ns=record.log_time_ns)
         garments = self._evaluator.add(frame, output, latency_ms)
-        self._result.frames.append(FrameResult(frame, latency_ms, output.stats.stage_ms, garments))
+        self._result.frames.append(FrameResult(frame, latency_ms, output.stats.stage_ms, output.stats.shift, garments))
 
     def _skip(self, reason: str) -> None:
         skips = self._result.skips
@@ -316,11 +320,14 @@ class _Replayer:
         """Completes the result."""
         self._result.before = {name: metrics.summary() for name, metrics in self._evaluator.before.items()}
         self._result.after = {name: metrics.summary() for name, metrics in self._evaluator.after.items()}
+        self._result.on_skin = {name: metrics.summary() for name, metrics in self._evaluator.on_skin.items()}
 
 
 @one_thread()
-def replay(options: ReplayOptions, *, progress: bool = False) -> ReplayResult:
+def replay(options: ReplayOptions, *, pipeline: GarmentPipeline | None = None, progress: bool = False) -> ReplayResult:
     """Runs every frame of the input through the pipeline, writes the output bag, measures.
+
+    `pipeline` is what `options.load_pipeline()` has given, if that was called already.
 
     An interrupt (Ctrl-C) ends the replay early: the bag is closed and the result so far is returned.
 
@@ -328,7 +335,7 @@ def replay(options: ReplayOptions, *, progress: bool = False) -> ReplayResult:
         RefuError: a bad input file, an unknown garment, an output that can't be written, or no frame that could be
             replayed.
     """
-    pipeline = options.load_pipeline()
+    pipeline = pipeline or options.load_pipeline()
     pipeline(
         SmplFrame(pose=np.zeros((24, 3), np.float32))
     )  # compiles kernels, so that the first frame's latency is a frame's

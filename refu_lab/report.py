@@ -21,9 +21,6 @@ from refu_lab.tables import REPLAY_HEADER, replay_rows
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from matplotlib.axes import Axes
-    from numpy.typing import NDArray
-
     from refu_core import GarmentPipeline
 
 _PICTURE = (420, 640)
@@ -34,7 +31,6 @@ h1 { font-size: 1.5rem; margin-bottom: .2rem; } h2 { font-size: 1.1rem; margin-t
 p.note, figcaption { opacity: .75; font-size: .9rem; }
 table { border-collapse: collapse; width: 100%; } th, td { padding: .3rem .6rem; border-bottom: 1px solid var(--line); }
 td, th { text-align: right; font-variant-numeric: tabular-nums; } td:first-child, th:first-child { text-align: left; }
-tr.sub td { opacity: .75; border-bottom-style: dotted; }
 img { max-width: 100%; border-radius: 6px; } img.plot { background: #fff; width: 100%; }
 .pictures { display: grid; grid-template-columns: repeat(auto-fit, minmax(300px, 1fr)); gap: 1rem; }
 figure { margin: 0; } .warn { border-left: 4px solid #d33; padding-left: .8rem; }
@@ -76,10 +72,7 @@ def write_report(result: ReplayResult, folder: Path, *, progress: bool = False) 
 def _plot(result: ReplayResult, pipeline: GarmentPipeline, folder: Path) -> None:
     start = result.frames[0].frame.stamp_ns
     times = np.array([1e-9 * (f.frame.stamp_ns - start) for f in result.frames])
-    contact = np.array([any(g.near_self_contact for g in f.garments.values()) for f in result.frames])
     drawn, axes = new_axes(3, size=(10.8, 7.5), sharex=True)
-    for ax in axes:
-        _shade(ax, times, contact)
     axes[-1].set_xlabel("time [s]")
     inside, pairs, depth = axes
     for name in result.after:
@@ -102,7 +95,6 @@ def _plot(result: ReplayResult, pipeline: GarmentPipeline, folder: Path) -> None
     save_svg(drawn, folder / "penetration.svg")
 
     drawn, (latency,) = new_axes(size=(10.8, 2.5))
-    _shade(latency, times, contact)
     stages = list(result.frames[0].stage_ms)
     values = [[f.stage_ms[stage] for f in result.frames] for stage in stages]
     rest = [f.latency_ms - sum(f.stage_ms.values()) for f in result.frames]
@@ -111,13 +103,6 @@ def _plot(result: ReplayResult, pipeline: GarmentPipeline, folder: Path) -> None
     latency.set_ylim(0, 1.3 * float(np.percentile([f.latency_ms for f in result.frames], 99)))
     latency.legend(loc="upper right", fontsize=8, ncols=len(stages) + 1)
     save_svg(drawn, folder / "latency.svg")
-
-
-def _shade(ax: Axes, times: NDArray[np.float64], contact: NDArray[np.bool_]) -> None:
-    """Marks the frames in which the body touches itself near a garment."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], contact, [False])).astype(int)))
-    for first, end in edges.reshape(-1, 2):
-        ax.axvspan(times[first], times[min(end, len(times) - 1)], color="0.5", alpha=0.12, lw=0)
 
 
 def _draw_frames(result: ReplayResult, pipeline: GarmentPipeline, folder: Path, *, progress: bool) -> list[_Pictured]:
@@ -158,8 +143,6 @@ def _caption(frame: FrameResult, when: str) -> str:
     for name, r in frame.garments.items():
         n_inside, n_pairs = (r.n_inside_before, r.n_pairs_before) if when == "before" else (r.n_inside, r.n_pairs)
         parts.append(f"{name}: {n_inside} vertices inside, {n_pairs} intersecting pairs")
-        if r.near_self_contact:
-            parts[-1] += " (the body touches itself here)"
     return "; ".join(parts)
 
 
@@ -175,22 +158,21 @@ def _page(result: ReplayResult, pictures: Sequence[_Pictured]) -> str:
         "</figcaption></figure>"
         for p in pictures
     )
-    frame = data["latency_ms"]
+    frame, shift = data["latency_ms"], data["skin_shift_mm"]
     return f"""<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
 <title>Replay of {html.escape(result.options.input.name)}</title><style>{_STYLE}</style></head><body>
 <h1>Replay of {html.escape(result.options.input.name)}</h1>
 <p class="note">{html.escape(result.source)}; backbone {html.escape(data["backbone"])}, signed distance
 {html.escape(data["sdf"])}, margin {1e3 * data["margin_m"]:g} mm, {html.escape(data["device"])}.
-{data["frames"]} frames, {data["self_contact_frames"]} with self-contact of the body near a garment.
+{data["frames"]} frames; skin moved to be free of itself: {shift["mean"]:.2f} mm on average,
+{shift["largest"]:.1f} mm at most.
 A whole frame, bytes to bytes: p50 {frame["p50"]:.1f}, p95 {frame["p95"]:.1f}, p99 {frame["p99"]:.1f} ms.</p>{warning}
 <h2>Figures</h2>{_table(data)}
 <p class="note">VFCP: vertices inside the body. CFMP: frames without any collision, vertices and triangles.
-Both by exact checks. Where the body intersects itself (an arm in the flank, the crease of an armpit, thighs in a squat)
-no garment can be free of it: the rows below a garment leave out the vertices near such places, or all frames that
-have one.</p>
+Both by exact checks of every frame and every vertex, against the collider: the posed body with its overlaps (an arm in
+the flank, thighs in a squat) pulled apart. The last column is against the skin, which runs through itself there.</p>
 <h2>Penetration over time</h2><img class="plot" src="penetration.svg" alt="penetration over time">
-<p class="note">Grey: the body touches itself near a garment.</p>
 <h2>Latency</h2><img class="plot" src="latency.svg" alt="latency over time">
 <h2>Worst, median and best frame</h2><div class="pictures">{figures}</div>
 <p class="note">Red: colliding triangles and vertices inside the body.</p>
@@ -201,6 +183,5 @@ have one.</p>
 def _table(data: dict[str, Any]) -> str:
     lines = ["<tr>" + "".join(f"<th>{name}</th>" for name in REPLAY_HEADER) + "</tr>"]
     for row in replay_rows(data["garments"]):
-        kind = ' class="sub"' if row[0].startswith(" ") else ""
-        lines.append(f"<tr{kind}>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>")
+        lines += ["<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>"]
     return f"<table>{''.join(lines)}</table>"

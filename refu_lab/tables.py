@@ -85,6 +85,10 @@ def replay_table(result: ReplayResult) -> str:
         f"frame, bytes to bytes: p50 {whole['p50']:.1f} ms, p95 {whole['p95']:.1f} ms, p99 {whole['p99']:.1f} ms"
         f" ({result.options.backbone} backbone, {result.options.sdf} signed distance, {result.options.device})"
     )
+    if result.options.collider:
+        shift = result.skin_shift_mm()
+        mean, largest = shift["mean"], shift["largest"]
+        lines.append(f"skin moved to be free of itself: {mean:.2f} mm on average, {largest:.1f} mm at most")
     lines += [f"skipped {count} x {reason}" for reason, count in result.skips.most_common()]
     lines += [f"warning: {text}" for text in result.warnings]
     if result.interrupted:
@@ -94,23 +98,21 @@ def replay_table(result: ReplayResult) -> str:
     return "\n".join(lines)
 
 
-REPLAY_HEADER = ("garment", "frames", "p50 ms", "p95 ms", "p99 ms", "VFCP %", "CFMP %", "depth mm", "MPVE mm")
-_FIGURES = (("vfcp_percent", 3), ("cfmp_percent", 1), ("max_depth_mm", 1), ("mpve_mm", 2))
-_SUBROWS = (
-    ("away from self-contact", "without_self_contact_vertices"),
-    ("frames without any", "without_self_contact_frames"),
+REPLAY_HEADER = (
+    *("garment", "frames", "p50 ms", "p95 ms", "p99 ms", "VFCP %", "CFMP %", "depth mm", "MPVE mm"),
+    "CFMP % on the skin",
 )
+_FIGURES = (("vfcp_percent", 3), ("cfmp_percent", 1), ("max_depth_mm", 1), ("mpve_mm", 2))
 
 
 def replay_rows(garments: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, ...]]:
-    """A row a garment of a replay's JSON, and indented rows without the body's self-contact where there is any."""
+    """A row a garment of a replay's JSON."""
     rows = []
     for name, after in garments.items():
         latency = [f"{after['latency_ms'][p]:.2f}" for p in ("p50", "p95", "p99")]
-        rows.append((name, str(after["n_frames"]), *latency, *_changes(after["before"], after)))
-        for label, key in _SUBROWS if after["self_contact_frames"] else ():
-            if (n := after[key]["n_frames"]) > 0:
-                rows.append((f"  {label}", str(n), "", "", "", *_changes(after[f"before_{key}"], after[key])))
+        on_skin = after["skin_cfmp_percent"]
+        figures = (*_changes(after["before"], after), "-" if on_skin is None else f"{on_skin:.1f}")
+        rows.append((name, str(after["n_frames"]), *latency, *figures))
     return rows
 
 

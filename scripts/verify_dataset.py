@@ -31,8 +31,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from tqdm import tqdm
 
-from refu_core.body import load_body
+from refu_core.body import Collider, load_body
 from refu_core.garments import load_garment
+from refu_core.simulation import colliders
 from refu_core.simulation._drape import comfort_poses
 
 F64 = NDArray[np.float64]
@@ -67,18 +68,19 @@ class Verdict:
 class Judge:
     """Judges garments of one kind on one body."""
 
-    def __init__(self, garment: str, body: str) -> None:
+    def __init__(self, garment: str, body: str, gap: float) -> None:
         self._garment = load_garment(garment)
         self._body = load_body(body)
+        self._collider = Collider(self._body, gap=gap)
         self._faces = self._garment.faces.numpy().astype(np.int64)
         self._body_faces = self._body.faces.numpy().astype(np.int64)
         self._edges = self._garment.mesh.edges
         self._lengths: tuple[bytes, F64] | None = None
 
     def judge(self, place: str, slot: int, vertices: F64, pose: Any, betas: Any, style: Any) -> Verdict:
-        """One garment (N, 3) [m] on the body of this pose (24, 3), shape (10,) and style (4,)."""
+        """One garment (N, 3) [m] on the collider of this pose (24, 3), shape (10,) and style (4,)."""
         shape = torch.from_numpy(np.array(betas))[None]
-        body = self._body(np.array(pose)[None], shape).vertices[0].numpy().astype(np.float64)
+        body = colliders(self._body, self._collider, np.array(pose)[None], np.array(betas))[0].astype(np.float64)
         distance = igl.signed_distance(vertices, body, self._body_faces, igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER)
         length = np.linalg.norm(vertices[self._edges[:, 0]] - vertices[self._edges[:, 1]], axis=1)
         return Verdict(
@@ -163,7 +165,7 @@ def places(directory: Path, card: dict[str, Any]) -> list[Place]:
     found: list[Place] = []
     for shard in sorted(directory.glob("shard-*-of-*")):
         done = np.load(shard / "state.npy", mmap_mode="r") == 1
-        if card["format"] == "refu-sequences-1":
+        if card["format"] == "refu-sequences-2":
             kept = (np.load(shard / "cause.npy", mmap_mode="r") == 0) & done[:, None]
             found += [(shard, int(row), int(frame)) for row, frame in np.argwhere(kept)]
         else:
@@ -172,9 +174,9 @@ def places(directory: Path, card: dict[str, Any]) -> list[Place]:
 
 
 @cache
-def _judge(garment: str, body: str) -> Judge:
+def _judge(garment: str, body: str, gap: float) -> Judge:
     torch.set_num_threads(1)
-    return Judge(garment, body)
+    return Judge(garment, body, gap)
 
 
 @cache
@@ -184,14 +186,14 @@ def _columns(shard: Path) -> dict[str, Any]:
     }
 
 
-def _verdict(task: tuple[Place, str, str, float]) -> Verdict:
-    (shard, row, frame), garment, body, quantum = task
+def _verdict(task: tuple[Place, tuple[str, str, float], float]) -> Verdict:
+    (shard, row, frame), judged_by, quantum = task
     column = _columns(shard)
     at = (row,) if frame < 0 else (row, frame)
     place = f"{shard.name} row {row}" + ("" if frame < 0 else f" frame {frame}")
     vertices = column["vertices"][at].astype(np.float64) * quantum
     slot = int(column["slot"][row])
-    return _judge(garment, body).judge(
+    return _judge(*judged_by).judge(
         place, slot, vertices, column["pose"][at], column["betas"][row], column["style"][row]
     )
 
@@ -202,7 +204,8 @@ def verdicts(directory: Path, *, body: str | None = None, processes: int = 1, ev
     body = body or load_garment(card["garment"]).body
     if load_body(body).fingerprint != card["body_fingerprint"]:
         sys.exit(f"{directory}: made for another body than {body!r}: name its file as --body")
-    tasks = [(place, card["garment"], body, float(card["quantum_m"])) for place in places(directory, card)[::every]]
+    judged_by = (card["garment"], body, float(card["settings"]["drape"]["gap"]))
+    tasks = [(place, judged_by, float(card["quantum_m"])) for place in places(directory, card)[::every]]
     bar = tqdm(total=len(tasks), unit="garment", disable=None)
     if processes == 1:
         for task in tasks:

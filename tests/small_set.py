@@ -30,7 +30,7 @@ def write_set(
     """Writes garments that follow the skin, displaced by a function of the poses (N, 24, 3) to (N, V, 3) [m].
 
     `pairs` style-shape pairs with `poses` poses each, whose angles spread by `spread` [rad]; the last `test_pairs` are
-    for the test. Every fourth sample asked for another left thigh than it got.
+    for the test.
     """
     rng = np.random.default_rng(0)
     n = pairs * poses
@@ -38,8 +38,6 @@ def write_set(
     betas = rng.normal(size=(pairs, 10)).astype("<f4")[pair]
     style = rng.normal(size=(pairs, 4)).astype("<f4")[pair]
     pose = rng.normal(0, spread, (n, 24, 3)).astype("<f4")
-    asked = pose.copy()
-    asked[::4, 1, 2] += 0.3
     with torch.no_grad():
         b, p = torch.as_tensor(betas), torch.as_tensor(pose)
         unposed = garment.rest(b, torch.as_tensor(style))
@@ -57,16 +55,15 @@ def write_set(
         "frame": np.full(n, -1, "<i4"),
         "split": (pair >= pairs - test_pairs).astype("|u1"),
         "state": np.ones(n, "|u1"),
-        "dropped": np.zeros((n, 5), "|u1"),
-        **{name: np.ones(n, "<f4") for name in ("share", "stretch", "speed", "seconds")},
+        "dropped": np.zeros((n, 4), "|u1"),
+        **{name: np.ones(n, "<f4") for name in ("stretch", "speed", "seconds")},
     }
     shard = folder / "shard-0-of-1"
     shard.mkdir(parents=True)
     for name, array in columns.items():
         np.save(shard / f"{name}.npy", array)
-    np.save(folder / "asked.npy", asked)
     card = {
-        "format": "refu-garments-1",
+        "format": "refu-garments-2",
         "garment": garment.name,
         "body": garment.body,
         "body_fingerprint": body.fingerprint,

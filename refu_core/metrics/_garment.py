@@ -20,10 +20,10 @@ ON_SKIN = 1e-6
 
 @dataclass(frozen=True)
 class FrameMetrics:
-    """Figures of one garment in one frame, over all of its vertices or those that were kept."""
+    """Figures of one garment in one frame, over all of its vertices."""
 
     n_vertices: int
-    """Vertices the figures are over."""
+    """Vertices of the garment."""
     n_inside: int
     """Of these, inside the body (deeper than `ON_SKIN`); as a percentage of all, VFCP."""
     is_free: bool
@@ -73,50 +73,27 @@ class Figures:
 
     @staticmethod
     def over(frames: list[FrameMetrics]) -> Figures:
-        """The figures of some frames; frames of no vertices count as no frames."""
-        kept = [frame for frame in frames if frame.n_vertices]
+        """The figures of some frames."""
 
         def mean(values: list[float]) -> float | None:
             return float(np.mean(values)) if values else None
 
         return Figures(
-            n_frames=len(kept),
-            mpve_mm=mean([frame.mpve_mm for frame in kept if frame.mpve_mm is not None]),
-            vfcp_percent=mean([100.0 * frame.n_inside / frame.n_vertices for frame in kept]),
-            cfmp_percent=mean([100.0 * frame.is_free for frame in kept]),
-            avg_vf=mean([frame.n_vf for frame in kept]),
-            avg_ee=mean([frame.n_ee for frame in kept]),
-            max_depth_mm=max((frame.max_depth_mm for frame in kept), default=None),
-            mean_energy=mean([frame.energy for frame in kept]),
-            mean_collision_error_mm=mean([frame.collision_error_mm for frame in kept]),
-            laplacian_mm=mean([frame.laplacian_mm for frame in kept if frame.laplacian_mm is not None]),
+            n_frames=len(frames),
+            mpve_mm=mean([frame.mpve_mm for frame in frames if frame.mpve_mm is not None]),
+            vfcp_percent=mean([100.0 * frame.n_inside / frame.n_vertices for frame in frames]),
+            cfmp_percent=mean([100.0 * frame.is_free for frame in frames]),
+            avg_vf=mean([frame.n_vf for frame in frames]),
+            avg_ee=mean([frame.n_ee for frame in frames]),
+            max_depth_mm=max((frame.max_depth_mm for frame in frames), default=None),
+            mean_energy=mean([frame.energy for frame in frames]),
+            mean_collision_error_mm=mean([frame.collision_error_mm for frame in frames]),
+            laplacian_mm=mean([frame.laplacian_mm for frame in frames if frame.laplacian_mm is not None]),
         )
 
     def as_dict(self) -> dict[str, Any]:
         """The figures by name, ready for JSON."""
         return asdict(self)
-
-
-@dataclass(frozen=True)
-class MetricsSummary:
-    """Figures with and without the places where the body touches itself."""
-
-    all: Figures
-    """Every frame, every vertex."""
-    contact_free_frames: Figures
-    """Only the frames of which no garment vertex is near a self-contact."""
-    contact_free_vertices: Figures
-    """Every frame, but only the vertices (and triangles of such) that aren't near a self-contact."""
-
-    @property
-    def n_frames(self) -> int:
-        """Frames in all."""
-        return self.all.n_frames
-
-    @property
-    def n_contact_frames(self) -> int:
-        """Frames with a self-contact near the garment."""
-        return self.all.n_frames - self.contact_free_frames.n_frames
 
 
 @dataclass(eq=False)
@@ -127,9 +104,7 @@ class GarmentMetrics:
     """
 
     faces: NDArray[np.int32]
-    _all: list[FrameMetrics] = field(default_factory=list, init=False, repr=False)
-    _away: list[FrameMetrics] = field(default_factory=list, init=False, repr=False)
-    _has_contact: list[bool] = field(default_factory=list, init=False, repr=False)
+    _frames: list[FrameMetrics] = field(default_factory=list, init=False, repr=False)
     _laplacian: csr_array | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -141,7 +116,6 @@ class GarmentMetrics:
         collisions: Collisions,
         *,
         truth: Any = None,
-        near_contact: Any = None,
         resolved: Any = None,
     ) -> FrameMetrics:
         """Takes in a frame and returns its figures over all vertices.
@@ -150,7 +124,6 @@ class GarmentMetrics:
             vertices: The garment [m], shape (N, 3).
             collisions: Its exact collisions.
             truth: The true garment [m], shape (N, 3), where there is one.
-            near_contact: Vertices near a self-contact of the body, bool, shape (N,); none by default.
             resolved: Vertices that collided before collisions were handled, bool, shape (N,): the local Laplacian error
                 is over these (the supplement's "initial collided vertex"); over all vertices by default.
 
@@ -160,55 +133,37 @@ class GarmentMetrics:
         garment = as_vertices("the garment's vertices", vertices)
         n = len(garment)
         target = None if truth is None else as_vertices("truth", truth)
-        near = np.zeros(n, np.bool_) if near_contact is None else np.asarray(near_contact, dtype=np.bool_)
         region = np.ones(n, np.bool_) if resolved is None else np.asarray(resolved, dtype=np.bool_)
-        shapes = {near.shape, region.shape, collisions.inside.shape}
+        shapes = {region.shape, collisions.inside.shape}
         if shapes != {(n,)} or (target is not None and target.shape != garment.shape) or self.faces.max() >= n:
             msg = (
-                f"truth, near_contact, resolved and collisions must belong to the garment's {n} vertices, got shapes "
-                f"{None if target is None else target.shape}, {near.shape}, {region.shape}, {collisions.inside.shape}"
+                f"truth, resolved and collisions must belong to the garment's {n} vertices, got shapes "
+                f"{None if target is None else target.shape}, {region.shape}, {collisions.inside.shape}"
             )
             raise MeshError(msg)
         errors = laplacians = None
         if target is not None:
             errors = np.linalg.norm(garment.astype(np.float64) - target, axis=1)
             laplacians = np.linalg.norm(self._laplacian_of(garment) - self._laplacian_of(target), axis=1)
-        everything = np.ones(n, np.bool_)
-        frame = self._figures(everything, collisions, errors, laplacians, region)
-        self._all.append(frame)
-        self._away.append(self._figures(~near, collisions, errors, laplacians, region))
-        self._has_contact.append(bool(near.any()))
-        return frame
-
-    def summary(self) -> MetricsSummary:
-        """The figures over the frames added so far."""
-        untouched = [frame for frame, contact in zip(self._all, self._has_contact, strict=True) if not contact]
-        return MetricsSummary(Figures.over(self._all), Figures.over(untouched), Figures.over(self._away))
-
-    def _figures(
-        self,
-        kept: NDArray[np.bool_],
-        collisions: Collisions,
-        errors: NDArray[np.float64] | None,
-        laplacians: NDArray[np.float64] | None,
-        region: NDArray[np.bool_],
-    ) -> FrameMetrics:
-        of_kept = kept[self.faces[collisions.pairs[:, 0]]].all(axis=1)
-        pairs, is_vf = collisions.pairs[of_kept, 0], collisions.pair_is_vf[of_kept]
-        depth = collisions.depth[kept].astype(np.float64)
-        region = region & kept
-        return FrameMetrics(
-            n_vertices=int(kept.sum()),
+        depth = collisions.depth.astype(np.float64)
+        frame = FrameMetrics(
+            n_vertices=n,
             n_inside=int((depth > ON_SKIN).sum()),
-            is_free=not len(pairs) and not collisions.inside[kept].any(),
-            n_vf=len(np.unique(pairs[is_vf])),
-            n_ee=len(np.unique(pairs[~is_vf])),
-            max_depth_mm=1e3 * float(depth.max(initial=0.0)),
+            is_free=collisions.is_free,
+            n_vf=collisions.n_vf,
+            n_ee=collisions.n_ee,
+            max_depth_mm=1e3 * collisions.max_depth,
             energy=float((depth**2).sum()),
             collision_error_mm=1e3 * float(depth.sum()),
-            mpve_mm=None if errors is None or not kept.any() else 1e3 * float(errors[kept].mean()),
+            mpve_mm=None if errors is None else 1e3 * float(errors.mean()),
             laplacian_mm=None if laplacians is None or not region.any() else 1e3 * float(laplacians[region].mean()),
         )
+        self._frames.append(frame)
+        return frame
+
+    def summary(self) -> Figures:
+        """The figures over the frames added so far."""
+        return Figures.over(self._frames)
 
     def _laplacian_of(self, vertices: NDArray[np.float32]) -> NDArray[np.float64]:
         """Each vertex minus the mean of its neighbours along edges (the uniform Laplacian) [m], shape (N, 3)."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -16,9 +16,20 @@ from refu_core._warp import as_warp, torch_stream
 from refu_core.errors import MeshError
 from refu_core.mesh import Connectivity
 from refu_core.metrics._intersect_kernels import intersect_kernel
-from refu_core.sdf import ExactSdf
 
 _CORNERS = np.array([[0, 1], [1, 2], [2, 0]])  # the two ends of edge k of a face
+
+
+class MeshOnDevice(Protocol):
+    """What triangles are looked up in."""
+
+    @property
+    def device(self) -> torch.device:
+        """Where it is."""
+
+    @property
+    def mesh_id(self) -> int:
+        """Warp's handle."""
 
 
 class Crossings(NamedTuple):
@@ -48,7 +59,7 @@ def as_vertices(name: str, values: Any) -> NDArray[np.float32]:
 
 
 def crossings(
-    body: ExactSdf, vertices: NDArray[np.float32], faces: NDArray[np.int32], *, is_body: bool = False
+    body: MeshOnDevice, vertices: NDArray[np.float32], faces: NDArray[np.int32], *, is_body: bool = False
 ) -> Crossings:
     """The crossings of a mesh, (N, 3) [m] and (G, 3), with the body last given to `body`.
 

@@ -1,4 +1,4 @@
-"""Where the body intersects itself: no garment can be free of it there, so such places are reported apart."""
+"""Where a body intersects itself: what the collider is judged by."""
 
 from __future__ import annotations
 

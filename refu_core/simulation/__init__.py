@@ -8,10 +8,10 @@ from refu_core.simulation._dataset import (
     GarmentSequences,
     open_dataset,
 )
-from refu_core.simulation._drape import Draper, DrapeSettings, SettledDrape, canonical_pose
+from refu_core.simulation._drape import Draper, DrapeSettings, SettledDrape, canonical_pose, colliders
 from refu_core.simulation._errors import SimulationError
 from refu_core.simulation._plan import SamplePlan
-from refu_core.simulation._poses import Clip, RoomSettings, load_clips, split_clips
+from refu_core.simulation._poses import Clip, load_clips, split_clips
 from refu_core.simulation._produce import Progress
 from refu_core.simulation._selection import CAUSES, SelectionSettings
 from refu_core.simulation._sequences import SequencePlan, SequenceSettings, simulate_sequences
@@ -31,7 +31,6 @@ __all__ = [
     "GarmentSequence",
     "GarmentSequences",
     "Progress",
-    "RoomSettings",
     "SamplePlan",
     "SelectionSettings",
     "SequencePlan",
@@ -42,6 +41,7 @@ __all__ = [
     "StyleBasis",
     "build_styles",
     "canonical_pose",
+    "colliders",
     "load_clips",
     "open_dataset",
     "simulate_dataset",

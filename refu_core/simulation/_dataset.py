@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from refu_core._files import read_json
-from refu_core.frames import N_JOINTS
 from refu_core.simulation._errors import SimulationError
 from refu_core.simulation._motion import FPS
 from refu_core.simulation._plan import TEST
@@ -54,9 +53,6 @@ class GarmentSample:
     """Name of the motion that the pose is from; None for a drawn pose."""
     frame: int | None
     """Number of that motion's frame; None for a drawn pose."""
-    asked: NDArray[np.float32]
-    """θ before limbs were held back to make room for the cloth, rotation vectors [rad], shape (24, 3): equal to `pose`
-    where none was; NaN until a run of the set has ended."""
     unseen: float
     """Distance in (θ, β, γ) to the nearest training sample; NaN for those and until the set is summarised."""
 
@@ -71,8 +67,6 @@ class GarmentSequence:
     """Why a frame didn't pass (one of `CAUSES`), T entries; None for those that did."""
     pose: NDArray[np.float32]
     """θ that was simulated, rotation vectors [rad], shape (T, 24, 3)."""
-    asked: NDArray[np.float32]
-    """θ before limbs were held back to make room for the cloth [rad], shape (T, 24, 3)."""
     transl: NDArray[np.float32]
     """Translation of the body [m], shape (T, 3); not contained in the vertices."""
     betas: NDArray[np.float32]
@@ -139,7 +133,7 @@ class _Rows:
         return len(self._rows)
 
     def column(self, name: str) -> NDArray[Any]:
-        """A column of all rows as it is stored, shape (M, ...): `pose`, `asked`, `betas` and so on.
+        """A column of all rows as it is stored, shape (M, ...): `pose`, `betas` and so on.
 
         `vertices` comes in units of `card["quantum_m"]`, and is as large as the set.
 
@@ -180,15 +174,12 @@ class GarmentDataset(_Rows):
             msg = f"{path}: wanted a card with the number of samples in plan.count, got {str(count)[:80]}"
             raise SimulationError(msg)
         self._check(slot=(0, count))
-        self._by_slot = {
-            "unseen": read_by_slot(path, "unseen", (count,)),
-            "asked": read_by_slot(path, "asked", (count, N_JOINTS, 3)),
-        }
+        self._unseen = read_by_slot(path, "unseen", (count,))
 
     def column(self, name: str) -> NDArray[Any]:
-        """A column of all samples, shape (M, ...): also `asked` and `unseen`, which are kept by slot."""
-        if name in ("asked", "unseen"):
-            return np.asarray(self._by_slot[name][super().column("slot")])
+        """A column of all samples, shape (M, ...): also `unseen`, which is kept by slot."""
+        if name == "unseen":
+            return np.asarray(self._unseen[super().column("slot")])
         return super().column(name)
 
     def sample(self, index: int) -> GarmentSample:
@@ -208,8 +199,7 @@ class GarmentDataset(_Rows):
             split=split,
             clip=None if clip < 0 else self._clips[split][clip],
             frame=None if clip < 0 else int(row["frame"]),
-            asked=np.array(self._by_slot["asked"][row["slot"]]),
-            unseen=float(self._by_slot["unseen"][row["slot"]]),
+            unseen=float(self._unseen[row["slot"]]),
         )
 
 
@@ -234,7 +224,6 @@ class GarmentSequences(_Rows):
             kept=np.asarray(row["cause"] == 0),
             cause=[None if cause == 0 else CAUSES[cause - 1] for cause in row["cause"]],
             pose=np.array(row["pose"]),
-            asked=np.array(row["asked"]),
             transl=np.array(row["transl"]),
             betas=np.array(row["betas"]),
             style=np.array(row["style"]),

@@ -16,8 +16,10 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from refu_core.body import DEFAULT_GAP, Collider
 from refu_core.frames import N_BETAS, N_JOINTS
 from refu_core.garments import N_STYLES
+from refu_core.realtime._turn import RootTurn
 from refu_core.sdf import ExactSdf
 from refu_core.simulation._cloth import ClothSettings, SimulatedCloth
 from refu_core.simulation._mesh import ClothTopology
@@ -56,6 +58,8 @@ class DrapeSettings:
     """Rates at which velocity fades [1/s]: as the template becomes cloth, as the body moves, as the cloth settles."""
     waistband: float = 0.012
     """Width of the band that holds to the skin [m]."""
+    gap: float = DEFAULT_GAP
+    """Room between two parts of the body [m]."""
 
 
 def canonical_pose() -> NDArray[np.float32]:
@@ -95,6 +99,19 @@ def comfort_poses() -> NDArray[np.float32]:
     return np.stack((hang, bend, raised, spread))
 
 
+@torch.no_grad()
+def colliders(body: SmplBody, collider: Collider, poses: NDArray[np.floating], betas: NDArray[np.floating]) -> F32:
+    """The colliders of a body in poses (P, 24, 3) [rad] and a shape (10,), root rotation included [m], (P, V, 3).
+
+    Overlaps are pulled apart as the root sees them, as `refu_core.realtime.dress` does it: the root only turns.
+    """
+    shape = torch.as_tensor(betas, dtype=torch.float32).view(1, N_BETAS)
+    turns, at_root = RootTurn.taken_off(torch.as_tensor(poses, dtype=torch.float32), body.rest_joints(shape))
+    posed = body(at_root, shape)
+    found = collider(posed.vertices, posed.transforms)
+    return np.stack([turn.to_host(one) for turn, one in zip(turns, found, strict=True)])
+
+
 @dataclass(frozen=True, eq=False)
 class SettledDrape:
     """A settled garment."""
@@ -125,6 +142,7 @@ class Draper:
         # anew for each drape, on a mesh that only depends on the drape, and never in between.
         sdf = ExactSdf(body.faces, rebuild_distance=math.inf)
         self._sdf = sdf
+        self._collider = Collider(body, gap=self.settings.gap)
         self.cloth = SimulatedCloth(self.topology, sdf, settings=self.settings.cloth)
         self.waist: NDArray[np.intp] | None = None
         if garment.card.held_at_waist:
@@ -142,13 +160,12 @@ class Draper:
         rest: F32 = self.garment.rest(torch.as_tensor(betas, dtype=torch.float32).view(1, N_BETAS), gamma)[0].numpy()
         return rest
 
-    def _bodies(self, poses: NDArray[np.float32], betas: NDArray[np.floating]) -> F32:
-        shape = torch.as_tensor(betas, dtype=torch.float32).view(1, N_BETAS)
-        vertices: F32 = self.body(poses, shape).vertices.numpy()
-        return vertices
+    def bodies(self, poses: NDArray[np.floating], betas: NDArray[np.floating]) -> F32:
+        """What cloth lies on: the colliders of poses (P, 24, 3) [rad] and a shape (10,) [m], shape (P, V, 3)."""
+        return colliders(self.body, self._collider, poses, betas)
 
     def canonical(self, betas: NDArray[np.floating], style: NDArray[np.floating]) -> tuple[F32, F32]:
-        """The settled canonical drape of a shape and style and its body, (N, 3) and (V, 3) [m]."""
+        """The settled canonical drape of a shape and style and its collider, (N, 3) and (V, 3) [m]."""
         key = np.concatenate((betas, style)).astype(np.float32).tobytes()
         if self._canonical is None or self._canonical[0] != key:
             self._canonical = (key, *self._settle_canonical(betas, style))
@@ -158,14 +175,13 @@ class Draper:
     def _settle_canonical(self, betas: NDArray[np.floating], style: NDArray[np.floating]) -> tuple[F32, F32, float]:
         # Dressed in the T-pose that it was cut in: lowered by skinning, an armpit would start out folded into itself.
         s = self.settings
-        shape = torch.as_tensor(betas, dtype=torch.float32).view(1, N_BETAS)
         rest = self.rest(betas, style)
-        body: F32 = self.body.rest_vertices(shape)[0].numpy()
+        body = self.bodies(np.zeros((1, N_JOINTS, 3)), betas)[0]
         self.begin(rest, betas, style, body)
         gravity = np.array([0, -GRAVITY, 0], np.float32)
         for _ in range(s.dress_frames):
             self.cloth.frame(body, body, gravity=gravity, drag=s.drag[0])
-        for after in self._bodies(pose_path(np.zeros((N_JOINTS, 3)), canonical_pose(), s.lower_frames), betas):
+        for after in self.bodies(pose_path(np.zeros((N_JOINTS, 3)), canonical_pose(), s.lower_frames), betas):
             self.cloth.frame(body, after, gravity=gravity, drag=s.drag[1])
             body = after
         speed = np.inf
@@ -204,11 +220,11 @@ class Draper:
         target = np.array(pose, np.float32)
         root = Rotation.from_rotvec(target[0].astype(np.float64))
         target[0] = 0
-        way = np.linalg.norm(self._bodies(target[None], betas)[0] - body, axis=1).max()
+        way = np.linalg.norm(self.bodies(target[None], betas)[0] - body, axis=1).max()
         n = int(np.clip(np.ceil(way / s.speed), *s.move_frames))
         poses = pose_path(canonical_pose(), target, n)
         tilts = pose_path(np.zeros((1, 3)), root.as_rotvec()[None], n)
-        bodies = self._bodies(poses, betas)
+        bodies = self.bodies(poses, betas)
         self.begin(start, betas, style, bodies[-1])
         down = np.array([0, -GRAVITY, 0])
         gravity = np.zeros(3, np.float32)

@@ -1,27 +1,19 @@
-"""Where poses come from: frames of recorded motions, samples within the limits of human joints, and room for cloth."""
+"""Where poses come from: frames of recorded motions, and samples within the limits of human joints."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from refu_core._amass import n_resampled, read_recording
-from refu_core.body import ARMS, LEGS, MIRRORED_JOINTS, joints_of
-from refu_core.frames import N_BETAS, N_JOINTS
-from refu_core.metrics._self_contact import SelfContactDetector
-from refu_core.simulation._drape import canonical_pose
+from refu_core.body import MIRRORED_JOINTS
+from refu_core.frames import N_JOINTS
 from refu_core.simulation._errors import SimulationError
-
-if TYPE_CHECKING:
-    from refu_core.body import SmplBody
-    from refu_core.garments import GarmentTemplate
 
 # Range of each joint's rotation vector [degrees] about x, y, z, for the left side where there are two; the right side
 # is its mirror image. x points to the subject's left, y up, z forward, so a thigh is raised by a negative turn about x,
@@ -41,9 +33,6 @@ _LIMITS: dict[int, tuple[tuple[float, float], tuple[float, float], tuple[float, 
     18: ((-20, 20), (-120, 0), (-10, 10)),
     20: ((-20, 20), (-15, 15), (-30, 30)),
 }
-# With an arm goes its collar.
-_LIMBS = ((13, *ARMS[0]), (14, *ARMS[1]), *LEGS)
-_FREE_LIMBS = (*LEGS[0], *LEGS[1], *joints_of("left_forearm", "right_forearm"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,113 +139,3 @@ def clip_pose(clips: Sequence[Clip], rng: np.random.Generator) -> tuple[NDArray[
     if rng.random() < 0.5:
         pose = mirrored(pose)
     return without_heading(pose), which, frame
-
-
-@dataclass(frozen=True)
-class RoomSettings:
-    """How much room a garment needs between limbs."""
-
-    near: float = 0.008
-    """A vertex this close to skin that touches other skin has no room [m]."""
-    padding: float = 0.002
-    """Room that cloth takes on the skin of the trunk and the upper arms [m]."""
-    limb_padding: float = 0.004
-    """Room that it takes on the legs, which have two layers between them, and on forearms and hands [m]."""
-    tolerated: int = 4
-    """Vertices without room that don't count yet: creases of elbow and groin press skin on skin, too."""
-    step: float = 0.15
-    """Share of its way that a limb is moved back at once."""
-    least: float = 0.0
-    """Share of the way that a limb must go at least."""
-
-
-class RoomMaker:
-    """Keeps limbs from pressing into each other where the garment would lie between them.
-
-    Recorded arms hang so close that the built-in bodies' upper arms sink into their flanks: no sleeve can be free of
-    both. A limb that touches is moved back on its way from the canonical pose, a little at a time, until there is room.
-    """
-
-    def __init__(self, garment: GarmentTemplate, body: SmplBody, *, settings: RoomSettings | None = None) -> None:
-        """For `garment` on `body`, both on the CPU."""
-        self.settings = settings or RoomSettings()
-        self._garment = garment
-        self._body = body
-        rest = body.rest_vertices(torch.zeros(1, N_BETAS))[0]
-        free = body.weights.argmax(1)[:, None] == torch.tensor(_FREE_LIMBS)
-        self._padding = torch.where(free.any(1), self.settings.limb_padding, self.settings.padding)[:, None]
-        self._detector = SelfContactDetector(body.faces, self._padded(rest))
-        main_joint = body.weights.argmax(1)[body.faces[:, 0]].numpy()
-        self._limb = np.full(len(main_joint), -1)
-        for k, joints in enumerate(_LIMBS):
-            self._limb[np.isin(main_joint, joints)] = k
-
-    def _padded(self, vertices: torch.Tensor) -> torch.Tensor:
-        """Body vertices moved out by what cloth between two limbs takes from the gap on either side."""
-        corners = vertices[self._body.faces]
-        normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        summed = torch.zeros_like(vertices).index_add_(0, self._body.faces.reshape(-1), normals.repeat_interleave(3, 0))
-        return vertices + self._padding * torch.nn.functional.normalize(summed, dim=1)
-
-    def crowded(
-        self, pose: NDArray[np.float32], betas: NDArray[np.floating], style: NDArray[np.floating]
-    ) -> tuple[int, NDArray[np.intp]]:
-        """How many vertices of the skinned garment have no room, and which limbs (0 to 3, see `_LIMBS`) take it."""
-        shape = torch.as_tensor(betas, dtype=torch.float32).view(1, N_BETAS)
-        posed = self._body(pose[None], shape)
-        contact = self._detector.detect(self._padded(posed.vertices[0]))
-        if contact.is_free:
-            return 0, np.zeros(0, np.intp)
-        gamma = None if self._garment.styledirs is None else torch.as_tensor(style, dtype=torch.float32).view(1, -1)
-        skinned = self._garment.pose(self._garment.rest(shape, gamma), posed.transforms)[0]
-        near = contact.near(skinned, distance=self.settings.near)
-        centres = contact.vertices[self._body.faces.numpy()[contact.faces]].mean(1)
-        if not near.any():
-            return 0, np.zeros(0, np.intp)
-        cloth = skinned.numpy()[near]
-        close = np.array([((cloth - c) ** 2).sum(1).min() < 0.03**2 for c in centres])
-        limbs = np.unique(self._limb[contact.faces[close]])
-        return int(near.sum()), limbs[limbs >= 0]
-
-    @property
-    def n_limbs(self) -> int:
-        """Limbs that can be held back."""
-        return len(_LIMBS)
-
-    def make_room(
-        self, pose: NDArray[np.float32], betas: NDArray[np.floating], style: NDArray[np.floating]
-    ) -> tuple[NDArray[np.float32], float] | None:
-        """The pose with limbs moved back until the garment has room, and the share of the way that the most held-back
-        limb goes; None where that isn't enough (the trunk folds, or a limb is back in the canonical pose)."""
-        share = self.shares(pose, betas, style)
-        return None if share is None else (self.held_back(pose, share), float(share.min()))
-
-    def shares(
-        self,
-        pose: NDArray[np.float32],
-        betas: NDArray[np.floating],
-        style: NDArray[np.floating],
-        *,
-        start: NDArray[np.floating] | None = None,
-    ) -> NDArray[np.float64] | None:
-        """The share of its way that each limb may go, shape (4,), none of them above `start`; None as `make_room`."""
-        share = np.ones(len(_LIMBS)) if start is None else np.array(start, np.float64)
-        while True:
-            count, limbs = self.crowded(self.held_back(pose, share), betas, style)
-            if count <= self.settings.tolerated:
-                return share
-            share[limbs] -= self.settings.step
-            if not len(limbs) or share.min() < self.settings.least - 1e-6:
-                return None
-
-    def held_back(self, pose: NDArray[np.float32], share: NDArray[np.floating]) -> NDArray[np.float32]:
-        """The pose with each limb at its share, (4,), of its way from the canonical pose."""
-        held = pose
-        for k, joints in enumerate(_LIMBS):
-            if share[k] < 1:
-                j = list(joints)
-                held = pose.copy() if held is pose else held
-                first = Rotation.from_rotvec(canonical_pose()[j].astype(np.float64))
-                turn = (first.inv() * Rotation.from_rotvec(pose[j].astype(np.float64))).as_rotvec()
-                held[j] = (first * Rotation.from_rotvec(turn * share[k])).as_rotvec()
-        return held

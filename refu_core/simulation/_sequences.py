@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from refu_core.frames import N_BETAS
@@ -20,12 +19,12 @@ from refu_core.garments import N_STYLES
 from refu_core.simulation._cloth import ClothSettings
 from refu_core.simulation._drape import GRAVITY, DrapeSettings, SettledDrape
 from refu_core.simulation._errors import SimulationError
-from refu_core.simulation._motion import FPS, STEPS, DrawnMotion, draw_motion, make_room_for
+from refu_core.simulation._motion import FPS, STEPS, DrawnMotion, draw_motion
 from refu_core.simulation._plan import TEST, TRAIN, truncated_normal
 from refu_core.simulation._poses import Clip, load_clips, split_clips
 from refu_core.simulation._produce import Progress, produce
 from refu_core.simulation._selection import CAUSES
-from refu_core.simulation._store import DONE, GIVEN_UP, SEQUENCES, SequenceShard, dequantise, quantise
+from refu_core.simulation._store import DONE, SEQUENCES, SequenceShard, dequantise, quantise
 from refu_core.simulation._summary import summarise_sequences
 from refu_core.simulation._worker import SimulationSettings, Simulator
 
@@ -85,9 +84,9 @@ class SequencePlan:
         u = np.random.default_rng(self._key(1, slot % self.shapes)).random(N_BETAS)
         return truncated_normal(u, self.spread), np.zeros(N_STYLES, np.float32)
 
-    def motion(self, slot: int, attempt: int, clips: list[Clip]) -> DrawnMotion:
-        """What a sequence shows at its `attempt`. Raises `SimulationError` when no clip is long enough."""
-        rng = np.random.default_rng(self._key(2, slot, attempt))
+    def motion(self, slot: int, clips: list[Clip]) -> DrawnMotion:
+        """What a sequence shows. Raises `SimulationError` when no clip is long enough."""
+        rng = np.random.default_rng(self._key(2, slot))
         return draw_motion(clips, self.n_frames, rng)
 
 
@@ -117,7 +116,7 @@ class SequenceSimulator(Simulator):
         """As `Simulator`; raises `SimulationError`, too, when the clips of a split are too short."""
         super().__init__(plan, clips, settings, body)
         for slot in (0, plan.count - 1):
-            plan.motion(slot, 0, clips[plan.split_of(slot) == TEST])
+            plan.motion(slot, clips[plan.split_of(slot) == TEST])
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -131,26 +130,18 @@ class SequenceSimulator(Simulator):
         split = plan.split_of(slot)
         betas, style = plan.style_shape(slot)
         row: dict[str, Any] = {"slot": slot, "shape": slot % plan.shapes, "split": split, "betas": betas}
-        row |= {"style": style, "state": GIVEN_UP, "dropped": np.zeros(len(CAUSES), np.int32)}
-        for attempt in range(self.settings.attempts):
-            motion = plan.motion(slot, attempt, self.clips[split == TEST])
-            first = make_room_for(self._room, motion.poses[:1], betas, style)
-            if first[2][0]:
-                continue
-            poses, share, crowded = make_room_for(self._room, motion.poses, betas, style)
-            vertices, cause, stretch, speed = self._play(poses, motion.acceleration(), crowded, betas, style)
-            row |= {"vertices": vertices, "cause": cause, "stretch": stretch, "speed": speed}
-            row |= {"pose": poses[::STEPS], "asked": motion.poses[::STEPS], "transl": motion.transl[::STEPS]}
-            row |= {"share": share[::STEPS], "clip": motion.clip, "start": motion.start, "mirrored": motion.mirrored}
-            row |= {"dropped": np.bincount(cause, minlength=len(CAUSES) + 1)[1:], "state": DONE}
-            break
+        motion = plan.motion(slot, self.clips[split == TEST])
+        vertices, cause, stretch, speed = self._play(motion.poses, motion.acceleration(), betas, style)
+        row |= {"style": style, "vertices": vertices, "cause": cause, "stretch": stretch, "speed": speed}
+        row |= {"pose": motion.poses[::STEPS], "transl": motion.transl[::STEPS]}
+        row |= {"clip": motion.clip, "start": motion.start, "mirrored": motion.mirrored}
+        row |= {"dropped": np.bincount(cause, minlength=len(CAUSES) + 1)[1:], "state": DONE}
         return row | {"seconds": time.perf_counter() - started}
 
     def _play(
         self,
         poses: NDArray[np.float32],
         acceleration: NDArray[np.float64],
-        crowded: NDArray[np.bool_],
         betas: NDArray[np.float32],
         style: NDArray[np.float32],
     ) -> tuple[NDArray[np.int16], NDArray[np.uint8], F32, F32]:
@@ -160,11 +151,8 @@ class SequenceSimulator(Simulator):
         is a gravity of the other sign, and the air is still. It starts at rest in the first pose.
         """
         s, cloth = self.settings, self._draper.cloth
-        shape = torch.from_numpy(betas)[None]
         drape = self._draper.drape(poses[0], betas, style)
-        bodies = np.concatenate(
-            [self.body(poses[k : k + 50], shape).vertices.numpy() for k in range(0, len(poses), 50)]
-        )
+        bodies = np.concatenate([self._draper.bodies(poses[k : k + 50], betas) for k in range(0, len(poses), 50)])
         self._draper.begin(drape.vertices, betas, style, bodies[0])
         gravity = (np.array([0, -GRAVITY, 0]) - acceleration).astype(np.float32)
         n = len(poses[::STEPS])
@@ -184,13 +172,13 @@ class SequenceSimulator(Simulator):
                 t = k // STEPS
                 vertices[t] = quantise(cloth.positions)
                 stretch[t], speed[t] = self._draper.stretch(), now
-                cause[t] = self._examine(dequantise(vertices[t]), body, float(stretch[t]), crowded=bool(crowded[k]))
+                cause[t] = self._examine(dequantise(vertices[t]), body, float(stretch[t]))
         return vertices, cause, stretch, speed
 
-    def _examine(self, stored: F32, body: F32, stretch: float, *, crowded: bool) -> int:
+    def _examine(self, stored: F32, body: F32, stretch: float) -> int:
         """0, or 1 and above for the cause why a frame isn't in the set; a moving cloth may be fast."""
         worst = max(stretch, self._draper.stretch(stored))  # rounding included, as for samples
-        cause = "no_room" if crowded else self._selector.cause(stored, body, SettledDrape(stored, 0.0, worst, 1))
+        cause = self._selector.cause(stored, body, SettledDrape(stored, 0.0, worst, 1))
         return 0 if cause is None else 1 + CAUSES.index(cause)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 from refu_core.simulation._plan import SamplePlan
 from refu_core.simulation._poses import Clip, load_clips, split_clips
 from refu_core.simulation._produce import Progress, produce
-from refu_core.simulation._summary import summarise, write_asked
+from refu_core.simulation._summary import summarise
 from refu_core.simulation._worker import SimulationSettings, SlotSimulator
 
 
@@ -65,6 +65,4 @@ def simulate_dataset(
         clips = split_clips(load_clips(motions))
     make = partial(SlotSimulator, plan, clips, settings or SimulationSettings(), body)
     produce(make, output, processes=processes, shard=shard, progress=progress)
-    card = summarise(output)
-    write_asked(output, plan, clips)
-    return card
+    return summarise(output)

@@ -2,7 +2,6 @@
 
     SET/card.json                       plan, settings, versions, hashes, counts, yield
     SET/unseen.npy                      (count,) distance of each test sample to the training set, NaN for the others
-    SET/asked.npy                       (count, 24, 3) float32, poses before limbs were held back, NaN where not done
     SET/shard-I-of-N/slot.npy           (S,) int32, number of each row's slot in the plan
                      state.npy          (S,) uint8, 0 to do, 1 done, 2 given up
                      vertices.npy       (S, N, 3) int16, posed garment in units of 2^-14 m, see `QUANTUM`
@@ -11,8 +10,8 @@
                      style.npy          (S, 4) float32
                      pair.npy clip.npy frame.npy      (S,) int32; clip and frame are -1 for a drawn pose
                      split.npy          (S,) uint8, 0 training, 1 test
-                     dropped.npy        (S, 5) uint8, attempts that failed, by cause
-                     share.npy stretch.npy speed.npy seconds.npy      (S,) float32
+                     dropped.npy        (S, 4) uint8, attempts that failed, by cause
+                     stretch.npy speed.npy seconds.npy      (S,) float32
 
 A set of sequences has the format `SEQUENCES`, one row a sequence, and other columns: see `sequence_columns`.
 
@@ -37,8 +36,8 @@ from refu_core._npz import DAMAGE, check_npy
 from refu_core.simulation._errors import SimulationError
 from refu_core.simulation._selection import CAUSES
 
-FORMAT = "refu-garments-1"
-SEQUENCES = "refu-sequences-1"
+FORMAT = "refu-garments-2"
+SEQUENCES = "refu-sequences-2"
 QUANTUM = 2.0**-14
 """Unit of stored positions [m]: 0.06 mm, so ±2 m fit and rounding moves a vertex by at most 0.03 mm an axis."""
 TO_DO, DONE, GIVEN_UP = 0, 1, 2
@@ -63,7 +62,6 @@ def sample_columns(shape: tuple[int, ...]) -> Columns:
         "frame": ((), "<i4"),
         "split": ((), "|u1"),
         "dropped": ((len(CAUSES),), "|u1"),
-        "share": ((), "<f4"),
         "stretch": ((), "<f4"),
         "speed": ((), "<f4"),
         "seconds": ((), "<f4"),
@@ -78,10 +76,8 @@ def sequence_columns(shape: tuple[int, ...]) -> Columns:
     return {
         "vertices": (shape, "<i2"),
         "pose": ((*frames, 24, 3), "<f4"),
-        "asked": ((*frames, 24, 3), "<f4"),
         "transl": ((*frames, 3), "<f4"),
         "cause": (frames, "|u1"),  # 0 a frame in the set, 1 and above: why not, by the order of `CAUSES`
-        "share": (frames, "<f4"),
         "stretch": (frames, "<f4"),
         "speed": (frames, "<f4"),
         "betas": ((10,), "<f4"),

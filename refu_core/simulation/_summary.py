@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from refu_core.frames import N_JOINTS
-from refu_core.simulation._errors import SimulationError
 from refu_core.simulation._motion import FPS
-from refu_core.simulation._plan import TEST, TRAIN, SamplePlan
+from refu_core.simulation._plan import TEST, TRAIN
 from refu_core.simulation._selection import CAUSES
 from refu_core.simulation._store import (
     DONE,
@@ -26,9 +25,6 @@ from refu_core.simulation._store import (
     write_by_slot,
     write_card,
 )
-
-if TYPE_CHECKING:
-    from refu_core.simulation._poses import Clip
 
 
 def _finished(output: Path, kind: type[Shard] = Shard) -> dict[str, NDArray[Any]]:
@@ -90,8 +86,8 @@ def summarise(output: str | Path) -> dict[str, Any]:
             unseen[column["slot"][row]] = np.sqrt(((parameters[train] - parameters[row]) ** 2).sum(1).min())
     write_by_slot(output, "unseen", unseen)
     dropped = column["dropped"].sum(0, dtype=np.int64)
-    _count(card, column, held_back=int((column["share"][kept] < 1).sum()))
-    _note_yield(card, int(kept.sum() + dropped[1:].sum()), kept.sum(), dropped)
+    _count(card, column)
+    _note_yield(card, int(kept.sum() + dropped.sum()), kept.sum(), dropped)
     if kept.any():
         pace = float(column["seconds"].sum() / kept.sum())
         card["figures"] = {"seconds_a_sample": pace, **_cloth_figures(column, kept)}
@@ -124,24 +120,3 @@ def summarise_sequences(output: str | Path) -> dict[str, Any]:
         }
     write_card(output, card)
     return card
-
-
-def write_asked(output: Path, plan: SamplePlan, clips: tuple[list[Clip], list[Clip]]) -> None:
-    """Writes `asked.npy`: by slot, the pose that was asked for before limbs were held back.
-
-    It follows from the plan alone: the pose that the slot draws at its first attempt that wasn't dropped.
-
-    Raises `SimulationError` when what is drawn here isn't what was drawn when the set was made.
-    """
-    column = _finished(output)
-    asked = np.full((plan.count, N_JOINTS, 3), np.nan, np.float32)
-    for row in np.flatnonzero(column["state"] == DONE):
-        slot = int(column["slot"][row])
-        attempt = int(column["dropped"][row].sum(dtype=np.int64))
-        pose, clip, frame = plan.pose(slot, attempt, clips[plan.split_of(slot) == TEST])
-        drawn = (clip, frame) == (column["clip"][row], column["frame"][row])
-        if not drawn or (column["share"][row] == 1 and np.abs(pose - column["pose"][row]).max() > 1e-5):
-            msg = f"{output}: slot {slot} draws another pose here than when it was made; use the card's `versions`"
-            raise SimulationError(msg)
-        asked[slot] = pose
-    write_by_slot(output, "asked", asked)

@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-import torch
 
 from refu_core.body import load_body
 from refu_core.garments import load_garment
 from refu_core.simulation._drape import Draper, DrapeSettings, SettledDrape
 from refu_core.simulation._plan import TEST, SamplePlan
-from refu_core.simulation._poses import Clip, RoomMaker, RoomSettings
+from refu_core.simulation._poses import Clip
 from refu_core.simulation._selection import CAUSES, SelectionSettings, Selector
 from refu_core.simulation._store import DONE, FORMAT, GIVEN_UP, Shard, dequantise, quantise
 
@@ -25,10 +24,9 @@ class SimulationSettings:
     """All settings of a data set but its plan."""
 
     drape: DrapeSettings = field(default_factory=DrapeSettings)
-    room: RoomSettings = field(default_factory=RoomSettings)
     selection: SelectionSettings = field(default_factory=SelectionSettings)
     attempts: int = 8
-    """Poses that a slot tries before it is given up; of a sequence, stretches of motion whose first pose has room."""
+    """Poses that a slot tries before it is given up."""
 
 
 class Simulator(ABC):
@@ -56,7 +54,6 @@ class Simulator(ABC):
         self.garment = load_garment(plan.garment)
         self.body = load_body(self.garment.body if body is None else body)
         self._draper = Draper(self.garment, self.body, settings=settings.drape)
-        self._room = RoomMaker(self.garment, self.body, settings=settings.room)
         self._selector = Selector(self.body.faces, self.garment.faces, settings=settings.selection)
 
     @property
@@ -87,17 +84,12 @@ class SlotSimulator(Simulator):
         row: dict[str, Any] = {"slot": slot, "pair": pair, "split": split, "betas": betas, "style": style}
         for attempt in range(self.settings.attempts):
             pose, clip, frame = plan.pose(slot, attempt, self.clips[split == TEST])
-            made = self._room.make_room(pose, betas, style)
-            if made is None:
-                dropped[CAUSES.index("no_room")] += 1
-                continue
-            pose, share = made
             drape = self._draper.drape(pose, betas, style)
             cause, stored = self._examine(drape, pose, betas)
             if cause is not None:
                 dropped[CAUSES.index(cause)] += 1
                 continue
-            row |= {"vertices": stored, "pose": pose, "clip": clip, "frame": frame, "share": share}
+            row |= {"vertices": stored, "pose": pose, "clip": clip, "frame": frame}
             row |= {"stretch": drape.stretch, "speed": drape.speed, "state": DONE}
             break
         else:
@@ -108,7 +100,7 @@ class SlotSimulator(Simulator):
         if not np.isfinite(drape.vertices).all() or np.abs(drape.vertices).max() > 1.9:
             return "unsettled", None
         stored = quantise(drape.vertices)
-        body = self.body(pose[None], torch.as_tensor(betas)[None]).vertices[0].numpy()
+        body = self._draper.bodies(pose[None], betas)[0]
         # What is checked is what will be read, rounding included.
         read = dequantise(stored)
         judged = replace(drape, stretch=max(drape.stretch, self._draper.stretch(read)))

@@ -26,8 +26,6 @@ class TrainingSamples:
 
     pose: Tensor
     """θ that was simulated, rotation vectors [rad], shape (N, 24, 3)."""
-    asked: Tensor
-    """θ before limbs were held back to make room for the cloth, shape (N, 24, 3); NaN where the set doesn't say."""
     betas: Tensor
     """β, shape (N, 10)."""
     style: Tensor
@@ -118,36 +116,19 @@ def read_samples(
 
     with torch.no_grad():
         found = in_chunks(displacement, vertices, column["pose"], column["betas"], column["style"])
-    return TrainingSamples(
-        column["pose"], column["asked"], column["betas"], column["style"], found, column["pair"].long()
-    )
+    return TrainingSamples(column["pose"], column["betas"], column["style"], found, column["pair"].long())
 
 
 def _columns(dataset: GarmentDataset, rows: NDArray[np.intp]) -> dict[str, NDArray[Any]]:
-    return {name: dataset.column(name)[rows] for name in ("vertices", "pose", "asked", "betas", "style", "pair")}
+    return {name: dataset.column(name)[rows] for name in ("vertices", "pose", "betas", "style", "pair")}
 
 
 def _frames(dataset: GarmentSequences, rows: NDArray[np.intp]) -> dict[str, NDArray[Any]]:
     """The same of every frame of some sequences that passed the selection; what a sequence is one of, is its pair."""
     kept = dataset.column("cause")[rows] == 0
-    found = {name: dataset.column(name)[rows][kept] for name in ("vertices", "pose", "asked")}
+    found = {name: dataset.column(name)[rows][kept] for name in ("vertices", "pose")}
     found |= {name: dataset.column(name)[rows].repeat(kept.sum(1), axis=0) for name in ("betas", "style")}
     return found | {"pair": dataset.column("slot")[rows].repeat(kept.sum(1))}
-
-
-def with_asked_poses(samples: TrainingSamples) -> TrainingSamples:
-    """The samples, and those whose limbs were held back once more: the same displacement at the pose that was asked.
-
-    So that what live motion is full of, hanging arms, is among a network's inputs although no cloth can be simulated
-    there (docs/guide/data.md, "Room for the cloth"). Sets that don't say what was asked give the samples as they are.
-    """
-    return samples.joined(asked_only(samples))
-
-
-def asked_only(samples: TrainingSamples) -> TrainingSamples:
-    """Those of the samples whose limbs were held back, at the pose that was asked."""
-    held_back = (samples.asked - samples.pose).abs().amax((1, 2)) > 1e-3  # false for NaN
-    return replace(samples, pose=samples.asked).take(held_back)
 
 
 def mirrored(samples: TrainingSamples, mirror: Mirror) -> TrainingSamples:
@@ -155,7 +136,6 @@ def mirrored(samples: TrainingSamples, mirror: Mirror) -> TrainingSamples:
     return replace(
         samples,
         pose=mirror_pose(samples.pose),
-        asked=mirror_pose(samples.asked),
         displacement=in_chunks(mirror.displacement, samples.displacement),
     )
 

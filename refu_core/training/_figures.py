@@ -10,7 +10,7 @@ from torch import Tensor
 from refu_core.backbones import Backbone, BasisDecoder
 from refu_core.body import SmplBody
 from refu_core.garments import GarmentTemplate
-from refu_core.training._data import TrainingSamples, asked_only, in_chunks
+from refu_core.training._data import TrainingSamples, in_chunks
 
 _CHUNK = 32
 
@@ -43,9 +43,8 @@ def backbone_figures(
 ) -> dict[str, Any]:
     """MPVE on the test split [mm], beside what it is to be measured against.
 
-    `mpve_mm` is on the simulated poses. `asked_mm` is on the poses that were asked where limbs were held back: the
-    distance to the garment of the simulated pose, posed as was asked. `skinned_mm` is without a network, `mean_mm`
-    (`mean`, shape (V, 3)) the best constant, and `basis_mm` the least that the output basis allows.
+    `skinned_mm` is without a network, `mean_mm` (`mean`, shape (V, 3)) the best constant, and `basis_mm` the least that
+    the output basis allows.
     """
 
     def mpve(predicted: Tensor, of: TrainingSamples) -> float:
@@ -61,8 +60,4 @@ def backbone_figures(
     decoder = getattr(backbone, "decoder", None)
     if isinstance(decoder, BasisDecoder):
         figures["basis_mm"] = mpve(decoder(decoder.encode(truth)), samples)
-    asked = asked_only(samples)
-    if len(asked):
-        figures["asked_samples"] = len(asked)
-        figures["asked_mm"] = mpve(displacements(backbone, asked), asked)
     return figures

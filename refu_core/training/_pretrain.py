@@ -36,7 +36,6 @@ from refu_core.training._data import (
     output_basis,
     read_samples,
     split_validation,
-    with_asked_poses,
 )
 from refu_core.training._figures import backbone_figures
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, start_parallel
@@ -64,8 +63,6 @@ class PretrainSettings:
     joint_rate: float = 0.3
     """Learning rate of the last stage with `joint` pivots, relative: the low-frequency net is only tuned there."""
     is_mirrored: bool = True
-    asks: bool = True
-    """Whether samples whose limbs were held back are shown at the pose that was asked, too."""
     validation_share: float = 0.08
 
     def __post_init__(self) -> None:
@@ -137,8 +134,6 @@ def pretrain(
         basis = basis_of(output, opened, mirror, settings.rank, is_writer=is_writer)
     # Which pairs are held out mustn't depend on what is made of the samples afterwards.
     train, validation = split_validation(samples, share=settings.validation_share, seed=settings.loop.seed)
-    if settings.asks:
-        train = with_asked_poses(train)
     if mirror is not None:
         train = train.joined(mirrored(train, mirror))
     with torch.random.fork_rng(devices=[]):

@@ -51,5 +51,5 @@ def accuracies(
                 found = checker.check(vertices, faces)
                 metrics[key].add(vertices, found, truth=truth.of(garment, record.frame))
                 progress()
-    summaries = {key: one.summary().all.as_dict() for key, one in metrics.items()}
+    summaries = {key: one.summary().as_dict() for key, one in metrics.items()}
     return {key: {name: float(s[name]) for name in FIGURES if s[name] is not None} for key, s in summaries.items()}

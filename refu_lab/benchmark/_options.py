@@ -29,6 +29,7 @@ class BenchmarkOptions:
     quick: bool = False
     output: Path = OUTPUT
     weights: Path | None = None
+    collider: bool = True
     device: str | None = None
     """`cuda` adds its rows to those of the CPU; None adds them where there is a GPU."""
 
@@ -72,7 +73,13 @@ class BenchmarkOptions:
     ) -> GarmentPipeline:
         """A pipeline of one garment. Raises `WeightsError` where there are no weights of the backbone for it."""
         return GarmentPipeline.load(
-            [garment], sdf=mode, backbone=backbone, weights=self.weights, device=device, graph=graph
+            [garment],
+            sdf=mode,
+            backbone=backbone,
+            weights=self.weights,
+            device=device,
+            graph=graph,
+            collider=self.collider,
         )
 
     @property
@@ -82,6 +89,7 @@ class BenchmarkOptions:
         parts += [f"--garments {','.join(self.garments)}"] if self.garments is not None else []
         parts += [f"--motions {self.motions.resolve().name}/"] if self.motions is not None else []
         parts += [f"--weights {self.weights.resolve().name}/"] if self.weights is not None else []
+        parts += [] if self.collider else ["--no-collider"]
         parts += ["--quick"] if self.quick else [f"--rounds {self.rounds}"]
         return " ".join(parts)
 

@@ -32,6 +32,7 @@ def main() -> None:
     parser.add_argument("--sdf", required=True)
     parser.add_argument("--backbone", required=True)
     parser.add_argument("--weights")
+    parser.add_argument("--no-collider", dest="collider", action="store_false")
     parser.add_argument("--started", type=float, required=True, help="when the process was started (Unix time)")
     args = parser.parse_args()
 
@@ -43,7 +44,11 @@ def main() -> None:
     torch.set_num_threads(1)
     imported = time.time()
     pipeline = GarmentPipeline.load(
-        args.garments.split(","), sdf=args.sdf, backbone=args.backbone, weights=args.weights
+        args.garments.split(","),
+        sdf=args.sdf,
+        backbone=args.backbone,
+        weights=args.weights,
+        collider=args.collider,
     )
     loaded = time.time()
     pose = np.zeros((24, 3), np.float32)

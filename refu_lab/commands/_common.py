@@ -160,6 +160,16 @@ def add_common(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
+def add_collider(parser: argparse.ArgumentParser) -> None:
+    """What every command has that dresses bodies."""
+    parser.add_argument(
+        "--no-collider",
+        dest="collider",
+        action="store_false",
+        help="bring garments off the posed body as it is, which runs through itself",
+    )
+
+
 def given(args: argparse.Namespace, options: type) -> dict[str, Any]:
     """The arguments that are fields of a dataclass of options, by name."""
     names_of_fields = {field.name for field in fields(options)}

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from refu_lab.commands._common import (
     EXIT_CHECK_FAILED,
+    add_collider,
     add_common,
     check_writable,
     in_path,
@@ -45,8 +46,9 @@ def add(commands: Any) -> None:
     parser.add_argument("--cache", type=out_folder, metavar="DIR", help="keep what was measured, and use it again")
     parser.add_argument("--every", type=positive, default=1, metavar="N", help="every N-th test sample (1)")
     parser.add_argument(
-        "--motion-every", type=positive, default=10, metavar="N", help="every N-th frame of a motion (10)"
+        "--motion-every", type=positive, default=1, metavar="N", help="every N-th frame of a motion (1)"
     )
+    add_collider(parser)
     parser.add_argument(
         "--quick",
         action="store_true",
@@ -86,6 +88,7 @@ def run(args: argparse.Namespace) -> int:
         cache=args.cache,
         every=args.every,
         motion_every=args.motion_every,
+        collider=args.collider,
     )
     tables = evaluate(options, progress=not args.quiet)
     print(results_text(tables, output))

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN
 from refu_lab.commands._common import (
     EXIT_INTERRUPTED,
+    add_collider,
     add_common,
     check_writable,
     given,
@@ -82,6 +83,7 @@ def add(commands: Any) -> None:
     parser.add_argument("--frame-id", type=word, default="map", metavar="ID", help="frame_id of the markers (map)")
     parser.add_argument("--device", default="cpu", metavar="DEVICE", help="cpu (default) or cuda")
     parser.add_argument("--max-frames", type=positive, metavar="N", help="stop after N frames")
+    add_collider(parser)
     parser.add_argument("--overwrite", action="store_true", help="replace an output that is there already")
     add_common(parser)
     parser.set_defaults(run=run)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from refu_core.modes import BUILTIN_GARMENTS
 from refu_lab.commands._common import (
     EXIT_CHECK_FAILED,
+    add_collider,
     add_common,
     between,
     check_writable,
@@ -66,6 +67,7 @@ def add(commands: Any) -> None:
         "--output", type=out_folder, default=Path("stress"), metavar="DIR", help="where the worst trials go (stress)"
     )
     parser.add_argument("--replay", type=in_path, metavar="FILE", help="try one of them again, and nothing else")
+    add_collider(parser)
     add_common(parser)
     parser.set_defaults(run=run)
 
@@ -78,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
         check_writable(path)
     options = StressOptions(**given(args, StressOptions))
     if args.replay is not None:
-        result = StressResult(tallies=[replay_trial(args.replay, weights=options.weights)])
+        result = StressResult(tallies=[replay_trial(args.replay, weights=options.weights, collider=options.collider)])
     else:
         result = run_stress(
             options, progress=not args.quiet, report=lambda so_far: write_json(args.json, so_far.as_dict())

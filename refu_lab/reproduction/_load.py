@@ -19,9 +19,10 @@ from refu_lab.reproduction._methods import Method
 class Library:
     """Trained weights: those of some folders, `<folder>/<garment>/<weights>`, before those that ship."""
 
-    def __init__(self, folders: Sequence[Path] = ()) -> None:
-        """Looks into `folders` first, in their order."""
+    def __init__(self, folders: Sequence[Path] = (), *, collider: bool = True) -> None:
+        """Looks into `folders` first, in their order; what is loaded is brought off the collider, or off the skin."""
         self._folders = tuple(folders)
+        self.collider = collider
 
     def find(self, method: Method, garment: str) -> Path:
         """The weights' files without suffix. Raises `WeightsError` where there are none."""
@@ -44,11 +45,16 @@ class Library:
         expect = {"garment": garment.name, "body_fingerprint": body.fingerprint}
         return trained_from_weights(load_weights(stem, expect=expect), garment)
 
-    def pipeline(self, method: Method, garment: str) -> GarmentPipeline:
-        """What the node runs, in the method's mode; `none` without handling of collisions. Raises `RefuError`."""
-        weights = None if method.weights is None else self.find(method, garment).parent.parent
+    def pipeline(self, method: Method, *garments: str) -> GarmentPipeline:
+        """What the node runs, in the method's mode; `none` without handling of collisions.
+
+        Raises `RefuError` where garments worn together have no weights in one folder.
+        """
+        weights = None if method.weights is None else self.find(method, garments[0]).parent.parent
         sdf = method.mode if method.handling == "node" else "none"
-        return GarmentPipeline.load([garment], sdf=sdf, backbone=method.backbone, weights=weights)
+        return GarmentPipeline.load(
+            garments, sdf=sdf, backbone=method.backbone, weights=weights, collider=self.collider
+        )
 
     def load_neural_sdf(self, preset: str, garment: str, body: SmplBody) -> BodySdf:
         """A distance network trained on a garment's set, `sdf-<preset>`. Raises `WeightsError` where there is none."""

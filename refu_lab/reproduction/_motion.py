@@ -1,125 +1,269 @@
-"""Real motion: the metrics that need no ground truth, clip by clip."""
+"""Real motion: every frame of recorded clips, every vertex, against the collider and against the skin."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 
 from refu_core.errors import RefuError
-from refu_core.frames import SmplFrame
-from refu_core.metrics import CollisionChecker, GarmentMetrics, temporal_jitter
+from refu_core.metrics import (
+    CollisionChecker,
+    Figures,
+    FrameMetrics,
+    GarmentMetrics,
+    SelfContact,
+    SelfContactDetector,
+    SheetChecker,
+)
+from refu_core.modes import DEFAULT_GARMENTS
 from refu_core.realtime import GarmentPipeline
-from refu_lab.body_contact import BodyContact
 from refu_lab.reproduction._load import Library
 from refu_lab.reproduction._methods import METHODS
-from refu_lab.reproduction._tables import Missing, ResultRow, ResultTable, weighted
+from refu_lab.reproduction._tables import Missing, ResultRow, ResultTable
 
-MOTION_METHODS = ("skinned", "node-skinned", "tailornet", "node-approx", "node-accurate", "node-hybrid")
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from msg_adapters import Motion
+    from refu_core.frames import SmplFrame
+    from refu_core.realtime import PipelineOutput
+
+OUTFITS = (DEFAULT_GARMENTS, ("shirt-male",), ("skirt-female",))
+"""What is worn together."""
+MOTION_METHODS = ("node-hybrid", "node-accurate")
 """What is shown for every clip, in the order of the rows."""
-_AWAY = ", away from self-contact"
-_METRICS = ("vfcp_percent", "cfmp_percent", "max_depth_mm")
+NEAR = 0.02
+"""A self-intersection of the collider this close to a garment [m] takes its room."""
+_RATE = 60.0
+"""Jumps are between frames about this far apart [1/s]."""
+_MOVED = 1e-4
+"""Skin that was moved by more than this counts as moved [m]."""
+_BIN = 1e-5  # [m]: to this percentiles of the skin's shift are known
+_LONGEST_WAY = 0.2  # [m]
+_STRETCHED = 2.0
+_SKIN = "skin"
+_ABOUT = (
+    "Recorded motion has no ground truth: what is measured is how free of the body garments are, how calm, and how "
+    "sound their cloth. Every frame and every vertex counts. The collider is the posed body with its overlaps pulled "
+    "apart, which garments are brought off; the skin runs through itself where limbs meet, so no garment can be free "
+    "of it there. *Collider cut* counts frames in which the collider runs through itself within "
+    f"{1e3 * NEAR:g} mm of the garment where the rest pose doesn't. *Jumps* are of the vertex that goes farthest in "
+    f"1/{_RATE:g} s against the garment skinned to the same motion. *Layers cut* counts frames in which T-shirt and "
+    "short pants, worn together, cut through each other. *Crossings* are pairs of a garment's own faces that "
+    "intersect, a frame."
+)
 
 
 def motion_table(
-    clips: Mapping[str, Sequence[SmplFrame]],
-    garments: Sequence[str],
+    clips: Mapping[str, Motion],
     *,
     library: Library,
     every: int,
     progress: Callable[[int, int], None] | None = None,
 ) -> ResultTable:
-    """VFCP, CFMP, depth and jitter of each clip, overall and away from where the body touches itself.
+    """Collisions, jumps, stretch and crossings of each garment, and how far skin was moved, clip by clip.
 
     Args:
         clips: Recorded motions by name.
-        garments: Built-in garments, each worn alone.
         library: Where trained networks are.
-        every: Every so many frames three consecutive ones are dressed; the middle one is checked for collisions.
+        every: Every so many frames one is dressed and judged; 1 for all.
         progress: Called with (frames done, frames in all).
     """
-    table = ResultTable(
-        "motion",
-        "Recorded motion",
-        "Recorded motion (CMU motion capture) has no ground truth: what is measured is how free of the body the "
-        "garments are, and how calm. Where the body touches itself (an arm in the flank) no garment can be free of it; "
-        'such frames are never left out, the rows "away from self-contact" leave out the vertices near such places. '
-        "Jitter is the mean length of x(t+1) - 2 x(t) + x(t-1): the moving body's own acceleration is in it, so "
-        "compare it with the skinned template's.",
-        labels={name + end: METHODS[name].label + end for name in MOTION_METHODS for end in ("", _AWAY)},
-    )
-    middles = {name: range(1, len(frames) - 1, every) for name, frames in clips.items()}
-    total, done = len(garments) * sum(map(len, middles.values())), 0
-    for garment in garments:
+    labels = {name: METHODS[name].label for name in MOTION_METHODS} | {_SKIN: "skin to collider"}
+    table = ResultTable("motion", "Recorded motion", _ABOUT, labels=labels)
+    indices = {name: range(0, len(clip) - _step(clip), every) for name, clip in clips.items()}
+    total, done = len(OUTFITS) * sum(map(len, indices.values())), 0
+    found: dict[str, dict[tuple[str, str], list[_Judged]]] = {}
+    shifts: dict[str, dict[str, SkinShifts]] = {}
+    for garments in OUTFITS:
         pipelines: dict[str, GarmentPipeline] = {}
-        for name in MOTION_METHODS:
-            method = METHODS[name]
+        for method in MOTION_METHODS:
+            made_by = METHODS[method]
             try:
-                pipelines[name] = library.pipeline(method, garment)
+                pipelines[method] = library.pipeline(made_by, *garments)
             except RefuError as error:
-                table.missing.append(Missing(garment, name, str(error), method.train_command(garment)))
-        contact = BodyContact(pipelines["skinned"].body)
-        rows: list[ResultRow] = []
-        counts: dict[str, int] = {}
-        for name, frames in clips.items():
-            worn = _WornClip(garment, pipelines, contact)
-            for middle in middles[name]:
-                worn.add(frames[middle - 1 : middle + 2])
+                command = made_by.train_command(garments[0])
+                table.missing += [Missing(garment, method, str(error), command) for garment in garments]
+        if not pipelines:
+            continue
+        worn = _Worn(garments, pipelines)
+        of_body = shifts.setdefault(worn.body.name, {})
+        is_first = not of_body
+        for name, clip in clips.items():
+            shift = SkinShifts()
+            for index in indices[name]:
+                judged, way = worn.judge([clip.frame(index), clip.frame(index + _step(clip))])
+                for (garment, method), one in judged.items():
+                    found.setdefault(garment, {}).setdefault((name, method), []).append(one)
+                shift.add(way)
                 done += 1
                 if progress is not None:
                     progress(done, total)
-            if middles[name]:
-                group = f"{garment}, {name}"
-                rows += worn.rows(group)
-                counts[group] = len(middles[name])
-        table.rows += [*_over_clips(garment, rows, counts), *rows]
+            if is_first:
+                of_body[name] = shift
+    for garment, by_clip in found.items():
+        for method in MOTION_METHODS:
+            everything = [one for (_, of), ones in by_clip.items() if of == method for one in ones]
+            table.rows += _rows(f"{garment}, all clips", method, everything)
+        for (name, method), ones in by_clip.items():
+            table.rows += _rows(f"{garment}, {name}", method, ones)
+    for body, of_clips in shifts.items():
+        table.rows += SkinShifts.joined(of_clips.values()).rows(f"{body} body, all clips")
+        for name, shift in of_clips.items():
+            table.rows += shift.rows(f"{body} body, {name}")
     return table
 
 
-class _WornClip:
-    """One garment, as every method makes it, over a clip."""
+class SkinShifts:
+    """How far vertices of the skin went to where they are on the collider, of many frames."""
 
-    def __init__(self, garment: str, pipelines: Mapping[str, GarmentPipeline], contact: BodyContact) -> None:
-        self._garment = garment
-        self._pipelines = pipelines
-        self._contact = contact
-        self._faces = pipelines["skinned"].garments[garment].faces.numpy()
-        self._checker = CollisionChecker(pipelines["skinned"].body.faces)
-        self._metrics = {name: GarmentMetrics(self._faces) for name in pipelines}
-        self._jitter: dict[str, list[float]] = {name: [] for name in pipelines}
+    def __init__(self) -> None:
+        self._count = np.zeros(int(_LONGEST_WAY / _BIN) + 1, np.int64)
+        self._sum, self._largest, self._moved = 0.0, 0.0, 0
 
-    def add(self, frames: Sequence[SmplFrame]) -> None:
-        """Takes in three consecutive frames."""
-        contact = None
-        for name, pipeline in self._pipelines.items():
-            outputs = pipeline(frames)
-            if contact is None:
-                self._checker.update(outputs[1].body)
-                contact = self._contact.detect(frames[1].betas, outputs[1].body)
-            local = outputs[1][self._garment].local
-            self._metrics[name].add(local, self._checker.check(local, self._faces), near_contact=contact.near(local))
-            self._jitter[name].append(temporal_jitter(*(output[self._garment].vertices for output in outputs)))
+    def add(self, way: NDArray[np.floating]) -> None:
+        """Takes in the ways of a frame's vertices [m], shape (V,)."""
+        np.add.at(self._count, np.minimum((way / _BIN).astype(np.int64), len(self._count) - 1), 1)
+        self._sum += float(way.sum())
+        self._largest = max(self._largest, float(way.max()))
+        self._moved += int((way > _MOVED).sum())
+
+    @classmethod
+    def joined(cls, parts: Iterable[SkinShifts]) -> SkinShifts:
+        """Of all frames of `parts`."""
+        whole = cls()
+        for part in parts:
+            whole._count += part._count
+            whole._sum += part._sum
+            whole._largest = max(whole._largest, part._largest)
+            whole._moved += part._moved
+        return whole
 
     def rows(self, group: str) -> list[ResultRow]:
-        """Overall and away from self-contact, method by method."""
-        rows = []
-        for name, metrics in self._metrics.items():
-            summary = metrics.summary()
-            rows += [ResultRow.of("motion", group, name, metric, getattr(summary.all, metric)) for metric in _METRICS]
-            rows.append(ResultRow.of("motion", group, name, "jitter_mm", float(np.mean(self._jitter[name]))))
-            away = summary.contact_free_vertices
-            rows += [ResultRow.of("motion", group, name + _AWAY, metric, getattr(away, metric)) for metric in _METRICS]
-        return rows
+        """Mean, 99th percentile (to a hundredth of a millimetre), largest, and share of the vertices that moved."""
+        n = int(self._count.sum())
+        if not n:
+            return []
+        p99 = int(np.searchsorted(self._count.cumsum(), 0.99 * n)) * _BIN
+        values = {
+            "shift_mean_mm": 1e3 * self._sum / n,
+            "shift_p99_mm": 1e3 * p99,
+            "shift_max_mm": 1e3 * self._largest,
+            "shift_moved_percent": 100 * self._moved / n,
+        }
+        return [ResultRow.of("motion", group, _SKIN, metric, value) for metric, value in values.items()]
 
 
-def _over_clips(garment: str, rows: Sequence[ResultRow], counts: Mapping[str, int]) -> list[ResultRow]:
-    """All clips of a garment together: the deepest depth, means weighted by frames; None for what isn't trained."""
-    value = {(row.garment, row.method, row.metric): row.value for row in rows}
-    summed = []
-    for method in dict.fromkeys([*(row.method for row in rows), *MOTION_METHODS]):
-        for metric in (*_METRICS, "jitter_mm"):
-            known = [(v, n) for group, n in counts.items() if (v := value.get((group, method, metric))) is not None]
-            deepest, mean = max((v for v, _ in known), default=None), weighted(known)
-            kept = deepest if metric == "max_depth_mm" else mean
-            summed.append(ResultRow.of("motion", f"{garment}, all clips", method, metric, kept))
-    return summed
+@dataclass(frozen=True)
+class _Judged:
+    """One garment in one frame, as one method makes it."""
+
+    on_collider: FrameMetrics
+    is_free_of_skin: bool
+    is_collider_cut: bool
+    jump_mm: float
+    stretched: float
+    """Share of the edges that are longer than `_STRETCHED` times their rest length."""
+    n_crossings: int
+    is_layer_cut: bool | None
+    """Whether it cuts through a garment worn with it; None for one worn alone."""
+
+
+def _rows(group: str, method: str, judged: Sequence[_Judged]) -> list[ResultRow]:
+    if not judged:
+        return []
+    figures = Figures.over([one.on_collider for one in judged])
+    jumps = np.array([one.jump_mm for one in judged])
+    layers = [one.is_layer_cut for one in judged if one.is_layer_cut is not None]
+    values = {
+        "vfcp_percent": figures.vfcp_percent,
+        "cfmp_percent": figures.cfmp_percent,
+        "max_depth_mm": figures.max_depth_mm,
+        "skin_cfmp_percent": 100 * float(np.mean([one.is_free_of_skin for one in judged])),
+        "collider_cut_percent": 100 * float(np.mean([one.is_collider_cut for one in judged])),
+        "jump_20_percent": 100 * float((jumps > 20).mean()),
+        "jump_40_percent": 100 * float((jumps > 40).mean()),
+        "jump_max_mm": float(jumps.max()),
+        "stretched_percent": 100 * float(np.mean([one.stretched for one in judged])),
+        "self_crossings": float(np.mean([one.n_crossings for one in judged])),
+        "layers_cut_percent": 100 * float(np.mean(layers)) if layers else None,
+    }
+    return [ResultRow.of("motion", group, method, metric, value) for metric, value in values.items()]
+
+
+class _Worn:
+    """Garments worn together, as every method makes them, and what judges them."""
+
+    def __init__(self, garments: Sequence[str], pipelines: Mapping[str, GarmentPipeline]) -> None:
+        self._pipelines = pipelines
+        self._skinned = GarmentPipeline.load(garments, backbone="skinned", sdf="none", collider=False)
+        self.body = self._skinned.body
+        self._collider, self._skin = CollisionChecker(self.body.faces), CollisionChecker(self.body.faces)
+        self._detector = lru_cache(maxsize=8)(self._make_detector)
+        templates = self._skinned.garments
+        self._metrics = {name: GarmentMetrics(one.faces.numpy()) for name, one in templates.items()}
+        self._sheets = {name: SheetChecker(one.faces.numpy()) for name, one in templates.items()}
+        self._lengths = lru_cache(maxsize=64)(self._rest_lengths)
+
+    def _make_detector(self, betas: bytes) -> SelfContactDetector:
+        """Which faces cross at rest already (toes) depends on the shape."""
+        shape = torch.from_numpy(np.frombuffer(betas, np.float32).copy())[None]
+        return SelfContactDetector(self.body.faces, self.body.rest_vertices(shape)[0])
+
+    def _rest_lengths(self, garment: str, betas: bytes) -> NDArray[np.floating]:
+        template = self._skinned.garments[garment]
+        rest = template.rest(torch.from_numpy(np.frombuffer(betas, np.float32).copy())[None])[0].numpy()
+        return self._edge_lengths(garment, rest)
+
+    def _edge_lengths(self, garment: str, vertices: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Of each edge [m], shape (E,)."""
+        a, b = vertices[self._skinned.garments[garment].mesh.edges.T]
+        lengths: NDArray[np.floating] = np.linalg.norm(a - b, axis=1)
+        return lengths
+
+    def judge(self, frames: Sequence[SmplFrame]) -> tuple[dict[tuple[str, str], _Judged], NDArray[np.floating]]:
+        """Judges the first of two frames, by (garment, method), and how far its skin went [m], shape (V,)."""
+        skinned = self._skinned(frames)
+        contact: SelfContact | None = None
+        judged: dict[tuple[str, str], _Judged] = {}
+        for method, pipeline in self._pipelines.items():
+            now, then = pipeline(frames)
+            if contact is None:
+                self._collider.update(now.body)
+                self._skin.update(now.skin)
+                contact = self._detector(frames[0].betas.tobytes()).detect(now.body)
+                way = np.linalg.norm(now.body - now.skin, axis=1)
+            for garment in now:
+                ahead = (then[garment].local - now[garment].local) - (
+                    skinned[1][garment].local - skinned[0][garment].local
+                )
+                judged[garment, method] = self._judge(garment, now, frames[0], contact, ahead)
+        return judged, way
+
+    def _judge(
+        self, garment: str, out: PipelineOutput, frame: SmplFrame, contact: SelfContact, ahead: NDArray[np.floating]
+    ) -> _Judged:
+        local, faces = out[garment].local, self._sheets[garment].faces
+        sheet = self._sheets[garment]
+        sheet.update(local)
+        others = [out[name] for name in out if name != garment]
+        stretch = self._edge_lengths(garment, local) / self._lengths(garment, frame.betas.tobytes())
+        return _Judged(
+            self._metrics[garment].add(local, self._collider.check(local, faces)),
+            self._skin.check(local, faces).is_free,
+            bool(contact.near(local, distance=NEAR).any()),
+            1e3 * float(np.linalg.norm(ahead, axis=1).max()),
+            float((stretch > _STRETCHED).mean()),
+            len(sheet.with_itself()),
+            any(len(sheet.with_other(one.local, one.faces)) for one in others) if others else None,
+        )
+
+
+def _step(clip: Motion) -> int:
+    """Frames from one to the next of a pair."""
+    return max(1, round(clip.fps / _RATE))

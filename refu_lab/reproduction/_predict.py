@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from refu_core.backbones import Skinned
-from refu_core.body import RigidTransforms, SmplBody, load_body
+from refu_core.body import Collider, RigidTransforms, SmplBody, load_body
 from refu_core.contact import Blend
 from refu_core.errors import WeightsError
 from refu_core.frames import SmplFrame
@@ -35,6 +35,7 @@ class GarmentSetup:
 
     template: GarmentTemplate
     body: SmplBody
+    collider: Collider | None
     exact: ExactSdf
     approx: ApproxSdf
     rest_faces: RestFaces
@@ -42,13 +43,14 @@ class GarmentSetup:
     blend: Blend
 
     @classmethod
-    def of(cls, garment: str) -> GarmentSetup:
-        """Prepares a built-in garment on its body."""
+    def of(cls, garment: str, *, collider: bool = True) -> GarmentSetup:
+        """Prepares a built-in garment on its body, whose overlaps are pulled apart or not."""
         template = load_garment(garment)
         body = load_body(template.body)
         return cls(
             template,
             body,
+            Collider(body) if collider else None,
             ExactSdf(body.faces),
             ApproxSdf(body),
             RestFaces(body),
@@ -73,13 +75,15 @@ class SampleScene:
     style: Tensor
     """γ, shape (1, 4)."""
     vertices: Tensor = field(init=False)
-    """Body [m], shape (V, 3)."""
+    """The collider [m], shape (V, 3)."""
     transforms: RigidTransforms = field(init=False)
     _update_ms: dict[str, float] = field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:
-        posed = self.setup.body(self.pose, self.betas)
-        self.vertices, self.transforms = posed.vertices[0], posed.transforms
+        bare = Outfit(self.setup.body, {}, self.setup.collider)
+        dressed = dress(self.pose, Wearer.of(bare, self.betas))
+        self.vertices = dressed.turns[0](dressed.body[0])
+        self.transforms = self.setup.body(self.pose, self.betas).transforms
 
     @classmethod
     def of(cls, setup: GarmentSetup, pose: ArrayLike, betas: ArrayLike, style: ArrayLike) -> SampleScene:
@@ -133,7 +137,7 @@ class Predictor:
             self._refu = _with_margin(network.refu, method.margin)
         self._name = setup.template.name
         wearable = Wearable(setup.template, network.backbone, self._refu, margin=0.0)
-        self._outfit = Outfit(setup.body, {self._name: wearable})
+        self._outfit = Outfit(setup.body, {self._name: wearable})  # what it is pushed off is the scene's
 
     @torch.no_grad()
     def __call__(self, scene: SampleScene) -> MethodOutput:

@@ -135,7 +135,7 @@ def run_methods(
     """
     garment = samples.garment
     study.n_samples[garment] = len(samples)
-    setup = GarmentSetup.of(garment)
+    setup = GarmentSetup.of(garment, collider=library.collider)
     ready: dict[str, Predictor] = {}
     files: dict[str, Path] = {}
     for method in _with_bases(methods):
@@ -206,7 +206,9 @@ def _with_bases(names: Sequence[str]) -> list[Method]:
 
 
 def _cache_name(garment: str, method: Method, samples_key: str, library: Library) -> str:
-    told = json.dumps([asdict(method), samples_key, library.key(method, garment), _code_hash()], sort_keys=True)
+    told = json.dumps(
+        [asdict(method), samples_key, library.key(method, garment), library.collider, _code_hash()], sort_keys=True
+    )
     return f"{garment}-{method.name}-{hashlib.sha256(told.encode()).hexdigest()[:16]}.json"
 
 

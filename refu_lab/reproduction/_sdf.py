@@ -11,30 +11,25 @@ from torch import Tensor
 
 from refu_core.errors import WeightsError
 from refu_core.sdf import BodySdf
-from refu_lab.body_contact import BodyContact
 from refu_lab.reproduction._load import Library
 from refu_lab.reproduction._predict import GarmentSetup, SampleScene
 from refu_lab.reproduction._samples import Sample, SampleSet
 from refu_lab.reproduction._tables import Missing, ResultRow, ResultTable
 from refu_lab.sdf_errors import SdfErrors
+from refu_lab.touching_poses import touching_pose
 
 DISTURBANCE = 0.01
 """Standard deviation of the Gaussian disturbance of every other point, each axis [m]."""
 NEAR_SKIN = 0.02
 """Within this of the skin [m] the distance decides what ReFU does."""
-FOLDED_POSES: Mapping[str, Mapping[int, tuple[float, float, float]]] = {
-    "squat": {1: (-1.5, 0, 0.2), 2: (-1.5, 0, -0.2), 4: (1.8, 0, 0), 5: (1.8, 0, 0)},
-    "crossed arms": {16: (0, -0.6, -1.1), 17: (0, 0.6, 1.1), 18: (0, -2.0, 0), 19: (0, 2.0, 0)},
-    "hands on hips": {16: (0.3, 0.5, -0.9), 17: (0.3, -0.5, 0.9), 18: (0, -1.7, 0), 19: (0, 1.7, 0)},
-}
-"""Poses in which the body touches itself: rotation vectors of joints [rad], zero for those that aren't named."""
+FOLDED_POSES = ("squat", "crossed arms", "hands on hips")
+"""Of `TOUCHING_POSES`."""
 _FOLDED_SHAPES = 8
 """Body shapes that each of them is taken with."""
 _POINTS_ASKED = 8
 """The network is asked for every so-many-th vertex: it takes a second a thousand points on one core."""
 _METRICS = ("mean_absolute_mm", "mean_relative_percent", "p99_mm", "missed_percent", "hidden_percent")
 _CLOSE = ", within 2 cm"
-_AWAY = ", within 2 cm, away from self-contact"
 _NAMES: Mapping[str, str] = {
     "approx": "walk over the posed mesh (real time)",
     "neural": "the paper's network",
@@ -46,7 +41,6 @@ def _labels() -> dict[str, str]:
     for name, title in _NAMES.items():
         labels[name] = title
         labels[name + _CLOSE] = "the same, points within 2 cm of the skin"
-        labels[name + _AWAY] = "the same, away from where the body touches itself, too"
         labels |= {f"{name}, {pose}": f"the same, {pose}, points within 2 cm of the skin" for pose in FOLDED_POSES}
     return labels
 
@@ -56,8 +50,6 @@ class _Asked(NamedTuple):
 
     approximate: Tensor
     accurate: Tensor
-    is_away: Tensor
-    """Whether the point is away from where the body touches itself."""
 
 
 def sdf_table(
@@ -75,13 +67,13 @@ def sdf_table(
         "each axis): the second of the paper's three kinds of samples, and the points that ReFU asks for. The paper's "
         "figures are over all three kinds, of its network. The relative error leaves out points within 0.1 mm of the "
         f"skin. Squat, crossed arms and hands on hips are those poses of {_FOLDED_SHAPES} of the bodies, with the "
-        "garment as it follows the skin: there the body runs into itself, and a limb's inside is another's outside.",
+        "garment as it follows the skin: there limbs press on each other, and the collider is pulled apart.",
         labels=_labels(),
     )
     total, done = sum(map(len, sets)), 0
     for samples in sets:
         garment = samples.garment
-        setup = GarmentSetup.of(garment)
+        setup = GarmentSetup.of(garment, collider=library.collider)
         sdfs: dict[str, BodySdf] = {"approx": setup.approx}
         try:
             sdfs["neural"] = library.load_neural_sdf("paper", garment, setup.body)
@@ -99,14 +91,10 @@ def sdf_table(
             if progress is not None:
                 progress(done, total)
         for name, asked in questions.answers().items():
-            away = _Asked(*(column[asked.is_away] for column in asked))
             table.rows += _rows(garment, name, asked)
             table.rows += _rows(garment, name + _CLOSE, asked, is_close=True)
-            table.rows += _rows(garment, name + _AWAY, away, is_close=True)
-        for title, folded in FOLDED_POSES.items():
-            pose = np.zeros((24, 3), np.float32)
-            for joint, rotation in folded.items():
-                pose[joint] = rotation
+        for title in FOLDED_POSES:
+            pose = touching_pose(title)
             for sample in list(bodies.values())[:_FOLDED_SHAPES]:
                 scene = SampleScene.of(setup, pose, sample.betas, sample.style)
                 unposed = setup.template.rest(scene.betas, scene.style)
@@ -122,7 +110,6 @@ class _Questions:
     def __init__(self, setup: GarmentSetup, sdfs: Mapping[str, BodySdf]) -> None:
         self._setup, self._sdfs = setup, sdfs
         self._random = np.random.default_rng(0)
-        self._contact = BodyContact(setup.body)
         self._asked: dict[str, list[_Asked]] = {name: [] for name in sdfs}
 
     def ask(self, scene: SampleScene, vertices: Tensor) -> None:
@@ -134,13 +121,11 @@ class _Questions:
         near = self._setup.near(unposed, scene.betas)
         exact, _ = scene.sdf("accurate")
         truth = exact.query(points).distance
-        contact = self._contact.detect(scene.betas[0], scene.vertices.numpy())
-        is_away = torch.from_numpy(~contact.near(points))
         for name, sdf in self._sdfs.items():
             sdf.update(scene.vertices, pose=scene.pose[0], betas=scene.betas[0])
             rows = slice(None, None, 1 if name == "approx" else _POINTS_ASKED)
             distance = sdf.query(points[rows], near=near[rows]).distance.detach()
-            self._asked[name].append(_Asked(distance, truth[rows], is_away[rows]))
+            self._asked[name].append(_Asked(distance, truth[rows]))
 
     def answers(self) -> dict[str, _Asked]:
         """All answers since the last call, by distance."""

@@ -31,6 +31,8 @@ class Metric(NamedTuple):
     label: str
     digits: int
     higher_is_better: bool = False
+    kind: str = ""
+    """Metrics of one kind stand side by side."""
 
 
 METRICS: Mapping[str, Metric] = {
@@ -51,7 +53,18 @@ METRICS: Mapping[str, Metric] = {
     "missed_percent": Metric("wrong by over 2 mm [%]", 3),
     "hidden_percent": Metric("over 2 mm inside, taken for outside [%]", 4),
     "ms": Metric("median time [ms]", 2),
-    "jitter_mm": Metric("jitter [mm/frame²]", 3),
+    "skin_cfmp_percent": Metric("CFMP on the skin [%]", 2, higher_is_better=True),
+    "collider_cut_percent": Metric("collider cut [% of frames]", 2),
+    "jump_20_percent": Metric("jumps > 20 mm [% of pairs]", 2, kind="cloth"),
+    "jump_40_percent": Metric("> 40 mm [%]", 2, kind="cloth"),
+    "jump_max_mm": Metric("largest [mm]", 1, kind="cloth"),
+    "stretched_percent": Metric("edges > 2 x rest [%]", 3, kind="cloth"),
+    "self_crossings": Metric("crossings a frame", 1, kind="cloth"),
+    "layers_cut_percent": Metric("layers cut [% of frames]", 2, kind="cloth"),
+    "shift_mean_mm": Metric("mean [mm]", 3),
+    "shift_p99_mm": Metric("99th percentile [mm]", 2),
+    "shift_max_mm": Metric("largest [mm]", 1),
+    "shift_moved_percent": Metric("moved by > 0.1 mm [%]", 2),
     "mpve_mm_trend": Metric("MPVE, change [%]", 1),
     "vfcp_percent_trend": Metric("VFCP, change [%]", 1),
     "cfmp_percent_trend": Metric("CFMP, change [%]", 1, higher_is_better=True),
@@ -276,7 +289,7 @@ def weighted(values: Iterable[tuple[float | None, int]]) -> float | None:
 def _kind(metric: str) -> str:
     if metric.endswith("_trend"):
         return "trend"
-    return "" if metric in METRICS else metric.split(" at ")[0]
+    return METRICS[metric].kind if metric in METRICS else metric.split(" at ")[0]
 
 
 def _unique(values: Iterable[str]) -> list[str]:

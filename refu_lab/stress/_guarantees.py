@@ -12,7 +12,7 @@ from refu_core.backbones import Skinned
 from refu_core.contact import DEFAULT_CONTACT
 from refu_core.garments import inner_first
 from refu_core.modes import DEFAULT_MARGIN
-from refu_core.realtime import Outfit, Wearer, dress
+from refu_core.realtime import Wearer, dress
 from refu_core.refu import MAX_DISPLACEMENT
 from refu_lab.stress._closest_kernels import closest_on_sheet
 from refu_lab.stress._numbers import n_not_finite
@@ -23,12 +23,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from refu_core.metrics import SelfContact
     from refu_core.realtime import GarmentMesh, GarmentPipeline, PipelineOutput
     from refu_lab.stress._subject import Subject
 
 DEPTH = 1e-4
-"""No vertex is deeper inside than this [m], away from where the body touches itself."""
+"""No vertex is deeper inside the collider than this [m]."""
 MULTIPLE = 2.0
 """No vertex is moved farther than this multiple of what the deepest one near it lacks to the margin."""
 REACH = 8
@@ -43,13 +42,12 @@ _BURIED = 0.02  # [m]
 
 
 def nothing_inside(subject: Subject, trial: Trial) -> Iterator[Measurement]:
-    """The depth of the deepest vertex, by winding number, away from where the body touches itself."""
+    """The depth of the deepest vertex, by winding number."""
     (out,) = subject.pipeline(trial.frames)
-    contact = subject.contacts.detect(out.body)
     subject.checker.update(out.body)
     for mesh in out.values():
-        depth = subject.checker.check(mesh.local, mesh.faces).depth[~_in_contact(contact, mesh)]
-        yield Measurement(nan=n_not_finite(mesh.vertices), deviation=float(depth.max(initial=0.0)), limit=DEPTH)
+        depth = subject.checker.check(mesh.local, mesh.faces).max_depth
+        yield Measurement(nan=n_not_finite(mesh.vertices), deviation=depth, limit=DEPTH)
 
 
 def counted(subject: Subject, trial: Trial) -> Iterator[Measurement]:
@@ -70,11 +68,10 @@ def buried(subject: Subject, trial: Trial) -> Iterator[Measurement]:
     skinned = {name: replace(one, backbone=Skinned()) for name, one in subject.pipeline.outfit.wearables.items()}
     pose, betas = torch.tensor(frame.pose)[None], torch.tensor(frame.betas)[None]
     with torch.no_grad():
-        dressed = dress(pose, Wearer.of(Outfit(subject.pipeline.body, skinned), betas))
+        dressed = dress(pose, Wearer.of(replace(subject.pipeline.outfit, wearables=skinned), betas))
         body, sdf = dressed.body[0], subject.distances["exact"]
         sdf.update(body)
         stage.update(body)
-        touching = subject.contacts.detect(body.numpy())
         subject.checker.update(body.numpy())
         for name, drape in dressed.drapes.items():
             points = drape.vertices[0]
@@ -88,27 +85,21 @@ def buried(subject: Subject, trial: Trial) -> Iterator[Measurement]:
                 scale=1.0,
                 n_layered=torch.zeros(1, dtype=torch.int32),
             ).vertices.numpy()
-            depth = subject.checker.check(done, skinned[name].template.faces.numpy()).depth
-            away = ~(touching.near(points.numpy()) | touching.near(done))
-            yield Measurement(nan=n_not_finite(done), deviation=float(depth[away].max(initial=0.0)), limit=DEPTH)
+            depth = subject.checker.check(done, skinned[name].template.faces.numpy()).max_depth
+            yield Measurement(nan=n_not_finite(done), deviation=depth, limit=DEPTH)
 
 
 def not_thrown(subject: Subject, trial: Trial) -> Iterator[Measurement]:
-    """How far vertices are moved off the body, against how far the deepest one near each is from the margin.
-
-    Where the body touches itself the way out of it may be longer: there it is bounded by `MAX_DISPLACEMENT` alone.
-    """
+    """How far vertices are moved off the body, against how far the deepest one near each is from the margin."""
     for name, pipeline in subject.one_by_one.items():
         (out,) = pipeline(trial.frames)
         mesh = out[name]
         sdf = subject.distances["exact"]
         sdf.update(torch.from_numpy(out.body))
         moved = np.linalg.norm(mesh.local - mesh.raw, axis=1)
-        limit = np.full_like(moved, MAX_DISPLACEMENT)
-        if subject.contacts.detect(out.body).is_free:
-            lack = np.maximum(DEFAULT_MARGIN - sdf.query(torch.from_numpy(mesh.raw)).distance.numpy(), 0)
-            near = _largest_near(lack, pipeline.garments[name].edges.numpy())
-            limit = np.minimum(limit, MULTIPLE * (near + DEFAULT_MARGIN))
+        lack = np.maximum(DEFAULT_MARGIN - sdf.query(torch.from_numpy(mesh.raw)).distance.numpy(), 0)
+        near = _largest_near(lack, pipeline.garments[name].edges.numpy())
+        limit = np.minimum(MAX_DISPLACEMENT, MULTIPLE * (near + DEFAULT_MARGIN))
         yield _finite(out)
         yield _farthest(moved, limit + _BOUND_SLACK)
 
@@ -127,8 +118,7 @@ def no_jumps(subject: Subject, trial: Trial) -> Iterator[Measurement]:
 
     What is pushed goes to the closest skin. That leaps where another way out becomes the shortest, from one side of a
     limb's medial axis to the other, and no projection that remembers nothing can follow it smoothly: so vertices may go
-    as far, in addition, as the closest skin does of what is pushed near them. Where the body touches itself, the way
-    out may change sides at any depth; cloth around is taken along, and left out here.
+    as far, in addition, as the closest skin does of what is pushed near them.
     """
     for pipeline in subject.one_by_one.values():
         yield from _jumps(subject, pipeline, trial)
@@ -148,13 +138,12 @@ def _jumps(subject: Subject, pipeline: GarmentPipeline, trial: Trial) -> Iterato
             pace = PACE * float(np.linalg.norm(out.body - last.body, axis=1).max()) + PACE_SLACK
             limit = pace + _leap(before[name], aims[name], pipeline.garments[name].edges.numpy())
             way = np.linalg.norm(mesh.local - last[name].local, axis=1)
-            way[before[name].is_left_out | aims[name].is_left_out] = 0
             yield _farthest(way, limit)
         before = aims
 
 
 def bounded_jumps(subject: Subject, trial: Trial) -> Iterator[Measurement]:
-    """All vertices, through self-contact: from one bound of the displacement to the other, and no farther."""
+    """As limbs go through each other: from one bound of the displacement to the other, and no farther."""
     for last, out in _pairs(subject.pipeline, trial):
         yield _finite(out)
         for name, mesh in out.items() if last is not None else ():
@@ -190,12 +179,10 @@ class _Aims:
     """The closest point of each surface to each vertex before collision handling [m], (N, 3)."""
     is_pushed: list[NDArray[np.bool_]]
     """Whether a vertex is nearer to that surface than it may be, (N,)."""
-    is_left_out: NDArray[np.bool_]
-    """The vertices with a self-contact of the body near, (N,)."""
 
 
 def _aims(subject: Subject, pipeline: GarmentPipeline, out: PipelineOutput) -> dict[str, _Aims]:
-    contact, skin = subject.contacts.detect(out.body), subject.distances["exact"]
+    skin = subject.distances["exact"]
     skin.update(torch.from_numpy(out.body))
     aims: dict[str, _Aims] = {}
     worn: list[GarmentMesh] = []
@@ -209,26 +196,18 @@ def _aims(subject: Subject, pipeline: GarmentPipeline, out: PipelineOutput) -> d
             places.append(closest)
             is_felt = np.linalg.norm(mesh.raw - closest, axis=1) < DEFAULT_CONTACT.layer_reach
             is_pushed.append((height < DEFAULT_CONTACT.layer_gap) & is_felt)
-        is_near = np.zeros(len(mesh.raw), np.bool_)
-        if not contact.is_free:
-            is_near = _largest_near(_in_contact(contact, mesh), pipeline.garments[name].edges.numpy())
-        aims[name] = _Aims(places, is_pushed, is_near)
+        aims[name] = _Aims(places, is_pushed)
         worn.append(mesh)
     return aims
 
 
 def _leap(before: _Aims, now: _Aims, edges: NDArray[np.int64]) -> NDArray[np.floating]:
     """How far, at most, the places go that vertices near each vertex are pushed to [m], (N,)."""
-    leap = np.zeros(len(now.is_left_out), np.float32)
+    leap = np.zeros(len(now.is_pushed[0]), np.float32)
     for i, place in enumerate(now.places):
         way = np.linalg.norm(place - before.places[i], axis=1)
         leap += _largest_near(np.where(before.is_pushed[i] | now.is_pushed[i], way, 0), edges)
     return leap
-
-
-def _in_contact(contact: SelfContact, mesh: GarmentMesh) -> NDArray[np.bool_]:
-    """The vertices (N,) that were, or have come, where the body touches itself."""
-    return contact.near(mesh.raw) | contact.near(mesh.local)
 
 
 def _largest_near(values: NDArray[Any], edges: NDArray[np.int64]) -> NDArray[Any]:

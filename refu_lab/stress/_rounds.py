@@ -44,6 +44,7 @@ class StressOptions:
     quick: bool = False
     seed: int = 0
     output: Path | None = None
+    collider: bool = True
 
     def __post_init__(self) -> None:
         unknown = [part for part in self.parts if part not in PARTS]
@@ -113,7 +114,9 @@ def run_stress(
     checks = [check for check in CHECKS.values() if check.part in options.parts]
     has_soak = "soak" in options.parts
     with one_thread():
-        subjects = {wardrobe: Subject(wardrobe, weights=options.weights) for wardrobe in wardrobes}
+        subjects = {
+            wardrobe: Subject(wardrobe, weights=options.weights, collider=options.collider) for wardrobe in wardrobes
+        }
         pairs = [
             (check, subject) for check in checks for subject in subjects.values() if check.holds_for(subject.wardrobe)
         ]
@@ -199,7 +202,7 @@ def _save_worst(tallies: Sequence[Tally], folder: Path) -> list[Path]:
     return written
 
 
-def replay_trial(path: Path, *, weights: Path | None = None) -> Tally:
+def replay_trial(path: Path, *, weights: Path | None = None, collider: bool = True) -> Tally:
     """Tries again what `refu stress` has written.
 
     Raises:
@@ -212,5 +215,5 @@ def replay_trial(path: Path, *, weights: Path | None = None) -> Tally:
         raise StressError(msg)
     tally = Tally(name, wardrobe.mode)
     with one_thread():
-        tally.add(wardrobe, trial, CHECKS[name].run(Subject(wardrobe, weights=weights), trial))
+        tally.add(wardrobe, trial, CHECKS[name].run(Subject(wardrobe, weights=weights, collider=collider), trial))
     return tally

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from refu_core.errors import RefuError
 from refu_core.frames import N_STYLES, SmplFrame
 from refu_core.garments import BUILTIN_GARMENTS
-from refu_core.metrics import CollisionChecker, SelfContactDetector
+from refu_core.metrics import CollisionChecker
 from refu_core.modes import SdfMode
 from refu_core.realtime import ContactStage, GarmentPipeline, Outfit, Wearer, dress
 from refu_core.sdf import ApproxSdf, BandSdf, BodySdf, ExactSdf
@@ -37,14 +37,14 @@ class Wardrobe:
 class Subject:
     """One wardrobe's pipeline and its references, each made when it is first asked for."""
 
-    def __init__(self, wardrobe: Wardrobe, *, weights: Path | None = None) -> None:
+    def __init__(self, wardrobe: Wardrobe, *, weights: Path | None = None, collider: bool = True) -> None:
         """Loads the pipeline; raises as `GarmentPipeline.load`."""
         unknown = [name for name in wardrobe.garments if name not in BUILTIN_GARMENTS]
         if unknown:
             msg = f"no garment {unknown[0]!r}: wanted {', '.join(BUILTIN_GARMENTS)}"
             raise RefuError(msg)
         self.wardrobe = wardrobe
-        self._weights = weights
+        self._weights, self._collider = weights, collider
         self.pipeline = self.load()
 
     def load(self, *garments: str) -> GarmentPipeline:
@@ -54,6 +54,7 @@ class Subject:
             backbone=self.wardrobe.backbone,
             sdf=self.wardrobe.sdf,
             weights=self._weights,
+            collider=self._collider,
         )
 
     @property
@@ -70,11 +71,6 @@ class Subject:
     def checker(self) -> CollisionChecker:
         """Exact collisions, by winding number."""
         return CollisionChecker(self.pipeline.body.faces)
-
-    @cached_property
-    def contacts(self) -> SelfContactDetector:
-        """Where the body touches itself."""
-        return SelfContactDetector(self.pipeline.body.faces, self.pipeline.body.v_template)
 
     @cached_property
     def distances(self) -> dict[str, BodySdf]:

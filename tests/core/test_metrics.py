@@ -39,54 +39,35 @@ def laplacian(vertices: NDArray[np.float64], i: int) -> NDArray[np.float64]:
 def test_equals_the_slow_reference(seed: int, n_frames: int) -> None:
     rng = np.random.default_rng(seed)
     metrics = GarmentMetrics(MESH.faces)
-    rows: dict[str, list[dict[str, float]]] = {"all": [], "frames": [], "vertices": []}
+    rows: list[dict[str, float]] = []
     for k in range(n_frames):
         vertices, collisions = random_frame(rng, free=k == 1)
         truth = (vertices + rng.normal(scale=0.01, size=(N, 3))).astype(np.float32)
-        near = np.zeros(N, np.bool_) if k == 2 else rng.random(N) < 0.3
         region = rng.random(N) < 0.5
-        metrics.add(vertices, collisions, truth=truth, near_contact=near, resolved=region)
-        for kind in rows:
-            if kind == "frames" and near.any():
-                continue
-            kept = [i for i in range(N) if kind != "vertices" or not near[i]]
-            pairs = [
-                (int(face), bool(is_vf))
-                for (face, _), is_vf in zip(collisions.pairs, collisions.pair_is_vf, strict=True)
-                if all(v in kept for v in MESH.faces[face])
-            ]
-            a, b = vertices.astype(float), truth.astype(float)
-            rows[kind].append(
-                {
-                    "mpve_mm": 1e3 * float(np.mean([np.linalg.norm(a[i] - b[i]) for i in kept])),
-                    "vfcp_percent": 100 * sum(bool(collisions.inside[i]) for i in kept) / len(kept),
-                    "cfmp_percent": 100.0 * (not pairs and not any(collisions.inside[i] for i in kept)),
-                    "avg_vf": len({face for face, is_vf in pairs if is_vf}),
-                    "avg_ee": len({face for face, is_vf in pairs if not is_vf}),
-                    "mean_energy": sum(float(collisions.depth[i]) ** 2 for i in kept),
-                    "mean_collision_error_mm": 1e3 * sum(float(collisions.depth[i]) for i in kept),
-                    "max_depth_mm": 1e3 * max(float(collisions.depth[i]) for i in kept),
-                    "laplacian_mm": 1e3
-                    * float(np.mean([np.linalg.norm(laplacian(a, i) - laplacian(b, i)) for i in kept if region[i]])),
-                }
-            )
-    summary = metrics.summary()
-    assert summary.n_frames == n_frames
-    assert summary.n_contact_frames == n_frames - len(rows["frames"])
-    for kind, figures in (
-        ("all", summary.all),
-        ("frames", summary.contact_free_frames),
-        ("vertices", summary.contact_free_vertices),
-    ):
-        found = figures.as_dict()
-        assert found.pop("n_frames") == len(rows[kind])
-        for name, value in found.items():
-            values = [row[name] for row in rows[kind]]
-            if not values:
-                assert value is None
-            else:
-                wanted = max(values) if name == "max_depth_mm" else np.mean(values)
-                assert value == pytest.approx(wanted, rel=1e-5, abs=1e-9), name
+        metrics.add(vertices, collisions, truth=truth, resolved=region)
+        pairs = [(int(f), bool(is_vf)) for (f, _), is_vf in zip(collisions.pairs, collisions.pair_is_vf, strict=True)]
+        a, b = vertices.astype(float), truth.astype(float)
+        depth, inside = collisions.depth.tolist(), collisions.inside.tolist()
+        smoothness = [np.linalg.norm(laplacian(a, i) - laplacian(b, i)) for i in range(N) if region[i]]
+        rows.append(
+            {
+                "mpve_mm": 1e3 * float(np.mean([np.linalg.norm(a[i] - b[i]) for i in range(N)])),
+                "vfcp_percent": 100 * sum(inside) / N,
+                "cfmp_percent": 100.0 * (not pairs and not any(inside)),
+                "avg_vf": len({face for face, is_vf in pairs if is_vf}),
+                "avg_ee": len({face for face, is_vf in pairs if not is_vf}),
+                "mean_energy": sum(one**2 for one in depth),
+                "mean_collision_error_mm": 1e3 * sum(depth),
+                "max_depth_mm": 1e3 * max(depth),
+                "laplacian_mm": 1e3 * float(np.mean(smoothness)),
+            }
+        )
+    found = metrics.summary().as_dict()
+    assert found.pop("n_frames") == n_frames
+    for name, value in found.items():
+        values = [row[name] for row in rows]
+        wanted = max(values) if name == "max_depth_mm" else np.mean(values)
+        assert value == pytest.approx(wanted, rel=1e-5, abs=1e-9), name
 
 
 def test_figures_of_one_frame() -> None:
@@ -120,9 +101,9 @@ def test_laplacian_error_ignores_translation_and_mpve_does_not() -> None:
     assert frame.laplacian_mm == pytest.approx(0, abs=1e-3)
 
 
-def test_nothing_added_and_everything_near() -> None:
+def test_nothing_added() -> None:
     metrics = GarmentMetrics(MESH.faces)
-    assert metrics.summary().all.as_dict() == {
+    assert metrics.summary().as_dict() == {
         "n_frames": 0,
         "mpve_mm": None,
         "vfcp_percent": None,
@@ -134,13 +115,7 @@ def test_nothing_added_and_everything_near() -> None:
         "mean_collision_error_mm": None,
         "laplacian_mm": None,
     }
-    vertices, collisions = random_frame(np.random.default_rng(2))
-    metrics.add(vertices, collisions, near_contact=np.ones(N, np.bool_))
-    summary = metrics.summary()
-    assert summary.contact_free_vertices.n_frames == 0
-    assert summary.contact_free_frames.vfcp_percent is None
-    assert summary.n_contact_frames == 1
-    json.dumps(summary.all.as_dict())
+    json.dumps(metrics.summary().as_dict())
 
 
 def test_refuses_arrays_of_another_garment() -> None:
@@ -149,6 +124,6 @@ def test_refuses_arrays_of_another_garment() -> None:
     with pytest.raises(MeshError, match=r"belong to the garment's 42 vertices"):
         metrics.add(vertices, collisions, truth=vertices[:10])
     with pytest.raises(MeshError, match=r"\(10,\)"):
-        metrics.add(vertices, collisions, near_contact=np.zeros(10, np.bool_))
+        metrics.add(vertices, collisions, resolved=np.zeros(10, np.bool_))
     with pytest.raises(MeshError, match=r"belong to the garment's 41 vertices"):
         metrics.add(vertices[:41], collisions)

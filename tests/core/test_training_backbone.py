@@ -37,7 +37,7 @@ from refu_core.training import (
     split_validation,
 )
 from refu_core.training import _loop as loop_module
-from refu_core.training._data import asked_only, mirrored, with_asked_poses
+from refu_core.training._data import mirrored
 from refu_core.weights import load_weights
 
 GARMENT = "short-pant-male"
@@ -140,20 +140,6 @@ def test_an_asymmetric_garment_has_no_mirror_image(garment: GarmentTemplate) -> 
         Mirror.of(leaning)
 
 
-def test_asked_poses_are_added_where_limbs_were_held_back(
-    dataset: Path, garment: GarmentTemplate, body: SmplBody
-) -> None:
-    samples = read_samples(GarmentDataset(dataset), body, garment, split="train")
-    asked = asked_only(samples)
-    assert len(asked) == 50
-    both = with_asked_poses(samples)
-    assert len(both) == 250
-    torch.testing.assert_close(both.pose[200:, 1, 2], samples.pose[::4, 1, 2] + 0.3)
-    assert torch.equal(both.displacement[200:], samples.displacement[::4])
-    unsaid = replace(samples, asked=torch.full_like(samples.asked, torch.nan))
-    assert len(with_asked_poses(unsaid)) == 200
-
-
 def test_pairs_are_held_out_whole(dataset: Path, garment: GarmentTemplate, body: SmplBody) -> None:
     samples = read_samples(GarmentDataset(dataset), body, garment, split="train")
     train, validation = split_validation(samples, share=0.3, seed=1)
@@ -191,7 +177,6 @@ def test_a_trained_tailornet_beats_the_mean(
     assert figures["mpve_mm"] < 0.95 * figures["mean_mm"]
     assert figures["basis_mm"] < 1.0
     assert figures["samples"] == 40
-    assert figures["asked_samples"] == 10
     assert card["body_fingerprint"] == body.fingerprint
     samples = read_samples(GarmentDataset(dataset), body, garment, split="test")
     loaded = load_backbone("tailornet", GARMENT, body_fingerprint=body.fingerprint, folder=tmp_path)
@@ -334,7 +319,7 @@ def test_two_processes_make_the_training_of_one(tmp_path: Path, dataset: Path) -
     script.write_text(_PARALLEL)
     torchrun = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
     command = [*torchrun, str(script), str(dataset), str(tmp_path / "two")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=1200, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
     runpy.run_path(str(script))["train"](str(dataset), str(tmp_path / "one"))
     one, two = (load_weights(tmp_path / folder / "mlp-none").tensors for folder in ("one", "two"))

@@ -252,7 +252,6 @@ def set_files(kind: str) -> dict[str, bytes]:
         files[f"shard-0-of-1/{name}.npy"] = npy_bytes(array)
     if not is_sequences:
         files["unseen.npy"] = npy_bytes(np.zeros(rows, np.float32))
-        files["asked.npy"] = npy_bytes(np.zeros((rows, 24, 3), np.float32))
     card = {
         "format": kind,
         "garment": GARMENT,

@@ -64,15 +64,15 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "clip": np.full(n, -1, np.int32),
         "frame": np.full(n, -1, np.int32),
         "split": (np.arange(n) % 2).astype(np.uint8),
-        "dropped": np.zeros((n, 5), np.uint8),
-        **{name: np.ones(n, np.float32) for name in ("share", "stretch", "speed", "seconds")},
+        "dropped": np.zeros((n, 4), np.uint8),
+        **{name: np.ones(n, np.float32) for name in ("stretch", "speed", "seconds")},
     }
     for name, values in columns.items():
         np.save(shard / f"{name}.npy", values)
     np.save(path / "unseen.npy", np.where(np.arange(n) % 2, 1.5, np.nan).astype(np.float32))
     body = load_body("male")
     card = {
-        "format": "refu-garments-1",
+        "format": "refu-garments-2",
         "garment": GARMENT,
         "body": "male",
         "body_fingerprint": body.fingerprint,
@@ -114,7 +114,8 @@ def test_motion_of_a_folder(tmp_path: Path) -> None:
     assert run(*arguments, "--json", file) == 0
     rows = json.loads(file.read_text(encoding="utf-8"))["rows"]
     assert {f"{GARMENT}, swing", "skirt-female, all clips"} <= {row["garment"] for row in rows}
-    assert "jitter_mm" in {row["metric"] for row in rows}
+    assert {"skin_cfmp_percent", "jump_20_percent", "shift_max_mm"} <= {row["metric"] for row in rows}
+    assert "skin to collider" in (tmp_path / "out" / "motion.md").read_text(encoding="utf-8")
 
 
 # ---- the quick check -------------------------------------------------------------------------------------------------
