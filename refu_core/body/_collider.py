@@ -101,7 +101,7 @@ class Collider:
                 tree.refit()
         run("touch", kernels.NEAR)
         for _ in range(self.settings.deepen_rounds):
-            work.counts[kernels.FOUND] = 0
+            work.counts[kernels.FOUND : kernels.FOUND + 1].zero_()
             run("deepen", kernels.NEAR)
             if self._is_serial and not work.counts[kernels.FOUND]:
                 break

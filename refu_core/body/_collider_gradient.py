@@ -14,8 +14,6 @@ from refu_core.body._kinematics import PARENTS
 if TYPE_CHECKING:
     from refu_core.body._collider import Collider
 
-_LEAST_STEP = 1e-5
-"""As the kernels': shorter ways aren't gone [m]."""
 _ON = 1e-6
 """A closest point with less of a corner than this lies on the edge across."""
 
@@ -154,7 +152,7 @@ def _ways_out(
     way = _unit(other - (other * normal).sum(1, keepdim=True).clamp_min(0) * normal - normal)
     rate = (way * other).sum(1) - ratio * (way * normal).sum(1)
     step = (lacks / torch.minimum(torch.maximum(rate, 0.5 + 0.5 * ratio), 1 + ratio))[:, None] * way
-    is_needed = (found.face >= 0) & (lacks >= _LEAST_STEP)
+    is_needed = (found.face >= 0) & (lacks > 0)
     return torch.where(is_needed[:, None], step, torch.zeros_like(step))
 
 

@@ -10,8 +10,6 @@ DEEPEST = wp.constant(0.1)
 """Deeper than this no vertex is in another segment [m]: the trunk's half."""
 # A ray along no axis of a mesh.
 _RAY = wp.constant(wp.vec3(0.5418, 0.6389, 0.5461))
-# Ways shorter than this aren't gone [m].
-_LEAST_STEP = wp.constant(1e-5)
 # A closest point with less than this of a corner lies on the edge across.
 _WITHIN = wp.constant(1e-4)
 
@@ -172,7 +170,7 @@ def way_out(
     if not hit.result:
         return wp.vec3()
     lacks = keeps - distance_of(segments.trees[k], p, hit) - ratio * sunk
-    if lacks < _LEAST_STEP:
+    if lacks <= 0.0:
         return wp.vec3()
     corners = segments.faces[segments.first_face[k] + hit.face]
     other = wp.vec3()
