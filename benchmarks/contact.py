@@ -129,7 +129,7 @@ def main() -> None:
         "# Collision handling: what half and twice of each setting do",
         "",
         f"T-shirt over shorts, mode `hybrid`, β = 0, {args.pairs} frames of recorded motion and the frame after each.",
-        "None is left out. Against the skinned body, which touches itself in all of them. By `benchmarks/contact.py`.",
+        "None is left out. Against the collider. By `benchmarks/contact.py`.",
         "",
         "CFMP: frames free of body-garment collisions. Jumps: pairs of frames in which a vertex moves more than 20 mm",
         "farther than the network's. Shift: mean distance of the vertices from those of the default settings.",

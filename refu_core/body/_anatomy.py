@@ -42,6 +42,9 @@ class ColliderSettings:
     segment_share: float = 0.3
     """Share of its distance from another segment in the rest pose that skin keeps, at most the gap: at a joint
     segments begin where they are 0 apart."""
+    farthest: float = 0.035
+    """No skin moves farther than this [m]. Where two parts overlap by more than twice as much they still do: no flesh
+    gives way to a pose that no body can take."""
     crease_rounds: int = 2
     """How often skin is brought to its side: at the groin several seams meet."""
     part_rounds: int = 4

@@ -39,6 +39,7 @@ def part_with_gradient(collider: Collider, skin: Tensor, rotation: Tensor) -> Te
         step = _crease_step(collider, skin, p, _between(rotation))
         is_moved = is_moved | (step.detach() != 0).any(1)
         p = p + step
+    p = _within(p, skin, how.farthest)
     p = _smooth(collider, skin, p, is_moved, how.smooth_first)
     points = collider.with_caps(p)
     touched = collider.touched(p)
@@ -56,10 +57,22 @@ def part_with_gradient(collider: Collider, skin: Tensor, rotation: Tensor) -> Te
         step = _together(step, vertex, len(p))
         is_moved = is_moved | (step.detach() != 0).any(1)
         p = p + step
+    is_parted = (p.detach() != start.detach()).any(1)
+    p = torch.where(is_parted[:, None], _within(p, skin, how.farthest), p)
     p = _smooth(collider, skin, p, is_moved, how.smooth_last)
     for _ in range(how.edge_rounds):
-        p = p + _edge_step(collider, points, normals, start, p, touched)
+        step = _edge_step(collider, points, normals, start, p, touched)
+        is_raised = (step.detach() != 0).any(1)
+        p = torch.where(is_raised[:, None], _within(p + step, skin, how.farthest), p)
     return p
+
+
+def _within(p: Tensor, skin: Tensor, farthest: float) -> Tensor:
+    """Points (V, 3) [m], or what is `farthest` [m] from the skin on the way to each of them."""
+    away = p - skin
+    squared = (away * away).sum(1, keepdim=True)
+    is_far = squared > farthest**2
+    return torch.where(is_far, skin + farthest / torch.where(is_far, squared, 1.0).sqrt() * away, p)
 
 
 def _between(rotation: Tensor) -> Tensor:
@@ -108,7 +121,7 @@ def _smooth(collider: Collider, skin: Tensor, p: Tensor, is_moved: Tensor, sweep
     degree = torch.as_tensor(start).diff().to(p)[:, None]
     for _ in range(sweeps):
         mean = torch.zeros_like(p).index_add(0, owner, p[torch.as_tensor(ring).long()]) / degree
-        p = p + share * (mean - p)
+        p = torch.where(is_moved[:, None], _within(p + share * (mean - p), skin, how.farthest), p)
     return p
 
 

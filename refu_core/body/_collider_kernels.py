@@ -133,9 +133,24 @@ def mean_kernel(
     mean[i] = total
 
 
+@wp.func
+def within(p: wp.vec3, skin: wp.vec3, farthest: float) -> wp.vec3:
+    """p, or what is `farthest` [m] from the skin on the way to it."""
+    away = wp.length(p - skin)
+    if away > farthest:
+        return skin + farthest / away * (p - skin)
+    return p
+
+
 @wp.kernel
 def crease_kernel(
-    work: Work, held: wp.array[int], stations: wp.array[wp.vec3], bones: Bones, seams: Seams, rounds: int
+    work: Work,
+    held: wp.array[int],
+    stations: wp.array[wp.vec3],
+    bones: Bones,
+    seams: Seams,
+    rounds: int,
+    farthest: float,
 ) -> None:
     """Brings skin back to its own side of the seams near by, most of all of those that it is far beyond."""
     i = wp.tid()
@@ -161,6 +176,7 @@ def crease_kernel(
         p += step / total
         is_held = 1
     if is_held == 1:
+        p = within(p, work.skin[v], farthest)
         work.here[v] = p
         work.there[v] = p
         work.is_moved[v] = 1
@@ -177,7 +193,9 @@ def share_kernel(work: Work, full: float, step: float) -> None:
 
 
 @wp.kernel
-def smooth_kernel(work: Work, rings: Rings, source: wp.array[wp.vec3], target: wp.array[wp.vec3]) -> None:
+def smooth_kernel(
+    work: Work, rings: Rings, source: wp.array[wp.vec3], target: wp.array[wp.vec3], farthest: float
+) -> None:
     """Levels what was moved."""
     i = wp.tid()
     if i < work.counts[MOVED]:
@@ -186,4 +204,4 @@ def smooth_kernel(work: Work, rings: Rings, source: wp.array[wp.vec3], target: w
         for k in range(rings.start[v], rings.start[v + 1]):
             total += source[rings.vertex[k]]
         mean = total / float(rings.start[v + 1] - rings.start[v])
-        target[v] = source[v] + work.share[v] * (mean - source[v])
+        target[v] = within(source[v] + work.share[v] * (mean - source[v]), work.skin[v], farthest)

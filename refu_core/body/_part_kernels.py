@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from refu_core.body._collider_kernels import ENDS, FOUND, HOT, MOVED, NEAR, WANTED, Bones, Rings, Work
+from refu_core.body._collider_kernels import ENDS, FOUND, HOT, MOVED, NEAR, WANTED, Bones, Rings, Work, within
 
 wp.set_module_options({"enable_backward": False})
 
@@ -187,7 +187,7 @@ def way_out(
 
 
 @wp.kernel
-def part_kernel(work: Work, segments: Segments, bones: Bones, rings: Rings, rounds: int) -> None:
+def part_kernel(work: Work, segments: Segments, bones: Bones, rings: Rings, rounds: int, farthest: float) -> None:
     """Moves each vertex to its own side of the surface between its segment and another one, in Newton's steps."""
     i = wp.tid()
     if i >= work.counts[NEAR]:
@@ -215,6 +215,7 @@ def part_kernel(work: Work, segments: Segments, bones: Bones, rings: Rings, roun
             break
         p += step / total
     if wp.length_sq(p - start) > 0.0:
+        p = within(p, work.skin[v], farthest)
         work.here[v] = p
         work.there[v] = p
         if work.is_moved[v] == 0:
@@ -268,7 +269,7 @@ def edge_kernel(
 
 
 @wp.kernel
-def follow_kernel(work: Work, moved: wp.array[wp.vec3], rings: Rings) -> None:
+def follow_kernel(work: Work, moved: wp.array[wp.vec3], rings: Rings, farthest: float) -> None:
     """Vertices go with their edges, most of all with those that have far to go."""
     i = wp.tid()
     if i >= work.counts[ENDS]:
@@ -282,7 +283,7 @@ def follow_kernel(work: Work, moved: wp.array[wp.vec3], rings: Rings) -> None:
             step += wp.length_sq(found) * found
             total += wp.length_sq(found)
     if total > 0.0:
-        moved[v] += step / total
+        moved[v] = within(moved[v] + step / total, work.skin[v], farthest)
 
 
 @wp.kernel

@@ -30,7 +30,7 @@ class Resolution:
 
     @property
     def n_unresolved(self) -> int:
-        """Vertices still inside, left where they were: between limbs that intersect, or deeper than they may move."""
+        """Vertices still inside: deeper than they may move, or where the body runs through itself."""
         return int(self.numbers[2])
 
     @property

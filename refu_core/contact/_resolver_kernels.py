@@ -177,9 +177,6 @@ def settle_kernel(state: State, skin: Skin, rules: Rules) -> None:
         distance = known
         gradient = state.gradient[i]
     push_on(i, here, distance, gradient, (goal - distance) / (rules.margin - distance), state, skin, rules)
-    if state.distance[i] < 0.0:
-        state.place[i] = origin
-        state.distance[i] = state.first[i]
 
 
 @wp.kernel(enable_backward=False)

@@ -28,6 +28,14 @@ class ContactSettings:
     looks: int = 3
     """How far a search goes from the rim of a patch of wrong closest faces into it [edges]."""
 
+    # Other limbs beside loose cloth
+    own_weight: float = 0.02
+    """A vertex lies on every limb that has more than this of its skinning weight: at the armpit, on trunk and arm."""
+    press_room: float = 0.006
+    """How far before a limb cloth stays, on the side of the skin it lies on; half way where there is less room [m]."""
+    press_pairs: int = 4
+    """Pairs of sweeps by which neighbours follow, as `blend_pairs`."""
+
     # Neighbours
     blend_reach: int = 2
     """How far the neighbourhood reaches that gives way with a pushed vertex [edges]. Farther out nothing collides, and
@@ -44,7 +52,7 @@ class ContactSettings:
     the normals below its ends: three times as far as a circle does."""
     through: float = 0.005
     """An edge whose middle lacks up to this is raised in full, and one that lacks twice as much not at all [m]. An edge
-    that lacks more runs through a limb, and raising it would throw its ends into another one."""
+    that lacks more runs through a hand, and raising it would throw its ends centimetres away."""
 
     # Garments over each other
     layer_gap: float = 0.003

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from refu_core.contact import DEFAULT_CONTACT, ContactSettings, Layer, Resolver
+from refu_core.contact import DEFAULT_CONTACT, ContactSettings, Layer, Press, Resolver
 from refu_core.garments import inner_first
 from refu_core.modes import SdfMode
 from refu_core.realtime._wearer import Outfit
@@ -72,6 +72,10 @@ class ContactStage:
         self.resolvers = {
             name: Resolver(one.faces, one.n_vertices, settings=settings) for name, one in garments.items()
         }
+        self._press = {}
+        if outfit.collider is not None:  # or there is no room
+            self._press = {name: Press(one, body, settings=settings) for name, one in garments.items()}
+        self._outfit = outfit
         self._below = {
             name: {
                 inner: Layer(
@@ -88,12 +92,19 @@ class ContactStage:
 
     def update(self, body: Tensor) -> None:
         """Takes over the body's new pose, shape (V, 3) [m]. Raises `MeshError` for one that isn't finite."""
+        self._body = body
         self.sdf.update(body)
         if self.winding is not None:
             self.winding.update(body)
 
     def lift(self, name: str, vertices: Tensor, worn: Mapping[str, Worn]) -> tuple[Tensor, Tensor]:
-        """Vertices (V, 3) [m] off the `worn` inner garments, and how many were too near one of those, shape (1,)."""
+        """Vertices (V, 3) [m] on their own side of other limbs and off the `worn` inner garments.
+
+        Also how many were too near one of those, shape (1,).
+        """
+        if name in self._press:
+            lies_on = self._outfit.below[name](self._body[None])[0]
+            vertices = self._press[name](vertices, lies_on, self._body)
         n_layered = torch.zeros(1, dtype=torch.int32, device=vertices.device)
         for inner, layer in self._below[name].items():
             vertices, n_low = layer(vertices, worn[inner].vertices)

@@ -45,8 +45,8 @@ class GarmentStats:
     n_pushed: int = 0
     """Vertices that were moved: inside, or nearer to the skin than the margin."""
     n_unresolved: int = 0
-    """Vertices inside the body afterwards, mostly where it touches itself: certified by their winding numbers, unless
-    the pipeline was loaded with `certify=False`; then by the distances that pushed them. 0 with `sdf="none"`."""
+    """Vertices inside the body (the collider) afterwards: certified by their winding numbers, unless the pipeline was
+    loaded with `certify=False`; then by the distances that pushed them. 0 with `sdf="none"`."""
     max_depth: float = 0.0
     """Deepest penetration before, likewise [m]."""
     n_layered: int = 0

@@ -53,11 +53,16 @@ def detector(body: SmplBody) -> SelfContactDetector:
     return SelfContactDetector(body.faces, body.v_template)
 
 
-def test_nothing_moves_where_nothing_is_near(body: SmplBody, collider: Collider) -> None:
-    apart = {"left_shoulder": (0.0, 0.2, 0.0), "left_elbow": (0.0, -0.5, 0.0), "left_knee": (0.4, 0.0, 0.0)}
-    for turns in ({}, apart):
-        skin = body(pose=posed(body, turns))
-        assert torch.equal(collider(skin.vertices, skin.transforms), skin.vertices)
+def test_the_rest_pose_stays_bit_for_bit(body: SmplBody, collider: Collider) -> None:
+    skin = body(pose=posed(body, {}))
+    assert torch.equal(collider(skin.vertices, skin.transforms), skin.vertices)
+
+
+@pytest.mark.parametrize("joint", ["left_elbow", "left_knee", "left_hip", "spine1"])
+def test_nothing_moves_where_nothing_is_near(joint: str, body: SmplBody, collider: Collider) -> None:
+    bends = {"left_elbow": (0.0, -1.0, 0.0), "left_knee": (0.4, 0.0, 0.0)}
+    skin = body(pose=posed(body, {joint: bends.get(joint, (-0.3, 0.0, 0.0))}))
+    assert (collider(skin.vertices, skin.transforms) - skin.vertices).norm(dim=2).max() < 0.1 * MM
 
 
 @pytest.mark.parametrize("name", POSES)
@@ -125,13 +130,13 @@ def test_its_derivative_is_that_of_finite_differences(name: str, body: SmplBody,
     torch.testing.assert_close((gradient * way).sum(), slope, rtol=2e-2, atol=1e-2)
 
 
-def test_a_gap_is_kept_between_an_arm_and_a_flank(body: SmplBody) -> None:
+def test_a_larger_gap_pushes_farther(body: SmplBody) -> None:
     skin = body(pose=posed(body, POSES["hanging arms"]))
-    of_arm = body.weights[:, [16, 18]].sum(1) > 0.95
-    of_trunk = body.weights[:, [0, 3, 6]].sum(1) > 0.95
-    apart = {gap: Collider(body, gap=gap)(skin.vertices, skin.transforms)[0] for gap in (0.004, 0.02)}
-    least = {gap: float(torch.cdist(one[of_arm], one[of_trunk]).min()) for gap, one in apart.items()}
-    assert least[0.02] > least[0.004] + 10 * MM
+    narrow, wide = (
+        float((Collider(body, gap=gap)(skin.vertices, skin.transforms) - skin.vertices).norm(dim=2).max())
+        for gap in (0.004, 0.012)
+    )
+    assert narrow + 2 * MM < wide < narrow + 6 * MM  # each side takes half of it
 
 
 def test_no_body_at_all(body: SmplBody, collider: Collider) -> None:
@@ -139,7 +144,7 @@ def test_no_body_at_all(body: SmplBody, collider: Collider) -> None:
     assert collider(skin.vertices, skin.transforms).shape == (0, body.n_vertices, 3)
 
 
-def test_a_body_of_another_topology(body: SmplBody, detector: SelfContactDetector) -> None:
+def test_a_body_of_another_topology(body: SmplBody) -> None:
     """One edge collapsed after another, until it has the number of vertices that SMPL's own body has."""
     coarse = _with_fewer_vertices(body, 6890)
     assert coarse.n_vertices == 6890
@@ -189,7 +194,9 @@ def _replaced(body: SmplBody, **arrays: NDArray[np.generic]) -> SmplBody:
         "weights": known.weights,
         "J_regressor": known.joint_regressor,
         "shapedirs": known.shapedirs,
-        "kintree_table": np.stack([[-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, *range(16, 22)], range(24)]),
+        "kintree_table": np.stack(
+            [[-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, *range(16, 22)], range(24)]
+        ),
     }
     return SmplBody(BodyArrays.from_mapping({**given_, **arrays}, source="test"), name="test")
 

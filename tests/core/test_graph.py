@@ -27,7 +27,7 @@ from torch.utils._pytree import tree_flatten
 
 from refu_core import GarmentPipeline, SmplFrame
 from refu_core.errors import MeshError
-from refu_core.realtime import GarmentStats, Wearer
+from refu_core.realtime import GarmentStats, SkinShift, Wearer
 from refu_core.realtime._frame import FrameStep
 from refu_core.realtime._graph import CudaCapture, StepGraphs
 from refu_core.sdf import ApproxSdf, ExactSdf, _mesh
@@ -119,12 +119,16 @@ class Tape:
 
 def as_on_a_gpu(pipeline: GarmentPipeline) -> FrameStep:
     """The pipeline's step, with the launches that a GPU gets, and a tree that isn't built anew."""
-    contact = pipeline._step.contact
+    contact, collider = pipeline._step.contact, pipeline.outfit.collider
+    if collider is not None:
+        collider._is_serial = False
     if contact is not None:
         if isinstance(contact.sdf, ExactSdf):
             contact.sdf._rebuild_distance = math.inf
         if isinstance(contact.sdf, ApproxSdf):
             contact.sdf._is_serial = False
+        for press in contact._press.values():
+            press._is_serial = False
         for resolver in contact.resolvers.values():
             resolver._is_serial = False
         for layers in contact._below.values():
@@ -310,9 +314,11 @@ def test_packed_and_unpacked() -> None:
     people = frames(0, 1)
     step = pipeline._step
     packed = step.packed(step_inputs(pipeline, people), (0.0, 0.0)).numpy()
-    for (body, *parts), old in zip(step.unpacked(packed), pipeline(people), strict=True):
+    for (body, skin, shift, *parts), old in zip(step.unpacked(packed), pipeline(people), strict=True):
         assert np.shares_memory(body, packed)
         np.testing.assert_array_equal(body, old.body)
+        np.testing.assert_array_equal(skin, old.skin)
+        assert SkinShift.of(shift.tolist()) == old.stats.shift
         for i, (name, mesh) in enumerate(old.items()):
             vertices, raw, numbers = parts[3 * i : 3 * i + 3]
             np.testing.assert_array_equal(vertices, mesh.local)

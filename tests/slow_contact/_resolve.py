@@ -36,8 +36,7 @@ def resolve(
     One push along the gradient (the paper's Eq. refu) can end inside another part of the body: in an armpit, between
     the thighs. So the pushed vertices, and no others, are asked again and pushed again while they are closer than
     `margin - tolerance`. Where limbs leave less room than twice the margin a vertex would be thrown to and fro: a push
-    against the last one goes half as far, and the best position found is kept. A vertex for which none is outside stays
-    where it was: cloth between limbs that intersect is as smooth as the backbone left it.
+    against the last one goes half as far, and the best position found is kept.
 
     Args:
         points: Garment vertices [m], shape (N, 3), in the frame of the body last given to `sdf`.
@@ -80,8 +79,6 @@ def resolve(
         rows, first, alpha = _push_blended(state, rows, first, alpha, blend)
         rounds += 1
     rounds += _push(state, rows, first, alpha, max_pushes)
-    stuck = state.distance < 0
-    state.vertices[stuck], state.distance[stuck] = points[stuck], start.distance[stuck]
     if edges is not None:
         rounds += _raise_edges(state, edges, max_pushes)
     vertices, distance = state.vertices, state.distance
@@ -211,7 +208,7 @@ def _raise_edges(state: _State, edges: Tensor, max_rounds: int) -> int:
 
     The middle is no lower than either end by more than half the edge's length, whatever the skin is like. Most edges at
     the margin are longer than that can clear; of these the ones are asked for that skin may reach which bulges between
-    their ends as the normals there say, or more: around an elbow, a shoulder, a hand, and between two limbs.
+    their ends as the normals there say, or more: around an elbow, a shoulder, a hand.
     """
     wanted = 0.5 * state.margin
     ends = state.distance[edges]
@@ -245,6 +242,6 @@ def _raise_edges(state: _State, edges: Tensor, max_rounds: int) -> int:
         clear = sample.distance >= state.distance[rows].clamp_max(state.margin - state.tolerance)
         raised = rows[clear]
         state.keep(raised, moved[clear], sample.rows(clear))
-        # Edges of which neither end could move are between two limbs, and stay there.
+        # Edges of which neither end could move have no room, and stay there.
         low = low[torch.isin(low, raised).any(dim=1)]
     return max_rounds
