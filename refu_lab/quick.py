@@ -26,7 +26,6 @@ _FRAMES = 30
 """Frames of a bag, at most."""
 _MODES = (("skinned", "accurate"), ("tailornet", "hybrid"))
 """(backbone, sdf) of the pipelines that are measured; what isn't trained is left out."""
-"""Worn in bags without ground truth."""
 
 
 class FigureKey(NamedTuple):
@@ -132,10 +131,10 @@ def _measure(bag: Path, *, progress: bool) -> Iterator[tuple[FigureKey, float]]:
             input=bag, garments=true or DEFAULT_GARMENTS, backbone=backbone, sdf=sdf, max_frames=_FRAMES
         )
         try:
-            options.load_pipeline()
+            pipeline = options.load_pipeline()
         except RefuError:  # no weights for one of the garments
             continue
-        result = replay(options, progress=progress)
+        result = replay(options, pipeline=pipeline, progress=progress)
         for garment in options.garments:
             yield from _rows(bag.stem, garment, backbone, result.before[garment])
             yield from _rows(bag.stem, garment, f"node, {backbone}, {sdf}", result.after[garment])

@@ -324,8 +324,10 @@ class _Replayer:
 
 
 @one_thread()
-def replay(options: ReplayOptions, *, progress: bool = False) -> ReplayResult:
+def replay(options: ReplayOptions, *, pipeline: GarmentPipeline | None = None, progress: bool = False) -> ReplayResult:
     """Runs every frame of the input through the pipeline, writes the output bag, measures.
+
+    `pipeline` is what `options.load_pipeline()` has given, if that was called already.
 
     An interrupt (Ctrl-C) ends the replay early: the bag is closed and the result so far is returned.
 
@@ -333,7 +335,7 @@ def replay(options: ReplayOptions, *, progress: bool = False) -> ReplayResult:
         RefuError: a bad input file, an unknown garment, an output that can't be written, or no frame that could be
             replayed.
     """
-    pipeline = options.load_pipeline()
+    pipeline = pipeline or options.load_pipeline()
     pipeline(
         SmplFrame(pose=np.zeros((24, 3), np.float32))
     )  # compiles kernels, so that the first frame's latency is a frame's

@@ -18,7 +18,8 @@ SECONDS = 2.0
 """Processor time that any reader may take to refuse a file [s]."""
 MEGABYTES = 600
 """Memory that it may take for that [MB]."""
-_HANGS = 20.0
+_HANGS = 120.0
+"""Time after which a call isn't waited for any longer, however busy the machine is [s]."""
 
 
 @dataclass(frozen=True)

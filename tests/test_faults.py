@@ -12,7 +12,7 @@ import runpy
 import struct
 import subprocess
 import sys
-import time
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -415,19 +415,21 @@ def test_a_read_only_disk_is_said_before_any_frame(monkeypatch: pytest.MonkeyPat
 
 
 def test_a_disk_that_stalls_costs_messages_and_no_time(tmp_path: Path) -> None:
+    gate = threading.Event()
+
     class Stalling(BagWriter):
         def write(self, *args: Any, **kwargs: Any) -> None:
-            time.sleep(0.02)
+            assert gate.wait(60), "the disk was waited for"
             super().write(*args, **kwargs)
 
     recorder = Recorder(tmp_path / "bag", max_queued_bytes=4_000, open_bag=Stalling)
-    started = time.thread_time()
     for i in range(500):
         recorder.put("/a", "std_msgs/msg/Float32MultiArray", bytes(1000), time_ns=i, qos=QosProfile())
-    assert time.thread_time() - started < 1.0  # twenty seconds, if it waited
+    gate.set()
     recorder.close()
     state = recorder.state()
     assert (state.written + state.dropped, state.error) == (500, "")
+    assert state.dropped >= 495
     with BagReader(tmp_path / "bag") as reader:
         assert sum(1 for _ in reader.messages()) == state.written
 
@@ -441,7 +443,7 @@ def test_kills_leave_what_can_be_read_and_gone_on_with(what: str, times: int) ->
         [sys.executable, str(KILL_TEST), "--what", what, "--times", str(times)],
         capture_output=True,
         text=True,
-        timeout=300,
+        timeout=1200,
         check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
@@ -481,7 +483,7 @@ def test_a_replay_asks_no_network_for_anything(tmp_path: Path) -> None:
         [sys.executable, "-c", OFFLINE, *arguments],
         capture_output=True,
         text=True,
-        timeout=300,
+        timeout=1200,
         check=False,
         env={**os.environ, **proxies, "HF_HUB_OFFLINE": "1"},
     )

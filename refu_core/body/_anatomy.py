@@ -33,15 +33,15 @@ class ColliderSettings:
 
     gap: float = DEFAULT_GAP
     """Room that is left between two parts [m]."""
-    crease_share: float = 0.25
+    crease_share: float = 0.5
     """Share of its height over a seam in the rest pose that skin keeps, at most half of the gap: nothing moves until a
-    fold has squeezed skin to a quarter."""
+    fold has squeezed skin to half."""
     crease_reach: float = 0.045
     """Skin up to this far from a seam keeps to its side [m], and skin beyond it less and less. Farther out segments
     find each other by their distance, and share what is to be given way in halves, which a plane doesn't."""
-    segment_share: float = 0.3
+    segment_share: float = 0.6
     """Share of its distance from another segment in the rest pose that skin keeps, at most the gap: at a joint
-    segments begin where they are 0 apart."""
+    segments are 0 apart. Half of it leaves 93 % of recorded frames free of intersections, in place of 97 %."""
     farthest: float = 0.035
     """No skin moves farther than this [m]. Where two parts overlap by more than twice as much they still do: no flesh
     gives way to a pose that no body can take."""
@@ -103,6 +103,7 @@ class Anatomy:
         bones = kernels.Bones()
         work = self.tensors
         bones.rotation, bones.between = as_warp(work.rotation, wp.mat33), as_warp(work.between, wp.mat33)
+        bones.bent = wp.zeros(len(PARENTS), dtype=wp.float32, device=str(self.device))
         bones.start = self._ints(np.searchsorted(vertex, np.arange(len(rest) + 1)))
         bones.joint, bones.weight = self._ints(joint), self._floats(weights[vertex, joint])
         normals = _smooth_normals(rest, mesh)

@@ -132,7 +132,9 @@ class Collider:
         def record(name: str, kernel: Any, most: int, inputs: list[Any]) -> None:
             commands[name] = wp.launch(kernel, most, inputs, device=str(self.device), record_cmd=True)
 
-        record("between", kernels.between_kernel, len(PARENTS), [bones.rotation, *known.chain, bones.between])
+        record(
+            "between", kernels.between_kernel, len(PARENTS), [bones.rotation, *known.chain, bones.between, bones.bent]
+        )
         record("stations", kernels.mean_kernel, len(known.stations[-1]), [work.skin, *known.stations])
         inputs = [work, known.held, known.stations[-1], bones, known.seams, how.crease_rounds, how.farthest]
         record("crease", kernels.crease_kernel, len(known.held), inputs)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from refu_core.body import _collider_kernels as kernels
 from refu_core.body._creases import LEVELS
 from refu_core.body._kinematics import PARENTS
 
@@ -36,7 +37,7 @@ def part_with_gradient(collider: Collider, skin: Tensor, rotation: Tensor) -> Te
     p = skin
     is_moved = torch.zeros(len(skin), dtype=torch.bool, device=skin.device)
     for _ in range(how.crease_rounds):
-        step = _crease_step(collider, skin, p, _between(rotation))
+        step = _crease_step(collider, skin, p, rotation)
         is_moved = is_moved | (step.detach() != 0).any(1)
         p = p + step
     p = _within(p, skin, how.farthest)
@@ -75,8 +76,8 @@ def _within(p: Tensor, skin: Tensor, farthest: float) -> Tensor:
     return torch.where(is_far, skin + farthest / torch.where(is_far, squared, 1.0).sqrt() * away, p)
 
 
-def _between(rotation: Tensor) -> Tensor:
-    """The rotations on the way from each joint's parent to the joint, one a level, shape (24 L, 3, 3)."""
+def _between(rotation: Tensor) -> tuple[Tensor, Tensor]:
+    """Rotations on the way from a joint's parent to it, one a level, (24 L, 3, 3), and how bent it is, (24 L,)."""
     above = rotation[[max(parent, 0) for parent in PARENTS]]
     turn = above.transpose(1, 2) @ rotation
     w = 0.5 * (1 + turn.diagonal(dim1=1, dim2=2).sum(1)).clamp_min(1e-6).sqrt()
@@ -92,10 +93,12 @@ def _between(rotation: Tensor) -> Tensor:
         (2 * (x * z - y * r), 2 * (y * z + x * r), 1 - 2 * (x * x + y * y)),
     )
     matrix = torch.stack([torch.stack(row, -1) for row in rows], -2)
-    return (above[:, None] @ matrix).flatten(0, 1)
+    bent = ((kernels.STRAIGHT - w) / (kernels.STRAIGHT - kernels.BENT)).clamp(0, 1)
+    return (above[:, None] @ matrix).flatten(0, 1), bent.repeat_interleave(len(LEVELS))
 
 
-def _crease_step(collider: Collider, skin: Tensor, p: Tensor, between: Tensor) -> Tensor:
+def _crease_step(collider: Collider, skin: Tensor, p: Tensor, rotation: Tensor) -> Tensor:
+    between, bent = _between(rotation)
     seams = collider.anatomy.creases
     n_stations = len(seams.station_start) - 1
     of_station = torch.repeat_interleave(torch.arange(n_stations), torch.as_tensor(seams.station_start).long().diff())
@@ -103,10 +106,11 @@ def _crease_step(collider: Collider, skin: Tensor, p: Tensor, between: Tensor) -
     stations = p.new_zeros(n_stations, 3).index_add(0, of_station.to(p.device), weighted)
     weights = torch.as_tensor(seams.weights).to(p)
     through = (stations[torch.as_tensor(seams.stations).long()] * weights[..., None]).sum(1)
-    rotated = between[torch.as_tensor(seams.rotation).long()]
+    of_seam = torch.as_tensor(seams.rotation).long()
+    rotated = between[of_seam]
     normal = (rotated @ torch.as_tensor(seams.normal).to(p)[..., None])[..., 0]
     vertex = torch.as_tensor(seams.vertex).long().to(p.device)
-    lacks = collider.anatomy.least.to(p) - ((p[vertex] - through) * normal).sum(1)
+    lacks = bent[of_seam] * (collider.anatomy.least.to(p) - ((p[vertex] - through) * normal).sum(1))
     return _together(lacks.clamp_min(0)[:, None] * normal, vertex, len(p))
 
 

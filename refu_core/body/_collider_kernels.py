@@ -3,15 +3,22 @@
 Segments are told apart by the bits of an integer. `touched` has the segments that a vertex has to give way to.
 """
 
+import math
 from typing import TYPE_CHECKING
 
 import warp as wp
 
 from refu_core import _warp  # noqa: F401  (quiets Warp before it starts)
+from refu_core.body._creases import LEVELS
 
 wp.set_module_options({"enable_backward": False})
 
 N_STATIONS = 6
+N_LEVELS = len(LEVELS)
+STRAIGHT = wp.constant(math.cos(0.05))
+"""Cosine of half the angle up to which a joint folds no skin: 0.1 rad."""
+BENT = wp.constant(math.cos(0.15))
+"""The same of 0.3 rad, from where on its seams hold in full."""
 if TYPE_CHECKING:
     Stations = wp.Vector[int]
     StationWeights = wp.Vector[float]
@@ -28,6 +35,8 @@ class Bones:
     """Of each joint."""
     between: wp.array[wp.mat33]
     """Of each joint's seams, between the parent's rotation and the joint's."""
+    bent: wp.array[float]
+    """How much each joint's seams hold: not at all where it is straight."""
     start: wp.array[int]
     joint: wp.array[int]
     weight: wp.array[float]
@@ -104,7 +113,11 @@ class Rings:
 
 @wp.kernel
 def between_kernel(
-    rotation: wp.array[wp.mat33], parent: wp.array[int], levels: wp.array[float], between: wp.array[wp.mat33]
+    rotation: wp.array[wp.mat33],
+    parent: wp.array[int],
+    levels: wp.array[float],
+    between: wp.array[wp.mat33],
+    bent: wp.array[float],
 ) -> None:
     """The rotations on the way from each joint's parent to the joint, one a seam."""
     j = wp.tid()
@@ -112,6 +125,7 @@ def between_kernel(
     turn = wp.transpose(above) @ rotation[j]
     w = 0.5 * wp.sqrt(wp.max(1.0 + wp.trace(turn), 1.0e-6))
     axis = wp.vec3(turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]) / (4.0 * w)
+    bent[j] = wp.clamp((STRAIGHT - w) / (STRAIGHT - BENT), 0.0, 1.0)
     for i in range(levels.shape[0]):
         t = levels[i]
         q = wp.normalize(wp.quat(t * axis[0], t * axis[1], t * axis[2], t * w + 1.0 - t))
@@ -161,16 +175,19 @@ def crease_kernel(
         total = float(0.0)
         step = wp.vec3()
         for r in range(seams.start[i], seams.start[i + 1]):
-            through = wp.vec3()
-            which = seams.stations[r]
-            weights = seams.weights[r]
-            for k in range(wp.static(N_STATIONS)):
-                through += weights[k] * stations[which[k]]
-            normal = bones.between[seams.rotation[r]] @ seams.normal[r]
-            lacks = seams.least[r] - wp.dot(p - through, normal)
-            if lacks > 0.0:
-                step += lacks * lacks * lacks * normal
-                total += lacks * lacks
+            rotation = seams.rotation[r]
+            bent = bones.bent[rotation // wp.static(N_LEVELS)]
+            if bent > 0.0:
+                through = wp.vec3()
+                which = seams.stations[r]
+                weights = seams.weights[r]
+                for k in range(wp.static(N_STATIONS)):
+                    through += weights[k] * stations[which[k]]
+                normal = bones.between[rotation] @ seams.normal[r]
+                lacks = bent * (seams.least[r] - wp.dot(p - through, normal))
+                if lacks > 0.0:
+                    step += lacks * lacks * lacks * normal
+                    total += lacks * lacks
         if total == 0.0:
             break
         p += step / total

@@ -50,10 +50,15 @@ def pierces(a: Array, b: Array, triangle: Array) -> bool:
 
 
 def all_pairs(garment: Array, garment_faces: Array, body: Array, body_faces: Array) -> dict[tuple[int, int], bool]:
-    """Every pair of triangles, one by one: (garment face, body face) -> is it vertex-face?"""
+    """Every pair of triangles, one by one: (garment face, body face) -> is it vertex-face?
+
+    But for those that are apart along an axis, by more than what is rounded.
+    """
     found = {}
+    corners = body[body_faces].astype(np.float64)
     for i, first in enumerate(garment[garment_faces].astype(np.float64)):
-        for j, second in enumerate(body[body_faces].astype(np.float64)):
+        is_near = ((corners.max(1) > first.min(0) - 1e-6) & (corners.min(1) < first.max(0) + 1e-6)).all(1)
+        for j, second in ((j, corners[j]) for j in np.flatnonzero(is_near).tolist()):
             ours = sum(pierces(first[k], first[(k + 1) % 3], second) for k in range(3))
             theirs = sum(pierces(second[k], second[(k + 1) % 3], first) for k in range(3))
             if ours + theirs:

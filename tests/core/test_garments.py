@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from refu_core import GarmentError, GarmentPipeline, SmplFrame, WeightsError, load_body, load_garment
@@ -28,6 +28,7 @@ def test_about_the_papers_size(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", BUILTIN_GARMENTS)
+@settings(max_examples=10)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_unposing_inverts_posing(name: str, seed: int) -> None:
     rng = np.random.default_rng(seed)

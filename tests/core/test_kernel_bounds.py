@@ -19,7 +19,8 @@ from refu_core import GarmentPipeline, SmplFrame
 
 torch.set_num_threads(1)
 rng = np.random.default_rng(0)
-frames = [SmplFrame(pose=rng.normal(0, 0.4, (24, 3)), betas=rng.normal(size=10)) for _ in range(40)]
+spreads = np.linspace(0.1, 0.8, 10)  # from who hardly moves to limbs through each other and the trunk
+frames = [SmplFrame(pose=rng.normal(0, spread, (24, 3)), betas=rng.normal(size=10)) for spread in spreads]
 for sdf in ("accurate", "hybrid"):
     pipeline = GarmentPipeline.load(["tshirt-male", "short-pant-male"], sdf=sdf, backbone="tailornet")
     for frame in frames:
@@ -30,7 +31,7 @@ print("in bounds")
 
 def test_kernels_stay_in_bounds_on_bodies_in_a_tangle(tmp_path: Path) -> None:
     done = subprocess.run(
-        [sys.executable, "-c", _RUN, str(tmp_path)], capture_output=True, text=True, timeout=500, check=False
+        [sys.executable, "-c", _RUN, str(tmp_path)], capture_output=True, text=True, timeout=1800, check=False
     )
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stdout.endswith("in bounds\n")

@@ -90,9 +90,9 @@ def _is_told_in_one_line(error: str, cache: Path) -> bool:
 
 def test_two_first_starts_at_once_then_every_damage_then_a_full_disk(tmp_path: Path) -> None:
     first, second = _start(tmp_path, _LOAD), _start(tmp_path, _LOAD + _DAMAGE)
-    _, error = first.communicate(timeout=120)
+    _, error = first.communicate(timeout=600)
     assert first.returncode == 0, error
-    out, error = second.communicate(input="\n", timeout=120)
+    out, error = second.communicate(input="\n", timeout=600)
     assert int(out.splitlines()[-1]) > 200, error
     assert second.returncode == 1
     assert _is_told_in_one_line(error, tmp_path), error
@@ -102,6 +102,6 @@ def test_a_cache_that_cannot_be_made_is_told_in_one_line(tmp_path: Path) -> None
     file = tmp_path / "cache"
     file.write_text("where a folder is wanted")
     process = _start(file, _LOAD)
-    _, error = process.communicate(timeout=120)
+    _, error = process.communicate(timeout=600)
     assert process.returncode == 1
     assert _is_told_in_one_line(error, file), error

@@ -110,7 +110,7 @@ def test_shells(radius: float, centre: tuple[float, float, float], inside: float
     assert (got < 0).float().mean() == pytest.approx(inside, abs=0.1)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     radius=st.floats(0.01, 0.6),
     x=st.floats(-0.7, 0.7),
@@ -161,7 +161,7 @@ def test_what_a_limb_shuts_in_beside_the_skin_of_another_is_asked(reach: float) 
     torch.testing.assert_close(got, wanted.clamp(max=BAND), atol=1e-6, rtol=0)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(seed=st.integers(0, 2**31), n=st.integers(1, 700), spread=st.sampled_from([0.2, 0.5, 5.0, 1e4, 1e7]))
 def test_query_is_the_exact_one(seed: int, n: int, spread: float) -> None:
     band, exact = posed_ball()
@@ -172,7 +172,7 @@ def test_query_is_the_exact_one(seed: int, n: int, spread: float) -> None:
     torch.testing.assert_close(got, wanted, atol=1e-6, rtol=1e-6)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seed=st.integers(0, 2**31), n=st.integers(1, 3000), spread=st.sampled_from([0.2, 0.5, 5.0, 1e4]))
 def test_a_face_said_to_be_near_is_a_hint_only(seed: int, n: int, spread: float) -> None:
     """Any face, near or not: nothing closer is missed, by a tree built for whatever pose."""
@@ -224,7 +224,7 @@ def test_a_large_face_reaches_all_around_the_grid() -> None:
     torch.testing.assert_close(sdf.query(points).distance, torch.full((500,), 0.004), atol=1e-5, rtol=0)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(n=st.integers(1, 5000), seed=st.integers(0, 2**31))
 def test_groups_are_whole(n: int, seed: int) -> None:
     """Every place once; and eight, 64, ... in a row are nearer to each other than any are that are drawn at random."""

@@ -9,6 +9,7 @@ import multiprocessing
 import os
 import shutil
 import sys
+import time
 from dataclasses import asdict
 from functools import cache
 from pathlib import Path
@@ -286,8 +287,24 @@ def test_two_shards_are_all_slots(simulated: Path) -> None:
     assert (columns(simulated)["state"] == DONE).all()
 
 
-def test_killed_run_goes_on_to_the_same_samples(simulated: Path, clips: Path, tmp_path: Path) -> None:
+def first_block_only(rows: list[int]) -> int:
+    """Simulates rows, where no other process has begun with any; otherwise waits to be killed."""
+    assert _produce._state is not None
+    try:
+        _produce._state[1].directory.parent.with_name("begun").mkdir()
+    except FileExistsError:
+        time.sleep(600)
+    return _SIMULATE_BLOCK(rows)
+
+
+_SIMULATE_BLOCK = _produce._simulate_block
+
+
+def test_killed_run_goes_on_to_the_same_samples(
+    simulated: Path, clips: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     output = tmp_path / "killed"
+    monkeypatch.setattr(_produce, "_simulate_block", first_block_only)
     kept: list[dict[str, NDArray[Any]]] = []
 
     def kill(_: Progress) -> None:

@@ -319,7 +319,7 @@ def test_two_processes_make_the_training_of_one(tmp_path: Path, dataset: Path) -
     script.write_text(_PARALLEL)
     torchrun = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
     command = [*torchrun, str(script), str(dataset), str(tmp_path / "two")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=1200, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
     runpy.run_path(str(script))["train"](str(dataset), str(tmp_path / "one"))
     one, two = (load_weights(tmp_path / folder / "mlp-none").tensors for folder in ("one", "two"))

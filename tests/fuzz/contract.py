@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 LONGEST_LINE = 500
 """Of a message [characters]."""
-_SILENT_S = 60.0
+_SILENT_S = 300.0
 """Longer, and a reader hangs where Python can't interrupt it: the process ends."""
 
 _ROOT = Path(__file__).resolve().parents[2]

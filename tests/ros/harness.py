@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import argparse
+import fcntl
+import functools
 import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.srv import SetParameters
@@ -30,14 +34,20 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).parents[2]
 GARMENTS = ("tshirt-male", "short-pant-male")
+PATIENCE_S = 300.0
+"""How long anything that has to happen may take, on a machine that has a lot to do: nobody waits any longer for what
+has happened, so only what never does takes that long."""
 
 
 class NodeProcess:
     """`garment_node` with parameters; killed at the end of the block if it still runs."""
 
-    def __init__(self, log: Path, prepare: Callable[[], None] | None = None, **parameters: Any) -> None:
+    def __init__(
+        self, log: Path, prepare: Callable[[], None] | None = None, *, program: str = "", **parameters: Any
+    ) -> None:
         self._log = log
-        command = [sys.executable, "-m", "refu_ros.garment_node", *ros_arguments(parameters)]
+        start = ["-c", program] if program else ["-m", "refu_ros.garment_node"]
+        command = [sys.executable, *start, *ros_arguments(parameters)]
         with log.open("wb") as file:
             self.process = subprocess.Popen(
                 command,
@@ -66,7 +76,11 @@ class NodeProcess:
         for number in signals:
             self.process.send_signal(number)
             time.sleep(0.05)
-        return self.process.wait(timeout=60)
+        return self.ends()
+
+    def ends(self) -> int:
+        """Waits for the exit status."""
+        return self.process.wait(timeout=PATIENCE_S)
 
 
 def ros_arguments(parameters: dict[str, Any]) -> list[str]:
@@ -108,7 +122,7 @@ class Peer:
         """Listens no longer."""
         self.node.destroy_subscription(self._subscription)
 
-    def spin_until(self, condition: Callable[[], Any], what: str, *, timeout: float = 60.0) -> None:
+    def spin_until(self, condition: Callable[[], Any], what: str, *, timeout: float = PATIENCE_S) -> None:
         """Fails with `what` when it doesn't come true."""
         end = time.monotonic() + timeout
         while not condition():
@@ -129,7 +143,6 @@ class Peer:
                 and self.node.count_publishers("garments")
             ),
             "the node listens",
-            timeout=120.0,
         )
 
     def listeners(self, person: str = "") -> int:
@@ -156,10 +169,15 @@ class Peer:
                     return marker
         return None
 
+    def shown(self) -> set[str]:
+        """The namespaces of the garments that a viewer shows who has got all messages since `garments` was cleared."""
+        last = {marker.ns: marker.action for markers in self.garments for marker in markers}
+        return {ns for ns, action in last.items() if action == 0}
+
     def dress(self, frame: SmplFrame, person: str = "") -> Marker:
         """Sends a frame (again and again: input is best effort) until its T-shirt comes back."""
         ns = f"{person}/{GARMENTS[0]}" if person else GARMENTS[0]
-        end = time.monotonic() + 60
+        end = time.monotonic() + PATIENCE_S
         while (marker := self.seen(frame.stamp_ns, ns)) is None:
             assert time.monotonic() < end, f"no garment for {person or 'the frame'}"
             self.send(frame, person)
@@ -184,7 +202,7 @@ class Peer:
         """A service's answer."""
         client = self.node.create_client(service_type, name)
         try:
-            assert client.wait_for_service(timeout_sec=60.0), name
+            assert client.wait_for_service(timeout_sec=PATIENCE_S), name
             future = client.call_async(request)
             self.spin_until(future.done, f"{name} answers")
             return future.result()
@@ -237,5 +255,20 @@ def start(module: ModuleType) -> argparse.Namespace:
 def isolate() -> None:
     """Keeps tests on this machine and apart from other tests and robots."""
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
+    os.environ["ROS_DOMAIN_ID"] = str(own_domain())
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+
+@functools.cache
+def own_domain() -> int:
+    """A domain that no other test process on this machine has got: each keeps a lock as long as it runs."""
+    for domain in range(1, 101):
+        path = Path(tempfile.gettempdir(), f"refu-ros-domain-{os.getuid()}-{domain}.lock")
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(descriptor)
+        else:
+            return domain
+    pytest.fail("a hundred other processes test ROS nodes on this machine")

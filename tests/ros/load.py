@@ -23,14 +23,14 @@ from visualization_msgs.msg import MarkerArray
 
 from msg_adapters import BagReader, decode_marker_array, decoder_for
 from refu_lab.stress import JUDGED_FROM, TOLERANCE, Yardstick, is_slower, resident_mb, soak_frames
-from tests.ros.harness import NodeProcess, Peer, start
+from tests.ros.harness import PATIENCE_S, NodeProcess, Peer, start
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
 RATE = 30.0
 """Frames a second."""
-_LAST_S = 5.0
+_LAST_S = 60.0
 """How long the last messages may take."""
 _SETTLE = 60
 """Frames that are sent before anything is counted."""
@@ -134,7 +134,7 @@ class LoadPeer(Peer):
     def settle(self) -> None:
         """Until frames come back; fails where they don't."""
         self.wait_for_node()
-        end = time.monotonic() + 60
+        end = time.monotonic() + PATIENCE_S
         while len(self._came) < _SETTLE:
             assert time.monotonic() < end, "the node doesn't dress anybody: see its log"
             self._send_now(len(self._came))

@@ -16,7 +16,7 @@ import pytest
 
 pytest.importorskip("launch_ros", reason="launch_ros isn't installed: it comes with a ROS installation")
 
-from harness import GARMENTS, Peer
+from harness import GARMENTS, PATIENCE_S, Peer
 from launch.launch_description_sources import get_launch_description_from_python_launch_file
 from launch.utilities import perform_substitutions
 
@@ -68,7 +68,7 @@ def test_every_parameter_is_a_described_argument() -> None:
 @pytest.mark.usefixtures("prefix")
 def test_a_bad_value_is_one_line_and_nothing_is_started() -> None:
     command = [sys.executable, "-c", ROS2, "launch", "refu_ros", "demo.launch.py", "margin:=abc"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     said = done.stdout + done.stderr
     assert done.returncode == 1
     assert "margin: wanted a value like 0.004, got 'abc'" in said
@@ -118,10 +118,9 @@ def test_the_demo_follows_its_arguments_and_goes_on_without_a_viewer(ros: None, 
                 process.poll() is not None or wanted <= {marker.ns for markers in peer.garments for marker in markers}
             ),
             "both are dressed",
-            timeout=120,
         )
         process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=60) == 0
+        assert process.wait(timeout=PATIENCE_S) == 0
     finally:
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)

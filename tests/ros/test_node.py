@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import signal
 import struct
 from typing import TYPE_CHECKING
@@ -83,7 +84,13 @@ def test_bad_input_is_counted_and_harms_nobody(scene: Peer) -> None:
         scene.send_raw(data, "ann")
         scene.dress(frame(100 + i), "bob")
     scene.dress(frame(99), "ann")
-    scene.spin_until(lambda: scene.count("input", "dropped: invalid") > before + len(sent) // 2, "bad input is counted")
+    again = itertools.cycle(sent)
+
+    def counted() -> bool:  # input is best effort: what was sent once may have been lost
+        scene.send_raw(next(again), "ann")
+        return scene.count("input", "dropped: invalid") > before + len(sent) // 2
+
+    scene.spin_until(counted, "bad input is counted")
     assert all(np.isfinite(marker.points).all() for markers in scene.garments for marker in markers)
 
 
@@ -111,14 +118,14 @@ def test_ten_thousand_messages_at_once_leave_no_backlog(scene: Peer) -> None:
 
 def test_parameters_change_while_frames_flow(scene: Peer) -> None:
     scene.dress(frame(30), "bob")
+    both = {f"bob/{name}" for name in GARMENTS}
+    assert both <= scene.shown()
     (result,) = scene.set(garments=[GARMENTS[0]])
     assert result.successful, result.reason
-    scene.garments.clear()
 
     def deleted() -> bool:
         scene.send(frame(31), "bob")
-        last = f"bob/{GARMENTS[1]}"
-        return any(marker.ns == last and marker.action == 2 for markers in scene.garments for marker in markers)
+        return scene.shown() & both == {f"bob/{GARMENTS[0]}"}
 
     scene.spin_until(deleted, "the garment that isn't worn any more is taken out of the scene")
     (result,) = scene.set(frame_id="odom")
@@ -155,11 +162,19 @@ def test_work_nobody_needs_is_skipped_and_counted(scene: Peer) -> None:
         return scene.count("garments", f"skipped: {kind}")
 
     unchanged, distance, unwatched = skipped("unchanged"), skipped("distance"), skipped("unwatched")
-    for i in range(5):
-        scene.dress(frame(7, stamp_ns=90 * 10**9 + i), "ann")  # the same pose at another time
-    scene.spin_until(lambda: skipped("unchanged") >= unchanged + 3, "unchanged frames are skipped")
-    scene.send(frame(8, transl=(0.0, 0.0, 60.0)), "ann")
-    scene.spin_until(lambda: skipped("distance") > distance, "who is too far away is skipped")
+    stamps = itertools.count(90 * 10**9)
+
+    def stands_still() -> bool:
+        scene.dress(frame(7, stamp_ns=next(stamps)), "ann")  # the same pose at another time
+        return skipped("unchanged") >= unchanged + 3
+
+    scene.spin_until(stands_still, "unchanged frames are skipped")
+
+    def is_far_away() -> bool:
+        scene.send(frame(8, transl=(0.0, 0.0, 60.0)), "ann")
+        return skipped("distance") > distance
+
+    scene.spin_until(is_far_away, "who is too far away is skipped")
     scene.unwatch()
 
     def skips() -> bool:
@@ -172,28 +187,24 @@ def test_work_nobody_needs_is_skipped_and_counted(scene: Peer) -> None:
 
 
 def test_who_leaves_is_taken_out_of_the_scene(scene: Peer) -> None:
+    of_ann = {f"ann/{name}" for name in GARMENTS}
     scene.dress(frame(40), "ann")
-    scene.garments.clear()
-    scene.spin_until(
-        lambda: (
-            {m.ns for markers in scene.garments for m in markers if m.action == 2} >= {f"ann/{g}" for g in GARMENTS}
-        ),
-        "the garments of who has left are deleted",
-    )
+    assert any(of_ann <= {marker.ns for marker in markers} for markers in scene.garments)
+    scene.spin_until(lambda: not of_ann & scene.shown(), "the garments of who has left are deleted")
     scene.spin_until(lambda: "ann" in scene.status("input")[1], "silence is reported")
     assert scene.status("input")[0] == 1
 
 
 def test_a_bad_start_is_one_line(ros: None, tmp_path: Path) -> None:  # noqa: ARG001
     with NodeProcess(tmp_path / "log.txt", garments=["cape"]) as node:
-        assert node.process.wait(timeout=40) == 2
+        assert node.ends() == 2
         assert "no garment 'cape'" in node.log
         assert "Traceback" not in node.log
 
 
 def test_a_quality_that_does_not_exist_is_one_line(ros: None, tmp_path: Path) -> None:  # noqa: ARG001
     with NodeProcess(tmp_path / "log.txt", **{"qos_overrides./smpl_params.subscription.reliability": "magic"}) as node:
-        assert node.process.wait(timeout=120) == 2
+        assert node.ends() == 2
         assert "can't be activated" in node.log
         assert "magic" in node.log
         assert "Traceback" not in node.log
@@ -207,12 +218,10 @@ def test_humans_come_and_go(ros: None, tmp_path: Path) -> None:  # noqa: ARG001
         peer.dress(frame(1), "ann")
         peer.dress(frame(2), "bob")
         peer.fall_silent("ann")
-        peer.garments.clear()
 
         def left() -> bool:
             peer.send(frame(3), "bob")
-            gone = f"ann/{GARMENTS[0]}"
-            return any(m.ns == gone and m.action == 2 for markers in peer.garments for m in markers)
+            return peer.shown() == {f"bob/{GARMENTS[0]}"}
 
         peer.spin_until(left, "ann is taken out of the scene")
         peer.dress(frame(4), "bob")

@@ -67,7 +67,7 @@ def test_a_subscriber_that_does_not_read_holds_nobody_up(scene: Peer) -> None:
                     got_one.append(pipe.readline())
                 return bool(got_one)
 
-            scene.spin_until(reads, "the second subscriber got one", timeout=120.0)
+            scene.spin_until(reads, "the second subscriber got one")
             stalled.send_signal(signal.SIGSTOP)
             scene.garments.clear()
             for i in range(40):  # eight times what the publisher keeps for who is slow
@@ -83,14 +83,10 @@ def test_a_subscriber_that_does_not_read_holds_nobody_up(scene: Peer) -> None:
 
 def test_a_second_node_of_the_name_is_reported_by_both(scene: Peer, tmp_path: Path) -> None:
     with NodeProcess(tmp_path / "log.txt", input_type="joint_state", garments=[GARMENTS[0]], sdf="accurate") as second:
-        scene.spin_until(
-            lambda: "2 nodes have this name" in scene.status("garments")[1], "the twin is seen", timeout=120.0
-        )
+        scene.spin_until(lambda: "2 nodes have this name" in scene.status("garments")[1], "the twin is seen")
         scene.dress(frame(50))
         scene.spin_until(lambda: "2 nodes are called" in second.log, "the second one says so, too")
         assert second.stop(signal.SIGINT) == 0, second.log
     scene.diagnostics.clear()
-    scene.spin_until(
-        lambda: scene.diagnostics and "2 nodes" not in scene.status("garments")[1], "the twin is gone", timeout=120.0
-    )
+    scene.spin_until(lambda: scene.diagnostics and "2 nodes" not in scene.status("garments")[1], "the twin is gone")
     scene.dress(frame(51))

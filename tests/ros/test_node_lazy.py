@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import math
 import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -124,7 +125,10 @@ def test_viewers_come_and_go_and_leave_nothing_behind(
             scene.dresses(i + 1000)
             scene.peer.unwatch()
     scene.rests()
-    assert held() == before
+    # What the middleware holds for a moment is none of it; what each viewer leaves behind would be a dozen by now.
+    scene.until(
+        lambda: all(now <= then for now, then in zip(held(), before, strict=True)), f"nothing is left: {before}"
+    )
     scene.peer.watch()
     scene.dresses(2000)
 
@@ -146,7 +150,8 @@ def test_an_event_or_the_second_is_enough(
     scene.rests()
 
 
-def test_rest_is_reported_and_is_no_fault(stage: Callable[..., Stage]) -> None:
+def test_rest_is_reported_and_is_no_fault(stage: Callable[..., Stage], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("refu_ros._diagnostics._FIRST_INPUT_S", math.inf)  # nobody can have sent yet
     scene = stage(person_timeout=0.05)
     scene.peer.watch()
     scene.dresses()
@@ -160,7 +165,8 @@ def test_rest_is_reported_and_is_no_fault(stage: Callable[..., Stage]) -> None:
     assert "nobody listens" in message
     assert scene.peer.status("garments")[:2] == (0, "nobody listens")
     scene.peer.watch()
-    assert scene.reports(2)[0] == 0  # nobody can have sent yet
+    assert scene.reports(2)[0] == 0
+    monkeypatch.setattr("refu_ros._diagnostics._FIRST_INPUT_S", 2.0)
     scene.until(lambda: scene.peer.status("input")[0] == 1, "who doesn't send though somebody listens is missed")
     assert scene.peer.status("input")[2]["subscribed"] == "yes"
 

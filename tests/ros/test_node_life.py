@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy isn't installed (extra ros): the node isn't tested")
 
-from harness import NodeProcess, Peer, frame
+from harness import PATIENCE_S, NodeProcess, Peer, frame
 
 from tests.ros.peers import CHEAP, HostilePeers
 
@@ -24,7 +24,7 @@ def test_hostile_peers_do_not_end_it(ros: None, tmp_path: Path) -> None:  # noqa
     with NodeProcess(tmp_path / "log.txt", **CHEAP, use_sim_time=True) as node:
         peers = HostilePeers(tmp_path, seed=0)
         peers.wait()
-        peers.attack(15.0, alive=lambda: node.process.poll() is None)
+        peers.attack(tries=2000, alive=lambda: node.process.poll() is None)
         peers.recover(alive=lambda: node.process.poll() is None)
         peers.close()
         assert not peers.result.problems, (peers.result, node.log)
@@ -49,18 +49,31 @@ def test_a_bad_parameter_is_named_in_one_line(
     words: str,
 ) -> None:
     with NodeProcess(tmp_path / "log.txt", **arguments) as node:
-        assert node.process.wait(timeout=60) == 2
+        assert node.ends() == 2
         (line,) = node.log.splitlines()
         assert line.startswith("garment_node: error: ")
         assert words in line
 
 
-def test_a_signal_ends_it_while_it_loads(ros: None, tmp_path: Path) -> None:  # noqa: ARG001
-    with NodeProcess(tmp_path / "log.txt") as node:
-        time.sleep(1.5)
-        start = time.monotonic()
-        node.stop(signal.SIGINT)
-        assert time.monotonic() - start < 1.5
+LOADS_FOREVER = """
+import sys, threading
+from refu_ros import _settings, garment_node
+def load(_):
+    print("loading", flush=True)
+    threading.Event().wait()
+_settings.PipelineKey.load = load
+sys.exit(garment_node.main())
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_while_it_loads(ros: None, tmp_path: Path, number: signal.Signals) -> None:  # noqa: ARG001
+    with NodeProcess(tmp_path / "log.txt", program=LOADS_FOREVER) as node:
+        end = time.monotonic() + PATIENCE_S
+        while "loading" not in node.log and node.process.poll() is None and time.monotonic() < end:
+            time.sleep(0.05)
+        assert "loading" in node.log
+        assert node.stop(number) == -number, node.log  # at once: it never gets as far as to look whether it was told to
         assert "Traceback" not in node.log
 
 

@@ -33,13 +33,14 @@ def peer(ros: None) -> Iterator[Peer]:  # noqa: ARG001
 
 
 def play(peer: Peer) -> set[int]:
-    """Sends frames and returns the stamps of the garments that came back."""
+    """Sends frames and returns the stamps of the garments that came back: a third of them at least."""
     peer.wait_for_node()
-    peer.dress(frame(0))
-    for i in range(1, N_FRAMES):
-        peer.send(frame(i))
-        peer.spin(1 / 30)
-    peer.dress(frame(N_FRAMES))
+    for i in range(N_FRAMES):
+        if i % 3:
+            peer.send(frame(i))
+            peer.spin(1 / 30)
+        else:  # also by a node that is slower than the frames
+            peer.dress(frame(i))
     return stamps_of(peer)
 
 
@@ -74,7 +75,7 @@ def test_signals_lose_nothing(peer: Peer, tmp_path: Path, signals: tuple[signal.
     inputs, garments, truncated = recorded(bag)
     assert not truncated
     assert (bag / "metadata.yaml").is_file()
-    assert len(published) > N_FRAMES // 4
+    assert len(published) > N_FRAMES // 3
     assert published <= garments <= inputs
 
 
@@ -84,7 +85,7 @@ def test_a_lifecycle_shutdown_loses_nothing(peer: Peer, tmp_path: Path) -> None:
         published = play(peer)
         request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_ACTIVE_SHUTDOWN))
         assert peer.call(ChangeState, "garment_node/change_state", request).success
-        assert node.process.wait(timeout=20) == 0, node.log
+        assert node.ends() == 0, node.log
     inputs, garments, truncated = recorded(bag)
     assert not truncated
     assert published <= garments <= inputs
@@ -121,11 +122,12 @@ def test_the_service_starts_and_stops(peer: Peer, tmp_path: Path) -> None:
         assert call(False).success
         assert not call(False).success
         peer.dress(frame(2))
+        peer.dress(frame(3))  # which is sent until it comes back: some may still be on its way when the next bag begins
         assert call(True).success
-        peer.dress(frame(3))
+        peer.dress(frame(4))
         assert node.stop(signal.SIGINT) == 0, node.log
     assert recorded(tmp_path / "bag")[1] == {first.stamp_ns}
-    assert recorded(tmp_path / "bag-1")[1] == {frame(3).stamp_ns}
+    assert {frame(4).stamp_ns} <= recorded(tmp_path / "bag-1")[1] <= {frame(3).stamp_ns, frame(4).stamp_ns}
 
 
 def test_a_full_disk_stops_the_recording_and_not_the_node(peer: Peer, tmp_path: Path) -> None:
@@ -143,7 +145,7 @@ def test_a_full_disk_stops_the_recording_and_not_the_node(peer: Peer, tmp_path: 
             peer.send(frame(len(peer.garments)))
             return peer.status("recording")[0] == 2
 
-        peer.spin_until(failed, "the full disk is an error", timeout=40.0)
+        peer.spin_until(failed, "the full disk is an error")
         assert "can't be written" in peer.status("recording")[1]
         peer.dress(frame(10_000))
         assert node.stop(signal.SIGINT) == 0, node.log
