@@ -44,7 +44,7 @@ class ClothSettings:
     """Time step [s]."""
     substeps: int = 40
     """Time steps a frame."""
-    refresh: int = 20
+    refresh: int = 10
     """Time steps between two looks for contacts."""
     iterations: int = 1
     """Sweeps over all constraints a time step: more steps of one sweep stretch less than fewer of several."""
@@ -189,15 +189,14 @@ class SimulatedCloth:
             edges = (
                 self._edge_contacts(body, motion) if careful else (np.zeros((0, 2), np.int32), empty3, empty3, empty3)
             )
-            if first == 0 or careful:
-                pairs = find_pairs(
-                    self.positions,
-                    self.topology.mesh.faces,
-                    self._rest,
-                    np.float32(2.2 * self._edge_length),
-                    np.float32(_PAIR_REACH),
-                    np.float32(_PAIR_REACH + 0.85 * self._edge_length),
-                )
+            pairs = find_pairs(
+                self.positions,
+                self.topology.mesh.faces,
+                self._rest,
+                np.float32(2.2 * self._edge_length),
+                np.float32(_PAIR_REACH),
+                np.float32(_PAIR_REACH + 0.85 * self._edge_length),
+            )
             for _ in range(min(refresh, s.substeps - first)):
                 substep(
                     self.positions, self.velocities, self._previous, self._inverse_mass,

@@ -44,9 +44,9 @@ class DrapeSettings:
     """Frames in which the arms go down from the T-pose to the canonical one."""
     canonical_frames: int = 60
     """Most frames in which the canonical drape settles."""
-    speed: float = 0.05
+    speed: float = 0.02
     """Way of the fastest part of the body in a frame of the move, on average [m]."""
-    move_frames: tuple[int, int] = (8, 24)
+    move_frames: tuple[int, int] = (20, 60)
     """Fewest and most frames of the move."""
     settle_frames: tuple[int, int] = (14, 45)
     """Fewest and most frames of settling; it ends early when the cloth rests."""

@@ -6,7 +6,7 @@ import math
 import time
 import zlib
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from refu_core.frames import N_BETAS
 from refu_core.garments import N_STYLES
-from refu_core.simulation._cloth import ClothSettings
-from refu_core.simulation._drape import GRAVITY, DrapeSettings, SettledDrape
+from refu_core.simulation._drape import GRAVITY, SettledDrape
 from refu_core.simulation._errors import SimulationError
 from refu_core.simulation._motion import FPS, STEPS, DrawnMotion, draw_motion
 from refu_core.simulation._plan import TEST, TRAIN, truncated_normal
@@ -94,8 +93,6 @@ class SequencePlan:
 class SequenceSettings(SimulationSettings):
     """All settings of a set of sequences but its plan."""
 
-    drape: DrapeSettings = field(default_factory=lambda: DrapeSettings(cloth=ClothSettings(refresh=10)))
-    """A moving body is looked at for contacts four times a simulated frame."""
     drag: float = 6.0
     """Rate at which the cloth's velocity fades in the air that goes with the body [1/s]."""
     rebuild_every: int = 10
