@@ -45,6 +45,8 @@ class ColliderSettings:
     farthest: float = 0.035
     """No skin moves farther than this [m]. Where two parts overlap by more than twice as much they still do: no flesh
     gives way to a pose that no body can take."""
+    thin: float = 0.4
+    """Nor farther than this share of what is below it: a finger gives way by millimetres, and isn't turned over."""
     crease_rounds: int = 2
     """How often skin is brought to its side: at the groin several seams meet."""
     part_rounds: int = 4
@@ -86,7 +88,10 @@ class Anatomy:
         self.bones = self._bind_bones(rest, mesh, weights)
         self.seams = self._bind_seams(rest, mesh, weights)
         self.segments = self._bind_segments(rest, mesh, weights)
+        self.farthest = self._thickness(rest, mesh).mul(settings.thin).clamp(max=settings.farthest)
+        """How far skin may be moved [m], shape (V,)."""
         self.work = self.tensors.bound()
+        self.work.farthest = as_warp(self.farthest, wp.float32)
 
     def _bind_rings(self, mesh: Connectivity) -> Any:
         ring = mesh.ring
@@ -139,6 +144,17 @@ class Anatomy:
         ]
         self.held, self.stations = self._ints(held), stations
         return seams
+
+    def _thickness(self, rest: NDArray[np.float64], mesh: Connectivity) -> torch.Tensor:
+        """How far it is to the skin on the other side [m], the least of each vertex and those around it, (V,)."""
+        device, points = str(self.device), self._vectors(rest)
+        body = wp.Mesh(points, self._ints(mesh.faces.ravel()))
+        across = wp.zeros(len(rest), dtype=wp.float32, device=device)
+        wp.launch(parting.thickness_kernel, len(rest), [body.id, points, self.bones.normal, across], device=device)
+        found = across.numpy()
+        least = found.copy()
+        np.minimum.at(least, mesh.ring.owner, found[mesh.ring.items])
+        return torch.as_tensor(least, device=self.device)
 
     def _bind_segments(self, rest: NDArray[np.float64], mesh: Connectivity, weights: NDArray[np.float64]) -> Any:
         how, n, device = self.settings, len(rest), str(self.device)

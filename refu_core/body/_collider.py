@@ -136,21 +136,21 @@ class Collider:
             "between", kernels.between_kernel, len(PARENTS), [bones.rotation, *known.chain, bones.between, bones.bent]
         )
         record("stations", kernels.mean_kernel, len(known.stations[-1]), [work.skin, *known.stations])
-        inputs = [work, known.held, known.stations[-1], bones, known.seams, how.crease_rounds, how.farthest]
+        inputs = [work, known.held, known.stations[-1], bones, known.seams, how.crease_rounds]
         record("crease", kernels.crease_kernel, len(known.held), inputs)
         record("share", kernels.share_kernel, n, [work, how.smooth_full, how.smooth_step])
-        record("smooth", kernels.smooth_kernel, n, [work, rings, work.here, work.there, how.farthest])
-        record("smooth back", kernels.smooth_kernel, n, [work, rings, work.there, work.here, how.farthest])
+        record("smooth", kernels.smooth_kernel, n, [work, rings, work.here, work.there])
+        record("smooth back", kernels.smooth_kernel, n, [work, rings, work.there, work.here])
         record("caps", kernels.mean_kernel, len(known.caps[-1]), [work.points, *known.caps])
         record("box", parting.box_kernel, n, [work.points, segments.own, segments.low, segments.high])
         record("meet", parting.meet_kernel, len(known.trees), [segments, how.gap, work.meets])
         record("near", parting.near_kernel, n, [work, segments])
         record("touch", parting.touch_kernel, n, [work, segments])
         record("deepen", parting.deepen_kernel, n, [work, segments, rings])
-        record("part", parting.part_kernel, n, [work, segments, bones, rings, how.part_rounds, how.farthest])
+        record("part", parting.part_kernel, n, [work, segments, bones, rings, how.part_rounds])
         for which, moved in (("here", work.here), ("there", work.there)):
             record(f"edge {which}", parting.edge_kernel, n_edges, [work, moved, rings, segments, bones, how.steep])
-            record(f"follow {which}", parting.follow_kernel, n, [work, moved, rings, how.farthest])
+            record(f"follow {which}", parting.follow_kernel, n, [work, moved, rings])
         return commands
 
     @torch.no_grad()

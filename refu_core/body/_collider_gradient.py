@@ -38,7 +38,7 @@ def part_with_gradient(collider: Collider, skin: Tensor, rotation: Tensor) -> Te
         step = _crease_step(collider, skin, p, rotation)
         is_moved = is_moved | (step.detach() != 0).any(1)
         p = p + step
-    p = _within(p, skin, how.farthest)
+    p = _within(p, skin, collider.anatomy.farthest.to(skin))
     p = _smooth(collider, skin, p, is_moved, how.smooth_first)
     points = collider.with_caps(p)
     touched = collider.touched(p)
@@ -57,19 +57,20 @@ def part_with_gradient(collider: Collider, skin: Tensor, rotation: Tensor) -> Te
         is_moved = is_moved | (step.detach() != 0).any(1)
         p = p + step
     is_parted = (p.detach() != start.detach()).any(1)
-    p = torch.where(is_parted[:, None], _within(p, skin, how.farthest), p)
+    p = torch.where(is_parted[:, None], _within(p, skin, collider.anatomy.farthest.to(skin)), p)
     p = _smooth(collider, skin, p, is_moved, how.smooth_last)
     for _ in range(how.edge_rounds):
         step = _edge_step(collider, points, normals, start, p, touched)
         is_raised = (step.detach() != 0).any(1)
-        p = torch.where(is_raised[:, None], _within(p + step, skin, how.farthest), p)
+        p = torch.where(is_raised[:, None], _within(p + step, skin, collider.anatomy.farthest.to(skin)), p)
     return p
 
 
-def _within(p: Tensor, skin: Tensor, farthest: float) -> Tensor:
-    """Points (V, 3) [m], or what is `farthest` [m] from the skin on the way to each of them."""
+def _within(p: Tensor, skin: Tensor, farthest: Tensor) -> Tensor:
+    """Points (V, 3) [m], or what is `farthest` (V,) [m] from the skin on the way to each of them."""
     away = p - skin
     squared = (away * away).sum(1, keepdim=True)
+    farthest = farthest[:, None]
     is_far = squared > farthest**2
     return torch.where(is_far, skin + farthest / torch.where(is_far, squared, 1.0).sqrt() * away, p)
 
@@ -123,7 +124,7 @@ def _smooth(collider: Collider, skin: Tensor, p: Tensor, is_moved: Tensor, sweep
     degree = torch.as_tensor(start).diff().to(p)[:, None]
     for _ in range(sweeps):
         mean = torch.zeros_like(p).index_add(0, owner, p[torch.as_tensor(ring).long()]) / degree
-        p = torch.where(is_moved[:, None], _within(p + share * (mean - p), skin, how.farthest), p)
+        p = torch.where(is_moved[:, None], _within(p + share * (mean - p), skin, collider.anatomy.farthest.to(skin)), p)
     return p
 
 

@@ -67,6 +67,8 @@ class Work:
     here: wp.array[wp.vec3]
     there: wp.array[wp.vec3]
     """What sweeps go to and fro between."""
+    farthest: wp.array[float]
+    """How far skin may be moved [m]."""
     share: wp.array[float]
     """How much of a sweep each vertex of `moved` takes."""
     moved: wp.array[int]
@@ -164,7 +166,6 @@ def crease_kernel(
     bones: Bones,
     seams: Seams,
     rounds: int,
-    farthest: float,
 ) -> None:
     """Brings skin back to its own side of the seams near by, most of all of those that it is far beyond."""
     i = wp.tid()
@@ -193,7 +194,7 @@ def crease_kernel(
         p += step / total
         is_held = 1
     if is_held == 1:
-        p = within(p, work.skin[v], farthest)
+        p = within(p, work.skin[v], work.farthest[v])
         work.here[v] = p
         work.there[v] = p
         work.is_moved[v] = 1
@@ -210,9 +211,7 @@ def share_kernel(work: Work, full: float, step: float) -> None:
 
 
 @wp.kernel
-def smooth_kernel(
-    work: Work, rings: Rings, source: wp.array[wp.vec3], target: wp.array[wp.vec3], farthest: float
-) -> None:
+def smooth_kernel(work: Work, rings: Rings, source: wp.array[wp.vec3], target: wp.array[wp.vec3]) -> None:
     """Levels what was moved."""
     i = wp.tid()
     if i < work.counts[MOVED]:
@@ -221,4 +220,4 @@ def smooth_kernel(
         for k in range(rings.start[v], rings.start[v + 1]):
             total += source[rings.vertex[k]]
         mean = total / float(rings.start[v + 1] - rings.start[v])
-        target[v] = within(source[v] + work.share[v] * (mean - source[v]), work.skin[v], farthest)
+        target[v] = within(source[v] + work.share[v] * (mean - source[v]), work.skin[v], work.farthest[v])

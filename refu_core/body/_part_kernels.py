@@ -185,7 +185,7 @@ def way_out(
 
 
 @wp.kernel
-def part_kernel(work: Work, segments: Segments, bones: Bones, rings: Rings, rounds: int, farthest: float) -> None:
+def part_kernel(work: Work, segments: Segments, bones: Bones, rings: Rings, rounds: int) -> None:
     """Moves each vertex to its own side of the surface between its segment and another one, in Newton's steps."""
     i = wp.tid()
     if i >= work.counts[NEAR]:
@@ -213,7 +213,7 @@ def part_kernel(work: Work, segments: Segments, bones: Bones, rings: Rings, roun
             break
         p += step / total
     if wp.length_sq(p - start) > 0.0:
-        p = within(p, work.skin[v], farthest)
+        p = within(p, work.skin[v], work.farthest[v])
         work.here[v] = p
         work.there[v] = p
         if work.is_moved[v] == 0:
@@ -267,7 +267,7 @@ def edge_kernel(
 
 
 @wp.kernel
-def follow_kernel(work: Work, moved: wp.array[wp.vec3], rings: Rings, farthest: float) -> None:
+def follow_kernel(work: Work, moved: wp.array[wp.vec3], rings: Rings) -> None:
     """Vertices go with their edges, most of all with those that have far to go."""
     i = wp.tid()
     if i >= work.counts[ENDS]:
@@ -281,7 +281,7 @@ def follow_kernel(work: Work, moved: wp.array[wp.vec3], rings: Rings, farthest: 
             step += wp.length_sq(found) * found
             total += wp.length_sq(found)
     if total > 0.0:
-        moved[v] = within(moved[v] + step / total, work.skin[v], farthest)
+        moved[v] = within(moved[v] + step / total, work.skin[v], work.farthest[v])
 
 
 @wp.kernel
@@ -303,6 +303,18 @@ def closest_kernel(
         face[i] = segments.first_face[k] + hit.face
         corners[i] = wp.vec3(hit.u, hit.v, 1.0 - hit.u - hit.v)
         sign[i] = wp.sign(distance_of(segments.trees[k], points[i], hit))
+
+
+@wp.kernel
+def thickness_kernel(
+    body: wp.uint64, points: wp.array[wp.vec3], normal: wp.array[wp.vec3], thickness: wp.array[float]
+) -> None:
+    """How far it is from each vertex to the skin on the other side [m]."""
+    v = wp.tid()
+    thickness[v] = DEEPEST
+    hit = wp.mesh_query_ray(body, points[v] - 1.0e-4 * normal[v], -normal[v], DEEPEST)
+    if hit.result:
+        thickness[v] = hit.t
 
 
 @wp.kernel

@@ -14,6 +14,9 @@ from refu_lab.stress._trial import Measurement, Trial
 
 ROUNDING = 5e-6
 """What float32 may cost a body of a metre or two [m]: fifty times its resolution there."""
+COLLIDER_ROUNDING = 2e-5
+"""The same with the collider [m], whose ways between two surfaces are quotients of short distances. In everyday poses
+alone: where joints are turned as no body's can be, rounding may decide which of two sides is nearer."""
 PIVOTS = 2e-3
 """Share of the largest displacement that pivots which weigh 0.1 % may make: they may point the other way."""
 _DISTANCE_ROUNDING = 2e-6
@@ -25,11 +28,24 @@ _COLLAPSED = 40
 
 
 def against_float64(subject: Subject, trial: Trial) -> Iterator[Measurement]:
-    """Bodies and garments before collision handling, in float32 and in float64; and the whole pipeline for the first.
+    """Bodies and garments before collision handling, in float32 and in float64; and the pipeline for the first frame.
 
     The limit grows with the size of what is computed, and with the angles: float32 holds 1,000 rad to 6e-5. What
     TailorNet leaves out of its mixture in a pipeline, a thousandth of a displacement, is no matter of precision.
     """
+    yield from _compared(subject.on_skin, trial, ROUNDING)
+    out = subject.pipeline(trial.frames[0])
+    yield Measurement(
+        nan=n_not_finite(out.body, *(mesh.raw for mesh in out.values()), *(m.vertices for m in out.values()))
+    )
+
+
+def collider_against_float64(subject: Subject, trial: Trial) -> Iterator[Measurement]:
+    """The same with the collider, and garments on it."""
+    yield from _compared(subject, trial, COLLIDER_ROUNDING)
+
+
+def _compared(subject: Subject, trial: Trial, rounding: float) -> Iterator[Measurement]:
     out = subject.pipeline(trial.frames[0])
     first = [out.body, *(mesh.raw for mesh in out.values())]
     ours, wanted = subject.in_float32(trial.frames), subject.in_float64(trial.frames)
@@ -40,7 +56,7 @@ def against_float64(subject: Subject, trial: Trial) -> Iterator[Measurement]:
     for got, whole, right in zip(ours, first, wanted, strict=True):
         error = np.abs(got - right).max((1, 2))
         error[0] = max(error[0], np.abs(whole - right[0]).max() - left_out)
-        limit = np.maximum(limit, ROUNDING * turn * np.abs(right).max((1, 2), initial=1.0))
+        limit = np.maximum(limit, rounding * turn * np.abs(right).max((1, 2), initial=1.0))
         deviation = np.maximum(deviation, error)
     for i in range(len(trial.frames)):
         yield Measurement(deviation=float(deviation[i]), limit=float(limit[i]), culprit=i)

@@ -47,6 +47,11 @@ class Subject:
         self._weights, self._collider = weights, collider
         self.pipeline = self.load()
 
+    @cached_property
+    def on_skin(self) -> Subject:
+        """The same wardrobe on the skin, without a collider."""
+        return Subject(self.wardrobe, weights=self._weights, collider=False)
+
     def load(self, *garments: str) -> GarmentPipeline:
         """A pipeline that has never seen a frame, of these garments or all."""
         return GarmentPipeline.load(
