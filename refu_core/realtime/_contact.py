@@ -75,7 +75,7 @@ class ContactStage:
         self._press = {}
         if outfit.collider is not None:  # or there is no room
             self._press = {name: Press(one, body, settings=settings) for name, one in garments.items()}
-        self._outfit = outfit
+        self._outfit, self._farthest = outfit, settings.max_displacement
         self._below = {
             name: {
                 inner: Layer(
@@ -116,15 +116,21 @@ class ContactStage:
         name: str,
         vertices: Tensor,
         *,
+        raw: Tensor,
         on_mean: Tensor,
         margin: float,
         scale: float | VertexScale,
         n_layered: Tensor,
     ) -> Resolved:
-        """Vertices (V, 3) [m] off the body, which has the last word."""
+        """Vertices (V, 3) [m] off the body, which has the last word, and within reach of where they were, `raw`."""
         start = self._asked[name](vertices, on_mean=on_mean, reach=margin + _ASKED_FROM)
         assert start.face is not None  # these distances are to faces
         done = self.resolvers[name](vertices, self.sdf, start, margin=margin, scale=scale)
+        vertices = done.vertices
+        if name in self._press:  # what is pressed and then pushed goes two ways
+            away = vertices - raw
+            length = torch.linalg.vector_norm(away, dim=1, keepdim=True)
+            vertices = torch.where(length > self._farthest, raw + self._farthest / length * away, vertices)
         if self.winding is not None:
-            done.numbers[_N_UNRESOLVED] = torch.count_nonzero(self.winding(done.vertices))
-        return Resolved(done.vertices, torch.cat((done.numbers, n_layered)), (start.face < 0).sum())
+            done.numbers[_N_UNRESOLVED] = torch.count_nonzero(self.winding(vertices))
+        return Resolved(vertices, torch.cat((done.numbers, n_layered)), (start.face < 0).sum())

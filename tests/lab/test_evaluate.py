@@ -30,7 +30,7 @@ def frames(n: int = 4) -> list[SmplFrame]:
     made = []
     for k in range(n):
         pose = np.zeros((24, 3), np.float32)
-        pose[1, 0], pose[2, 0], pose[2, 2] = -0.9 + 0.2 * k, 0.1 * k, 0.12
+        pose[1, 0], pose[2, 0], pose[2, 2] = -0.2 + 0.05 * k, 0.1 * k, 0.12
         betas = np.full(10, 0.2 * k, np.float32)
         made.append(SmplFrame(pose, betas, style=np.zeros(4, np.float32), stamp_ns=10**18 + k * 10**9))
     return made
