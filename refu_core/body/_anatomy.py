@@ -177,6 +177,9 @@ class Anatomy:
         segments = parting.Segments()
         segments.trees = wp.array([tree.id for tree in self.trees], dtype=wp.uint64, device=device)
         segments.own = self._ints(solids.of_vertex)
+        members = [np.unique(faces[faces < n]) for faces in solids.faces]
+        segments.member = self._ints(np.concatenate(members))
+        segments.member_of = self._ints(np.repeat(np.arange(n_segments), [len(one) for one in members]))
         segments.low, segments.high = as_warp(work.low, wp.vec3), as_warp(work.high, wp.vec3)
         segments.faces = wp.array(np.concatenate(solids.faces), dtype=wp.vec3i, device=device)
         segments.first_face = self._ints(np.cumsum([0, *map(len, solids.faces)]))

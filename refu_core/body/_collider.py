@@ -142,7 +142,7 @@ class Collider:
         record("smooth", kernels.smooth_kernel, n, [work, rings, work.here, work.there])
         record("smooth back", kernels.smooth_kernel, n, [work, rings, work.there, work.here])
         record("caps", kernels.mean_kernel, len(known.caps[-1]), [work.points, *known.caps])
-        record("box", parting.box_kernel, n, [work.points, segments.own, segments.low, segments.high])
+        record("box", parting.box_kernel, len(segments.member), [work.points, segments])
         record("meet", parting.meet_kernel, len(known.trees), [segments, how.gap, work.meets])
         record("near", parting.near_kernel, n, [work, segments])
         record("touch", parting.touch_kernel, n, [work, segments])

@@ -21,6 +21,9 @@ class Segments:
     trees: wp.array[wp.uint64]
     own: wp.array[int]
     """The segment of each vertex."""
+    member: wp.array[int]
+    member_of: wp.array[int]
+    """Each vertex of each segment's faces, and the segment."""
     low: wp.array[wp.vec3]
     high: wp.array[wp.vec3]
     faces: wp.array[wp.vec3i]
@@ -32,10 +35,13 @@ class Segments:
 
 
 @wp.kernel
-def box_kernel(points: wp.array[wp.vec3], own: wp.array[int], low: wp.array[wp.vec3], high: wp.array[wp.vec3]) -> None:
-    v = wp.tid()
-    wp.atomic_min(low, own[v], points[v])
-    wp.atomic_max(high, own[v], points[v])
+def box_kernel(points: wp.array[wp.vec3], segments: Segments) -> None:
+    """The boxes of the segments, the rims of those next to them included."""
+    i = wp.tid()
+    k = segments.member_of[i]
+    p = points[segments.member[i]]
+    wp.atomic_min(segments.low, k, p)
+    wp.atomic_max(segments.high, k, p)
 
 
 @wp.func
@@ -137,7 +143,7 @@ def deepen_kernel(work: Work, segments: Segments, rings: Rings) -> None:
         return
     work.counts[FOUND] = 1
     for k in range(segments.trees.shape[0]):
-        if (around >> k) & 1 == 1:
+        if (around >> k) & 1 == 1 and segments.gap[v, k] > 0.0:
             if wp.mesh_query_ray_count_intersections(segments.trees[k], work.points[v], _RAY) % 2 == 1:
                 work.touched[v] = work.touched[v] | (1 << k)
             else:

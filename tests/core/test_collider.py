@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from refu_core import load_body
-from refu_core.body import Collider, SmplBody
+from refu_core.body import Collider, RigidTransforms, SmplBody, rotvec_to_rotmat
 from refu_core.errors import MeshError
 from refu_core.metrics import SelfContactDetector
 
@@ -129,6 +129,15 @@ def test_its_derivative_is_that_of_finite_differences(name: str, body: SmplBody,
     with torch.no_grad():
         slope = (seen(pose + step * way) - seen(pose - step * way)) / (2 * step)
     torch.testing.assert_close((gradient * way).sum(), slope, rtol=2e-2, atol=1e-2)
+
+
+@pytest.mark.parametrize("name", POSES)
+def test_it_turns_with_the_body(name: str, body: SmplBody, collider: Collider) -> None:
+    skin = body(pose=posed(body, POSES[name]))
+    turn = rotvec_to_rotmat(torch.tensor([0.7, -1.9, 0.4]))
+    turned = RigidTransforms(turn @ skin.transforms.rotation, skin.transforms.translation @ turn.T)
+    apart, apart_turned = collider(skin.vertices, skin.transforms), collider(skin.vertices @ turn.T, turned)
+    torch.testing.assert_close(apart_turned @ turn, apart, rtol=0, atol=1e-5)
 
 
 def test_a_larger_gap_pushes_farther(body: SmplBody) -> None:

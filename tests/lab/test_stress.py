@@ -141,7 +141,8 @@ def test_checks_notice(name: str, spoil: Spoil, subject: Subject, monkeypatch: p
     trial = trial_of(check)
     sound = check.run(subject, trial)
     assert not sound.is_failure, sound
-    monkeypatch.setattr(subject, "pipeline", Spoiled(subject.pipeline, spoil))
+    for one in (subject, subject.on_skin):
+        monkeypatch.setattr(one, "pipeline", Spoiled(one.pipeline, spoil))
     assert check.run(subject, trial).is_failure
 
 
