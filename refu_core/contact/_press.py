@@ -41,7 +41,11 @@ class Press:
         faces = body.faces.cpu().numpy()
         self._body = torch.zeros_like(body.v_template).copy_(body.v_template)
         mesh = Connectivity.of(garment.faces.cpu(), n)
-        ring, self._ends = mesh.ring, np.ascontiguousarray(mesh.edges.T)
+        ring = mesh.ring
+        # Rows of one length: those of fewer neighbours name the vertex itself, too.
+        sizes = np.diff(ring.start)
+        self._around = np.repeat(np.arange(n)[:, None], sizes.max(), axis=1)
+        self._around[ring.owner, np.arange(len(ring.items)) - ring.start[ring.owner]] = ring.items
         self._rows = torch.arange(n, dtype=torch.int32, device=self.device)
         rings = [wp.array(one.astype(np.int32), dtype=wp.int32, device=device) for one in (ring.start, ring.items)]
         self._meshes: list[Any] = []
@@ -103,11 +107,12 @@ class Press:
 
     def _list_reached(self) -> None:
         """What is pressed, and as far as sweeps reach; a GPU isn't waited for to know, and goes through all."""
-        first, second = self._ends
         reached = self._push.any(dim=1).numpy()
+        front = np.flatnonzero(reached)
         for _ in range(2 * self._settings.press_pairs):
-            beside = reached[first] | reached[second]
-            reached[first[beside]] = reached[second[beside]] = True
+            around = self._around[front].ravel()
+            front = np.unique(around[~reached[around]])
+            reached[front] = True
         rows = np.flatnonzero(reached)
         self._rows[: len(rows)] = torch.from_numpy(rows)
         for sweep in self._sweeps:

@@ -132,15 +132,21 @@ def test_motion_files_replay(motions: list[Path], tmp_path: Path) -> None:
 @pytest.mark.parametrize("backbone", ["skinned", "tailornet"])
 @pytest.mark.parametrize("garment", BUILTIN_GARMENTS)
 def test_nothing_is_inside_the_body(garment: str, backbone: str, motions: list[Path]) -> None:
-    """No frame and no vertex left out; judged by libigl's winding number, on frames of every motion and shipped bag."""
+    """Judged by libigl's winding number, on frames of every motion and shipped bag: none within the promised range, and
+    beyond it as many as the frame itself says."""
     pipeline = GarmentPipeline.load([garment], sdf="accurate", backbone=backbone)
     faces = pipeline.body.faces.numpy().astype(np.int64)
+    n_promised = 0
     for frame in sampled_frames(motions):
         out = pipeline(frame)
         mesh = out[garment]
         kind = igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
         distance = igl.signed_distance(mesh.local.astype(np.float64), out.body.astype(np.float64), faces, kind)[0]
-        assert distance.min() > 0, f"{(distance <= 0).sum()} vertices inside, {-1e3 * distance.min():.2f} mm deep"
+        n_inside = int((distance <= 0).sum())
+        n_promised += out.stats.within_promise
+        assert n_inside == out.stats.garments[garment].n_unresolved
+        assert n_inside <= (0 if out.stats.within_promise else 1)
+    assert n_promised > 10
 
 
 def test_figures_are_against_the_collider_and_beside_it_against_the_skin(tmp_path: Path) -> None:
