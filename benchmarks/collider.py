@@ -22,17 +22,11 @@ from refu_core import load_body, load_garment
 from refu_core._warp import as_warp
 from refu_core.body import Collider, ColliderSettings, SmplBody
 from refu_core.metrics import SelfContactDetector
+from refu_lab.benchmark._sdfs import plain_kernel
 
 REACH = 0.02
 """Skin at most this far from a built-in garment at rest counts as within its reach [m]."""
 GARMENTS = ("tshirt-male", "short-pant-male", "shirt-male")
-
-
-@wp.kernel(enable_backward=False)
-def plain_query_kernel(body: wp.uint64, points: wp.array[wp.vec3], distance: wp.array[float]) -> None:
-    i = wp.tid()
-    hit = wp.mesh_query_point_sign_normal(body, points[i], 1.0e6)
-    distance[i] = hit.sign * wp.length(points[i] - wp.mesh_eval_position(body, hit.face, hit.u, hit.v))
 
 
 class Bench:
@@ -80,7 +74,8 @@ class Bench:
     def cost(self) -> dict[str, float]:
         """The collider's time by that of the plain query of a T-shirt (BVH refitted, every vertex asked), medians."""
         collider, garment = Collider(self.body), load_garment("tshirt-male")
-        points, distance = torch.zeros(garment.n_vertices, 3), torch.zeros(garment.n_vertices)
+        distance = torch.zeros(garment.n_vertices)
+        points, gradient = (torch.zeros(garment.n_vertices, 3) for _ in range(2))
         posed = torch.zeros_like(self.body.v_template).copy_(self.body.v_template)
         tree = wp.Mesh(as_warp(posed, wp.vec3), as_warp(self.body.faces.int().view(-1), wp.int32))
         took: dict[str, list[float]] = {"plain": [], "motion": [], "rest": []}
@@ -91,8 +86,8 @@ class Bench:
             points.copy_(garment.pose(garment.v_template[None], skin.transforms)[0])
             start = time.process_time()
             tree.refit()
-            inputs = [tree.id, as_warp(points, wp.vec3), as_warp(distance, wp.float32)]
-            wp.launch(plain_query_kernel, len(points), inputs, device="cpu")
+            inputs = [tree.id, as_warp(points, wp.vec3), as_warp(distance, wp.float32), as_warp(gradient, wp.vec3)]
+            wp.launch(plain_kernel, len(points), inputs, device="cpu")
             took["plain"].append(time.process_time() - start)
             for name, one in (("motion", skin), ("rest", rest)):
                 start = time.process_time()

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
 from refu_core.errors import MeshError
+
+_Float = TypeVar("_Float", np.float32, np.float64)
 
 
 class Adjacency(NamedTuple):
@@ -151,6 +153,15 @@ def check_faces(faces: Any, *, n_vertices: int | None = None) -> NDArray[np.int3
         msg = f"every face needs three different vertices; {repeated.sum()} of {len(array)} repeat one"
         raise MeshError(msg)
     return np.ascontiguousarray(array, dtype=np.int32)
+
+
+def vertex_normals(vertices: NDArray[_Float], faces: NDArray[np.int32]) -> NDArray[_Float]:
+    """Unit normals at the vertices (V, 3) of faces (F, 3): the mean of the faces around each, by area; shape (V, 3)."""
+    a, b, c = vertices[faces].transpose(1, 0, 2)
+    normals = np.zeros_like(vertices)
+    np.add.at(normals, faces, np.cross(b - a, c - a)[:, None])
+    unit: NDArray[_Float] = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
+    return unit
 
 
 def _grouped(owner: NDArray[Any], items: NDArray[Any], n: int) -> Adjacency:

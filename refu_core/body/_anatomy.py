@@ -17,7 +17,7 @@ from refu_core.body._creases import LEVELS, find_creases
 from refu_core.body._kinematics import PARENTS
 from refu_core.body._model import SmplBody
 from refu_core.body._segments import SOFTNESS, cut
-from refu_core.mesh import Connectivity
+from refu_core.mesh import Connectivity, vertex_normals
 
 DEFAULT_GAP = 0.012
 """Room between two parts of a body [m]: for two layers of cloth, each 4 mm off the skin, and some to spare."""
@@ -243,11 +243,7 @@ class Tensors:
 
 def _smooth_normals(vertices: NDArray[np.float64], mesh: Connectivity) -> NDArray[np.float64]:
     """Unit normals at the vertices (V, 3) [m], levelled over two rings."""
-    a, b, c = vertices[mesh.faces].transpose(1, 0, 2)
-    normals = np.zeros_like(vertices)
-    np.add.at(normals, mesh.faces, np.cross(b - a, c - a)[:, None])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
-    ring = mesh.ring
+    normals, ring = vertex_normals(vertices, mesh.faces), mesh.ring
     for _ in range(2):
         means = np.zeros_like(normals)
         np.add.at(means, ring.owner, normals[ring.items])

@@ -34,8 +34,9 @@ def part_with_gradient(collider: Collider, skin: Tensor, rotation: Tensor) -> Te
     how = collider.settings
     p = skin
     is_moved = torch.zeros(len(skin), dtype=torch.bool, device=skin.device)
+    between, bent = _between(rotation)
     for _ in range(how.crease_rounds):
-        step = _crease_step(collider, skin, p, rotation)
+        step = _crease_step(collider, skin, p, between, bent)
         is_moved = is_moved | (step.detach() != 0).any(1)
         p = p + step
     p = _within(p, skin, collider.anatomy.farthest.to(skin))
@@ -96,8 +97,7 @@ def _between(rotation: Tensor) -> tuple[Tensor, Tensor]:
     return (above[:, None] @ matrix).flatten(0, 1), bent.repeat_interleave(len(LEVELS))
 
 
-def _crease_step(collider: Collider, skin: Tensor, p: Tensor, rotation: Tensor) -> Tensor:
-    between, bent = _between(rotation)
+def _crease_step(collider: Collider, skin: Tensor, p: Tensor, between: Tensor, bent: Tensor) -> Tensor:
     seams = collider.anatomy.creases
     n_stations = len(seams.station_start) - 1
     of_station = torch.repeat_interleave(torch.arange(n_stations), torch.as_tensor(seams.station_start).long().diff())

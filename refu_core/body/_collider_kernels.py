@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING
 import warp as wp
 
 from refu_core import _warp  # noqa: F401  (quiets Warp before it starts)
-from refu_core.body._creases import LEVELS
+from refu_core.body._creases import LEVELS, N_STATIONS
 
 wp.set_module_options({"enable_backward": False})
 
-N_STATIONS = 6
 N_LEVELS = len(LEVELS)
 STRAIGHT = wp.constant(math.cos(0.05))
 """Cosine of half the angle up to which a joint folds no skin: 0.1 rad."""

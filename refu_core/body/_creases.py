@@ -25,7 +25,7 @@ _ASIDE = 0.03
 _AHEAD = 0.2
 """Skin lower over a seam than this share of its distance lies along the seam, which doesn't part it from anything:
 held by it, single vertices moved by up to 3 mm where nothing overlaps."""
-_N_STATIONS = 6
+N_STATIONS = 6
 """Stations that a vertex sees."""
 
 
@@ -92,8 +92,8 @@ def find_creases(
         along = np.asarray(cKDTree(seam).query(rest, distance_upper_bound=reach)[0])
         vertex = np.flatnonzero(np.isfinite(along))
         distance = np.linalg.norm(rest[vertex][:, None] - places[None], axis=2)
-        chosen = np.argsort(distance, axis=1, kind="stable")[:, :_N_STATIONS]
-        chosen = np.pad(chosen, ((0, 0), (0, _N_STATIONS - chosen.shape[1])), mode="edge")
+        chosen = np.argsort(distance, axis=1, kind="stable")[:, :N_STATIONS]
+        chosen = np.pad(chosen, ((0, 0), (0, N_STATIONS - chosen.shape[1])), mode="edge")
         weight = _falloff(np.take_along_axis(distance, chosen, axis=1), _WIDTH)
         normal = _unit(np.einsum("rk,rkc->rc", weight, normals[chosen]))
         normal *= np.where(moved[vertex] > level, 1.0, -1.0)[:, None]

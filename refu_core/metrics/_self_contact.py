@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from refu_core._warp import as_warp
 from refu_core.errors import MeshError
-from refu_core.mesh import Connectivity
+from refu_core.mesh import Connectivity, vertex_normals
 from refu_core.metrics._intersect import EdgeGraph, as_vertices, crossings, pierced_edges
 from refu_core.metrics._self_contact_kernels import self_contact_kernel
 from refu_core.sdf import ExactSdf
@@ -119,7 +119,7 @@ class SelfContactDetector:
                 self._edges_at(_pinched(self._faces, found.pairs)),
             ]
         )
-        above = vertices + _OFF_SURFACE * _vertex_normals(vertices, self._faces)
+        above = vertices + _OFF_SURFACE * vertex_normals(vertices, self._faces)
         buried = self._graph.inside(
             pierced, lambda rows: (self._body.closest(torch.from_numpy(above[rows])).sign < 0).numpy()
         )
@@ -141,11 +141,3 @@ def _pinched(faces: NDArray[np.int32], pairs: NDArray[np.int32]) -> NDArray[np.i
     them the skin goes on into both layers without piercing anything."""
     first, second = faces[pairs[:, 0]], faces[pairs[:, 1]]
     return np.unique(first[(first[:, :, None] == second[:, None, :]).any(axis=2)])
-
-
-def _vertex_normals(vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> NDArray[np.float32]:
-    a, b, c = vertices[faces].transpose(1, 0, 2)
-    normals = np.zeros_like(vertices)
-    np.add.at(normals, faces, np.cross(b - a, c - a)[:, None])
-    unit: NDArray[np.float32] = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
-    return unit
