@@ -21,10 +21,10 @@ def press_kernel(
     points: wp.array[wp.vec3],
     clearance: float,
     # output
-    push: wp.array[wp.vec3],
+    room: wp.array[float],
     count: wp.array[int],
 ) -> None:
-    """Where a limb comes between a vertex and the skin that it lies on, or nearly, the vertex stays on this side."""
+    """How far from the skin that it lies on a vertex may be: where a limb comes in between, on this side of it."""
     i = limb.foreign[wp.tid()]
     way = points[i] - skin[i]
     height = wp.length(way)
@@ -34,34 +34,43 @@ def press_kernel(
     hit = wp.mesh_query_ray(limb.mesh, skin[i], up, height + clearance)
     if not hit.result or wp.dot(hit.normal, up) >= 0.0:
         return  # nothing there, or the skin itself is within the limb
-    room = wp.max(hit.t - clearance, 0.5 * hit.t)
-    down = height - room
-    if down > wp.length(push[i]):
-        push[i] = -down * up
+    left = wp.max(hit.t - clearance, 0.5 * hit.t)
+    if left < height:
         wp.atomic_add(count, PRESSED, 1)
+        room[i] = wp.min(room[i], left)
 
 
 @wp.kernel(enable_backward=False)
-def spread_press_kernel(
+def spread_room_kernel(
     rows: wp.array[int],
     ring_start: wp.array[int],
     ring: wp.array[int],
-    push: wp.array[wp.vec3],
-    step: float,
-    field: wp.array[wp.vec3],
+    points: wp.array[wp.vec3],
+    slope: float,
+    room: wp.array[float],
     # output
-    smoother: wp.array[wp.vec3],
+    spread: wp.array[float],
 ) -> None:
-    """A step towards the mean of the neighbours, but no less than a vertex is pressed."""
+    """A vertex has no more room than a neighbour of it, and what `slope` gives for the way from there."""
     i = rows[wp.tid()]
-    first = ring_start[i]
-    last = ring_start[i + 1]
-    mean = wp.vec3()
-    for k in range(first, last):
-        mean += field[ring[k]]
-    here = field[i] + step * (mean / float(wp.max(last - first, 1)) - field[i])
-    least = wp.length(push[i])
-    if least > 0.0:
-        heading = push[i] / least
-        here += wp.max(least - wp.dot(here, heading), 0.0) * heading
-    smoother[i] = here
+    least = room[i]
+    for k in range(ring_start[i], ring_start[i + 1]):
+        j = ring[k]
+        least = wp.min(least, room[j] + slope * wp.length(points[i] - points[j]))
+    spread[i] = least
+
+
+@wp.kernel(enable_backward=False)
+def lower_kernel(
+    rows: wp.array[int],
+    skin: wp.array[wp.vec3],
+    room: wp.array[float],
+    # output
+    points: wp.array[wp.vec3],
+) -> None:
+    """Draws vertices back to the room that they have, towards the skin."""
+    i = rows[wp.tid()]
+    way = points[i] - skin[i]
+    height = wp.length(way)
+    if height > room[i]:
+        points[i] = skin[i] + (room[i] / height) * way

@@ -33,8 +33,13 @@ class ContactSettings:
     """A vertex lies on every limb that has more than this of its skinning weight: at the armpit, on trunk and arm."""
     press_room: float = 0.006
     """How far before a limb cloth stays, on the side of the skin it lies on; half way where there is less room [m]."""
-    press_pairs: int = 4
-    """Pairs of sweeps by which neighbours follow, as `blend_pairs`."""
+    press_reach: int = 2
+    """How far around a pressed vertex others have no more room than it has [edges]. Fingers are thinner than a
+    garment's edges are long: cloth between two of them would be left behind."""
+    press_slope: float = 0.7
+    """How fast cloth rises again beyond that, per length along its edges: a dent, not a tear."""
+    press_sweeps: int = 8
+    """How far a dent reaches [edges]. Even: what is swept ends where it began."""
 
     # Neighbours
     blend_reach: int = 2

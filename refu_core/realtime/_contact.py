@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from refu_core.contact import DEFAULT_CONTACT, ContactSettings, Layer, Press, Resolver
+from refu_core.contact import DEFAULT_CONTACT, ContactSettings, Layer, Limbs, Press, Resolver
 from refu_core.garments import inner_first
 from refu_core.modes import SdfMode
 from refu_core.realtime._wearer import Outfit
@@ -72,9 +72,10 @@ class ContactStage:
         self.resolvers = {
             name: Resolver(one.faces, one.n_vertices, settings=settings) for name, one in garments.items()
         }
-        self._press = {}
+        self._limbs, self._press = None, {}
         if outfit.collider is not None:  # or there is no room
-            self._press = {name: Press(one, body, settings=settings) for name, one in garments.items()}
+            self._limbs = limbs = Limbs(body)
+            self._press = {name: Press(one, limbs, settings=settings) for name, one in garments.items()}
         self._outfit, self._farthest = outfit, settings.max_displacement
         self._below = {
             name: {
@@ -96,6 +97,8 @@ class ContactStage:
         self.sdf.update(body)
         if self.winding is not None:
             self.winding.update(body)
+        if self._limbs is not None:
+            self._limbs.update(body)
 
     def lift(self, name: str, vertices: Tensor, worn: Mapping[str, Worn]) -> tuple[Tensor, Tensor]:
         """Vertices (V, 3) [m] on their own side of other limbs and off the `worn` inner garments.
@@ -104,7 +107,7 @@ class ContactStage:
         """
         if name in self._press:
             lies_on = self._outfit.below[name](self._body[None])[0]
-            vertices = self._press[name](vertices, lies_on, self._body)
+            vertices = self._press[name](vertices, lies_on)
         n_layered = torch.zeros(1, dtype=torch.int32, device=vertices.device)
         for inner, layer in self._below[name].items():
             vertices, n_low = layer(vertices, worn[inner].vertices)
