@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from refu_core.contact import DEFAULT_CONTACT, ContactSettings, Layer, Limbs, Press, Resolver
+from refu_core.contact import DEFAULT_CONTACT, ContactSettings, Layer, Limbs, Press, Resolution, Resolver
 from refu_core.garments import inner_first
 from refu_core.modes import SdfMode
 from refu_core.realtime._wearer import Outfit
@@ -17,6 +17,9 @@ from refu_core.sdf import ApproxSdf, MeshSdf, Winding, exact_sdf
 
 _ASKED_FROM = 2e-3
 """Vertices are asked exactly up to this far beyond the margin [m]."""
+_KEPT = 0.5
+"""Share of the margin that is left once a garment was brought off those below it again: what pushes a vertex off the
+body may push it into a layer, and the other way round. Both have this much to give."""
 
 
 class Worn(NamedTuple):
@@ -108,16 +111,13 @@ class ContactStage:
         if name in self._press:
             lies_on = self._outfit.below[name](self._body[None])[0]
             vertices = self._press[name](vertices, lies_on)
-        n_layered = torch.zeros(1, dtype=torch.int32, device=vertices.device)
-        for inner, layer in self._below[name].items():
-            vertices, n_low = layer(vertices, worn[inner].vertices)
-            n_layered = n_layered + n_low
-        return vertices, n_layered
+        return self._off_layers(name, vertices, worn)
 
     def resolve(
         self,
         name: str,
         vertices: Tensor,
+        worn: Mapping[str, Worn],
         *,
         raw: Tensor,
         on_mean: Tensor,
@@ -126,14 +126,32 @@ class ContactStage:
         n_layered: Tensor,
     ) -> Resolved:
         """Vertices (V, 3) [m] off the body, which has the last word, and within reach of where they were, `raw`."""
-        start = self._asked[name](vertices, on_mean=on_mean, reach=margin + _ASKED_FROM)
-        assert start.face is not None  # these distances are to faces
-        done = self.resolvers[name](vertices, self.sdf, start, margin=margin, scale=scale)
-        vertices = done.vertices
-        if name in self._press:  # what is pressed and then pushed goes two ways
+        done, n_clipped = self._off_body(name, vertices, on_mean=on_mean, margin=margin, scale=scale)
+        vertices, numbers = done.vertices, done.numbers
+        if self._below[name]:
+            vertices, _ = self._off_layers(name, vertices, worn)
+            again, _ = self._off_body(name, vertices, on_mean=on_mean, margin=_KEPT * margin, scale=1.0)
+            vertices, numbers[_N_UNRESOLVED] = again.vertices, again.numbers[_N_UNRESOLVED]
+        if name in self._press or self._below[name]:  # what goes several ways
             away = vertices - raw
             length = torch.linalg.vector_norm(away, dim=1, keepdim=True)
             vertices = torch.where(length > self._farthest, raw + self._farthest / length * away, vertices)
         if self.winding is not None:
-            done.numbers[_N_UNRESOLVED] = torch.count_nonzero(self.winding(vertices))
-        return Resolved(vertices, torch.cat((done.numbers, n_layered)), (start.face < 0).sum())
+            numbers[_N_UNRESOLVED] = torch.count_nonzero(self.winding(vertices))
+        return Resolved(vertices, torch.cat((numbers, n_layered)), n_clipped)
+
+    def _off_layers(self, name: str, vertices: Tensor, worn: Mapping[str, Worn]) -> tuple[Tensor, Tensor]:
+        """Off the inner garments, and how many were too near one of those, shape (1,)."""
+        n_layered = torch.zeros(1, dtype=torch.int32, device=vertices.device)
+        for inner, layer in self._below[name].items():
+            vertices, n_low = layer(vertices, worn[inner].vertices)
+            n_layered = n_layered + n_low
+        return vertices, n_layered
+
+    def _off_body(
+        self, name: str, vertices: Tensor, *, on_mean: Tensor, margin: float, scale: float | VertexScale
+    ) -> tuple[Resolution, Tensor]:
+        """Off the body, and how many weren't asked, since they are far off, shape ()."""
+        start = self._asked[name](vertices, on_mean=on_mean, reach=margin + _ASKED_FROM)
+        assert start.face is not None  # these distances are to faces
+        return self.resolvers[name](vertices, self.sdf, start, margin=margin, scale=scale), (start.face < 0).sum()

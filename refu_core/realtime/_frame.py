@@ -109,6 +109,7 @@ class FrameStep:
                     vertices, numbers, n_clipped = self.contact.resolve(
                         name,
                         vertices,
+                        garments,
                         raw=raw,
                         on_mean=drape.on_mean[person],
                         margin=margin_of[name],

@@ -120,7 +120,7 @@ def test_cloth_beyond_a_rim_is_felt_less_and_less() -> None:
     assert moved[-1] == 0
     smooth, _ = Layer(above_faces, above, below_faces, below)(above - torch.tensor([0.0, 0.006, 0.0]), below)
     step = smooth[:, 1].view(16, 16).diff(dim=0).abs().max()
-    assert step < 0.004, "over the rim in a curve and not in a step"
+    assert step < 0.45 * (0.006 + LAYER_GAP), "over the rim in a curve and not in a step"
 
 
 @pytest.mark.parametrize("is_flipped", [False, True])
