@@ -1,0 +1,391 @@
+"""A person's keypoints, frame by frame, to a pose of SMPL: a Kalman filter on the pose.
+
+The state is a pose (pelvis, the turns of the joints, betas) and the rates of its parts, each with its variance. A frame
+of keypoints updates it by Gauss-Newton steps towards the most likely pose: of the keypoints as far as they are seen and
+believed, of the pose that was predicted, and of what joints do at rest. So bones keep their lengths, a joint that isn't
+seen goes on for a while and then comes to rest, and how much a keypoint moves the pose follows from how sure both are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
+
+from refu_core.errors import FrameError
+from refu_core.frames import N_BETAS, N_JOINTS, SmplFrame
+from refu_core.keypoints._anatomy import resting
+from refu_core.keypoints._guess import first_pose
+from refu_core.keypoints._pose import Pose, Skeleton, exp_so3, log_so3, skew
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+    Array = NDArray[np.float64]
+
+_N = 3 + 3 * N_JOINTS + N_BETAS
+_TURNS, _BETAS = slice(3, 3 + 3 * N_JOINTS), slice(3 + 3 * N_JOINTS, _N)
+_MEAN, _SPREAD = resting()
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackerSettings:
+    """The tuned numbers; `docs/guide/inputs.md` has what half and twice of the first two do."""
+
+    smoothing: float = 1.0
+    """How much smoother than the most likely motion: accelerations are believed this many times smaller."""
+    noise: float = 0.01
+    """Standard deviation of a keypoint along each axis that a track begins with [m]; the filter follows what it sees."""
+    least_noise: float = 0.004
+    """[m]"""
+    most_noise: float = 0.06
+    """[m]"""
+    offset_noise: float = 0.01
+    """What is added for keypoints beside a joint, whose places differ between people and trackers [m]."""
+    push: float = 1.5
+    """Power of the pelvis's acceleration [m²/s³]: about 5 m/s² for 60 ms."""
+    twist: float = 40.0
+    """Power of the joints' angular acceleration [rad²/s³]: about 25 rad/s² for 60 ms."""
+    growth: float = 1e-3
+    """Power of the betas' drift [1/s]: 0.03 in a second, for the first guess may be wrong."""
+    rest_after: float = 0.25
+    """A joint that isn't seen comes to rest in about this time [s]."""
+    coast: float = 0.25
+    """A rate of what isn't seen dies away in this time [s]."""
+    outlier: float = 3.0
+    """A keypoint so many deviations off has half the weight, and soon none."""
+    hold: float = 0.5
+    """A person of whom nothing is seen for so long isn't there [s]."""
+    doubt: float = 1.0
+    """Left and right, or a pose that doesn't fit, are believed after so long of it [s]."""
+    jump: float = 0.75
+    """Keypoints that are so far from the prediction are of somebody else [m]."""
+    beta_step: float = 0.1
+    """Betas that are sent change by this at least: each change costs the pipeline a few frames' time."""
+    most_beta: float = 3.0
+    """Betas stay within this."""
+    steps: int = 2
+    """Gauss-Newton steps a frame; the third moves no joint by a tenth of a millimetre."""
+
+
+DEFAULTS = TrackerSettings()
+
+
+class _Seen(NamedTuple):
+    """A frame of keypoints, cleaned."""
+
+    points: Array
+    """[m], shape (K, 3); zeros where nothing is seen."""
+    weights: Array
+    """Confidence from 0 to 1, shape (K,)."""
+
+
+class KeypointTracker:
+    """One person. Not thread-safe.
+
+    Args:
+        skeleton: the keypoints' layout on the body that is dressed.
+        betas: the person's shape (10,) where it is known; estimated from the lengths of bones if not given.
+        settings: the tuned numbers.
+    """
+
+    def __init__(
+        self, skeleton: Skeleton, *, betas: ArrayLike | None = None, settings: TrackerSettings = DEFAULTS
+    ) -> None:
+        self.skeleton = skeleton
+        self._settings = settings
+        self._known = None if betas is None else np.asarray(betas, np.float64)
+        self._free = np.ones(_N, bool)
+        carried = skeleton.jacobian(skeleton.posed(self._neutral())).any(axis=0)
+        self._free[_TURNS] = np.repeat(carried[_TURNS].reshape(N_JOINTS, 3).any(axis=1), 3)
+        self._free[_BETAS] = carried[_BETAS] & (self._known is None)
+        self._offset = settings.offset_noise * skeleton.layout.offsets.any(axis=1)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets the person."""
+        self._pose: Pose | None = None
+        self._sent_betas: Array | None = None
+        self._stamp = self._seen_at = 0
+        self._noise = self._settings.noise
+        self._swapped_for = self._unfit_for = 0.0
+
+    def _neutral(self) -> Pose:
+        betas = np.zeros(N_BETAS) if self._known is None else self._known
+        return Pose(np.zeros(3), exp_so3(np.where(_SPREAD < 10, _MEAN, 0.0)), betas)
+
+    # A frame --------------------------------------------------------------------------------------
+
+    def update(self, points: ArrayLike, stamp_ns: int, *, confidence: ArrayLike | None = None) -> SmplFrame | None:
+        """The pose after a frame of keypoints, None while there is no person to be seen.
+
+        Args:
+            points: [m], shape (K, 3); a keypoint that isn't seen is NaN, or has no confidence.
+            stamp_ns: when they were seen [ns]. What is older than the newest changes nothing; after a second without
+                any, or of a clock that was set back by more, the track begins anew.
+            confidence: from 0 to 1, shape (K,); NaN and negative numbers are none. Whatever reaches above 1 counts to
+                100.
+
+        Raises:
+            FrameError: another number of keypoints.
+        """
+        seen = self._cleaned(points, confidence)
+        dt = 1e-9 * (stamp_ns - self._stamp)
+        if self._pose is not None and not -1.0 < dt <= 1.0:
+            self.reset()
+        if self._pose is None:
+            return self._begin(seen, stamp_ns)
+        if dt <= 0:
+            return self.at(self._stamp)
+        self._predict(dt)
+        self._stamp = stamp_ns
+        if (seen.weights > 0).any():
+            seen = self._sided(seen, dt)
+            if self._is_somebody_else(seen):
+                self.reset()
+                return self._begin(seen, stamp_ns)
+            self._correct(seen, dt)
+            if self._unfit_for > self._settings.doubt:
+                self._begin_again(seen)
+        if 1e-9 * (stamp_ns - self._seen_at) > self._settings.hold:
+            self.reset()
+        return self.at(stamp_ns)
+
+    def at(self, stamp_ns: int) -> SmplFrame | None:
+        """The pose at another time, before the next keypoints: rates go on, and die away.
+
+        None where nobody was seen for `hold`.
+        """
+        if self._pose is None or 1e-9 * (stamp_ns - self._seen_at) > self._settings.hold:
+            return None
+        coast = self._settings.coast
+        ahead = coast * (1 - np.exp(-max(0.0, 1e-9 * (stamp_ns - self._stamp)) / coast))
+        pose = self._pose.moved(ahead * self._rate)
+        betas = self._steady_betas(pose.betas)
+        transl = pose.pelvis - self.skeleton.proportions.of(betas)[0]
+        return SmplFrame(log_so3(pose.turns), betas=betas, transl=transl, stamp_ns=stamp_ns)
+
+    def _steady_betas(self, betas: Array) -> Array:
+        if self._sent_betas is None or np.abs(betas - self._sent_betas).max() > self._settings.beta_step:
+            self._sent_betas = betas.copy()
+        return self._sent_betas
+
+    def _cleaned(self, points: ArrayLike, confidence: ArrayLike | None) -> _Seen:
+        n = len(self.skeleton.layout)
+        given = np.asarray(points, np.float64)
+        weights = np.ones(n) if confidence is None else np.asarray(confidence, np.float64).copy()
+        if given.shape != (n, 3) or weights.shape != (n,):
+            msg = f"wanted {n} keypoints of {self.skeleton.layout.name}, got {given.shape} and {weights.shape}"
+            raise FrameError(msg)
+        weights[~(weights > 0)] = 0.0
+        top = weights.max(initial=0.0)
+        weights = np.minimum(weights if top <= 1 else weights / 100, 1.0)
+        here = np.isfinite(given).all(axis=1) & (np.abs(given) < 1e6).all(axis=1)
+        weights[~here] = 0.0
+        return _Seen(np.where(weights[:, None] > 0, given, 0.0), weights)
+
+    # Beginnings -----------------------------------------------------------------------------------
+
+    def _begin(self, seen: _Seen, stamp_ns: int) -> SmplFrame | None:
+        guess = self._guessed(seen)
+        if guess is None:
+            return None
+        self._take(*guess)
+        self._stamp = self._seen_at = stamp_ns
+        return self.at(stamp_ns)
+
+    def _guessed(self, seen: _Seen) -> tuple[Pose, Array, float] | None:
+        """The pose, its variances, and how badly it fits [m], from one frame alone, left and right as it fits best."""
+        found = []
+        other = self.skeleton.layout.mirrored
+        for sides in (seen, _Seen(seen.points[other], seen.weights[other])):
+            pose = first_pose(self.skeleton, sides.points, sides.weights > 0, self._neutral())
+            if pose is not None:
+                solved, variance = self._solved(pose, sides, prior=None, rest=1.0, steps=8)
+                found.append((solved, variance, self._misfit(solved, sides)))
+        if not found:
+            return None
+        # What the tracker says is believed unless the mirror image fits much better: most people are symmetric.
+        return found[1] if len(found) == 2 and found[1][2] < 0.5 * found[0][2] else found[0]
+
+    def _take(self, pose: Pose, variance: Array, _: float) -> None:
+        self._pose = pose
+        self._rate = np.zeros(_N)
+        self._variance = variance
+        self._mixed = np.zeros(_N)
+        self._rate_variance = np.concatenate([np.full(3, 1.0), np.full(3 * N_JOINTS, 4.0), np.zeros(N_BETAS)])
+        self._swapped_for = self._unfit_for = 0.0
+
+    def _begin_again(self, seen: _Seen) -> None:
+        """Where the pose hasn't fitted for long: from this frame alone, if that fits better."""
+        assert self._pose is not None
+        self._unfit_for = 0.0
+        guess = self._guessed(seen)
+        if guess is not None and guess[2] < 0.7 * self._misfit(self._pose, seen):
+            self._take(*guess)
+
+    def _misfit(self, pose: Pose, seen: _Seen) -> float:
+        """Median distance of keypoints from where the pose has them [m], the farther half of it."""
+        off = np.linalg.norm(self.skeleton.posed(pose).points - seen.points, axis=1)[seen.weights > 0]
+        return float(np.sqrt(np.mean(np.minimum(off, 0.5) ** 2))) if len(off) else 0.0
+
+    def _is_somebody_else(self, seen: _Seen) -> bool:
+        assert self._pose is not None
+        off = np.linalg.norm(self.skeleton.posed(self._pose).points - seen.points, axis=1)[seen.weights > 0]
+        return len(off) >= 4 and float(np.median(off)) > self._settings.jump
+
+    def _sided(self, seen: _Seen, dt: float) -> _Seen:
+        """The frame with arms, legs or face exchanged where they are on the wrong side of the prediction."""
+        assert self._pose is not None
+        other, joints = self.skeleton.layout.mirrored, self.skeleton.layout.joints
+        expected = self.skeleton.posed(self._pose).points
+        taken, is_swapped = np.arange(len(joints)), False
+        for group in _GROUPS:
+            here = np.flatnonzero(np.isin(joints, group) & (other != taken) & (seen.weights > 0) & (seen.weights[other] > 0))
+            if len(here) < 2:
+                continue
+            as_is = np.minimum(np.linalg.norm(seen.points[here] - expected[here], axis=1), 0.5)
+            exchanged = np.minimum(np.linalg.norm(seen.points[other[here]] - expected[here], axis=1), 0.5)
+            if as_is.max() > 0.1 and (exchanged**2).sum() < 0.4 * (as_is**2).sum():
+                taken[here], is_swapped = other[here], True
+        self._swapped_for = self._swapped_for + dt if is_swapped else 0.0
+        if self._swapped_for > self._settings.doubt:  # it was the prediction that had the sides wrong
+            self._swapped_for, self._unfit_for = 0.0, np.inf
+            return seen
+        return _Seen(seen.points[taken], seen.weights[taken])
+
+    # The filter -----------------------------------------------------------------------------------
+
+    def _predict(self, dt: float) -> None:
+        """Constant rates that die away; variances of the same."""
+        assert self._pose is not None
+        own = self._settings
+        keep = np.exp(-dt / own.coast)
+        ahead = own.coast * (1 - keep)
+        self._pose = self._pose.moved(ahead * self._rate)
+        power = np.concatenate([np.full(3, own.push), np.full(3 * N_JOINTS, own.twist), np.zeros(N_BETAS)])
+        power = power / own.smoothing**2
+        p, m, r = self._variance, self._mixed, self._rate_variance
+        self._variance = p + 2 * ahead * m + ahead**2 * r + power * dt**3 / 3
+        self._variance[_BETAS] += own.growth * dt
+        self._mixed = keep * (m + ahead * r) + power * dt**2 / 2
+        self._rate_variance = keep**2 * r + power * dt
+        self._rate = keep * self._rate
+
+    def _correct(self, seen: _Seen, dt: float) -> None:
+        assert self._pose is not None
+        own, before = self._settings, self._pose
+        rest = min(1.0, dt / own.rest_after)
+        after, variance = self._solved(before, seen, prior=1 / self._variance, rest=rest, steps=own.steps)
+        step = np.concatenate(
+            [after.pelvis - before.pelvis, _between(before.turns, after.turns).ravel(), after.betas - before.betas]
+        )
+        gain = self._mixed / self._variance
+        shrunk = 1 - variance / self._variance
+        self._rate = np.clip(self._rate + gain * step, -_FASTEST, _FASTEST)
+        self._rate_variance = self._rate_variance - gain * self._mixed * shrunk
+        self._mixed = gain * variance
+        self._variance = variance
+        self._pose = after
+        self._seen_at = self._stamp
+        self._learn_noise(seen, dt)
+
+    def _learn_noise(self, seen: _Seen, dt: float) -> None:
+        """Follows what the tracker's noise is, by the median of what is left."""
+        assert self._pose is not None
+        off = np.linalg.norm(self.skeleton.posed(self._pose).points - seen.points, axis=1)[seen.weights > 0]
+        if len(off) < 4:
+            return
+        own, median = self._settings, float(np.median(off))
+        # Of three normal components the median length is 1.54 deviations; the fit takes up about a quarter of them.
+        target = np.clip(median / 1.54 * 1.25, own.least_noise, own.most_noise)
+        self._noise += min(1.0, dt) * (float(target) - self._noise)
+        self._unfit_for = self._unfit_for + dt if median > max(4 * self._noise, 0.08) else 0.0
+
+    def _solved(
+        self, pose: Pose, seen: _Seen, *, prior: Array | None, rest: float, steps: int
+    ) -> tuple[Pose, Array]:
+        """The most likely pose near `pose`, and the variances of its parts, shape (85,).
+
+        `prior` are the parts' precisions before the keypoints were seen, `rest` the share of a look that joints at rest
+        count as.
+        """
+        own, free, start = self._settings, self._free, pose
+        # Not one, but slightly spread out: at the very start nothing but the keypoints counts.
+        precision = np.full(_N, 1e-2) if prior is None else prior
+        deviation = np.sqrt(self._noise**2 + self._offset**2)
+        base = np.full(_N, 0.0)
+        base[_BETAS] = rest
+        off_start = np.zeros(_N)
+        for _ in range(steps):
+            posed = self.skeleton.posed(pose)
+            off = seen.points - posed.points
+            slack = deviation**2 + (0.02**2 if prior is not None else 0.1**2)
+            far = (off * off).sum(axis=1) / (own.outlier**2 * 3 * slack)
+            weights = seen.weights / ((1 + far) ** 2 * deviation**2)
+            root = np.sqrt(np.repeat(weights, 3))[:, None]
+            jacobian = self.skeleton.jacobian(posed)[:, free]
+            scaled = jacobian * root
+            vectors = log_so3(pose.turns)
+            shaped = (_MEAN - vectors) * (rest / _SPREAD**2)
+            inverse = _inverse_right_jacobian(vectors)
+            pull = np.zeros(_N)
+            pull[_TURNS] = (inverse.swapaxes(1, 2) @ shaped[:, :, None]).ravel()
+            pull[_BETAS] = -rest * pose.betas
+            stiff = inverse.swapaxes(1, 2) @ (inverse * (rest / _SPREAD**2)[:, :, None])
+            normal = scaled.T @ scaled
+            whole = _blocks(stiff, base + precision)[np.ix_(free, free)] if free is not None else normal
+            normal += whole
+            gradient = scaled.T @ (off.reshape(-1) * root[:, 0]) + (pull - precision * off_start)[free]
+            factor, info = dpotrf(normal, lower=1)
+            if info:  # not positive: keypoints that say nothing
+                break
+            change = np.zeros(_N)
+            change[free] = dpotrs(factor, gradient, lower=1)[0]
+            largest = float(np.abs(change[_TURNS]).max())
+            change *= min(1.0, _BOLDEST / max(largest, 1e-9))
+            pose = pose.moved(change)
+            pose = replace(pose, betas=np.clip(pose.betas, -own.most_beta, own.most_beta))
+            off_start[:3] = pose.pelvis - start.pelvis
+            off_start[_TURNS] = _between(start.turns, pose.turns).ravel()
+            off_start[_BETAS] = pose.betas - start.betas
+        variance = 1 / np.maximum(precision, 1e-2)
+        if not info:
+            variance[free] = np.diag(dpotri(factor, lower=1)[0])
+        return pose, variance
+
+
+_GROUPS = ((16, 18, 20, 22, 17, 19, 21, 23), (1, 4, 7, 10, 2, 5, 8, 11), (15,))
+"""Joints of arms, legs and head, whose keypoints trackers exchange together."""
+_FASTEST = np.concatenate([np.full(3, 12.0), np.full(3 * N_JOINTS, 40.0), np.zeros(N_BETAS)])
+"""No pelvis [m/s], no joint [rad/s] is faster."""
+_BOLDEST = 0.6
+"""A step of Gauss and Newton turns no joint by more [rad]."""
+
+
+def _between(start: Array, end: Array) -> Array:
+    """Rotation vectors [rad], shape (24, 3), from one set of turns to another, in the joints' own axes."""
+    return log_so3(start.swapaxes(1, 2) @ end)
+
+
+def _inverse_right_jacobian(vectors: Array) -> Array:
+    """How rotation vectors (n, 3) change with a turn in the joint's own axes, shape (n, 3, 3)."""
+    squared = np.einsum("ij,ij->i", vectors, vectors)
+    angle = np.sqrt(squared)
+    safe = np.maximum(angle, 1e-3)
+    # 1/θ² - (1 + cos θ) / (2 θ sin θ), which is finite up to near 2π
+    factor = np.where(angle < 1e-3, 1 / 12, 1 / safe**2 - (1 + np.cos(safe)) / (2 * safe * np.maximum(np.sin(safe), 1e-3)))
+    k = skew(vectors)
+    result: Array = np.eye(3) + 0.5 * k + factor[:, None, None] * (k @ k)
+    return result
+
+
+def _blocks(turns: Array, diagonal: Array) -> Array:
+    """A matrix (85, 85) with blocks (24, 3, 3) for the joints, and a diagonal (85,) added."""
+    matrix = np.zeros((_N, _N))
+    rows = np.arange(3, 3 + 3 * N_JOINTS).reshape(N_JOINTS, 3)
+    matrix[rows[:, :, None], rows[:, None, :]] = turns
+    matrix[np.arange(_N), np.arange(_N)] += diagonal
+    return matrix
