@@ -102,6 +102,7 @@ class Skeleton:
         self._bone_dirs = proportions.shapedirs - proportions.shapedirs[above]
         self._carried = CARRIES[layout.joints].astype(np.float64)
         self._carried[np.arange(len(layout)), layout.joints] *= layout.offsets.any(axis=1)
+        self._last: tuple[Pose, Posed] | None = None
 
     def bones(self, betas: Array) -> Array:
         """From each joint's parent to it in the T-pose [m], shape (24, 3)."""
@@ -109,7 +110,12 @@ class Skeleton:
         return joints - joints[np.maximum(_ABOVE, 0)]
 
     def posed(self, pose: Pose) -> Posed:
-        """Joints and keypoints of a pose."""
+        """Joints and keypoints of a pose; of the last one asked for it is known."""
+        if self._last is None or self._last[0] is not pose:
+            self._last = pose, self._posed(pose)
+        return self._last[1]
+
+    def _posed(self, pose: Pose) -> Posed:
         turns, joints = pose.turns.copy(), np.empty((N_JOINTS, 3))
         joints[0] = pose.pelvis
         bones = self.bones(pose.betas)[:, :, None]

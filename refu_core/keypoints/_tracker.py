@@ -44,15 +44,15 @@ class TrackerSettings:
     """[m]"""
     offset_noise: float = 0.01
     """What is added for keypoints beside a joint, whose places differ between people and trackers [m]."""
-    push: float = 1.5
-    """Power of the pelvis's acceleration [m²/s³]: about 5 m/s² for 60 ms."""
-    twist: float = 40.0
-    """Power of the joints' angular acceleration [rad²/s³]: about 25 rad/s² for 60 ms."""
+    push: float = 5.0
+    """Power of the pelvis's acceleration [m²/s³]: about 9 m/s² for 60 ms."""
+    twist: float = 80.0
+    """Power of the joints' angular acceleration [rad²/s³]: about 35 rad/s² for 60 ms."""
     growth: float = 1e-3
     """Power of the betas' drift [1/s]: 0.03 in a second, for the first guess may be wrong."""
-    rest_after: float = 0.25
+    rest_after: float = 0.1
     """A joint that isn't seen comes to rest in about this time [s]."""
-    coast: float = 0.25
+    coast: float = 0.2
     """A rate of what isn't seen dies away in this time [s]."""
     outlier: float = 3.0
     """A keypoint so many deviations off has half the weight, and soon none."""
@@ -101,6 +101,10 @@ class KeypointTracker:
         carried = skeleton.jacobian(skeleton.posed(self._neutral())).any(axis=0)
         self._free[_TURNS] = np.repeat(carried[_TURNS].reshape(N_JOINTS, 3).any(axis=1), 3)
         self._free[_BETAS] = carried[_BETAS] & (self._known is None)
+        joints, other = skeleton.layout.joints, skeleton.layout.mirrored
+        self._sides = [
+            np.flatnonzero(np.isin(joints, group) & (other != np.arange(len(other)))) for group in _GROUPS
+        ]
         self._offset = settings.offset_noise * skeleton.layout.offsets.any(axis=1)
         self.reset()
 
@@ -239,11 +243,11 @@ class KeypointTracker:
     def _sided(self, seen: _Seen, dt: float) -> _Seen:
         """The frame with arms, legs or face exchanged where they are on the wrong side of the prediction."""
         assert self._pose is not None
-        other, joints = self.skeleton.layout.mirrored, self.skeleton.layout.joints
+        other, taken, is_swapped = self.skeleton.layout.mirrored, np.arange(len(seen.weights)), False
         expected = self.skeleton.posed(self._pose).points
-        taken, is_swapped = np.arange(len(joints)), False
-        for group in _GROUPS:
-            here = np.flatnonzero(np.isin(joints, group) & (other != taken) & (seen.weights > 0) & (seen.weights[other] > 0))
+        both = (seen.weights > 0) & (seen.weights[other] > 0)
+        for group in self._sides:
+            here = group[both[group]]
             if len(here) < 2:
                 continue
             as_is = np.minimum(np.linalg.norm(seen.points[here] - expected[here], axis=1), 0.5)
@@ -322,11 +326,12 @@ class KeypointTracker:
         for _ in range(steps):
             posed = self.skeleton.posed(pose)
             off = seen.points - posed.points
-            slack = deviation**2 + (0.02**2 if prior is not None else 0.1**2)
-            far = (off * off).sum(axis=1) / (own.outlier**2 * 3 * slack)
+            jacobian = self.skeleton.jacobian(posed)[:, free]
+            # How far off a keypoint may be that is none the worse: by its own noise and by that of the prediction.
+            doubt = _LOOSE**2 if prior is None else ((jacobian**2) @ (1 / prior[free])).reshape(-1, 3).mean(axis=1)
+            far = (off * off).sum(axis=1) / (own.outlier**2 * 3 * (deviation**2 + doubt))
             weights = seen.weights / ((1 + far) ** 2 * deviation**2)
             root = np.sqrt(np.repeat(weights, 3))[:, None]
-            jacobian = self.skeleton.jacobian(posed)[:, free]
             scaled = jacobian * root
             vectors = log_so3(pose.turns)
             shaped = (_MEAN - vectors) * (rest / _SPREAD**2)
@@ -336,8 +341,7 @@ class KeypointTracker:
             pull[_BETAS] = -rest * pose.betas
             stiff = inverse.swapaxes(1, 2) @ (inverse * (rest / _SPREAD**2)[:, :, None])
             normal = scaled.T @ scaled
-            whole = _blocks(stiff, base + precision)[np.ix_(free, free)] if free is not None else normal
-            normal += whole
+            normal += _blocks(stiff, base + precision)[np.ix_(free, free)]
             gradient = scaled.T @ (off.reshape(-1) * root[:, 0]) + (pull - precision * off_start)[free]
             factor, info = dpotrf(normal, lower=1)
             if info:  # not positive: keypoints that say nothing
@@ -351,6 +355,8 @@ class KeypointTracker:
             off_start[:3] = pose.pelvis - start.pelvis
             off_start[_TURNS] = _between(start.turns, pose.turns).ravel()
             off_start[_BETAS] = pose.betas - start.betas
+            if largest < _CLOSE and prior is not None:
+                break
         variance = 1 / np.maximum(precision, 1e-2)
         if not info:
             variance[free] = np.diag(dpotri(factor, lower=1)[0])
@@ -361,6 +367,10 @@ _GROUPS = ((16, 18, 20, 22, 17, 19, 21, 23), (1, 4, 7, 10, 2, 5, 8, 11), (15,))
 """Joints of arms, legs and head, whose keypoints trackers exchange together."""
 _FASTEST = np.concatenate([np.full(3, 12.0), np.full(3 * N_JOINTS, 40.0), np.zeros(N_BETAS)])
 """No pelvis [m/s], no joint [rad/s] is faster."""
+_LOOSE = 0.1
+"""How far a first guess may be off [m]."""
+_CLOSE = 0.05
+"""After a step that turns no joint by more [rad] another one moves none by half a millimetre."""
 _BOLDEST = 0.6
 """A step of Gauss and Newton turns no joint by more [rad]."""
 
