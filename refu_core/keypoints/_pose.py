@@ -7,6 +7,7 @@ from importlib import resources
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from refu_core._npz import read_npz
 from refu_core.errors import BodyError
@@ -24,7 +25,13 @@ _ABOVE = np.array(PARENTS)
 _DEPTH = np.zeros(N_JOINTS, int)
 for _joint in range(1, N_JOINTS):
     _DEPTH[_joint] = _DEPTH[_ABOVE[_joint]] + 1
-_LEVELS = [(found, _ABOVE[found]) for depth in range(1, _DEPTH.max() + 1) for found in [np.flatnonzero(_DEPTH == depth)]]
+# Joints as deep as each other follow one another in SMPL's order.
+_LEVELS = [
+    (slice(int(found[0]), int(found[-1]) + 1), _ABOVE[found])
+    for found in (np.flatnonzero(_DEPTH == depth) for depth in range(1, _DEPTH.max() + 1))
+]
+_BELOW, _OVER = [7, 2, 3], [5, 6, 1]  # entries of a 3 x 3 matrix across the diagonal from each other
+_NEARLY_HALF = -1.98  # twice the cosine of 172°
 CARRIES = np.eye(N_JOINTS, dtype=bool)
 """Whether what hangs from a joint (row) moves when another (column) turns, shape (24, 24)."""
 for _joint in range(1, N_JOINTS):
@@ -99,50 +106,57 @@ class Skeleton:
         self.layout = layout
         self.proportions = proportions
         above = np.maximum(_ABOVE, 0)
+        self._bones = proportions.joints - proportions.joints[above]
         self._bone_dirs = proportions.shapedirs - proportions.shapedirs[above]
-        self._carried = CARRIES[layout.joints].astype(np.float64)
-        self._carried[np.arange(len(layout)), layout.joints] *= layout.offsets.any(axis=1)
+        carried = CARRIES[layout.joints].astype(np.float64)
+        carried[np.arange(len(layout)), layout.joints] *= layout.offsets.any(axis=1)
+        self.turning = np.flatnonzero(carried.any(axis=0))
+        """Joints that move a keypoint when they turn."""
+        self._carried = carried[None, :, self.turning]
+        parts = np.concatenate([np.arange(3), (3 + 3 * self.turning[:, None] + np.arange(3)).ravel()])
+        self.parts = np.concatenate([parts, 3 + 3 * N_JOINTS + np.arange(N_BETAS)])
+        """Which of the 85 numbers of a step that `Pose.moved` takes the keypoints depend on, in order, shape (P,)."""
         self._last: tuple[Pose, Posed] | None = None
 
     def bones(self, betas: Array) -> Array:
         """From each joint's parent to it in the T-pose [m], shape (24, 3)."""
-        joints = self.proportions.of(betas)
-        return joints - joints[np.maximum(_ABOVE, 0)]
+        return self._bones + self._bone_dirs @ betas
 
     def posed(self, pose: Pose) -> Posed:
-        """Joints and keypoints of a pose; of the last one asked for it is known."""
+        """Joints and keypoints of a pose; of the last one asked for they are known."""
         if self._last is None or self._last[0] is not pose:
             self._last = pose, self._posed(pose)
         return self._last[1]
 
     def _posed(self, pose: Pose) -> Posed:
-        turns, joints = pose.turns.copy(), np.empty((N_JOINTS, 3))
+        placed = np.empty((N_JOINTS, 3, 4))  # a joint's turn, and the way to it from its parent
+        placed[:, :, :3], placed[:, :, 3] = pose.turns, self.bones(pose.betas)
+        joints = np.empty((N_JOINTS, 3))
         joints[0] = pose.pelvis
-        bones = self.bones(pose.betas)[:, :, None]
         for here, above in _LEVELS:
-            turns[here] = turns[above] @ turns[here]
-            joints[here] = joints[above] + (turns[above] @ bones[here])[:, :, 0]
-        at = self.layout.joints
+            placed[here] = placed[above, :, :3] @ placed[here]
+            joints[here] = joints[above] + placed[here, :, 3]
+        at, turns = self.layout.joints, placed[:, :, :3]
         points = joints[at] + (turns[at] @ self.layout.offsets[:, :, None])[:, :, 0]
         return Posed(turns, joints, points)
 
     def jacobian(self, posed: Posed) -> Array:
-        """How keypoints move with a step as `Pose.moved` takes it, shape (3 K, 85)."""
-        n = len(self.layout)
-        jacobian = np.zeros((n, 3, 3 + 3 * N_JOINTS + N_BETAS))
-        jacobian[:, :, :3] = np.eye(3)
-        arms = (posed.points[:, None] - posed.joints[None]) * self._carried[:, :, None]  # K, 24, 3
-        x, y, z = (arms[:, :, None, i] for i in range(3))
-        u, v, w = (posed.turns[None, :, i] for i in range(3))  # 1, 24, 3: rows of the axes
-        turning = jacobian[:, :, 3 : 3 + 3 * N_JOINTS].reshape(n, 3, N_JOINTS, 3)
-        turning[:, 0] = v * z - w * y
-        turning[:, 1] = w * x - u * z
-        turning[:, 2] = u * y - v * x
+        """How keypoints move with `parts`, shape (3 K, P): first the x of all of them, then y, then z."""
+        n, m = len(self.layout), len(self.turning)
+        jacobian = np.zeros((3, n, len(self.parts)))
+        for axis in range(3):
+            jacobian[axis, :, axis] = 1.0
+        arms = (posed.points.T[:, :, None] - posed.joints[self.turning].T[:, None]) * self._carried  # 3, K, m
+        x, y, z = arms[:, :, :, None]
+        u, v, w = (np.ascontiguousarray(posed.turns[self.turning, i]) for i in range(3))  # m, 3: rows of the axes
+        turning = jacobian[:, :, 3 : 3 + 3 * m]
+        turning[0] = (v * z - w * y).reshape(n, 3 * m)
+        turning[1] = (w * x - u * z).reshape(n, 3 * m)
+        turning[2] = (u * y - v * x).reshape(n, 3 * m)
         moves = np.zeros((N_JOINTS, 3, N_BETAS))
         for here, above in _LEVELS:
             moves[here] = moves[above] + posed.turns[above] @ self._bone_dirs[here]
-        jacobian[:, :, 3 : 3 + 3 * N_JOINTS] = turning.reshape(n, 3, 3 * N_JOINTS)
-        jacobian[:, :, 3 + 3 * N_JOINTS :] = moves[self.layout.joints]
+        jacobian[:, :, 3 + 3 * m :] = moves[self.layout.joints].swapaxes(0, 1)
         return jacobian.reshape(3 * n, -1)
 
 
@@ -160,23 +174,13 @@ def exp_so3(vectors: Array) -> Array:
 
 def log_so3(matrices: Array) -> Array:
     """Rotation vectors (n, 3) [rad], no longer than pi, of rotation matrices (n, 3, 3)."""
-    w = 0.5 * np.sqrt(np.maximum(0.0, 1 + np.trace(matrices, axis1=1, axis2=2)))
-    vector = np.stack(
-        [
-            matrices[:, 2, 1] - matrices[:, 1, 2],
-            matrices[:, 0, 2] - matrices[:, 2, 0],
-            matrices[:, 1, 0] - matrices[:, 0, 1],
-        ],
-        axis=1,
-    )
-    near_pi = w < 0.05  # the difference above vanishes there; the column of the largest entry doesn't
-    sine = 0.5 * np.linalg.norm(vector, axis=1)
-    angle = np.arctan2(sine, 2 * w * w - 1)
-    scale = np.where(sine < 1e-6, 0.5, angle / np.maximum(2 * sine, 1e-12))
+    flat = matrices.reshape(-1, 9)
+    vector = flat[:, _BELOW] - flat[:, _OVER]
+    twice_sine = np.sqrt(np.einsum("ij,ij->i", vector, vector))
+    twice_cosine = flat[:, 0] + flat[:, 4] + flat[:, 8] - 1
+    scale = np.where(twice_sine < 1e-9, 0.5, np.arctan2(twice_sine, twice_cosine) / np.maximum(twice_sine, 1e-9))
     result: Array = scale[:, None] * vector
-    for i in np.flatnonzero(near_pi):
-        from scipy.spatial.transform import Rotation
-
+    for i in np.flatnonzero(twice_cosine < _NEARLY_HALF):  # the difference vanishes there
         result[i] = Rotation.from_matrix(matrices[i]).as_rotvec()
     return result
 

@@ -67,7 +67,7 @@ class TrackerSettings:
     most_beta: float = 3.0
     """Betas stay within this."""
     steps: int = 2
-    """Gauss-Newton steps a frame; the third moves no joint by a tenth of a millimetre."""
+    """Gauss-Newton steps a frame at most; a third one changes the error by a hundredth of a millimetre."""
 
 
 DEFAULTS = TrackerSettings()
@@ -97,10 +97,8 @@ class KeypointTracker:
         self.skeleton = skeleton
         self._settings = settings
         self._known = None if betas is None else np.asarray(betas, np.float64)
-        self._free = np.ones(_N, bool)
-        carried = skeleton.jacobian(skeleton.posed(self._neutral())).any(axis=0)
-        self._free[_TURNS] = np.repeat(carried[_TURNS].reshape(N_JOINTS, 3).any(axis=1), 3)
-        self._free[_BETAS] = carried[_BETAS] & (self._known is None)
+        n_fixed = 0 if self._known is None else N_BETAS
+        self._free = skeleton.parts[: len(skeleton.parts) - n_fixed]
         joints, other = skeleton.layout.joints, skeleton.layout.mirrored
         self._sides = [
             np.flatnonzero(np.isin(joints, group) & (other != np.arange(len(other)))) for group in _GROUPS
@@ -166,7 +164,7 @@ class KeypointTracker:
             return None
         coast = self._settings.coast
         ahead = coast * (1 - np.exp(-max(0.0, 1e-9 * (stamp_ns - self._stamp)) / coast))
-        pose = self._pose.moved(ahead * self._rate)
+        pose = self._pose.moved(ahead * self._rate) if ahead else self._pose
         betas = self._steady_betas(pose.betas)
         transl = pose.pelvis - self.skeleton.proportions.of(betas)[0]
         return SmplFrame(log_so3(pose.turns), betas=betas, transl=transl, stamp_ns=stamp_ns)
@@ -326,12 +324,12 @@ class KeypointTracker:
         for _ in range(steps):
             posed = self.skeleton.posed(pose)
             off = seen.points - posed.points
-            jacobian = self.skeleton.jacobian(posed)[:, free]
+            jacobian = self.skeleton.jacobian(posed)[:, : len(free)]
             # How far off a keypoint may be that is none the worse: by its own noise and by that of the prediction.
-            doubt = _LOOSE**2 if prior is None else ((jacobian**2) @ (1 / prior[free])).reshape(-1, 3).mean(axis=1)
+            doubt = _LOOSE**2 if prior is None else ((jacobian**2) @ (1 / prior[free])).reshape(3, -1).mean(axis=0)
             far = (off * off).sum(axis=1) / (own.outlier**2 * 3 * (deviation**2 + doubt))
             weights = seen.weights / ((1 + far) ** 2 * deviation**2)
-            root = np.sqrt(np.repeat(weights, 3))[:, None]
+            root = np.sqrt(np.tile(weights, 3))[:, None]
             scaled = jacobian * root
             vectors = log_so3(pose.turns)
             shaped = (_MEAN - vectors) * (rest / _SPREAD**2)
@@ -341,8 +339,8 @@ class KeypointTracker:
             pull[_BETAS] = -rest * pose.betas
             stiff = inverse.swapaxes(1, 2) @ (inverse * (rest / _SPREAD**2)[:, :, None])
             normal = scaled.T @ scaled
-            normal += _blocks(stiff, base + precision)[np.ix_(free, free)]
-            gradient = scaled.T @ (off.reshape(-1) * root[:, 0]) + (pull - precision * off_start)[free]
+            normal += _blocks(stiff, self.skeleton.turning, (base + precision)[free])
+            gradient = scaled.T @ (off.T.reshape(-1) * root[:, 0]) + (pull - precision * off_start)[free]
             factor, info = dpotrf(normal, lower=1)
             if info:  # not positive: keypoints that say nothing
                 break
@@ -355,7 +353,8 @@ class KeypointTracker:
             off_start[:3] = pose.pelvis - start.pelvis
             off_start[_TURNS] = _between(start.turns, pose.turns).ravel()
             off_start[_BETAS] = pose.betas - start.betas
-            if largest < _CLOSE and prior is not None:
+            moved = posed.points + (jacobian @ change[free]).reshape(3, -1).T
+            if np.abs(self.skeleton.posed(pose).points - moved).max() < _CLOSE:
                 break
         variance = 1 / np.maximum(precision, 1e-2)
         if not info:
@@ -369,8 +368,8 @@ _FASTEST = np.concatenate([np.full(3, 12.0), np.full(3 * N_JOINTS, 40.0), np.zer
 """No pelvis [m/s], no joint [rad/s] is faster."""
 _LOOSE = 0.1
 """How far a first guess may be off [m]."""
-_CLOSE = 0.05
-"""After a step that turns no joint by more [rad] another one moves none by half a millimetre."""
+_CLOSE = 2e-3
+"""Where a step moves the keypoints as a linear one would, but for so much [m], it was the last."""
 _BOLDEST = 0.6
 """A step of Gauss and Newton turns no joint by more [rad]."""
 
@@ -392,10 +391,9 @@ def _inverse_right_jacobian(vectors: Array) -> Array:
     return result
 
 
-def _blocks(turns: Array, diagonal: Array) -> Array:
-    """A matrix (85, 85) with blocks (24, 3, 3) for the joints, and a diagonal (85,) added."""
-    matrix = np.zeros((_N, _N))
-    rows = np.arange(3, 3 + 3 * N_JOINTS).reshape(N_JOINTS, 3)
-    matrix[rows[:, :, None], rows[:, None, :]] = turns
-    matrix[np.arange(_N), np.arange(_N)] += diagonal
+def _blocks(turns: Array, joints: NDArray[np.intp], diagonal: Array) -> Array:
+    """A matrix (P, P) with the blocks (3, 3) of some joints, of `turns` (24, 3, 3), and a diagonal (P,) added."""
+    matrix = np.diag(diagonal)
+    rows = 3 + 3 * np.arange(len(joints))[:, None] + np.arange(3)
+    matrix[rows[:, :, None], rows[:, None, :]] += turns[joints]
     return matrix
