@@ -97,7 +97,9 @@ class PickledArrays:
             msg = f"a tensor that reaches to number {last} of {len(flat)}"
             raise ValueError(msg)
         steps = tuple(stride * flat.itemsize for stride in strides)
-        return np.lib.stride_tricks.as_strided(flat[offset:], shape, steps, writeable=False).copy()
+        view: NDArray[Any] = np.lib.stride_tricks.as_strided(flat[offset:], shape, steps, writeable=False)
+        dense: NDArray[Any] = view.copy()
+        return dense
 
     def _sparse(self, state: dict[str, Any]) -> NDArray[Any]:
         """A `scipy.sparse` matrix in compressed columns."""

@@ -199,7 +199,7 @@ class Machine:
         if self._is_model:
             return {exactly(str, key): value for key, value in pairs}
         named = ((_number_of(key) if type(key) is Record else key, value) for key, value in pairs)
-        return {key: value for key, value in named if type(key) in (str, int)}
+        return {key: value for key, value in named if isinstance(key, (str, int))}
 
     def _array_behind(self, wrapper: Record, file: BinaryIO) -> Any:
         """The array whose bytes joblib has put between two opcodes."""

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 _TRUNK = (0, 1, 2, 3, 6, 9, 12, 13, 14, 15, 16, 17)
 """Joints that turn with the pelvis, more or less."""
 _LIMBS = ((16, 18, 20, 1.0), (17, 19, 21, 1.0), (1, 4, 7, -1.0), (2, 5, 8, -1.0))
-"""Ball, hinge, end; and where the end goes in the T-pose as the hinge bends, along z: a forearm forward, a shin back."""
+"""Ball, hinge, end; and where the end goes in the T-pose as the hinge bends, along z: forearms forward, shins back."""
 _LEAST = 0.05
 """Length [m] of what a direction is taken from, and half the width of a trunk that shows which way it faces."""
 _BENT = 0.15
@@ -25,7 +25,7 @@ _BENT = 0.15
 
 
 def first_pose(skeleton: Skeleton, points: Array, seen: NDArray[np.bool_], start: Pose) -> Pose | None:
-    """A pose near that of keypoints [m], shape (K, 3), as far as they are seen, shape (K,); None for too few of them."""
+    """A pose near that of keypoints [m], shape (K, 3), as far as seen, shape (K,); None for too few of them."""
     joints = skeleton.layout.joints
     upright = Pose(start.pelvis, np.broadcast_to(np.eye(3), start.turns.shape).copy(), start.betas)
     rest = skeleton.posed(upright).points
@@ -68,8 +68,8 @@ def _turn_above(turns: Array, joint: int) -> Array:
 
 
 def _unit(vector: Array) -> Array:
-    length = float(np.linalg.norm(vector))
-    return vector / length if length > 1e-9 else vector
+    unit: Array = vector / max(float(np.linalg.norm(vector)), 1e-9)
+    return unit
 
 
 def _shortest(start: Array, end: Array) -> Array:
@@ -77,10 +77,11 @@ def _shortest(start: Array, end: Array) -> Array:
     a, b = _unit(start), _unit(end)
     axis = np.cross(a, b)
     sine, cosine = float(np.linalg.norm(axis)), float(a @ b)
-    if sine < 1e-9:
-        side = _unit(np.cross(a, np.eye(3)[np.abs(a).argmin()]))
-        return np.eye(3) if cosine > 0 else exp_so3(np.pi * side[None])[0]
-    return exp_so3(axis[None] / sine * np.arctan2(sine, cosine))[0]
+    if sine < 1e-9:  # the same way, or the opposite one, about any axis across
+        axis = _unit(np.cross(a, np.eye(3)[np.abs(a).argmin()]))
+    angle = np.arctan2(sine, cosine)
+    turn: Array = exp_so3(_unit(axis)[None] * angle)[0]
+    return turn
 
 
 def _aligned(bone: Array, bend: Array, upper: Array, lower: Array) -> Array:
@@ -93,4 +94,5 @@ def _aligned(bone: Array, bend: Array, upper: Array, lower: Array) -> Array:
     across = _unit(bend - (bend @ first) * first)
     before = np.stack([first, across, np.cross(first, across)], axis=1)
     side = _unit(side)
-    return np.stack([along, side, np.cross(along, side)], axis=1) @ before.T
+    result: Array = np.stack([along, side, np.cross(along, side)], axis=1) @ before.T
+    return result

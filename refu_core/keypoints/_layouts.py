@@ -30,6 +30,7 @@ _POINTS: dict[str, tuple[str, tuple[float, float, float]]] = {
     "l_shoulder": ("left_shoulder", (0, 0, 0)),
     "l_elbow": ("left_elbow", (0, 0, 0)),
     "l_wrist": ("left_wrist", (0, 0, 0)),
+    "l_palm": ("left_hand", (0, 0, 0)),
     "l_hand": ("left_wrist", (0.08, -0.01, 0)),
     "l_handtip": ("left_wrist", (0.19, -0.03, 0)),
     "l_index": ("left_wrist", (0.105, -0.01, 0.025)),
@@ -54,24 +55,26 @@ _KINECT += "r_foot head nose l_eye l_ear r_eye r_ear"
 _NAMES: dict[str, str] = {
     "coco17": _COCO,
     "halpe26": _COCO + " head_top neck pelvis l_big_toe r_big_toe l_small_toe r_small_toe l_heel r_heel",
-    "body25": "nose neck r_shoulder r_elbow r_wrist l_shoulder l_elbow l_wrist pelvis r_hip r_knee r_ankle l_hip l_knee "
-    "l_ankle r_eye l_eye r_ear l_ear l_big_toe l_small_toe l_heel r_big_toe r_small_toe r_heel",
+    "body25": "nose neck r_shoulder r_elbow r_wrist l_shoulder l_elbow l_wrist pelvis r_hip r_knee r_ankle l_hip "
+    "l_knee l_ankle r_eye l_eye r_ear l_ear l_big_toe l_small_toe l_heel r_big_toe r_small_toe r_heel",
     "h36m17": "pelvis r_hip r_knee r_ankle l_hip l_knee l_ankle spine_mid thorax nose head_top l_shoulder l_elbow "
     "l_wrist r_shoulder r_elbow r_wrist",
     "mediapipe33": "nose l_eye l_eye l_eye r_eye r_eye r_eye l_ear r_ear l_mouth r_mouth l_shoulder r_shoulder l_elbow "
     "r_elbow l_wrist r_wrist l_pinky r_pinky l_index r_index l_thumb r_thumb l_hip r_hip l_knee r_knee l_ankle r_ankle "
     "l_heel r_heel l_big_toe r_big_toe",
-    "zed18": "nose neck r_shoulder r_elbow r_wrist l_shoulder l_elbow l_wrist r_hip r_knee r_ankle l_hip l_knee l_ankle "
-    "r_eye l_eye r_ear l_ear",
+    "zed18": "nose neck r_shoulder r_elbow r_wrist l_shoulder l_elbow l_wrist r_hip r_knee r_ankle l_hip l_knee "
+    "l_ankle r_eye l_eye r_ear l_ear",
     "zed34": _KINECT + " l_heel r_heel",
     "zed38": "pelvis spine_low spine_mid spine_high neck nose l_eye r_eye l_ear r_ear l_clavicle r_clavicle l_shoulder "
     "r_shoulder l_elbow r_elbow l_wrist r_wrist l_hip r_hip l_knee r_knee l_ankle r_ankle l_big_toe r_big_toe "
     "l_small_toe r_small_toe l_heel r_heel l_thumb r_thumb l_index r_index l_handtip r_handtip l_pinky r_pinky",
     "kinect32": _KINECT,
+    "smpl24": "pelvis l_hip r_hip spine_low l_knee r_knee spine_mid l_ankle r_ankle spine_high l_foot r_foot neck "
+    "l_clavicle r_clavicle head l_shoulder r_shoulder l_elbow r_elbow l_wrist r_wrist l_palm r_palm",
 }
 """Points of each layout, in the order in which trackers send them. A thorax, a clavicle, fingers and MediaPipe's eye
 corners are where they are within 2 cm."""
-LAYOUTS: tuple[str, ...] = (*_NAMES, "smpl24")
+LAYOUTS: tuple[str, ...] = tuple(_NAMES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,16 +102,15 @@ class KeypointLayout:
 @cache
 def keypoint_layout(name: str) -> KeypointLayout:
     """A layout of `LAYOUTS`. Raises `KeyError` for another name."""
-    if name == "smpl24":
-        words = [joint.replace("left_", "l_").replace("right_", "r_") for joint in SMPL_JOINTS]
-        joints, offsets = np.arange(len(SMPL_JOINTS)), np.zeros((len(SMPL_JOINTS), 3))
-    else:
-        words = _NAMES[name].split()
-        places = [_place(word) for word in words]
-        joints = np.array([SMPL_JOINTS.index(joint) for joint, _ in places])
-        offsets = np.array([offset for _, offset in places], np.float64)
-    mirrored = [_twin(words, i) for i in range(len(words))]
-    return KeypointLayout(name, joints, offsets, np.array(mirrored))
+    return layout_of(name, tuple(_NAMES[name].split()))
+
+
+def layout_of(name: str, words: tuple[str, ...]) -> KeypointLayout:
+    """A layout of points of the table, in any order. Raises `KeyError` for one that isn't there."""
+    places = [_place(word) for word in words]
+    joints = np.array([SMPL_JOINTS.index(joint) for joint, _ in places])
+    offsets = np.array([offset for _, offset in places], np.float64)
+    return KeypointLayout(name, joints, offsets, np.array([_twin(words, i) for i in range(len(words))]))
 
 
 def _place(word: str) -> tuple[str, tuple[float, float, float]]:
@@ -118,7 +120,7 @@ def _place(word: str) -> tuple[str, tuple[float, float, float]]:
     return joint.replace("left_", "right_"), (-x, y, z)
 
 
-def _twin(words: list[str], i: int) -> int:
+def _twin(words: tuple[str, ...], i: int) -> int:
     """The number of the same point on the other side; of several of one name the one that comes as late."""
     word = words[i]
     if word[:2] not in ("l_", "r_"):

@@ -28,7 +28,7 @@ for _joint in range(1, N_JOINTS):
 # Joints as deep as each other follow one another in SMPL's order.
 _LEVELS = [
     (slice(int(found[0]), int(found[-1]) + 1), _ABOVE[found])
-    for found in (np.flatnonzero(_DEPTH == depth) for depth in range(1, _DEPTH.max() + 1))
+    for found in (np.flatnonzero(depth == _DEPTH) for depth in range(1, _DEPTH.max() + 1))
 ]
 _BELOW, _OVER = [7, 2, 3], [5, 6, 1]  # entries of a 3 x 3 matrix across the diagonal from each other
 _NEARLY_HALF = -1.98  # twice the cosine of 172°
@@ -68,7 +68,8 @@ class Proportions:
 
     def of(self, betas: Array) -> Array:
         """Joints in the T-pose [m], shape (24, 3), of betas (10,)."""
-        return self.joints + self.shapedirs @ betas
+        joints: Array = self.joints + self.shapedirs @ betas
+        return joints
 
 
 class Posed(NamedTuple):
@@ -120,7 +121,8 @@ class Skeleton:
 
     def bones(self, betas: Array) -> Array:
         """From each joint's parent to it in the T-pose [m], shape (24, 3)."""
-        return self._bones + self._bone_dirs @ betas
+        bones: Array = self._bones + self._bone_dirs @ betas
+        return bones
 
     def posed(self, pose: Pose) -> Posed:
         """Joints and keypoints of a pose; of the last one asked for they are known."""
@@ -169,7 +171,8 @@ def exp_so3(vectors: Array) -> Array:
     a = np.where(small, 1 - squared / 6, np.sin(safe) / safe)
     b = np.where(small, 0.5 - squared / 24, (1 - np.cos(safe)) / (safe * safe))
     k = skew(vectors)
-    return np.eye(3) + a[:, None, None] * k + b[:, None, None] * (k @ k)
+    matrices: Array = np.eye(3) + a[:, None, None] * k + b[:, None, None] * (k @ k)
+    return matrices
 
 
 def log_so3(matrices: Array) -> Array:

@@ -37,7 +37,7 @@ class TrackerSettings:
     smoothing: float = 1.0
     """How much smoother than the most likely motion: accelerations are believed this many times smaller."""
     noise: float = 0.01
-    """Standard deviation of a keypoint along each axis that a track begins with [m]; the filter follows what it sees."""
+    """Standard deviation of a keypoint along each axis that a track begins with [m]; it follows what it sees."""
     least_noise: float = 0.004
     """[m]"""
     most_noise: float = 0.06
@@ -100,9 +100,7 @@ class KeypointTracker:
         n_fixed = 0 if self._known is None else N_BETAS
         self._free = skeleton.parts[: len(skeleton.parts) - n_fixed]
         joints, other = skeleton.layout.joints, skeleton.layout.mirrored
-        self._sides = [
-            np.flatnonzero(np.isin(joints, group) & (other != np.arange(len(other)))) for group in _GROUPS
-        ]
+        self._sides = [np.flatnonzero(np.isin(joints, group) & (other != np.arange(len(other)))) for group in _GROUPS]
         self._offset = settings.offset_noise * skeleton.layout.offsets.any(axis=1)
         self.reset()
 
@@ -167,7 +165,9 @@ class KeypointTracker:
         pose = self._pose.moved(ahead * self._rate) if ahead else self._pose
         betas = self._steady_betas(pose.betas)
         transl = pose.pelvis - self.skeleton.proportions.of(betas)[0]
-        return SmplFrame(log_so3(pose.turns), betas=betas, transl=transl, stamp_ns=stamp_ns)
+        return SmplFrame(
+            log_so3(pose.turns).astype(np.float32), betas=betas.astype(np.float32), transl=transl, stamp_ns=stamp_ns
+        )
 
     def _steady_betas(self, betas: Array) -> Array:
         if self._sent_betas is None or np.abs(betas - self._sent_betas).max() > self._settings.beta_step:
@@ -306,9 +306,7 @@ class KeypointTracker:
         self._noise += min(1.0, dt) * (float(target) - self._noise)
         self._unfit_for = self._unfit_for + dt if median > max(4 * self._noise, 0.08) else 0.0
 
-    def _solved(
-        self, pose: Pose, seen: _Seen, *, prior: Array | None, rest: float, steps: int
-    ) -> tuple[Pose, Array]:
+    def _solved(self, pose: Pose, seen: _Seen, *, prior: Array | None, rest: float, steps: int) -> tuple[Pose, Array]:
         """The most likely pose near `pose`, and the variances of its parts, shape (85,).
 
         `prior` are the parts' precisions before the keypoints were seen, `rest` the share of a look that joints at rest
@@ -384,8 +382,8 @@ def _inverse_right_jacobian(vectors: Array) -> Array:
     squared = np.einsum("ij,ij->i", vectors, vectors)
     angle = np.sqrt(squared)
     safe = np.maximum(angle, 1e-3)
-    # 1/θ² - (1 + cos θ) / (2 θ sin θ), which is finite up to near 2π
-    factor = np.where(angle < 1e-3, 1 / 12, 1 / safe**2 - (1 + np.cos(safe)) / (2 * safe * np.maximum(np.sin(safe), 1e-3)))
+    # finite and smooth up to 2π, since a cotangent has the cosine over the sine
+    factor = np.where(angle < 1e-3, 1 / 12, 1 / safe**2 - 1 / (2 * safe * np.tan(safe / 2)))
     k = skew(vectors)
     result: Array = np.eye(3) + 0.5 * k + factor[:, None, None] * (k @ k)
     return result

@@ -171,7 +171,8 @@ def _find(content: Content, person: str | None, notes: list[str]) -> tuple[_Foun
     best = min(found.rank for found in every)
     same = [found for found in every if found.rank == best]
     others = {" with ".join(found.layout.pose) for found in every if found.rank[0] != best[0]}
-    if best[0] == 0 and others or best[1] == 0 and any("camera" in found.layout.writers for found in every):
+    is_both = best[1] == 0 and any("camera" in found.layout.writers for found in every)
+    if is_both or (best[0] == 0 and others):
         notes.append("the file has the motion in a camera, too: the one in the world is taken")
     names = [_person(found.path) for found in same]
     lengths = [len(content.array(found.node[found.layout.pose[0]])) for found in same]

@@ -1,4 +1,4 @@
-"""Rotations as files have them: vectors, matrices, or six numbers; seen from an array's shape, checked by its numbers."""
+"""Rotations as files have them: vectors, matrices, or six numbers; seen by an array's shape, checked by its numbers."""
 
 from __future__ import annotations
 
@@ -95,8 +95,8 @@ def _check_radians(vectors: Array, name: str) -> None:
 
 def _rotvecs(matrices: Array, name: str) -> Array:
     """Rotation vectors of matrices (T, n, 3, 3); a frame with one that is not finite, or all zero, becomes NaN."""
-    result = np.full(matrices.shape[:2] + (3,), np.nan)
-    there = np.isfinite(matrices).all(axis=(1, 2, 3)) & np.abs(matrices).any(axis=(2, 3)).all(axis=1)
+    result = np.full((*matrices.shape[:2], 3), np.nan)
+    there = np.isfinite(matrices).all(axis=(1, 2, 3)) & (np.abs(matrices).max(axis=(2, 3)) > 0).all(axis=1)
     sound = matrices[there]
     with np.errstate(over="ignore", invalid="ignore"):
         skew = np.abs(sound @ sound.swapaxes(-1, -2) - np.eye(3)).max(axis=(2, 3), initial=0.0)

@@ -67,7 +67,8 @@ def to_smpl(roots: Array, transl: Array, axes: Axes, notes: list[str], *, usual:
     """Roots [rad] and translations [m], shapes (T, 3), in SMPL's axes; `usual` is what such files mean, where seen."""
     if axes == "frame":
         return roots, transl
-    chosen, lies = axes, False
+    chosen: str = axes
+    lies = False
     if axes == "auto":
         axis = axis_of(roots)
         chosen = {"+y": "smpl", "+z": "z-up", "-y": "y-down"}.get(axis, usual)
