@@ -2,7 +2,7 @@
 
 from refu_core.recordings._rate import FPS_RANGE, MAX_FRAMES, n_resampled
 from refu_core.recordings._recording import SUFFIXES, Recording, read_recording
-from refu_core.recordings._upright import AXES, Axes, axis_of, upright_share
+from refu_core.recordings._upright import AXES, Axes, axis_of, upright_share, upright_turn
 
 __all__ = [
     "AXES",
@@ -15,4 +15,5 @@ __all__ = [
     "n_resampled",
     "read_recording",
     "upright_share",
+    "upright_turn",
 ]

@@ -63,6 +63,11 @@ def axis_of(roots: Array) -> str:
     return f"{'+' if mean[axis] > 0 else '-'}{'xyz'[axis]}" if abs(mean[axis]) >= _CLEAR else ""
 
 
+def upright_turn(roots: Array) -> Array:
+    """The rotation (3, 3) to SMPL's axes from those that people stand in, as far as it shows; the identity if not."""
+    return _TURNS.get({"+z": "z-up", "-y": "y-down"}.get(axis_of(roots), ""), np.eye(3))
+
+
 def to_smpl(roots: Array, transl: Array, axes: Axes, notes: list[str], *, usual: Axes) -> tuple[Array, Array]:
     """Roots [rad] and translations [m], shapes (T, 3), in SMPL's axes; `usual` is what such files mean, where seen."""
     if axes == "frame":

@@ -87,6 +87,11 @@ def load_clips(path: str | Path, *, axes: Axes = "auto", fps: float | None = Non
     return [_load_clip(file, axes, fps) for file in files]
 
 
+def as_clips(motions: str | Path | Sequence[Clip]) -> list[Clip]:
+    """Clips that were loaded already, or those of a file or folder. Raises as `load_clips`."""
+    return load_clips(motions) if isinstance(motions, (str, Path)) else list(motions)
+
+
 def _load_clip(path: Path, axes: Axes, fps: float | None) -> Clip:
     recording = read_recording(path, error=SimulationError, axes="z-up" if axes == "frame" else axes, fps=fps)
     if not (np.isfinite(recording.poses).all() and np.isfinite(recording.transl).all()):
