@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
 MAX_PICKLE_BYTES = 512 << 20
 """The largest official file has 236 MiB: it's text, and takes three times what its arrays do."""
-_MODEL_OPCODES, _DATA_OPCODES = 100_000, 2_000_000
-"""An official file has some hundreds; a tracker's, of a thousand frames of five persons, a million."""
+_MODEL_OPCODES, _DATA_OPCODES = 100_000, 1_000_000
+"""An official file has some hundreds; a tracker's has a thousand a frame."""
 _MAX_NESTED = 4
 """Pickles in a pickle: joblib writes arrays of objects so."""
 _LONG_TEXT = 1 << 16

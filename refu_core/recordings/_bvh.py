@@ -211,7 +211,7 @@ def _sided(name: str) -> tuple[str, str]:
         side, rest = match[1], match[2]
     else:
         match = re.fullmatch(r"(?i)(.+?)[_. ](left|right|l|r)", bare)
-        rest, side = (match[1], match[2]) if match else (bare.rpartition("_")[2] or bare, "")
+        rest, side = (match[1], match[2]) if match else (re.sub(r"^[A-Za-z0-9]+_(?=[A-Za-z])", "", bare), "")
     return side[:1].lower(), re.sub(r"[^a-z0-9]", "", rest.lower())
 
 

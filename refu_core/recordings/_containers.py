@@ -15,7 +15,7 @@ from refu_core._npz import DAMAGE as ARCHIVE_DAMAGE
 from refu_core._npz import ArrayBudget, check_npy, npz_names, read_npz
 from refu_core._pickle import DAMAGE, PickledArrays
 from refu_core._pickle_machine import MAX_PICKLE_BYTES, Machine, Record
-from refu_core.recordings._layouts import ALL_KEYS, UNREAD, WANTED
+from refu_core.recordings._layouts import ALL_KEYS, POSE_KEYS, UNREAD, WANTED
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -107,7 +107,7 @@ def open_content(path: Path, *, error: type[RefuError]) -> Content:
 
 def _npz(path: Path, names: list[str], error: type[RefuError]) -> Content:
     wanted = {name for name in names if _steps(name)[-1] in ALL_KEYS}
-    if not wanted:  # a dictionary that NumPy has pickled into an array
+    if not any(_steps(name)[-1] in POSE_KEYS for name in names):  # a dictionary that NumPy has pickled into an array
         for name in names:
             held = _object(path, name)
             if held is not None:

@@ -64,6 +64,7 @@ SCALINGS = ("smpl_scaling",)
 """AIST++'s translations are of a body that is larger by so much."""
 MODELS = ("surface_model_type",)
 
+POSE_KEYS = frozenset(name for layout in LAYOUTS for name in layout.pose)
 ALL_KEYS = frozenset(
     {name for layout in LAYOUTS for names in (layout.pose, layout.transl, layout.betas) for name in names}
     | {*RATES, *GENDERS, *FRAME_NUMBERS, *SCALINGS, *MODELS}
