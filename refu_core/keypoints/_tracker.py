@@ -185,7 +185,7 @@ class KeypointTracker:
         top = weights.max(initial=0.0)
         weights = np.minimum(weights if top <= 1 else weights / 100, 1.0)
         here = np.isfinite(given).all(axis=1) & (np.abs(given) < 1e6).all(axis=1)
-        weights[~here] = 0.0
+        weights[~here | (weights < _LEAST)] = 0.0
         return _Seen(np.where(weights[:, None] > 0, given, 0.0), weights)
 
     # Beginnings -----------------------------------------------------------------------------------
@@ -352,7 +352,7 @@ class KeypointTracker:
             off_start[_TURNS] = _between(start.turns, pose.turns).ravel()
             off_start[_BETAS] = pose.betas - start.betas
             moved = posed.points + (jacobian @ change[free]).reshape(3, -1).T
-            if np.abs(self.skeleton.posed(pose).points - moved).max() < _CLOSE:
+            if ((self.skeleton.posed(pose).points - moved) ** 2).sum(axis=1).max() < _CLOSE**2:
                 break
         variance = 1 / np.maximum(precision, 1e-2)
         if not info:
@@ -364,6 +364,8 @@ _GROUPS = ((16, 18, 20, 22, 17, 19, 21, 23), (1, 4, 7, 10, 2, 5, 8, 11), (15,))
 """Joints of arms, legs and head, whose keypoints trackers exchange together."""
 _FASTEST = np.concatenate([np.full(3, 12.0), np.full(3 * N_JOINTS, 40.0), np.zeros(N_BETAS)])
 """No pelvis [m/s], no joint [rad/s] is faster."""
+_LEAST = 0.05
+"""A confidence below it is none."""
 _LOOSE = 0.1
 """How far a first guess may be off [m]."""
 _CLOSE = 2e-3

@@ -96,10 +96,10 @@ def open_content(path: Path, *, error: type[RefuError]) -> Content:
         try:
             if magic == _NPY:
                 return _npy(file, file.size)
-            packed: BinaryIO = file
-            if magic[:1] == b"x" or magic.startswith(_GZIP):
-                packed = io.BytesIO(_unpacked(file, is_gzip=magic.startswith(_GZIP)))
-            return Content(Machine(is_model=False).run(packed))
+            is_packed = magic[:1] == b"x" or magic.startswith(_GZIP)
+            # All at once: the machine reads byte by byte, which takes three times as long from a file.
+            data = _unpacked(file, is_gzip=magic.startswith(_GZIP)) if is_packed else file.read()
+            return Content(Machine(is_model=False).run(io.BytesIO(data)))
         except (*DAMAGE, *ARCHIVE_DAMAGE) as cause:
             msg = f"{path}: can't be read: {str(cause) or type(cause).__name__}; wanted {WANTED}"
             raise error(msg) from cause
