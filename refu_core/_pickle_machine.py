@@ -26,6 +26,8 @@ MAX_PICKLE_BYTES = 512 << 20
 """The largest official file has 236 MiB: it's text, and takes three times what its arrays do."""
 _MODEL_OPCODES, _DATA_OPCODES = 100_000, 1_000_000
 """An official file has some hundreds; a tracker's has a thousand a frame."""
+_MAX_MARKS = 10_000
+"""Values in values; Python itself writes no more than a thousand."""
 _MAX_NESTED = 4
 """Pickles in a pickle: joblib writes arrays of objects so."""
 _LONG_TEXT = 1 << 16
@@ -121,6 +123,9 @@ class Machine:
             case "PROTO" | "FRAME":
                 pass
             case "MARK":
+                if len(self._marked) == _MAX_MARKS:
+                    msg = f"values in each other, {_MAX_MARKS} deep"
+                    raise ValueError(msg)
                 self._marked.append(self._stack)
                 self._stack = []
             case "PUT" | "BINPUT" | "LONG_BINPUT":

@@ -128,7 +128,7 @@ def test_streams_and_bags(tmp_path: Path) -> None:
     assert (sorted(frames), frame_id) == (["left_a", "left_b"], "camera")
     assert frames["left_b"].transl[0] - frames["left_a"].transl[0] == pytest.approx(2, abs=1e-6)
     assert sorted(stream.predicted(10**8)) == ["left_a", "left_b"]
-    with pytest.raises(DecodeError, match="wanted keypoint_poses or keypoint_markers of coco17, .* of 'coco'"):
+    with pytest.raises(DecodeError, match=r"wanted keypoint_poses or keypoint_markers of coco17, .* of 'coco'"):
         KeypointStream("keypoint_markers", "coco", Proportions.builtin("male"))
     with BagWriter(tmp_path / "a.mcap") as writer:
         writer.add_topic("/skeletons", POSES)

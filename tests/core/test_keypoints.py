@@ -166,7 +166,7 @@ def test_a_turned_world_turns_the_pose_alone() -> None:
     rng = np.random.default_rng(3)
     for frame in clip("walk").frames[:20]:
         seen = noisy(points_of(frame, "coco17"), rng)
-        a, b = plain.update(seen, frame.stamp_ns), other.update(turn.apply(seen) + [1, 2, 10], frame.stamp_ns)
+        a, b = plain.update(seen, frame.stamp_ns), other.update(turn.apply(seen) + np.array([1, 2, 10]), frame.stamp_ns)
         assert a is not None
         assert b is not None
         np.testing.assert_allclose(a.pose[1:], b.pose[1:], atol=2e-3)
@@ -246,11 +246,13 @@ def test_people_come_and_go() -> None:
     assert track.at(last + 3 * 10**8) is not None
     assert track.at(last + 10**9) is None
     assert track.update(empty, last + 8 * 10**8) is None  # gone
-    far = points_of(known[20], "zed38") + [5, 0, 0]
+    far = points_of(known[20], "zed38") + np.array([5, 0, 0])
     came = track.update(far, last + 9 * 10**8)
     assert came is not None
     assert np.linalg.norm(came.transl - known[20].transl - [5, 0, 0]) < 0.1
-    jumped = track.update(far + [0, 0, 3], last + 9 * 10**8 + 33_000_000)  # another person under the same name
+    jumped = track.update(
+        far + np.array([0, 0, 3]), last + 9 * 10**8 + 33_000_000
+    )  # another person under the same name
     assert jumped is not None
     assert np.linalg.norm(jumped.transl - known[20].transl - [5, 0, 3]) < 0.1
 
@@ -266,7 +268,7 @@ def test_clocks() -> None:
     assert late is not None
     np.testing.assert_array_equal(first.transl, again.transl)
     np.testing.assert_array_equal(first.transl, late.transl)
-    back = track.update(points + [0.5, 0, 0], 10**9)  # the sender has started again
+    back = track.update(points + np.array([0.5, 0, 0]), 10**9)  # the sender has started again
     assert back is not None
     assert (back.stamp_ns, round(back.transl[0] - first.transl[0], 1)) == (10**9, 0.5)
 

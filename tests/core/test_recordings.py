@@ -80,7 +80,10 @@ FORMS: dict[str, tuple[dict[str, Any], str]] = {
     "MDM, time last": ({"thetas": np.moveaxis(R[:, :, :2].reshape(T, 24, 6), 0, -1)}, "first two rows"),
     "groups": ({"smpl_params_global/poses": POSES, "smpl_params_incam/poses": turned(POSES, CAMERA)}, "in the world"),
     "ROMP": ({"results": {"smpl_thetas": POSES.reshape(T, 72), "cam_trans": TRANSL}}, ""),
-    "two persons": ({"root_orient": np.stack([POSES[:, 0]] * 2), "pose_body": np.stack([POSES[:, 1:22]] * 2).reshape(2, T, 63)}, "2 persons: 0, 1; 0 is taken"),
+    "two persons": (
+        {"root_orient": np.stack([POSES[:, 0]] * 2), "pose_body": np.stack([POSES[:, 1:22].reshape(T, 63)] * 2)},
+        "2 persons: 0, 1; 0 is taken",
+    ),
 }  # fmt: skip
 
 
@@ -148,7 +151,7 @@ def test_any_rotation_comes_back(seed: int, size: int) -> None:
         ({"global_orient": POSES[:, 0], "body_pose": np.zeros((T, 32))}, r"body_pose must be .* got \(30, 32\)"),
         ({"global_orient": POSES[:9, 0], "body_pose": POSES[:, 1:]}, "global_orient has 9 frames, body_pose 30"),
         ({"poses": POSES, "fps": None}, "no frame rate in the file: say it, as in --fps 30"),
-        ({"poses": POSES, "betas": np.zeros((4, 10))}, "betas must be one row of coefficients, or a row for each of 30"),
+        ({"poses": POSES, "betas": np.zeros((4, 10))}, "betas must be one row of .*, or a row for each of 30"),
         ({"verts": np.zeros((T, 9, 3))}, "no poses; wanted pose_world, .*; the file has"),
         ({"mhr_model_params": np.zeros((T, 204))}, "MHR .* aren't read: convert it"),
     ],
