@@ -32,7 +32,7 @@ _MEAN, _SPREAD = resting()
 
 @dataclass(frozen=True, kw_only=True)
 class TrackerSettings:
-    """The tuned numbers; `docs/guide/inputs.md` has what half and twice of the first two do."""
+    """The tuned numbers, on ten clips of CMU at 30 and 60 Hz; `docs/guide/inputs.md` has what comes of them."""
 
     smoothing: float = 1.0
     """How much smoother than the most likely motion: accelerations are believed this many times smaller."""
