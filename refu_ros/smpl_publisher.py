@@ -155,7 +155,8 @@ class SmplPublisher(GuardedNode):
         options = PublisherOptions(**values)
         numbers = (options.rate, options.fps, options.spacing)
         if not all(isinstance(n, float) and np.isfinite(n) for n in numbers) or min(numbers[:2]) < 0:
-            msg = f"wanted finite numbers, none below 0, got rate, fps and spacing {numbers!r}"
+            rate, fps, spacing = numbers
+            msg = f"wanted finite numbers, rate >= 0, got rate {rate!r}, fps {fps!r}, spacing {spacing!r}"
             raise RefuError(msg)
         if not all(name.isidentifier() for name in options.persons):
             msg = f"persons: wanted names of letters, digits and underscores, got {list(options.persons)}"

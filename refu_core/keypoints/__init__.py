@@ -3,7 +3,8 @@
 from refu_core.keypoints._layouts import LAYOUTS, KeypointLayout, keypoint_layout, layout_of
 from refu_core.keypoints._people import People
 from refu_core.keypoints._pose import Proportions, Skeleton
-from refu_core.keypoints._tracker import KeypointTracker, TrackerSettings
+from refu_core.keypoints._settings import TrackerSettings
+from refu_core.keypoints._tracker import KeypointTracker
 
 __all__ = [
     "LAYOUTS",

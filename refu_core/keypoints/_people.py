@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from refu_core.keypoints._tracker import DEFAULTS, KeypointTracker, TrackerSettings
+from refu_core.keypoints._settings import DEFAULTS, TrackerSettings
+from refu_core.keypoints._tracker import KeypointTracker
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike

@@ -8,69 +8,21 @@ seen goes on for a while and then comes to rest, and how much a keypoint moves t
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
 from refu_core.errors import FrameError
 from refu_core.frames import N_BETAS, N_JOINTS, SmplFrame
-from refu_core.keypoints._anatomy import resting
 from refu_core.keypoints._guess import first_pose
-from refu_core.keypoints._pose import Pose, Skeleton, exp_so3, log_so3, skew
+from refu_core.keypoints._pose import Pose, Skeleton, exp_so3, log_so3
+from refu_core.keypoints._settings import DEFAULTS, TrackerSettings
+from refu_core.keypoints._solver import BETAS, MEAN, N_PARTS, SPREAD, Solution, solve
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     Array = NDArray[np.float64]
-
-_N = 3 + 3 * N_JOINTS + N_BETAS
-_TURNS, _BETAS = slice(3, 3 + 3 * N_JOINTS), slice(3 + 3 * N_JOINTS, _N)
-_MEAN, _SPREAD = resting()
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrackerSettings:
-    """The tuned numbers, on ten clips of CMU at 30 and 60 Hz; `docs/guide/inputs.md` has what comes of them."""
-
-    smoothing: float = 1.0
-    """How much smoother than the most likely motion: accelerations are believed this many times smaller."""
-    noise: float = 0.01
-    """Standard deviation of a keypoint along each axis that a track begins with [m]; it follows what it sees."""
-    least_noise: float = 0.004
-    """[m]"""
-    most_noise: float = 0.06
-    """[m]"""
-    offset_noise: float = 0.01
-    """What is added for keypoints beside a joint, whose places differ between people and trackers [m]."""
-    push: float = 5.0
-    """Power of the pelvis's acceleration [m²/s³]: about 9 m/s² for 60 ms."""
-    twist: float = 80.0
-    """Power of the joints' angular acceleration [rad²/s³]: about 35 rad/s² for 60 ms."""
-    growth: float = 1e-3
-    """Power of the betas' drift [1/s]: 0.03 in a second, for the first guess may be wrong."""
-    rest_after: float = 0.1
-    """A joint that isn't seen comes to rest in about this time [s]."""
-    coast: float = 0.2
-    """A rate of what isn't seen dies away in this time [s]."""
-    outlier: float = 3.0
-    """A keypoint so many deviations off has half the weight, and soon none."""
-    hold: float = 0.5
-    """A person of whom nothing is seen for so long isn't there [s]."""
-    doubt: float = 1.0
-    """Left and right, or a pose that doesn't fit, are believed after so long of it [s]."""
-    jump: float = 0.75
-    """Keypoints that are so far from the prediction are of somebody else [m]."""
-    beta_step: float = 0.1
-    """Betas that are sent change by this at least: each change costs the pipeline a few frames' time."""
-    most_beta: float = 3.0
-    """Betas stay within this."""
-    steps: int = 2
-    """Gauss-Newton steps a frame at most; a third one changes the error by a hundredth of a millimetre."""
-
-
-DEFAULTS = TrackerSettings()
 
 
 class _Seen(NamedTuple):
@@ -114,7 +66,7 @@ class KeypointTracker:
 
     def _neutral(self) -> Pose:
         betas = np.zeros(N_BETAS) if self._known is None else self._known
-        return Pose(np.zeros(3), exp_so3(np.where(_SPREAD < 10, _MEAN, 0.0)), betas)
+        return Pose(np.zeros(3), exp_so3(np.where(SPREAD < 10, MEAN, 0.0)), betas)
 
     # A frame --------------------------------------------------------------------------------------
 
@@ -142,11 +94,11 @@ class KeypointTracker:
         self._predict(dt)
         self._stamp = stamp_ns
         if (seen.weights > 0).any():
-            seen = self._sided(seen, dt)
-            if self._is_somebody_else(seen):
+            sided = self._sided(seen, dt)
+            if sided is None:
                 self.reset()
                 return self._begin(seen, stamp_ns)
-            self._correct(seen, dt)
+            self._correct(sided, dt)
             if self._unfit_for > self._settings.doubt:
                 self._begin_again(seen)
         if 1e-9 * (stamp_ns - self._seen_at) > self._settings.hold:
@@ -205,8 +157,8 @@ class KeypointTracker:
         for sides in (seen, _Seen(seen.points[other], seen.weights[other])):
             pose = first_pose(self.skeleton, sides.points, sides.weights > 0, self._neutral())
             if pose is not None:
-                solved, variance = self._solved(pose, sides, prior=None, rest=1.0, steps=8)
-                found.append((solved, variance, self._misfit(solved, sides)))
+                solved = self._solved(pose, sides, prior=None, rest=1.0, steps=8)
+                found.append((solved.pose, solved.variance, self._misfit(solved.pose, sides)))
         if not found:
             return None
         # What the tracker says is believed unless the mirror image fits much better: most people are symmetric.
@@ -214,9 +166,9 @@ class KeypointTracker:
 
     def _take(self, pose: Pose, variance: Array, _: float) -> None:
         self._pose = pose
-        self._rate = np.zeros(_N)
+        self._rate = np.zeros(N_PARTS)
         self._variance = variance
-        self._mixed = np.zeros(_N)
+        self._mixed = np.zeros(N_PARTS)
         self._rate_variance = np.concatenate([np.full(3, 1.0), np.full(3 * N_JOINTS, 4.0), np.zeros(N_BETAS)])
         self._swapped_for = self._unfit_for = 0.0
 
@@ -233,24 +185,28 @@ class KeypointTracker:
         off = np.linalg.norm(self.skeleton.posed(pose).points - seen.points, axis=1)[seen.weights > 0]
         return float(np.sqrt(np.mean(np.minimum(off, 0.5) ** 2))) if len(off) else 0.0
 
-    def _is_somebody_else(self, seen: _Seen) -> bool:
-        assert self._pose is not None
-        off = np.linalg.norm(self.skeleton.posed(self._pose).points - seen.points, axis=1)[seen.weights > 0]
-        return len(off) >= 4 and float(np.median(off)) > self._settings.jump
+    def _sided(self, seen: _Seen, dt: float) -> _Seen | None:
+        """The frame with arms, legs or face exchanged where they are on the wrong side; None if it is somebody else's.
 
-    def _sided(self, seen: _Seen, dt: float) -> _Seen:
-        """The frame with arms, legs or face exchanged where they are on the wrong side of the prediction."""
+        Nothing is done for keypoints that are all near where they were expected.
+        """
         assert self._pose is not None
-        other, taken, is_swapped = self.skeleton.layout.mirrored, np.arange(len(seen.weights)), False
         expected = self.skeleton.posed(self._pose).points
-        both = (seen.weights > 0) & (seen.weights[other] > 0)
+        off = np.square(seen.points - expected).sum(axis=1)
+        visible = seen.weights > 0
+        if off[visible].max() < _NEAR**2:
+            self._swapped_for = 0.0
+            return seen
+        if visible.sum() >= 4 and float(np.median(off[visible])) > self._settings.jump**2:
+            return None
+        other, taken, is_swapped = self.skeleton.layout.mirrored, np.arange(len(visible)), False
+        both = visible & visible[other]
         for group in self._sides:
             here = group[both[group]]
-            if len(here) < 2:
+            if len(here) < 2 or off[here].max() < _NEAR**2:
                 continue
-            as_is = np.minimum(np.linalg.norm(seen.points[here] - expected[here], axis=1), 0.5)
-            exchanged = np.minimum(np.linalg.norm(seen.points[other[here]] - expected[here], axis=1), 0.5)
-            if as_is.max() > 0.1 and (exchanged**2).sum() < 0.4 * (as_is**2).sum():
+            exchanged = np.square(seen.points[other[here]] - expected[here]).sum(axis=1)
+            if np.minimum(exchanged, _FAR**2).sum() < 0.4 * np.minimum(off[here], _FAR**2).sum():
                 taken[here], is_swapped = other[here], True
         self._swapped_for = self._swapped_for + dt if is_swapped else 0.0
         if self._swapped_for > self._settings.doubt:  # it was the prediction that had the sides wrong
@@ -271,23 +227,21 @@ class KeypointTracker:
         power = power / own.smoothing**2
         p, m, r = self._variance, self._mixed, self._rate_variance
         self._variance = p + 2 * ahead * m + ahead**2 * r + power * dt**3 / 3
-        self._variance[_BETAS] += own.growth * dt
+        self._variance[BETAS] += own.growth * dt
         self._mixed = keep * (m + ahead * r) + power * dt**2 / 2
         self._rate_variance = keep**2 * r + power * dt
         self._rate = keep * self._rate
 
     def _correct(self, seen: _Seen, dt: float) -> None:
         assert self._pose is not None
-        own, before = self._settings, self._pose
-        rest = min(1.0, dt / own.rest_after)
-        after, variance = self._solved(before, seen, prior=1 / self._variance, rest=rest, steps=own.steps)
-        step = np.concatenate(
-            [after.pelvis - before.pelvis, _between(before.turns, after.turns).ravel(), after.betas - before.betas]
+        rest = min(1.0, dt / self._settings.rest_after)
+        after, variance, step = self._solved(
+            self._pose, seen, prior=1 / self._variance, rest=rest, steps=self._settings.steps
         )
         gain = self._mixed / self._variance
         shrunk = 1 - variance / self._variance
         self._rate = np.clip(self._rate + gain * step, -_FASTEST, _FASTEST)
-        self._rate_variance = self._rate_variance - gain * self._mixed * shrunk
+        self._rate_variance = np.maximum(self._rate_variance - gain * self._mixed * shrunk, 0.0)
         self._mixed = gain * variance
         self._variance = variance
         self._pose = after
@@ -306,58 +260,20 @@ class KeypointTracker:
         self._noise += min(1.0, dt) * (float(target) - self._noise)
         self._unfit_for = self._unfit_for + dt if median > max(4 * self._noise, 0.08) else 0.0
 
-    def _solved(self, pose: Pose, seen: _Seen, *, prior: Array | None, rest: float, steps: int) -> tuple[Pose, Array]:
-        """The most likely pose near `pose`, and the variances of its parts, shape (85,).
-
-        `prior` are the parts' precisions before the keypoints were seen, `rest` the share of a look that joints at rest
-        count as.
-        """
-        own, free, start = self._settings, self._free, pose
-        # Not one, but slightly spread out: at the very start nothing but the keypoints counts.
-        precision = np.full(_N, 1e-2) if prior is None else prior
+    def _solved(self, pose: Pose, seen: _Seen, *, prior: Array | None, rest: float, steps: int) -> Solution:
         deviation = np.sqrt(self._noise**2 + self._offset**2)
-        base = np.full(_N, 0.0)
-        base[_BETAS] = rest
-        off_start = np.zeros(_N)
-        for _ in range(steps):
-            posed = self.skeleton.posed(pose)
-            off = seen.points - posed.points
-            jacobian = self.skeleton.jacobian(posed)[:, : len(free)]
-            # How far off a keypoint may be that is none the worse: by its own noise and by that of the prediction.
-            doubt = _LOOSE**2 if prior is None else ((jacobian**2) @ (1 / prior[free])).reshape(3, -1).mean(axis=0)
-            far = (off * off).sum(axis=1) / (own.outlier**2 * 3 * (deviation**2 + doubt))
-            weights = seen.weights / ((1 + far) ** 2 * deviation**2)
-            root = np.sqrt(np.tile(weights, 3))[:, None]
-            scaled = jacobian * root
-            vectors = log_so3(pose.turns)
-            shaped = (_MEAN - vectors) * (rest / _SPREAD**2)
-            inverse = _inverse_right_jacobian(vectors)
-            pull = np.zeros(_N)
-            pull[_TURNS] = (inverse.swapaxes(1, 2) @ shaped[:, :, None]).ravel()
-            pull[_BETAS] = -rest * pose.betas
-            stiff = inverse.swapaxes(1, 2) @ (inverse * (rest / _SPREAD**2)[:, :, None])
-            normal = scaled.T @ scaled
-            normal += _blocks(stiff, self.skeleton.turning, (base + precision)[free])
-            gradient = scaled.T @ (off.T.reshape(-1) * root[:, 0]) + (pull - precision * off_start)[free]
-            factor, info = dpotrf(normal, lower=1)
-            if info:  # not positive: keypoints that say nothing
-                break
-            change = np.zeros(_N)
-            change[free] = dpotrs(factor, gradient, lower=1)[0]
-            largest = float(np.abs(change[_TURNS]).max())
-            change *= min(1.0, _BOLDEST / max(largest, 1e-9))
-            pose = pose.moved(change)
-            pose = replace(pose, betas=np.clip(pose.betas, -own.most_beta, own.most_beta))
-            off_start[:3] = pose.pelvis - start.pelvis
-            off_start[_TURNS] = _between(start.turns, pose.turns).ravel()
-            off_start[_BETAS] = pose.betas - start.betas
-            moved = posed.points + (jacobian @ change[free]).reshape(3, -1).T
-            if ((self.skeleton.posed(pose).points - moved) ** 2).sum(axis=1).max() < _CLOSE**2:
-                break
-        variance = 1 / np.maximum(precision, 1e-2)
-        if not info:
-            variance[free] = np.diag(dpotri(factor, lower=1)[0])
-        return pose, variance
+        return solve(
+            self.skeleton,
+            pose,
+            seen.points,
+            seen.weights,
+            free=self._free,
+            deviation=deviation,
+            prior=prior,
+            rest=rest,
+            steps=steps,
+            settings=self._settings,
+        )
 
 
 _GROUPS = ((16, 18, 20, 22, 17, 19, 21, 23), (1, 4, 7, 10, 2, 5, 8, 11), (15,))
@@ -366,34 +282,5 @@ _FASTEST = np.concatenate([np.full(3, 12.0), np.full(3 * N_JOINTS, 40.0), np.zer
 """No pelvis [m/s], no joint [rad/s] is faster."""
 _LEAST = 0.05
 """A confidence below it is none."""
-_LOOSE = 0.1
-"""How far a first guess may be off [m]."""
-_CLOSE = 2e-3
-"""Where a step moves the keypoints as a linear one would, but for so much [m], it was the last."""
-_BOLDEST = 0.6
-"""A step of Gauss and Newton turns no joint by more [rad]."""
-
-
-def _between(start: Array, end: Array) -> Array:
-    """Rotation vectors [rad], shape (24, 3), from one set of turns to another, in the joints' own axes."""
-    return log_so3(start.swapaxes(1, 2) @ end)
-
-
-def _inverse_right_jacobian(vectors: Array) -> Array:
-    """How rotation vectors (n, 3) change with a turn in the joint's own axes, shape (n, 3, 3)."""
-    squared = np.einsum("ij,ij->i", vectors, vectors)
-    angle = np.sqrt(squared)
-    safe = np.maximum(angle, 1e-3)
-    # finite and smooth up to 2π, since a cotangent has the cosine over the sine
-    factor = np.where(angle < 1e-3, 1 / 12, 1 / safe**2 - 1 / (2 * safe * np.tan(safe / 2)))
-    k = skew(vectors)
-    result: Array = np.eye(3) + 0.5 * k + factor[:, None, None] * (k @ k)
-    return result
-
-
-def _blocks(turns: Array, joints: NDArray[np.intp], diagonal: Array) -> Array:
-    """A matrix (P, P) with the blocks (3, 3) of some joints, of `turns` (24, 3, 3), and a diagonal (P,) added."""
-    matrix = np.diag(diagonal)
-    rows = 3 + 3 * np.arange(len(joints))[:, None] + np.arange(3)
-    matrix[rows[:, :, None], rows[:, None, :]] += turns[joints]
-    return matrix
+_NEAR, _FAR = 0.1, 0.5
+"""A keypoint that is nearer to where it was expected is on its side; one that is farther isn't farther yet [m]."""
