@@ -29,8 +29,11 @@ Key = str | int
 _ZIP, _NPY, _GZIP = b"PK\x03\x04", b"\x93NUMPY", b"\x1f\x8b"
 _MOST_NODES = 20_000
 _MOST_DEPTH = 5
+_MOST_ITEMS = 2_000_000
+"""Of lists: a quarter of an hour of poses at 30 Hz."""
 _MOST_HELD = 256 << 20
-"""Of a dictionary in an array [bytes]."""
+"""Of a dictionary in an array, and of what was packed [bytes]."""
+_STEP = 1 << 20
 
 
 class Content:
@@ -39,14 +42,19 @@ class Content:
     def __init__(self, root: Any, arrays: PickledArrays | None = None) -> None:
         self.root = root
         self._arrays = arrays or PickledArrays()
+        self._left = _MOST_ITEMS
 
-    def array(self, value: Any) -> NDArray[Any]:
+    def array(self, value: Any, depth: int = 0) -> NDArray[Any]:
         """The array that a value stands for; a list of rows is one, too. Raises `ValueError` for anything else."""
         if isinstance(value, np.ndarray):
             return value
+        self._left -= len(value) if _is_list(value) else 0  # lists that are shared count as often as they are seen
+        if depth > _MOST_DEPTH or self._left < 0:
+            msg = f"lists of lists, more than {_MOST_DEPTH} deep or of more than {_MOST_ITEMS} items"
+            raise ValueError(msg)
         try:
             if isinstance(value, (list, tuple)) and value and not all(type(item) in (int, float) for item in value):
-                return np.stack([self.array(item) for item in value])
+                return np.stack([self.array(item, depth + 1) for item in value])
             return self._arrays.of(value)
         except (RecursionError, *DAMAGE) as cause:
             raise ValueError(str(cause) or type(cause).__name__) from cause
@@ -98,8 +106,8 @@ def open_content(path: Path, *, error: type[RefuError]) -> Content:
                 return _npy(file, file.size)
             is_packed = magic[:1] == b"x" or magic.startswith(_GZIP)
             # All at once: the machine reads byte by byte, which takes three times as long from a file.
-            data = _unpacked(file, is_gzip=magic.startswith(_GZIP)) if is_packed else file.read()
-            return Content(Machine(is_model=False).run(io.BytesIO(data)))
+            data = _unpacked(file, is_gzip=magic.startswith(_GZIP)) if is_packed else io.BytesIO(file.read())
+            return Content(Machine(is_model=False).run(data))
         except (*DAMAGE, *ARCHIVE_DAMAGE) as cause:
             msg = f"{path}: can't be read: {str(cause) or type(cause).__name__}; wanted {WANTED}"
             raise error(msg) from cause
@@ -155,14 +163,18 @@ def _npy(file: BinaryIO, size: int) -> Content:
     return Content(npy.read_array(file, allow_pickle=False))
 
 
-def _unpacked(file: BinaryIO, *, is_gzip: bool) -> bytes:
+def _unpacked(file: BinaryIO, *, is_gzip: bool) -> BinaryIO:
     """Raises `ValueError` for more than a pickle may have."""
-    unpacker = zlib.decompressobj(wbits=31 if is_gzip else 15)
-    data = unpacker.decompress(file.read(), MAX_PICKLE_BYTES)
-    if unpacker.unconsumed_tail or not unpacker.eof:
-        msg = f"unpacks to more than {MAX_PICKLE_BYTES >> 20} MiB, or was cut short"
+    unpacker, unpacked = zlib.decompressobj(wbits=31 if is_gzip else 15), io.BytesIO()
+    packed = file.read(_STEP)
+    while packed and not unpacker.eof and unpacked.tell() <= _MOST_HELD:
+        unpacked.write(unpacker.decompress(packed, _STEP))
+        packed = unpacker.unconsumed_tail or file.read(_STEP)
+    if not unpacker.eof:
+        msg = f"unpacks to more than {_MOST_HELD >> 20} MiB, or was cut short"
         raise ValueError(msg)
-    return data
+    unpacked.seek(0)
+    return unpacked
 
 
 def _torch(path: Path, error: type[RefuError]) -> Content:

@@ -222,10 +222,19 @@ def test_nothing_in_a_pickle_is_executed(tmp_path: Path) -> None:
     (tmp_path / "a.pkl").write_bytes(content)
     assert "no poses" in refusal(lambda: read_motion(tmp_path / "a.pkl"))
     assert not target.exists()
-    for content in (b"N" * 3_000_000 + b".", b"(" * 3_000_000 + b".", b"]" * 90_000 + b"a" * 89_999 + b"."):
+    shared = b"}U\x05poses" + b"N" + b"2\x86" * 60 + b"s."  # a tuple of 2⁶⁰ leaves, all shared
+    rows = b"](" + b"K\x01" * 999 + b"eq\x01"
+    wide = b"}U\x05poses](" + (b"](" + rows + b"h\x01" * 999 + b"eq\x02") + b"h\x02" * 999 + b"es."  # 10⁹ leaves
+    for content in (
+        shared,
+        wide,
+        b"N" * 1_100_000 + b".",
+        b"(" * 1_100_000 + b".",
+        b"]" * 90_000 + b"a" * 89_999 + b".",
+    ):
         (tmp_path / "a.pkl").write_bytes(content)
         assert run_limited(lambda: read_motion(tmp_path / "a.pkl")).error
-    (tmp_path / "a.pkl").write_bytes(zlib.compress(bytes(1 << 30), 9))
+    (tmp_path / "a.pkl").write_bytes(zlib.compress(bytes(300 << 20), 1))
     assert "unpacks to more" in run_limited(lambda: read_motion(tmp_path / "a.pkl")).error
 
 
