@@ -123,7 +123,8 @@ def _choose(
     if found:
         msg = f"{path}: {len(found)} topics could carry the body: {_listing(found)}; choose one with --topic"
     else:
-        msg = f"{path}: no SMPL topic; the bag has {_listing(topics)}, wanted a topic of {_supported()}"
+        wanted = own.message_type if own else _supported()
+        msg = f"{path}: no SMPL topic; the bag has {_listing(topics)}, wanted a topic of {wanted}"
     raise BagError(msg)
 
 
