@@ -159,6 +159,8 @@ class KeypointTracker:
             if pose is not None:
                 solved = self._solved(pose, sides, prior=None, rest=1.0, steps=8)
                 found.append((solved.pose, solved.variance, self._misfit(solved.pose, sides)))
+                if found[0][2] < _FITS:
+                    break
         if not found:
             return None
         # What the tracker says is believed unless the mirror image fits much better: most people are symmetric.
@@ -282,5 +284,7 @@ _FASTEST = np.concatenate([np.full(3, 12.0), np.full(3 * N_JOINTS, 40.0), np.zer
 """No pelvis [m/s], no joint [rad/s] is faster."""
 _LEAST = 0.05
 """A confidence below it is none."""
+_FITS = 0.04
+"""A first pose that its keypoints lie so near to [m] has its sides right."""
 _NEAR, _FAR = 0.1, 0.5
 """A keypoint that is nearer to where it was expected is on its side; one that is farther isn't farther yet [m]."""

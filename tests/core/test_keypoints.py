@@ -336,3 +336,14 @@ def test_confidence() -> None:
         np.testing.assert_allclose(frame.pose, reference.pose, atol=1e-3)
     with pytest.raises(FrameError, match=r"wanted 17 keypoints of coco17, got \(33, 3\)"):
         KeypointTracker(skeleton("coco17")).update(np.zeros((33, 3)), 1)
+
+
+def test_a_tracker_that_begins_with_the_sides_exchanged_is_put_right() -> None:
+    """Which way somebody faces shows in noses, toes, knees and elbows, whatever is called left."""
+    kept, frame = keypoint_layout("zed38"), clip("walk").frames[0]
+    points = points_of(frame, "zed38")
+    right = KeypointTracker(skeleton("zed38")).update(points, 1)
+    got = KeypointTracker(skeleton("zed38")).update(points[kept.mirrored], 1)
+    assert right is not None
+    assert got is not None
+    np.testing.assert_allclose(got.pose, right.pose, atol=1e-3)
