@@ -1,7 +1,7 @@
 """A person in motion, dressed, in RViz2: smpl_publisher (or a bag played by rosbag2), the garment node and RViz2.
 
 ros2 launch refu_ros demo.launch.py
-ros2 launch refu_ros demo.launch.py motion:=clip.npz input_axes:=frame persons:="[ann, bob]"
+ros2 launch refu_ros demo.launch.py motion:=clip.npz persons:="[ann, bob]"
 ros2 launch refu_ros demo.launch.py bag:=recording input_type:=joint_state rviz:=false
 """
 
@@ -24,7 +24,7 @@ from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
 
 SHARE = Path(get_package_share_directory("refu_ros"))
 OWN = {
-    "motion": (str(SHARE / "bags" / "walk"), ".npz, .mcap or rosbag2 directory for smpl_publisher to play"),
+    "motion": (str(SHARE / "bags" / "walk"), "file of motion, .mcap or rosbag2 directory for smpl_publisher to play"),
     "bag": ("", "rosbag2 directory for `ros2 bag play` to play instead, all its topics by their recorded names"),
     "in_place": ("true", "hold the person at the place of the first frame"),
     "rviz": ("true", "start RViz2; the demo ends when it is closed"),
@@ -32,7 +32,7 @@ OWN = {
 """Arguments of the demo alone; all of garments.launch.py's are the demo's, too."""
 SHARED = {
     "input_type": ("multiarray", "message that carries the body: multiarray, joint_state, pose_array, smpl_msgs"),
-    "input_axes": ("smpl", "axes of the motion: smpl (y up), or frame (z up, as AMASS's own files)"),
+    "input_axes": ("smpl", "axes that are sent: smpl (y up; files are turned), or frame (as a file has them)"),
     "frame_id": ("map", "frame of the garments"),
 }
 """Arguments that the player and the viewer have to know, too, with the values that all of them begin with."""

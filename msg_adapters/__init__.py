@@ -18,7 +18,19 @@ from msg_adapters.bags import (
 from msg_adapters.definitions import MessageDefinition, message_definition
 from msg_adapters.diagnostics import DIAGNOSTIC_ARRAY, DiagnosticStatus, encode_diagnostics
 from msg_adapters.errors import AdapterError, BagError, DecodeError, EncodeError, MotionFileError
-from msg_adapters.inputs import INPUT_TYPES, Decoder, Encoder, InputType, decoder_for, encoder_for, frame_id_of
+from msg_adapters.inputs import (
+    INPUT_TYPES,
+    KEYPOINT_TYPES,
+    Decoder,
+    Encoder,
+    InputType,
+    Keypoints,
+    KeypointType,
+    decode_keypoints,
+    decoder_for,
+    encoder_for,
+    frame_id_of,
+)
 from msg_adapters.joints import SMPL_JOINTS
 from msg_adapters.markers import (
     MARKER_ARRAY,
@@ -34,11 +46,13 @@ from msg_adapters.markers import (
     vertices_from_points,
 )
 from msg_adapters.motion import Motion, read_motion
+from msg_adapters.people import KeypointStream
 from msg_adapters.rotations import quaternion_from_rotvec, rotvec_from_quaternion, slerp
 
 __all__ = [
     "DIAGNOSTIC_ARRAY",
     "INPUT_TYPES",
+    "KEYPOINT_TYPES",
     "MARKER_ARRAY",
     "POINTS",
     "SMPL_JOINTS",
@@ -55,6 +69,9 @@ __all__ = [
     "FrameRecord",
     "InputAxes",
     "InputType",
+    "KeypointStream",
+    "KeypointType",
+    "Keypoints",
     "Marker",
     "MarkerArrayEncoder",
     "MarkerMesh",
@@ -64,6 +81,7 @@ __all__ = [
     "QosProfile",
     "SmplBag",
     "TopicInfo",
+    "decode_keypoints",
     "decode_marker_array",
     "decoder_for",
     "encode_delete",

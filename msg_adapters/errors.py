@@ -22,4 +22,4 @@ class BagError(AdapterError):
 
 
 class MotionFileError(AdapterError):
-    """An AMASS-style `.npz` that can't be read."""
+    """A file of motion that can't be read."""

@@ -1,11 +1,8 @@
-"""Recorded motion as AMASS keeps it: an `.npz` with `poses`, `trans`, `betas`, a frame rate and a gender.
-
-AMASS's own files have z up: encode their garments with `axes="frame"`.
-"""
+"""Recorded motion: what archives, pose estimators and motion capture write, as frames in SMPL's axes."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,14 +10,16 @@ import numpy as np
 from msg_adapters.cdr import NS_PER_S
 from msg_adapters.errors import MotionFileError
 from msg_adapters.rotations import quaternion_from_rotvec, rotvec_from_quaternion, slerp
-from refu_core._amass import MAX_FRAMES, n_resampled, read_recording
 from refu_core.frames import N_JOINTS, SmplFrame
+from refu_core.recordings import MAX_FRAMES, n_resampled, read_recording
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
     from numpy.typing import NDArray
+
+    from refu_core.recordings import Axes
 
 _BLOCK = 10_000  # frames that are resampled at once: a clip of hours would take gigabytes
 
@@ -38,6 +37,8 @@ class Motion:
     fps: float
     """Frames a second."""
     gender: str = "neutral"
+    notes: tuple[str, ...] = ()
+    """What the reader took for granted, left out or turned: to be shown to whoever gave the file."""
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -83,16 +84,31 @@ class Motion:
             first, last = (quaternion_from_rotvec(self.poses[which[rows]]) for which in (before, after))
             poses[rows] = rotvec_from_quaternion(slerp(first, last, fraction[rows, None]))
         transl = self.transl[before] + fraction[:, None] * (self.transl[after] - self.transl[before])
-        return Motion(poses, transl, self.betas, float(fps), self.gender)
+        return replace(self, poses=poses, transl=transl, fps=float(fps))
 
 
-def read_motion(path: str | Path, *, max_frames: int = MAX_FRAMES) -> Motion:
-    """Reads an AMASS-style `.npz`: `poses` (T, 72 | 156 | 165) [rad], a frame rate; optional `trans` and `betas`.
+def read_motion(
+    path: str | Path,
+    *,
+    fps: float | None = None,
+    axes: Axes = "auto",
+    person: str | None = None,
+    max_frames: int = MAX_FRAMES,
+) -> Motion:
+    """Reads a file of motion: `docs/guide/inputs.md` lists what is recognised.
 
-    Raises `MotionFileError` for a file that can't be read, or whose arrays are of other shapes.
+    Args:
+        path: an .npz, .npy, pickle (also joblib's and torch's) or .bvh. Nothing in a pickle is executed.
+        fps: frames a second, in place of what the file says; must be given where it says nothing.
+        axes: what root orientations and translations are expressed in; `auto` sees it from the people, and says so in
+            the motion's `notes`. The motion is in SMPL's axes, but for `frame`, which leaves it as it is.
+        person: whose motion, where the file has several; the one with most frames if not given.
+        max_frames: a longer clip is refused.
+
+    Raises `MotionFileError` for a file that can't be read or isn't recognised, or whose arrays have other shapes.
     """
-    recording = read_recording(path, error=MotionFileError)
+    recording = read_recording(path, error=MotionFileError, fps=fps, axes=axes, person=person)
     if len(recording.poses) > max_frames:
         msg = f"{path}: {len(recording.poses)} frames, at most {max_frames} are read; cut the clip"
         raise MotionFileError(msg)
-    return Motion(*recording)
+    return Motion(**{item.name: getattr(recording, item.name) for item in fields(recording)})

@@ -1,8 +1,9 @@
 """Garments on SMPL bodies in real time, free of body-garment collisions.
 
 Start with `GarmentPipeline.load(["tshirt-male"])` and call it with a `SmplFrame`. The parts can be used alone, each
-from the package it is in: `body`, `garments`, `backbones`, `sdf`, `refu` (the paper's layer), `contact` (what brings a
-garment off the body), `realtime`, `metrics`, `simulation`, `training`. The names most often needed are here, too.
+from the package it is in: `keypoints` and `recordings` (what comes in), `body`, `garments`, `backbones`, `sdf`, `refu`
+(the paper's layer), `contact` (what brings a garment off the body), `realtime`, `metrics`, `simulation`, `training`.
+The names most often needed are here, too.
 
 Most names are imported when they are first used: code that needs `SmplFrame` alone doesn't wait for torch and warp.
 """

@@ -96,6 +96,18 @@ def read_npz(path: Path, *, keys: Collection[str], error: type[RefuError], wante
             raise error(msg) from cause
 
 
+def npz_names(path: Path, *, error: type[RefuError], wanted: str) -> list[str]:
+    """The names of what an archive holds. Raises `error` as `read_npz`."""
+    with open_file(path, most=_MAX_FILE_BYTES, error=error, wanted=wanted) as file:
+        file.step = _MAX_READ
+        try:
+            with zipfile.ZipFile(file) as archive:
+                return [name.removesuffix(".npy") for name in archive.namelist()]
+        except DAMAGE as cause:
+            msg = f"{path}: can't be read as .npz: {str(cause) or type(cause).__name__}"
+            raise error(msg) from cause
+
+
 def check_npy(file: IO[bytes], size: int) -> tuple[tuple[int, ...], np.dtype[Any]]:
     """Checks that a file of `size` bytes, read from its start on, holds the array that its header announces.
 

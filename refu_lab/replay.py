@@ -7,7 +7,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -16,18 +16,20 @@ import numpy as np
 from tqdm import tqdm
 
 import msg_adapters as adapters
-from refu_core import FrameError, GarmentPipeline, SmplFrame
+from refu_core import GarmentPipeline, SmplFrame
 from refu_core._device import one_thread
 from refu_core.metrics import CollisionChecker, Figures, GarmentMetrics
 from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN
+from refu_core.recordings import axis_of, upright_share
+from refu_lab.sources import Source, open_source
 from refu_lab.truth import GroundTruth
 
 if TYPE_CHECKING:
     from msg_adapters import FrameRecord
     from refu_core.realtime import PipelineOutput, SkinShift
+    from refu_core.recordings import Axes
 
 GARMENTS_TOPIC = "/garments"
-INPUT_TOPIC = "/smpl_params"
 _MAX_REASONS = 20
 _LONGEST_PAUSE_S = 60.0
 """Reasons of skips that are counted apart."""
@@ -49,12 +51,20 @@ class ReplayOptions:
     speed: Literal["max", "real"] = "max"
     topic: str | None = None
     input_type: str | None = None
-    input_axes: Literal["smpl", "frame"] = "smpl"
+    input_axes: Axes = "auto"
+    fps: float | None = None
+    person: str | None = None
+    keypoints: str = "zed38"
     frame_id: str = "map"
     device: str = "cpu"
     max_frames: int | None = None
     overwrite: bool = False
     collider: bool = True
+
+    @property
+    def axes(self) -> adapters.InputAxes:
+        """What the frames' roots, and so the garments, are expressed in."""
+        return "frame" if self.input_axes == "frame" or self.input_type in adapters.KEYPOINT_TYPES else "smpl"
 
     def load_pipeline(self) -> GarmentPipeline:
         """The pipeline that these options ask for. Raises `RefuError` for options that make none."""
@@ -166,56 +176,6 @@ class ReplayResult:
         }
 
 
-@dataclass(eq=False)
-class Source:
-    """Frames of a bag or of a motion file, as records of one kind."""
-
-    description: str
-    """A topic and its type, or a motion file."""
-    topic: str
-    message_type: str
-    decoder: adapters.Decoder
-    records: Iterator[FrameRecord]
-    count: int | None
-    """Records, where the file says how many there are."""
-    bag: adapters.SmplBag | None = None
-    """What is read; None for a motion file."""
-
-    @property
-    def warnings(self) -> list[str]:
-        """What was wrong with the file as a whole; complete after the last record."""
-        return list(self.bag.reader.warnings) if self.bag else []
-
-
-@contextmanager
-def open_source(options: ReplayOptions) -> Iterator[Source]:
-    """Opens the input. Raises `RefuError` for one that can't be read."""
-    if options.input.suffix == ".npz":
-        motion = adapters.read_motion(options.input)
-        description = f"{options.input.name}, {len(motion)} frames at {motion.fps:g} Hz"
-        records, decoder = _motion_records(motion, INPUT_TOPIC), adapters.decoder_for("multiarray")
-        yield Source(description, INPUT_TOPIC, adapters.INPUT_TYPES["multiarray"], decoder, records, len(motion))
-        return
-    with adapters.open_smpl_bag(options.input, topic=options.topic, input_type=options.input_type) as bag:
-        topic, kind = bag.topic.name, bag.topic.message_type
-        yield Source(f"{topic} ({kind})", topic, kind, bag.decoder, iter(bag), bag.message_count, bag)
-
-
-def _motion_records(motion: adapters.Motion, topic: str) -> Iterator[FrameRecord]:
-    encode = adapters.encoder_for("multiarray")
-    for i in range(len(motion)):
-        stamp_ns = round(1e9 * i / motion.fps)
-        frame, error, raw = None, None, b""
-        try:
-            frame = motion.frame(i)
-            raw = encode(frame)
-        except FrameError as cause:  # one bad frame of a clip is skipped like one bad message of a bag
-            error = adapters.DecodeError(str(cause))
-        yield adapters.FrameRecord(
-            frame=frame, error=error, stamp_ns=stamp_ns, log_time_ns=stamp_ns, topic=topic, raw=raw
-        )
-
-
 class Evaluator:
     """Exact metrics of every frame, before and after collision handling, against the collider and against the skin."""
 
@@ -262,7 +222,7 @@ class _Replayer:
         self._source = source
         self._result = result
         faces = {name: garment.faces.cpu().numpy() for name, garment in pipeline.garments.items()}
-        truth = GroundTruth.of_bag(options.input, faces, axes=options.input_axes) if source.bag is not None else None
+        truth = GroundTruth.of_bag(options.input, faces, axes=options.axes) if source.bag is not None else None
         self._evaluator = Evaluator(pipeline, truth)
         self._betas = None if options.betas is None else np.asarray(options.betas, np.float32)
         meshes = [
@@ -274,7 +234,7 @@ class _Replayer:
             )
             for name, garment in pipeline.garments.items()
         ]
-        self._encoder = adapters.MarkerArrayEncoder(meshes, frame_id=options.frame_id, axes=options.input_axes)
+        self._encoder = adapters.MarkerArrayEncoder(meshes, frame_id=options.frame_id, axes=options.axes)
 
     def open_writer(self) -> adapters.BagWriter | None:
         """The output bag with its topics, None where no output was asked for."""
@@ -303,7 +263,7 @@ class _Replayer:
             data = self._encoder.encode(
                 [mesh.local for mesh in output.values()], stamp_ns=frame.stamp_ns, transl=frame.transl
             )
-        except adapters.EncodeError as error:
+        except (adapters.DecodeError, adapters.EncodeError) as error:
             self._skip(str(error))
             return
         latency_ms = 1e3 * (time.perf_counter() - start)
@@ -340,7 +300,7 @@ def replay(options: ReplayOptions, *, pipeline: GarmentPipeline | None = None, p
         SmplFrame(pose=np.zeros((24, 3), np.float32))
     )  # compiles kernels, so that the first frame's latency is a frame's
     with ExitStack() as stack:
-        source = stack.enter_context(open_source(options))
+        source = stack.enter_context(open_source(options, pipeline.body))
         result = ReplayResult(options, source.description)
         replayer = _Replayer(options, pipeline, source, result)
         writer = replayer.open_writer()
@@ -356,12 +316,27 @@ def replay(options: ReplayOptions, *, pipeline: GarmentPipeline | None = None, p
         except KeyboardInterrupt:
             result.interrupted = True
         result.warnings += source.warnings
+    result.warnings += _doubts(result, source, pipeline.body.name)
     replayer.summarise()
     if not result.frames and not result.interrupted:
         reasons = "; ".join(f"{count} x {reason}" for reason, count in result.skips.most_common(3))
         msg = f"{options.input}: no frame could be replayed: {reasons or 'the input is empty'}"
         raise adapters.BagError(msg)
     return result
+
+
+def _doubts(result: ReplayResult, source: Source, body: str) -> list[str]:
+    """What about the people should be looked at: another gender than the body's, or lying down."""
+    doubts = []
+    if {source.gender, body} == {"male", "female"}:
+        doubts.append(f"the motion is of a {source.gender} person, the garments are for the {body} body")
+    if source.bag is not None and result.frames:
+        roots = np.array([one.frame.pose[0] for one in result.frames], np.float64)
+        up, upright = axis_of(roots), upright_share(roots)
+        if result.options.axes == "smpl" and upright < 0.5:
+            along = f": they stand along {up} (--input-axes frame?)" if up else ""
+            doubts.append(f"people are upright in {100 * upright:.0f} % of the frames only{along}")
+    return doubts
 
 
 def _paced(records: Iterable[FrameRecord], speed: Literal["max", "real"]) -> Iterator[FrameRecord]:

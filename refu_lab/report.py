@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from refu_core import RefuError
 from refu_core.metrics import CollisionChecker
+from refu_core.recordings import upright_turn
 from refu_lab.plots import new_axes, save_svg
 from refu_lab.render import Camera, RenderMesh, collision_mesh, render, save_png
 from refu_lab.replay import FrameResult, ReplayResult
@@ -20,6 +21,8 @@ from refu_lab.tables import REPLAY_HEADER, replay_rows
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+    from numpy.typing import NDArray
 
     from refu_core import GarmentPipeline
 
@@ -112,19 +115,23 @@ def _draw_frames(result: ReplayResult, pipeline: GarmentPipeline, folder: Path, 
     body_faces = pipeline.body.faces.cpu().numpy()
     checker = CollisionChecker(body_faces)
     pictures = []
+    # A frame has axes of its own (a camera's, or z up); the pictures have y up.
+    roots = np.array([one.frame.pose[0] for one in result.frames], np.float64)
+    turn = (upright_turn(roots) if result.options.axes == "frame" else np.eye(3)).astype(np.float32)
     with tqdm(total=2 * len(chosen), desc="pictures", unit="picture", disable=None if progress else True) as bar:
         for title, index in chosen.items():
             frame = result.frames[index]
             output = pipeline(frame.frame)
             checker.update(output.body)
-            camera = Camera.framing(output.body, size=_PICTURE, yaw=_front(frame))
+            body = output.body @ turn.T
+            camera = Camera.framing(body, size=_PICTURE, yaw=_front(frame, turn))
             for when in ("before", "after"):
-                meshes = [RenderMesh(output.body, body_faces)]
+                meshes = [RenderMesh(body, body_faces)]
                 for name, mesh in output.items():
                     vertices = mesh.raw if when == "before" else mesh.local
                     found = checker.check(vertices, mesh.faces)
                     colour = pipeline.garments[name].card.color
-                    meshes.append(collision_mesh(vertices, mesh.faces, found, colour=colour))
+                    meshes.append(collision_mesh(vertices @ turn.T, mesh.faces, found, colour=colour))
                 file = f"{title}_{when}.png"
                 save_png(render(meshes, camera=camera, size=_PICTURE), folder / file)
                 pictures.append(_Pictured(f"{title} frame, {when}", index, file, _caption(frame, when)))
@@ -132,9 +139,9 @@ def _draw_frames(result: ReplayResult, pipeline: GarmentPipeline, folder: Path, 
     return pictures
 
 
-def _front(frame: FrameResult) -> float:
+def _front(frame: FrameResult, turn: NDArray[np.float32]) -> float:
     """Yaw of the camera that looks at the person's front, a little from the side [degrees]."""
-    forward = Rotation.from_rotvec(frame.frame.pose[0]).apply([0.0, 0.0, 1.0])
+    forward = turn @ Rotation.from_rotvec(frame.frame.pose[0]).apply([0.0, 0.0, 1.0])
     return float(np.degrees(np.arctan2(forward[0], forward[2]))) + 25.0
 
 

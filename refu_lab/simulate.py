@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import sys
+from collections import Counter
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
-from refu_core.simulation import GarmentDataset, Progress, simulate_dataset, simulate_sequences
+from refu_core.simulation import GarmentDataset, Progress, load_clips, simulate_dataset, simulate_sequences
 from refu_lab.contact_sheet import contact_sheet
 from refu_lab.render import save_png
 from refu_lab.tables import format_table
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from refu_core.recordings import Axes
 
 SHEET = "samples.png"
 """Random samples of a finished set, to look at before anything is trained on it."""
@@ -25,6 +29,8 @@ def simulate(
     output: Path,
     *,
     motions: Path | None,
+    axes: Axes = "auto",
+    fps: float | None = None,
     body: str | None,
     seed: int,
     processes: int,
@@ -40,6 +46,9 @@ def simulate(
 
     Raises `RefuError`.
     """
+    clips = None if motions is None else load_clips(motions, axes=axes, fps=fps)
+    for note, count in Counter(note for clip in clips or () for note in clip.notes).most_common():
+        print(f"motions: {note} ({count} of {len(clips or ())} files)", file=sys.stderr)
     with ExitStack() as stack:
         unit = "sequence" if sequences else "sample"
         bar = stack.enter_context(tqdm(total=None, unit=unit, disable=None if progress else True))
@@ -49,7 +58,7 @@ def simulate(
             bar.set_postfix(state.dropped, refresh=False)
             bar.update(state.done - bar.n)
 
-        options: dict[str, Any] = {"motions": motions, "body": body, "seed": seed, "progress": show}
+        options: dict[str, Any] = {"motions": clips, "body": body, "seed": seed, "progress": show}
         options |= {"processes": processes, "shard": shard}
         if sequences:
             return simulate_sequences(garment, count, output, shapes=shapes, seconds=seconds, **options)

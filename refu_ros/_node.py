@@ -17,13 +17,14 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 import msg_adapters as adapters
 from refu_core import FrameError, RefuError
 from refu_core.errors import printable
+from refu_ros._decoding import InputDecoder
 from refu_ros._diagnostics import statuses
 from refu_ros._guard import GuardedNode, answer_no, transition
 from refu_ros._interfaces import interface
 from refu_ros._loader import PipelineLoader
 from refu_ros._parameters import declare_settings
 from refu_ros._recording import Recording
-from refu_ros._scene import Scene, check_plausible
+from refu_ros._scene import Scene
 from refu_ros._settings import specs
 from refu_ros._worker import Worker
 
@@ -67,8 +68,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         self._listening_since: float | None = None
         self._wanted_at = 0.0
         self._has_sent = False
-        self._decoder = adapters.decoder_for(self.settings.layout)
-        self._input_type = adapters.INPUT_TYPES[self.settings.layout]
+        self._decoder = InputDecoder(self.settings)
         # These live as long as the node: who looks stays connected while it is configured anew.
         self._garments, self._body = (
             self.create_lifecycle_publisher(
@@ -87,6 +87,8 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         # Steady time: a simulation that stands still must not stop the diagnostics.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(1.0, self.guarded("each second", self._on_second), clock=steady)
+        if self._decoder.is_steady:
+            self.create_timer(1 / self.settings.keypoint_rate, self.guarded("predict", self._on_due), clock=steady)
 
     # Lifecycle ------------------------------------------------------------------------------------
 
@@ -94,12 +96,13 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Loads the garments."""
         try:
-            interface(self._input_type)
+            interface(self._decoder.message_type)
             self._pipeline, self._in_use = self.settings.pipeline.load(), self.settings.pipeline
         except RefuError as error:
             self.get_logger().error(f"can't be configured: {printable(error)}")
             return TransitionCallbackReturn.FAILURE
         self._loader = PipelineLoader(self._on_loaded, self._on_not_loaded)
+        self._decoder.use(self.settings, self._pipeline.body)
         self._state = "inactive"
         self.get_logger().info(f"configured with {self._in_use}")
         return super().on_configure(state)
@@ -205,9 +208,9 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
 
     def _listen(self, person: str, topic: str) -> None:
         full_name = self.resolve_topic_name(topic)
-        self.get_logger().info(f"listening to {full_name} ({self._input_type})")
+        self.get_logger().info(f"listening to {full_name} ({self._decoder.message_type})")
         self._inputs[person] = self.create_subscription(
-            interface(self._input_type),
+            interface(self._decoder.message_type),
             topic,
             lambda data: self._on_input(person, full_name, data),
             _ros_qos(_INPUT_QOS),
@@ -220,21 +223,24 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         if self._scene is None:
             return
         self.statistics.receive()
-        self.recording.put(topic, self._input_type, data, _INPUT_QOS)
+        self.recording.put(topic, self._decoder.message_type, data, _INPUT_QOS)
         if not (self.watched() or self.body_watched()):
             self.statistics.skip("unwatched")
             return
         try:
-            frame = self._decoder.from_bytes(data)
-            if frame.stamp_ns == 0:  # the message has no header, or an empty one: when it came is the best there is
-                frame = replace(frame, stamp_ns=self.now_ns())
-            check_plausible(frame)
+            frames, given = self._decoder.frames(person, data, self.now_ns())
         except (adapters.AdapterError, FrameError) as error:
             self.statistics.drop("invalid", str(error))
             self.get_logger().warning(f"{topic}: {printable(error)}", throttle_duration_sec=_LOG_PERIOD_S)
             return
-        self._compare_frames(topic, printable(adapters.frame_id_of(data, self.settings.layout)))
-        self._scene.put(person, frame)
+        self._compare_frames(topic, printable(given))
+        for name, frame in frames.items() if not self._decoder.is_steady else ():
+            self._scene.put(name, frame)
+
+    def _on_due(self) -> None:
+        if self._scene is not None and (self.watched() or self.body_watched()):
+            for name, frame in self._decoder.predicted(self.now_ns()).items():
+                self._scene.put(name, frame)
 
     def _compare_frames(self, topic: str, given: str) -> None:
         """Says, once, that the sender's frame isn't the garments', where the sender names one."""
@@ -320,6 +326,8 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
             self._lost = ""  # the operator knows better
         self.settings = settings
         self._attend()  # a recording may have begun
+        if self._pipeline is not None:
+            self._decoder.use(settings, self._pipeline.body)
         if self._worker is not None:
             self._worker.settings = settings
         if reload and self._loader is not None:
@@ -328,6 +336,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
 
     def _on_loaded(self, pipeline: GarmentPipeline, key: PipelineKey) -> None:
         self._pipeline, self._in_use = pipeline, key
+        self._decoder.use(self.settings, pipeline.body)
         if self._worker is not None:
             self._worker.use(pipeline)
         self.statistics.set_error(f"{self._lost}: on the cpu now; set device to try it again" if self._lost else "")

@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from msg_adapters import INPUT_TYPES, InputAxes, InputType
+from msg_adapters import INPUT_TYPES, KEYPOINT_TYPES, InputAxes, InputType
 from refu_core import GarmentPipeline, RefuError, SmplFrame, load_garment
 from refu_core._device import checked_device
 from refu_core.frames import N_JOINTS
+from refu_core.keypoints import LAYOUTS
 from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN, MAX_MARGIN, BackboneName, SdfMode
 from refu_core.weights import weights_folder
 
@@ -124,7 +125,26 @@ class NodeSettings:
         "message", "Whether the body shape is the message's, or the parameter betas.", choices=("message", "fixed")
     )
     input_type: str = _parameter(
-        "multiarray", "Message type and layout of smpl_params.", choices=tuple(INPUT_TYPES), live=False
+        "multiarray",
+        "Message type and layout of smpl_params.",
+        choices=(*INPUT_TYPES, *KEYPOINT_TYPES),
+        live=False,
+    )
+    keypoints: str = _parameter(
+        "zed38", "Which points of the body the tracker sends, where input_type is of keypoints.", choices=LAYOUTS
+    )
+    keypoint_rate: float = _parameter(
+        0.0,
+        "Poses of keypoints, predicted, so many a second; 0 for one a message [Hz].",
+        low=0.0,
+        high=240.0,
+        live=False,
+    )
+    keypoint_smoothing: float = _parameter(
+        1.0,
+        "How much smoother than people usually move poses of keypoints are: 2 is calmer and later.",
+        low=0.1,
+        high=10.0,
     )
     input_axes: str = _parameter(
         "smpl",
@@ -237,8 +257,15 @@ class NodeSettings:
 
     @property
     def axes(self) -> InputAxes:
-        """`input_axes`, checked."""
+        """`input_axes`, checked; keypoints are in the axes of `frame_id`, whichever these are."""
+        if self.input_type in KEYPOINT_TYPES:
+            return "frame"
         return cast("InputAxes", self.input_axes)
+
+    @property
+    def known_betas(self) -> tuple[float, ...] | None:
+        """The shape of people whose keypoints come; None where the lengths of their bones tell it."""
+        return self.betas if self.betas_source == "fixed" else None
 
     @property
     def layout(self) -> InputType:

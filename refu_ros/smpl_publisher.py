@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from msg_adapters import INPUT_TYPES, SMPL_JOINTS, BagError, Motion, encoder_for, iter_smpl_frames, read_motion
 from refu_core import FrameError, RefuError, SmplFrame
+from refu_core.recordings import SUFFIXES, Axes
 from refu_ros._guard import GuardedNode
 from refu_ros._interfaces import interface
 from refu_ros._program import make_executor, on_signals, run, spin
@@ -39,6 +40,7 @@ class PublisherOptions:
     input_type: InputType = "multiarray"
     input_axes: Literal["smpl", "frame"] = "smpl"
     frame_id: str = "map"
+    fps: float = 0.0
     rate: float = 30.0
     loop: bool = True
     in_place: bool = False
@@ -47,10 +49,11 @@ class PublisherOptions:
 
 
 DESCRIPTIONS = {
-    "motion": "AMASS-style .npz, .mcap, or rosbag2 directory to play; empty for a march on the spot",
+    "motion": "file of motion (docs/guide/inputs.md), .mcap, or rosbag2 directory to play; empty: a march on the spot",
     "input_type": f"message to send: {', '.join(INPUT_TYPES)}",
-    "input_axes": "axes of the root: smpl (y up), or frame (z up, as AMASS has it: set it at the garment node, too)",
+    "input_axes": "axes that are sent: smpl (y up; files are turned), or frame (as a file has them: z up)",
     "frame_id": "frame_id of messages that have a header",
+    "fps": "frame rate of a file of motion, in place of its own; 0 for that [Hz]",
     "rate": "messages a second, the motion resampled to it [Hz]; 0 for the rate it was recorded at",
     "loop": "start again after the last frame, instead of stopping the node",
     "in_place": "hold the horizontal position of the first frame",
@@ -77,15 +80,15 @@ def march() -> Motion:
     return Motion(pose.astype(np.float32), transl, np.zeros(10, np.float32), _MARCH_FPS)
 
 
-def load_motion(path: str) -> Motion:
+def load_motion(path: str, *, axes: Axes = "auto", fps: float = 0.0) -> Motion:
     """The motion of a file, of a bag (evenly spaced, with the betas of its first frame), or `march` for an empty path.
 
-    Raises `MotionFileError` and `BagError`.
+    A file's axes and rate (0 for its own) are as `read_motion` takes them. Raises `MotionFileError` and `BagError`.
     """
     if not path:
         return march()
-    if Path(path).suffix == ".npz":
-        return read_motion(path)
+    if Path(path).suffix.lower() in SUFFIXES:
+        return read_motion(path, axes=axes, fps=fps or None)
     frames = [record.frame for record in iter_smpl_frames(path) if record.frame is not None]
     if not frames:
         msg = f"{path}: no frame of its SMPL topic can be decoded; `refu replay {path}` says why"
@@ -111,7 +114,11 @@ class SmplPublisher(GuardedNode):
         super().__init__("smpl_publisher", **options)
         self.options = self._declare()
         self.encode: Encoder = encoder_for(self.options.input_type)
-        self.motion = self._prepare(load_motion(self.options.motion))
+        axes: Axes = "frame" if self.options.input_axes == "frame" else "auto"
+        motion = load_motion(self.options.motion, axes=axes, fps=self.options.fps)
+        for note in motion.notes:
+            self.get_logger().warning(f"{self.options.motion}: {note}")
+        self.motion = self._prepare(motion)
         self.finished = False
         self._index = 0
         message_class = interface(INPUT_TYPES[self.options.input_type])
@@ -146,9 +153,10 @@ class SmplPublisher(GuardedNode):
             values[field.name] = float(value) if number and type(value) is int else value
         values["persons"] = tuple(name for name in values["persons"] if name)
         options = PublisherOptions(**values)
-        numbers = (options.rate, options.spacing)
-        if not all(isinstance(n, float) and np.isfinite(n) for n in numbers) or options.rate < 0:
-            msg = f"wanted finite numbers, rate >= 0, got rate {options.rate!r}, spacing {options.spacing!r}"
+        numbers = (options.rate, options.fps, options.spacing)
+        if not all(isinstance(n, float) and np.isfinite(n) for n in numbers) or min(numbers[:2]) < 0:
+            rate, fps, spacing = numbers
+            msg = f"wanted finite numbers, rate >= 0, got rate {rate!r}, fps {fps!r}, spacing {spacing!r}"
             raise RefuError(msg)
         if not all(name.isidentifier() for name in options.persons):
             msg = f"persons: wanted names of letters, digits and underscores, got {list(options.persons)}"

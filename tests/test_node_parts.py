@@ -6,6 +6,7 @@ import os
 import resource
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,8 +17,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from msg_adapters import BagError, BagReader, BagWriter, Marker, QosProfile, decode_marker_array
-from refu_core import FrameError, GarmentPipeline, SmplFrame
+from msg_adapters import BagError, BagReader, BagWriter, DecodeError, Marker, QosProfile, decode_marker_array
+from msg_adapters.cdr import CdrWriter
+from refu_core import FrameError, GarmentPipeline, SmplFrame, load_body
+from refu_core.keypoints import Proportions, Skeleton, keypoint_layout
+from refu_core.keypoints._pose import Pose
+from refu_ros._decoding import InputDecoder
 from refu_ros._diagnostics import statuses
 from refu_ros._loader import PipelineLoader
 from refu_ros._recorder import Recorder, RecorderState, free_path
@@ -542,3 +547,45 @@ def test_the_collider_is_a_parameter_that_needs_another_pipeline(collider: bool)
     assert (asked.pipeline.load().outfit.collider is not None) is collider
     with pytest.raises(SettingsError, match="true or false"):
         plain.changed({"collider": "yes"})
+
+
+# Keypoints ----------------------------------------------------------------------------------------
+
+
+def test_keypoints_are_followed_from_message_to_frames() -> None:
+    settings = NodeSettings(input_type="keypoint_poses", keypoints="coco17", keypoint_rate=30.0)
+    assert (settings.axes, settings.known_betas) == ("frame", None)
+    decoder, body = InputDecoder(settings), load_body("male")
+    assert (decoder.message_type, decoder.is_steady, decoder.predicted(0)) == ("geometry_msgs/msg/PoseArray", True, {})
+    decoder.use(settings, body)
+    bones = Skeleton(keypoint_layout("coco17"), Proportions.of_body(body))
+    turns = np.tile(np.eye(3), (24, 1, 1))
+
+    def message(stamp_ns: int, x: float) -> bytes:
+        points = bones.posed(Pose(np.array([x, 1.0, 0.0]), turns, np.zeros(10))).points
+        cdr = CdrWriter()
+        cdr.header(stamp_ns, "camera")
+        cdr.numbers("I", len(points))
+        cdr.array("f8", np.pad(points, ((0, 0), (0, 4))))
+        return cdr.to_bytes()
+
+    for i in range(10):
+        frames, frame_id = decoder.frames("ann", message(10**9 + i * 33_333_333, 0.05 * i), 5 * 10**9 + i * 33_333_333)
+    assert (list(frames), frame_id) == (["ann"], "camera")
+    now = 5 * 10**9 + 9 * 33_333_333
+    held, ahead = decoder.predicted(now)["ann"], decoder.predicted(now + 66_666_666)["ann"]
+    assert 0.05 < ahead.transl[0] - held.transl[0] < 0.11  # goes on at 1.5 m/s, and dies away
+    assert ahead.stamp_ns - held.stamp_ns == 66_666_666
+    assert decoder.predicted(now + 10**9) == {}
+    with pytest.raises(DecodeError, match="wanted 17 poses"):
+        decoder.frames("ann", _of_ones(33), 0)
+    decoder.use(replace(settings, betas_source="fixed"), body)  # other settings: everybody begins anew
+    assert decoder.predicted(now) == {}
+
+
+def _of_ones(n: int) -> bytes:
+    cdr = CdrWriter()
+    cdr.header(1, "camera")
+    cdr.numbers("I", n)
+    cdr.array("f8", np.ones((n, 7)))
+    return cdr.to_bytes()

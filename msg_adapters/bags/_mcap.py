@@ -268,7 +268,7 @@ def open_mcap(path: Path) -> BinaryIO:
 
     Raises `BagError` when it can't be opened or isn't an MCAP file.
     """
-    wanted = "a .mcap file, a rosbag2 directory or an AMASS-style .npz"
+    wanted = "a .mcap file, a rosbag2 directory, or a file of motion (.npz, .pkl, .bvh …: docs/guide/inputs.md)"
     file = open_file(path, most=_LONGEST, error=BagError, wanted=wanted)
     try:
         start = file.read(len(MAGIC))

@@ -50,6 +50,14 @@ class SmplBag:
         """Messages of the topic."""
         return self.topic.message_count
 
+    def undecoded(self) -> Iterator[FrameRecord]:
+        """Each message as it is, stamped with its log time: for a decoder that remembers and so may see it but once."""
+        for message in self.reader.messages({self.topic.name}):
+            log = message.log_time_ns
+            yield FrameRecord(
+                frame=None, error=None, stamp_ns=log, log_time_ns=log, topic=message.topic, raw=message.data
+            )
+
     def __enter__(self) -> Self:
         return self
 
@@ -91,18 +99,22 @@ def _listing(topics: tuple[TopicInfo, ...] | list[TopicInfo]) -> str:
     return ", ".join(f"{topic.name} ({topic.message_type or 'no type'})" for topic in topics)
 
 
-def _choose(path: Path, topics: tuple[TopicInfo, ...], name: str | None, input_type: str | None) -> TopicInfo:
+def _choose(
+    path: Path, topics: tuple[TopicInfo, ...], name: str | None, input_type: str | None, own: Decoder | None
+) -> TopicInfo:
     if name is not None:
         chosen = next((topic for topic in topics if topic.name.lstrip("/") == name.lstrip("/")), None)
         if chosen is None:
             msg = f"{path}: no topic {name}; the bag has {_listing(topics)}"
             raise BagError(msg)
-        wanted = input_type and decoder_for(input_type).message_type
-        if wanted not in (None, chosen.message_type) or chosen.message_type not in INPUT_TYPES.values():
+        wanted = own.message_type if own else input_type and decoder_for(input_type).message_type
+        known = (wanted,) if own else INPUT_TYPES.values()
+        if wanted not in (None, chosen.message_type) or chosen.message_type not in known:
             msg = f"{path}: {_listing([chosen])} doesn't carry {wanted or 'a body'}; wanted {wanted or _supported()}"
             raise BagError(msg)
         return chosen
-    types = {decoder_for(input_type).message_type} if input_type else set(INPUT_TYPES.values())
+    types = {decoder_for(input_type).message_type} if input_type and not own else set(INPUT_TYPES.values())
+    types = {own.message_type} if own else types
     found = [topic for topic in topics if topic.message_type in types and topic.message_count]
     # A robot's own joint states are of an input type too: the name the node listens to decides before giving up.
     usual = [topic for topic in found if topic.name.rsplit("/", maxsplit=1)[-1] == _USUAL_NAME]
@@ -111,7 +123,8 @@ def _choose(path: Path, topics: tuple[TopicInfo, ...], name: str | None, input_t
     if found:
         msg = f"{path}: {len(found)} topics could carry the body: {_listing(found)}; choose one with --topic"
     else:
-        msg = f"{path}: no SMPL topic; the bag has {_listing(topics)}, wanted a topic of {_supported()}"
+        wanted = own.message_type if own else _supported()
+        msg = f"{path}: no SMPL topic; the bag has {_listing(topics)}, wanted a topic of {wanted}"
     raise BagError(msg)
 
 
@@ -119,8 +132,10 @@ def _supported() -> str:
     return ", ".join(INPUT_TYPES.values())
 
 
-def open_smpl_bag(path: str | Path, *, topic: str | None = None, input_type: str | None = None) -> SmplBag:
-    """Open a bag and find the topic that carries a body.
+def open_smpl_bag(
+    path: str | Path, *, topic: str | None = None, input_type: str | None = None, decoder: Decoder | None = None
+) -> SmplBag:
+    """Open a bag and find the topic that carries a body; a `decoder` of one's own is used for its type of message.
 
     Without `topic` it is the only one of an input type (of `input_type` where given), or the only one of those named
     `smpl_params`.
@@ -134,20 +149,21 @@ def open_smpl_bag(path: str | Path, *, topic: str | None = None, input_type: str
         msg = f"{reader.path}: no message in this bag{why}"
         raise BagError(msg)
     try:
-        chosen = _choose(reader.path, topics, topic, input_type)
+        chosen = _choose(reader.path, topics, topic, input_type, decoder)
         doubtful = not chosen.message_count
     except BagError:
-        doubtful = any(not info.message_count and info.message_type in INPUT_TYPES.values() for info in topics)
+        types = {decoder.message_type} if decoder else set(INPUT_TYPES.values())
+        doubtful = any(not info.message_count and info.message_type in types for info in topics)
         if not doubtful:
             raise
     if doubtful:  # a summary isn't believed that a topic is empty
-        chosen = _choose(reader.path, reader.count(), topic, input_type)
+        chosen = _choose(reader.path, reader.count(), topic, input_type, decoder)
     if chosen.encoding != "cdr":
         msg = (
             f"{reader.path}: {chosen.name} is encoded as {chosen.encoding or 'nothing'}; wanted cdr, as ROS 2 writes it"
         )
         raise BagError(msg)
-    return SmplBag(reader, chosen, decoder_for(chosen.message_type, definition=chosen.definition or None))
+    return SmplBag(reader, chosen, decoder or decoder_for(chosen.message_type, definition=chosen.definition or None))
 
 
 def iter_smpl_frames(

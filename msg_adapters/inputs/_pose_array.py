@@ -39,7 +39,10 @@ def _frame(poses: NDArray[np.float64], stamp_ns: int) -> SmplFrame:
 
 def _check_count(count: int) -> None:
     if count != N_JOINTS:
-        msg = f"wanted {N_JOINTS} poses, one for each joint of SMPL, got {count}"
+        msg = (
+            f"wanted {N_JOINTS} poses, one for each joint of SMPL, got {count}; points of a tracker are the input type "
+            "keypoint_poses"
+        )
         raise DecodeError(msg)
 
 

@@ -4,8 +4,6 @@ from refu_core.body._anatomy import DEFAULT_GAP, ColliderSettings
 from refu_core.body._collider import Collider
 from refu_core.body._io import BUILTIN_BODIES, load_body
 from refu_core.body._kinematics import (
-    JOINT_NAMES,
-    PARENTS,
     RigidTransforms,
     forward_kinematics,
     rotvec_to_rotmat,
@@ -13,6 +11,7 @@ from refu_core.body._kinematics import (
 from refu_core.body._model import BodyOutput, Shape, SmplBody
 from refu_core.body._parts import ARMS, LEGS, MIRRORED_JOINTS, SEGMENTS, joints_of, part_of_faces, weight_of_parts
 from refu_core.body._skinning import Skinning, apply_transforms, blend_transforms, unapply_transforms
+from refu_core.skeleton import JOINT_NAMES, PARENTS
 
 __all__ = [
     "ARMS",

@@ -9,8 +9,8 @@ from pathlib import Path
 import torch
 
 from refu_core._npz import read_npz
+from refu_core._pickle import read_smpl_pickle
 from refu_core.body._model import BodyArrays, SmplBody
-from refu_core.body._pickle import read_smpl_pickle
 from refu_core.errors import BodyError, require_type
 
 BUILTIN_BODIES: tuple[str, ...] = ("male", "female", "neutral")

@@ -11,37 +11,8 @@ from torch import Tensor
 
 from refu_core._warp import argument, is_plain, torch_stream
 from refu_core.body._pose_kernels import chain_kernel, rotation_kernel
-
-JOINT_NAMES: tuple[str, ...] = (
-    "pelvis",
-    "left_hip",
-    "right_hip",
-    "spine1",
-    "left_knee",
-    "right_knee",
-    "spine2",
-    "left_ankle",
-    "right_ankle",
-    "spine3",
-    "left_foot",
-    "right_foot",
-    "neck",
-    "left_collar",
-    "right_collar",
-    "head",
-    "left_shoulder",
-    "right_shoulder",
-    "left_elbow",
-    "right_elbow",
-    "left_wrist",
-    "right_wrist",
-    "left_hand",
-    "right_hand",
-)
-"""Names of the SMPL joints in their order."""
-
-PARENTS: tuple[int, ...] = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
-"""Parent of each SMPL joint, -1 for the root; parents come before their children."""
+from refu_core.skeleton import JOINT_NAMES as JOINT_NAMES
+from refu_core.skeleton import PARENTS as PARENTS
 
 
 def rotvec_to_rotmat(rotvec: Tensor) -> Tensor:

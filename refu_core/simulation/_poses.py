@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from refu_core._amass import n_resampled, read_recording
 from refu_core.body import MIRRORED_JOINTS
 from refu_core.frames import N_JOINTS
+from refu_core.recordings import SUFFIXES, Axes, n_resampled, read_recording
 from refu_core.simulation._errors import SimulationError
 
 # Range of each joint's rotation vector [degrees] about x, y, z, for the left side where there are two; the right side
@@ -47,6 +47,8 @@ class Clip:
     """Translations [m], shape (T, 3)."""
     fps: float
     """Frames a second."""
+    notes: tuple[str, ...] = ()
+    """What the reader took for granted or turned: to be shown to whoever gave the file."""
 
     def resampled(self, fps: float) -> Clip:
         """The motion at another frame rate, rotations on the shorter arc; `SimulationError` for a million frames."""
@@ -63,29 +65,39 @@ class Clip:
             [Slerp(times, Rotation.from_rotvec(self.poses[:, j]))(wanted).as_rotvec() for j in range(N_JOINTS)], 1
         )
         transl = np.stack([np.interp(wanted, times, self.transl[:, k]) for k in range(3)], 1)
-        return Clip(self.name, poses.astype(np.float32), transl, fps)
+        return Clip(self.name, poses.astype(np.float32), transl, fps, self.notes)
 
 
-def load_clips(path: str | Path) -> list[Clip]:
-    """The AMASS-style motions (`.npz` with poses, trans, mocap_framerate) of a file or a folder, by name.
+def load_clips(path: str | Path, *, axes: Axes = "auto", fps: float | None = None) -> list[Clip]:
+    """The motions of a file or a folder, by name, with y up; `docs/guide/inputs.md` lists what files are recognised.
+
+    Args:
+        path: a file, or a folder of them.
+        axes: what the files' roots are expressed in; `auto` sees it from the people, and says so in `Clip.notes`.
+        fps: frames a second, in place of what the files say.
 
     Raises:
         SimulationError: nothing there, or a file of another layout.
     """
     path = Path(path)
-    files = sorted(path.glob("*.npz")) if path.is_dir() else [path]
+    files = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES) if path.is_dir() else [path]
     if not files or not files[0].exists():
-        msg = f"{path}: wanted AMASS-style .npz motions, found none; give a folder of them or a file"
+        msg = f"{path}: wanted motions ({', '.join(SUFFIXES)}), found none; give a folder of them or a file"
         raise SimulationError(msg)
-    return [_load_clip(file) for file in files]
+    return [_load_clip(file, axes, fps) for file in files]
 
 
-def _load_clip(path: Path) -> Clip:
-    recording = read_recording(path, error=SimulationError)
+def as_clips(motions: str | Path | Sequence[Clip]) -> list[Clip]:
+    """Clips that were loaded already, or those of a file or folder. Raises as `load_clips`."""
+    return load_clips(motions) if isinstance(motions, (str, Path)) else list(motions)
+
+
+def _load_clip(path: Path, axes: Axes, fps: float | None) -> Clip:
+    recording = read_recording(path, error=SimulationError, axes="z-up" if axes == "frame" else axes, fps=fps)
     if not (np.isfinite(recording.poses).all() and np.isfinite(recording.transl).all()):
         msg = f"{path}: wanted finite poses and trans; cut out the frames that aren't"
         raise SimulationError(msg)
-    return Clip(path.stem, recording.poses, recording.transl, recording.fps)
+    return Clip(path.stem, recording.poses, recording.transl, recording.fps, recording.notes)
 
 
 def split_clips(clips: Sequence[Clip], *, test_every: int = 5) -> tuple[list[Clip], list[Clip]]:

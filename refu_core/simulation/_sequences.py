@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -20,7 +20,7 @@ from refu_core.simulation._drape import GRAVITY, SettledDrape
 from refu_core.simulation._errors import SimulationError
 from refu_core.simulation._motion import FPS, STEPS, DrawnMotion, draw_motion
 from refu_core.simulation._plan import TEST, TRAIN, truncated_normal
-from refu_core.simulation._poses import Clip, load_clips, split_clips
+from refu_core.simulation._poses import Clip, as_clips, split_clips
 from refu_core.simulation._produce import Progress, produce
 from refu_core.simulation._selection import CAUSES
 from refu_core.simulation._store import DONE, SEQUENCES, SequenceShard, dequantise, quantise
@@ -184,7 +184,7 @@ def simulate_sequences(
     count: int,
     output: str | Path,
     *,
-    motions: str | Path | None,
+    motions: str | Path | Sequence[Clip] | None,
     shapes: int = 5,
     seconds: float = 10.0,
     body: str | Path | None = None,
@@ -202,7 +202,7 @@ def simulate_sequences(
         garment: `tshirt-male` or another built-in garment.
         count: sequences in the set, training and test together, over all shards; best a multiple of `shapes`.
         output: directory of the set; it is made, or must hold the beginning of the same set.
-        motions: a folder of AMASS-style `.npz` files, two at least, of `seconds` or more.
+        motions: a folder of motion files, or what `load_clips` has read, two at least, of `seconds` or more.
         shapes: body shapes in the set.
         seconds: length of each sequence.
         body: name or file of a body; None for the one the garment was cut for.
@@ -221,10 +221,10 @@ def simulate_sequences(
         BodyError, GarmentError: no such body or garment.
     """
     if motions is None:
-        msg = f"sequences need recorded motion: give a folder of AMASS-style .npz files, of {seconds:g} s or more each"
+        msg = f"sequences need recorded motion: give a folder of motion files, of {seconds:g} s or more each"
         raise SimulationError(msg)
     plan = SequencePlan(garment, count, shapes=shapes, seconds=seconds, seed=seed)
-    clips = split_clips(load_clips(motions))
+    clips = split_clips(as_clips(motions))
     make = partial(SequenceSimulator, plan, clips, settings or SequenceSettings(), body)
     produce(make, Path(output), processes=processes, shard=shard, progress=progress, fps=FPS)
     return summarise_sequences(output)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from refu_core.simulation._plan import SamplePlan
-from refu_core.simulation._poses import Clip, load_clips, split_clips
+from refu_core.simulation._poses import Clip, as_clips, split_clips
 from refu_core.simulation._produce import Progress, produce
 from refu_core.simulation._summary import summarise
 from refu_core.simulation._worker import SimulationSettings, SlotSimulator
@@ -20,7 +20,7 @@ def simulate_dataset(
     count: int,
     output: str | Path,
     *,
-    motions: str | Path | None = None,
+    motions: str | Path | Sequence[Clip] | None = None,
     body: str | Path | None = None,
     seed: int = 0,
     processes: int = 1,
@@ -38,7 +38,7 @@ def simulate_dataset(
         garment: `tshirt-male` or another built-in garment.
         count: samples in the set, training and test together, over all shards.
         output: directory of the set; it is made, or must hold the beginning of the same set.
-        motions: a folder of AMASS-style `.npz` files, two at least; None for drawn poses alone.
+        motions: a folder of motion files, or what `load_clips` has read, two at least; None for drawn poses alone.
         body: name or file of a body; None for the one the garment was cut for.
         seed: of everything that is drawn.
         processes: how many processes share the work, one thread each.
@@ -62,7 +62,7 @@ def simulate_dataset(
     if motions is None:
         plan = replace(plan, recorded_share=0.0)
     else:
-        clips = split_clips(load_clips(motions))
+        clips = split_clips(as_clips(motions))
     make = partial(SlotSimulator, plan, clips, settings or SimulationSettings(), body)
     produce(make, output, processes=processes, shard=shard, progress=progress)
     return summarise(output)

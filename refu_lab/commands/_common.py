@@ -170,6 +170,20 @@ def add_collider(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_axes(parser: argparse.ArgumentParser, what: str, frame: str) -> None:
+    """What every command has that reads files of motion: how their numbers are meant."""
+    parser.add_argument(
+        "--input-axes",
+        choices=("auto", "smpl", "z-up", "y-down", "frame"),
+        default="auto",
+        help=f"axes of the {what} root: seen from the people, and said (auto, default); y up (smpl); z-up (AMASS); "
+        f"y-down (a camera); or {frame} (frame)",
+    )
+    parser.add_argument(
+        "--fps", type=between(0.001, 10_000), metavar="HZ", help="frame rate of motion files, in place of their own"
+    )
+
+
 def given(args: argparse.Namespace, options: type) -> dict[str, Any]:
     """The arguments that are fields of a dataclass of options, by name."""
     names_of_fields = {field.name for field in fields(options)}

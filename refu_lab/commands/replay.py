@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from refu_core.keypoints import LAYOUTS
 from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN
 from refu_lab.commands._common import (
     EXIT_INTERRUPTED,
+    add_axes,
     add_collider,
     add_common,
     check_writable,
@@ -34,7 +36,10 @@ def add(commands: Any) -> None:
         "evaluate them with exact collision checks.",
     )
     parser.add_argument(
-        "input", type=in_path, metavar="INPUT", help="an .mcap, a rosbag2 directory, or an AMASS-style .npz"
+        "input",
+        type=in_path,
+        metavar="INPUT",
+        help="an .mcap, a rosbag2 directory, or a file of motion: AMASS, pose estimators', BVH (docs/guide/inputs.md)",
     )
     parser.add_argument(
         "--output", type=out_bag, metavar="OUT", help="bag to write: OUT.mcap, or a directory for rosbag2"
@@ -72,14 +77,16 @@ def add(commands: Any) -> None:
         "--topic", type=word, metavar="NAME", help="input topic, where a bag has several of SMPL parameters"
     )
     parser.add_argument(
-        "--input-type", type=word, metavar="TYPE", help="multiarray, joint_state, pose_array or smpl_msgs"
+        "--input-type",
+        type=word,
+        metavar="TYPE",
+        help="multiarray, joint_state, pose_array, smpl_msgs, keypoint_poses or keypoint_markers",
     )
     parser.add_argument(
-        "--input-axes",
-        choices=("smpl", "frame"),
-        default="smpl",
-        help="axes of the recorded root: SMPL's world, y up (default), or those of the frame itself",
+        "--keypoints", default="zed38", choices=LAYOUTS, help="which points of the body, with keypoints as input"
     )
+    parser.add_argument("--person", type=word, metavar="NAME", help="whose motion, where the input has several people")
+    add_axes(parser, "recorded", "those of the frame itself, left as they are")
     parser.add_argument("--frame-id", type=word, default="map", metavar="ID", help="frame_id of the markers (map)")
     parser.add_argument("--device", default="cpu", metavar="DEVICE", help="cpu (default) or cuda")
     parser.add_argument("--max-frames", type=positive, metavar="N", help="stop after N frames")

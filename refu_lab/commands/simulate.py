@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from refu_lab.commands._common import (
+    add_axes,
     add_common,
     between,
     check_writable,
@@ -37,8 +38,9 @@ def add(commands: Any) -> None:
         "--motions",
         type=in_path,
         metavar="DIR",
-        help="folder of AMASS-style .npz files, two at least (default: drawn poses alone)",
+        help="folder of motion files, two at least (default: drawn poses alone)",
     )
+    add_axes(parser, "motions'", "z up, as ROS has it")
     parser.add_argument(
         "--body", metavar="BODY", help="a body's name or file (default: the one the garment is cut for)"
     )
@@ -66,6 +68,8 @@ def run(args: argparse.Namespace) -> int:
         args.count,
         args.output,
         motions=args.motions,
+        axes=args.input_axes,
+        fps=args.fps,
         body=args.body,
         seed=args.seed,
         processes=args.processes,

@@ -34,7 +34,7 @@ def save(path: Path, **changes: Any) -> Path:
 @pytest.mark.parametrize("columns", [72, 156, 165])
 def test_layouts(tmp_path: Path, columns: int) -> None:
     poses, trans = RNG.normal(size=(T, columns)), RNG.normal(size=(T, 3))
-    motion = read_motion(save(tmp_path / "a.npz", poses=poses, trans=trans, gender=b"male"))
+    motion = read_motion(save(tmp_path / "a.npz", poses=poses, trans=trans, gender=b"male"), axes="smpl")
     shared = 24 if columns == 72 else 22
     assert len(motion) == T
     np.testing.assert_array_equal(motion.poses[:, :shared].reshape(T, -1), poses[:, : shared * 3].astype(np.float32))
@@ -65,18 +65,18 @@ def test_what_may_be_left_out(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"poses": None}, "no array 'poses'"),
-        ({"poses": np.zeros((T, 69))}, r"poses must be \(T, 72 \| 156 \| 165\) with T > 0, got \(12, 69\)"),
+        ({"poses": None}, "no poses; wanted pose_world, "),
+        ({"poses": np.zeros((T, 70))}, r"poses must be \(T, n, 3\) or .* got \(12, 70\)"),
         ({"poses": np.zeros((0, 72))}, r"got \(0, 72\)"),
-        ({"poses": np.zeros((T, 24, 3))}, r"got \(12, 24, 3\)"),
+        ({"poses": np.zeros((T, 24, 2))}, r"got \(12, 24, 2\)"),
         ({"poses": np.full((T, 72), "x")}, "poses must be numbers"),
         ({"poses": np.full((T, 72), None)}, "can't be read as .npz: Object arrays cannot be loaded"),
-        ({"trans": np.zeros((T - 1, 3))}, r"trans must be \(12, 3\) like poses, got \(11, 3\)"),
+        ({"trans": np.zeros((T - 1, 3))}, r"trans or transl must be \(12, 3\) like the pose, got \(11, 3\)"),
         ({"betas": np.full(10, np.nan)}, "betas has values that are NaN"),
-        ({"betas": np.zeros((T, 10))}, "betas must be one row"),
+        ({"betas": np.zeros((T - 2, 10))}, "betas must be one row"),
         ({"mocap_framerate": None}, "no frame rate"),
-        ({"mocap_framerate": 0.0}, r"frame rate .* in \[0.001, 10000\], got 0"),
-        ({"mocap_framerate": 1e-300}, r"frame rate .* in \[0.001, 10000\], got 1e-300"),
+        ({"mocap_framerate": 0.0}, r"frame rate in \[0.001, 10000\], got 0"),
+        ({"mocap_framerate": 1e-300}, r"frame rate in \[0.001, 10000\], got 1e-300"),
         ({"mocap_framerate": 30j}, "wanted plain numbers"),
         ({"mocap_framerate": np.zeros(2, [("a", "f8")])[0]}, "wanted plain numbers"),
         ({"poses": np.full((T, 72), complex("nan"))}, "wanted plain numbers"),
@@ -84,7 +84,7 @@ def test_what_may_be_left_out(tmp_path: Path) -> None:
         ({"betas": np.full(10, 1e300)}, "too large for float32"),
         ({"gender": "x" * 10_000}, "at most 4096 bytes of text"),
         ({"mocap_framerate": np.nan}, "frame rate"),
-        ({"mocap_framerate": "fast"}, "mocap_framerate must be numbers"),
+        ({"mocap_framerate": "fast"}, "mocap_framerate must be one number"),
     ],
 )
 def test_files_that_are_refused(tmp_path: Path, changes: dict[str, Any], message: str) -> None:

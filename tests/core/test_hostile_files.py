@@ -18,7 +18,7 @@ import pytest
 
 from msg_adapters import read_motion
 from refu_core import load_body
-from refu_core.body._pickle import _NAMES
+from refu_core._pickle_machine import _NAMES
 from tests.core.test_body import random_model
 from tests.core.test_files import SPECIAL
 from tests.limits import refusal, run_limited

@@ -596,13 +596,13 @@ def test_folder_without_motions_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("replaced", "match"),
     [
-        ({"poses": np.zeros((5, 70))}, "72"),
-        ({"poses": np.zeros((5, 72), int)}, "72"),
+        ({"poses": np.zeros((5, 70))}, r"got \(5, 70\)"),
+        ({"poses": np.zeros((5, 72), int)}, "with a fraction"),
         ({"poses": None}, "no poses"),
         ({"poses": np.full((5, 72), np.nan)}, "finite"),
         ({"trans": np.zeros((4, 3))}, "trans"),
-        ({"mocap_framerate": None}, "mocap_framerate"),
-        ({"mocap_framerate": np.array(0.0)}, "mocap_framerate"),
+        ({"mocap_framerate": None}, "frame rate"),
+        ({"mocap_framerate": np.array(0.0)}, "frame rate"),
     ],
 )
 def test_motions_of_another_layout_are_refused(replaced: dict[str, Any], match: str, tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import pickle
 import struct
+import zlib
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -186,6 +187,21 @@ def _claiming(array: NDArray[Any]) -> bytes:
     """An array file that claims to hold a million times as much as there is."""
     header = npy_bytes(np.zeros((1, *array.shape[1:]), array.dtype)) if array.ndim else npy_bytes(array)
     return header.replace(b"(1,", b"(1000000000000,").replace(b", }" + b" " * 12, b", }")
+
+
+def motion_pickles() -> list[bytes]:
+    """Motions as pickles of every protocol: a dictionary a person, a dictionary a frame, packed."""
+    rng = np.random.default_rng(0)
+    person = {
+        "pose_world": rng.normal(size=(4, 72)),
+        "trans_world": rng.normal(size=(4, 3)),
+        "betas": np.zeros((4, 10)),
+    }
+    body = {"global_orient": np.eye(3)[None], "body_pose": np.tile(np.eye(3), (23, 1, 1)), "betas": np.zeros(10)}
+    frames = {f"{i}.jpg": {"smpl": [body], "tid": [1], "path": "x"} for i in range(3)}
+    found = [pickle.dumps({np.int64(1): person, 2: person}, protocol) for protocol in range(6)]
+    found.append(pickle.dumps(frames, 4))
+    return [*found, *(data[:-1] + gadget + b"." for data in found[2:3] for gadget in GADGETS), zlib.compress(found[2])]
 
 
 def body_pickles() -> list[bytes]:

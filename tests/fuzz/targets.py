@@ -102,6 +102,20 @@ def _bag_folder(folder: Path) -> Reader:
     return st.tuples(near_file(texts), near_file(st.just(content))), read
 
 
+def _motion_pickle(folder: Path) -> Reader:
+    """What trackers write."""
+    path = folder / "file.pkl"
+
+    def read(content: bytes | Special) -> None:
+        place(path, content)
+        motion = adapters.read_motion(path, fps=30.0)
+        for i in range(min(len(motion), MOST_READ)):
+            with contextlib.suppress(FrameError):
+                ms.check_frame(motion.frame(i))
+
+    return near_file(near(corpus.motion_pickles(), corpus.GADGETS)), read
+
+
 def _motion(folder: Path) -> Reader:
     path = folder / "file.npz"
 
@@ -271,6 +285,7 @@ _ALL = (
     Target("mcap", "MCAP files", _mcap, 40),
     Target("bag", "rosbag2 directories", _bag_folder, 40),
     Target("motion", "AMASS-style .npz", _motion),
+    Target("motion_pkl", "motion as .pkl, as trackers write it", _motion_pickle),
     Target("body_npz", "bodies as .npz", _body("file.npz", lambda: near_zip(corpus.body_archives()))),
     Target(
         "body_pkl", "bodies as official .pkl", _body("file.pkl", lambda: near(corpus.body_pickles(), corpus.GADGETS))

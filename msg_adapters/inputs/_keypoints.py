@@ -1,0 +1,139 @@
+"""3D keypoints of people: geometry_msgs/PoseArray and visualization_msgs/MarkerArray to points and confidences.
+
+A PoseArray is one person; a pose's position is a keypoint, its orientation isn't read. In a MarkerArray a person is a
+SPHERE_LIST, CUBE_LIST or POINTS with all keypoints, or spheres (or cubes) with the ids 100 * person + keypoint, as the
+driver of Azure Kinect sends them; lines and texts are left alone. Alpha is the confidence. A keypoint that isn't seen
+is NaN, or exactly zero in all of x, y, z.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from msg_adapters.cdr import CdrReader
+from msg_adapters.errors import DecodeError
+from msg_adapters.inputs._frame import decoding
+from msg_adapters.markers import MARKER_ARRAY, decode_marker_array
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from msg_adapters.cdr import Buffer
+    from msg_adapters.markers import Marker
+
+KeypointType = Literal["keypoint_poses", "keypoint_markers"]
+
+KEYPOINT_TYPES: dict[KeypointType, str] = {
+    "keypoint_poses": "geometry_msgs/msg/PoseArray",
+    "keypoint_markers": MARKER_ARRAY,
+}
+"""Message type of each input type that holds keypoints."""
+
+_CUBE, _SPHERE, _ADD = 1, 2, 0
+_LISTS = (6, 7, 8)  # CUBE_LIST, SPHERE_LIST, POINTS
+_PERSON = 100
+"""Ids of one person's markers."""
+_POSE_NUMBERS = 7
+_LONGEST_NAME = 60
+
+
+@dataclass(frozen=True, eq=False)
+class Keypoints:
+    """One person's keypoints."""
+
+    points: NDArray[np.float64]
+    """[m] in the axes of `frame_id`, shape (K, 3); NaN where not seen."""
+    confidence: NDArray[np.float64]
+    """As the message has it, shape (K,); ones where it has none."""
+    stamp_ns: int
+    """0 where the message has none."""
+    frame_id: str
+
+
+def decode_keypoints(input_type: str, data: Buffer, n: int) -> dict[str, Keypoints]:
+    """Everybody in a message of one of `KEYPOINT_TYPES`, in CDR; nobody in an empty one.
+
+    Args:
+        input_type: a key of `KEYPOINT_TYPES`.
+        data: the message.
+        n: keypoints a person has.
+
+    Returns:
+        Keypoints by person. The name is that of the namespace, a letter, digits and underscores; empty for a PoseArray
+        and for an empty namespace.
+
+    Raises:
+        DecodeError: damaged bytes, another number of keypoints, no keypoints among the markers.
+    """
+    if input_type == "keypoint_poses":
+        with decoding(KEYPOINT_TYPES["keypoint_poses"]):
+            return _of_poses(data, n)
+    with decoding(MARKER_ARRAY):
+        return _of_markers(decode_marker_array(data), n)
+
+
+def _of_poses(data: Buffer, n: int) -> dict[str, Keypoints]:
+    reader = CdrReader(data)
+    stamp_ns, frame_id = reader.stamp_ns(), reader.string()
+    count = reader.length(item_bytes=_POSE_NUMBERS * 8)
+    poses = reader.array("f8", count * _POSE_NUMBERS).reshape(count, _POSE_NUMBERS)
+    reader.finish()
+    if not count:
+        return {}
+    _check_count(count, n, "poses")
+    return {"": _keypoints(poses[:, :3], np.ones(n), stamp_ns, frame_id)}
+
+
+def _of_markers(markers: Sequence[Marker], n: int) -> dict[str, Keypoints]:
+    people: dict[str, Keypoints] = {}
+    loose: dict[str, list[Marker]] = {}
+    shown = [marker for marker in markers if marker.action == _ADD]
+    lists = [marker for marker in shown if marker.type in _LISTS]
+    several = len({marker.ns for marker in lists}) < len(lists)
+    for marker in lists:
+        _check_count(len(marker.points), n, "points")
+        alpha = marker.colors[:, 3] if len(marker.colors) == n else np.full(n, 1.0)
+        name = _name(marker.ns, marker.id if several else 0)
+        people[name] = _keypoints(marker.points, alpha, marker.stamp_ns, marker.frame_id)
+    for marker in shown:
+        if marker.type in (_CUBE, _SPHERE):
+            loose.setdefault(_name(marker.ns, marker.id // _PERSON), []).append(marker)
+    for name, found in loose.items():
+        points, alpha = np.full((n, 3), np.nan), np.zeros(n)
+        for marker in found:
+            which = marker.id % _PERSON
+            if which >= n:
+                msg = f"the marker {marker.ns}/{marker.id} is keypoint {which}, wanted 0 to {n - 1}; set keypoints"
+                raise DecodeError(msg)
+            points[which], alpha[which] = marker.pose[:3], marker.color[3]
+        people.setdefault(name, _keypoints(points, alpha, found[0].stamp_ns, found[0].frame_id))
+    if shown and not people:
+        msg = f"{len(shown)} markers, none of them keypoints; wanted a SPHERE_LIST or POINTS a person, or spheres"
+        raise DecodeError(msg)
+    return people
+
+
+def _check_count(count: int, n: int, what: str) -> None:
+    if count != n:
+        msg = f"wanted {n} {what}, one for each keypoint, got {count}; set keypoints to the tracker's layout"
+        raise DecodeError(msg)
+
+
+def _keypoints(points: NDArray[np.float64], confidence: NDArray[np.floating], stamp: int, frame_id: str) -> Keypoints:
+    seen = np.array(points, np.float64)
+    seen[~seen.any(axis=1)] = np.nan
+    return Keypoints(seen, np.asarray(confidence, np.float64), stamp, frame_id)
+
+
+def _name(namespace: str, number: int) -> str:
+    """A person's name as garments' namespaces and topics may have it."""
+    word = re.sub(r"\W", "_", namespace, flags=re.ASCII)[:_LONGEST_NAME]
+    if word and not word[0].isalpha():
+        word = f"person_{word}"
+    return f"{word or 'person'}_{number}" if number else word

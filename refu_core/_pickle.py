@@ -1,0 +1,157 @@
+"""Arrays of pickles: what the machine has read, rebuilt within the budget of all files."""
+
+from __future__ import annotations
+
+import operator
+import re
+import struct
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from refu_core._files import open_file
+from refu_core._npz import ArrayBudget
+from refu_core._pickle_machine import MAX_PICKLE_BYTES, Machine, Record, exactly, kind_of_name
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from refu_core.errors import RefuError
+
+DAMAGE = (ValueError, TypeError, LookupError, struct.error, OverflowError, MemoryError, OSError)
+"""What the machine, and arrays, raise where a file is damaged."""
+_STORAGES = ("f4", "f8", "f2", "i8", "i4", "i2", "u1", "i1", "b1")
+
+
+class PickledArrays:
+    """Makes arrays of records; `storage` gives the bytes that torch keeps beside its pickle, by their key."""
+
+    def __init__(self, storage: Callable[[str], bytes] | None = None) -> None:
+        self._budget = ArrayBudget()
+        self._storage = storage
+
+    def of(self, value: Any) -> NDArray[Any]:
+        """The array that a value of a pickle stands for. Raises `ValueError`, `KeyError`, `TypeError`."""
+        for _ in range(8):  # variables of variables; one that is its own value never ends
+            if not isinstance(value, Record) or value.kind != "chumpy":
+                break
+            if type(value.state) is not dict or "x" not in value.state:
+                msg = "a chumpy expression; save the model again with its values as plain arrays"
+                raise ValueError(msg)
+            value = value.state["x"]
+        if isinstance(value, Record) and value.kind in ("array", "buffer"):
+            return self._plain(value)
+        if isinstance(value, Record) and value.kind == "sparse":
+            return self._sparse(exactly(dict, value.state))
+        if isinstance(value, Record) and value.kind == "tensor":
+            return self._tensor(value)
+        if isinstance(value, Record) and value.kind == "scalar":
+            dtype, raw = value.args
+            return np.frombuffer(exactly(bytes, raw), _dtype(exactly(Record, dtype)), count=1).reshape(())
+        if isinstance(value, (list, tuple)) and all(type(item) in (int, float) for item in value):
+            self._budget.take((len(value),), np.dtype(np.float64))
+            return np.asarray(value)
+        msg = f"{getattr(value, 'kind', type(value).__name__)} where an array was expected"
+        raise ValueError(msg)
+
+    def _plain(self, record: Record) -> NDArray[Any]:
+        if record.kind == "buffer":  # protocol 5
+            raw, kind, shape, order = record.args
+        else:
+            if type(record.state) is not tuple or len(record.state) != 5:
+                msg = "an array without content"
+                raise ValueError(msg)
+            _, shape, kind, is_fortran, raw = record.state
+            order = "F" if is_fortran else "C"
+        raw = raw.encode("latin1") if isinstance(raw, str) else raw
+        if not isinstance(kind, Record) or kind.kind != "dtype" or not isinstance(raw, bytes):
+            msg = "an array of objects"
+            raise ValueError(msg)
+        dtype = _dtype(kind)
+        shape = tuple(operator.index(n) for n in exactly(tuple, shape))
+        self._budget.take(shape, dtype)
+        flat: NDArray[Any] = np.frombuffer(raw, dtype)
+        return flat.reshape(shape, order="F" if order == "F" else "C")
+
+    def _tensor(self, record: Record) -> NDArray[Any]:
+        """A tensor of torch: a view of a storage."""
+        storage, offset, shape, strides = record.args[:4]
+        _, name, key = exactly(Record, storage).args[:3]
+        kind = kind_of_name(name)
+        if self._storage is None or kind not in _STORAGES or type(key) is not str:
+            msg = "a tensor without its numbers, or of a type that isn't read"
+            raise ValueError(msg)
+        shape, strides = (tuple(operator.index(n) for n in exactly(tuple, pair)) for pair in (shape, strides))
+        if len(shape) != len(strides) or min((*shape, *strides, operator.index(offset)), default=0) < 0:
+            msg = f"a tensor of the shape {str(shape)[:80]} and the strides {str(strides)[:80]}"
+            raise ValueError(msg)
+        self._budget.take(shape, np.dtype(kind))
+        flat = np.frombuffer(self._storage(key), np.dtype("<" + kind))
+        if 0 in shape:
+            return np.zeros(shape, kind)
+        last = offset + sum((n - 1) * stride for n, stride in zip(shape, strides, strict=True))
+        if last >= len(flat):
+            msg = f"a tensor that reaches to number {last} of {len(flat)}"
+            raise ValueError(msg)
+        steps = tuple(stride * flat.itemsize for stride in strides)
+        view: NDArray[Any] = np.lib.stride_tricks.as_strided(flat[offset:], shape, steps, writeable=False)
+        dense: NDArray[Any] = view.copy()
+        return dense
+
+    def _sparse(self, state: dict[str, Any]) -> NDArray[Any]:
+        """A `scipy.sparse` matrix in compressed columns."""
+        rows, columns = (operator.index(n) for n in exactly(tuple, state["_shape" if "_shape" in state else "shape"]))
+        data, indices, pointers = (self.of(state[key]).reshape(-1) for key in ("data", "indices", "indptr"))
+        self._budget.take((rows, columns), np.dtype(np.float64))
+        if len(pointers) != columns + 1 or len(indices) != len(data) or indices.dtype.kind not in "iu":
+            msg = f"a sparse matrix of {rows} x {columns} with {len(data)} entries"
+            raise ValueError(msg)
+        counts = np.diff(pointers)
+        if counts.min(initial=0) < 0 or counts.sum() != len(indices):
+            msg = f"a sparse matrix whose columns have {counts.sum()} entries, and {len(indices)} are given"
+            raise ValueError(msg)
+        dense = np.zeros((rows, columns))
+        column = np.repeat(np.arange(columns), counts)
+        np.add.at(dense, (indices, column), data)
+        return dense
+
+
+def _dtype(record: Record) -> np.dtype[Any]:
+    code = record.args[0] if record.args else None
+    order = record.state[1] if type(record.state) is tuple and len(record.state) > 1 else "|"
+    code, order = (text.decode("latin1") if type(text) is bytes else text for text in (code, order))
+    if type(code) is not str or not re.fullmatch("[biuf][1248]", code):
+        msg = f"arrays of the type {code[:20] if type(code) is str else type(code).__name__!r} are not read"
+        raise ValueError(msg)
+    return np.dtype(order + code) if order in ("<", ">") else np.dtype(code)
+
+
+def read_smpl_pickle(
+    path: Path, *, keys: Collection[str], error: type[RefuError], wanted: str
+) -> dict[str, NDArray[Any]]:
+    """The arrays of an official SMPL `.pkl` whose names are in `keys`.
+
+    Raises:
+        error: the file is too large, isn't a pickle, isn't a model, or refers to anything but arrays.
+    """
+    with open_file(path, most=MAX_PICKLE_BYTES, error=error, wanted=wanted) as file:
+        try:
+            content = Machine(is_model=True).run(file)
+        except DAMAGE as cause:
+            msg = f"{path}: can't be read as an SMPL pickle: {str(cause) or type(cause).__name__}"
+            raise error(msg) from cause
+    if type(content) is not dict:
+        msg = f"{path}: an SMPL pickle holds a dictionary, this one a {type(content).__name__}"
+        raise error(msg)
+    arrays, made = PickledArrays(), {}
+    for key in keys:
+        if key in content:
+            try:
+                made[key] = arrays.of(content[key])
+            except DAMAGE as cause:
+                msg = f"{path}: {key} can't be read: {cause}"
+                raise error(msg) from cause
+    return made

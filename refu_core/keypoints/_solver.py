@@ -1,0 +1,147 @@
+"""The most likely pose of keypoints: Gauss-Newton steps on what is seen, what was predicted, and joints at rest."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
+
+from refu_core.frames import N_BETAS, N_JOINTS
+from refu_core.keypoints._anatomy import resting
+from refu_core.keypoints._pose import Pose, Skeleton, log_so3, skew
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from refu_core.keypoints._settings import TrackerSettings
+
+    Array = NDArray[np.float64]
+
+N_PARTS = 3 + 3 * N_JOINTS + N_BETAS
+TURNS, BETAS = slice(3, 3 + 3 * N_JOINTS), slice(3 + 3 * N_JOINTS, N_PARTS)
+"""Of the numbers of a step as `Pose.moved` takes it."""
+MEAN, SPREAD = resting()
+
+_FLAT = 1e-2
+"""Precision of what nothing is known of."""
+_LOOSE = 0.1
+"""How far a first guess may be off [m]."""
+_CLOSE = 2e-3
+"""Where a step moves the keypoints as a linear one would, but for so much [m], it was the last."""
+_BOLDEST = 0.6
+"""A step turns no joint by more [rad]."""
+
+
+class Solution(NamedTuple):
+    """The most likely pose."""
+
+    pose: Pose
+    variance: Array
+    """Of its parts, shape (85,)."""
+    step: Array
+    """From where it was looked for to it, shape (85,)."""
+
+
+def solve(
+    skeleton: Skeleton,
+    pose: Pose,
+    points: Array,
+    weights: Array,
+    *,
+    free: NDArray[np.intp],
+    deviation: Array,
+    prior: Array | None,
+    rest: float,
+    steps: int,
+    settings: TrackerSettings,
+) -> Solution:
+    """The most likely pose near `pose`.
+
+    Args:
+        skeleton: whose keypoints they are.
+        pose: where it is looked for: the prediction, or a guess.
+        points: keypoints [m], shape (K, 3).
+        weights: how far each is believed, 0 to 1, shape (K,).
+        free: which of `skeleton.parts` may change.
+        deviation: of each keypoint along an axis [m], shape (K,).
+        prior: precision of the prediction's parts, shape (85,); None for a guess, which pulls at nothing.
+        rest: the share of a look that joints at rest count as.
+        steps: of Gauss and Newton at most.
+        settings: the tuned numbers.
+    """
+    precision = np.full(N_PARTS, _FLAT) if prior is None else prior
+    step, factor, info = np.zeros(N_PARTS), np.zeros((0, 0)), 1
+    resting_ = _Resting(pose, rest)
+    for _ in range(steps):
+        posed = skeleton.posed(pose)
+        off = points - posed.points
+        jacobian = skeleton.jacobian(posed)[:, : len(free)]
+        # How far off a keypoint may be that is none the worse: by its own noise and by that of the prediction.
+        doubt = _LOOSE**2 if prior is None else (np.square(jacobian) @ (1 / prior[free])).reshape(3, -1).mean(axis=0)
+        far = (off * off).sum(axis=1) / (settings.outlier**2 * 3 * (deviation**2 + doubt))
+        root = np.tile(np.sqrt(weights) / ((1 + far) * deviation), 3)
+        scaled = jacobian * root[:, None]
+        normal = scaled.T @ scaled
+        diagonal = precision.copy()
+        diagonal[BETAS] += rest
+        _add_blocks(normal, resting_.stiffness, skeleton.turning, diagonal[free])
+        pull = resting_.pull - precision * step
+        pull[BETAS] -= rest * pose.betas
+        factor, info = dpotrf(normal, lower=1)
+        if info:  # not positive: keypoints that say nothing
+            break
+        change = np.zeros(N_PARTS)
+        change[free] = dpotrs(factor, scaled.T @ (off.T.reshape(-1) * root) + pull[free], lower=1)[0]
+        change *= min(1.0, _BOLDEST / max(float(np.abs(change[TURNS]).max()), 1e-9))
+        betas = np.clip(pose.betas + change[BETAS], -settings.most_beta, settings.most_beta)
+        pose = replace(pose.moved(change), betas=betas)
+        step += change  # turns that follow each other add up, as long as the second one is small
+        moved = posed.points + (jacobian @ change[free]).reshape(3, -1).T
+        if np.square(skeleton.posed(pose).points - moved).sum(axis=1).max() < _CLOSE**2:
+            break
+        resting_ = _Resting(pose, rest) if prior is None else resting_.after(change)
+    variance = 1 / np.maximum(precision, _FLAT)
+    if not info:
+        variance[free] = np.diag(dpotri(factor, lower=1)[0])
+    return Solution(pose, variance, step)
+
+
+class _Resting:
+    """What pulls joints to where they rest, and how stiffly."""
+
+    def __init__(self, pose: Pose, rest: float) -> None:
+        vectors = log_so3(pose.turns)
+        inverse = _inverse_right_jacobian(vectors)
+        strength = rest / SPREAD**2
+        transposed = inverse.swapaxes(1, 2)
+        self.stiffness = transposed @ (inverse * strength[:, :, None])
+        """Shape (24, 3, 3)."""
+        self.pull = np.zeros(N_PARTS)
+        """Shape (85,)."""
+        self.pull[TURNS] = (transposed @ ((MEAN - vectors) * strength)[:, :, None]).ravel()
+
+    def after(self, change: Array) -> _Resting:
+        """The same after a small step (85,), to first order."""
+        turns = change[TURNS].reshape(N_JOINTS, 3, 1)
+        self.pull[TURNS] -= (self.stiffness @ turns).ravel()
+        return self
+
+
+def _inverse_right_jacobian(vectors: Array) -> Array:
+    """How rotation vectors (n, 3) change with a turn in the joint's own axes, shape (n, 3, 3)."""
+    angle = np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
+    safe = np.maximum(angle, 1e-3)
+    # Finite and smooth up to 2π, since a cotangent has the cosine over the sine.
+    factor = np.where(angle < 1e-3, 1 / 12, 1 / safe**2 - 1 / (2 * safe * np.tan(safe / 2)))
+    k = skew(vectors)
+    result: Array = np.eye(3) + 0.5 * k + factor[:, None, None] * (k @ k)
+    return result
+
+
+def _add_blocks(matrix: Array, blocks: Array, joints: NDArray[np.intp], diagonal: Array) -> None:
+    """Adds the blocks of some joints, of (24, 3, 3), and a diagonal (P,), to a matrix (P, P)."""
+    rows = 3 + 3 * np.arange(len(joints))[:, None] + np.arange(3)
+    matrix[rows[:, :, None], rows[:, None, :]] += blocks[joints]
+    matrix[np.arange(len(matrix)), np.arange(len(matrix))] += diagonal

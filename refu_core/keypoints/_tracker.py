@@ -1,0 +1,290 @@
+"""A person's keypoints, frame by frame, to a pose of SMPL: a Kalman filter on the pose.
+
+The state is a pose (pelvis, the turns of the joints, betas) and the rates of its parts, each with its variance. A frame
+of keypoints updates it by Gauss-Newton steps towards the most likely pose: of the keypoints as far as they are seen and
+believed, of the pose that was predicted, and of what joints do at rest. So bones keep their lengths, a joint that isn't
+seen goes on for a while and then comes to rest, and how much a keypoint moves the pose follows from how sure both are.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from refu_core.errors import FrameError
+from refu_core.frames import N_BETAS, N_JOINTS, SmplFrame
+from refu_core.keypoints._guess import first_pose
+from refu_core.keypoints._pose import Pose, Skeleton, exp_so3, log_so3
+from refu_core.keypoints._settings import DEFAULTS, TrackerSettings
+from refu_core.keypoints._solver import BETAS, MEAN, N_PARTS, SPREAD, Solution, solve
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+    Array = NDArray[np.float64]
+
+
+class _Seen(NamedTuple):
+    """A frame of keypoints, cleaned."""
+
+    points: Array
+    """[m], shape (K, 3); zeros where nothing is seen."""
+    weights: Array
+    """Confidence from 0 to 1, shape (K,)."""
+
+
+class KeypointTracker:
+    """One person. Not thread-safe.
+
+    Args:
+        skeleton: the keypoints' layout on the body that is dressed.
+        betas: the person's shape (10,) where it is known; estimated from the lengths of bones if not given.
+        settings: the tuned numbers.
+    """
+
+    def __init__(
+        self, skeleton: Skeleton, *, betas: ArrayLike | None = None, settings: TrackerSettings = DEFAULTS
+    ) -> None:
+        self.skeleton = skeleton
+        self._settings = settings
+        self._known = None if betas is None else np.asarray(betas, np.float64)
+        n_fixed = 0 if self._known is None else N_BETAS
+        self._free = skeleton.parts[: len(skeleton.parts) - n_fixed]
+        joints, other = skeleton.layout.joints, skeleton.layout.mirrored
+        self._sides = [np.flatnonzero(np.isin(joints, group) & (other != np.arange(len(other)))) for group in _GROUPS]
+        self._offset = settings.offset_noise * skeleton.layout.offsets.any(axis=1)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets the person."""
+        self._pose: Pose | None = None
+        self._sent_betas: Array | None = None
+        self._stamp = self._seen_at = 0
+        self._noise = self._settings.noise
+        self._swapped_for = self._unfit_for = 0.0
+
+    def _neutral(self) -> Pose:
+        betas = np.zeros(N_BETAS) if self._known is None else self._known
+        return Pose(np.zeros(3), exp_so3(np.where(SPREAD < 10, MEAN, 0.0)), betas)
+
+    # A frame --------------------------------------------------------------------------------------
+
+    def update(self, points: ArrayLike, stamp_ns: int, *, confidence: ArrayLike | None = None) -> SmplFrame | None:
+        """The pose after a frame of keypoints, None while there is no person to be seen.
+
+        Args:
+            points: [m], shape (K, 3); a keypoint that isn't seen is NaN, or has no confidence.
+            stamp_ns: when they were seen [ns]. What is older than the newest changes nothing; after a second without
+                any, or of a clock that was set back by more, the track begins anew.
+            confidence: from 0 to 1, shape (K,); NaN and negative numbers are none. Whatever reaches above 1 counts to
+                100.
+
+        Raises:
+            FrameError: another number of keypoints.
+        """
+        seen = self._cleaned(points, confidence)
+        dt = 1e-9 * (stamp_ns - self._stamp)
+        if self._pose is not None and not -1.0 < dt <= 1.0:
+            self.reset()
+        if self._pose is None:
+            return self._begin(seen, stamp_ns)
+        if dt <= 0:
+            return self.at(self._stamp)
+        self._predict(dt)
+        self._stamp = stamp_ns
+        if (seen.weights > 0).any():
+            sided = self._sided(seen, dt)
+            if sided is None:
+                self.reset()
+                return self._begin(seen, stamp_ns)
+            self._correct(sided, dt)
+            if self._unfit_for > self._settings.doubt:
+                self._begin_again(seen)
+        if 1e-9 * (stamp_ns - self._seen_at) > self._settings.hold:
+            self.reset()
+        return self.at(stamp_ns)
+
+    def at(self, stamp_ns: int) -> SmplFrame | None:
+        """The pose at another time, before the next keypoints: rates go on, and die away.
+
+        None where nobody was seen for `hold`.
+        """
+        if self._pose is None or 1e-9 * (stamp_ns - self._seen_at) > self._settings.hold:
+            return None
+        coast = self._settings.coast
+        ahead = coast * (1 - np.exp(-max(0.0, 1e-9 * (stamp_ns - self._stamp)) / coast))
+        pose = self._pose.moved(ahead * self._rate) if ahead else self._pose
+        betas = self._steady_betas(pose.betas)
+        transl = pose.pelvis - self.skeleton.proportions.of(betas)[0]
+        return SmplFrame(
+            log_so3(pose.turns).astype(np.float32), betas=betas.astype(np.float32), transl=transl, stamp_ns=stamp_ns
+        )
+
+    def _steady_betas(self, betas: Array) -> Array:
+        if self._sent_betas is None or np.abs(betas - self._sent_betas).max() > self._settings.beta_step:
+            self._sent_betas = betas.copy()
+        return self._sent_betas
+
+    def _cleaned(self, points: ArrayLike, confidence: ArrayLike | None) -> _Seen:
+        n = len(self.skeleton.layout)
+        given = np.asarray(points, np.float64)
+        weights = np.ones(n) if confidence is None else np.asarray(confidence, np.float64).copy()
+        if given.shape != (n, 3) or weights.shape != (n,):
+            msg = f"wanted {n} keypoints of {self.skeleton.layout.name}, got {given.shape} and {weights.shape}"
+            raise FrameError(msg)
+        weights[~(weights > 0)] = 0.0
+        top = weights.max(initial=0.0)
+        weights = np.minimum(weights if top <= 1 else weights / 100, 1.0)
+        here = np.isfinite(given).all(axis=1) & (np.abs(given) < 1e6).all(axis=1)
+        weights[~here | (weights < _LEAST)] = 0.0
+        return _Seen(np.where(weights[:, None] > 0, given, 0.0), weights)
+
+    # Beginnings -----------------------------------------------------------------------------------
+
+    def _begin(self, seen: _Seen, stamp_ns: int) -> SmplFrame | None:
+        guess = self._guessed(seen)
+        if guess is None:
+            return None
+        self._take(*guess)
+        self._stamp = self._seen_at = stamp_ns
+        return self.at(stamp_ns)
+
+    def _guessed(self, seen: _Seen) -> tuple[Pose, Array, float] | None:
+        """The pose, its variances, and how badly it fits [m], from one frame alone, left and right as it fits best."""
+        found = []
+        other = self.skeleton.layout.mirrored
+        for sides in (seen, _Seen(seen.points[other], seen.weights[other])):
+            pose = first_pose(self.skeleton, sides.points, sides.weights > 0, self._neutral())
+            if pose is not None:
+                solved = self._solved(pose, sides, prior=None, rest=1.0, steps=8)
+                found.append((solved.pose, solved.variance, self._misfit(solved.pose, sides)))
+                if found[0][2] < _FITS:
+                    break
+        if not found:
+            return None
+        # What the tracker says is believed unless the mirror image fits much better: most people are symmetric.
+        return found[1] if len(found) == 2 and found[1][2] < 0.5 * found[0][2] else found[0]
+
+    def _take(self, pose: Pose, variance: Array, _: float) -> None:
+        self._pose = pose
+        self._rate = np.zeros(N_PARTS)
+        self._variance = variance
+        self._mixed = np.zeros(N_PARTS)
+        self._rate_variance = np.concatenate([np.full(3, 1.0), np.full(3 * N_JOINTS, 4.0), np.zeros(N_BETAS)])
+        self._swapped_for = self._unfit_for = 0.0
+
+    def _begin_again(self, seen: _Seen) -> None:
+        """Where the pose hasn't fitted for long: from this frame alone, if that fits better."""
+        assert self._pose is not None
+        self._unfit_for = 0.0
+        guess = self._guessed(seen)
+        if guess is not None and guess[2] < 0.7 * self._misfit(self._pose, seen):
+            self._take(*guess)
+
+    def _misfit(self, pose: Pose, seen: _Seen) -> float:
+        """Median distance of keypoints from where the pose has them [m], the farther half of it."""
+        off = np.linalg.norm(self.skeleton.posed(pose).points - seen.points, axis=1)[seen.weights > 0]
+        return float(np.sqrt(np.mean(np.minimum(off, 0.5) ** 2))) if len(off) else 0.0
+
+    def _sided(self, seen: _Seen, dt: float) -> _Seen | None:
+        """The frame with arms, legs or face exchanged where they are on the wrong side; None if it is somebody else's.
+
+        Nothing is done for keypoints that are all near where they were expected.
+        """
+        assert self._pose is not None
+        expected = self.skeleton.posed(self._pose).points
+        off = np.square(seen.points - expected).sum(axis=1)
+        visible = seen.weights > 0
+        if off[visible].max() < _NEAR**2:
+            self._swapped_for = 0.0
+            return seen
+        if visible.sum() >= 4 and float(np.median(off[visible])) > self._settings.jump**2:
+            return None
+        other, taken, is_swapped = self.skeleton.layout.mirrored, np.arange(len(visible)), False
+        both = visible & visible[other]
+        for group in self._sides:
+            here = group[both[group]]
+            if len(here) < 2 or off[here].max() < _NEAR**2:
+                continue
+            exchanged = np.square(seen.points[other[here]] - expected[here]).sum(axis=1)
+            if np.minimum(exchanged, _FAR**2).sum() < 0.4 * np.minimum(off[here], _FAR**2).sum():
+                taken[here], is_swapped = other[here], True
+        self._swapped_for = self._swapped_for + dt if is_swapped else 0.0
+        if self._swapped_for > self._settings.doubt:  # it was the prediction that had the sides wrong
+            self._swapped_for, self._unfit_for = 0.0, np.inf
+            return seen
+        return _Seen(seen.points[taken], seen.weights[taken])
+
+    # The filter -----------------------------------------------------------------------------------
+
+    def _predict(self, dt: float) -> None:
+        """Constant rates that die away; variances of the same."""
+        assert self._pose is not None
+        own = self._settings
+        keep = np.exp(-dt / own.coast)
+        ahead = own.coast * (1 - keep)
+        self._pose = self._pose.moved(ahead * self._rate)
+        power = np.concatenate([np.full(3, own.push), np.full(3 * N_JOINTS, own.twist), np.zeros(N_BETAS)])
+        power = power / own.smoothing**2
+        p, m, r = self._variance, self._mixed, self._rate_variance
+        self._variance = p + 2 * ahead * m + ahead**2 * r + power * dt**3 / 3
+        self._variance[BETAS] += own.growth * dt
+        self._mixed = keep * (m + ahead * r) + power * dt**2 / 2
+        self._rate_variance = keep**2 * r + power * dt
+        self._rate = keep * self._rate
+
+    def _correct(self, seen: _Seen, dt: float) -> None:
+        assert self._pose is not None
+        rest = min(1.0, dt / self._settings.rest_after)
+        after, variance, step = self._solved(
+            self._pose, seen, prior=1 / self._variance, rest=rest, steps=self._settings.steps
+        )
+        gain = self._mixed / self._variance
+        shrunk = 1 - variance / self._variance
+        self._rate = np.clip(self._rate + gain * step, -_FASTEST, _FASTEST)
+        self._rate_variance = np.maximum(self._rate_variance - gain * self._mixed * shrunk, 0.0)
+        self._mixed = gain * variance
+        self._variance = variance
+        self._pose = after
+        self._seen_at = self._stamp
+        self._learn_noise(seen, dt)
+
+    def _learn_noise(self, seen: _Seen, dt: float) -> None:
+        """Follows what the tracker's noise is, by the median of what is left."""
+        assert self._pose is not None
+        off = np.linalg.norm(self.skeleton.posed(self._pose).points - seen.points, axis=1)[seen.weights > 0]
+        if len(off) < 4:
+            return
+        own, median = self._settings, float(np.median(off))
+        # Of three normal components the median length is 1.54 deviations; the fit takes up about a quarter of them.
+        target = np.clip(median / 1.54 * 1.25, own.least_noise, own.most_noise)
+        self._noise += min(1.0, dt) * (float(target) - self._noise)
+        self._unfit_for = self._unfit_for + dt if median > max(4 * self._noise, 0.08) else 0.0
+
+    def _solved(self, pose: Pose, seen: _Seen, *, prior: Array | None, rest: float, steps: int) -> Solution:
+        deviation = np.sqrt(self._noise**2 + self._offset**2)
+        return solve(
+            self.skeleton,
+            pose,
+            seen.points,
+            seen.weights,
+            free=self._free,
+            deviation=deviation,
+            prior=prior,
+            rest=rest,
+            steps=steps,
+            settings=self._settings,
+        )
+
+
+_GROUPS = ((16, 18, 20, 22, 17, 19, 21, 23), (1, 4, 7, 10, 2, 5, 8, 11), (15,))
+"""Joints of arms, legs and head, whose keypoints trackers exchange together."""
+_FASTEST = np.concatenate([np.full(3, 12.0), np.full(3 * N_JOINTS, 40.0), np.zeros(N_BETAS)])
+"""No pelvis [m/s], no joint [rad/s] is faster."""
+_LEAST = 0.05
+"""A confidence below it is none."""
+_FITS = 0.04
+"""A first pose that its keypoints lie so near to [m] has its sides right."""
+_NEAR, _FAR = 0.1, 0.5
+"""A keypoint that is nearer to where it was expected is on its side; one that is farther isn't farther yet [m]."""

@@ -1,0 +1,232 @@
+"""BVH: any person's skeleton in motion, fitted with SMPL's by the positions of its joints.
+
+A BVH file says nothing of what its joints are but their names, nothing of its units, and its rest pose may be any. So
+its joints are posed, known by their names, and followed as keypoints are.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from refu_core._files import read_file
+from refu_core.keypoints import KeypointTracker, Proportions, Skeleton, TrackerSettings, layout_of
+from refu_core.recordings._layouts import WANTED
+from refu_core.recordings._rate import MAX_FRAMES, check_fps
+from refu_core.recordings._recording import Recording
+from refu_core.recordings._upright import Axes, to_smpl
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from refu_core.errors import RefuError
+
+    Array = NDArray[np.float64]
+
+_MAX_BYTES = 256 << 20
+_MAX_JOINTS = 1000
+_CHANNELS = {f"{axis}{kind}": (kind, i) for kind in ("position", "rotation") for i, axis in enumerate("xyz")}
+_NAMES = {
+    "hip": ("upleg", "thigh", "upperleg", "femur", "hip"),
+    "knee": ("leg", "knee", "shin", "lowerleg", "lowleg", "calf", "tibia"),
+    "ankle": ("foot", "ankle"),
+    "foot": ("toebase", "toe", "toes", "ball"),
+    "shoulder": ("arm", "upperarm", "uparm", "shldr", "humerus", "shoulder"),
+    "elbow": ("forearm", "elbow", "lowerarm", "lowarm", "radius"),
+    "wrist": ("hand", "wrist"),
+    "pelvis": ("hips", "pelvis", "hip"),
+    "neck": ("neck", "neck1", "neck01"),
+    "head": ("head",),
+}
+"""What joints are called, without their side; the first that a file has. A `shoulder` is a collar where there is an
+arm, too."""
+_SIDED = ("hip", "knee", "ankle", "foot", "shoulder", "elbow", "wrist")
+_NEEDED = tuple(f"{side}_{part}" for side in "lr" for part in ("hip", "knee", "shoulder", "elbow"))
+_UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254, "CMU's units": 0.0254 / 0.45}
+_LEG = 0.82
+"""Hip to knee to ankle of the mean body [m]."""
+_LEGS = (0.45, 1.1)
+"""Of people [m]; a unit with which it's outside isn't meant."""
+_FIT = 100  # frames that a person's shape is taken from
+
+
+@dataclass(eq=False)
+class _Joint:
+    name: str
+    parent: int
+    offset: Array
+    channels: list[str] = field(default_factory=list)
+
+
+def read_bvh(path: Path, *, error: type[RefuError], fps: float | None, axes: Axes) -> Recording:
+    """The motion of a BVH file. Raises `error` for a damaged one, and for a skeleton that isn't a person's."""
+    text = read_file(path, most=_MAX_BYTES, error=error, wanted=WANTED).decode("utf-8", "replace")
+    try:
+        joints, rows, seconds = _parsed(text)
+        rate = check_fps(fps if fps is not None else 1 / seconds if seconds > 0 else 0.0)
+        return _fitted(joints, _placed(joints, rows), rate, axes)
+    except ValueError as cause:
+        msg = f"{path}: {cause}"
+        raise error(msg) from cause
+
+
+def _parsed(text: str) -> tuple[list[_Joint], Array, float]:
+    """Joints, a row of channels a frame, and the seconds between frames. Raises `ValueError`."""
+    hierarchy, word, motion = text.partition("MOTION")
+    head = re.match(r"\s*Frames:\s*(\d+)\s+Frame\s+Time:\s*([-+.\deE]+)", motion) if word else None
+    if head is None:
+        msg = "not a BVH file: wanted HIERARCHY, then MOTION, Frames: and Frame Time:"
+        raise ValueError(msg)
+    joints = _joints(iter(hierarchy.split()))
+    n_channels, count = sum(len(joint.channels) for joint in joints), int(head[1])
+    numbers = np.array(motion[head.end() :].split(), dtype=np.float64)
+    if not 0 < count <= MAX_FRAMES or numbers.size != count * n_channels or not np.isfinite(numbers).all():
+        msg = f"wanted {count} frames (1 to {MAX_FRAMES}) of {n_channels} finite numbers, got {numbers.size} in all"
+        raise ValueError(msg)
+    return joints, numbers.reshape(count, n_channels), float(head[2])
+
+
+def _joints(words: Iterator[str]) -> list[_Joint]:
+    joints: list[_Joint] = []
+    open_: list[int] = []
+    try:
+        for word in words:
+            if word in ("ROOT", "JOINT", "End"):
+                name = next(words)
+                joints.append(_Joint("" if word == "End" else name, open_[-1] if open_ else -1, np.zeros(3)))
+            elif word == "{":
+                open_.append(len(joints) - 1)
+            elif word == "}":
+                open_.pop()
+            elif word == "OFFSET":
+                joints[open_[-1]].offset = np.array([float(next(words)) for _ in range(3)])
+            elif word == "CHANNELS":
+                joints[open_[-1]].channels = [next(words).lower() for _ in range(int(next(words)))]
+            if len(joints) > _MAX_JOINTS:
+                msg = f"more than {_MAX_JOINTS} joints"
+                raise ValueError(msg)
+    except (StopIteration, IndexError) as cause:
+        msg = "its hierarchy is cut short"
+        raise ValueError(msg) from cause
+    unknown = [name for joint in joints for name in joint.channels if name not in _CHANNELS]
+    if not joints or unknown:
+        msg = f"unknown channel {unknown[0]!r}" if unknown else "no joints"
+        raise ValueError(msg)
+    return joints
+
+
+def _placed(joints: list[_Joint], rows: Array) -> Array:
+    """Positions of the joints in the file's units, shape (T, J, 3)."""
+    places, turns = np.zeros((len(joints), len(rows), 3)), np.zeros((len(joints), len(rows), 3, 3))
+    start = 0
+    for i, joint in enumerate(joints):
+        own = rows[:, start : start + len(joint.channels)]
+        start += len(joint.channels)
+        way, order = np.broadcast_to(joint.offset, (len(rows), 3)).copy(), ""
+        angles: list[Array] = []
+        for name, column in zip(joint.channels, own.T, strict=True):
+            kind, axis = _CHANNELS[name]
+            if kind == "position":  # in place of the offset: the root's, and of every joint in some files
+                way[:, axis] = column
+            else:
+                order, angles = order + "XYZ"[axis], [*angles, column]
+        if order and len(set(order)) == len(order):
+            turn = Rotation.from_euler(order, np.stack(angles, axis=1), degrees=True).as_matrix()
+        elif order:
+            msg = f"{joint.name} turns twice about one axis: {order}"
+            raise ValueError(msg)
+        else:
+            turn = np.broadcast_to(np.eye(3), (len(rows), 3, 3))
+        if joint.parent < 0:
+            places[i], turns[i] = way, turn
+        else:
+            above = turns[joint.parent]
+            places[i] = places[joint.parent] + np.einsum("tij,tj->ti", above, way)
+            turns[i] = above @ turn
+    frames: Array = places.swapaxes(0, 1)
+    return frames
+
+
+def _fitted(joints: list[_Joint], places: Array, fps: float, axes: Axes) -> Recording:
+    points = _points(joints)
+    missing = [name for name in _NEEDED if name not in points]
+    if missing:
+        names = ", ".join(joint.name for joint in joints[:12] if joint.name)
+        msg = f"not a person's skeleton, or its names aren't known: no {', '.join(missing)} among {names} …"
+        raise ValueError(msg)
+    notes: list[str] = []
+    scale = _scale(points, places[0], notes)
+    skeleton = Skeleton(layout_of("bvh", tuple(points)), Proportions.builtin("neutral"))
+    seen = scale * places[:, list(points.values())]
+    settings = TrackerSettings(noise=0.01, rest_after=1.0)
+    some = np.linspace(0, len(seen) - 1, min(_FIT, len(seen))).astype(int)
+    shapes = [KeypointTracker(skeleton, settings=settings).update(seen[i], 0) for i in some]
+    known = [frame.betas for frame in shapes if frame is not None]
+    if not known:
+        msg = "its joints are in no order that a person's are in"
+        raise ValueError(msg)
+    betas = np.median(known, axis=0)
+    track = KeypointTracker(skeleton, betas=betas, settings=settings)
+    frames = [track.update(place, round(1e9 * i / fps)) for i, place in enumerate(seen)]
+    poses = np.stack([np.full((24, 3), np.nan) if frame is None else frame.pose for frame in frames])
+    transl = np.stack([np.full(3, np.nan) if frame is None else frame.transl for frame in frames])
+    notes.append(f"the skeleton of {len(joints)} joints is fitted by the positions of {len(points)}")
+    roots, transl = to_smpl(poses[:, 0].astype(np.float64), transl, axes, notes, usual="smpl")
+    poses[:, 0] = roots
+    return Recording(poses.astype(np.float32), transl, betas.astype(np.float32), fps, "neutral", tuple(notes))
+
+
+def _points(joints: list[_Joint]) -> dict[str, int]:
+    """The joint that each point of the body is."""
+    sides: dict[tuple[str, str], int] = {}
+    for i, joint in enumerate(joints):
+        if joint.name:
+            sides.setdefault(_sided(joint.name), i)
+    points = {}
+    for part, names in _NAMES.items():
+        for side in ("l", "r") if part in _SIDED else ("",):
+            found = next((sides[side, name] for name in names if (side, name) in sides), None)
+            if found is not None:
+                points[f"{side}_{part}" if side else part] = found
+    end = next((i for i, joint in enumerate(joints) if not joint.name and joint.parent == points.get("head")), None)
+    if end is not None:
+        points["head_top"] = end
+    return points
+
+
+def _sided(name: str) -> tuple[str, str]:
+    """The side, `l`, `r` or none, and the rest of a joint's name, in any of the ways that tools write it."""
+    bare = re.split(r"[:|]", name)[-1]
+    match = re.fullmatch(r"(?i)(?:.*[_. ])?(left|right)[_. ]?(.+)", bare)
+    match = match or re.fullmatch(r"(?:.*[_. ])?([lLrR])(?:[_. ]|(?=[A-Z]))(.+)", bare)
+    if match:
+        side, rest = match[1], match[2]
+    else:
+        match = re.fullmatch(r"(?i)(.+?)[_. ](left|right|l|r)", bare)
+        rest, side = (match[1], match[2]) if match else (re.sub(r"^[A-Za-z0-9]+_(?=[A-Za-z])", "", bare), "")
+    return side[:1].lower(), re.sub(r"[^a-z0-9]", "", rest.lower())
+
+
+def _scale(points: dict[str, int], places: Array, notes: list[str]) -> float:
+    """Metres a unit of the file."""
+    ends = ("l_hip", "l_knee", "l_ankle") if "l_ankle" in points else ("l_hip", "l_knee")
+    leg = sum(float(np.linalg.norm(places[points[a]] - places[points[b]])) for a, b in pairwise(ends))
+    leg *= 1.0 if len(ends) == 3 else 2.0
+    if not leg > 0:
+        msg = "its legs have no length"
+        raise ValueError(msg)
+    unit = min(_UNITS, key=lambda name: abs(np.log(leg * _UNITS[name] / _LEG)))
+    scale = _UNITS[unit]
+    if not _LEGS[0] <= leg * scale <= _LEGS[1]:
+        notes.append(f"no unit makes its legs as long as people's: scaled so that they are {_LEG:g} m")
+        return _LEG / leg
+    notes.append(f"taken as {unit}: its legs are {leg * scale:.2f} m long")
+    return scale

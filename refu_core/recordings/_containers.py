@@ -1,0 +1,203 @@
+"""Files of arrays, opened without executing anything in them: .npz, .npy, pickles of Python, joblib and torch."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+import zlib
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+import numpy as np
+from numpy.lib import format as npy
+
+from refu_core._files import open_file
+from refu_core._npz import DAMAGE as ARCHIVE_DAMAGE
+from refu_core._npz import ArrayBudget, check_npy, npz_names, read_npz
+from refu_core._pickle import DAMAGE, PickledArrays
+from refu_core._pickle_machine import MAX_PICKLE_BYTES, Machine, Record
+from refu_core.recordings._layouts import ALL_KEYS, POSE_KEYS, UNREAD, WANTED
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from refu_core.errors import RefuError
+
+Key = str | int
+_ZIP, _NPY, _GZIP = b"PK\x03\x04", b"\x93NUMPY", b"\x1f\x8b"
+_MOST_NODES = 20_000
+_MOST_DEPTH = 5
+_MOST_ITEMS = 2_000_000
+"""Of lists: a quarter of an hour of poses at 30 Hz."""
+_MOST_HELD = 256 << 20
+"""Of a dictionary in an array, and of what was packed [bytes]."""
+_STEP = 1 << 20
+
+
+class Content:
+    """What a file holds: mappings, lists and arrays in each other. Arrays are made when they are asked for."""
+
+    def __init__(self, root: Any, arrays: PickledArrays | None = None) -> None:
+        self.root = root
+        self._arrays = arrays or PickledArrays()
+        self._left = _MOST_ITEMS
+
+    def array(self, value: Any, depth: int = 0) -> NDArray[Any]:
+        """The array that a value stands for; a list of rows is one, too. Raises `ValueError` for anything else."""
+        if isinstance(value, np.ndarray):
+            return value
+        self._left -= len(value) if _is_list(value) else 0  # lists that are shared count as often as they are seen
+        if depth > _MOST_DEPTH or self._left < 0:
+            msg = f"lists of lists, more than {_MOST_DEPTH} deep or of more than {_MOST_ITEMS} items"
+            raise ValueError(msg)
+        try:
+            if isinstance(value, (list, tuple)) and value and not all(type(item) in (int, float) for item in value):
+                return np.stack([self.array(item, depth + 1) for item in value])
+            return self._arrays.of(value)
+        except (RecursionError, *DAMAGE) as cause:
+            raise ValueError(str(cause) or type(cause).__name__) from cause
+
+    def nodes(self) -> Iterator[tuple[tuple[Key, ...], Mapping[Key, Any]]]:
+        """Every mapping in the file and the way to it, from the outside inwards."""
+        todo: list[tuple[tuple[Key, ...], Any]] = [((), self.root)]
+        for count, (path, value) in enumerate(todo):
+            inside = entries(value)
+            if inside is None or count > _MOST_NODES:
+                continue
+            if not _is_list(value):
+                yield path, inside
+            if len(path) < _MOST_DEPTH and len(todo) < _MOST_NODES:
+                todo += [((*path, key), item) for key, item in inside.items() if entries(item) is not None]
+
+
+def _is_list(value: Any) -> bool:
+    return isinstance(value, (list, tuple))
+
+
+def entries(value: Any) -> Mapping[Key, Any] | None:
+    """The entries of a mapping, of an object's attributes, or of a list of such; None for anything else."""
+    if isinstance(value, dict):
+        return value
+    if isinstance(value, Record):
+        if value.kind == "array" and isinstance(value.state, tuple) and len(value.state) == 5:
+            held = value.state[4]  # an array of objects: NumPy's way to save a dictionary
+            return entries(held[0] if len(held) == 1 else held) if isinstance(held, list) and held else None
+        state = value.items or value.state
+        return state if value.kind == "foreign" and isinstance(state, dict) else None
+    if _is_list(value) and value and all(isinstance(item, (dict, Record)) for item in value[:1]):
+        return dict(enumerate(value)) if entries(value[0]) is not None else None
+    return None
+
+
+def open_content(path: Path, *, error: type[RefuError]) -> Content:
+    """Opens a file of any of the kinds. Raises `error` for one that can't be read."""
+    with open_file(path, most=1 << 32, error=error, wanted=WANTED) as file:
+        magic = file.read(6)
+    if path.suffix == ".npz" or magic.startswith(_ZIP):
+        names = npz_names(path, error=error, wanted=WANTED)
+        if any(name.endswith("data.pkl") for name in names):
+            return _torch(path, error)
+        return _npz(path, names, error)
+    with open_file(path, most=MAX_PICKLE_BYTES, error=error, wanted=WANTED) as file:
+        try:
+            if magic == _NPY:
+                return _npy(file, file.size)
+            is_packed = magic[:1] == b"x" or magic.startswith(_GZIP)
+            # All at once: the machine reads byte by byte, which takes three times as long from a file.
+            data = _unpacked(file, is_gzip=magic.startswith(_GZIP)) if is_packed else io.BytesIO(file.read())
+            return Content(Machine(is_model=False).run(data))
+        except (*DAMAGE, *ARCHIVE_DAMAGE) as cause:
+            msg = f"{path}: can't be read: {str(cause) or type(cause).__name__}; wanted {WANTED}"
+            raise error(msg) from cause
+
+
+def _npz(path: Path, names: list[str], error: type[RefuError]) -> Content:
+    wanted = {name for name in names if _steps(name)[-1] in ALL_KEYS}
+    if not any(_steps(name)[-1] in POSE_KEYS for name in names):  # a dictionary that NumPy has pickled into an array
+        for name in names:
+            held = _object(path, name)
+            if held is not None:
+                return Content(held)
+    known = {key for keys in UNREAD.values() for key in keys}
+    root: dict[Key, Any] = {key: None for key in names if key in known or not wanted}
+    for name, array in read_npz(path, keys=wanted, error=error, wanted=WANTED).items():
+        node = root
+        *above, last = _steps(name)
+        for step in above:
+            inner = node.setdefault(step, {})
+            node = inner if isinstance(inner, dict) else {}
+        node[last] = array
+    return Content(root)
+
+
+def _steps(name: str) -> list[str]:
+    """Names of arrays in groups, as in `smpl_params_global/body_pose`."""
+    return [step for step in name.replace(".", "/").split("/") if step] or [name]
+
+
+def _object(path: Path, name: str) -> Any:
+    """The dictionary in an array of objects, None where it is an array of anything else."""
+    try:
+        with zipfile.ZipFile(path) as archive, archive.open(f"{name}.npy") as member:
+            head = member.read(128)
+            if b"'|O'" not in head:
+                return None
+            data = head + member.read(_MOST_HELD)
+        return _npy(io.BytesIO(data), len(data)).root
+    except (*DAMAGE, *ARCHIVE_DAMAGE):
+        return None
+
+
+def _npy(file: BinaryIO, size: int) -> Content:
+    file.seek(0)
+    version = npy.read_magic(file)
+    _, _, dtype = (npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0)(file)
+    if dtype.hasobject:
+        return Content(Machine(is_model=False).run(file))
+    file.seek(0)
+    shape, dtype = check_npy(file, size)
+    ArrayBudget().take(shape, dtype)
+    file.seek(0)
+    return Content(npy.read_array(file, allow_pickle=False))
+
+
+def _unpacked(file: BinaryIO, *, is_gzip: bool) -> BinaryIO:
+    """Raises `ValueError` for more than a pickle may have."""
+    unpacker, unpacked = zlib.decompressobj(wbits=31 if is_gzip else 15), io.BytesIO()
+    packed = file.read(_STEP)
+    while packed and not unpacker.eof and unpacked.tell() <= _MOST_HELD:
+        unpacked.write(unpacker.decompress(packed, _STEP))
+        packed = unpacker.unconsumed_tail or file.read(_STEP)
+    if not unpacker.eof:
+        msg = f"unpacks to more than {_MOST_HELD >> 20} MiB, or was cut short"
+        raise ValueError(msg)
+    unpacked.seek(0)
+    return unpacked
+
+
+def _torch(path: Path, error: type[RefuError]) -> Content:
+    """A file of `torch.save`: an archive of a pickle and the numbers of each tensor."""
+
+    def storage(key: str) -> bytes:
+        with zipfile.ZipFile(path) as archive:
+            return _member(archive, f"{folder}/data/{key}")
+
+    try:
+        with zipfile.ZipFile(path) as archive:
+            name = next(name for name in archive.namelist() if name.endswith("data.pkl"))
+            folder = name.rpartition("/")[0]
+            tree = Machine(is_model=False).run(io.BytesIO(_member(archive, name)))
+        return Content(tree, PickledArrays(storage))
+    except (*DAMAGE, *ARCHIVE_DAMAGE) as cause:
+        msg = f"{path}: can't be read as a file of torch: {str(cause) or type(cause).__name__}"
+        raise error(msg) from cause
+
+
+def _member(archive: zipfile.ZipFile, name: str) -> bytes:
+    entry = archive.getinfo(name)
+    if entry.compress_type != zipfile.ZIP_STORED or entry.file_size > MAX_PICKLE_BYTES:
+        msg = f"{name} is compressed, or has {entry.file_size >> 20} MiB"
+        raise ValueError(msg)
+    return archive.read(entry)

@@ -1,0 +1,92 @@
+"""The one table of what files of motion are laid out like: which arrays hold the pose, the place, the shape.
+
+A file is recognised by the names of its arrays; how each holds its rotations is seen from its shape (`_rotations`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layout:
+    """One way to lay out a person's motion."""
+
+    writers: str
+    """Who writes it."""
+    pose: tuple[str, ...]
+    """Arrays whose joints, one after another, are the pose; the root first where there is one."""
+    transl: tuple[str, ...] = ("trans", "transl")
+    """Names that the translation may have [m]."""
+    betas: tuple[str, ...] = ("betas",)
+    """Names that the shape may have."""
+    place: Literal["world", "camera", "screen"] = "world"
+    """What the translation means; on a screen its depth is for a focal length that was made up, and it isn't read."""
+    is_time_last: bool = False
+
+
+LAYOUTS: tuple[Layout, ...] = (
+    Layout(writers="WHAM, in the world", pose=("pose_world",), transl=("trans_world",)),
+    Layout(writers="BEDLAM, in the world", pose=("poses_world",), transl=("trans_world",), betas=("betas", "shape")),
+    Layout(writers="AMASS, 3DPW, and most others", pose=("poses",)),
+    Layout(writers="AMASS's SMPL-X, SLAHMR", pose=("root_orient", "pose_body")),
+    Layout(writers="smplx, GVHMR, 4DHumans, HMR 2", pose=("global_orient", "body_pose")),
+    Layout(writers="EMDB", pose=("poses_root", "poses_body")),
+    Layout(writers="AIST++", pose=("smpl_poses",), transl=("smpl_trans",)),
+    Layout(
+        writers="ROMP, BEV, TRACE",
+        pose=("smpl_thetas",),
+        transl=("cam_trans",),
+        betas=("smpl_betas",),
+        place="camera",
+    ),
+    Layout(writers="HybrIK", pose=("pred_thetas",), transl=("transl",), betas=("pred_betas",), place="camera"),
+    Layout(writers="TRAM", pose=("pred_rotmat",), transl=("pred_trans",), betas=("pred_shape",), place="camera"),
+    Layout(writers="MDM", pose=("thetas",), transl=("root_translation",), is_time_last=True),
+    Layout(
+        writers="WHAM, VIBE, CLIFF, in the camera",
+        pose=("pose",),
+        transl=("trans", "global_t", "transl"),
+        betas=("betas", "shape"),
+        place="camera",
+    ),
+    Layout(writers="BEDLAM, in the camera", pose=("poses_cam",), transl=("trans_cam",), place="camera"),
+    Layout(writers="a body without its root", pose=("pose_body",)),
+    Layout(writers="a body without its root", pose=("body_pose",)),
+)
+"""In the order of preference, where a file holds several."""
+
+RATES = ("mocap_framerate", "mocap_frame_rate", "fps", "framerate", "frame_rate")
+GENDERS = ("gender", "genders")
+FRAME_NUMBERS = ("frame_ids", "frame_id")
+SCALINGS = ("smpl_scaling",)
+"""AIST++'s translations are of a body that is larger by so much."""
+MODELS = ("surface_model_type",)
+
+POSE_KEYS = frozenset(name for layout in LAYOUTS for name in layout.pose)
+ALL_KEYS = frozenset(
+    {name for layout in LAYOUTS for names in (layout.pose, layout.transl, layout.betas) for name in names}
+    | {*RATES, *GENDERS, *FRAME_NUMBERS, *SCALINGS, *MODELS}
+)
+"""Everything that is read; all else in a file, meshes and pictures, is left unread."""
+
+UNREAD = {
+    "MHR (SAM 3D Body)": ("mhr_model_params", "body_pose_params", "lbs_model_params", "identity_coeffs"),
+    "HumanML3D features": ("motion_feats", "new_joint_vecs"),
+    "EasyMocap": ("Rh", "Th"),
+}
+"""What is recognised and can't be read, by names that give it away."""
+UNREAD_ADVICE = {
+    "MHR (SAM 3D Body)": "convert it with MHR's own tool for SMPL, or give its 3D keypoints (docs/guide/inputs.md)",
+    "HumanML3D features": "fit SMPL to its joints, or give them as keypoints (docs/guide/inputs.md)",
+    "EasyMocap": "save poses with Rh as their first three columns, and smplx's transl",
+}
+
+WANTED = "a motion: .npz, .npy, .pkl, .pt of an estimator or archive, or .bvh (docs/guide/inputs.md lists them)"
+
+
+def accepted() -> str:
+    """The names that a file may have its pose under, for a message."""
+    names = dict.fromkeys(" with ".join(layout.pose) for layout in LAYOUTS if "without" not in layout.writers)
+    return ", ".join(names)

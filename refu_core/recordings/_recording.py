@@ -1,0 +1,353 @@
+"""One person's recorded motion, from any file that is recognised, in SMPL's axes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from refu_core.frames import N_BETAS, N_JOINTS
+from refu_core.recordings import _layouts as table
+from refu_core.recordings._containers import Content, open_content
+from refu_core.recordings._rate import MAX_FRAMES, check_fps
+from refu_core.recordings._rotations import BODY, WHOLE, rotvecs_of
+from refu_core.recordings._tracks import tracks_of
+from refu_core.recordings._upright import Axes, to_smpl
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from refu_core.errors import RefuError
+    from refu_core.recordings._containers import Key
+
+SUFFIXES = (".npz", ".npy", ".pkl", ".pickle", ".pk", ".p", ".joblib", ".pt", ".pth", ".bvh")
+"""Of files that hold motion."""
+_BODY_JOINTS = 22  # what SMPL, SMPL-H and SMPL-X share; SMPL's two hand joints have no counterpart in the others
+_WORLD, _CAMERA = ("world", "global"), ("cam", "incam", "camera")
+_GENDERS = {"m": "male", "male": "male", "f": "female", "female": "female", "n": "neutral", "neutral": "neutral"}
+_STEADY = 1e-3  # betas that differ by less between frames are one shape
+_SHOWN = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """One person moving, sampled evenly, in SMPL's axes (y up) unless they were to be left as they are."""
+
+    poses: NDArray[np.float32]
+    """Rotation vectors of SMPL's joints [rad], shape (T, 24, 3); recordings do have frames that aren't finite."""
+    transl: NDArray[np.float64]
+    """Translations [m], shape (T, 3)."""
+    betas: NDArray[np.float32]
+    """Shape coefficients, shape (10,)."""
+    fps: float
+    """Frames a second."""
+    gender: str = "neutral"
+    """male, female or neutral: whose shape space the betas are of."""
+    notes: tuple[str, ...] = field(default=())
+    """What was taken for granted, left out or turned: a sentence each, to be shown to whoever gave the file."""
+
+
+@dataclass(frozen=True)
+class _Found:
+    """A mapping with the arrays of a layout."""
+
+    layout: table.Layout
+    path: tuple[Key, ...]
+    node: Mapping[Key, Any]
+
+    @property
+    def rank(self) -> tuple[int, int]:
+        """What is in the world before what is in a camera, then the order of the table."""
+        words = [str(step).lower() for step in self.path]
+        is_world = any(word in step for step in words for word in _WORLD)
+        is_camera = any(word in step for step in words for word in _CAMERA)
+        return (0 if is_world else 2 if is_camera else 1), table.LAYOUTS.index(self.layout)
+
+
+def read_recording(
+    path: str | Path,
+    *,
+    error: type[RefuError],
+    fps: float | None = None,
+    axes: Axes = "auto",
+    person: str | None = None,
+) -> Recording:
+    """Reads the motion of a file; `docs/guide/inputs.md` lists what is recognised.
+
+    Args:
+        path: an .npz, .npy, pickle (also joblib's and torch's) or .bvh. Nothing in a pickle is executed.
+        error: what is raised.
+        fps: frames a second, in place of what the file says; must be given where it says nothing.
+        axes: what root orientations and translations are expressed in.
+        person: whose motion, where the file has several; the one with most frames if not given.
+
+    Raises:
+        error: the file can't be read, isn't recognised, has no frame rate, or its arrays have other shapes or meanings.
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".bvh":
+        from refu_core.recordings._bvh import read_bvh
+
+        return read_bvh(path, error=error, fps=fps, axes=axes)
+    content = open_content(path, error=error)
+    try:
+        return _recording(content, fps=fps, axes=axes, person=person)
+    except ValueError as cause:
+        msg = f"{path}: {cause}"
+        raise error(msg) from cause
+
+
+def _recording(content: Content, *, fps: float | None, axes: Axes, person: str | None) -> Recording:
+    notes: list[str] = []
+    found, above = _find(content, person, notes)
+    layout, node = found.layout, found.node
+    arrays = {name: content.array(node[name]) for name in layout.pose}
+    if layout.is_time_last:
+        arrays = {name: np.moveaxis(array, -1, 0) for name, array in arrays.items()}
+    n_persons = _persons(arrays)
+    which = _chosen([str(i) for i in range(n_persons)], person, [0] * n_persons, notes) if n_persons > 1 else 0
+    if n_persons:
+        arrays = {name: array[which] for name, array in arrays.items()}
+    poses = _poses(arrays, notes)
+    n = len(poses)
+
+    def one(names: Sequence[str]) -> NDArray[Any] | None:
+        name = next((name for name in names if node.get(name) is not None), None)
+        if name is None:
+            return None
+        array = content.array(node[name])
+        array = np.moveaxis(array, -1, 0) if layout.is_time_last and array.ndim == 2 else array
+        return array[which] if n_persons and len(array) == n_persons and array.ndim > 1 else array
+
+    transl = _transl(one(layout.transl), layout, n, notes)
+    scaling = one(table.SCALINGS)
+    if scaling is not None:
+        transl = transl / float(scaling.reshape(-1)[0])
+        notes.append(f"translations are divided by {table.SCALINGS[0]}")
+    is_smplx = "x" in _word(content, _first(above, table.MODELS)) or _columns(arrays) in (165, 330, 495)
+    betas = _betas(one(layout.betas), n, notes, is_smplx=is_smplx)
+    rate = fps if fps is not None else _fps(content, above)
+    frames = one(table.FRAME_NUMBERS)
+    if frames is not None:
+        poses, transl = _filled(poses, transl, frames, notes)
+    of_amass = _columns(arrays) in (156, 165) and _first(above, table.RATES[:2]) is not None
+    roots = poses[:, 0].astype(np.float64)
+    roots, transl = to_smpl(roots, transl, axes, notes, usual="z-up" if of_amass else "smpl")
+    if axes != "frame":
+        with np.errstate(over="ignore", invalid="ignore"):
+            poses[:, 0] = roots
+    gender = _gender(_word(content, _first(above, table.GENDERS), which), notes)
+    with np.errstate(over="ignore", invalid="ignore"):  # becomes inf or NaN, which the frame refuses
+        return Recording(poses.astype(np.float32), transl, betas, check_fps(rate), gender, tuple(notes))
+
+
+# Where it is ----------------------------------------------------------------------------------------------------------
+
+
+def _find(content: Content, person: str | None, notes: list[str]) -> tuple[_Found, list[Mapping[Key, Any]]]:
+    """The mapping that holds the motion, and those around it from the inside outwards."""
+    if isinstance(content.root, np.ndarray):
+        notes.append("an array without a name: taken as poses")
+        bare: dict[Key, Any] = _bare(content.root, notes)
+        return _Found(_layout("poses"), (), bare), [bare]
+    tracks = tracks_of(content)
+    if tracks is not None:
+        notes.append("PHALP's camera has a made-up focal length: the person stays in one place")
+        content = Content(tracks)
+    nodes = dict(content.nodes())
+    every = [
+        _Found(layout, path, node)
+        for path, node in nodes.items()
+        for layout in table.LAYOUTS
+        if all(node.get(name) is not None for name in layout.pose)
+    ]
+    if not every:
+        raise ValueError(_unknown(nodes))
+    best = min(found.rank for found in every)
+    same = [found for found in every if found.rank == best]
+    others = {" with ".join(found.layout.pose) for found in every if found.rank[0] != best[0]}
+    is_both = best[1] == 0 and any("camera" in found.layout.writers for found in every)
+    if is_both or (best[0] == 0 and others):
+        notes.append("the file has the motion in a camera, too: the one in the world is taken")
+    names = [_person(found.path) for found in same]
+    lengths = [len(content.array(found.node[found.layout.pose[0]])) for found in same]
+    found = same[_chosen(names, person, lengths, notes) if len(same) > 1 else 0]
+    return found, [nodes[found.path[:i]] for i in range(len(found.path), -1, -1) if found.path[:i] in nodes]
+
+
+def _layout(name: str) -> table.Layout:
+    return next(layout for layout in table.LAYOUTS if layout.pose == (name,))
+
+
+def _bare(array: NDArray[Any], notes: list[str]) -> dict[Key, Any]:
+    """An array alone: a pose, or the columns of Motion-X."""
+    if array.ndim == 2 and array.shape[1] == 322:
+        notes.append("322 columns: taken as Motion-X's")
+        return {"poses": array[:, :66], "trans": array[:, 309:312], "betas": array[:, 312:322]}
+    if array.ndim == 2 and array.shape[1] == 263:
+        msg = f"263 columns are HumanML3D features; {table.UNREAD_ADVICE['HumanML3D features']}"
+        raise ValueError(msg)
+    return {"poses": array}
+
+
+def _person(path: tuple[Key, ...]) -> str:
+    return next((str(step) for step in reversed(path) if isinstance(step, int)), "/".join(map(str, path)) or "0")
+
+
+def _persons(arrays: Mapping[str, NDArray[Any]]) -> int:
+    """How many persons the first axis counts (SLAHMR), 0 where there is no such axis."""
+    ways = [3 * n for n in (*WHOLE, *BODY)]
+    batched = [array for array in arrays.values() if array.ndim == 3 and array.shape[2] in ways and array.shape[1] > 1]
+    return len(batched[0]) if batched else 0
+
+
+def _chosen(names: Sequence[str], person: str | None, lengths: Sequence[int], notes: list[str]) -> int:
+    listing = ", ".join(f"{name} ({n} frames)" if n else name for name, n in zip(names[:_SHOWN], lengths, strict=False))
+    listing += " …" if len(names) > _SHOWN else ""
+    if person is not None:
+        if person not in names:
+            msg = f"no person {person!r}; the file has {listing}"
+            raise ValueError(msg)
+        return names.index(person)
+    best = max(range(len(names)), key=lambda i: lengths[i])
+    notes.append(f"{len(names)} persons: {listing}; {names[best]} is taken (--person chooses another)")
+    return best
+
+
+def _unknown(nodes: Mapping[tuple[Key, ...], Mapping[Key, Any]]) -> str:
+    keys = list(dict.fromkeys(str(key) for node in list(nodes.values())[:_SHOWN] for key in node))
+    for what, names in table.UNREAD.items():
+        if any(name in keys for name in names):
+            return f"{what} parameters aren't read: {table.UNREAD_ADVICE[what]}"
+    has = ", ".join(keys[:_SHOWN]) + (" …" if len(keys) > _SHOWN else "") or "nothing that has a name"
+    return f"no poses; wanted {table.accepted()} (docs/guide/inputs.md); the file has {has}"
+
+
+def _first(above: Sequence[Mapping[Key, Any]], names: Sequence[str]) -> Any:
+    """The first of these entries, nearest to the motion."""
+    return next((node[name] for node in above for name in names if node.get(name) is not None), None)
+
+
+# What it means --------------------------------------------------------------------------------------------------------
+
+
+def _columns(arrays: Mapping[str, NDArray[Any]]) -> int:
+    return sum(int(np.prod(array.shape[1:])) for array in arrays.values())
+
+
+def _poses(arrays: Mapping[str, NDArray[Any]], notes: list[str]) -> NDArray[np.float64]:
+    """SMPL's 24 joints of any layout."""
+    names, given = list(arrays), list(arrays.values())
+    if len(given) == 2:
+        root, _ = rotvecs_of(given[0], names[0], (1,), notes, has_root=True)
+        body, n = rotvecs_of(given[1], names[1], BODY, notes, has_root=False)
+        if len(root) != len(body):
+            msg = f"{names[0]} has {len(root)} frames, {names[1]} {len(body)}; wanted as many"
+            raise ValueError(msg)
+    else:
+        whole, n = rotvecs_of(given[0], names[0], (*WHOLE, *BODY), notes, has_root=True)
+        if n in BODY:
+            notes.append(f"{names[0]} has no root: the person stands upright and looks along z")
+            root, body = np.zeros((len(whole), 1, 3)), whole
+        else:
+            root, body, n = whole[:, :1], whole[:, 1:], n - 1
+    kept = n if n == N_JOINTS - 1 else _BODY_JOINTS - 1
+    if len(body) > MAX_FRAMES:
+        msg = f"{len(body)} frames, at most {MAX_FRAMES} are read; cut the clip"
+        raise ValueError(msg)
+    poses = np.zeros((len(body), N_JOINTS, 3))
+    poses[:, :1], poses[:, 1 : 1 + kept] = root, body[:, :kept]
+    return poses
+
+
+def _transl(array: NDArray[Any] | None, layout: table.Layout, n: int, notes: list[str]) -> NDArray[np.float64]:
+    if array is None:
+        notes.append(f"no translation ({' or '.join(layout.transl)}): the person stays in one place")
+        return np.zeros((n, 3))
+    if array.dtype.kind not in "iuf":
+        msg = f"{' or '.join(layout.transl)} must be numbers, got {array.dtype} {array.shape}"
+        raise ValueError(msg)
+    if array.shape not in ((n, 3), (n, 1, 3), (1, n, 3)) and (n, *array.shape) != (1, 3):
+        msg = f"{' or '.join(layout.transl)} must be ({n}, 3) like the pose, got {array.shape}"
+        raise ValueError(msg)
+    return array.reshape(n, 3).astype(np.float64)
+
+
+def _betas(array: NDArray[Any] | None, n: int, notes: list[str], *, is_smplx: bool) -> NDArray[np.float32]:
+    """The first 10 coefficients; the mean shape's zeros where there are fewer. A person has one shape: the median."""
+    betas = np.zeros(N_BETAS, np.float32)
+    if array is None:
+        notes.append("no betas: the mean shape")
+        return betas
+    if array.dtype.kind not in "iuf" or array.ndim > 3 or (array.ndim > 1 and len(array) not in (1, n)):
+        msg = f"betas must be one row of coefficients, or a row for each of {n} frames, got {array.dtype} {array.shape}"
+        raise ValueError(msg)
+    rows = np.atleast_1d(array).astype(np.float64)
+    rows = rows.reshape(-1, rows.shape[-1])[:, :N_BETAS]
+    if len(rows) > 1:
+        spread = float(np.ptp(rows, axis=0).max(initial=0.0))
+        if spread > _STEADY:
+            notes.append(f"betas differ by up to {spread:.2g} between frames: a person has one shape, the median")
+    with np.errstate(over="ignore"):
+        betas[: rows.shape[1]] = np.median(rows, axis=0) if len(rows) else 0.0
+    if not np.isfinite(betas).all():
+        msg = "betas has values that are NaN or infinite, or too large for float32"
+        raise ValueError(msg)
+    if is_smplx and betas.any():
+        notes.append("betas are SMPL-X's: another shape space than SMPL's")
+    return betas
+
+
+def _fps(content: Content, above: Sequence[Mapping[Key, Any]]) -> float:
+    value = _first(above, table.RATES)
+    if value is None:
+        msg = "no frame rate in the file: say it, as in --fps 30 (in Python: fps=30)"
+        raise ValueError(msg)
+    if type(value) in (int, float):
+        return float(value)
+    array = content.array(value)
+    if array.size != 1 or array.dtype.kind not in "iuf":
+        msg = f"no frame rate: {table.RATES[0]} must be one number, got {array.dtype} {array.shape}"
+        raise ValueError(msg)
+    return float(array.item())
+
+
+def _word(content: Content, value: Any, which: int = 0) -> str:
+    """A word of text in any of its disguises."""
+    if isinstance(value, (list, tuple)) and value:
+        value = value[min(which, len(value) - 1)]
+    if value is not None and not isinstance(value, (str, bytes)):
+        try:
+            found = content.array(value).reshape(-1)[:1].tolist()
+        except ValueError:
+            found = []
+        value = found[0] if found else ""
+    word = value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value or "")
+    return word.strip().removeprefix("b'").removesuffix("'").lower()
+
+
+def _gender(word: str, notes: list[str]) -> str:
+    if word and word not in _GENDERS:
+        notes.append(f"the gender {word[:20]!r} isn't known: neutral")
+    return _GENDERS.get(word, "neutral")
+
+
+def _filled(
+    poses: NDArray[np.float64], transl: NDArray[np.float64], frames: NDArray[Any], notes: list[str]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The frames that a tracker has lost in between, on the shorter arc between those around them."""
+    at = frames.reshape(-1)
+    gaps = np.diff(at) if at.dtype.kind in "iu" and len(at) == len(poses) else np.zeros(0)
+    if not len(gaps) or (gaps == 1).all() or gaps.min() < 1 or at[-1] - at[0] >= MAX_FRAMES:
+        return poses, transl
+    if not (np.isfinite(poses).all() and np.isfinite(transl).all()):
+        return poses, transl
+    wanted = np.arange(at[0], at[-1] + 1)
+    joints = [Slerp(at, Rotation.from_rotvec(poses[:, j]))(wanted).as_rotvec() for j in range(N_JOINTS)]
+    notes.append(f"{len(wanted) - len(at)} of {len(wanted)} frames are missing: interpolated")
+    return np.stack(joints, 1), np.stack([np.interp(wanted, at, transl[:, k]) for k in range(3)], 1)

@@ -1,0 +1,171 @@
+"""Rotations as files have them: vectors, matrices, or six numbers; seen by an array's shape, checked by its numbers."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
+
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+
+WHOLE = (24, 22, 52, 55)
+"""Joints of SMPL, of its body without hands, of SMPL-H, of SMPL-X; with the root."""
+BODY = (23, 21, 51, 54)
+"""The same without it."""
+_FORMS = {3: "rotation vectors", 9: "matrices", 6: "6D rotations", 4: "quaternions"}
+_LONGEST = 2 * np.pi + 0.1  # [rad] a vector that was unwrapped may be so long, and no median of sound ones is longer
+_MOST_SKEW = 0.05  # of R Rᵀ - I: 16-bit floats have 0.001, networks that don't project 0.01
+_MOST_UNEVEN = 0.3  # mean deviation of raw network output from two orthonormal vectors; anything else has 0.5 at least
+
+
+def rotvecs_of(
+    array: NDArray[Any], name: str, counts: Collection[int], notes: list[str], *, has_root: bool
+) -> tuple[Array, int]:
+    """Rotation vectors [rad], shape (T, n, 3), and n, one of `counts`.
+
+    Raises:
+        ValueError: another shape, quaternions, degrees, or matrices that aren't rotations.
+    """
+    size, n, frames = _form(array, name, counts)
+    numbers = np.asarray(array, np.float64).reshape(frames, n, size)
+    if size == 4:
+        msg = (
+            f"{name} {array.shape} looks like quaternions, whose order a file doesn't say; save rotation vectors: "
+            "scipy's Rotation.from_quat(q) takes xyzw, then .as_rotvec()"
+        )
+        raise ValueError(msg)
+    if size == 3:
+        _check_radians(numbers, name)
+        return numbers, n
+    if size == 9:
+        matrices = numbers.reshape(frames, n, 3, 3)
+        notes.append(f"{name} holds rotation matrices")
+    else:
+        matrices = _of_six(numbers, name, notes, first=0 if has_root else 1)
+    return _rotvecs(matrices, name), n
+
+
+def _form(array: NDArray[Any], name: str, counts: Collection[int]) -> tuple[int, int, int]:
+    """Numbers a joint, joints, frames."""
+    if array.dtype.kind != "f":
+        msg = f"{name} must be numbers with a fraction, got {array.dtype} {array.shape}"
+        raise ValueError(msg)
+    shape = array.shape
+    inner = shape[1:]
+    if len(shape) > 2 and inner[0] == 1 and 1 not in counts:  # an axis of one person
+        inner = inner[1:]
+    found: list[tuple[int, int, int]] = []
+    for n in counts:
+        for size in _FORMS:
+            ways: list[tuple[int, ...]] = [(n * size,), (n, size)]
+            ways += [(n, 3, 3), (n * 9,)] if size == 9 else []
+            ways += [(3, 3)] if size == 9 and n == 1 else []
+            if inner in ways:
+                found.append((size, n, shape[0]))
+            elif shape in ways:
+                found.append((size, n, 1))
+    if not found or not array.size:
+        per = " | ".join(str(n) for n in counts)
+        msg = (
+            f"{name} must be (T, n, 3) or (T, n*3) rotation vectors [rad], (T, n, 3, 3) or (T, n*9) matrices, or "
+            f"(T, n, 6) or (T, n*6), with T > 0 and n = {per} joints, got {shape}"
+        )
+        raise ValueError(msg)
+    # (24, 3) is a frame of SMPL; as 24 frames of a root it would have been asked for with the count 1.
+    return next((form for form in found if form[0] != 4), found[0])
+
+
+def _check_radians(vectors: Array, name: str) -> None:
+    with np.errstate(over="ignore", invalid="ignore"):
+        longest = np.linalg.norm(vectors, axis=-1).max(axis=1)
+    longest = longest[np.isfinite(longest)]
+    if longest.size and float(np.median(longest)) > _LONGEST:
+        msg = (
+            f"{name} has rotation vectors as long as {np.median(longest):.0f} in most frames, wanted radians, 6.3 at "
+            "most; where they are degrees, save np.radians of them"
+        )
+        raise ValueError(msg)
+
+
+def _rotvecs(matrices: Array, name: str) -> Array:
+    """Rotation vectors of matrices (T, n, 3, 3); a frame with one that is not finite, or all zero, becomes NaN."""
+    result = np.full((*matrices.shape[:2], 3), np.nan)
+    there = np.isfinite(matrices).all(axis=(1, 2, 3)) & (np.abs(matrices).max(axis=(2, 3)) > 0).all(axis=1)
+    sound = matrices[there]
+    with np.errstate(over="ignore", invalid="ignore"):
+        skew = np.abs(sound @ sound.swapaxes(-1, -2) - np.eye(3)).max(axis=(2, 3), initial=0.0)
+    bad = np.argwhere(~(skew <= _MOST_SKEW))
+    if not len(bad):
+        bad = np.argwhere(np.linalg.det(sound) < 0)
+    if len(bad):
+        frame, joint = bad[0]
+        one = sound[frame, joint]
+        what = "mirrors" if skew[frame, joint] <= _MOST_SKEW else "isn't a rotation"
+        msg = (
+            f"{name}: the matrix of joint {joint} in frame {np.flatnonzero(there)[frame]} {what} (determinant "
+            f"{np.linalg.det(one):.2g}, R Rᵀ is {skew[frame, joint]:.2g} off the identity); wanted rotations"
+        )
+        raise ValueError(msg)
+    if len(sound):
+        flat = Rotation.from_matrix(sound.reshape(-1, 3, 3)).as_rotvec()
+        result[there] = flat.reshape(*sound.shape[:2], 3)
+    return result
+
+
+def _of_six(six: Array, name: str, notes: list[str], *, first: int) -> Array:
+    """Matrices (T, n, 3, 3) of two of their rows or columns, shape (T, n, 6); `first` is the number of joint 0.
+
+    Three orders are in use. Interleaved columns show by their numbers. Rows and columns are each other's inverses, and
+    knees and elbows bend one way only.
+    """
+    pairs = {"interleaved columns": (six[..., 0::2], six[..., 1::2]), "halves": (six[..., :3], six[..., 3:])}
+    with np.errstate(over="ignore", invalid="ignore"):
+        uneven = {way: _unevenness(*pair) for way, pair in pairs.items()}
+    way = min(uneven, key=lambda key: uneven[key])
+    if not uneven[way] <= _MOST_UNEVEN:
+        msg = f"{name} {six.shape}: six numbers a joint that aren't two rows or columns of a rotation matrix"
+        raise ValueError(msg)
+    columns = _completed(*pairs[way])
+    if way == "interleaved columns":
+        notes.append(f"{name} holds 6D rotations, taken as interleaved columns")
+        return columns
+    rows = columns.swapaxes(-1, -2)
+    as_rows, as_columns = _flexion(rows, first), _flexion(columns, first)
+    is_rows = as_rows >= as_columns
+    said = "knees and elbows bend so" if abs(as_rows - as_columns) > 0.1 else "as PyTorch3D has them: no limb bends"
+    notes.append(f"{name} holds 6D rotations, taken as the first two {'rows' if is_rows else 'columns'} ({said})")
+    return rows if is_rows else columns
+
+
+def _unevenness(a: Array, b: Array) -> float:
+    lengths = np.abs(np.linalg.norm(a, axis=-1) - 1) + np.abs(np.linalg.norm(b, axis=-1) - 1)
+    off = lengths + np.abs((a * b).sum(axis=-1))
+    return float(off[np.isfinite(off)].mean()) if np.isfinite(off).any() else np.inf
+
+
+def _completed(a: Array, b: Array) -> Array:
+    """Matrices whose first two columns are nearest to a and b, shapes (..., 3), by Gram and Schmidt."""
+    tiny = 1e-12
+    x = a / np.maximum(np.linalg.norm(a, axis=-1, keepdims=True), tiny)
+    b = b - (x * b).sum(axis=-1, keepdims=True) * x
+    y = b / np.maximum(np.linalg.norm(b, axis=-1, keepdims=True), tiny)
+    return np.stack([x, y, np.cross(x, y)], axis=-1)
+
+
+def _flexion(matrices: Array, first: int) -> float:
+    """How far knees and elbows bend the way they can [rad], all together, on average."""
+    n, total = matrices.shape[1], 0.0
+    for joint, axis, sign in ((4, 0, 1), (5, 0, 1), (18, 1, -1), (19, 1, 1)):
+        if 0 <= joint - first < n:
+            one = matrices[:, joint - first]
+            one = one[np.isfinite(one).all(axis=(1, 2))]
+            if len(one):
+                turn = 0.5 * (one - one.swapaxes(-1, -2))  # the sine times the axis
+                total += sign * float((turn[:, 2, 1], turn[:, 0, 2])[axis].mean())
+    return total

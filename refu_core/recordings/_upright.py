@@ -1,0 +1,107 @@
+"""Which way is up: seen from the people, who stand most of the time."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal, get_args
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from refu_core.frames import MAX_ANGLE
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+
+Axes = Literal["auto", "smpl", "z-up", "y-down", "frame"]
+"""What root orientations and translations are expressed in: `smpl` (y up), `z-up` (AMASS, ROS), `y-down` (a camera's
+optical frame). `auto` sees it from the people; `frame` leaves the numbers as they are, whatever they mean."""
+AXES: tuple[Axes, ...] = get_args(Axes)
+
+PELVIS = np.array([0.0, -0.22, 0.02])
+"""SMPL's pelvis at rest [m], shape (3,): within 5 mm that of the built-in bodies, whatever the betas. The root turns
+about it, and a translation is added afterwards."""
+_TURNS: dict[str, Array] = {
+    "z-up": np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]),  # as vertices_smpl_from_ros: in ROS axes nothing changes
+    "y-down": np.diag([1.0, -1, -1]),
+}
+_CLEAR = 0.6
+"""Length that the mean of the up vectors has along an axis, at least, for that axis to be up: people who walk, reach
+and squat have 0.9 and more, and a quarter of a clip on the floor leaves 0.7."""
+_LEANS = 0.9
+"""Below it [cosine], on average, a person who should stand leans: the camera is tilted by 26° or more."""
+_UP = 0.5
+"""Cosine between body and vertical above which a person is upright."""
+
+
+def _are_sound(roots: Array) -> NDArray[np.bool_]:
+    """Whether each can be computed with; NaN can't."""
+    sound: NDArray[np.bool_] = np.abs(roots).max(axis=1) <= MAX_ANGLE
+    return sound
+
+
+def up_of_root(roots: Array) -> Array:
+    """Directions from the pelvis upwards, shape (T, 3), of root rotation vectors [rad], shape (T, 3)."""
+    up: Array = Rotation.from_rotvec(roots).apply([0.0, 1.0, 0.0])
+    return up.reshape(-1, 3)
+
+
+def upright_share(roots: Array) -> float:
+    """Share of frames, 0 to 1, in which a person is upright in SMPL's axes; 1 for none that is finite."""
+    roots = roots[_are_sound(roots)]
+    return float((up_of_root(roots)[:, 1] > _UP).mean()) if len(roots) else 1.0
+
+
+def axis_of(roots: Array) -> str:
+    """The axis that people stand along, as `+y`; empty where none is clear."""
+    roots = roots[_are_sound(roots)]
+    if not len(roots):
+        return ""
+    mean = up_of_root(roots).mean(axis=0)
+    axis = int(np.abs(mean).argmax())
+    return f"{'+' if mean[axis] > 0 else '-'}{'xyz'[axis]}" if abs(mean[axis]) >= _CLEAR else ""
+
+
+def upright_turn(roots: Array) -> Array:
+    """The rotation (3, 3) to SMPL's axes from those that people stand in, as far as it shows; the identity if not."""
+    return _TURNS.get({"+z": "z-up", "-y": "y-down"}.get(axis_of(roots), ""), np.eye(3))
+
+
+def to_smpl(roots: Array, transl: Array, axes: Axes, notes: list[str], *, usual: Axes) -> tuple[Array, Array]:
+    """Roots [rad] and translations [m], shapes (T, 3), in SMPL's axes; `usual` is what such files mean, where seen."""
+    if axes == "frame":
+        return roots, transl
+    chosen: str = axes
+    lies = False
+    if axes == "auto":
+        axis = axis_of(roots)
+        chosen = {"+y": "smpl", "+z": "z-up", "-y": "y-down"}.get(axis, usual)
+        if axis in ("+z", "-y"):
+            what = "z up" if axis == "+z" else "y down, as a camera has it"
+            notes.append(f"the person stands along {axis}: taken as {what} (--input-axes says it otherwise)")
+        elif axis != "+y":
+            seen = f"the person lies along {axis}" if axis else "it doesn't show which way is up"
+            notes.append(f"{seen}: taken as {'y' if chosen == 'smpl' else 'z'} up (--input-axes says it otherwise)")
+            lies = True
+    turn = _TURNS.get(chosen)
+    if turn is not None:
+        there = _are_sound(roots)
+        turned = roots.copy()
+        if there.any():
+            turned[there] = (Rotation.from_matrix(turn) * Rotation.from_rotvec(roots[there])).as_rotvec()
+        roots, transl = turned, transl @ turn.T + (turn - np.eye(3)) @ PELVIS
+    if not lies:
+        _tell_lying(roots, notes)
+    return roots, transl
+
+
+def _tell_lying(roots: Array, notes: list[str]) -> None:
+    sound = roots[_are_sound(roots)]
+    if not len(sound):
+        return
+    share, lean = upright_share(sound), float(up_of_root(sound)[:, 1].mean())
+    if share < 0.5:
+        notes.append(f"the person is upright in {100 * share:.0f} % of the frames only")
+    elif lean < _LEANS:
+        notes.append(f"the person leans by {np.degrees(np.arccos(lean)):.0f}° on average: perhaps the camera is tilted")

@@ -1,0 +1,141 @@
+"""Messages of keypoints, serialised by rosbags: one person's poses, several persons' markers, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from reference import header, make, serialise
+
+from msg_adapters import KEYPOINT_TYPES, BagWriter, DecodeError, KeypointStream, decode_keypoints, open_smpl_bag
+from refu_core.keypoints import Proportions, Skeleton, keypoint_layout
+from refu_core.keypoints._pose import Pose, exp_so3
+
+POSES, MARKERS = KEYPOINT_TYPES["keypoint_poses"], KEYPOINT_TYPES["keypoint_markers"]
+K = 17
+numbers = hnp.arrays(np.float64, (K, 3), elements=st.floats(-10, 10).filter(lambda x: abs(x) > 1e-6))
+
+
+def point(xyz: Any) -> Any:
+    return make("geometry_msgs/msg/Point", *map(float, xyz))
+
+
+def pose(xyz: Any) -> Any:
+    return make("geometry_msgs/msg/Pose", point(xyz), make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 0.0))
+
+
+def pose_array(points: Any, stamp_ns: int = 5, frame_id: str = "camera") -> bytes:
+    return serialise(make(POSES, header(stamp_ns, frame_id), [pose(xyz) for xyz in points]), POSES)
+
+
+def marker(kind: int, number: int = 0, *, ns: str = "", at: Any = (0, 0, 0), points: Any = (), alpha: Any = 1.0) -> Any:
+    zero = make("builtin_interfaces/msg/Duration", 0, 0)
+    alphas = np.broadcast_to(alpha, max(len(points), 1))
+    colors = [make("std_msgs/msg/ColorRGBA", 0.0, 0.0, 0.0, float(a)) for a in alphas]
+    texture = make("sensor_msgs/msg/CompressedImage", header(0, ""), "", np.zeros(0, np.uint8))
+    mesh = make("visualization_msgs/msg/MeshFile", "", np.zeros(0, np.uint8))
+    scale = make("geometry_msgs/msg/Vector3", 0.1, 0.1, 0.1)
+    spots = [point(xyz) for xyz in points]
+    return make(
+        "visualization_msgs/msg/Marker", header(7, "camera"), ns, number, kind, 0, pose(at), scale, colors[0], zero,
+        False, spots, colors if len(points) else [], "", texture, [], "", "", mesh, False,
+    )  # fmt: skip
+
+
+def marker_array(*markers: Any) -> bytes:
+    return serialise(make(MARKERS, list(markers)), MARKERS)
+
+
+@settings(max_examples=15)
+@given(numbers, st.integers(0, 2**31 * 10**9 - 1))
+def test_poses(points: Any, stamp_ns: int) -> None:
+    (person, seen), *others = decode_keypoints("keypoint_poses", pose_array(points, stamp_ns), K).items()
+    assert (person, others, seen.stamp_ns, seen.frame_id) == ("", [], stamp_ns, "camera")
+    np.testing.assert_array_equal(seen.points, points)
+    assert (seen.confidence == 1).all()
+
+
+@settings(max_examples=8)
+@given(numbers, numbers, hnp.arrays(np.float32, K, elements=st.floats(0, 1, width=32)))
+def test_markers(one: Any, two: Any, alpha: Any) -> None:
+    lines = marker(5, 1, ns="bones", points=one[:2])
+    lists = marker_array(lines, marker(7, 0, ns="ann", points=one, alpha=alpha), marker(8, 0, ns="bob", points=two))
+    spheres = [
+        marker(2, 100 * p + i, at=xyz, alpha=alpha[i]) for p, x in ((0, one), (4, two)) for i, xyz in enumerate(x)
+    ]
+    for data, names in ((lists, ["ann", "bob"]), (marker_array(lines, *spheres[::-1]), ["person_4", ""])):
+        found = decode_keypoints("keypoint_markers", data, K)
+        assert sorted(found) == sorted(names)
+        for name, points in zip(sorted(names), (one, two), strict=True):
+            np.testing.assert_array_equal(found[name].points, points)
+        np.testing.assert_array_equal(found[sorted(names)[0]].confidence, alpha)
+
+
+def test_what_is_not_seen_is_nan() -> None:
+    points = np.ones((K, 3))
+    points[3] = 0
+    points[4, 1] = np.nan
+    (seen,) = decode_keypoints("keypoint_poses", pose_array(points), K).values()
+    np.testing.assert_array_equal(np.isnan(seen.points).any(axis=1), [i in (3, 4) for i in range(K)])
+    (seen,) = decode_keypoints("keypoint_markers", marker_array(marker(2, 5, at=(1, 2, 3))), K).values()
+    assert np.isfinite(seen.points).all(axis=1).tolist() == [i == 5 for i in range(K)]
+    assert decode_keypoints("keypoint_poses", pose_array([]), K) == {}
+    assert decode_keypoints("keypoint_markers", marker_array(), K) == {}
+
+
+@pytest.mark.parametrize(
+    ("kind", "data", "said"),
+    [
+        ("keypoint_poses", pose_array(np.ones((33, 3))), "wanted 17 poses, .* got 33; set keypoints"),
+        ("keypoint_markers", marker_array(marker(7, points=np.ones((38, 3)))), "wanted 17 points, .* got 38"),
+        ("keypoint_markers", marker_array(marker(2, 118)), "is keypoint 18, wanted 0 to 16"),
+        ("keypoint_markers", marker_array(marker(5, points=np.ones((4, 3)))), "1 markers, none of them keypoints"),
+        ("keypoint_poses", pose_array(np.ones((K, 3)))[:-9], "geometry_msgs/msg/PoseArray: "),
+    ],
+)
+def test_what_is_refused(kind: str, data: bytes, said: str) -> None:
+    with pytest.raises(DecodeError, match=said):
+        decode_keypoints(kind, data, K)
+
+
+@settings(max_examples=15)
+@given(st.text(max_size=80))
+def test_names_do_for_topics(namespace: str) -> None:
+    try:
+        data = marker_array(marker(7, ns=namespace.replace("\0", ""), points=np.ones((K, 3))))
+    except UnicodeEncodeError:
+        return
+    (name,) = decode_keypoints("keypoint_markers", data, K)
+    assert name == "" or (name.isidentifier() and name.isascii() and name[0] != "_")
+
+
+def standing(layout: str, place: float = 0.0) -> Any:
+    bones = Skeleton(keypoint_layout(layout), Proportions.builtin("male"))
+    turns = np.zeros((24, 3))
+    turns[16, 2], turns[17, 2] = -1.0, 1.0
+    return bones.posed(Pose(np.array([place, 1.0, 0.0]), exp_so3(turns), np.zeros(10))).points
+
+
+def test_streams_and_bags(tmp_path: Path) -> None:
+    stream = KeypointStream("keypoint_markers", "coco17", Proportions.builtin("male"))
+    data = marker_array(*(marker(7, ns=ns, points=standing("coco17", x)) for ns, x in (("a", 0.0), ("b", 2.0))))
+    frames, frame_id = stream.frames(data, 5, sender="left")
+    assert (sorted(frames), frame_id) == (["left_a", "left_b"], "camera")
+    assert frames["left_b"].transl[0] - frames["left_a"].transl[0] == pytest.approx(2, abs=1e-6)
+    assert sorted(stream.predicted(10**8)) == ["left_a", "left_b"]
+    with pytest.raises(DecodeError, match=r"wanted keypoint_poses or keypoint_markers of coco17, .* of 'coco'"):
+        KeypointStream("keypoint_markers", "coco", Proportions.builtin("male"))
+    with BagWriter(tmp_path / "a.mcap") as writer:
+        writer.add_topic("/skeletons", POSES)
+        for i in range(3):
+            stamp = 10**9 + i * 33_000_000
+            writer.write("/skeletons", pose_array(standing("coco17"), stamp), log_time_ns=stamp)
+    with open_smpl_bag(tmp_path / "a.mcap") as bag:
+        records = list(bag.undecoded())
+    assert [record.stamp_ns for record in records] == [10**9, 1_033_000_000, 1_066_000_000]
+    assert all(record.frame is None and record.error is None for record in records)

@@ -1,0 +1,349 @@
+"""Keypoints to poses: against the body model, and a known motion with noise, gaps, exchanged sides and other people."""
+
+from __future__ import annotations
+
+import os
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from msg_adapters import iter_smpl_frames, read_motion
+from refu_core import FrameError, SmplFrame, load_body
+from refu_core.keypoints import LAYOUTS, KeypointTracker, People, Proportions, Skeleton, keypoint_layout
+from refu_core.keypoints._pose import Pose, exp_so3, log_so3
+from refu_core.skeleton import JOINT_NAMES
+
+ROOT = Path(__file__).parents[2]
+MOTIONS = Path(os.environ.get("REFU_MOTIONS", "/nowhere"))
+Array = NDArray[np.float64]
+SHOWN = [i for i, name in enumerate(JOINT_NAMES) if "hand" not in name and "foot" not in name]
+"""Joints that the layouts show, or that lie between what they show."""
+
+
+@cache
+def proportions() -> Proportions:
+    return Proportions.builtin("male")
+
+
+@cache
+def skeleton(name: str) -> Skeleton:
+    return Skeleton(keypoint_layout(name), proportions())
+
+
+def pose_of(frame: SmplFrame) -> Pose:
+    betas = frame.betas.astype(np.float64)
+    return Pose(frame.transl + proportions().of(betas)[0], exp_so3(frame.pose.astype(np.float64)), betas)
+
+
+def points_of(frame: SmplFrame, layout: str) -> Array:
+    return skeleton(layout).posed(pose_of(frame)).points
+
+
+def joints_of(frame: SmplFrame) -> Array:
+    return skeleton("smpl24").posed(pose_of(frame)).joints
+
+
+class Clip(NamedTuple):
+    frames: list[SmplFrame]
+    fps: float
+
+
+@cache
+def clip(name: str, n: int = 75) -> Clip:
+    """Known motion, of somebody who isn't of mean shape."""
+    betas = np.random.default_rng(0).normal(size=10).astype(np.float32) * 0.8
+    if name.startswith("cmu"):
+        if not (MOTIONS / f"{name}.npz").exists():
+            pytest.skip("REFU_MOTIONS has no recorded motion")
+        motion = read_motion(MOTIONS / f"{name}.npz")
+        frames, fps = [motion.frame(i) for i in range(min(n, len(motion)))], motion.fps
+    else:
+        frames = [record.frame for record in iter_smpl_frames(ROOT / "bags" / name) if record.frame][:n]
+        fps = 30.0
+    stamps = [10**9 + round(1e9 * i / fps) for i in range(len(frames))]
+    known = [SmplFrame(f.pose, betas, f.transl, stamp_ns=stamp) for f, stamp in zip(frames, stamps, strict=True)]
+    return Clip(known, fps)
+
+
+def noisy(points: Array, rng: np.random.Generator, *, noise: float = 0.01, dropped: float = 0.1) -> Array:
+    seen = points + rng.normal(size=points.shape) * noise
+    seen[rng.random(len(points)) < dropped] = np.nan
+    return seen
+
+
+def errors(got: list[SmplFrame | None], known: list[SmplFrame]) -> Array:
+    """[m], shape (T, joints)."""
+    assert all(frame is not None for frame in got)
+    pairs = zip(got, known, strict=True)
+    return np.array([np.linalg.norm(joints_of(a) - joints_of(b), axis=1)[SHOWN] for a, b in pairs if a is not None])
+
+
+def jitter(places: list[Array]) -> float:
+    """Median of the second differences [m]."""
+    return float(np.median(np.linalg.norm(np.diff(places, 2, axis=0), axis=-1)))
+
+
+# The model --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_joints_are_the_bodys(layout: str) -> None:
+    rng = np.random.default_rng(1)
+    body = load_body("male", dtype=torch.float64)
+    assert np.abs(Proportions.of_body(body).shapedirs - proportions().shapedirs).max() < 1e-9
+    pose, betas = rng.normal(size=(24, 3)) * 0.6, rng.normal(size=10)
+    model = body(pose[None], betas[None]).joints[0].numpy()
+    posed = skeleton(layout).posed(Pose(model[0], exp_so3(pose), betas))
+    np.testing.assert_allclose(posed.joints, model, atol=1e-9)
+    kept = keypoint_layout(layout)
+    np.testing.assert_array_equal(kept.mirrored[kept.mirrored], np.arange(len(kept)))
+    at = [i for i in range(24) if kept.at_joint(i) >= 0]
+    np.testing.assert_allclose(posed.points[[kept.at_joint(i) for i in at]], model[at], atol=1e-9)
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=10)
+def test_jacobian_is_that_of_small_steps(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    bones = skeleton("zed38")
+    pose = Pose(rng.normal(size=3), exp_so3(rng.normal(size=(24, 3))), rng.normal(size=10))
+    jacobian = bones.jacobian(bones.posed(pose))
+    steps = 1e-5 * np.eye(85)
+    moved = [(bones.posed(pose.moved(s)).points - bones.posed(pose.moved(-s)).points).T.ravel() / 2e-5 for s in steps]
+    np.testing.assert_allclose(jacobian, np.array(moved).T[:, bones.parts], atol=1e-8)
+    others = np.setdiff1d(np.arange(85), bones.parts)
+    assert not np.array(moved)[others].any()
+
+
+@given(hnp.arrays(np.float64, (4, 3), elements=st.floats(-1.8, 1.8)))
+def test_exp_and_log(vectors: Array) -> None:
+    np.testing.assert_allclose(exp_so3(vectors), Rotation.from_rotvec(vectors).as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(log_so3(exp_so3(vectors)), Rotation.from_rotvec(vectors).as_rotvec(), atol=1e-7)
+
+
+def test_half_turns_have_a_logarithm() -> None:
+    turns = Rotation.from_rotvec(np.pi * np.eye(3)).as_matrix()
+    np.testing.assert_allclose(exp_so3(log_so3(turns)), turns, atol=1e-9)
+
+
+# What must hold ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("layout", ["zed38", "mediapipe33", "coco17"])
+@pytest.mark.parametrize("name", ["walk", "reach_squat", "cmu_02_06", "cmu_03_01"])
+def test_noise_of_10_mm_and_a_tenth_not_seen(layout: str, name: str) -> None:
+    rng = np.random.default_rng(2)
+    known, track = clip(name).frames, KeypointTracker(skeleton(layout))
+    seen = [points_of(frame, layout) + rng.normal(size=(len(skeleton(layout).layout), 3)) * 0.01 for frame in known]
+    holes = [np.where(rng.random(len(points))[:, None] < 0.1, np.nan, points) for points in seen]
+    got = [track.update(points, frame.stamp_ns) for points, frame in zip(holes, known, strict=True)]
+    assert errors(got, known).mean() <= 0.015
+    assert jitter([joints_of(frame) for frame in got if frame]) <= 0.7 * jitter(seen)
+    changes = np.abs(np.diff([frame.betas for frame in got if frame], axis=0)).max(axis=1)
+    assert (changes[30:] > 0).sum() <= 6  # a shape that never settles would cost the pipeline every frame
+
+
+def test_exact_keypoints_are_met() -> None:
+    known = clip("walk").frames
+    track = KeypointTracker(skeleton("zed38"), betas=known[0].betas)
+    got = [track.update(points_of(frame, "zed38"), frame.stamp_ns) for frame in known]
+    assert errors(got, known)[5:].mean() < 0.004
+
+
+def test_a_turned_world_turns_the_pose_alone() -> None:
+    """A camera's axes: y down, tilted, ten metres away."""
+    turn = Rotation.from_euler("xyz", [160, 20, -30], degrees=True)
+    plain, other = KeypointTracker(skeleton("coco17")), KeypointTracker(skeleton("coco17"))
+    rng = np.random.default_rng(3)
+    for frame in clip("walk").frames[:20]:
+        seen = noisy(points_of(frame, "coco17"), rng)
+        a, b = plain.update(seen, frame.stamp_ns), other.update(turn.apply(seen) + np.array([1, 2, 10]), frame.stamp_ns)
+        assert a is not None
+        assert b is not None
+        np.testing.assert_allclose(a.pose[1:], b.pose[1:], atol=2e-3)
+        off = Rotation.from_rotvec(b.pose[0]) * (turn * Rotation.from_rotvec(a.pose[0])).inv()
+        assert off.magnitude() < 2e-3
+
+
+# What trackers do -------------------------------------------------------------------------------------------------
+
+
+def followed(change: Any, layout: str = "zed38", name: str = "walk") -> tuple[list[SmplFrame | None], list[SmplFrame]]:
+    """A clip with 5 mm of noise whose keypoints `change(i, points)` has changed."""
+    rng, known = np.random.default_rng(4), clip(name).frames
+    track = KeypointTracker(skeleton(layout))
+    seen = [change(i, noisy(points_of(f, layout), rng, noise=0.005, dropped=0.0)) for i, f in enumerate(known)]
+    return [track.update(points, f.stamp_ns) for points, f in zip(seen, known, strict=True)], known
+
+
+@pytest.mark.parametrize("group", [("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle")])
+def test_exchanged_sides_are_put_right(group: tuple[str, ...]) -> None:
+    kept = keypoint_layout("coco17")
+    these = [i for i, joint in enumerate(kept.joints) if any(part in JOINT_NAMES[joint] for part in group)]
+
+    def change(i: int, points: Array) -> Array:
+        if i in (20, 21, 22, 40):
+            points[these] = points[kept.mirrored[these]]
+        return points
+
+    got, known = followed(change, "coco17")
+    off = errors(got, known)
+    assert off[18:45].max() < 0.12
+    assert off[18:45].mean() < 0.02
+
+
+def test_an_arm_that_is_not_seen_for_long_comes_to_rest_and_comes_back() -> None:
+    kept = keypoint_layout("zed38")
+    arm = [i for i, joint in enumerate(kept.joints) if JOINT_NAMES[joint] in ("left_elbow", "left_wrist")]
+
+    def change(i: int, points: Array) -> Array:
+        if 20 <= i < 55:
+            points[arm] = np.nan
+        return points
+
+    got, known = followed(change)
+    off = errors(got, known)
+    trunk = [SHOWN.index(i) for i, name in enumerate(JOINT_NAMES) if i in SHOWN and "left" not in name]
+    assert off[:, trunk].mean() < 0.012
+    assert off[20:55].max() < 0.6  # an arm's length: it hangs on its person
+    assert off[65:].mean() < 0.015
+
+
+def test_outliers_move_nobody() -> None:
+    rng = np.random.default_rng(5)
+
+    def change(i: int, points: Array) -> Array:
+        if i > 5:
+            points[rng.integers(len(points), size=2)] += rng.normal(size=(2, 3)) * 2
+        return points
+
+    got, known = followed(change)
+    assert errors(got, known)[6:].mean() < 0.015
+
+
+def test_people_come_and_go() -> None:
+    known = clip("walk").frames
+    track = KeypointTracker(skeleton("zed38"))
+    empty = np.full((38, 3), np.nan)
+    assert track.update(empty, 10**9) is None
+    assert track.at(10**9) is None
+    few = empty.copy()
+    few[:4] = points_of(known[0], "zed38")[:4]  # a spine says nothing of where somebody faces
+    assert track.update(few, 2 * 10**9) is None
+    got = [track.update(points_of(frame, "zed38"), 3 * 10**9 + frame.stamp_ns) for frame in known[:10]]
+    assert all(got)
+    last = 3 * 10**9 + known[9].stamp_ns
+    assert track.update(empty, last + 2 * 10**8) is not None  # held
+    assert track.at(last + 3 * 10**8) is not None
+    assert track.at(last + 10**9) is None
+    assert track.update(empty, last + 8 * 10**8) is None  # gone
+    far = points_of(known[20], "zed38") + np.array([5, 0, 0])
+    came = track.update(far, last + 9 * 10**8)
+    assert came is not None
+    assert np.linalg.norm(came.transl - known[20].transl - [5, 0, 0]) < 0.1
+    jumped = track.update(
+        far + np.array([0, 0, 3]), last + 9 * 10**8 + 33_000_000
+    )  # another person under the same name
+    assert jumped is not None
+    assert np.linalg.norm(jumped.transl - known[20].transl - [5, 0, 3]) < 0.1
+
+
+def test_clocks() -> None:
+    frame = clip("walk").frames[0]
+    track, points = KeypointTracker(skeleton("zed38")), points_of(frame, "zed38")
+    first = track.update(points, 10**10)
+    again = track.update(points + 0.5, 10**10)  # a message that came twice, or late, changes nothing
+    late = track.update(points + 0.5, 10**10 - 10**7)
+    assert first is not None
+    assert again is not None
+    assert late is not None
+    np.testing.assert_array_equal(first.transl, again.transl)
+    np.testing.assert_array_equal(first.transl, late.transl)
+    back = track.update(points + np.array([0.5, 0, 0]), 10**9)  # the sender has started again
+    assert back is not None
+    assert (back.stamp_ns, round(back.transl[0] - first.transl[0], 1)) == (10**9, 0.5)
+
+
+def test_predictions_at_a_steady_rate() -> None:
+    """Somebody who is seen 15 times a second is where they are 60 times a second."""
+    known = clip("cmu_03_01").frames
+    people, off, held = People(skeleton("zed38")), [], []
+    rng = np.random.default_rng(6)
+    newest = None
+    for i, frame in enumerate(known):
+        if i % 4 == 0:
+            seen = noisy(points_of(frame, "zed38"), rng)
+            stamp = 7 * 10**9 + frame.stamp_ns  # of another clock
+            newest = people.update("ann", seen, confidence=None, stamp_ns=stamp, now_ns=frame.stamp_ns)
+        ahead = people.at(frame.stamp_ns)["ann"]
+        assert newest is not None
+        off.append(np.linalg.norm(joints_of(ahead) - joints_of(frame), axis=1)[SHOWN].mean())
+        held.append(np.linalg.norm(joints_of(newest) - joints_of(frame), axis=1)[SHOWN].mean())
+    assert np.mean(off[16:]) < 0.7 * np.mean(held[16:])
+    assert people.at(known[-1].stamp_ns + 10**9) == {}
+
+
+messy = st.one_of(st.floats(-3, 3), st.sampled_from([np.nan, np.inf, -np.inf, 0.0, 1e300, -1e5]))
+
+
+@given(
+    st.lists(
+        st.tuples(
+            hnp.arrays(np.float64, (17, 3), elements=messy),
+            hnp.arrays(np.float64, 17, elements=st.one_of(messy, st.floats(0, 100))),
+            st.integers(-(10**9), 2 * 10**9),
+        ),
+        max_size=6,
+    ),
+    st.booleans(),
+)
+@settings(max_examples=60)
+def test_whatever_comes_a_pose_is_finite(messages: list[tuple[Array, Array, int]], begun: bool) -> None:
+    track, stamp = KeypointTracker(skeleton("coco17")), 10**12
+    if begun:
+        track.update(points_of(clip("walk").frames[0], "coco17"), stamp)
+    for points, confidence, step in messages:
+        stamp += step
+        track.update(points, stamp, confidence=confidence)  # a SmplFrame is finite, or an error
+        track.at(stamp + 10**8)
+
+
+def test_confidence() -> None:
+    points = points_of(clip("walk").frames[0], "coco17")
+    wrong = points.copy()
+    wrong[7] += [0, 0.5, 0]
+    frames = []
+    for level in (np.nan, -1.0, 0.0, 1e-9):
+        confidence = np.ones(17)
+        confidence[7] = level
+        frames.append(KeypointTracker(skeleton("coco17")).update(wrong, 1, confidence=confidence))
+        frames.append(KeypointTracker(skeleton("coco17")).update(wrong, 1, confidence=100 * confidence))
+    gone = wrong.copy()
+    gone[7] = np.nan
+    reference = KeypointTracker(skeleton("coco17")).update(gone, 1)
+    assert reference is not None
+    for frame in frames:
+        assert frame is not None
+        np.testing.assert_allclose(frame.pose, reference.pose, atol=1e-3)
+    with pytest.raises(FrameError, match=r"wanted 17 keypoints of coco17, got \(33, 3\)"):
+        KeypointTracker(skeleton("coco17")).update(np.zeros((33, 3)), 1)
+
+
+def test_a_tracker_that_begins_with_the_sides_exchanged_is_put_right() -> None:
+    """Which way somebody faces shows in noses, toes, knees and elbows, whatever is called left."""
+    kept, frame = keypoint_layout("zed38"), clip("walk").frames[0]
+    points = points_of(frame, "zed38")
+    right = KeypointTracker(skeleton("zed38")).update(points, 1)
+    got = KeypointTracker(skeleton("zed38")).update(points[kept.mirrored], 1)
+    assert right is not None
+    assert got is not None
+    np.testing.assert_allclose(got.pose, right.pose, atol=1e-3)

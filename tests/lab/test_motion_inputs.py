@@ -1,0 +1,140 @@
+"""What the commands do with files and bags that aren't in SMPL's axes, of another gender, or of keypoints."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import msg_adapters as adapters
+from msg_adapters.cdr import CdrWriter
+from refu_core.keypoints import Proportions, Skeleton, keypoint_layout
+from refu_core.keypoints._pose import Pose, exp_so3
+from refu_lab.cli import main
+from refu_lab.replay import ReplayOptions, ReplayResult, replay
+from refu_lab.report import write_report
+
+ROOT = Path(__file__).parents[2]
+Z_UP = Rotation.from_matrix([[0, 0, 1], [1, 0, 0], [0, 1, 0]])
+PLAIN: dict[str, Any] = {"garments": ("short-pant-male",), "backbone": "skinned", "sdf": "none", "collider": False}
+FRAMES = [record.frame for record in adapters.iter_smpl_frames(ROOT / "bags" / "walk") if record.frame][:8]
+
+
+def z_up(path: Path, **changes: Any) -> Path:
+    """A clip as AMASS has it."""
+    poses = np.array([frame.pose for frame in FRAMES], np.float64)
+    poses[:, 0] = (Z_UP * Rotation.from_rotvec(poses[:, 0])).as_rotvec()
+    wide = np.pad(poses[:, :22].reshape(len(poses), 66), ((0, 0), (0, 90)))
+    trans = Z_UP.apply([frame.transl for frame in FRAMES])
+    arrays = {"poses": wide, "trans": trans, "betas": np.zeros(16), "mocap_framerate": 30.0, "gender": "male"}
+    np.savez(path, **arrays | changes)
+    return path
+
+
+def run(path: Path, **options: Any) -> ReplayResult:
+    return replay(ReplayOptions(input=path, **{"max_frames": 3} | PLAIN | options))
+
+
+def heights(result: ReplayResult) -> tuple[float, float]:
+    """Along y and along z, of the first frame's pelvis to head [m]."""
+    pose, bones = result.frames[0].frame, Skeleton(keypoint_layout("smpl24"), Proportions.builtin("male"))
+    joints = bones.posed(Pose(np.zeros(3), exp_so3(pose.pose.astype(float)), np.zeros(10))).joints
+    return float(joints[15, 1]), float(joints[15, 2])
+
+
+def test_z_up_is_seen_and_pictures_stand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[Any] = []
+
+    def draw(meshes: Any, **_: Any) -> Any:  # what is drawn matters here, and to draw it takes seconds
+        drawn.extend(meshes)
+        return np.zeros((4, 4, 3), np.uint8)
+
+    monkeypatch.setattr("refu_lab.report.render", draw)
+    path = z_up(tmp_path / "a.npz")
+    seen, left = run(path, max_frames=1), run(path, max_frames=1, input_axes="frame")
+    assert heights(seen)[0] > 0.6
+    assert heights(left)[1] > 0.6
+    assert any("+z: taken as z up" in warning for warning in seen.warnings)
+    assert (seen.options.axes, left.options.axes) == ("smpl", "frame")
+    for result in (seen, left):
+        write_report(result, tmp_path / "report")
+    for body, garment in zip(drawn[::2], drawn[1::2], strict=True):
+        extent = np.ptp(body.vertices, axis=0)
+        assert extent[1] > 1.6 > 1.3 > extent[2]  # stands
+        assert abs(garment.vertices[:, 1].mean() - body.vertices[:, 1].mean()) < 0.3
+
+
+def test_garments_are_in_the_same_place_either_way(tmp_path: Path) -> None:
+    """z up in ROS is z up in the file: turned to SMPL's axes and back again, or left as it is."""
+    path, places = z_up(tmp_path / "a.npz"), []
+    for axes in ("auto", "frame", "z-up"):
+        out = tmp_path / f"{axes}.mcap"
+        run(path, input_axes=axes, output=out)
+        with adapters.BagReader(out) as reader:
+            (message, *_) = reader.messages(["/garments"])
+        places.append(adapters.decode_marker_array(message.data)[0].points)
+    np.testing.assert_allclose(places[0], places[1], atol=6e-3)
+    np.testing.assert_array_equal(places[0], places[2])
+
+
+def test_another_gender_is_said(tmp_path: Path) -> None:
+    result = run(z_up(tmp_path / "a.npz", gender="female"))
+    assert "the motion is of a female person, the garments are for the male body" in result.warnings
+    assert not any("person, the garments" in warning for warning in run(z_up(tmp_path / "b.npz")).warnings)
+
+
+def test_a_bag_of_people_who_lie_is_said(tmp_path: Path) -> None:
+    encode = adapters.encoder_for("multiarray")
+    with adapters.BagWriter(tmp_path / "a.mcap") as writer:
+        writer.add_topic("/smpl_params", adapters.INPUT_TYPES["multiarray"])
+        for i, frame in enumerate(FRAMES[:3]):
+            pose = frame.pose.copy()
+            pose[0] = (Z_UP * Rotation.from_rotvec(pose[0])).as_rotvec()
+            lying = type(frame)(pose, frame.betas, frame.transl)
+            writer.write("/smpl_params", encode(lying), log_time_ns=10**9 + i)
+    said = "; ".join(run(tmp_path / "a.mcap").warnings)
+    assert "people are upright in 0 % of the frames only: they stand along +z (--input-axes frame?)" in said
+    assert run(tmp_path / "a.mcap", input_axes="frame").warnings == []
+
+
+def test_keypoints_of_a_bag(tmp_path: Path) -> None:
+    bones = Skeleton(keypoint_layout("zed38"), Proportions.builtin("male"))
+    with adapters.BagWriter(tmp_path / "a.mcap") as writer:
+        writer.add_topic("/skeleton", adapters.KEYPOINT_TYPES["keypoint_poses"])
+        for i, frame in enumerate(FRAMES):
+            pose = Pose(frame.transl + np.array([0, -0.22, 0.02]), exp_so3(frame.pose.astype(float)), np.zeros(10))
+            points = Z_UP.apply(bones.posed(pose).points)
+            stamp = 10**9 + round(i * 1e9 / 30)
+            cdr = CdrWriter()
+            cdr.header(stamp, "map")
+            cdr.numbers("I", len(points))
+            cdr.array("f8", np.pad(points, ((0, 0), (0, 4))))
+            writer.write("/skeleton", cdr.to_bytes(), log_time_ns=stamp)
+    result = run(tmp_path / "a.mcap", input_type="keypoint_poses", keypoints="zed38", max_frames=None)
+    assert (len(result.frames), result.options.axes) == (len(FRAMES), "frame")
+    for got, known in zip(result.frames, FRAMES, strict=True):
+        root = Rotation.from_rotvec(known.pose[0]).inv() * Z_UP.inv() * Rotation.from_rotvec(got.frame.pose[0])
+        assert root.magnitude() < 0.2
+    assert main(["replay", str(tmp_path / "a.mcap"), "--input-type", "keypoint_poses", "--keypoints", "coco17"]) == 2
+    assert main(["replay", str(tmp_path / "a.mcap")]) == 2
+
+
+def test_simulate_says_how_motions_were_meant(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def said(path: Path, *options: str) -> str:
+        out = str(tmp_path / "set")
+        assert (
+            main(["simulate", "short-pant-male", "--count", "6", "--output", out, "--motions", str(path), *options])
+            == 2
+        )
+        return capsys.readouterr().err
+
+    # One clip can't be split: nothing is simulated, but how it was read is said before.
+    assert "stands along +z: taken as z up" in said(z_up(tmp_path / "a.npz"))
+    assert "z up" not in said(tmp_path / "a.npz", "--input-axes", "frame")
+    assert "upright in 0 %" in said(tmp_path / "a.npz", "--input-axes", "smpl")
+    np.savez(tmp_path / "b.npz", poses=np.zeros((5, 72)))
+    assert "say it, as in --fps 30" in said(tmp_path / "b.npz")
+    assert "two motions or more" in said(tmp_path / "b.npz", "--fps", "30")
