@@ -2,6 +2,7 @@
 
 from refu_core.body._anatomy import DEFAULT_GAP, ColliderSettings
 from refu_core.body._collider import Collider
+from refu_core.body._fit import BodyFit, Difference, ShapeMap, fit_body
 from refu_core.body._io import BUILTIN_BODIES, load_body
 from refu_core.body._kinematics import (
     JOINT_NAMES,
@@ -13,6 +14,7 @@ from refu_core.body._kinematics import (
 from refu_core.body._model import BodyOutput, Shape, SmplBody
 from refu_core.body._parts import ARMS, LEGS, MIRRORED_JOINTS, SEGMENTS, joints_of, part_of_faces, weight_of_parts
 from refu_core.body._skinning import Skinning, apply_transforms, blend_transforms, unapply_transforms
+from refu_core.body._surface import Surface
 
 __all__ = [
     "ARMS",
@@ -24,6 +26,11 @@ __all__ = [
     "PARENTS",
     "SEGMENTS",
     "BodyOutput",
+    "fit_body",
+    "Surface",
+    "ShapeMap",
+    "Difference",
+    "BodyFit",
     "Collider",
     "ColliderSettings",
     "RigidTransforms",

@@ -161,6 +161,11 @@ class SmplBody:
         return f"SmplBody({self.name!r}, {self.n_vertices} vertices, {self.dtype}, {self.device})"
 
     @property
+    def arrays(self) -> BodyArrays:
+        """The model's arrays as its file has them, in float64."""
+        return self._arrays
+
+    @property
     def n_vertices(self) -> int:
         """Number of vertices V."""
         return len(self.v_template)

@@ -1,0 +1,180 @@
+"""A body that isn't built in, and what the built-in ones are to it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from refu_core.body._io import load_body
+from refu_core.body._model import BodyArrays, SmplBody
+from refu_core.body._register import ENDS, Registration, register
+from refu_core.body._surface import OnSurface, Surface
+from refu_core.frames import N_BETAS, N_JOINTS
+
+if TYPE_CHECKING:
+    from refu_core.body._register import Array
+
+REGISTERED = "neutral"
+"""The built-in body that is laid onto others: half way between the two it can become."""
+POOR_FIT = 3e-3
+"""Surfaces that are farther apart than this on average [m] aren't those of two bodies in the T-pose. (Those in
+tests/smpl_file.py are .3 to .5 mm apart.)"""
+_ANGLE_SPREAD = 0.1
+"""Of a joint between two rest poses [rad]."""
+_TRUST = 1e-3
+"""A unit of β that moves skin by no more than this [m] isn't taken for what it fits: it would be noise."""
+_END_SHARE = 0.1
+"""How much hands, feet and heads count where shapes are compared."""
+_REGRESSED = 400
+"""Vertices that a joint is regressed from."""
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeMap:
+    """Betas of one body to those of another: β' = offset + matrix β."""
+
+    matrix: Tensor
+    """Shape (10, 10)."""
+    offset: Tensor
+    """Shape (10,)."""
+    limit: float = 3.0
+    """No component of β' is larger: nothing was trained beyond."""
+
+    def __call__(self, betas: Tensor) -> Tensor:
+        """Of betas (B, 10), shape (B, 10). Differentiable."""
+        return (self.offset.to(betas) + betas @ self.matrix.to(betas).T).clamp(-self.limit, self.limit)
+
+
+@dataclass(frozen=True, eq=False)
+class Difference:
+    """What of a body isn't in the shape space of a built-in one, at the V vertices of the built-in mesh."""
+
+    source: SmplBody
+    """The built-in body, float64, on the CPU."""
+    betas: ShapeMap
+    """The body's betas to those of the built-in one."""
+    template: Array
+    """Of the mean shape at rest [m], shape (V, 3)."""
+    directions: Array
+    """Of a unit of each beta [m], shape (V, 3, 10)."""
+    weights: Array
+    """Of the skinning weights, shape (V, 24)."""
+
+
+class BodyFit:
+    """A body and the built-in mesh laid onto it."""
+
+    def __init__(self, body: SmplBody, registration: Registration) -> None:
+        self.body = body
+        self.registration = registration
+        self._of: dict[str, Difference] = {}
+
+    @property
+    def is_poor(self) -> bool:
+        """Whether the surfaces are too far apart to trust what was transferred."""
+        return self.registration.mean_distance > POOR_FIT
+
+    @property
+    def text(self) -> str:
+        """The quality, for people."""
+        found = self.registration
+        return f"{1e3 * found.mean_distance:.1f} mm on average, {1e3 * found.far_distance:.1f} mm at the 99th percentile"
+
+    def carried(self, values: NDArray[np.floating]) -> Array:
+        """`values` of the body's vertices (N, …) at the vertices of the built-in mesh (V, …)."""
+        place = self.registration.place
+        faces = self.body.faces.cpu().numpy()
+        there: Array = np.einsum("nk,nk...->n...", place.weight, values.astype(np.float64)[faces[place.face]])
+        return there
+
+    def directions(self) -> Array:
+        """What a unit of each beta does to the built-in mesh on this body [m], shape (V, 3, 10)."""
+        return self.carried(self.body.arrays.shapedirs)
+
+    def difference(self, name: str) -> Difference:
+        """From the built-in body `name`."""
+        if name not in self._of:
+            self._of[name] = self._differ(load_body(name, dtype=torch.float64))
+        return self._of[name]
+
+    def _differ(self, source: SmplBody) -> Difference:
+        rest, own = source.v_template.numpy(), source.arrays.shapedirs
+        goal = np.concatenate(((self.registration.vertices - rest)[:, :, None], self.directions()), axis=2)
+        bent = _bent(source.name)
+        place = np.broadcast_to(np.eye(3), (len(rest), 3, 3))
+        columns = np.concatenate((own, bent, place), axis=2).reshape(3 * len(rest), -1)
+        share = np.where(source.weights[:, list(ENDS)].sum(1).numpy() > 0.5, _END_SHARE, 1.0)
+        weight = np.repeat(share / share.sum(), 3)[:, None]
+        prior = _TRUST**2 * np.repeat([1.0, _ANGLE_SPREAD**-2, 1e-6], [N_BETAS, bent.shape[2], 3])
+        found = np.linalg.solve(
+            columns.T @ (weight * columns) + np.diag(prior), columns.T @ (weight * goal.reshape(len(columns), -1))
+        )[:N_BETAS]
+        left = goal - np.einsum("vck,kr->vcr", own, found)
+        shape_map = ShapeMap(torch.as_tensor(found[:, 1:]), torch.as_tensor(found[:, 0]))
+        weights = self.carried(self.body.arrays.weights) - source.arrays.weights
+        return Difference(source, shape_map, left[:, :, 0], left[:, :, 1:], weights)
+
+    def resampled(self) -> BodyFit:
+        """The same body as the built-in mesh: its shape space, joints and skin, whatever its own mesh is like."""
+        arrays, source = self.body.arrays, load_body(REGISTERED)
+        vertices, directions = self.registration.vertices, self.directions()
+        weights = self.carried(arrays.weights).clip(0)
+        made = BodyArrays(
+            v_template=vertices,
+            faces=source.arrays.faces,
+            weights=weights / weights.sum(1, keepdims=True),
+            joint_regressor=_regressor(self.body, vertices, directions),
+            shapedirs=directions,
+            posedirs=None if arrays.posedirs is None else self.carried(arrays.posedirs),
+        )
+        body = SmplBody(made, name=self.body.name, device=self.body.device, dtype=self.body.dtype)
+        corner = np.zeros(len(vertices), np.int64)
+        face = np.zeros(len(vertices), np.int64)
+        for k in range(3):
+            face[made.faces[:, k]], corner[made.faces[:, k]] = np.arange(len(made.faces)), k
+        place = OnSurface(face, np.eye(3)[corner])
+        known = self.registration
+        return BodyFit(body, Registration(vertices, place, known.mean_distance, known.far_distance))
+
+
+@cache
+def _bent(name: str) -> Array:
+    """What a radian about each axis of each joint does to a built-in body at rest [m], shape (V, 3, 72)."""
+    source, step = load_body(name, dtype=torch.float64), 1e-4
+    poses = step * torch.eye(3 * N_JOINTS, dtype=torch.float64)
+    moved = torch.stack([source(pose[None]).vertices[0] for pose in poses])
+    bent: Array = ((moved - source.v_template) / step).permute(1, 2, 0).numpy()
+    return bent
+
+
+def _regressor(body: SmplBody, vertices: Array, directions: Array) -> Array:
+    """The body's joints, for every β, from vertices (V, 3) near them that move by `directions` (V, 3, 10)."""
+    exact = body.to(device="cpu", dtype=torch.float64)
+    joints = exact.rest_joints(torch.zeros(1, N_BETAS, dtype=torch.float64))[0].numpy()
+    moved = exact.rest_joints(torch.eye(N_BETAS, dtype=torch.float64)).numpy() - joints  # (10, 24, 3)
+    tree, rows = cKDTree(vertices), np.zeros((N_JOINTS, len(vertices)))
+    for j, joint in enumerate(joints):
+        _, near = tree.query(joint, _REGRESSED)
+        # Millimetres a unit of β count as much as metres of the place: both must be right.
+        known = [np.ones((1, len(near))), vertices[near].T, directions[near].reshape(len(near), -1).T]
+        goal = [np.ones(1), joint, moved[:, j].T.ravel()]
+        uniform = np.full(len(near), 1 / len(near))
+        lacks = np.concatenate(goal) - np.concatenate(known) @ uniform
+        rows[j, near] = uniform + np.linalg.lstsq(np.concatenate(known), lacks, rcond=1e-6)[0]
+        rows[j] /= rows[j].sum()
+    return rows
+
+
+def fit_body(body: SmplBody) -> BodyFit:
+    """Lays the built-in mesh onto `body`."""
+    return BodyFit(body, register(load_body(REGISTERED), body))
+
+
+__all__ = ["BodyFit", "Difference", "ShapeMap", "Surface", "fit_body"]
