@@ -26,8 +26,8 @@ from refu_core.mesh import Connectivity, vertex_normals
 Array = NDArray[np.float64]
 N_VERTICES = 6890
 N_FACES = 13776
-_JOINT_SHIFT = {0: (0, -0.02, 0.01), 1: (-0.05, -0.09, 0), 3: (0, -0.06, 0), 9: (0, -0.06, 0.05), 13: (0.055, -0.06, -0.05)}
-_JOINT_SHIFT |= {16: (-0.01, -0.02, -0.05), 18: (-0.02, -0.03, -0.07), 7: (-0.02, 0, -0.02), 12: (0, -0.06, -0.045)}
+_JOINT_SHIFT = {0: (0, -0.02, 0.01), 1: (-0.05, -0.09, 0), 3: (0, -0.06, 0), 9: (0, -0.06, 0.03), 13: (0.05, -0.06, -0.03)}
+_JOINT_SHIFT |= {16: (-0.01, -0.02, -0.01), 18: (-0.02, -0.005, -0.01), 7: (-0.01, 0, -0.01), 12: (0, -0.05, -0.03)}
 _PAIRS = {1: 2, 4: 5, 7: 8, 10: 11, 13: 14, 16: 17, 18: 19, 20: 21, 22: 23}
 
 
@@ -94,7 +94,9 @@ def smpl_arrays(gender: str = "female", *, n_betas: int = 10, seed: int = 0) -> 
     }
 
 
-def write_smpl(folder: Path, gender: str = "female", *, n_betas: int = 10, suffix: str = ".npz", **changed: Any) -> Path:
+def write_smpl(
+    folder: Path, gender: str = "female", *, n_betas: int = 10, suffix: str = ".npz", **changed: Any
+) -> Path:
     """Writes such a file, with some arrays changed; returns its path."""
     path = folder / f"SMPL_{gender.upper()}{suffix}"
     arrays = {**smpl_arrays(gender, n_betas=n_betas), **changed}

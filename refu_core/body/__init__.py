@@ -2,7 +2,7 @@
 
 from refu_core.body._anatomy import DEFAULT_GAP, ColliderSettings
 from refu_core.body._collider import Collider
-from refu_core.body._fit import BodyFit, Difference, ShapeMap, fit_body
+from refu_core.body._fit import BodyFit, Difference, ShapeMap, load_fit
 from refu_core.body._io import BUILTIN_BODIES, load_body
 from refu_core.body._kinematics import (
     JOINT_NAMES,
@@ -13,6 +13,7 @@ from refu_core.body._kinematics import (
 )
 from refu_core.body._model import BodyOutput, Shape, SmplBody
 from refu_core.body._parts import ARMS, LEGS, MIRRORED_JOINTS, SEGMENTS, joints_of, part_of_faces, weight_of_parts
+from refu_core.body._rest_pose import require_rest_pose
 from refu_core.body._skinning import Skinning, apply_transforms, blend_transforms, unapply_transforms
 from refu_core.body._surface import Surface
 
@@ -26,7 +27,7 @@ __all__ = [
     "PARENTS",
     "SEGMENTS",
     "BodyOutput",
-    "fit_body",
+    "load_fit",
     "Surface",
     "ShapeMap",
     "Difference",
@@ -43,6 +44,7 @@ __all__ = [
     "joints_of",
     "load_body",
     "part_of_faces",
+    "require_rest_pose",
     "rotvec_to_rotmat",
     "unapply_transforms",
     "weight_of_parts",

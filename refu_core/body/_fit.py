@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING
+from os import PathLike
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -12,13 +13,17 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from refu_core.body._io import load_body
+from refu_core._cache import keep, recall
+from refu_core.body._io import BUILTIN_BODIES, load_body
 from refu_core.body._model import BodyArrays, SmplBody
 from refu_core.body._register import ENDS, Registration, register
-from refu_core.body._surface import OnSurface, Surface
+from refu_core.body._rest_pose import require_rest_pose
+from refu_core.body._surface import OnSurface
 from refu_core.frames import N_BETAS, N_JOINTS
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from refu_core.body._register import Array
 
 REGISTERED = "neutral"
@@ -34,6 +39,8 @@ _END_SHARE = 0.1
 """How much hands, feet and heads count where shapes are compared."""
 _REGRESSED = 400
 """Vertices that a joint is regressed from."""
+_VERSION = 1
+"""Of what `register` does: what another version has kept isn't used."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,9 +78,11 @@ class Difference:
 class BodyFit:
     """A body and the built-in mesh laid onto it."""
 
-    def __init__(self, body: SmplBody, registration: Registration) -> None:
+    def __init__(self, body: SmplBody, registration: Registration, *, fingerprints: tuple[str, ...] = ()) -> None:
         self.body = body
         self.registration = registration
+        self.fingerprints = fingerprints or (body.fingerprint,)
+        """Bodies that weights may have been trained on to be this one's own."""
         self._of: dict[str, Difference] = {}
 
     @property
@@ -85,7 +94,9 @@ class BodyFit:
     def text(self) -> str:
         """The quality, for people."""
         found = self.registration
-        return f"{1e3 * found.mean_distance:.1f} mm on average, {1e3 * found.far_distance:.1f} mm at the 99th percentile"
+        return (
+            f"{1e3 * found.mean_distance:.1f} mm on average, {1e3 * found.far_distance:.1f} mm at the 99th percentile"
+        )
 
     def carried(self, values: NDArray[np.floating]) -> Array:
         """`values` of the body's vertices (N, …) at the vertices of the built-in mesh (V, …)."""
@@ -135,13 +146,10 @@ class BodyFit:
             posedirs=None if arrays.posedirs is None else self.carried(arrays.posedirs),
         )
         body = SmplBody(made, name=self.body.name, device=self.body.device, dtype=self.body.dtype)
-        corner = np.zeros(len(vertices), np.int64)
-        face = np.zeros(len(vertices), np.int64)
-        for k in range(3):
-            face[made.faces[:, k]], corner[made.faces[:, k]] = np.arange(len(made.faces)), k
-        place = OnSurface(face, np.eye(3)[corner])
         known = self.registration
-        return BodyFit(body, Registration(vertices, place, known.mean_distance, known.far_distance))
+        place = _corners(made.faces, len(vertices))
+        laid = Registration(vertices, place, known.mean_distance, known.far_distance)
+        return BodyFit(body, laid, fingerprints=(body.fingerprint, self.body.fingerprint))
 
 
 @cache
@@ -172,9 +180,62 @@ def _regressor(body: SmplBody, vertices: Array, directions: Array) -> Array:
     return rows
 
 
-def fit_body(body: SmplBody) -> BodyFit:
-    """Lays the built-in mesh onto `body`."""
-    return BodyFit(body, register(load_body(REGISTERED), body))
+def load_fit(
+    body: str | PathLike[str] | SmplBody, *, betas_from: bool = False, device: str | torch.device = "cpu"
+) -> BodyFit:
+    """A body and the built-in mesh laid onto it: some seconds for one that hasn't been seen before.
+
+    Args:
+        body: a built-in name, the path of an SMPL-layout file, or a loaded body.
+        betas_from: give the same body as the built-in mesh, whatever the file's own mesh is like (`BodyFit.resampled`).
+        device: where its tensors live.
+
+    Raises:
+        BodyError: no such body, or one that isn't in metres, upright, in the T-pose, closed (`require_rest_pose`).
+    """
+    loaded = body.to(device=device) if isinstance(body, SmplBody) else load_body(body, device=device)
+    source = load_body(REGISTERED)
+    if _same_mesh(loaded, source):
+        place = _corners(source.arrays.faces, source.n_vertices)
+        return BodyFit(loaded, Registration(loaded.arrays.v_template, place, 0.0, 0.0))
+    require_rest_pose(loaded, closed=not betas_from)
+    found = BodyFit(loaded, _registered(source, loaded))
+    return found.resampled() if betas_from else found
 
 
-__all__ = ["BodyFit", "Difference", "ShapeMap", "Surface", "fit_body"]
+def _same_mesh(body: SmplBody, source: SmplBody) -> bool:
+    """Whether a body is one of the built-in ones."""
+    shared = body.n_vertices == source.n_vertices and np.array_equal(body.arrays.faces, source.arrays.faces)
+    return shared and any(body.fingerprint == load_body(name).fingerprint for name in BUILTIN_BODIES)
+
+
+def _corners(faces: NDArray[np.int64], n_vertices: int) -> OnSurface:
+    """Each vertex as a place of the mesh that it is of."""
+    face, corner = np.zeros(n_vertices, np.int64), np.zeros(n_vertices, np.int64)
+    for k in range(3):
+        face[faces[:, k]], corner[faces[:, k]] = np.arange(len(faces)), k
+    return OnSurface(face, np.eye(3)[corner])
+
+
+def _registered(source: SmplBody, body: SmplBody) -> Registration:
+    """As `register`, kept from one process to the next."""
+    name = f"fit-{_VERSION}-{source.fingerprint}-{body.fingerprint}"
+    known = recall(name, keys=("vertices", "face", "weight", "distances"))
+    if known is None or not _makes_sense(known, source, body):
+        made = register(source, body)
+        distances = np.array([made.mean_distance, made.far_distance], np.float32)
+        known = {"vertices": made.vertices.astype(np.float32), "face": made.place.face.astype(np.int32)}
+        known |= {"weight": made.place.weight.astype(np.float32), "distances": distances}
+        keep(name, known)
+    # What was kept is rounded, so what wasn't is, too: both are the same body.
+    place = OnSurface(known["face"].astype(np.int64), known["weight"].astype(np.float64))
+    mean, far = known["distances"].tolist()
+    return Registration(known["vertices"].astype(np.float64), place, mean, far)
+
+
+def _makes_sense(known: Mapping[str, NDArray[Any]], source: SmplBody, body: SmplBody) -> bool:
+    n = source.n_vertices
+    shapes = {"vertices": (n, 3), "face": (n,), "weight": (n, 3), "distances": (2,)}
+    return all(known[key].shape == shape and np.isfinite(known[key]).all() for key, shape in shapes.items()) and bool(
+        (known["face"] >= 0).all() and (known["face"] < len(body.faces)).all()
+    )

@@ -11,7 +11,7 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
-from refu_core.body import BodyFit, Surface
+from refu_core.body import BodyFit, Surface, load_body
 from refu_core.frames import N_BETAS
 
 if TYPE_CHECKING:
@@ -40,12 +40,14 @@ _INFLUENCES = 6
 """Joints of a vertex, as in the garments that ship."""
 
 
-def transferred(garment: GarmentTemplate, fit: BodyFit) -> GarmentTemplate:
+def worn_on(garment: GarmentTemplate, fit: BodyFit | None) -> GarmentTemplate:
     """`garment` on the body of `fit`: it follows that body's betas and skin, and its styles are as they were.
 
-    What of the body is in the shape space of the one that the garment was cut for, the garment knows already how to
+    Itself on the body that it was cut for, which None stands for. What of the body is in the shape space of the one that the garment was cut for, the garment knows already how to
     follow. The rest is carried over by the skin below it. So nothing changes on the garment's own body.
     """
+    if fit is None or fit.body.fingerprint == load_body(garment.body).fingerprint:
+        return garment
     differs = fit.difference(garment.body)
     exact = garment.to(device="cpu", dtype=torch.float64)
     source, betas = differs.source, differs.betas
