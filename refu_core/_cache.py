@@ -50,7 +50,7 @@ def keep(name: str, arrays: Mapping[str, NDArray[Any]]) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile(dir=folder, suffix=".part", delete=False) as part:
             try:
-                np.savez(part, **arrays)
+                np.savez(part, allow_pickle=False, **arrays)
                 part.close()
                 Path(part.name).replace(folder / f"{name}.npz")
             except OSError:

@@ -19,7 +19,8 @@ import msg_adapters as adapters
 from refu_core import FrameError, GarmentPipeline, SmplFrame
 from refu_core._device import one_thread
 from refu_core.metrics import CollisionChecker, Figures, GarmentMetrics
-from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN
+from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN, FOREIGN_BETAS, BetasSource
+from refu_lab.bodies import body_facts, body_warnings
 from refu_lab.truth import GroundTruth
 
 if TYPE_CHECKING:
@@ -39,6 +40,9 @@ class ReplayOptions:
 
     input: Path
     garments: tuple[str, ...] = DEFAULT_GARMENTS
+    body: str | None = None
+    betas_from: str | None = None
+    betas_source: str = BetasSource.MESSAGE
     output: Path | None = None
     backbone: str = "tailornet"
     sdf: str = "hybrid"
@@ -60,6 +64,8 @@ class ReplayOptions:
         """The pipeline that these options ask for. Raises `RefuError` for options that make none."""
         return GarmentPipeline.load(
             self.garments,
+            body=self.body,
+            betas_from=self.betas_from,
             sdf=self.sdf,
             backbone=self.backbone,
             style=self.style,
@@ -124,6 +130,8 @@ class ReplayResult:
     on_skin: dict[str, Figures] = field(default_factory=dict)
     """As `after`, held against the skin in place of the collider."""
     interrupted: bool = False
+    body: dict[str, Any] = field(default_factory=dict)
+    """Who wore the garments, and how well the built-in mesh lies on that body."""
 
     def latency_ms(self, garment: str | None = None) -> dict[str, float]:
         """Percentiles of the latency of a garment (the frame without the others' own stages), or of the frame [ms]."""
@@ -160,6 +168,7 @@ class ReplayResult:
             "warnings": self.warnings,
             "interrupted": self.interrupted,
             "collider": self.options.collider,
+            "body": self.body,
             "skin_shift_mm": self.skin_shift_mm(),
             "latency_ms": self.latency_ms(),
             "garments": garments,
@@ -180,6 +189,8 @@ class Source:
     """Records, where the file says how many there are."""
     bag: adapters.SmplBag | None = None
     """What is read; None for a motion file."""
+    gender: str = ""
+    """What the file says of the person; empty where it says nothing."""
 
     @property
     def warnings(self) -> list[str]:
@@ -194,7 +205,15 @@ def open_source(options: ReplayOptions) -> Iterator[Source]:
         motion = adapters.read_motion(options.input)
         description = f"{options.input.name}, {len(motion)} frames at {motion.fps:g} Hz"
         records, decoder = _motion_records(motion, INPUT_TOPIC), adapters.decoder_for("multiarray")
-        yield Source(description, INPUT_TOPIC, adapters.INPUT_TYPES["multiarray"], decoder, records, len(motion))
+        yield Source(
+            description,
+            INPUT_TOPIC,
+            adapters.INPUT_TYPES["multiarray"],
+            decoder,
+            records,
+            len(motion),
+            gender=motion.gender,
+        )
         return
     with adapters.open_smpl_bag(options.input, topic=options.topic, input_type=options.input_type) as bag:
         topic, kind = bag.topic.name, bag.topic.message_type
@@ -312,6 +331,14 @@ class _Replayer:
         garments = self._evaluator.add(frame, output, latency_ms)
         self._result.frames.append(FrameResult(frame, latency_ms, output.stats.stage_ms, output.stats.shift, garments))
 
+    @property
+    def betas_are_foreign(self) -> bool:
+        """Whether nothing says what the recorded betas mean. Bags with ground truth are of the built-in bodies."""
+        told = self._betas is not None or self._pipeline.fit is not None or self._evaluator.truth.garments
+        if told or self._options.betas_source == BetasSource.BUILTIN:
+            return False
+        return any(one.frame.betas.any() for one in self._result.frames)
+
     def _skip(self, reason: str) -> None:
         skips = self._result.skips
         skips[reason if reason in skips or len(skips) < _MAX_REASONS else "other reasons"] += 1
@@ -341,7 +368,8 @@ def replay(options: ReplayOptions, *, pipeline: GarmentPipeline | None = None, p
     )  # compiles kernels, so that the first frame's latency is a frame's
     with ExitStack() as stack:
         source = stack.enter_context(open_source(options))
-        result = ReplayResult(options, source.description)
+        result = ReplayResult(options, source.description, body=body_facts(pipeline))
+        result.warnings += body_warnings(pipeline, gender=source.gender)
         replayer = _Replayer(options, pipeline, source, result)
         writer = replayer.open_writer()
         if writer is not None:
@@ -357,6 +385,8 @@ def replay(options: ReplayOptions, *, pipeline: GarmentPipeline | None = None, p
             result.interrupted = True
         result.warnings += source.warnings
     replayer.summarise()
+    if replayer.betas_are_foreign:
+        result.warnings.append(FOREIGN_BETAS)
     if not result.frames and not result.interrupted:
         reasons = "; ".join(f"{count} x {reason}" for reason, count in result.skips.most_common(3))
         msg = f"{options.input}: no frame could be replayed: {reasons or 'the input is empty'}"

@@ -1,9 +1,9 @@
-"""Body model files in SMPL's format that aren't SMPL's: 6,890 vertices in an order of their own, own shapes and joints.
+"""Body model files in SMPL's format that aren't SMPL's.
 
-Made from the built-in bodies, and as far from them as SMPL's are: other triangles, legs nearer together and arms lower in
-the rest pose, other proportions (bust, hips, belly, head, feet), hip joints 9 cm lower and 5 cm nearer to the middle, skin
-that is shared otherwise between joints, a shape space of which a part isn't in the built-in one, and pose blend shapes that
-move skin by a centimetre where a joint bends.
+Made from the built-in bodies, and as far from them as SMPL's are: 6,890 vertices in an order of their own, other
+triangles, legs nearer together and arms lower in the rest pose, other proportions (bust, hips, belly, head), hip joints
+9 cm lower and 5 cm nearer to the middle, skin that is shared otherwise between joints, a shape space of which a part
+isn't in the built-in one, and pose blend shapes that move skin by up to a centimetre where a joint bends.
 """
 
 from __future__ import annotations
@@ -26,7 +26,13 @@ from refu_core.mesh import Connectivity, vertex_normals
 Array = NDArray[np.float64]
 N_VERTICES = 6890
 N_FACES = 13776
-_JOINT_SHIFT = {0: (0, -0.02, 0.01), 1: (-0.05, -0.09, 0), 3: (0, -0.06, 0), 9: (0, -0.06, 0.03), 13: (0.05, -0.06, -0.03)}
+_JOINT_SHIFT = {
+    0: (0, -0.02, 0.01),
+    1: (-0.05, -0.09, 0),
+    3: (0, -0.06, 0),
+    9: (0, -0.06, 0.03),
+    13: (0.05, -0.06, -0.03),
+}
 _JOINT_SHIFT |= {16: (-0.01, -0.02, -0.01), 18: (-0.02, -0.005, -0.01), 7: (-0.01, 0, -0.01), 12: (0, -0.05, -0.03)}
 _PAIRS = {1: 2, 4: 5, 7: 8, 10: 11, 13: 14, 16: 17, 18: 19, 20: 21, 22: 23}
 
@@ -74,7 +80,7 @@ def smpl_arrays(gender: str = "female", *, n_betas: int = 10, seed: int = 0) -> 
     normals = vertex_normals(rest_v, mesh.faces)
     vertices, joints = _proportioned(rest_v, joints, normals, how)
     shapes = np.einsum("vab,vbk->vak", turned, known.shapedirs)
-    shapes = _own_shapes(shapes, vertices, normals, joints, n_betas, rng)
+    shapes = _own_shapes(shapes, vertices, normals, n_betas, rng)
     for joint, shift in _JOINT_SHIFT.items():
         joints[joint] += shift
         if joint in _PAIRS:
@@ -132,7 +138,7 @@ def _proportioned(vertices: Array, joints: Array, normals: Array, how: Proportio
     return longer(moved), longer(joints)
 
 
-def _own_shapes(shapes: Array, vertices: Array, normals: Array, joints: Array, n: int, rng: Any) -> Array:
+def _own_shapes(shapes: Array, vertices: Array, normals: Array, n: int, rng: Any) -> Array:
     """A rotation of the built-in space, and in each direction some millimetres that aren't in it."""
     mix, _ = np.linalg.qr(rng.normal(size=(10, 10)))
     mix = 0.5 * mix + 0.5 * np.diag(rng.choice([-1.0, 1.0], 10))

@@ -2,7 +2,7 @@
 
 from refu_core.body._anatomy import DEFAULT_GAP, ColliderSettings
 from refu_core.body._collider import Collider
-from refu_core.body._fit import BodyFit, Difference, ShapeMap, load_fit
+from refu_core.body._fit import POOR_FIT, BodyFit, Difference, ShapeMap, load_fit
 from refu_core.body._io import BUILTIN_BODIES, load_body
 from refu_core.body._kinematics import (
     JOINT_NAMES,
@@ -25,24 +25,25 @@ __all__ = [
     "LEGS",
     "MIRRORED_JOINTS",
     "PARENTS",
+    "POOR_FIT",
     "SEGMENTS",
-    "BodyOutput",
-    "load_fit",
-    "Surface",
-    "ShapeMap",
-    "Difference",
     "BodyFit",
+    "BodyOutput",
     "Collider",
     "ColliderSettings",
+    "Difference",
     "RigidTransforms",
     "Shape",
+    "ShapeMap",
     "Skinning",
     "SmplBody",
+    "Surface",
     "apply_transforms",
     "blend_transforms",
     "forward_kinematics",
     "joints_of",
     "load_body",
+    "load_fit",
     "part_of_faces",
     "require_rest_pose",
     "rotvec_to_rotmat",

@@ -98,6 +98,14 @@ class BodyFit:
             f"{1e3 * found.mean_distance:.1f} mm on average, {1e3 * found.far_distance:.1f} mm at the 99th percentile"
         )
 
+    @property
+    def warnings(self) -> list[str]:
+        """What there is to warn of, for people."""
+        if not self.is_poor:
+            return []
+        wanted = f"wanted {1e3 * POOR_FIT:g} mm at most"
+        return [f"the built-in mesh lies on {self.body.name} {self.text}, {wanted}: garments may fit it badly"]
+
     def carried(self, values: NDArray[np.floating]) -> Array:
         """`values` of the body's vertices (N, …) at the vertices of the built-in mesh (V, …)."""
         place = self.registration.place
@@ -169,7 +177,7 @@ def _regressor(body: SmplBody, vertices: Array, directions: Array) -> Array:
     moved = exact.rest_joints(torch.eye(N_BETAS, dtype=torch.float64)).numpy() - joints  # (10, 24, 3)
     tree, rows = cKDTree(vertices), np.zeros((N_JOINTS, len(vertices)))
     for j, joint in enumerate(joints):
-        _, near = tree.query(joint, _REGRESSED)
+        near = np.asarray(tree.query(joint, _REGRESSED)[1])
         # Millimetres a unit of β count as much as metres of the place: both must be right.
         known = [np.ones((1, len(near))), vertices[near].T, directions[near].reshape(len(near), -1).T]
         goal = [np.ones(1), joint, moved[:, j].T.ravel()]

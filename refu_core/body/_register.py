@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -47,7 +48,7 @@ class RegistrationSettings:
     noise: float = 0.01
     """Of the surface against joints, angles and betas [m]."""
     stiffness: tuple[float, ...] = (300.0, 100.0, 30.0, 10.0, 3.0, 1.0, 1.0, 0.3, 0.3, 0.3)
-    """How much more it counts, from round to round, that neighbours move alike than that vertices are on the surface."""
+    """How much more it counts that neighbours move alike than that vertices are on the surface, from round to round."""
     stiff_ends: float = 30.0
     """How many times stiffer hands, feet and heads are: nothing is worn there, and fingers find the wrong finger."""
 
@@ -72,6 +73,34 @@ _LOOKED_AT = tuple(
     for name in ("knee", "ankle", "shoulder", "elbow", "wrist")
 )
 ENDS = (*joints_of("head"), 7, 8, 10, 11, 20, 21, 22, 23)
+
+
+_ALONG = 0.05
+"""How much a gap along the surface counts of one across it: closest points slide."""
+_SEEN = 0.01
+"""As if every hundredth vertex were looked at: neighbours are wrong by as much as each other."""
+
+
+class _State(NamedTuple):
+    """What is fitted first."""
+
+    betas: Tensor
+    pose: Tensor
+    transl: Tensor
+
+
+class _Pairs(NamedTuple):
+    """Vertices of the source and of the target that belong together, and how much each pair counts."""
+
+    mine: Tensor
+    theirs: Tensor
+    weight: Tensor
+
+    @classmethod
+    def of(cls, mine: NDArray[Any], theirs: NDArray[Any], at: Array, goal: Array, reach: float) -> _Pairs:
+        """What is farther apart than `reach` [m] counts less and less."""
+        weight = 1 / (1 + ((at[mine] - goal[theirs]) ** 2).sum(1) / reach**2) ** 2
+        return cls(torch.as_tensor(mine), torch.as_tensor(theirs), torch.as_tensor(weight))
 
 
 def register(source: SmplBody, target: SmplBody, settings: RegistrationSettings | None = None) -> Registration:
@@ -115,56 +144,54 @@ class _Registrar:
     def _articulated(self) -> Array:
         """The source in the shape, pose and place that are nearest to the target [m], shape (V, 3)."""
         how = self.how
-        betas = torch.zeros(1, N_BETAS, dtype=torch.float64, requires_grad=True)
-        pose = torch.zeros(1, N_JOINTS, 3, dtype=torch.float64, requires_grad=True)
-        transl = (self.joints - self.source(pose.detach()).joints[0])[list(_LOOKED_AT)].mean(0)
-        transl = transl.clone().requires_grad_(True)
-        looked_at = list(_LOOKED_AT)
-        goal_points = torch.as_tensor(self.surface.vertices)
-        goal_normals = torch.as_tensor(self.surface.normals)
+        betas = torch.zeros(1, N_BETAS, dtype=torch.float64)
+        pose = torch.zeros(1, N_JOINTS, 3, dtype=torch.float64)
+        transl = (self.joints - self.source(pose).joints[0])[list(_LOOKED_AT)].mean(0)
+        state = _State(betas.requires_grad_(), pose.requires_grad_(), transl.clone().requires_grad_())
         for k in range(how.rounds):
-            with torch.no_grad():
-                at = (self.source(pose, betas).vertices[0] + transl).numpy()
-            normals = vertex_normals(at, self.mesh.faces)
-            features = self._features(at, normals)
-            _, theirs = self._tree.query(features)
-            _, mine = cKDTree(features).query(self._tree.data)
+            at = self._at(state)
+            features = self._features(at, vertex_normals(at, self.mesh.faces))
+            theirs = np.asarray(self._tree.query(features)[1])
+            mine = np.asarray(cKDTree(features).query(self._tree.data)[1])
             reach = how.reach if k < how.rounds // 2 else how.reach / 2
             pairs = [
-                (torch.arange(len(at)), torch.as_tensor(theirs)),
-                (torch.as_tensor(mine), torch.arange(len(goal_points))),
+                _Pairs.of(np.arange(len(at)), theirs, at, self.surface.vertices, reach),
+                _Pairs.of(mine, np.arange(len(mine)), at, self.surface.vertices, reach),
             ]
-            kept = [
-                1 / (1 + (torch.as_tensor(at)[i] - goal_points[j]).square().sum(1) / reach**2) ** 2 for i, j in pairs
-            ]
-            optimiser = torch.optim.LBFGS([betas, pose, transl], max_iter=how.steps, line_search_fn="strong_wolfe")
+            self._step(state, pairs)
+        return self._at(state)
 
-            def loss() -> Tensor:
-                optimiser.zero_grad()
-                posed = self.source(pose, betas)
-                vertices, joints = posed.vertices[0] + transl, posed.joints[0] + transl
-                total = ((joints - self.joints)[looked_at] / how.joint_spread).square().sum()
-                total = total + (pose / how.angle_spread).square().sum() + betas.square().sum()
-                for (i, j), weight in zip(pairs, kept, strict=True):
-                    gap = vertices[i] - goal_points[j]
-                    off = (gap * goal_normals[j]).sum(1).square() + 0.05 * gap.square().sum(1)
-                    # As much as if every hundredth vertex were seen: neighbours are wrong by as much.
-                    total = total + 0.01 * (weight * off).sum() / how.noise**2
-                total.backward()
-                return total
-
-            optimiser.step(loss)
+    def _at(self, state: _State) -> Array:
         with torch.no_grad():
-            return (self.source(pose, betas).vertices[0] + transl).numpy()
+            vertices: Array = (self.source(state.pose, state.betas).vertices[0] + state.transl).numpy()
+        return vertices
+
+    def _step(self, state: _State, pairs: list[_Pairs]) -> None:
+        """Brings pairs of points together, as far as joints, angles and betas let them."""
+        how, looked_at = self.how, list(_LOOKED_AT)
+        goal, normals = torch.as_tensor(self.surface.vertices), torch.as_tensor(self.surface.normals)
+        optimiser: Any = torch.optim.LBFGS(list(state), max_iter=how.steps, line_search_fn="strong_wolfe")
+
+        def loss() -> Tensor:
+            optimiser.zero_grad()
+            posed = self.source(state.pose, state.betas)
+            vertices, joints = posed.vertices[0] + state.transl, posed.joints[0] + state.transl
+            total = ((joints - self.joints)[looked_at] / how.joint_spread).square().sum()
+            total = total + (state.pose / how.angle_spread).square().sum() + state.betas.square().sum()
+            for mine, theirs, weight in pairs:
+                gap = vertices[mine] - goal[theirs]
+                off = (gap * normals[theirs]).sum(1).square() + _ALONG * gap.square().sum(1)
+                total = total + _SEEN * (weight * off).sum() / how.noise**2
+            torch.autograd.backward(total)
+            return total
+
+        optimiser.step(loss)
 
     def _draped(self, start: Array) -> Array:
         """Vertices (V, 3) [m] brought to the target's surface."""
-        n = len(start)
-        graph = self.mesh.adjacency_matrix()
         stiff = np.where(self.is_end, self.how.stiff_ends, 1.0)
         laplacian = self.mesh.uniform_laplacian()
         bending = sparse.csr_array(laplacian.T @ sparse.diags_array(stiff) @ laplacian)
-        del graph
         at = start
         for stiffness in self.how.stiffness:
             place = self.surface.closest(at)
@@ -176,5 +203,4 @@ class _Registrar:
             weight = agree / (1 + distance2 / self.how.reach**2) + 1e-4
             matrix = sparse.csc_array(sparse.diags_array(weight) + stiffness * bending)
             at = start + splu(matrix).solve(weight[:, None] * (goal - start))
-        assert len(at) == n
         return at

@@ -43,7 +43,9 @@ _INFLUENCES = 6
 def worn_on(garment: GarmentTemplate, fit: BodyFit | None) -> GarmentTemplate:
     """`garment` on the body of `fit`: it follows that body's betas and skin, and its styles are as they were.
 
-    Itself on the body that it was cut for, which None stands for. What of the body is in the shape space of the one that the garment was cut for, the garment knows already how to
+    Itself on the body that it was cut for, which None stands for.
+
+    What of the body is in the shape space of the one that the garment was cut for, the garment knows already how to
     follow. The rest is carried over by the skin below it. So nothing changes on the garment's own body.
     """
     if fit is None or fit.body.fingerprint == load_body(garment.body).fingerprint:
@@ -77,7 +79,7 @@ class _Carrier:
     """Takes what skin does over to the cloth on it."""
 
     def __init__(self, rest: Array, garment: GarmentTemplate, skin: Array) -> None:
-        distance, vertex = cKDTree(skin).query(rest, _NEIGHBOURS)
+        distance, vertex = map(np.asarray, cKDTree(skin).query(rest, _NEIGHBOURS))
         weight = np.exp((distance[:, :1] ** 2 - distance**2) / (2 * _WIDTH**2))
         weight /= weight.sum(1, keepdims=True)
         rows = np.repeat(np.arange(len(rest)), _NEIGHBOURS)

@@ -13,7 +13,7 @@ from refu_core.garments import GarmentTemplate, load_garment, worn_on
 from refu_core.modes import DEFAULT_MARGIN
 from refu_core.realtime._wearer import Outfit, Wearable
 from refu_core.refu import trained_from_weights
-from refu_core.weights import weights_folder
+from refu_core.weights import Weights, weights_folder
 
 if TYPE_CHECKING:
     from os import PathLike
@@ -87,10 +87,21 @@ def _wearable(
     weights: str | PathLike[str] | None,
     device: torch.device,
 ) -> Wearable:
-    worn = worn_on(template, fit)
     stored = backbone_weights(backbone, template.name, mode=mode, folder=weights_folder(template.name, weights))
     if stored is None:
-        return Wearable(worn, Skinned(), None, DEFAULT_MARGIN)
+        return Wearable(worn_on(template, fit), Skinned(), None, DEFAULT_MARGIN)
+    return wearable_of(stored, template, fit, device=device)
+
+
+def wearable_of(
+    stored: Weights, template: GarmentTemplate, fit: BodyFit | None, *, device: str | torch.device = "cpu"
+) -> Wearable:
+    """A garment as it was cut, and the networks in `stored`, on the body of `fit` or (None) on its own.
+
+    Raises:
+        WeightsError: they were trained on a third body, or don't fit the garment.
+    """
+    worn = worn_on(template, fit)
     trained_on, source = stored.card.get("body_fingerprint"), load_body(template.body).fingerprint
     betas = None
     if fit is not None and trained_on in fit.fingerprints:
