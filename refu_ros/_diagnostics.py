@@ -44,7 +44,7 @@ def statuses(
 
     `node` is the name with its namespace; `listening_for` is the time since the inputs were subscribed to [s], None
     where they aren't; `in_use` is what is computed with; `input_frame` is the sender's, where it isn't the markers';
-    `has_foreign_betas` says that betas came of which nobody knows what they mean; `n_namesakes` are other nodes of this name.
+    `has_foreign_betas`: nobody knows what the betas mean that came; `n_namesakes` are other nodes of this name.
     """
     active = state == "active"
     found = [

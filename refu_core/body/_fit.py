@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +15,7 @@ from torch import Tensor
 from refu_core._cache import keep, recall
 from refu_core.body._io import BUILTIN_BODIES, load_body
 from refu_core.body._model import BodyArrays, SmplBody
-from refu_core.body._register import ENDS, Registration, register
+from refu_core.body._register import ENDS, Registration, derivatives, register
 from refu_core.body._rest_pose import require_rest_pose
 from refu_core.body._surface import OnSurface
 from refu_core.frames import N_BETAS, N_JOINTS
@@ -125,13 +124,12 @@ class BodyFit:
 
     def _differ(self, source: SmplBody) -> Difference:
         rest, own = source.v_template.numpy(), source.arrays.shapedirs
+        columns = derivatives(source.name).vertices
         goal = np.concatenate(((self.registration.vertices - rest)[:, :, None], self.directions()), axis=2)
-        bent = _bent(source.name)
-        place = np.broadcast_to(np.eye(3), (len(rest), 3, 3))
-        columns = np.concatenate((own, bent, place), axis=2).reshape(3 * len(rest), -1)
+        columns = columns.reshape(-1, columns.shape[2])
         share = np.where(source.weights[:, list(ENDS)].sum(1).numpy() > 0.5, _END_SHARE, 1.0)
         weight = np.repeat(share / share.sum(), 3)[:, None]
-        prior = _TRUST**2 * np.repeat([1.0, _ANGLE_SPREAD**-2, 1e-6], [N_BETAS, bent.shape[2], 3])
+        prior = _TRUST**2 * np.repeat([1.0, _ANGLE_SPREAD**-2, 1e-6], [N_BETAS, 3 * N_JOINTS, 3])
         found = np.linalg.solve(
             columns.T @ (weight * columns) + np.diag(prior), columns.T @ (weight * goal.reshape(len(columns), -1))
         )[:N_BETAS]
@@ -158,16 +156,6 @@ class BodyFit:
         place = _corners(made.faces, len(vertices))
         laid = Registration(vertices, place, known.mean_distance, known.far_distance)
         return BodyFit(body, laid, fingerprints=(body.fingerprint, self.body.fingerprint))
-
-
-@cache
-def _bent(name: str) -> Array:
-    """What a radian about each axis of each joint does to a built-in body at rest [m], shape (V, 3, 72)."""
-    source, step = load_body(name, dtype=torch.float64), 1e-4
-    poses = step * torch.eye(3 * N_JOINTS, dtype=torch.float64)
-    moved = torch.stack([source(pose[None]).vertices[0] for pose in poses])
-    bent: Array = ((moved - source.v_template) / step).permute(1, 2, 0).numpy()
-    return bent
 
 
 def _regressor(body: SmplBody, vertices: Array, directions: Array) -> Array:

@@ -7,8 +7,8 @@ the other body.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, NamedTuple
+from functools import cache, cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
-from torch import Tensor
 
+from refu_core.body._io import load_body
 from refu_core.body._kinematics import JOINT_NAMES
 from refu_core.body._model import SmplBody
 from refu_core.body._parts import joints_of
@@ -32,10 +32,8 @@ Array = NDArray[np.float64]
 class RegistrationSettings:
     """How a mesh is laid onto a surface; figures are of the bodies in tests/smpl_file.py."""
 
-    rounds: int = 12
-    """How often closest points are looked for while shape and pose are fitted: they no longer change by then."""
-    steps: int = 12
-    """Of the optimiser in each round."""
+    rounds: int = 10
+    """Newton's steps to shape and pose, each with the points that are closest then."""
     normal_scale: float = 0.05
     """Of two normals that stand at right angles, as far as being 1.4 times so far apart counts [m]: flanks don't find
     the arm beside them."""
@@ -45,9 +43,9 @@ class RegistrationSettings:
     """How far joints of two models are apart in one body [m]. Hips (by 10 cm), spine and collars aren't looked at."""
     angle_spread: float = 0.1
     """How far a joint is turned from one rest pose to the other [rad]."""
-    noise: float = 0.01
+    noise: float = 0.005
     """Of the surface against joints, angles and betas [m]."""
-    stiffness: tuple[float, ...] = (300.0, 100.0, 30.0, 10.0, 3.0, 1.0, 1.0, 0.3, 0.3, 0.3)
+    stiffness: tuple[float, ...] = (300.0, 30.0, 10.0, 3.0, 1.0, 0.3)
     """How much more it counts that neighbours move alike than that vertices are on the surface, from round to round."""
     stiff_ends: float = 30.0
     """How many times stiffer hands, feet and heads are: nothing is worn there, and fingers find the wrong finger."""
@@ -81,26 +79,30 @@ _SEEN = 0.01
 """As if every hundredth vertex were looked at: neighbours are wrong by as much as each other."""
 
 
-class _State(NamedTuple):
-    """What is fitted first."""
+class Derivatives(NamedTuple):
+    """What a unit of each beta, a radian about each axis of each joint, and a metre along each axis do at rest."""
 
-    betas: Tensor
-    pose: Tensor
-    transl: Tensor
+    vertices: Array
+    """[m], shape (V, 3, 85)."""
+    joints: Array
+    """[m], shape (24, 3, 85)."""
 
 
-class _Pairs(NamedTuple):
-    """Vertices of the source and of the target that belong together, and how much each pair counts."""
-
-    mine: Tensor
-    theirs: Tensor
-    weight: Tensor
-
-    @classmethod
-    def of(cls, mine: NDArray[Any], theirs: NDArray[Any], at: Array, goal: Array, reach: float) -> _Pairs:
-        """What is farther apart than `reach` [m] counts less and less."""
-        weight = 1 / (1 + ((at[mine] - goal[theirs]) ** 2).sum(1) / reach**2) ** 2
-        return cls(torch.as_tensor(mine), torch.as_tensor(theirs), torch.as_tensor(weight))
+@cache
+def derivatives(name: str) -> Derivatives:
+    """Of a built-in body."""
+    source, step = load_body(name, dtype=torch.float64), 1e-4
+    rest = source(torch.zeros(1, N_JOINTS, 3, dtype=torch.float64))
+    turns = [source(pose[None]) for pose in step * torch.eye(3 * N_JOINTS, dtype=torch.float64)]
+    betas = torch.eye(N_BETAS, dtype=torch.float64)
+    place = torch.eye(3, dtype=torch.float64)
+    found = []
+    for part, shaped in (("vertices", source.rest_vertices(betas)), ("joints", source.rest_joints(betas))):
+        zero = getattr(rest, part)[0]
+        bent = torch.stack([getattr(turn, part)[0] - zero for turn in turns]) / step
+        columns = torch.cat((shaped - zero, bent, place[:, None].expand(-1, len(zero), -1)))
+        found.append(columns.permute(1, 2, 0).contiguous().numpy())
+    return Derivatives(*found)
 
 
 def register(source: SmplBody, target: SmplBody, settings: RegistrationSettings | None = None) -> Registration:
@@ -119,7 +121,7 @@ class _Registrar:
         self.target = target.to(device="cpu", dtype=torch.float64)
         self.mesh = Connectivity.of(source.faces.cpu().numpy(), source.n_vertices)
         self.surface = Surface(self.target.v_template.numpy(), target.faces.cpu().numpy().astype(np.int32))
-        self.joints = self.target.rest_joints(torch.zeros(1, N_BETAS, dtype=torch.float64))[0]
+        self.joints = self.target.rest_joints(torch.zeros(1, N_BETAS, dtype=torch.float64))[0].numpy()
         self.is_end = self.source.weights[:, list(ENDS)].sum(1).numpy() > 0.5
 
     def run(self) -> Registration:
@@ -143,49 +145,44 @@ class _Registrar:
 
     def _articulated(self) -> Array:
         """The source in the shape, pose and place that are nearest to the target [m], shape (V, 3)."""
-        how = self.how
-        betas = torch.zeros(1, N_BETAS, dtype=torch.float64)
-        pose = torch.zeros(1, N_JOINTS, 3, dtype=torch.float64)
-        transl = (self.joints - self.source(pose).joints[0])[list(_LOOKED_AT)].mean(0)
-        state = _State(betas.requires_grad_(), pose.requires_grad_(), transl.clone().requires_grad_())
+        how, linear = self.how, derivatives(self.source.name)
+        own = self.source.rest_joints(torch.zeros(1, N_BETAS, dtype=torch.float64))[0].numpy()
+        state = np.zeros(linear.vertices.shape[2])
+        state[-3:] = (self.joints - own)[list(_LOOKED_AT)].mean(0)
+        at, joints = self._at(state)
         for k in range(how.rounds):
-            at = self._at(state)
             features = self._features(at, vertex_normals(at, self.mesh.faces))
             theirs = np.asarray(self._tree.query(features)[1])
             mine = np.asarray(cKDTree(features).query(self._tree.data)[1])
+            mine, theirs = (
+                np.concatenate(both) for both in ((np.arange(len(at)), mine), (theirs, np.arange(len(mine))))
+            )
             reach = how.reach if k < how.rounds // 2 else how.reach / 2
-            pairs = [
-                _Pairs.of(np.arange(len(at)), theirs, at, self.surface.vertices, reach),
-                _Pairs.of(mine, np.arange(len(mine)), at, self.surface.vertices, reach),
+            gap = at[mine] - self.surface.vertices[theirs]
+            weight = _SEEN / how.noise**2 / (1 + (gap**2).sum(1) / reach**2) ** 2
+            prior = np.repeat([1.0, how.angle_spread**-2, 0.0], [N_BETAS, 3 * N_JOINTS, 3])
+            rows = [
+                (np.einsum("nck,nc->nk", linear.vertices[mine], self.surface.normals[theirs]), weight),
+                (linear.vertices[mine].reshape(-1, len(state)), np.repeat(_ALONG * weight, 3)),
+                (linear.joints[_LOOKED_AT, :].reshape(-1, len(state)), how.joint_spread**-2),
             ]
-            self._step(state, pairs)
-        return self._at(state)
+            off = [
+                (gap * self.surface.normals[theirs]).sum(1),
+                gap.ravel(),
+                (joints - self.joints)[list(_LOOKED_AT)].ravel(),
+            ]
+            normal = np.diag(prior) + sum(a.T @ (np.reshape(w, (-1, 1)) * a) for a, w in rows)
+            slope = prior * state + sum(a.T @ (w * r) for (a, w), r in zip(rows, off, strict=True))
+            state = state - np.linalg.solve(normal, slope)
+            at, joints = self._at(state)
+        return at
 
-    def _at(self, state: _State) -> Array:
+    def _at(self, state: Array) -> tuple[Array, Array]:
+        """Vertices (V, 3) and joints (24, 3) [m] of betas, pose [rad] and place [m], side by side, (85,)."""
         with torch.no_grad():
-            vertices: Array = (self.source(state.pose, state.betas).vertices[0] + state.transl).numpy()
-        return vertices
-
-    def _step(self, state: _State, pairs: list[_Pairs]) -> None:
-        """Brings pairs of points together, as far as joints, angles and betas let them."""
-        how, looked_at = self.how, list(_LOOKED_AT)
-        goal, normals = torch.as_tensor(self.surface.vertices), torch.as_tensor(self.surface.normals)
-        optimiser: Any = torch.optim.LBFGS(list(state), max_iter=how.steps, line_search_fn="strong_wolfe")
-
-        def loss() -> Tensor:
-            optimiser.zero_grad()
-            posed = self.source(state.pose, state.betas)
-            vertices, joints = posed.vertices[0] + state.transl, posed.joints[0] + state.transl
-            total = ((joints - self.joints)[looked_at] / how.joint_spread).square().sum()
-            total = total + (state.pose / how.angle_spread).square().sum() + state.betas.square().sum()
-            for mine, theirs, weight in pairs:
-                gap = vertices[mine] - goal[theirs]
-                off = (gap * normals[theirs]).sum(1).square() + _ALONG * gap.square().sum(1)
-                total = total + _SEEN * (weight * off).sum() / how.noise**2
-            torch.autograd.backward(total)
-            return total
-
-        optimiser.step(loss)
+            numbers = torch.as_tensor(state)
+            posed = self.source(numbers[None, N_BETAS:-3], numbers[None, :N_BETAS])
+        return posed.vertices[0].numpy() + state[-3:], posed.joints[0].numpy() + state[-3:]
 
     def _draped(self, start: Array) -> Array:
         """Vertices (V, 3) [m] brought to the target's surface."""
