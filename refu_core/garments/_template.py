@@ -85,7 +85,7 @@ class GarmentTemplate:
                 msg = f"{self.name} has one style only: leave the style out"
                 raise GarmentError(msg)
             offset = offset + style @ self.styledirs.T
-        return self.v_template + offset.view(len(offset), -1, 3)
+        return self.v_template + offset.view(len(offset), self.n_vertices, 3)
 
     def vertex_transforms(self, transforms: RigidTransforms) -> RigidTransforms:
         """The body's transforms (leading shape (B, 24)) blended at the garment's vertices (leading shape (B, V))."""

@@ -32,6 +32,8 @@ _HELD_WITHIN = 0.03
 """Cloth that is farther off the skin than this follows its own neighbours rather [m]: between two legs, neither one."""
 _CLEARANCE = 0.006
 """What garments are cut clear of their body [m]: no more is asked for on another."""
+_FROM_MIDDLE = 0.003
+"""What vertices keep from the plane between left and right, if they have as much as cut [m]."""
 _LIFTS = 6
 """Rounds of lifting: hardly anything is below its clearance after three."""
 _SPREADS = 3
@@ -62,7 +64,8 @@ def worn_on(garment: GarmentTemplate, fit: BodyFit | None) -> GarmentTemplate:
     directions = own.reshape(n, 3, N_BETAS) + carry(differs.directions)
     vertices = rest + carry(differs.template)
     clear = np.minimum(Surface(skin, source.arrays.faces.astype(np.int32)).heights(rest)[0], _CLEARANCE)
-    vertices = _lifted(vertices, clear, garment, fit)
+    own_side = exact.v_template[:, 0].numpy()
+    vertices = _on_own_side(_lifted(_on_own_side(vertices, own_side), clear, garment, fit), own_side)
     weights = (exact.weights.numpy() + carry(differs.weights)).clip(0)
     few = np.sort(weights, axis=1)[:, -_INFLUENCES, None]
     weights = np.where(weights >= few, weights, 0)
@@ -93,6 +96,14 @@ class _Carrier:
         there = self._attach @ values.reshape(len(values), -1)
         levelled: Array = self._solve(self._hold[:, None] * there)
         return levelled.reshape(-1, *values.shape[1:])
+
+
+def _on_own_side(vertices: Array, own_side: Array) -> Array:
+    """Vertices on the side of the body's middle that they are on as cut, x (N,) [m]: one trouser leg isn't in the
+    other on a body whose legs are nearer together."""
+    side, kept = np.where(own_side > 0, 1.0, -1.0), vertices.copy()
+    kept[:, 0] = side * np.maximum(side * vertices[:, 0], np.minimum(np.abs(own_side), _FROM_MIDDLE))
+    return kept
 
 
 def _lifted(vertices: Array, clear: Array, garment: GarmentTemplate, fit: BodyFit) -> Array:
