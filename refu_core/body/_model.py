@@ -13,7 +13,7 @@ from torch import Tensor
 
 from refu_core.body._kinematics import PARENTS, RigidTransforms, forward_kinematics, rotvec_to_rotmat
 from refu_core.body._skinning import Skinning
-from refu_core.errors import BodyError, FrameError
+from refu_core.errors import BodyError, FrameError, require_type
 from refu_core.frames import N_BETAS, N_JOINTS
 
 if TYPE_CHECKING:
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
 N_POSE_FEATURES = 9 * (N_JOINTS - 1)
+_TENSOR = "{} as a torch.Tensor, such as torch.as_tensor(array) gives"
 _LARGEST = 1e6
 """No model has larger numbers, and in float32 products of much larger ones are infinite."""
 
@@ -194,10 +195,12 @@ class SmplBody:
 
     def rest_joints(self, betas: Tensor) -> Tensor:
         """Joints of the unposed shapes [m], shape (B, 24, 3), for betas (B, 10)."""
+        require_type(betas, Tensor, _TENSOR.format("betas"), error=FrameError)
         return self._joint_template + torch.einsum("jck,bk->bjc", self._joint_shapedirs, betas)
 
     def rest_vertices(self, betas: Tensor) -> Tensor:
         """Unposed bodies without pose blend shapes [m], shape (B, V, 3), for betas (B, 10)."""
+        require_type(betas, Tensor, _TENSOR.format("betas"), error=FrameError)
         return torch.addmm(self.v_template.view(1, -1), betas, self._shapedirs).view(-1, self.n_vertices, 3)
 
     def __call__(
@@ -237,6 +240,7 @@ class SmplBody:
 
     def posed(self, pose: Tensor, shape: Shape) -> BodyOutput:
         """Poses bodies: rotation vectors (B, 24, 3) [rad] of as many shapes, or of one."""
+        require_type(pose, Tensor, _TENSOR.format("pose"), error=FrameError)
         rotations = rotvec_to_rotmat(pose)
         joints, transforms = forward_kinematics(rotations, shape.joints)
         vertices = shape.vertices

@@ -11,9 +11,12 @@ import torch
 from torch import Tensor
 
 from refu_core.body import RigidTransforms, Skinning, blend_transforms, unapply_transforms
-from refu_core.errors import GarmentError
+from refu_core.errors import GarmentError, require_type
 from refu_core.garments._card import GarmentCard
 from refu_core.mesh import Connectivity
+
+
+_TENSOR = "a torch.Tensor, such as torch.as_tensor(array) gives"
 
 
 def inner_first(garments: Mapping[str, GarmentTemplate]) -> list[str]:
@@ -79,6 +82,7 @@ class GarmentTemplate:
         Raises:
             GarmentError: a style was asked of a garment that has one style only.
         """
+        require_type(betas, Tensor, _TENSOR, error=GarmentError)
         offset = betas @ self.shapedirs.T
         if style is not None:
             if self.styledirs is None:
@@ -93,6 +97,7 @@ class GarmentTemplate:
 
     def pose(self, unposed: Tensor, transforms: RigidTransforms) -> Tensor:
         """Posed garment [m], shape (B, V, 3), of an unposed one of the same shape, by the body's transforms (B, 24)."""
+        require_type(unposed, Tensor, _TENSOR, error=GarmentError)
         return self._skinning(unposed, transforms)
 
     @cached_property
@@ -101,4 +106,5 @@ class GarmentTemplate:
 
     def unpose(self, posed: Tensor, transforms: RigidTransforms) -> Tensor:
         """The inverse of `pose`, exact to rounding (see `refu_core.body.unapply_transforms`)."""
+        require_type(posed, Tensor, _TENSOR, error=GarmentError)
         return unapply_transforms(posed, self.vertex_transforms(transforms))

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from refu_core.backbones import Backbone
 from refu_core.body import BodyFit, Collider, Shape, ShapeMap, SmplBody
+from refu_core.errors import FrameError, require_type
 from refu_core.frames import N_STYLES
 from refu_core.garments import GarmentTemplate, SkinBelow
 from refu_core.refu import Refu
@@ -92,6 +93,7 @@ class Wearer:
         Raises:
             GarmentError: a style for a garment that has one style only.
         """
+        require_type(betas, Tensor, "betas as a torch.Tensor, such as torch.as_tensor(array) gives", error=FrameError)
         mean = betas.new_zeros(1, betas.shape[1])
         garments = {}
         for name, one in outfit.wearables.items():
