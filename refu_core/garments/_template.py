@@ -15,7 +15,6 @@ from refu_core.errors import GarmentError, require_type
 from refu_core.garments._card import GarmentCard
 from refu_core.mesh import Connectivity
 
-
 _TENSOR = "a torch.Tensor, such as torch.as_tensor(array) gives"
 
 
