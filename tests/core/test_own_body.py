@@ -17,6 +17,7 @@ from refu_core import BodyError, GarmentError, GarmentPipeline, SmplFrame, Weigh
 from refu_core._cache import cache_folder
 from refu_core.body import BodyFit, SmplBody, Surface, _fit, load_fit
 from refu_core.garments import worn_on
+from refu_core.mesh import Connectivity
 from refu_core.metrics import CollisionChecker
 
 MM = 1e-3
@@ -62,15 +63,14 @@ def renumbered(name: str) -> SmplBody:
 # Registration
 
 
-@pytest.mark.parametrize(("gender", "suffix", "n_betas"), [("male", ".pkl", 300), ("neutral", ".npz", 10)])
-def test_the_built_in_mesh_lies_on_a_file(folder: Path, gender: str, suffix: str, n_betas: int) -> None:
-    path = write_smpl(folder, gender, suffix=suffix, n_betas=n_betas)
-    body = load_body(path)
-    assert (body.n_vertices, len(body.faces)) == (N_VERTICES, N_FACES)
-    found = load_fit(path)
-    assert found.registration.mean_distance < 1 * MM
-    assert found.registration.far_distance < 5 * MM
-    assert not found.warnings
+def test_the_built_in_mesh_lies_on_a_file(folder: Path, fit: BodyFit) -> None:
+    """As SMPL's files are, the one with 10 betas and the other with 300."""
+    pickled = load_fit(write_smpl(folder, "male", suffix=".pkl", n_betas=300))
+    for found in (fit, pickled):
+        assert (found.body.n_vertices, len(found.body.faces)) == (N_VERTICES, N_FACES)
+        assert found.registration.mean_distance < 1 * MM
+        assert found.registration.far_distance < 5 * MM
+        assert not found.warnings
 
 
 def test_a_file_is_registered_once(female: Path, fit: BodyFit, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -111,19 +111,28 @@ def test_nowhere_to_keep_anything(fit: BodyFit, tmp_path: Path, monkeypatch: pyt
 # Garments
 
 
-@pytest.mark.parametrize("name", ["tshirt-male", "skirt-female"])
-def test_a_garment_stays_as_it_is_on_its_own_body(name: str) -> None:
-    garment = load_garment(name)
-    assert worn_on(garment, load_fit(garment.body)) is garment
-    again = worn_on(garment, load_fit(renumbered(garment.body)))
+def test_a_garment_stays_as_it_is_on_its_own_body() -> None:
+    """And nearly so where that body's vertices are numbered otherwise; networks are told nearly the same betas.
+
+    A unit that moves skin by a millimetre isn't told from noise.
+    """
+    garment, again = load_garment("tshirt-male"), load_fit(renumbered("male"))
+    assert worn_on(garment, load_fit("male")) is garment
+    worn = worn_on(garment, again)
     betas = torch.eye(10).mul(2)
-    gap = (again.rest(betas) - garment.rest(betas)).norm(dim=-1)
-    assert gap.mean() < 1 * MM
-    assert gap.max() < 12 * MM
-    assert (again.weights - garment.weights).abs().mean() < 0.002
+    gap = (worn.rest(betas) - garment.rest(betas)).norm(dim=-1)
+    assert gap.mean() < 0.5 * MM
+    assert gap.max() < 5 * MM
+    assert (worn.weights - garment.weights).abs().mean() < 0.001
+    known = again.difference("male").betas
+    seen = load_body("male").arrays.shapedirs.reshape(-1, 10).std(0) > 2 * MM
+    assert known.offset[seen].abs().max() < 0.1
+    matrix = known.matrix.numpy()[np.ix_(seen, seen)]
+    np.testing.assert_allclose(matrix, np.eye(len(matrix)), atol=0.2)
+    assert known(torch.full((1, 10), 50.0)).abs().max() == 3, "nothing was trained beyond"
 
 
-@pytest.mark.parametrize("name", ["shirt-male", "short-pant-male", "skirt-female"])
+@pytest.mark.parametrize("name", ["short-pant-male", "skirt-female"])
 def test_a_garment_is_outside_of_the_body_that_it_is_transferred_to(fit: BodyFit, name: str) -> None:
     garment = load_garment(name)
     worn = worn_on(garment, fit)
@@ -169,17 +178,6 @@ def _follower() -> tuple[SmplBody, SmplBody]:
     return _MADE[0]
 
 
-def test_networks_are_told_the_betas_of_the_body_that_they_know() -> None:
-    """Of the same body, nearly the same ones: a unit that moves skin by a millimetre isn't told from noise."""
-    found = load_fit(renumbered("male")).difference("male").betas
-    assert found.offset.abs().max() < 0.35
-    seen = load_body("male").arrays.shapedirs.reshape(-1, 10).std(0) > 2 * MM
-    matrix = found.matrix.numpy()[np.ix_(seen, seen)]
-    np.testing.assert_allclose(matrix, np.eye(len(matrix)), atol=0.2)
-    far = found(torch.full((1, 10), 50.0))
-    assert far.abs().max() == 3, "nothing was trained beyond"
-
-
 # The pipeline
 
 
@@ -193,17 +191,14 @@ def frames() -> list[SmplFrame]:
     return made
 
 
-@pytest.mark.parametrize("how", ["body", "betas_from"])
-def test_shipped_garments_and_weights_on_an_own_body(female: Path, how: str) -> None:
+def test_shipped_garments_and_weights_on_an_own_body(female: Path) -> None:
     """A garment of each gender's body, together."""
     garments = ["tshirt-male", "skirt-female"]
-    pipeline = GarmentPipeline.load(garments, **{how: female})
-    body = load_body(female)
-    checker = CollisionChecker(pipeline.body.faces.numpy())
+    pipeline = GarmentPipeline.load(garments, body=female)
+    body, checker = load_body(female), CollisionChecker(pipeline.body.faces.numpy())
     for frame, out in zip(frames(), pipeline(frames()), strict=True):
-        theirs = body(frame.pose[None], frame.betas[None]).vertices[0].double().numpy()
-        gap = distances(body, theirs, out.skin.astype(np.float64))
-        assert gap.mean() < (1e-5 if how == "body" else 1 * MM), "the betas are the file's"
+        theirs = body(frame.pose[None], frame.betas[None]).vertices[0].numpy()
+        np.testing.assert_allclose(out.skin, theirs, atol=1e-5, err_msg="the betas are the file's")
         checker.update(out.body)
         for name in garments:
             found = checker.check(out[name].local, pipeline.garments[name].faces.numpy())
@@ -212,11 +207,12 @@ def test_shipped_garments_and_weights_on_an_own_body(female: Path, how: str) -> 
 
 
 def test_a_built_in_body_wears_what_is_cut_for_another() -> None:
+    garments = ["tshirt-male", "skirt-female"]
     with pytest.raises(GarmentError, match="name a body to have them transferred"):
-        GarmentPipeline.load(["tshirt-male", "skirt-female"])
-    pipeline = GarmentPipeline.load(["tshirt-male", "skirt-female"], body="neutral")
+        GarmentPipeline.load(garments)
+    pipeline = GarmentPipeline.load(garments, body="neutral", sdf="none", backbone="skinned", collider=False)
     assert pipeline.body.name == "neutral"
-    assert pipeline(frames()[0]).stats.garments["skirt-female"].n_unresolved == 0
+    assert not torch.equal(pipeline.garments["skirt-female"].v_template, load_garment("skirt-female").v_template)
 
 
 def test_weights_of_a_third_body_are_refused(tmp_path: Path, female: Path) -> None:
@@ -291,4 +287,4 @@ def test_a_file_with_holes_can_say_what_betas_mean() -> None:
     body = SmplBody(type(load_body("male").arrays).from_mapping(arrays, source="holes"), name="holes")
     found = load_fit(body, betas_from=True)
     assert found.registration.mean_distance < 1 * MM
-    assert GarmentPipeline.load(["tshirt-male"], betas_from=body)(frames()[0]).stats.is_certified
+    Connectivity.of(found.body.faces.numpy()).require_closed()
