@@ -5,9 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from refu_core.body import BUILTIN_BODIES
+from refu_core.modes import FOREIGN_BETAS, BetasSource
 
 if TYPE_CHECKING:
-    from refu_core import GarmentPipeline
+    from collections.abc import Iterable
+
+    from refu_core import GarmentPipeline, SmplFrame
     from refu_core.body import BodyFit
 
 
@@ -25,7 +28,7 @@ def fit_facts(fit: BodyFit) -> dict[str, float]:
 
 def body_warnings(pipeline: GarmentPipeline, *, gender: str = "") -> list[str]:
     """What there is to warn of, for a recording that says it is of a `gender`, or (empty) doesn't."""
-    warnings = [] if pipeline.fit is None else list(pipeline.fit.warnings)
+    warnings = pipeline.warnings
     known = pipeline.body.name if pipeline.fit is None or pipeline.body.name in BUILTIN_BODIES else ""
     said = gender.strip().lower()
     if said in ("male", "female") and known and said != known:
@@ -34,3 +37,10 @@ def body_warnings(pipeline: GarmentPipeline, *, gender: str = "") -> list[str]:
             "and garments are transferred to it"
         )
     return warnings
+
+
+def betas_warnings(pipeline: GarmentPipeline, frames: Iterable[SmplFrame], *, source: str) -> list[str]:
+    """Whether nothing says what the betas of frames are of."""
+    if pipeline.fit is not None or source != BetasSource.MESSAGE or not any(one.betas.any() for one in frames):
+        return []
+    return [FOREIGN_BETAS]

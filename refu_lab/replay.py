@@ -19,8 +19,8 @@ import msg_adapters as adapters
 from refu_core import FrameError, GarmentPipeline, SmplFrame
 from refu_core._device import one_thread
 from refu_core.metrics import CollisionChecker, Figures, GarmentMetrics
-from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN, FOREIGN_BETAS, BetasSource
-from refu_lab.bodies import body_facts, body_warnings
+from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN, BetasSource
+from refu_lab.bodies import betas_warnings, body_facts, body_warnings
 from refu_lab.truth import GroundTruth
 
 if TYPE_CHECKING:
@@ -331,14 +331,6 @@ class _Replayer:
         garments = self._evaluator.add(frame, output, latency_ms)
         self._result.frames.append(FrameResult(frame, latency_ms, output.stats.stage_ms, output.stats.shift, garments))
 
-    @property
-    def betas_are_foreign(self) -> bool:
-        """Whether nothing says what the recorded betas mean. Bags with ground truth are of the built-in bodies."""
-        told = self._betas is not None or self._pipeline.fit is not None or self._evaluator.truth.garments
-        if told or self._options.betas_source == BetasSource.BUILTIN:
-            return False
-        return any(one.frame.betas.any() for one in self._result.frames)
-
     def _skip(self, reason: str) -> None:
         skips = self._result.skips
         skips[reason if reason in skips or len(skips) < _MAX_REASONS else "other reasons"] += 1
@@ -348,6 +340,9 @@ class _Replayer:
         self._result.before = {name: metrics.summary() for name, metrics in self._evaluator.before.items()}
         self._result.after = {name: metrics.summary() for name, metrics in self._evaluator.after.items()}
         self._result.on_skin = {name: metrics.summary() for name, metrics in self._evaluator.on_skin.items()}
+        if self._betas is None and not self._evaluator.truth.garments:  # with it, of the built-in bodies
+            frames = (one.frame for one in self._result.frames)
+            self._result.warnings += betas_warnings(self._pipeline, frames, source=self._options.betas_source)
 
 
 @one_thread()
@@ -385,8 +380,6 @@ def replay(options: ReplayOptions, *, pipeline: GarmentPipeline | None = None, p
             result.interrupted = True
         result.warnings += source.warnings
     replayer.summarise()
-    if replayer.betas_are_foreign:
-        result.warnings.append(FOREIGN_BETAS)
     if not result.frames and not result.interrupted:
         reasons = "; ".join(f"{count} x {reason}" for reason, count in result.skips.most_common(3))
         msg = f"{options.input}: no frame could be replayed: {reasons or 'the input is empty'}"

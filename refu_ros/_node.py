@@ -29,7 +29,7 @@ from refu_ros._settings import specs
 from refu_ros._worker import Worker
 
 if TYPE_CHECKING:
-    from refu_core import GarmentPipeline, SmplFrame
+    from refu_core import GarmentPipeline
     from refu_ros._settings import PipelineKey
 
 NODE_NAME = "garment_node"
@@ -64,8 +64,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         self._in_use: PipelineKey | None = None
         self._lost = ""
         self._inputs: dict[str, Any] = {}
-        self._input_frame = ""
-        self._has_foreign_betas = False
+        self._input_frame, self._has_foreign_betas = "", False
         self._listening_since: float | None = None
         self._wanted_at = 0.0
         self._has_sent = False
@@ -103,7 +102,8 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
             return TransitionCallbackReturn.FAILURE
         self._loader = PipelineLoader(self._on_loaded, self._on_not_loaded)
         self._state = "inactive"
-        self._warn_of_fit(self._pipeline)
+        for text in self._pipeline.warnings:
+            self.get_logger().warning(text)
         self.get_logger().info(f"configured with {self._in_use}")
         return super().on_configure(state)
 
@@ -237,14 +237,10 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
             self.get_logger().warning(f"{topic}: {printable(error)}", throttle_duration_sec=_LOG_PERIOD_S)
             return
         self._compare_frames(topic, printable(adapters.frame_id_of(data, self.settings.layout)))
-        self._mind_betas(topic, frame)
-        self._scene.put(person, frame)
-
-    def _mind_betas(self, topic: str, frame: SmplFrame) -> None:
-        """Says, once, that nobody knows what the sender's betas mean."""
-        if not self._has_foreign_betas and frame.betas.any() and not self.settings.betas_are_told:
+        if frame.betas.any() and not (self._has_foreign_betas or self.settings.betas_are_told):
             self._has_foreign_betas = True
             self.get_logger().warning(f"{topic}: {FOREIGN_BETAS}")
+        self._scene.put(person, frame)
 
     def _compare_frames(self, topic: str, given: str) -> None:
         """Says, once, that the sender's frame isn't the garments', where the sender names one."""
@@ -338,15 +334,12 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
 
     def _on_loaded(self, pipeline: GarmentPipeline, key: PipelineKey) -> None:
         self._pipeline, self._in_use = pipeline, key
-        self._warn_of_fit(pipeline)
+        for text in pipeline.warnings:
+            self.get_logger().warning(text)
         if self._worker is not None:
             self._worker.use(pipeline)
         self.statistics.set_error(f"{self._lost}: on the cpu now; set device to try it again" if self._lost else "")
         self.get_logger().info(f"now with {key}")
-
-    def _warn_of_fit(self, pipeline: GarmentPipeline) -> None:
-        for text in () if pipeline.fit is None else pipeline.fit.warnings:
-            self.get_logger().warning(text)
 
     def _on_not_loaded(self, error: Exception, key: PipelineKey) -> None:
         text = printable(f"{key} can't be loaded, {self._in_use} stays: {error}")

@@ -101,7 +101,8 @@ class _Carrier:
 def _on_own_side(vertices: Array, own_side: Array) -> Array:
     """Vertices on the side of the body's middle that they are on as cut, x (N,) [m]: one trouser leg isn't in the
     other on a body whose legs are nearer together."""
-    side, kept = np.where(own_side > 0, 1.0, -1.0), vertices.copy()
+    side: Array = np.where(own_side > 0, 1.0, -1.0)
+    kept: Array = vertices.copy()
     kept[:, 0] = side * np.maximum(side * vertices[:, 0], np.minimum(np.abs(own_side), _FROM_MIDDLE))
     return kept
 

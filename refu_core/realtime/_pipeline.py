@@ -95,6 +95,11 @@ class GarmentPipeline:
         return self.outfit.fit
 
     @property
+    def warnings(self) -> list[str]:
+        """What there is to warn of before anything is dressed, for people."""
+        return [] if self.fit is None else self.fit.warnings
+
+    @property
     def margin(self) -> float | None:
         """Clearance that is kept from the skin [m]; None for what each garment's weights were trained with."""
         return self._margin
