@@ -82,16 +82,9 @@ class PipelineKey:
 
         Raises `RefuError`.
         """
-        pipeline = GarmentPipeline.load(
-            self.garments,
-            body=self.body or None,
-            betas_from=self.betas_from or None,
-            sdf=self.sdf,
-            backbone=self.backbone,
-            weights=self.weights or None,
-            device=self.device,
-            collider=self.collider,
-        )
+        named = ((item.name, getattr(self, item.name)) for item in fields(self))  # as `load` names them
+        asked: dict[str, Any] = {name: None if value == "" else value for name, value in named}
+        pipeline = GarmentPipeline.load(**asked)
         pipeline(SmplFrame(np.zeros((N_JOINTS, 3), np.float32)))
         return pipeline
 
@@ -227,16 +220,7 @@ class NodeSettings:
     @property
     def pipeline(self) -> PipelineKey:
         """What the pipeline depends on."""
-        return PipelineKey(
-            garments=self.garments,
-            sdf=self.sdf,
-            backbone=self.backbone,
-            weights=self.weights,
-            device=self.device,
-            collider=self.collider,
-            body=self.body,
-            betas_from=self.betas_from,
-        )
+        return PipelineKey(**{item.name: getattr(self, item.name) for item in fields(PipelineKey)})
 
     @property
     def betas_are_told(self) -> bool:
