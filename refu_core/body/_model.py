@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from refu_core.body._fingers import without_fingers
 from refu_core.body._kinematics import PARENTS, RigidTransforms, forward_kinematics, rotvec_to_rotmat
 from refu_core.body._skinning import Skinning
 from refu_core.errors import BodyError, FrameError, require_type
@@ -85,14 +86,17 @@ class BodyArrays:
                 raise BodyError(msg)
             return array
 
+        read = {key: numbers(key) for key in ("weights", "J_regressor", "kintree_table", "posedirs") if key in data}
+        read = without_fingers(read)
         v_template = numbers("v_template")
         n = len(v_template) if v_template.ndim == 2 else 0
-        parents = numbers("kintree_table")
+        parents = read["kintree_table"]
         # The root's parent is stored as 2**32 - 1 or -1.
         if parents.shape != (2, N_JOINTS) or tuple(parents[0, 1:].tolist()) != PARENTS[1:]:
-            msg = f"{source}: kintree_table must be the tree of SMPL's {N_JOINTS} joints, got the shape {parents.shape}"
+            msg = f"{source}: kintree_table must be the tree of SMPL's {N_JOINTS} joints, or of SMPL-H's or SMPL-X's, "
+            msg += f"got the shape {parents.shape}"
             raise BodyError(msg)
-        posedirs = numbers("posedirs") if "posedirs" in data else None
+        posedirs = read.get("posedirs")
         shapedirs = numbers("shapedirs")
         if shapedirs.ndim != 3 or shapedirs.shape[2] < N_BETAS:
             msg = f"{source}: shapedirs must be (V, 3, {N_BETAS} or more), got {shapedirs.shape}"
@@ -100,8 +104,8 @@ class BodyArrays:
         arrays = cls(
             v_template=v_template,
             faces=np.atleast_1d(numbers("f")).astype(np.int64),
-            weights=numbers("weights"),
-            joint_regressor=numbers("J_regressor"),
+            weights=read["weights"],
+            joint_regressor=read["J_regressor"],
             shapedirs=shapedirs[:, :, :N_BETAS],
             posedirs=posedirs if posedirs is not None and posedirs.any() else None,
         )

@@ -288,3 +288,36 @@ def test_a_file_with_holes_can_say_what_betas_mean() -> None:
     found = load_fit(body, betas_from=True)
     assert found.registration.mean_distance < 1 * MM
     Connectivity.of(found.body.faces.numpy()).require_closed()
+
+
+@pytest.mark.parametrize("n_joints", [52, 55])
+def test_fingers_and_faces_are_folded_into_hands_and_heads(n_joints: int) -> None:
+    """SMPL-H's 15 finger joints a hand; SMPL-X's jaw and eyes before them. Where no finger bends, nothing changes."""
+    arrays = dict(smpl_arrays("male"))
+    faces = [15, 15, 15] if n_joints == 55 else []
+    first = 22 + len(faces)
+    fingers = [
+        parent
+        for hand, wrist in enumerate((20, 21))
+        for finger in range(5)
+        for parent in (wrist, first + 15 * hand + 3 * finger, first + 15 * hand + 3 * finger + 1)
+    ]
+    parents = [*arrays["kintree_table"][0, :22].tolist(), *faces, *fingers]
+    weights, regressor = np.zeros((N_VERTICES, n_joints)), np.zeros((n_joints, N_VERTICES))
+    weights[:, :22], regressor[:22] = arrays["weights"][:, :22], arrays["J_regressor"][:22]
+    for hand in range(2):
+        of = slice(first + 15 * hand, first + 15 * hand + 15)
+        weights[:, of] = arrays["weights"][:, 22 + hand, None] / 15
+        regressor[of] = arrays["J_regressor"][22 + hand]
+    poses = np.random.default_rng(0).normal(size=(N_VERTICES, 3, 9 * (n_joints - 1)))
+    poses[:, :, :189] = arrays["posedirs"][:, :, :189]
+    changed = {"weights": weights, "J_regressor": regressor, "posedirs": poses}
+    changed["kintree_table"] = np.array([parents, range(n_joints)])
+    kind = type(load_body("male").arrays)
+    folded = SmplBody(kind.from_mapping({**arrays, **changed}, source="fingers"), name="fingers")
+    plain_poses = arrays["posedirs"].copy()
+    plain_poses[:, :, 189:] = 0
+    plain = SmplBody(kind.from_mapping({**arrays, "posedirs": plain_poses}, source="plain"), name="plain")
+    pose = 0.3 * torch.sin(torch.arange(72.0)).view(1, 24, 3)
+    torch.testing.assert_close(folded(pose).vertices, plain(pose).vertices, atol=1e-5, rtol=0)
+    torch.testing.assert_close(folded(pose).joints, plain(pose).joints, atol=1e-5, rtol=0)
