@@ -19,7 +19,7 @@ def main(n_persons: int = 4) -> list[dict[str, int]]:
         pose = 0.1 * rng.standard_normal((24, 3))  # rotation vectors, SMPL joint order [rad]
         pose[0] = 0  # the root: upright, facing z
         pose[16, 2], pose[17, 2] = -0.8, 0.8  # arms lowered
-        frames.append(SmplFrame(pose=pose, betas=rng.standard_normal(10), transl=[1.5 * person, 0.9, 0.0]))
+        frames.append(SmplFrame(pose=pose, betas=rng.standard_normal(10), transl=[1.5 * person, 1.16, 0.0]))
     left = []
     for person, output in enumerate(pipeline(frames)):
         for name, mesh in output.items():

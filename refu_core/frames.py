@@ -36,11 +36,13 @@ def _array(
     """`value` as a read-only array of numbers up to `limit`; accepts any layout with the right number of elements."""
     try:
         array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, RuntimeError) as error:  # the last: a tensor that tracks gradients
         msg = f"{name} must be {shape} numbers, got {type(value).__name__}: {error}"
         raise FrameError(msg) from error
     if array.size != np.prod(shape) or array.shape not in (shape, (array.size,)):
-        msg = f"{name} must have the shape {shape} or {(int(np.prod(shape)),)}, got {array.shape}"
+        wanted = dict.fromkeys((shape, (int(np.prod(shape)),)))
+        msg = f"{name} must have the shape {' or '.join(map(str, wanted))}, got {array.shape}"
+        msg += f": take the first {shape[0]}" if len(shape) == array.ndim == 1 and array.size > shape[0] else ""
         raise FrameError(msg)
     bad = int(np.count_nonzero(~np.isfinite(array)))
     if bad:

@@ -57,3 +57,21 @@ class BackboneName(Choice):
     TAILORNET = "tailornet"
     MLP = "mlp"
     GCNN = "gcnn"
+
+
+class BetasSource(Choice):
+    """What the betas that arrive are of."""
+
+    MESSAGE = "message"
+    """Of the body that was named; where none was, of nothing that is known, which is warned of."""
+    BUILTIN = "builtin"
+    """Of the built-in body's own shape space."""
+    FIXED = "fixed"
+    """Of nobody: those that were set are used instead."""
+
+
+FOREIGN_BETAS = (
+    "betas arrive, and nothing says what they are of: they are taken for the built-in body's own, and SMPL's mean "
+    "other shapes; name the SMPL file that they are of (body or betas_from), or set betas_source to builtin or fixed"
+)
+"""The warning, once, where betas other than zeros arrive by messages or files for a built-in body."""

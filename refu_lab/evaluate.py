@@ -36,6 +36,7 @@ class EvaluateOptions:
     every: int = 1
     motion_every: int = 1
     collider: bool = True
+    body: str | None = None
 
     def command(self, table: str) -> str:
         """The command that makes a table again, with the names of folders alone."""
@@ -46,6 +47,7 @@ class EvaluateOptions:
         else:
             parts += [f"--data {' '.join(f'data/{path.resolve().name}' for path in self.data)}"]
             parts += [f"--every {self.every}"] if self.every > 1 else []
+        parts += [f"--body {Path(self.body).name}"] if self.body is not None else []
         parts += [] if self.collider else ["--no-collider"]
         parts += [f"--weights {path.resolve().name}" for path in self.weights]
         return " ".join(parts)
@@ -78,7 +80,7 @@ class _Maker:
         _check_sets(sets)
         self._posed = [samples for samples in sets if samples.shapes is None]
         self._moving = [samples for samples in sets if samples.shapes is not None]
-        self._library = rp.Library(options.weights, collider=options.collider)
+        self._library = rp.Library(options.weights, collider=options.collider, body=options.body)
         self.wanted = [name for name in RESULT_TABLES if options.table in ("all", name) and self._has_data_for(name)]
         if not self.wanted:
             kind = "sequences (refu simulate --sequences)" if options.table == "sequence" else "poses"

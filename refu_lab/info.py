@@ -7,11 +7,12 @@ from importlib import metadata
 from importlib.util import find_spec
 from typing import Any
 
-from refu_core import MeshError, __version__
-from refu_core.body import BUILTIN_BODIES, load_body
+from refu_core import BodyError, MeshError, __version__
+from refu_core.body import BUILTIN_BODIES, POOR_FIT, load_body, load_fit
 from refu_core.garments import BUILTIN_GARMENTS, load_garment
 from refu_core.mesh import Connectivity
 from refu_core.modes import BackboneName, SdfMode
+from refu_lab.bodies import fit_facts
 
 
 def _version(distribution: str) -> str:
@@ -22,7 +23,7 @@ def _version(distribution: str) -> str:
 
 
 def describe_body(source: str) -> dict[str, Any]:
-    """What a body model file holds, and whether it can be used. Raises `BodyError`."""
+    """What a body model file holds, whether it can be used, and how well garments will. Raises `BodyError`."""
     body = load_body(source)
     try:
         Connectivity.of(body.faces).require_closed()
@@ -30,7 +31,7 @@ def describe_body(source: str) -> dict[str, Any]:
     except MeshError as error:
         closed = f"no, its signed distance can't be used: {error}"
     low, high = body.v_template[:, 1].min(), body.v_template[:, 1].max()
-    return {
+    facts: dict[str, Any] = {
         "body": source,
         "fingerprint": body.fingerprint,
         "vertices": body.n_vertices,
@@ -38,6 +39,13 @@ def describe_body(source: str) -> dict[str, Any]:
         "height": f"{float(high - low):.2f} m",
         "watertight": closed,
     }
+    try:
+        fit = load_fit(body)
+    except BodyError as error:
+        return facts | {"can be worn": f"no: {error}"}
+    poor = f"; more than {1e3 * POOR_FIT:g} mm is poor" if fit.is_poor else ""
+    facts["built-in mesh on it"] = f"{fit.text}{poor}"
+    return facts | fit_facts(fit)
 
 
 def collect() -> dict[str, Any]:

@@ -19,8 +19,9 @@ import msg_adapters as adapters
 from refu_core import GarmentPipeline, SmplFrame
 from refu_core._device import one_thread
 from refu_core.metrics import CollisionChecker, Figures, GarmentMetrics
-from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN
+from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN, BetasSource
 from refu_core.recordings import axis_of, upright_share
+from refu_lab.bodies import betas_warnings, body_facts, body_warnings
 from refu_lab.sources import Source, open_source
 from refu_lab.truth import GroundTruth
 
@@ -41,6 +42,9 @@ class ReplayOptions:
 
     input: Path
     garments: tuple[str, ...] = DEFAULT_GARMENTS
+    body: str | None = None
+    betas_from: str | None = None
+    betas_source: str = BetasSource.MESSAGE
     output: Path | None = None
     backbone: str = "tailornet"
     sdf: str = "hybrid"
@@ -70,6 +74,8 @@ class ReplayOptions:
         """The pipeline that these options ask for. Raises `RefuError` for options that make none."""
         return GarmentPipeline.load(
             self.garments,
+            body=self.body,
+            betas_from=self.betas_from,
             sdf=self.sdf,
             backbone=self.backbone,
             style=self.style,
@@ -134,6 +140,8 @@ class ReplayResult:
     on_skin: dict[str, Figures] = field(default_factory=dict)
     """As `after`, held against the skin in place of the collider."""
     interrupted: bool = False
+    body: dict[str, Any] = field(default_factory=dict)
+    """Who wore the garments, and how well the built-in mesh lies on that body."""
 
     def latency_ms(self, garment: str | None = None) -> dict[str, float]:
         """Percentiles of the latency of a garment (the frame without the others' own stages), or of the frame [ms]."""
@@ -170,6 +178,7 @@ class ReplayResult:
             "warnings": self.warnings,
             "interrupted": self.interrupted,
             "collider": self.options.collider,
+            "body": self.body,
             "skin_shift_mm": self.skin_shift_mm(),
             "latency_ms": self.latency_ms(),
             "garments": garments,
@@ -281,6 +290,10 @@ class _Replayer:
         self._result.before = {name: metrics.summary() for name, metrics in self._evaluator.before.items()}
         self._result.after = {name: metrics.summary() for name, metrics in self._evaluator.after.items()}
         self._result.on_skin = {name: metrics.summary() for name, metrics in self._evaluator.on_skin.items()}
+        is_told = self._betas is not None or self._options.input_type in adapters.KEYPOINT_TYPES
+        if not is_told and not self._evaluator.truth.garments:  # with it, of the built-in bodies
+            frames = (one.frame for one in self._result.frames)
+            self._result.warnings += betas_warnings(self._pipeline, frames, source=self._options.betas_source)
 
 
 @one_thread()
@@ -301,7 +314,8 @@ def replay(options: ReplayOptions, *, pipeline: GarmentPipeline | None = None, p
     )  # compiles kernels, so that the first frame's latency is a frame's
     with ExitStack() as stack:
         source = stack.enter_context(open_source(options, pipeline.body))
-        result = ReplayResult(options, source.description)
+        result = ReplayResult(options, source.description, body=body_facts(pipeline))
+        result.warnings += body_warnings(pipeline, gender=source.gender)
         replayer = _Replayer(options, pipeline, source, result)
         writer = replayer.open_writer()
         if writer is not None:
@@ -316,7 +330,7 @@ def replay(options: ReplayOptions, *, pipeline: GarmentPipeline | None = None, p
         except KeyboardInterrupt:
             result.interrupted = True
         result.warnings += source.warnings
-    result.warnings += _doubts(result, source, pipeline.body.name)
+    result.warnings += _doubts(result, source)
     replayer.summarise()
     if not result.frames and not result.interrupted:
         reasons = "; ".join(f"{count} x {reason}" for reason, count in result.skips.most_common(3))
@@ -325,11 +339,9 @@ def replay(options: ReplayOptions, *, pipeline: GarmentPipeline | None = None, p
     return result
 
 
-def _doubts(result: ReplayResult, source: Source, body: str) -> list[str]:
-    """What about the people should be looked at: another gender than the body's, or lying down."""
+def _doubts(result: ReplayResult, source: Source) -> list[str]:
+    """Whether people lie, who should perhaps stand."""
     doubts = []
-    if {source.gender, body} == {"male", "female"}:
-        doubts.append(f"the motion is of a {source.gender} person, the garments are for the {body} body")
     if source.bag is not None and result.frames:
         roots = np.array([one.frame.pose[0] for one in result.frames], np.float64)
         up, upright = axis_of(roots), upright_share(roots)

@@ -6,10 +6,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from refu_core import GarmentError, RefuError, load_body, load_garment
+from refu_core import GarmentError, RefuError, load_garment
 from refu_core._device import checked_device
 from refu_core.backbones import PRESETS
-from refu_core.garments import BUILTIN_GARMENTS
+from refu_core.body import load_fit
+from refu_core.garments import BUILTIN_GARMENTS, worn_on
 from refu_core.modes import MAX_MARGIN
 from refu_core.sdf import SDF_PRESETS
 from refu_core.simulation import GarmentDataset, open_dataset
@@ -69,7 +70,8 @@ def train(options: TrainOptions, *, progress: bool) -> dict[str, Any]:
     """
     _check(options)
     template = load_garment(options.garment)
-    body = load_body(options.body or template.body)
+    fit = load_fit(options.body or template.body)
+    template, body = worn_on(template, fit), fit.body
     common: dict[str, Any] = {"device": options.device, "quiet": not progress}
     if options.network == "sdf":
         return train_sdf(

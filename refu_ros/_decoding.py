@@ -7,9 +7,12 @@ from typing import TYPE_CHECKING
 
 from msg_adapters import INPUT_TYPES, KEYPOINT_TYPES, KeypointStream, decoder_for, frame_id_of
 from refu_core.keypoints import Proportions
+from refu_core.modes import FOREIGN_BETAS
 from refu_ros._scene import check_plausible
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from refu_core import SmplBody, SmplFrame
     from refu_ros._settings import NodeSettings
 
@@ -23,6 +26,7 @@ class InputDecoder:
         self._decoder = decoder_for(self._layout) if settings.input_type in INPUT_TYPES else None
         self._stream: KeypointStream | None = None
         self._body: SmplBody | None = None
+        self._is_doubted = False
 
     @property
     def is_steady(self) -> bool:
@@ -55,6 +59,19 @@ class InputDecoder:
         for frame in frames.values():
             check_plausible(frame)
         return frames, frame_id
+
+    @property
+    def has_foreign_betas(self) -> bool:
+        """Whether betas arrived, and nothing says what they are of."""
+        return self._is_doubted and not self._settings.betas_are_told
+
+    def doubt(self, frames: Iterable[SmplFrame]) -> str:
+        """What is to be said of the betas of frames, once; keypoints' are measured on the body that is dressed."""
+        is_told = self._decoder is None or self._is_doubted or self._settings.betas_are_told
+        if is_told or not any(frame.betas.any() for frame in frames):
+            return ""
+        self._is_doubted = True
+        return FOREIGN_BETAS
 
     def predicted(self, now_ns: int) -> dict[str, SmplFrame]:
         """Everybody who is followed, by now."""

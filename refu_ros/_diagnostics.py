@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from msg_adapters import DiagnosticStatus
 from msg_adapters.diagnostics import ERROR, OK, WARN
+from refu_core.modes import FOREIGN_BETAS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -36,13 +37,14 @@ def statuses(
     listening_for: float | None = math.inf,
     in_use: PipelineKey | None = None,
     input_frame: str = "",
+    has_foreign_betas: bool = False,
     n_namesakes: int = 0,
 ) -> list[DiagnosticStatus]:
     """Node, input, output and recording; `state` is the lifecycle's, `persons` are those in the scene.
 
     `node` is the name with its namespace; `listening_for` is the time since the inputs were subscribed to [s], None
     where they aren't; `in_use` is what is computed with; `input_frame` is the sender's, where it isn't the markers';
-    `n_namesakes` are other nodes of this name.
+    `has_foreign_betas`: nobody knows what the betas mean that came; `n_namesakes` are other nodes of this name.
     """
     active = state == "active"
     found = [
@@ -55,6 +57,7 @@ def statuses(
             active=active,
             listening_for=listening_for,
             input_frame=input_frame,
+            has_foreign_betas=has_foreign_betas,
         ),
         _output(
             report,
@@ -91,6 +94,7 @@ def _input(
     active: bool,
     listening_for: float | None,
     input_frame: str,
+    has_foreign_betas: bool,
 ) -> DiagnosticStatus:
     invalid, received = report.recent["drop.invalid"], report.recent["received"]
     missing = [] if settings.follow_humans else [person for person in settings.persons if person not in persons]
@@ -114,6 +118,8 @@ def _input(
         who = ", ".join(filter(None, missing))
         level = WARN
         message = f"no input from {who}" if who else f"no input for {min(report.silent_for, listening_for):.1f} s"
+    elif has_foreign_betas:
+        level, message = WARN, FOREIGN_BETAS
     values = {
         "subscribed": "no" if listening_for is None else "yes",
         "rate [Hz]": f"{report.rate('received'):.1f}",
@@ -173,6 +179,7 @@ def _output(
     if in_use is not None:
         values |= {
             "garments": ", ".join(in_use.garments),
+            "body": in_use.body or in_use.betas_from or "the garments' own",
             "backbone": in_use.backbone,
             "sdf": in_use.sdf,
             "weights": in_use.weights or "those that ship",

@@ -104,6 +104,8 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         self._loader = PipelineLoader(self._on_loaded, self._on_not_loaded)
         self._decoder.use(self.settings, self._pipeline.body)
         self._state = "inactive"
+        for text in self._pipeline.warnings:
+            self.get_logger().warning(text)
         self.get_logger().info(f"configured with {self._in_use}")
         return super().on_configure(state)
 
@@ -234,6 +236,8 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
             self.get_logger().warning(f"{topic}: {printable(error)}", throttle_duration_sec=_LOG_PERIOD_S)
             return
         self._compare_frames(topic, printable(given))
+        if doubt := self._decoder.doubt(frames.values()):
+            self.get_logger().warning(f"{topic}: {doubt}")
         for name, frame in frames.items() if not self._decoder.is_steady else ():
             self._scene.put(name, frame)
 
@@ -337,6 +341,8 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
     def _on_loaded(self, pipeline: GarmentPipeline, key: PipelineKey) -> None:
         self._pipeline, self._in_use = pipeline, key
         self._decoder.use(self.settings, pipeline.body)
+        for text in pipeline.warnings:
+            self.get_logger().warning(text)
         if self._worker is not None:
             self._worker.use(pipeline)
         self.statistics.set_error(f"{self._lost}: on the cpu now; set device to try it again" if self._lost else "")
@@ -375,6 +381,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
                 state=self._state,
                 in_use=self._in_use,
                 input_frame=self._input_frame,
+                has_foreign_betas=self._decoder.has_foreign_betas,
                 persons=() if self._scene is None else self._scene.persons,
                 recording=recording,
                 recording_error=error,

@@ -16,7 +16,7 @@ from refu_core import GarmentPipeline, RefuError, SmplFrame, load_garment
 from refu_core._device import checked_device
 from refu_core.frames import N_JOINTS
 from refu_core.keypoints import LAYOUTS
-from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN, MAX_MARGIN, BackboneName, SdfMode
+from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN, MAX_MARGIN, BackboneName, BetasSource, SdfMode
 from refu_core.weights import weights_folder
 
 if TYPE_CHECKING:
@@ -59,11 +59,14 @@ class PipelineKey:
     weights: str
     device: str
     collider: bool
+    body: str
+    betas_from: str
 
     def __str__(self) -> str:
         weights = f", weights {self.weights}" if self.weights else ""
         raw = "" if self.collider else ", no collider"
-        return f"{', '.join(self.garments)} ({self.backbone}, {self.sdf}, {self.device}{weights}{raw})"
+        wearer = f" on {self.body or self.betas_from}" if self.body or self.betas_from else ""
+        return f"{', '.join(self.garments)}{wearer} ({self.backbone}, {self.sdf}, {self.device}{weights}{raw})"
 
     def check(self) -> None:
         """Raises `RefuError` for what can't be loaded, as far as that shows without loading it."""
@@ -80,14 +83,9 @@ class PipelineKey:
 
         Raises `RefuError`.
         """
-        pipeline = GarmentPipeline.load(
-            self.garments,
-            sdf=self.sdf,
-            backbone=self.backbone,
-            weights=self.weights or None,
-            device=self.device,
-            collider=self.collider,
-        )
+        named = ((item.name, getattr(self, item.name)) for item in fields(self))  # as `load` names them
+        asked: dict[str, Any] = {name: None if value == "" else value for name, value in named}
+        pipeline = GarmentPipeline.load(**asked)
         pipeline(SmplFrame(np.zeros((N_JOINTS, 3), np.float32)))
         return pipeline
 
@@ -99,7 +97,9 @@ class NodeSettings:
     Raises `SettingsError` for a value out of range and for values that can't go together.
     """
 
-    garments: tuple[str, ...] = _parameter(DEFAULT_GARMENTS, "Garments that every person wears; all of one body.")
+    garments: tuple[str, ...] = _parameter(DEFAULT_GARMENTS, "Garments that every person wears.")
+    body: str = _parameter("", "Who wears them: an SMPL file, or a built-in name; empty for the garments' own.")
+    betas_from: str = _parameter("", "An SMPL file whose betas arrive: the built-in mesh follows them; empty for none.")
     backbone: str = _parameter(
         "tailornet", "What predicts the garment before collisions are handled.", choices=tuple(BackboneName)
     )
@@ -122,7 +122,9 @@ class NodeSettings:
         (0.0,) * 10, "Body shape in standard deviations, where betas_source is fixed.", low=-20.0, high=20.0
     )
     betas_source: str = _parameter(
-        "message", "Whether the body shape is the message's, or the parameter betas.", choices=("message", "fixed")
+        "message",
+        "message: betas that arrive are of body or betas_from; builtin: of the built-in body; fixed: parameter betas.",
+        choices=tuple(BetasSource),
     )
     input_type: str = _parameter(
         "multiarray",
@@ -221,7 +223,7 @@ class NodeSettings:
         except RefuError as error:
             msg = f"garments: {error}"
             raise SettingsError(msg) from error
-        if len({template.body for template in templates.values()}) > 1:
+        if not (self.body or self.betas_from) and len({template.body for template in templates.values()}) > 1:
             cut_for = ", ".join(f"{name} ({template.body})" for name, template in templates.items())
             msg = f"garments: one person wears garments of one body, got {cut_for}"
             raise SettingsError(msg)
@@ -238,14 +240,12 @@ class NodeSettings:
     @property
     def pipeline(self) -> PipelineKey:
         """What the pipeline depends on."""
-        return PipelineKey(
-            garments=self.garments,
-            sdf=self.sdf,
-            backbone=self.backbone,
-            weights=self.weights,
-            device=self.device,
-            collider=self.collider,
-        )
+        return PipelineKey(**{item.name: getattr(self, item.name) for item in fields(PipelineKey)})
+
+    @property
+    def betas_are_told(self) -> bool:
+        """Whether it is known what betas that arrive are of."""
+        return bool(self.body or self.betas_from) or self.betas_source != BetasSource.MESSAGE
 
     @property
     def lifetime_ns(self) -> int:

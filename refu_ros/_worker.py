@@ -12,6 +12,7 @@ import torch
 
 from msg_adapters import EncodeError, MarkerArrayEncoder, MarkerMesh, encode_delete, garment_namespace
 from refu_core._device import is_device_loss
+from refu_core.modes import BetasSource
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -282,7 +283,7 @@ class Worker:
 
 def _with_settings(frame: SmplFrame, settings: NodeSettings) -> SmplFrame:
     """The frame with the shape and style that the parameters ask for."""
-    if settings.betas_source == "fixed":
+    if settings.betas_source == BetasSource.FIXED:
         frame = replace(frame, betas=np.array(settings.betas))
     if frame.style is None and any(settings.style):
         frame = replace(frame, style=np.array(settings.style))

@@ -68,6 +68,12 @@ def pytest_pycollect_makemodule(module_path: Path, parent: pytest.Collector) -> 
     return Unable.from_parent(parent, path=module_path) if under_colcon and _MISSING else None
 
 
+@pytest.fixture(scope="session", autouse=True)
+def cache(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """What is kept from one process to the next is kept apart from the user's own."""
+    os.environ["REFU_CACHE"] = str(tmp_path_factory.getbasetemp() / "cache")
+
+
 @pytest.fixture(scope="session")
 def motions() -> list[Path]:
     """Recorded human motion (AMASS-style npz); its folder is REFU_MOTIONS, or ../shared/motions beside the checkout."""

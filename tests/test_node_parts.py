@@ -19,9 +19,10 @@ from hypothesis import strategies as st
 
 from msg_adapters import BagError, BagReader, BagWriter, DecodeError, Marker, QosProfile, decode_marker_array
 from msg_adapters.cdr import CdrWriter
-from refu_core import FrameError, GarmentPipeline, SmplFrame, load_body
+from refu_core import BodyError, FrameError, GarmentPipeline, SmplFrame, load_body
 from refu_core.keypoints import Proportions, Skeleton, keypoint_layout
 from refu_core.keypoints._pose import Pose
+from refu_core.modes import FOREIGN_BETAS
 from refu_ros._decoding import InputDecoder
 from refu_ros._diagnostics import statuses
 from refu_ros._loader import PipelineLoader
@@ -436,7 +437,9 @@ def test_what_cannot_be_loaded_is_reported() -> None:
 # Diagnostics --------------------------------------------------------------------------------------
 
 
-def report_of(statistics: Statistics, recording: RecorderState | None = None, **settings: Any) -> dict[str, Any]:
+def report_of(
+    statistics: Statistics, recording: RecorderState | None = None, *, has_foreign_betas: bool = False, **settings: Any
+) -> dict[str, Any]:
     found = statuses(
         statistics.report(),
         NodeSettings().changed(settings),
@@ -445,6 +448,7 @@ def report_of(statistics: Statistics, recording: RecorderState | None = None, **
         persons=("",),
         recording=recording,
         recording_error=recording.error if recording else "",
+        has_foreign_betas=has_foreign_betas,
     )
     return {status.name.removeprefix("n: "): status for status in found}
 
@@ -535,6 +539,30 @@ def test_without_room_everything_stays_as_it_is(
 
     monkeypatch.setattr("shutil.disk_usage", usage)
     assert not make_room()
+
+
+@pytest.mark.parametrize("how", ["body", "betas_from"])
+def test_who_wears_the_garments_is_a_parameter_that_needs_another_pipeline(how: str) -> None:
+    two = {"garments": ["short-pant-male", "skirt-female"], "backbone": "skinned", "sdf": "none", "collider": False}
+    with pytest.raises(SettingsError, match="garments of one body"):
+        NodeSettings().changed(two)
+    asked = NodeSettings().changed({**two, how: "neutral"})
+    assert " on neutral " in str(asked.pipeline)
+    assert asked.pipeline.load().body.name == "neutral"
+    assert asked.betas_are_told
+    missing = asked.changed({"body": "", "betas_from": "", "garments": ["short-pant-male"], how: "/none/SMPL.pkl"})
+    with pytest.raises(BodyError, match=r"/none/SMPL\.pkl: can't be read"):
+        missing.pipeline.load()
+
+
+def test_betas_of_unknown_meaning_are_warned_of() -> None:
+    statistics = Statistics()
+    statistics.receive()
+    assert report_of(statistics, has_foreign_betas=False)["input"].level == 0
+    status = report_of(statistics, has_foreign_betas=True)["input"]
+    assert (status.level, status.message) == (1, FOREIGN_BETAS)
+    for source in ("message", "builtin", "fixed"):
+        assert NodeSettings().changed({"betas_source": source}).betas_are_told is (source != "message")
 
 
 @pytest.mark.parametrize("collider", [True, False])

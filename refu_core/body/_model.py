@@ -11,9 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from refu_core.body._fingers import without_fingers
 from refu_core.body._kinematics import PARENTS, RigidTransforms, forward_kinematics, rotvec_to_rotmat
 from refu_core.body._skinning import Skinning
-from refu_core.errors import BodyError, FrameError
+from refu_core.errors import BodyError, FrameError, require_type
 from refu_core.frames import N_BETAS, N_JOINTS
 
 if TYPE_CHECKING:
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
 N_POSE_FEATURES = 9 * (N_JOINTS - 1)
+_TENSOR = "{} as a torch.Tensor, such as torch.as_tensor(array) gives"
 _LARGEST = 1e6
 """No model has larger numbers, and in float32 products of much larger ones are infinite."""
 
@@ -84,14 +86,17 @@ class BodyArrays:
                 raise BodyError(msg)
             return array
 
+        read = {key: numbers(key) for key in ("weights", "J_regressor", "kintree_table", "posedirs") if key in data}
+        read = without_fingers(read)
         v_template = numbers("v_template")
         n = len(v_template) if v_template.ndim == 2 else 0
-        parents = numbers("kintree_table")
+        parents = read["kintree_table"]
         # The root's parent is stored as 2**32 - 1 or -1.
         if parents.shape != (2, N_JOINTS) or tuple(parents[0, 1:].tolist()) != PARENTS[1:]:
-            msg = f"{source}: kintree_table must be the tree of SMPL's {N_JOINTS} joints, got the shape {parents.shape}"
+            msg = f"{source}: kintree_table must be the tree of SMPL's {N_JOINTS} joints, or of SMPL-H's or SMPL-X's, "
+            msg += f"got the shape {parents.shape}"
             raise BodyError(msg)
-        posedirs = numbers("posedirs") if "posedirs" in data else None
+        posedirs = read.get("posedirs")
         shapedirs = numbers("shapedirs")
         if shapedirs.ndim != 3 or shapedirs.shape[2] < N_BETAS:
             msg = f"{source}: shapedirs must be (V, 3, {N_BETAS} or more), got {shapedirs.shape}"
@@ -99,8 +104,8 @@ class BodyArrays:
         arrays = cls(
             v_template=v_template,
             faces=np.atleast_1d(numbers("f")).astype(np.int64),
-            weights=numbers("weights"),
-            joint_regressor=numbers("J_regressor"),
+            weights=read["weights"],
+            joint_regressor=read["J_regressor"],
             shapedirs=shapedirs[:, :, :N_BETAS],
             posedirs=posedirs if posedirs is not None and posedirs.any() else None,
         )
@@ -161,6 +166,11 @@ class SmplBody:
         return f"SmplBody({self.name!r}, {self.n_vertices} vertices, {self.dtype}, {self.device})"
 
     @property
+    def arrays(self) -> BodyArrays:
+        """The model's arrays as its file has them, in float64."""
+        return self._arrays
+
+    @property
     def n_vertices(self) -> int:
         """Number of vertices V."""
         return len(self.v_template)
@@ -189,10 +199,12 @@ class SmplBody:
 
     def rest_joints(self, betas: Tensor) -> Tensor:
         """Joints of the unposed shapes [m], shape (B, 24, 3), for betas (B, 10)."""
+        require_type(betas, Tensor, _TENSOR.format("betas"), error=FrameError)
         return self._joint_template + torch.einsum("jck,bk->bjc", self._joint_shapedirs, betas)
 
     def rest_vertices(self, betas: Tensor) -> Tensor:
         """Unposed bodies without pose blend shapes [m], shape (B, V, 3), for betas (B, 10)."""
+        require_type(betas, Tensor, _TENSOR.format("betas"), error=FrameError)
         return torch.addmm(self.v_template.view(1, -1), betas, self._shapedirs).view(-1, self.n_vertices, 3)
 
     def __call__(
@@ -232,6 +244,7 @@ class SmplBody:
 
     def posed(self, pose: Tensor, shape: Shape) -> BodyOutput:
         """Poses bodies: rotation vectors (B, 24, 3) [rad] of as many shapes, or of one."""
+        require_type(pose, Tensor, _TENSOR.format("pose"), error=FrameError)
         rotations = rotvec_to_rotmat(pose)
         joints, transforms = forward_kinematics(rotations, shape.joints)
         vertices = shape.vertices

@@ -333,3 +333,14 @@ def clearance_kernel(points: wp.array[wp.vec3], segments: Segments, clearance: w
         if hit.result:
             distance = distance_of(segments.trees[k], points[v], hit)
     clearance[v, k] = distance
+
+
+@wp.kernel
+def nearest_kernel(
+    tree: wp.uint64, points: wp.array[wp.vec3], face: wp.array[wp.int32], weight: wp.array[wp.vec3]
+) -> None:
+    """The face closest to each point, and the barycentrics of the closest point at its vertices 0, 1, 2."""
+    i = wp.tid()
+    hit = wp.mesh_query_point_no_sign(tree, points[i], 1.0e3)
+    face[i] = hit.face
+    weight[i] = wp.vec3(hit.u, hit.v, 1.0 - hit.u - hit.v)

@@ -5,6 +5,7 @@ from refu_core.garments._below import SkinBelow
 from refu_core.garments._card import GarmentCard, Tailoring, card_to_json
 from refu_core.garments._file import load_garment
 from refu_core.garments._template import GarmentTemplate, inner_first
+from refu_core.garments._transfer import worn_on
 from refu_core.modes import BUILTIN_GARMENTS, DEFAULT_GARMENTS
 
 __all__ = [
@@ -18,4 +19,5 @@ __all__ = [
     "card_to_json",
     "inner_first",
     "load_garment",
+    "worn_on",
 ]

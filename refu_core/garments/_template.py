@@ -11,9 +11,11 @@ import torch
 from torch import Tensor
 
 from refu_core.body import RigidTransforms, Skinning, blend_transforms, unapply_transforms
-from refu_core.errors import GarmentError
+from refu_core.errors import GarmentError, require_type
 from refu_core.garments._card import GarmentCard
 from refu_core.mesh import Connectivity
+
+_TENSOR = "a torch.Tensor, such as torch.as_tensor(array) gives"
 
 
 def inner_first(garments: Mapping[str, GarmentTemplate]) -> list[str]:
@@ -79,13 +81,14 @@ class GarmentTemplate:
         Raises:
             GarmentError: a style was asked of a garment that has one style only.
         """
+        require_type(betas, Tensor, _TENSOR, error=GarmentError)
         offset = betas @ self.shapedirs.T
         if style is not None:
             if self.styledirs is None:
                 msg = f"{self.name} has one style only: leave the style out"
                 raise GarmentError(msg)
             offset = offset + style @ self.styledirs.T
-        return self.v_template + offset.view(len(offset), -1, 3)
+        return self.v_template + offset.view(len(offset), self.n_vertices, 3)
 
     def vertex_transforms(self, transforms: RigidTransforms) -> RigidTransforms:
         """The body's transforms (leading shape (B, 24)) blended at the garment's vertices (leading shape (B, V))."""
@@ -93,6 +96,7 @@ class GarmentTemplate:
 
     def pose(self, unposed: Tensor, transforms: RigidTransforms) -> Tensor:
         """Posed garment [m], shape (B, V, 3), of an unposed one of the same shape, by the body's transforms (B, 24)."""
+        require_type(unposed, Tensor, _TENSOR, error=GarmentError)
         return self._skinning(unposed, transforms)
 
     @cached_property
@@ -101,4 +105,5 @@ class GarmentTemplate:
 
     def unpose(self, posed: Tensor, transforms: RigidTransforms) -> Tensor:
         """The inverse of `pose`, exact to rounding (see `refu_core.body.unapply_transforms`)."""
+        require_type(posed, Tensor, _TENSOR, error=GarmentError)
         return unapply_transforms(posed, self.vertex_transforms(transforms))

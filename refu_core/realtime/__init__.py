@@ -2,6 +2,7 @@
 
 from refu_core.realtime._contact import ContactStage
 from refu_core.realtime._dress import Drape, Dressed, dress
+from refu_core.realtime._load import wearable_of
 from refu_core.realtime._outputs import SKIPS, FrameStats, GarmentMesh, GarmentStats, PipelineOutput, SkinShift
 from refu_core.realtime._pipeline import GarmentPipeline
 from refu_core.realtime._promise import PROMISED_POSES, PROMISED_SIZE, within_promise
@@ -24,5 +25,6 @@ __all__ = [
     "Wearable",
     "Wearer",
     "dress",
+    "wearable_of",
     "within_promise",
 ]

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from refu_core.backbones import MAX_OFFSET
 from refu_core.body import RigidTransforms
+from refu_core.errors import FrameError, require_type
 from refu_core.realtime._turn import RootTurn
 from refu_core.realtime._wearer import UnposedGarment, Wearable, Wearer
 from refu_core.refu import VertexScale
@@ -53,6 +54,7 @@ def dress(pose: Tensor, wearer: Wearer, *, lap: Lap = _no_lap) -> Dressed:
     Pipeline, CUDA graph, training, evaluation and benchmark all call this. It is a pure function of tensors and
     differentiable: nothing is remembered, and no device is waited for. `lap` is called at the end of each stage.
     """
+    require_type(pose, Tensor, "a pose as a torch.Tensor, such as torch.as_tensor(array) gives", error=FrameError)
     turns, at_root = RootTurn.taken_off(pose, wearer.shape.joints)
     posed = wearer.outfit.body.posed(at_root, wearer.shape)
     lap("body", None)
@@ -80,12 +82,12 @@ def scale_of(wearable: Wearable, drape: Drape, person: int) -> float | VertexSca
 def _drape(
     pose: Tensor, wearer: Wearer, wearable: Wearable, garment: UnposedGarment, transforms: RigidTransforms
 ) -> Drape:
-    predicted = wearable.backbone(wearer.betas, pose, wearer.style, wearer_code=garment.code)
+    predicted = wearable.backbone(garment.betas, pose, wearer.style, wearer_code=garment.code)
     unposed, on_mean = garment.rest, garment.on_mean
     if predicted.displacement is not None:
         displacement = predicted.displacement.clamp(-MAX_OFFSET, MAX_OFFSET).to(unposed)
         unposed, on_mean = unposed + displacement, on_mean + displacement
     z = None
     if wearable.refu is not None:
-        z = wearable.refu.feature(wearer.betas, pose, wearer.style, predicted.feature)
+        z = wearable.refu.feature(garment.betas, pose, wearer.style, predicted.feature)
     return Drape(wearable.template.pose(unposed, transforms), unposed, on_mean, z)

@@ -125,6 +125,11 @@ class PipelineOutput(Mapping[str, GarmentMesh]):
         """Vertices of the posed body without the translation, SMPL axes [m], shape (V, 3)."""
         return self.posed_skin()
 
+    @property
+    def transl(self) -> NDArray[np.float64]:
+        """Translation of the person [m], shape (3,): `body + transl` is where `vertices` of the garments are."""
+        return next(iter(self.garments.values())).transl
+
     def __getitem__(self, name: str) -> GarmentMesh:
         return self.garments[name]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import threading
 from collections import OrderedDict
 from collections.abc import Collection, Mapping, Sequence
@@ -17,20 +16,19 @@ import torch
 from torch import Tensor
 
 from refu_core._device import checked_device
-from refu_core.body import Collider, SmplBody, load_body
+from refu_core.body import BodyFit, SmplBody
 from refu_core.errors import FrameError, GarmentError, RefuError, require_type
 from refu_core.frames import SmplFrame
-from refu_core.garments import N_STYLES, GarmentTemplate, load_garment
-from refu_core.modes import DEFAULT_MARGIN, MAX_MARGIN, SdfMode
+from refu_core.garments import N_STYLES, GarmentTemplate
+from refu_core.modes import MAX_MARGIN, SdfMode
 from refu_core.realtime._contact import ContactStage
 from refu_core.realtime._frame import FrameStep, StageClock
 from refu_core.realtime._graph import StepGraphs
+from refu_core.realtime._load import load_outfit
 from refu_core.realtime._outputs import SKIPS, FrameStats, GarmentMesh, GarmentStats, PipelineOutput, SkinShift
 from refu_core.realtime._promise import within_promise
-from refu_core.realtime._wearer import Outfit, Wearable, Wearer
-from refu_core.refu import load_trained
+from refu_core.realtime._wearer import Outfit, Wearer
 from refu_core.sdf import require_outward
-from refu_core.weights import weights_folder
 
 if TYPE_CHECKING:
     from os import PathLike
@@ -92,6 +90,16 @@ class GarmentPipeline:
         return self.outfit.body
 
     @property
+    def fit(self) -> BodyFit | None:
+        """How well the built-in mesh lies on a body that was named; None where none was."""
+        return self.outfit.fit
+
+    @property
+    def warnings(self) -> list[str]:
+        """What there is to warn of before anything is dressed, for people."""
+        return [] if self.fit is None else self.fit.warnings
+
+    @property
     def margin(self) -> float | None:
         """Clearance that is kept from the skin [m]; None for what each garment's weights were trained with."""
         return self._margin
@@ -113,6 +121,8 @@ class GarmentPipeline:
         cls,
         garments: Sequence[str | PathLike[str] | GarmentTemplate],
         *,
+        body: str | PathLike[str] | SmplBody | None = None,
+        betas_from: str | PathLike[str] | SmplBody | None = None,
         sdf: str = "hybrid",
         backbone: str = "tailornet",
         style: ArrayLike | None = None,
@@ -127,7 +137,12 @@ class GarmentPipeline:
         """Loads garments and what they need.
 
         Args:
-            garments: of one body: names of built-in ones, paths of garment files, or templates.
+            garments: names of built-in ones, paths of garment files, or templates; of one body, unless one is named.
+            body: who wears them: the path of an SMPL file (`.npz` or official `.pkl`), a built-in name, or a loaded
+                body. Garments and what their networks know are transferred to it, its betas are its own, and weights
+                that were trained on it are taken, too. By default the built-in body that they were cut for.
+            betas_from: the path of an SMPL file whose betas frames have, in place of `body`: the built-in mesh follows
+                them, and the file's own mesh isn't used.
             sdf: `hybrid`, `approx`, `accurate` or `none`.
             backbone: `tailornet`, `mlp`, `gcnn`, or `skinned`, which needs no weights.
             style: γ of all garments, shape (4,); the mean style if not given.
@@ -143,15 +158,10 @@ class GarmentPipeline:
 
         Raises:
             GarmentError: no garment, an unknown one, garments of two bodies, or a bad style.
+            BodyError: no such body, or one that isn't in metres, upright, facing forward, in the T-pose and closed.
             WeightsError: no such backbone, or no weights of it for a garment, a mode, and the garment's body.
             RefuError: an unknown mode, margin, device or skip.
         """
-        if isinstance(garments, (str, os.PathLike, GarmentTemplate)):
-            garments = [garments]
-        require_type(garments, Collection, "names of garments", error=GarmentError)
-        if not garments:
-            msg = "no garment was asked for: name at least one"
-            raise GarmentError(msg)
         mode = SdfMode.of(sdf, "sdf mode")
         _check_margin(margin)
         unknown = sorted({no_skip} if isinstance(no_skip, str) else set(no_skip) - set(SKIPS))
@@ -159,33 +169,22 @@ class GarmentPipeline:
             msg = f"nothing is skipped by the name {', '.join(unknown)}: wanted a collection of {', '.join(SKIPS)}"
             raise RefuError(msg)
         torch_device = checked_device(device)
-        templates: dict[str, GarmentTemplate] = {}
-        for one in garments:
-            template = one if isinstance(one, GarmentTemplate) else load_garment(one)
-            templates[template.name] = template.to(device=torch_device)
-        worn_by = {template.body for template in templates.values()}
-        if len(worn_by) > 1:
-            cut_for = ", ".join(f"{name} ({template.body})" for name, template in templates.items())
-            msg = f"one person wears garments of one body: got {cut_for}"
-            raise GarmentError(msg)
-        body = load_body(worn_by.pop(), device=torch_device)
-        wearables = {}
-        for name, template in templates.items():
-            network, refu = load_trained(
-                backbone,
-                template,
-                mode=mode,
-                body_fingerprint=body.fingerprint,
-                folder=weights_folder(name, weights),
-                device=torch_device,
-            )
-            kept = DEFAULT_MARGIN if refu is None else float(refu.margin)
-            wearables[name] = Wearable(template, network, refu, kept)
-        outfit = Outfit(body, wearables, Collider(body) if collider else None)
+        outfit = load_outfit(
+            garments,
+            body=body,
+            betas_from=betas_from,
+            backbone=backbone,
+            mode=mode,
+            weights=weights,
+            device=torch_device,
+            collider=collider,
+        )
         gamma = None if style is None else _style(style, torch_device)
         if gamma is not None:
-            for template in templates.values():
-                template.rest(gamma.new_zeros(1, 10), gamma)  # says now, not in the first frame, if it has no styles
+            for one in outfit.wearables.values():
+                one.template.rest(
+                    gamma.new_zeros(1, 10), gamma
+                )  # says now, not in the first frame, if it has no styles
         contact = None
         if mode is not SdfMode.NONE:
             contact = ContactStage(outfit, sdf=mode, uses_band="band" not in no_skip, certify=certify)

@@ -12,7 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from refu_core.backbones import Backbone
-from refu_core.body import Collider, Shape, SmplBody
+from refu_core.body import BodyFit, Collider, Shape, ShapeMap, SmplBody
+from refu_core.errors import FrameError, require_type
 from refu_core.frames import N_STYLES
 from refu_core.garments import GarmentTemplate, SkinBelow
 from refu_core.refu import Refu
@@ -28,6 +29,12 @@ class Wearable:
     """Predicts the scale α; None for α = 1."""
     margin: float
     """ε that the networks were trained with [m]."""
+    betas: ShapeMap | None = None
+    """The body's betas to those of the body that the networks were trained on; None where that is this one."""
+
+    def known_as(self, betas: Tensor) -> Tensor:
+        """The networks' betas for those of the body, (B, 10) both."""
+        return betas if self.betas is None else self.betas(betas)
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +46,8 @@ class Outfit:
     """By name."""
     collider: Collider | None = None
     """What of the posed body garments are brought off; None for the posed body as it is, which runs through itself."""
+    fit: BodyFit | None = None
+    """What a body that isn't the garments' own has to do with the built-in ones."""
 
     @cached_property
     def below(self) -> Mapping[str, SkinBelow]:
@@ -49,7 +58,7 @@ class Outfit:
         """The same in another precision; nothing is shared."""
         body = self.body.to(dtype=dtype)
         collider = None if self.collider is None else Collider(body, gap=self.collider.gap)
-        return Outfit(body, {name: _cast(one, dtype) for name, one in self.wearables.items()}, collider)
+        return Outfit(body, {name: _cast(one, dtype) for name, one in self.wearables.items()}, collider, self.fit)
 
 
 class UnposedGarment(NamedTuple):
@@ -61,6 +70,8 @@ class UnposedGarment(NamedTuple):
     """t(0, γ), the same on the mean shape [m], shape (B, V, 3)."""
     code: Tensor | None
     """`Backbone.wearer_code`, shape (B, K)."""
+    betas: Tensor
+    """β as the garment's networks know the person, shape (B, 10)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,12 +93,14 @@ class Wearer:
         Raises:
             GarmentError: a style for a garment that has one style only.
         """
+        require_type(betas, Tensor, "betas as a torch.Tensor, such as torch.as_tensor(array) gives", error=FrameError)
         mean = betas.new_zeros(1, betas.shape[1])
         garments = {}
         for name, one in outfit.wearables.items():
             rest = one.template.rest(betas, style)
             on_mean = one.template.rest(mean, style).expand_as(rest)
-            garments[name] = UnposedGarment(rest, on_mean, one.backbone.wearer_code(betas, style))
+            known = one.known_as(betas)
+            garments[name] = UnposedGarment(rest, on_mean, one.backbone.wearer_code(known, style), known)
         given = betas.new_zeros(len(betas), N_STYLES) if style is None else style
         return cls(outfit, betas, given, outfit.body.shape(betas), garments)
 

@@ -10,8 +10,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from refu_core.body import load_body
-from refu_core.garments import load_garment
+from refu_core.body import load_body, load_fit
+from refu_core.garments import load_garment, worn_on
 from refu_core.simulation._drape import Draper, DrapeSettings, SettledDrape
 from refu_core.simulation._plan import TEST, SamplePlan
 from refu_core.simulation._poses import Clip
@@ -46,13 +46,16 @@ class Simulator(ABC):
     ) -> None:
         """For the clips of the training and of the test set, on a body or (None) the one the garment is cut for.
 
+        On another one the garment is transferred to it (`refu_core.garments.worn_on`).
+
         Raises `BodyError` or `GarmentError` where there is no such body or garment; `MeshError` as `Draper`.
         """
         self.plan = plan
         self.settings = settings
         self.clips = clips
-        self.garment = load_garment(plan.garment)
-        self.body = load_body(self.garment.body if body is None else body)
+        own = None if body is None else load_fit(body)
+        self.garment = worn_on(load_garment(plan.garment), own)
+        self.body = load_body(self.garment.body) if own is None else own.body
         self._draper = Draper(self.garment, self.body, settings=settings.drape)
         self._selector = Selector(self.body.faces, self.garment.faces, settings=settings.selection)
 

@@ -19,6 +19,9 @@ from refu_core.garments import GarmentTemplate, load_garment
 from refu_core.simulation import GarmentDataset, GarmentSequences, open_dataset
 from refu_core.training._mirror import Mirror, mirror_pose
 
+_FEWEST = 2
+"""Samples that anything can be learnt from; hundreds are needed to learn it well."""
+
 
 @dataclass(frozen=True, eq=False)
 class TrainingSamples:
@@ -154,15 +157,16 @@ def split_validation(samples: TrainingSamples, *, share: float, seed: int) -> tu
 
 
 def output_basis(displacement: Tensor, *, rank: int) -> BasisDecoder:
-    """The `rank` principal components of displacements (N, V, 3) [m].
+    """The `rank` principal components of displacements (N, V, 3) [m]; of N of them there are N - 1 at most.
 
     Raises:
-        RefuError: there are fewer samples than components.
+        RefuError: there are fewer than two samples.
     """
     n = len(displacement)
-    if n <= rank:
-        msg = f"an output basis of {rank} components needs more samples than that, got {n}: simulate more"
+    if n < _FEWEST:
+        msg = f"an output basis needs {_FEWEST} samples at least, got {n}: simulate more"
         raise RefuError(msg)
+    rank = min(rank, n - 1)
     mean = displacement.mean(0)
     centred = (displacement - mean).flatten(1)
     # The samples' products instead of the vertices': N is smaller than 3 V.

@@ -124,6 +124,7 @@ def pretrain(
     """
     opened = TrainingSet.of(garment, dataset, body)
     template, body, samples, identity = opened.garment, opened.body, opened.samples, opened.identity
+    test = read_samples(opened.rows, body, template, split="test")  # what there is none of is said before hours of work
     settings = PretrainSettings.of(backbone, preset) if settings is None else settings
     config = backbone_config(backbone, template, preset=preset) if config is None else config
     is_writer, torch_device = start_parallel(torch.device(device))
@@ -160,7 +161,6 @@ def pretrain(
     for stage in found:
         loop.run(stage)
     model.to("cpu").eval()
-    test = read_samples(opened.rows, body, template, split="test")
     card = {
         **described,
         "mode": "none",

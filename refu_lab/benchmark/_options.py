@@ -7,8 +7,9 @@ from pathlib import Path
 
 import torch
 
-from refu_core import GarmentPipeline, RefuError
-from refu_core.garments import BUILTIN_GARMENTS
+from refu_core import GarmentPipeline, GarmentTemplate, RefuError, SmplBody, load_garment
+from refu_core.body import load_fit
+from refu_core.garments import BUILTIN_GARMENTS, worn_on
 
 OUTPUT = Path("docs/results")
 BAGS = Path("bags")
@@ -29,6 +30,8 @@ class BenchmarkOptions:
     quick: bool = False
     output: Path = OUTPUT
     weights: Path | None = None
+    body: str | None = None
+    """Who wears them, a body's name or file; None for the one that each is cut for."""
     collider: bool = True
     device: str | None = None
     """`cuda` adds its rows to those of the CPU; None adds them where there is a GPU."""
@@ -68,12 +71,19 @@ class BenchmarkOptions:
         """How much is measured."""
         return _QUICK if self.quick else BenchmarkSizes(rounds=self.rounds)
 
+    def on_body(self, garment: str, *, device: str = "cpu") -> tuple[GarmentTemplate, SmplBody]:
+        """A garment, and who wears it. Raises `RefuError` where there is no such body."""
+        template = load_garment(garment, device=device)
+        fit = load_fit(template.body if self.body is None else self.body, device=device)
+        return worn_on(template, fit), fit.body
+
     def load_pipeline(
         self, garment: str, *, mode: str, backbone: str, device: str, graph: bool = True
     ) -> GarmentPipeline:
         """A pipeline of one garment. Raises `WeightsError` where there are no weights of the backbone for it."""
         return GarmentPipeline.load(
             [garment],
+            body=self.body,
             sdf=mode,
             backbone=backbone,
             weights=self.weights,
@@ -89,6 +99,7 @@ class BenchmarkOptions:
         parts += [f"--garments {','.join(self.garments)}"] if self.garments is not None else []
         parts += [f"--motions {self.motions.resolve().name}/"] if self.motions is not None else []
         parts += [f"--weights {self.weights.resolve().name}/"] if self.weights is not None else []
+        parts += [f"--body {Path(self.body).name}"] if self.body is not None else []
         parts += [] if self.collider else ["--no-collider"]
         parts += ["--quick"] if self.quick else [f"--rounds {self.rounds}"]
         return " ".join(parts)

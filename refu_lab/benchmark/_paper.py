@@ -10,10 +10,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from refu_core import GarmentTemplate, SmplBody
 from refu_core.backbones import Backbone, Prediction, WithoutWearerCode, backbone_config, build_backbone
-from refu_core.body import load_body
 from refu_core.frames import N_BETAS, N_STYLES, SmplFrame
-from refu_core.garments import load_garment
 from refu_core.realtime import Outfit, Wearable, Wearer, dress
 from refu_core.refu import PAPER, ScaleNet, repulse
 from refu_core.sdf import SdfNetwork, SdfNetworkConfig, SdfSample, body_frame, with_gradient
@@ -58,15 +57,14 @@ class PaperStructure:
     On a CPU it takes 2.5 GB for a T-shirt, and seconds a frame.
     """
 
-    def __init__(self, garment: str, *, settings: PaperSettings | None = None, device: str = "cpu") -> None:
-        """For a built-in garment on its body. Raises `GarmentError` for a garment that there isn't."""
+    def __init__(self, garment: GarmentTemplate, body: SmplBody, *, settings: PaperSettings | None = None) -> None:
+        """For a garment on its body, on their device."""
         settings = settings or PaperSettings()
         self._dtype = settings.dtype
-        self._garment = load_garment(garment, device=device)
-        self._body = load_body(self._garment.body, device=device)
+        self._garment, self._body, device = garment, body, body.device
         backbone = build_backbone(
             backbone_config("tailornet", self._garment, preset="paper"),
-            load_garment(garment),
+            garment.to(device="cpu"),
             pivots=torch.randn(settings.pivots, N_BETAS + N_STYLES),
         )
         # Of ReFU's networks h and g: k is evaluated for all vertices here, which is one product.
@@ -75,7 +73,7 @@ class PaperStructure:
         backbone = backbone.to(device, self._dtype).eval().requires_grad_(False)
         self._networks: list[nn.Module] = [backbone]
         wearable = Wearable(self._garment, _InPrecision(backbone, self._dtype), None, margin=0.0)
-        self._outfit = Outfit(self._body, {garment: wearable})
+        self._outfit = Outfit(self._body, {garment.name: wearable})
         self._distance = (
             SdfNetwork(SdfNetworkConfig(width=settings.width)).to(device, self._dtype).requires_grad_(False)
         )

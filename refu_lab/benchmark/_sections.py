@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from refu_core import GarmentPipeline, SmplFrame, load_body, load_garment
+from refu_core import GarmentPipeline, SmplFrame, load_garment
 from refu_core.realtime import FrameStats, GarmentMesh, PipelineOutput
 from refu_lab.benchmark._frames import FrameRunner
 from refu_lab.benchmark._inputs import Moment, Window
@@ -55,8 +55,8 @@ class Section:
 
     def plain(self) -> Callable[[Moment], object]:
         """The plain query on this section's device."""
-        garment = load_garment(self.garment)
-        methods, _ = sdf_methods(load_body(garment.body), garment, network=False, device=self.device)
+        garment, body = self.options.on_body(self.garment)
+        methods, _ = sdf_methods(body, garment, network=False, device=self.device)
         return _of_sdf(methods[0].ask)
 
     def add(self, stage: str, mode: str, timing: Timing, plain: Timing, **facts: Any) -> None:
@@ -84,8 +84,7 @@ def _backbone(pipelines: Pipelines) -> str:
 
 def measure_sdfs(section: Section, *, network: bool) -> None:
     """Every way to the distances, of the same vertices; the paper's `network`, too, where it is asked for."""
-    garment = load_garment(section.garment, device=section.device)
-    body = load_body(garment.body, device=section.device)
+    garment, body = section.options.on_body(section.garment, device=section.device)
     methods, missing = sdf_methods(body, garment, network=network, device=section.device)
     section.result.missing.update(missing)
     slow = {method.name for method in methods if method.is_slow}
@@ -176,7 +175,7 @@ def measure_paper(section: Section, pipelines: Pipelines) -> None:
     types = (torch.float32, torch.bfloat16, torch.float16) if section.device == "cuda" else (torch.float32,)
     for dtype in types:
         settings = PaperSettings(dtype=dtype) if full else PaperSettings(pivots=2, width=64, dtype=dtype)
-        paper = PaperStructure(section.garment, settings=settings, device=section.device)
+        paper = PaperStructure(*section.options.on_body(section.garment, device=section.device), settings=settings)
         runner = FrameRunner(_dressing(paper, section.garment), {section.garment: load_garment(section.garment)})
         contenders: dict[str, Callable[[Moment], object]] = {PLAIN_QUERY: section.plain(), "paper": runner}
         contenders |= {mode: FrameRunner.of(pipelines[_backbone(pipelines), mode]) for mode in MAIN_MODES}

@@ -37,6 +37,7 @@ def start_row(
     command = [sys.executable, str(Path(__file__).with_name("start.py"))]
     command += ["--garments", ",".join(TWO), "--sdf", mode, "--backbone", backbone]
     command += ["--weights", str(options.weights)] if options.weights is not None else []
+    command += ["--body", options.body] if options.body is not None else []
     command += [] if options.collider else ["--no-collider"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     with tempfile.TemporaryDirectory() as empty:

@@ -32,6 +32,7 @@ def main() -> None:
     parser.add_argument("--sdf", required=True)
     parser.add_argument("--backbone", required=True)
     parser.add_argument("--weights")
+    parser.add_argument("--body")
     parser.add_argument("--no-collider", dest="collider", action="store_false")
     parser.add_argument("--started", type=float, required=True, help="when the process was started (Unix time)")
     args = parser.parse_args()
@@ -48,6 +49,7 @@ def main() -> None:
         sdf=args.sdf,
         backbone=args.backbone,
         weights=args.weights,
+        body=args.body,
         collider=args.collider,
     )
     loaded = time.time()

@@ -184,6 +184,17 @@ def add_axes(parser: argparse.ArgumentParser, what: str, frame: str) -> None:
     )
 
 
+def add_body(parser: argparse.ArgumentParser) -> None:
+    """What every command has that dresses bodies: whose betas, and whose skin."""
+    parser.add_argument(
+        "--body",
+        type=word,
+        metavar="FILE",
+        help="who wears it: an SMPL file (.npz, official .pkl), or a built-in body's name; garments and networks are "
+        "transferred (default: the garments' own)",
+    )
+
+
 def given(args: argparse.Namespace, options: type) -> dict[str, Any]:
     """The arguments that are fields of a dataclass of options, by name."""
     names_of_fields = {field.name for field in fields(options)}

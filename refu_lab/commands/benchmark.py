@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from refu_lab.commands._common import (
     EXIT_INTERRUPTED,
+    add_body,
     add_collider,
     add_common,
     check_writable,
@@ -44,6 +45,7 @@ def add(commands: Any) -> None:
     )
     parser.add_argument("--device", metavar="DEVICE", help="cpu, or cuda for both (default: cuda where there is one)")
     parser.add_argument("--output", type=out_folder, metavar="DIR", help="where page, data and plot go (docs/results)")
+    add_body(parser)
     add_collider(parser)
     add_common(parser)
     parser.set_defaults(run=run)

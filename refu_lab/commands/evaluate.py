@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from refu_lab.commands._common import (
     EXIT_CHECK_FAILED,
+    add_body,
     add_collider,
     add_common,
     check_writable,
@@ -48,6 +49,7 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--motion-every", type=positive, default=1, metavar="N", help="every N-th frame of a motion (1)"
     )
+    add_body(parser)
     add_collider(parser)
     parser.add_argument(
         "--quick",
@@ -89,6 +91,7 @@ def run(args: argparse.Namespace) -> int:
         every=args.every,
         motion_every=args.motion_every,
         collider=args.collider,
+        body=args.body,
     )
     tables = evaluate(options, progress=not args.quiet)
     print(results_text(tables, output))

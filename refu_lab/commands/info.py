@@ -26,6 +26,10 @@ def run(args: argparse.Namespace) -> int:
 
     facts = collect() if args.body is None else describe_body(args.body)
     for name, value in facts.items():
-        print(f"{name:>12}  {value}")
+        print(f"{name:>19}  {value if isinstance(value, str) else _short(value)}")
     write_json(args.json, facts)
     return 0
+
+
+def _short(value: Any) -> str:
+    return f"{value:.2f}" if isinstance(value, float) else str(value)

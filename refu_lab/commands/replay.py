@@ -9,6 +9,7 @@ from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN
 from refu_lab.commands._common import (
     EXIT_INTERRUPTED,
     add_axes,
+    add_body,
     add_collider,
     add_common,
     check_writable,
@@ -90,6 +91,20 @@ def add(commands: Any) -> None:
     parser.add_argument("--frame-id", type=word, default="map", metavar="ID", help="frame_id of the markers (map)")
     parser.add_argument("--device", default="cpu", metavar="DEVICE", help="cpu (default) or cuda")
     parser.add_argument("--max-frames", type=positive, metavar="N", help="stop after N frames")
+    add_body(parser)
+    parser.add_argument(
+        "--betas-from",
+        type=word,
+        metavar="FILE",
+        help="an SMPL file whose betas the recording has: the built-in mesh follows them",
+    )
+    parser.add_argument(
+        "--betas-source",
+        choices=("message", "builtin"),
+        default="message",
+        help="message (default): the recorded betas are those of --body or --betas-from, and without either of unknown "
+        "meaning, which is warned of; builtin: the built-in body's own",
+    )
     add_collider(parser)
     parser.add_argument("--overwrite", action="store_true", help="replace an output that is there already")
     add_common(parser)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from refu_lab.commands._common import (
     add_axes,
+    add_body,
     add_common,
     between,
     check_writable,
@@ -41,9 +42,7 @@ def add(commands: Any) -> None:
         help="folder of motion files, two at least (default: drawn poses alone)",
     )
     add_axes(parser, "motions'", "z up, as ROS has it")
-    parser.add_argument(
-        "--body", metavar="BODY", help="a body's name or file (default: the one the garment is cut for)"
-    )
+    add_body(parser)
     parser.add_argument("--seed", type=seed, default=0, metavar="S", help="of everything that is drawn (0)")
     parser.add_argument("--processes", type=positive, default=1, metavar="P", help="processes, a thread each (1)")
     parser.add_argument("--shard", type=shard, default=(0, 1), metavar="I/N", help="make the I-th of N parts, from 0")

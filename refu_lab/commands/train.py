@@ -5,7 +5,17 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from refu_core.modes import DEFAULT_MARGIN
-from refu_lab.commands._common import add_common, check_writable, given, in_path, out_folder, positive, seed, write_json
+from refu_lab.commands._common import (
+    add_body,
+    add_common,
+    check_writable,
+    given,
+    in_path,
+    out_folder,
+    positive,
+    seed,
+    write_json,
+)
 
 if TYPE_CHECKING:
     import argparse
@@ -50,9 +60,7 @@ def add(commands: Any) -> None:
         "--margin", type=float, metavar="M", help=f"clearance that ReFU is trained to keep [m] ({DEFAULT_MARGIN:g})"
     )
     parser.add_argument("--unblended", action="store_true", help="pushed vertices don't take their neighbours along")
-    parser.add_argument(
-        "--body", metavar="BODY", help="a body's name or file (default: the one the garment is cut for)"
-    )
+    add_body(parser)
     parser.add_argument("--seed", type=seed, default=0, metavar="S", help="of everything that is drawn (0)")
     parser.add_argument("--steps", type=positive, metavar="N", help="steps of each stage (default: the preset's)")
     parser.add_argument("--device", default="cpu", metavar="DEVICE", help="cpu (default) or cuda")

@@ -6,11 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from refu_core._files import read_json
-from refu_core.body import SmplBody
+from refu_core.body import SmplBody, load_fit
 from refu_core.errors import WeightsError
-from refu_core.garments import GarmentTemplate
-from refu_core.realtime import GarmentPipeline
-from refu_core.refu import Trained, trained_from_weights
+from refu_core.garments import load_garment
+from refu_core.realtime import GarmentPipeline, Wearable, wearable_of
 from refu_core.sdf import BodySdf, NeuralSdf, load_sdf_network
 from refu_core.weights import load_weights, weights_folder
 from refu_lab.reproduction._methods import Method
@@ -19,10 +18,21 @@ from refu_lab.reproduction._methods import Method
 class Library:
     """Trained weights: those of some folders, `<folder>/<garment>/<weights>`, before those that ship."""
 
-    def __init__(self, folders: Sequence[Path] = (), *, collider: bool = True) -> None:
-        """Looks into `folders` first, in their order; what is loaded is brought off the collider, or off the skin."""
+    def __init__(self, folders: Sequence[Path] = (), *, collider: bool = True, body: str | None = None) -> None:
+        """Looks into `folders` first, in their order; what is loaded is brought off the collider, or off the skin.
+
+        It is for a `body`, a name or a file, or (None) for the one that each garment is cut for.
+
+        Raises `BodyError` where there is no such body, or one that garments can't be transferred to.
+        """
         self._folders = tuple(folders)
         self.collider = collider
+        self.fit = None if body is None else load_fit(body)
+
+    @property
+    def body(self) -> str:
+        """Fingerprint of the body; empty for the garments' own."""
+        return "" if self.fit is None else self.fit.body.fingerprint
 
     def find(self, method: Method, garment: str) -> Path:
         """The weights' files without suffix. Raises `WeightsError` where there are none."""
@@ -39,11 +49,10 @@ class Library:
         except WeightsError:
             return ""
 
-    def load(self, method: Method, garment: GarmentTemplate, body: SmplBody) -> Trained:
+    def load(self, method: Method, garment: str) -> Wearable:
         """A method's networks. Raises `WeightsError` where they are missing, damaged or of another body."""
-        stem = self.find(method, garment.name)
-        expect = {"garment": garment.name, "body_fingerprint": body.fingerprint}
-        return trained_from_weights(load_weights(stem, expect=expect), garment)
+        stored = load_weights(self.find(method, garment), expect={"garment": garment})
+        return wearable_of(stored, load_garment(garment), self.fit)
 
     def pipeline(self, method: Method, *garments: str) -> GarmentPipeline:
         """What the node runs, in the method's mode; `none` without handling of collisions.
@@ -53,7 +62,12 @@ class Library:
         weights = None if method.weights is None else self.find(method, garments[0]).parent.parent
         sdf = method.mode if method.handling == "node" else "none"
         return GarmentPipeline.load(
-            garments, sdf=sdf, backbone=method.backbone, weights=weights, collider=self.collider
+            garments,
+            body=None if self.fit is None else self.fit.body,
+            sdf=sdf,
+            backbone=method.backbone,
+            weights=weights,
+            collider=self.collider,
         )
 
     def load_neural_sdf(self, preset: str, garment: str, body: SmplBody) -> BodySdf:

@@ -201,7 +201,9 @@ class _Worn:
 
     def __init__(self, garments: Sequence[str], pipelines: Mapping[str, GarmentPipeline]) -> None:
         self._pipelines = pipelines
-        self._skinned = GarmentPipeline.load(garments, backbone="skinned", sdf="none", collider=False)
+        self._skinned = GarmentPipeline.load(
+            garments, body=next(iter(pipelines.values())).body, backbone="skinned", sdf="none", collider=False
+        )
         self.body = self._skinned.body
         self._collider, self._skin = CollisionChecker(self.body.faces), CollisionChecker(self.body.faces)
         self._detector = lru_cache(maxsize=8)(self._make_detector)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -12,13 +12,13 @@ import torch
 from torch import Tensor
 
 from refu_core.backbones import Skinned
-from refu_core.body import Collider, RigidTransforms, SmplBody, load_body
+from refu_core.body import BodyFit, Collider, RigidTransforms, SmplBody, load_body
 from refu_core.contact import Blend
 from refu_core.errors import WeightsError
 from refu_core.frames import SmplFrame
-from refu_core.garments import GarmentTemplate, load_garment
+from refu_core.garments import GarmentTemplate, load_garment, worn_on
 from refu_core.realtime import GarmentPipeline, Outfit, Wearable, Wearer, dress
-from refu_core.refu import Refu, Trained
+from refu_core.refu import Refu
 from refu_core.sdf import ApproxSdf, BodySdf, ExactSdf, RestFaces, SdfSample
 from refu_lab.baselines import PostProcess, push_naively
 from refu_lab.reproduction._load import Library
@@ -43,10 +43,10 @@ class GarmentSetup:
     blend: Blend
 
     @classmethod
-    def of(cls, garment: str, *, collider: bool = True) -> GarmentSetup:
-        """Prepares a built-in garment on its body, whose overlaps are pulled apart or not."""
-        template = load_garment(garment)
-        body = load_body(template.body)
+    def of(cls, garment: str, *, collider: bool = True, fit: BodyFit | None = None) -> GarmentSetup:
+        """Prepares a built-in garment on its body or another, whose overlaps are pulled apart or not."""
+        template = worn_on(load_garment(garment), fit)
+        body = load_body(template.body) if fit is None else fit.body
         return cls(
             template,
             body,
@@ -124,20 +124,20 @@ class Predictor:
         self._method = method
         self._setup = setup
         self._pipeline: GarmentPipeline | None = None
-        network = Trained(Skinned(), None)
+        worn = Wearable(setup.template, Skinned(), None, margin=0.0)
         if method.handling == "node":
             self._pipeline = library.pipeline(method, setup.template.name)
         elif method.backbone != "skinned":
-            network = library.load(method, setup.template, setup.body)
+            worn = library.load(method, setup.template.name)
         self._refu: Refu | None = None
         if method.handling == "refu":
-            if network.refu is None:
+            if worn.refu is None:
                 msg = f"{method.weights}: weights of a backbone alone, wanted those of one with ReFU"
                 raise WeightsError(msg)
-            self._refu = _with_margin(network.refu, method.margin)
+            self._refu = _with_margin(worn.refu, method.margin)
         self._name = setup.template.name
-        wearable = Wearable(setup.template, network.backbone, self._refu, margin=0.0)
-        self._outfit = Outfit(setup.body, {self._name: wearable})  # what it is pushed off is the scene's
+        # What it is pushed off is the scene's.
+        self._outfit = Outfit(setup.body, {self._name: replace(worn, refu=self._refu)})
 
     @torch.no_grad()
     def __call__(self, scene: SampleScene) -> MethodOutput:

@@ -135,7 +135,7 @@ def run_methods(
     """
     garment = samples.garment
     study.n_samples[garment] = len(samples)
-    setup = GarmentSetup.of(garment, collider=library.collider)
+    setup = GarmentSetup.of(garment, collider=library.collider, fit=library.fit)
     ready: dict[str, Predictor] = {}
     files: dict[str, Path] = {}
     for method in _with_bases(methods):
@@ -207,7 +207,8 @@ def _with_bases(names: Sequence[str]) -> list[Method]:
 
 def _cache_name(garment: str, method: Method, samples_key: str, library: Library) -> str:
     told = json.dumps(
-        [asdict(method), samples_key, library.key(method, garment), library.collider, _code_hash()], sort_keys=True
+        [asdict(method), samples_key, library.key(method, garment), library.collider, library.body, _code_hash()],
+        sort_keys=True,
     )
     return f"{garment}-{method.name}-{hashlib.sha256(told.encode()).hexdigest()[:16]}.json"
 

@@ -73,7 +73,7 @@ def sdf_table(
     total, done = sum(map(len, sets)), 0
     for samples in sets:
         garment = samples.garment
-        setup = GarmentSetup.of(garment, collider=library.collider)
+        setup = GarmentSetup.of(garment, collider=library.collider, fit=library.fit)
         sdfs: dict[str, BodySdf] = {"approx": setup.approx}
         try:
             sdfs["neural"] = library.load_neural_sdf("paper", garment, setup.body)

@@ -209,7 +209,7 @@ def test_every_distance_means_the_same() -> None:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 def test_the_papers_structure_runs_and_counts_its_weights(dtype: torch.dtype) -> None:
     settings = PaperSettings(pivots=2, width=32, dtype=dtype)
-    paper = PaperStructure(SHORTS, settings=settings)
+    paper = PaperStructure(load_garment(SHORTS), load_body("male"), settings=settings)
     vertices = paper(SmplFrame(np.zeros((24, 3), np.float32)))
     n = load_garment(SHORTS).n_vertices
     assert vertices.shape == (n, 3)

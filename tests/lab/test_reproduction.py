@@ -19,11 +19,12 @@ from torch import Tensor
 from msg_adapters import Motion
 from refu_core import GarmentPipeline
 from refu_core.backbones import Prediction, WithoutWearerCode
-from refu_core.body import Collider, SmplBody, load_body
+from refu_core.body import Collider, load_body
 from refu_core.errors import RefuError, WeightsError
 from refu_core.garments import BUILTIN_GARMENTS, GarmentTemplate, load_garment
 from refu_core.modes import DEFAULT_GARMENTS
-from refu_core.refu import SCALE_PRESETS, Refu, Trained
+from refu_core.realtime import Wearable
+from refu_core.refu import SCALE_PRESETS, Refu
 from refu_lab import reproduction as rp
 from refu_lab.reproduction import _build, _pictures, _runs, _tables
 from refu_lab.tables import RESULT_TABLES
@@ -100,7 +101,7 @@ class Emulated(rp.Library):
     def key(self, method: rp.Method, garment: str) -> str:
         return f"{method.weights} {garment} {self.version}"
 
-    def load(self, method: rp.Method, garment: GarmentTemplate, body: SmplBody) -> Trained:  # noqa: ARG002
+    def load(self, method: rp.Method, garment: str) -> Wearable:
         if method.name in self.without:
             msg = "not trained"
             raise WeightsError(msg)
@@ -109,8 +110,9 @@ class Emulated(rp.Library):
         amplitude = 0.006 if method.mode == "none" else 0.005
         scale = None if method.folder == "fixed" else SCALE_PRESETS["realtime"]
         least = 1.0 if method.sdf == "accurate" else 0.0
-        refu = Refu(garment.n_vertices, least=least, scale=scale).eval().requires_grad_(False)
-        return Trained(Noisy(garment, amplitude), refu if method.handling == "refu" else None)
+        template = load_garment(garment)
+        refu = Refu(template.n_vertices, least=least, scale=scale).eval().requires_grad_(False)
+        return Wearable(template, Noisy(template, amplitude), refu if method.handling == "refu" else None, 0.0)
 
 
 @pytest.fixture(scope="module")

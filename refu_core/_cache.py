@@ -1,0 +1,58 @@
+"""What takes seconds to compute is kept in a folder of the user's, and computed again wherever it can't be."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from refu_core._npz import read_npz
+from refu_core.errors import RefuError
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Mapping
+
+    from numpy.typing import NDArray
+
+
+def cache_folder() -> Path:
+    """`REFU_CACHE`, or `refu` in the user's folder for such files (`XDG_CACHE_HOME`, ~/.cache); it needs not exist."""
+    chosen = os.environ.get("REFU_CACHE")
+    if chosen:
+        return Path(chosen)
+    home = os.environ.get("XDG_CACHE_HOME")
+    try:
+        return (Path(home) if home else Path.home() / ".cache") / "refu"
+    except RuntimeError:  # a user without a home
+        return Path(tempfile.gettempdir()) / "refu"
+
+
+def recall(name: str, *, keys: Collection[str]) -> dict[str, NDArray[Any]] | None:
+    """The arrays that were kept as `name`; None where there are none, or not all of `keys`."""
+    path = cache_folder() / f"{name}.npz"
+    if not path.exists():
+        return None
+    try:
+        found = read_npz(path, keys=keys, error=RefuError, wanted="what was kept")
+    except RefuError:  # cut short by a crash, perhaps
+        return None
+    return found if set(found) == set(keys) else None
+
+
+def keep(name: str, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Keeps arrays as `name`, whole or not at all; nothing is said where there is no room for them."""
+    with contextlib.suppress(OSError):
+        folder = cache_folder()
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=folder, suffix=".part", delete=False) as part:
+            try:
+                np.savez(part, allow_pickle=False, **arrays)
+                part.close()
+                Path(part.name).replace(folder / f"{name}.npz")
+            except OSError:
+                Path(part.name).unlink(missing_ok=True)
+                raise

@@ -1,0 +1,237 @@
+"""A body that isn't built in, and what the built-in ones are to it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from os import PathLike
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from refu_core._cache import keep, recall
+from refu_core.body._io import BUILTIN_BODIES, load_body
+from refu_core.body._model import BodyArrays, SmplBody
+from refu_core.body._register import ENDS, Registration, derivatives, register
+from refu_core.body._rest_pose import require_rest_pose
+from refu_core.body._surface import OnSurface
+from refu_core.frames import N_BETAS, N_JOINTS
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from refu_core.body._register import Array
+
+REGISTERED = "neutral"
+"""The built-in body that is laid onto others: half way between the two it can become."""
+POOR_FIT = 3e-3
+"""Surfaces that are farther apart than this on average [m] aren't those of two bodies in the T-pose. (Those in
+tests/smpl_file.py are .3 to .5 mm apart.)"""
+_ANGLE_SPREAD = 0.1
+"""Of a joint between two rest poses [rad]."""
+_TRUST = 1e-3
+"""A unit of β that moves skin by no more than this [m] isn't taken for what it fits: it would be noise."""
+_END_SHARE = 0.1
+"""How much hands, feet and heads count where shapes are compared."""
+_REGRESSED = 400
+"""Vertices that a joint is regressed from."""
+_VERSION = 1
+"""Of what `register` does: what another version has kept isn't used."""
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeMap:
+    """Betas of one body to those of another: β' = offset + matrix β."""
+
+    matrix: Tensor
+    """Shape (10, 10)."""
+    offset: Tensor
+    """Shape (10,)."""
+    limit: float = 3.0
+    """No component of β' is larger: nothing was trained beyond."""
+
+    def __call__(self, betas: Tensor) -> Tensor:
+        """Of betas (B, 10), shape (B, 10). Differentiable."""
+        return (self.offset.to(betas) + betas @ self.matrix.to(betas).T).clamp(-self.limit, self.limit)
+
+
+@dataclass(frozen=True, eq=False)
+class Difference:
+    """What of a body isn't in the shape space of a built-in one, at the V vertices of the built-in mesh."""
+
+    source: SmplBody
+    """The built-in body, float64, on the CPU."""
+    betas: ShapeMap
+    """The body's betas to those of the built-in one."""
+    template: Array
+    """Of the mean shape at rest [m], shape (V, 3)."""
+    directions: Array
+    """Of a unit of each beta [m], shape (V, 3, 10)."""
+    weights: Array
+    """Of the skinning weights, shape (V, 24)."""
+
+
+class BodyFit:
+    """A body and the built-in mesh laid onto it."""
+
+    def __init__(self, body: SmplBody, registration: Registration, *, fingerprints: tuple[str, ...] = ()) -> None:
+        self.body = body
+        self.registration = registration
+        self.fingerprints = fingerprints or (body.fingerprint,)
+        """Bodies that weights may have been trained on to be this one's own."""
+        self._of: dict[str, Difference] = {}
+
+    @property
+    def is_poor(self) -> bool:
+        """Whether the surfaces are too far apart to trust what was transferred."""
+        return self.registration.mean_distance > POOR_FIT
+
+    @property
+    def text(self) -> str:
+        """The quality, for people."""
+        found = self.registration
+        return (
+            f"{1e3 * found.mean_distance:.1f} mm on average, {1e3 * found.far_distance:.1f} mm at the 99th percentile"
+        )
+
+    @property
+    def warnings(self) -> list[str]:
+        """What there is to warn of, for people."""
+        if not self.is_poor:
+            return []
+        wanted = f"wanted {1e3 * POOR_FIT:g} mm at most"
+        return [f"the built-in mesh lies on {self.body.name} {self.text}, {wanted}: garments may fit it badly"]
+
+    def carried(self, values: NDArray[np.floating]) -> Array:
+        """`values` of the body's vertices (N, …) at the vertices of the built-in mesh (V, …)."""
+        place = self.registration.place
+        faces = self.body.faces.cpu().numpy()
+        there: Array = np.einsum("nk,nk...->n...", place.weight, values.astype(np.float64)[faces[place.face]])
+        return there
+
+    def directions(self) -> Array:
+        """What a unit of each beta does to the built-in mesh on this body [m], shape (V, 3, 10)."""
+        return self.carried(self.body.arrays.shapedirs)
+
+    def difference(self, name: str) -> Difference:
+        """From the built-in body `name`."""
+        if name not in self._of:
+            self._of[name] = self._differ(load_body(name, dtype=torch.float64))
+        return self._of[name]
+
+    def _differ(self, source: SmplBody) -> Difference:
+        rest, own = source.v_template.numpy(), source.arrays.shapedirs
+        columns = derivatives(source.name).vertices
+        goal = np.concatenate(((self.registration.vertices - rest)[:, :, None], self.directions()), axis=2)
+        columns = columns.reshape(-1, columns.shape[2])
+        share = np.where(source.weights[:, list(ENDS)].sum(1).numpy() > 0.5, _END_SHARE, 1.0)
+        weight = np.repeat(share / share.sum(), 3)[:, None]
+        prior = _TRUST**2 * np.repeat([1.0, _ANGLE_SPREAD**-2, 1e-6], [N_BETAS, 3 * N_JOINTS, 3])
+        found = np.linalg.solve(
+            columns.T @ (weight * columns) + np.diag(prior), columns.T @ (weight * goal.reshape(len(columns), -1))
+        )[:N_BETAS]
+        left = goal - np.einsum("vck,kr->vcr", own, found)
+        shape_map = ShapeMap(torch.as_tensor(found[:, 1:]), torch.as_tensor(found[:, 0]))
+        weights = self.carried(self.body.arrays.weights) - source.arrays.weights
+        return Difference(source, shape_map, left[:, :, 0], left[:, :, 1:], weights)
+
+    def resampled(self) -> BodyFit:
+        """The same body as the built-in mesh: its shape space, joints and skin, whatever its own mesh is like."""
+        arrays, source = self.body.arrays, load_body(REGISTERED)
+        vertices, directions = self.registration.vertices, self.directions()
+        weights = self.carried(arrays.weights).clip(0)
+        made = BodyArrays(
+            v_template=vertices,
+            faces=source.arrays.faces,
+            weights=weights / weights.sum(1, keepdims=True),
+            joint_regressor=_regressor(self.body, vertices, directions),
+            shapedirs=directions,
+            posedirs=None if arrays.posedirs is None else self.carried(arrays.posedirs),
+        )
+        body = SmplBody(made, name=self.body.name, device=self.body.device, dtype=self.body.dtype)
+        known = self.registration
+        place = _corners(made.faces, len(vertices))
+        laid = Registration(vertices, place, known.mean_distance, known.far_distance)
+        return BodyFit(body, laid, fingerprints=(body.fingerprint, self.body.fingerprint))
+
+
+def _regressor(body: SmplBody, vertices: Array, directions: Array) -> Array:
+    """The body's joints, for every β, from vertices (V, 3) near them that move by `directions` (V, 3, 10)."""
+    exact = body.to(device="cpu", dtype=torch.float64)
+    joints = exact.rest_joints(torch.zeros(1, N_BETAS, dtype=torch.float64))[0].numpy()
+    moved = exact.rest_joints(torch.eye(N_BETAS, dtype=torch.float64)).numpy() - joints  # (10, 24, 3)
+    tree, rows = cKDTree(vertices), np.zeros((N_JOINTS, len(vertices)))
+    for j, joint in enumerate(joints):
+        near = np.asarray(tree.query(joint, _REGRESSED)[1])
+        # Millimetres a unit of β count as much as metres of the place: both must be right.
+        known = [np.ones((1, len(near))), vertices[near].T, directions[near].reshape(len(near), -1).T]
+        goal = [np.ones(1), joint, moved[:, j].T.ravel()]
+        uniform = np.full(len(near), 1 / len(near))
+        lacks = np.concatenate(goal) - np.concatenate(known) @ uniform
+        rows[j, near] = uniform + np.linalg.lstsq(np.concatenate(known), lacks, rcond=1e-6)[0]
+        rows[j] /= rows[j].sum()
+    return rows
+
+
+def load_fit(
+    body: str | PathLike[str] | SmplBody, *, betas_from: bool = False, device: str | torch.device = "cpu"
+) -> BodyFit:
+    """A body and the built-in mesh laid onto it: some seconds for one that hasn't been seen before.
+
+    Args:
+        body: a built-in name, the path of an SMPL-layout file, or a loaded body.
+        betas_from: give the same body as the built-in mesh, whatever the file's own mesh is like (`BodyFit.resampled`).
+        device: where its tensors live.
+
+    Raises:
+        BodyError: no such body, or one that isn't in metres, upright, in the T-pose, closed (`require_rest_pose`).
+    """
+    loaded = body.to(device=device) if isinstance(body, SmplBody) else load_body(body, device=device)
+    source = load_body(REGISTERED)
+    if _same_mesh(loaded, source):
+        place = _corners(source.arrays.faces, source.n_vertices)
+        return BodyFit(loaded, Registration(loaded.arrays.v_template, place, 0.0, 0.0))
+    require_rest_pose(loaded, closed=not betas_from)
+    found = BodyFit(loaded, _registered(source, loaded))
+    return found.resampled() if betas_from else found
+
+
+def _same_mesh(body: SmplBody, source: SmplBody) -> bool:
+    """Whether a body is one of the built-in ones."""
+    shared = body.n_vertices == source.n_vertices and np.array_equal(body.arrays.faces, source.arrays.faces)
+    return shared and any(body.fingerprint == load_body(name).fingerprint for name in BUILTIN_BODIES)
+
+
+def _corners(faces: NDArray[np.int64], n_vertices: int) -> OnSurface:
+    """Each vertex as a place of the mesh that it is of."""
+    face, corner = np.zeros(n_vertices, np.int64), np.zeros(n_vertices, np.int64)
+    for k in range(3):
+        face[faces[:, k]], corner[faces[:, k]] = np.arange(len(faces)), k
+    return OnSurface(face, np.eye(3)[corner])
+
+
+def _registered(source: SmplBody, body: SmplBody) -> Registration:
+    """As `register`, kept from one process to the next."""
+    name = f"fit-{_VERSION}-{source.fingerprint}-{body.fingerprint}"
+    known = recall(name, keys=("vertices", "face", "weight", "distances"))
+    if known is None or not _makes_sense(known, source, body):
+        made = register(source, body)
+        distances = np.array([made.mean_distance, made.far_distance], np.float32)
+        known = {"vertices": made.vertices.astype(np.float32), "face": made.place.face.astype(np.int32)}
+        known |= {"weight": made.place.weight.astype(np.float32), "distances": distances}
+        keep(name, known)
+    # What was kept is rounded, so what wasn't is, too: both are the same body.
+    place = OnSurface(known["face"].astype(np.int64), known["weight"].astype(np.float64))
+    mean, far = known["distances"].tolist()
+    return Registration(known["vertices"].astype(np.float64), place, mean, far)
+
+
+def _makes_sense(known: Mapping[str, NDArray[Any]], source: SmplBody, body: SmplBody) -> bool:
+    n = source.n_vertices
+    shapes = {"vertices": (n, 3), "face": (n,), "weight": (n, 3), "distances": (2,)}
+    return all(known[key].shape == shape and np.isfinite(known[key]).all() for key, shape in shapes.items()) and bool(
+        (known["face"] >= 0).all() and (known["face"] < len(body.faces)).all()
+    )

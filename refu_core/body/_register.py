@@ -1,0 +1,203 @@
+"""Registration: the built-in mesh laid onto the surface of another body in its rest pose.
+
+Three bodies are built in and share one mesh, so one registration tells of all three which place of theirs is which of
+the other body.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache, cached_property
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import splu
+from scipy.spatial import cKDTree
+
+from refu_core.body._io import load_body
+from refu_core.body._kinematics import JOINT_NAMES
+from refu_core.body._model import SmplBody
+from refu_core.body._parts import joints_of
+from refu_core.body._surface import OnSurface, Surface
+from refu_core.frames import N_BETAS, N_JOINTS
+from refu_core.mesh import Connectivity, vertex_normals
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegistrationSettings:
+    """How a mesh is laid onto a surface; figures are of the bodies in tests/smpl_file.py."""
+
+    rounds: int = 10
+    """Newton's steps to shape and pose, each with the points that are closest then."""
+    normal_scale: float = 0.05
+    """Of two normals that stand at right angles, as far as being 1.4 times so far apart counts [m]: flanks don't find
+    the arm beside them."""
+    reach: float = 0.04
+    """What is farther from the surface than this counts less and less [m]."""
+    joint_spread: float = 0.04
+    """How far joints of two models are apart in one body [m]. Hips (by 10 cm), spine and collars aren't looked at."""
+    angle_spread: float = 0.1
+    """How far a joint is turned from one rest pose to the other [rad]."""
+    noise: float = 0.005
+    """Of the surface against joints, angles and betas [m]."""
+    stiffness: tuple[float, ...] = (300.0, 30.0, 10.0, 3.0, 1.0, 0.3)
+    """How much more it counts that neighbours move alike than that vertices are on the surface, from round to round."""
+    stiff_ends: float = 30.0
+    """How many times stiffer hands, feet and heads are: nothing is worn there, and fingers find the wrong finger."""
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """The built-in mesh (V vertices) on another body."""
+
+    vertices: Array
+    """On its rest surface, or near it [m], shape (V, 3)."""
+    place: OnSurface
+    """Which points of its surface these are."""
+    mean_distance: float
+    """Of the two surfaces, hands, feet and head left out [m]."""
+    far_distance: float
+    """The 99th percentile [m]."""
+
+
+_LOOKED_AT = tuple(
+    JOINT_NAMES.index(f"{side}_{name}")
+    for side in ("left", "right")
+    for name in ("knee", "ankle", "shoulder", "elbow", "wrist")
+)
+ENDS = (*joints_of("head"), 7, 8, 10, 11, 20, 21, 22, 23)
+
+
+_ALONG = 0.05
+"""How much a gap along the surface counts of one across it: closest points slide."""
+_SEEN = 0.01
+"""As if every hundredth vertex were looked at: neighbours are wrong by as much as each other."""
+
+
+class Derivatives(NamedTuple):
+    """What a unit of each beta, a radian about each axis of each joint, and a metre along each axis do at rest."""
+
+    vertices: Array
+    """[m], shape (V, 3, 85)."""
+    joints: Array
+    """[m], shape (24, 3, 85)."""
+
+
+@cache
+def derivatives(name: str) -> Derivatives:
+    """Of a built-in body."""
+    source, step = load_body(name, dtype=torch.float64), 1e-4
+    rest = source(torch.zeros(1, N_JOINTS, 3, dtype=torch.float64))
+    turns = [source(pose[None]) for pose in step * torch.eye(3 * N_JOINTS, dtype=torch.float64)]
+    betas = torch.eye(N_BETAS, dtype=torch.float64)
+    place = torch.eye(3, dtype=torch.float64)
+    found = []
+    for part, shaped in (("vertices", source.rest_vertices(betas)), ("joints", source.rest_joints(betas))):
+        zero = getattr(rest, part)[0]
+        bent = torch.stack([getattr(turn, part)[0] - zero for turn in turns]) / step
+        columns = torch.cat((shaped - zero, bent, place[:, None].expand(-1, len(zero), -1)))
+        found.append(columns.permute(1, 2, 0).contiguous().numpy())
+    return Derivatives(*found)
+
+
+def register(source: SmplBody, target: SmplBody, settings: RegistrationSettings | None = None) -> Registration:
+    """Lays the mesh of `source` onto the rest surface of `target`, in some seconds.
+
+    First by shape, pose and place of the source; then each vertex to the closest point, less and less held back by its
+    neighbours.
+    """
+    return _Registrar(source, target, settings or RegistrationSettings()).run()
+
+
+class _Registrar:
+    def __init__(self, source: SmplBody, target: SmplBody, settings: RegistrationSettings) -> None:
+        self.how = settings
+        self.source = source.to(device="cpu", dtype=torch.float64)
+        self.target = target.to(device="cpu", dtype=torch.float64)
+        self.mesh = Connectivity.of(source.faces.cpu().numpy(), source.n_vertices)
+        self.surface = Surface(self.target.v_template.numpy(), target.faces.cpu().numpy().astype(np.int32))
+        self.joints = self.target.rest_joints(torch.zeros(1, N_BETAS, dtype=torch.float64))[0].numpy()
+        self.is_end = self.source.weights[:, list(ENDS)].sum(1).numpy() > 0.5
+
+    def run(self) -> Registration:
+        """All of it."""
+        vertices = self._draped(self._articulated())
+        place = self.surface.closest(vertices)
+        there = np.linalg.norm(self.surface.at(place) - vertices, axis=1)[~self.is_end]
+        own = Surface(vertices, self.mesh.faces)
+        is_end = self.target.weights[:, list(ENDS)].sum(1).numpy() > 0.5
+        points = self.surface.vertices[~is_end]
+        back = np.linalg.norm(own.at(own.closest(points)) - points, axis=1)
+        both = np.concatenate((there, back))
+        return Registration(vertices, place, float(both.mean()), float(np.percentile(both, 99)))
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self._features(self.surface.vertices, self.surface.normals))
+
+    def _features(self, vertices: Array, normals: Array) -> Array:
+        return np.concatenate((vertices, self.how.normal_scale * normals), axis=1)
+
+    def _articulated(self) -> Array:
+        """The source in the shape, pose and place that are nearest to the target [m], shape (V, 3)."""
+        how, linear = self.how, derivatives(self.source.name)
+        own = self.source.rest_joints(torch.zeros(1, N_BETAS, dtype=torch.float64))[0].numpy()
+        state = np.zeros(linear.vertices.shape[2])
+        state[-3:] = (self.joints - own)[list(_LOOKED_AT)].mean(0)
+        at, joints = self._at(state)
+        for k in range(how.rounds):
+            features = self._features(at, vertex_normals(at, self.mesh.faces))
+            theirs = np.asarray(self._tree.query(features)[1])
+            mine = np.asarray(cKDTree(features).query(self._tree.data)[1])
+            mine, theirs = (
+                np.concatenate(both) for both in ((np.arange(len(at)), mine), (theirs, np.arange(len(mine))))
+            )
+            reach = how.reach if k < how.rounds // 2 else how.reach / 2
+            gap = at[mine] - self.surface.vertices[theirs]
+            weight = _SEEN / how.noise**2 / (1 + (gap**2).sum(1) / reach**2) ** 2
+            prior = np.repeat([1.0, how.angle_spread**-2, 0.0], [N_BETAS, 3 * N_JOINTS, 3])
+            rows = [
+                (np.einsum("nck,nc->nk", linear.vertices[mine], self.surface.normals[theirs]), weight),
+                (linear.vertices[mine].reshape(-1, len(state)), np.repeat(_ALONG * weight, 3)),
+                (linear.joints[_LOOKED_AT, :].reshape(-1, len(state)), how.joint_spread**-2),
+            ]
+            off = [
+                (gap * self.surface.normals[theirs]).sum(1),
+                gap.ravel(),
+                (joints - self.joints)[list(_LOOKED_AT)].ravel(),
+            ]
+            normal = np.diag(prior) + sum(a.T @ (np.reshape(w, (-1, 1)) * a) for a, w in rows)
+            slope = prior * state + sum(a.T @ (w * r) for (a, w), r in zip(rows, off, strict=True))
+            state = state - np.linalg.solve(normal, slope)
+            at, joints = self._at(state)
+        return at
+
+    def _at(self, state: Array) -> tuple[Array, Array]:
+        """Vertices (V, 3) and joints (24, 3) [m] of betas, pose [rad] and place [m], side by side, (85,)."""
+        with torch.no_grad():
+            numbers = torch.as_tensor(state)
+            posed = self.source(numbers[None, N_BETAS:-3], numbers[None, :N_BETAS])
+        return posed.vertices[0].numpy() + state[-3:], posed.joints[0].numpy() + state[-3:]
+
+    def _draped(self, start: Array) -> Array:
+        """Vertices (V, 3) [m] brought to the target's surface."""
+        stiff = np.where(self.is_end, self.how.stiff_ends, 1.0)
+        laplacian = self.mesh.uniform_laplacian()
+        bending = sparse.csr_array(laplacian.T @ sparse.diags_array(stiff) @ laplacian)
+        at = start
+        for stiffness in self.how.stiffness:
+            place = self.surface.closest(at)
+            goal = self.surface.at(place)
+            normal = self.surface.at(place, self.surface.normals)
+            own = vertex_normals(at, self.mesh.faces)
+            agree = np.clip(((normal * own).sum(1) - 0.5) / 0.4, 0, 1)
+            distance2 = ((goal - at) ** 2).sum(1)
+            weight = agree / (1 + distance2 / self.how.reach**2) + 1e-4
+            matrix = sparse.csc_array(sparse.diags_array(weight) + stiffness * bending)
+            at = start + splu(matrix).solve(weight[:, None] * (goal - start))
+        return at

@@ -1,0 +1,86 @@
+"""Whether a body model stands as all of this project expects it: in metres, upright, facing forward, in the T-pose."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from refu_core.body._kinematics import JOINT_NAMES
+from refu_core.errors import BodyError, MeshError
+from refu_core.mesh import Connectivity
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from refu_core.body._model import SmplBody
+
+_TALL = (0.3, 2.2)
+"""From the ankles to the neck [m]: children and giants."""
+_UNITS = {"millimetres": 1000.0, "centimetres": 100.0, "inches": 39.37, "feet": 3.281, "decimetres": 10.0}
+_ALONG = 0.8
+"""Cosine of the angle to an axis from which on a body stands, or faces, along it."""
+_ARMS = 0.5
+"""The same of arms that are stretched out to the sides."""
+_AXES = ("x", "y", "z")
+_WANTED = "wanted metres, y up, facing +z, the subject's left at +x, in the T-pose"
+
+
+def require_rest_pose(body: SmplBody, *, closed: bool = True) -> None:
+    """Nothing, where the mean shape stands as expected and is a closed surface whose faces are turned outward.
+
+    Raises:
+        BodyError: it has other units or axes, is mirrored, not in the T-pose, open or turned inside out, or its joints
+            are elsewhere.
+    """
+    fault = _fault(body.arrays.v_template, body.arrays.joint_regressor @ body.arrays.v_template)
+    if not fault:
+        mesh = Connectivity.of(body.faces.cpu().numpy(), body.n_vertices)
+        corners = body.arrays.v_template[mesh.faces]
+        volume = np.einsum("fc,fc->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
+        if volume <= 0:
+            fault = "its faces are turned inward; reverse the order of each face's vertices"
+        elif closed:
+            try:
+                mesh.require_closed()
+            except MeshError as error:
+                fault = f"{error}; or give it as betas_from, which needs its shapes alone"
+    if fault:
+        msg = f"body {body.name}: {fault}"
+        raise BodyError(msg)
+
+
+def _fault(vertices: NDArray[np.float64], joints: NDArray[np.float64]) -> str:
+    """What is wrong with the places of vertices (V, 3) and joints (24, 3); empty if nothing is."""
+    at = dict(zip(JOINT_NAMES, joints, strict=True))
+    up = at["neck"] - (at["left_ankle"] + at["right_ankle"]) / 2
+    tall = float(np.linalg.norm(up))
+    if not _TALL[0] <= tall <= _TALL[1]:
+        unit = min(_UNITS, key=lambda name: abs(np.log(max(tall, 1e-9) / _UNITS[name] / 1.4)))
+        guess = f": {unit}? Divide by {_UNITS[unit]:g}" if tall > 1 else ""
+        return f"it is {tall:.4g} from the ankles to the neck, wanted metres (about 1.4){guess}"
+    low, high = vertices.min(0) - 0.1 * tall, vertices.max(0) + 0.1 * tall
+    outside = [name for name, joint in at.items() if (joint < low).any() or (joint > high).any()]
+    if outside:
+        return f"{len(outside)} joints are outside of its mesh, {outside[0]} for one: J_regressor is of other vertices"
+    left = at["left_shoulder"] - at["right_shoulder"]
+    forward = at["left_foot"] + at["right_foot"] - at["left_ankle"] - at["right_ankle"]
+    ways = {name: _axis(way) for name, way in (("up", up), ("left", left), ("front", forward))}
+    if tuple(ways.values()) != ("+y", "+x", "+z"):
+        told = ", ".join(f"{name} is {way}" for name, way in ways.items())
+        handed = np.dot(np.cross(up, forward), left)
+        if handed < 0:
+            return f"it is mirrored ({told}): {_WANTED}; negate one coordinate, or exchange left and right"
+        return f"it stands otherwise ({told}): {_WANTED}; turn v_template, shapedirs and posedirs"
+    for side, out in (("left", 1), ("right", -1)):
+        arm = at[f"{side}_wrist"] - at[f"{side}_shoulder"]
+        if out * arm[0] < _ARMS * float(np.linalg.norm(arm)):
+            return f"its {side} arm isn't stretched out to the side at rest: {_WANTED}"
+    return ""
+
+
+def _axis(way: NDArray[np.float64]) -> str:
+    """`+y` and the like; `askew` for what is along no axis."""
+    unit = way / max(float(np.linalg.norm(way)), 1e-12)
+    k = int(np.abs(unit).argmax())
+    return f"{'+' if unit[k] > 0 else '-'}{_AXES[k]}" if abs(unit[k]) >= _ALONG else "askew"

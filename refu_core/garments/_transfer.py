@@ -1,0 +1,131 @@
+"""Garments on another body than the one that they were cut for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from scipy import sparse
+from scipy.sparse.linalg import splu
+from scipy.spatial import cKDTree
+
+from refu_core.body import BodyFit, Surface, load_body
+from refu_core.frames import N_BETAS
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from refu_core.garments._template import GarmentTemplate
+
+    Array = NDArray[np.float64]
+
+_NEIGHBOURS = 16
+"""Vertices of the skin that a garment's vertex is carried by."""
+_WIDTH = 0.02
+"""How much farther than the nearest one these may be to count for much [m]."""
+_STIFFNESS = 20.0
+"""How much more it counts that neighbours move alike than that they move as the skin does: cloth doesn't show a navel.
+Half of what changes within 7 edges, 7 cm of a T-shirt, is levelled."""
+_HELD_WITHIN = 0.03
+"""Cloth that is farther off the skin than this follows its own neighbours rather [m]: between two legs, neither one."""
+_CLEARANCE = 0.006
+"""What garments are cut clear of their body [m]: no more is asked for on another."""
+_FROM_MIDDLE = 0.003
+"""What vertices keep from the plane between left and right, if they have as much as cut [m]."""
+_LIFTS = 6
+"""Rounds of lifting: hardly anything is below its clearance after three."""
+_SPREADS = 3
+"""Rings around a vertex that is lifted that go along, less and less."""
+_INFLUENCES = 6
+"""Joints of a vertex, as in the garments that ship."""
+
+
+def worn_on(garment: GarmentTemplate, fit: BodyFit | None) -> GarmentTemplate:
+    """`garment` on the body of `fit`: it follows that body's betas and skin, and its styles are as they were.
+
+    Itself on the body that it was cut for, which None stands for.
+
+    What of the body is in the shape space of the one that the garment was cut for, the garment knows already how to
+    follow. The rest is carried over by the skin below it. So nothing changes on the garment's own body.
+    """
+    if fit is None or fit.body.fingerprint == load_body(garment.body).fingerprint:
+        return garment
+    differs = fit.difference(garment.body)
+    exact = garment.to(device="cpu", dtype=torch.float64)
+    source, betas = differs.source, differs.betas
+    with torch.no_grad():
+        rest = exact.rest(betas.offset[None])[0].numpy()
+        skin = source.rest_vertices(betas.offset[None])[0].numpy()
+    carry = _Carrier(rest, garment, skin)
+    own = exact.shapedirs.numpy() @ betas.matrix.numpy()
+    n = garment.n_vertices
+    directions = own.reshape(n, 3, N_BETAS) + carry(differs.directions)
+    vertices = rest + carry(differs.template)
+    clear = np.minimum(Surface(skin, source.arrays.faces.astype(np.int32)).heights(rest)[0], _CLEARANCE)
+    own_side = exact.v_template[:, 0].numpy()
+    vertices = _on_own_side(_lifted(_on_own_side(vertices, own_side), clear, garment, fit), own_side)
+    weights = (exact.weights.numpy() + carry(differs.weights)).clip(0)
+    few = np.sort(weights, axis=1)[:, -_INFLUENCES, None]
+    weights = np.where(weights >= few, weights, 0)
+    weights /= weights.sum(1, keepdims=True)
+    return replace(
+        garment,
+        v_template=torch.as_tensor(vertices).to(garment.v_template),
+        shapedirs=torch.as_tensor(directions.reshape(3 * n, N_BETAS)).to(garment.shapedirs),
+        weights=torch.as_tensor(weights).to(garment.weights),
+    )
+
+
+class _Carrier:
+    """Takes what skin does over to the cloth on it."""
+
+    def __init__(self, rest: Array, garment: GarmentTemplate, skin: Array) -> None:
+        distance, vertex = map(np.asarray, cKDTree(skin).query(rest, _NEIGHBOURS))
+        weight = np.exp((distance[:, :1] ** 2 - distance**2) / (2 * _WIDTH**2))
+        weight /= weight.sum(1, keepdims=True)
+        rows = np.repeat(np.arange(len(rest)), _NEIGHBOURS)
+        self._attach = sparse.csr_array((weight.ravel(), (rows, vertex.ravel())), shape=(len(rest), len(skin)))
+        self._hold = 1 / (1 + (distance[:, 0] / _HELD_WITHIN) ** 2) ** 2
+        bending = garment.mesh.uniform_laplacian()
+        self._solve = splu(sparse.csc_array(sparse.diags_array(self._hold) + _STIFFNESS * bending.T @ bending)).solve
+
+    def __call__(self, values: Array) -> Array:
+        """Of the skin's vertices (V, …) at the garment's (N, …)."""
+        there = self._attach @ values.reshape(len(values), -1)
+        levelled: Array = self._solve(self._hold[:, None] * there)
+        return levelled.reshape(-1, *values.shape[1:])
+
+
+def _on_own_side(vertices: Array, own_side: Array) -> Array:
+    """Vertices on the side of the body's middle that they are on as cut, x (N,) [m]: one trouser leg isn't in the
+    other on a body whose legs are nearer together."""
+    side: Array = np.where(own_side > 0, 1.0, -1.0)
+    kept: Array = vertices.copy()
+    kept[:, 0] = side * np.maximum(side * vertices[:, 0], np.minimum(np.abs(own_side), _FROM_MIDDLE))
+    return kept
+
+
+def _lifted(vertices: Array, clear: Array, garment: GarmentTemplate, fit: BodyFit) -> Array:
+    """Vertices and the middles of edges at least as far off the body as `clear` (N,) [m]."""
+    surface = Surface(fit.body.v_template.double().cpu().numpy(), fit.body.faces.cpu().numpy().astype(np.int32))
+    edges = garment.mesh.edges
+    mean = sparse.csr_array(sparse.eye_array(len(vertices)) - garment.mesh.uniform_laplacian())
+    n = len(vertices)
+    for _ in range(_LIFTS):
+        points = np.concatenate((vertices, vertices[edges].mean(1)))
+        height, direction = surface.heights(points)
+        lacks = np.concatenate((clear, clear[edges].mean(1))) - height
+        if lacks.max() <= 0:
+            break
+        # Of a vertex and the edges at it, the one that lacks most says which way.
+        lacks, owner = np.concatenate((lacks[:n], lacks[n:], lacks[n:])), np.concatenate((np.arange(n), *edges.T))
+        which = np.concatenate((np.arange(len(points)), np.arange(n, len(points))))
+        order = np.argsort(lacks)
+        push = np.zeros_like(vertices)
+        push[owner[order]] = lacks[order, None].clip(0) * direction[which[order]]
+        for _ in range(_SPREADS):
+            push = np.where(push.any(1, keepdims=True), push, mean @ push)
+        vertices = vertices + push
+    return vertices

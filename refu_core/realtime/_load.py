@@ -1,0 +1,121 @@
+"""What is worn by whom: garments, a body, and the networks that were trained for them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from refu_core.backbones import Skinned, backbone_weights
+from refu_core.body import BodyFit, Collider, load_body, load_fit
+from refu_core.errors import BodyError, GarmentError, WeightsError, require_type
+from refu_core.garments import GarmentTemplate, load_garment, worn_on
+from refu_core.modes import DEFAULT_MARGIN
+from refu_core.realtime._wearer import Outfit, Wearable
+from refu_core.refu import trained_from_weights
+from refu_core.weights import Weights, weights_folder
+
+if TYPE_CHECKING:
+    from os import PathLike
+
+    import torch
+
+    from refu_core.body import SmplBody
+
+
+def load_outfit(
+    garments: Sequence[str | PathLike[str] | GarmentTemplate],
+    *,
+    body: str | PathLike[str] | SmplBody | None,
+    betas_from: str | PathLike[str] | SmplBody | None,
+    backbone: str,
+    mode: str,
+    weights: str | PathLike[str] | None,
+    device: torch.device,
+    collider: bool,
+) -> Outfit:
+    """Loads garments, the body that wears them, and their networks; arguments and errors as of `GarmentPipeline.load`.
+
+    On a body that isn't the garments' own they are transferred (`worn_on`).
+    """
+    templates = _templates(garments, device)
+    if body is not None and betas_from is not None:
+        msg = "a body and betas_from were both given: a body file's betas are its own already, leave betas_from out"
+        raise BodyError(msg)
+    fit: BodyFit | None = None
+    if body is not None:
+        fit = load_fit(body, device=device)
+    elif betas_from is not None:
+        fit = load_fit(betas_from, betas_from=True, device=device)
+    wearer = load_body(_cut_for(templates), device=device) if fit is None else fit.body
+    wearables = {
+        name: _wearable(template, fit, backbone=backbone, mode=mode, weights=weights, device=device)
+        for name, template in templates.items()
+    }
+    return Outfit(wearer, wearables, Collider(wearer) if collider else None, fit)
+
+
+def _templates(
+    garments: Sequence[str | PathLike[str] | GarmentTemplate], device: torch.device
+) -> dict[str, GarmentTemplate]:
+    if isinstance(garments, (str, os.PathLike, GarmentTemplate)):
+        garments = [garments]
+    require_type(garments, Collection, "names of garments", error=GarmentError)
+    if not garments:
+        msg = "no garment was asked for: name at least one"
+        raise GarmentError(msg)
+    loaded = [one if isinstance(one, GarmentTemplate) else load_garment(one) for one in garments]
+    return {template.name: template.to(device=device) for template in loaded}
+
+
+def _cut_for(templates: Mapping[str, GarmentTemplate]) -> str:
+    """The body of all garments. Raises `GarmentError` where they are of several."""
+    bodies = {template.body for template in templates.values()}
+    if len(bodies) > 1:
+        cut_for = ", ".join(f"{name} ({template.body})" for name, template in templates.items())
+        msg = f"one person wears garments of one body: got {cut_for}; name a body to have them transferred to it"
+        raise GarmentError(msg)
+    return bodies.pop()
+
+
+def _wearable(
+    template: GarmentTemplate,
+    fit: BodyFit | None,
+    *,
+    backbone: str,
+    mode: str,
+    weights: str | PathLike[str] | None,
+    device: torch.device,
+) -> Wearable:
+    stored = backbone_weights(backbone, template.name, mode=mode, folder=weights_folder(template.name, weights))
+    if stored is None:
+        return Wearable(worn_on(template, fit), Skinned(), None, DEFAULT_MARGIN)
+    return wearable_of(stored, template, fit, device=device)
+
+
+def wearable_of(
+    stored: Weights, template: GarmentTemplate, fit: BodyFit | None, *, device: str | torch.device = "cpu"
+) -> Wearable:
+    """A garment as it was cut, and the networks in `stored`, on the body of `fit` or (None) on its own.
+
+    Raises:
+        WeightsError: they were trained on a third body, or don't fit the garment.
+    """
+    worn = worn_on(template, fit)
+    trained_on, source = stored.card.get("body_fingerprint"), load_body(template.body).fingerprint
+    betas = None
+    if fit is not None and trained_on in fit.fingerprints:
+        network, refu = trained_from_weights(stored, worn, device=device)
+    elif trained_on == source:
+        # Networks know the garment on the body that they were trained on.
+        network, refu = trained_from_weights(stored, template, device=device)
+        betas = None if worn is template or fit is None else fit.difference(template.body).betas
+    else:
+        own = "" if fit is None else f"{fit.body.name} ({fit.body.fingerprint}) or "
+        hint = "name that body's file as the body, or " if fit is None else ""
+        msg = (
+            f"{stored.path}: trained on the body {trained_on}, wanted {own}the built-in {template.body} ({source}); "
+            f"{hint}train some with `refu train {template.name} --body`"
+        )
+        raise WeightsError(msg)
+    return Wearable(worn, network, refu, DEFAULT_MARGIN if refu is None else float(refu.margin), betas)

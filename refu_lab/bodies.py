@@ -1,0 +1,46 @@
+"""Who wears the garments of a replay: what is known of the body, and what there is to warn of."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from refu_core.body import BUILTIN_BODIES
+from refu_core.modes import FOREIGN_BETAS, BetasSource
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from refu_core import GarmentPipeline, SmplFrame
+    from refu_core.body import BodyFit
+
+
+def body_facts(pipeline: GarmentPipeline) -> dict[str, Any]:
+    """Plain values, ready for JSON; of a body that was named, how far the built-in mesh is from its surface [mm]."""
+    facts: dict[str, Any] = {"name": pipeline.body.name, "fingerprint": pipeline.body.fingerprint}
+    return facts if pipeline.fit is None else facts | fit_facts(pipeline.fit)
+
+
+def fit_facts(fit: BodyFit) -> dict[str, float]:
+    """How far the built-in mesh is from the body's surface, hands, feet and head left out [mm]."""
+    found = fit.registration
+    return {"fit_mean_mm": 1e3 * found.mean_distance, "fit_p99_mm": 1e3 * found.far_distance}
+
+
+def body_warnings(pipeline: GarmentPipeline, *, gender: str = "") -> list[str]:
+    """What there is to warn of, for a recording that says it is of a `gender`, or (empty) doesn't."""
+    warnings = pipeline.warnings
+    known = pipeline.body.name if pipeline.fit is None or pipeline.body.name in BUILTIN_BODIES else ""
+    said = gender.strip().lower()
+    if said in ("male", "female") and known and said != known:
+        warnings.append(
+            f"the recording is of a {said} body and is dressed as {known}: name a body (body, --body {said}), "
+            "and garments are transferred to it"
+        )
+    return warnings
+
+
+def betas_warnings(pipeline: GarmentPipeline, frames: Iterable[SmplFrame], *, source: str) -> list[str]:
+    """Whether nothing says what the betas of frames are of."""
+    if pipeline.fit is not None or source != BetasSource.MESSAGE or not any(one.betas.any() for one in frames):
+        return []
+    return [FOREIGN_BETAS]
