@@ -5,6 +5,9 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+from msg_adapters import QosProfile
 from refu_core import RefuError
 
 
@@ -16,3 +19,9 @@ def interface(name: str) -> Any:
     except ImportError as error:
         msg = f"{name} isn't importable: install or source {package} ({error})"
         raise RefuError(msg) from error
+
+
+def ros_qos(profile: QosProfile) -> QoSProfile:
+    """The same as rclpy has it."""
+    reliability = ReliabilityPolicy.RELIABLE if profile.reliability == "reliable" else ReliabilityPolicy.BEST_EFFORT
+    return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=profile.depth, reliability=reliability)

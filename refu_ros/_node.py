@@ -11,7 +11,6 @@ from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import SetParametersResult
-from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 import msg_adapters as adapters
@@ -20,7 +19,7 @@ from refu_core.errors import printable
 from refu_ros._decoding import InputDecoder
 from refu_ros._diagnostics import statuses
 from refu_ros._guard import GuardedNode, answer_no, transition
-from refu_ros._interfaces import interface
+from refu_ros._interfaces import interface, ros_qos
 from refu_ros._loader import PipelineLoader
 from refu_ros._parameters import declare_settings
 from refu_ros._recording import Recording
@@ -74,7 +73,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
             self.create_lifecycle_publisher(
                 interface(adapters.MARKER_ARRAY),
                 topic,
-                _ros_qos(_OUTPUT_QOS),
+                ros_qos(_OUTPUT_QOS),
                 qos_overriding_options=_OVERRIDABLE,
                 event_callbacks=PublisherEventCallbacks(matched=lambda _: self._attend()),
             )
@@ -97,15 +96,12 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         """Loads the garments."""
         try:
             interface(self._decoder.message_type)
-            self._pipeline, self._in_use = self.settings.pipeline.load(), self.settings.pipeline
+            self._take(self.settings.pipeline.load(), self.settings.pipeline)
         except RefuError as error:
             self.get_logger().error(f"can't be configured: {printable(error)}")
             return TransitionCallbackReturn.FAILURE
         self._loader = PipelineLoader(self._on_loaded, self._on_not_loaded)
-        self._decoder.use(self.settings, self._pipeline.body)
         self._state = "inactive"
-        for text in self._pipeline.warnings:
-            self.get_logger().warning(text)
         self.get_logger().info(f"configured with {self._in_use}")
         return super().on_configure(state)
 
@@ -215,7 +211,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
             interface(self._decoder.message_type),
             topic,
             lambda data: self._on_input(person, full_name, data),
-            _ros_qos(_INPUT_QOS),
+            ros_qos(_INPUT_QOS),
             # Overrides are parameters, which never go: only topics that don't come and go have them.
             qos_overriding_options=None if self.settings.follow_humans else _OVERRIDABLE,
             raw=True,
@@ -318,8 +314,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
             return SetParametersResult(successful=True)
         try:
             settings = self.settings.changed(values)
-            reload = settings.pipeline != self.settings.pipeline
-            if reload:
+            if reload := settings.pipeline != self.settings.pipeline:
                 settings.pipeline.check()
             if settings.record != self.settings.record and self._state == "active":
                 self.recording.start(settings.record)
@@ -338,11 +333,14 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
             self._loader.request(self._pipeline_key)
         return SetParametersResult(successful=True)
 
-    def _on_loaded(self, pipeline: GarmentPipeline, key: PipelineKey) -> None:
+    def _take(self, pipeline: GarmentPipeline, key: PipelineKey) -> None:
         self._pipeline, self._in_use = pipeline, key
         self._decoder.use(self.settings, pipeline.body)
         for text in pipeline.warnings:
             self.get_logger().warning(text)
+
+    def _on_loaded(self, pipeline: GarmentPipeline, key: PipelineKey) -> None:
+        self._take(pipeline, key)
         if self._worker is not None:
             self._worker.use(pipeline)
         self.statistics.set_error(f"{self._lost}: on the cpu now; set device to try it again" if self._lost else "")
@@ -400,8 +398,3 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         if count:
             self.get_logger().warning(f"{count + 1} nodes are called {own[0]}", throttle_duration_sec=60.0)
         return count
-
-
-def _ros_qos(profile: adapters.QosProfile) -> QoSProfile:
-    reliability = ReliabilityPolicy.RELIABLE if profile.reliability == "reliable" else ReliabilityPolicy.BEST_EFFORT
-    return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=profile.depth, reliability=reliability)

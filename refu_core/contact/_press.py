@@ -112,7 +112,8 @@ class Press:
             for sweep in self._sweeps:
                 sweep.launch()
             self._lower.launch()
-        return self._points.clone()
+        pressed: Tensor = self._points.clone()
+        return pressed
 
     def _list_reached(self) -> None:
         """What is pressed, and as far as sweeps reach; a GPU isn't waited for to know, and goes through all."""

@@ -128,11 +128,11 @@ class ContactStage:
         """Vertices (V, 3) [m] off the body, which has the last word, and within reach of where they were, `raw`."""
         done, n_clipped = self._off_body(name, vertices, on_mean=on_mean, margin=margin, scale=scale)
         vertices, numbers = done.vertices, done.numbers
-        if self._below[name]:
+        if worn:
             vertices, _ = self._off_layers(name, vertices, worn)
             again, _ = self._off_body(name, vertices, on_mean=on_mean, margin=_KEPT * margin, scale=1.0)
             vertices, numbers[_N_UNRESOLVED] = again.vertices, again.numbers[_N_UNRESOLVED]
-        if name in self._press or self._below[name]:  # what goes several ways
+        if name in self._press or worn:  # what goes several ways
             away = vertices - raw
             length = torch.linalg.vector_norm(away, dim=1, keepdim=True)
             vertices = torch.where(length > self._farthest, raw + self._farthest / length * away, vertices)
@@ -143,8 +143,8 @@ class ContactStage:
     def _off_layers(self, name: str, vertices: Tensor, worn: Mapping[str, Worn]) -> tuple[Tensor, Tensor]:
         """Off the inner garments, and how many were too near one of those, shape (1,)."""
         n_layered = torch.zeros(1, dtype=torch.int32, device=vertices.device)
-        for inner, layer in self._below[name].items():
-            vertices, n_low = layer(vertices, worn[inner].vertices)
+        for inner, garment in worn.items():
+            vertices, n_low = self._below[name][inner](vertices, garment.vertices)
             n_layered = n_layered + n_low
         return vertices, n_layered
 

@@ -80,6 +80,7 @@ def buried(subject: Subject, trial: Trial) -> Iterator[Measurement]:
             done = stage.resolve(
                 name,
                 points,
+                {},
                 raw=points,
                 on_mean=drape.on_mean[0],
                 margin=skinned[name].margin,
