@@ -23,7 +23,7 @@ CORE = (
     {"body"},
     {"garments"},
     {"backbones", "sdf"},
-    {"refu"},
+    {"refu", "fitting"},
     {"contact"},
     {"realtime"},
     {"metrics"},

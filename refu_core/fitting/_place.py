@@ -1,0 +1,408 @@
+"""Where a mesh of unknown unit, axes, place and pose belongs on a body."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import torch
+from scipy.optimize import minimize
+
+from refu_core.body import JOINT_NAMES, RigidTransforms
+from refu_core.errors import GarmentError
+from refu_core.fitting._clean import components, face_normals
+from refu_core.frames import N_BETAS, N_JOINTS
+from refu_core.sdf import ExactSdf
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from refu_core.body import SmplBody
+    from refu_core.fitting._mesh_file import SurfaceMesh
+
+    F64 = NDArray[np.float64]
+
+UNITS: dict[str, float] = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+"""Metres of a unit."""
+UP_AXES: tuple[str, ...] = ("y", "z")
+
+_LEFT_SHOULDER, _RIGHT_SHOULDER = (JOINT_NAMES.index(f"{side}_shoulder") for side in ("left", "right"))
+_LEFT_HIP, _RIGHT_HIP = (JOINT_NAMES.index(f"{side}_hip") for side in ("left", "right"))
+_SIZES = (0.12, 2.1)
+"""The largest extent of a garment [m]: from a sock to a gown with a train."""
+_ARMS = (0.0, 0.35, 0.6, 0.85, 1.1)
+"""How far arms may hang when a search begins [rad]: T-pose to arms nearly down."""
+_N_POINTS = 400
+_TOLERANCE = 0.015
+"""A mesh is taken as it is unless something else fits this much better, as a share of its size."""
+_POSE_TOLERANCE = 0.002
+"""It is taken to be in the T-pose unless another pose fits this much better, likewise."""
+_TRIED_SIZES = (0.25, 0.4, 0.6, 0.85, 1.2, 1.7)
+"""Largest extents that a mesh of no known unit is tried with [m]."""
+_N_REFINED = 3
+
+
+@dataclass(frozen=True)
+class Placing:
+    """What is known of a mesh; None for what is to be found out."""
+
+    unit: float | None = None
+    """Metres of the mesh's unit."""
+    up: str | None = None
+    """`y` or `z`."""
+    pose: F64 | None = None
+    """That the mesh was modelled in: rotation vectors [rad], shape (24, 3); zeros for the T-pose."""
+    is_placed: bool = False
+    """Whether the mesh's origin is the body's; otherwise it may be moved."""
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """x_body = unit · turn x + shift, on the body in `pose`."""
+
+    unit: float
+    turn: F64
+    """Rotation, shape (3, 3)."""
+    shift: F64
+    """[m], shape (3,)."""
+    pose: F64
+    """Rotation vectors [rad], shape (24, 3)."""
+    fit: Fit
+    notes: list[str] = field(default_factory=list)
+
+    def is_like(self, other: Place) -> bool:
+        """Whether it has the same unit and axes."""
+        return self.unit == other.unit and bool(np.array_equal(self.turn, other.turn))
+
+    def __call__(self, vertices: F64) -> F64:
+        """Vertices (V, 3) on the body [m]."""
+        return self.unit * vertices @ self.turn.T + self.shift
+
+
+class Fit(NamedTuple):
+    """How well a mesh surrounds a body, lengths in metres."""
+
+    inside: float
+    """Share of the surface deeper than 1 cm in the body."""
+    depth: float
+    """Mean of what it lacks of 1 cm off the skin, at most 5 cm: what is worn neither touches nor is far off."""
+    distance: float
+    """Mean distance outside, at most 20 cm."""
+    facing: float
+    """Share of it that faces away from the body; half of what stands beside it does not."""
+
+    @property
+    def cost(self) -> float:
+        """Smaller is better [m]: cloth is outside, near, and faces away from the body."""
+        return 4 * self.depth + self.distance + 0.1 * (1 - self.facing)
+
+    @property
+    def is_good(self) -> bool:
+        """Whether it may be worn like that. Garments that were made for a body have 0.00–0.05, < 0.08 and > 0.93."""
+        return self.inside < 0.08 and self.distance < 0.13 and self.facing > 0.85
+
+
+class PosedBody:
+    """A body of mean shape in some pose, and how far from it things are."""
+
+    def __init__(self, body: SmplBody, pose: F64) -> None:
+        self.body, self.pose = body, pose
+        posed = body(torch.as_tensor(pose, dtype=torch.float32)[None])
+        self.vertices = posed.vertices[0]
+        self.transforms: RigidTransforms = posed.transforms
+        self._sdf = ExactSdf(body.faces)
+        self._sdf.update(self.vertices)
+
+    def move(self, pose: F64) -> None:
+        """Takes another pose."""
+        self.pose = pose
+        posed = self.body(torch.as_tensor(pose, dtype=torch.float32)[None])
+        self.vertices, self.transforms = posed.vertices[0], posed.transforms
+        self._sdf.update(self.vertices)
+
+    def __call__(self, points: F64) -> tuple[F64, F64]:
+        """Signed distance [m], shape (P,), and its unit gradient, (P, 3)."""
+        found = self._sdf.query(torch.as_tensor(points, dtype=torch.float32))
+        return found.distance.double().numpy(), found.gradient.double().numpy()
+
+    def closest(self, points: F64) -> tuple[NDArray[np.int64], F64]:
+        """The closest face of each point (P, 3), and where in it that is, as barycentric coordinates (P, 3)."""
+        face = self._sdf.closest(torch.as_tensor(points, dtype=torch.float32)).face.long().numpy()
+        corners = self.vertices.double().numpy()[self.body.faces.numpy()[face]]
+        return face, _barycentric(points, corners)
+
+
+class Samples(NamedTuple):
+    """Points all over a mesh, as many a square metre."""
+
+    points: F64
+    """In the mesh's own unit and axes, shape (P, 3)."""
+    normals: F64
+    """Unit, shape (P, 3); zero for those of closed pieces, which have cloth's both sides."""
+    piece: NDArray[np.int64]
+    """Of which piece, shape (P,)."""
+
+
+def sample(mesh: SurfaceMesh, count: int, seed: int = 0) -> Samples:
+    """`count` points drawn by area."""
+    rng = np.random.default_rng(seed)
+    normals = face_normals(mesh.vertices, mesh.faces)
+    area = np.linalg.norm(normals, axis=1)
+    face = np.searchsorted(np.cumsum(area), (np.arange(count) + rng.random(count)) / count * area.sum())
+    face = np.minimum(face, len(area) - 1)
+    u, v = rng.random((2, count))
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    a, b, c = (mesh.vertices[mesh.faces[face, k]] for k in range(3))
+    points = a + u[:, None] * (b - a) + v[:, None] * (c - a)
+    _, label = components(mesh.faces, len(mesh.vertices))
+    open_pieces = np.unique(label[_rim(mesh.faces)])
+    is_open = np.isin(label[mesh.faces[face, 0]], open_pieces)
+    unit = normals[face] / np.maximum(area[face], 1e-300)[:, None] * is_open[:, None]
+    return Samples(points, unit, label[mesh.faces[face, 0]])
+
+
+def fit_of(points: F64, samples: Samples, body: PosedBody) -> Fit:
+    """How well samples that are at `points` [m] surround the body; `samples.normals` in the same axes."""
+    distance, gradient = body(points)
+    outward = (samples.normals * gradient).sum(1)
+    has_side = samples.normals.any(1)
+    facing = 1.0
+    if has_side.any():
+        # A piece faces one way or the other: what is asked is whether all of it does.
+        votes = np.zeros((2, samples.piece.max() + 1))
+        np.add.at(votes[0], samples.piece[has_side], outward[has_side] > 0)
+        np.add.at(votes[1], samples.piece[has_side], outward[has_side] <= 0)
+        facing = float(votes.max(0).sum() / has_side.sum())
+    depth = np.clip(0.01 - distance, 0, 0.05)
+    return Fit(float((distance < -0.01).mean()), float(depth.mean()), float(np.clip(distance, 0, 0.2).mean()), facing)
+
+
+def standing_pose(arms: float, legs: float = 0.0) -> F64:
+    """The T-pose with arms lowered and legs spread by some angles [rad], shape (24, 3)."""
+    pose = np.zeros((N_JOINTS, 3))
+    pose[_LEFT_SHOULDER, 2], pose[_RIGHT_SHOULDER, 2] = -arms, arms
+    pose[_LEFT_HIP, 2], pose[_RIGHT_HIP, 2] = legs, -legs
+    return pose
+
+
+def find_place(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Place:
+    """Where a mesh belongs on a body of mean shape.
+
+    As it is, if it surrounds the body like that, or in another unit, with another axis up, standing on the floor, in an
+    A-pose. Else it is moved until it does; and if that doesn't help, scaled by what is no unit.
+
+    Raises:
+        GarmentError: in no unit is it as large as a garment, or it surrounds the body nowhere.
+    """
+    samples = sample(mesh, _N_POINTS)
+    extent = float(np.ptp(mesh.vertices, axis=0).max())
+    units = [placing.unit] if placing.unit else [u for u in UNITS.values() if _SIZES[0] <= u * extent <= _SIZES[1]]
+    if not units or (placing.unit and not _SIZES[0] <= placing.unit * extent <= _SIZES[1]):
+        size = f"{extent:.3g} units" + (f" = {placing.unit * extent:.3g} m" if placing.unit else "")
+        msg = f"the mesh is {size} large: wanted a garment of {_SIZES[0]} to {_SIZES[1]} m; say its unit (--unit)"
+        raise GarmentError(msg)
+    poses = [placing.pose] if placing.pose is not None else [standing_pose(arms) for arms in _ARMS]
+    bodies = [PosedBody(body, pose) for pose in poses]
+    turns = _turns(placing.up)
+    found = [
+        _Candidate(_at(samples, unit, turn, shift, here), kind, here)
+        for here, turn, unit in itertools.product(bodies, turns, units)
+        for kind, shift in _shifts(here, is_placed=placing.is_placed)
+    ]
+    good = [one for one in found if one.place.fit.is_good]
+    if good:
+        least = min(one.cost(extent) for one in good)
+        chosen = next(one for one in good if one.cost(extent) < least + _TOLERANCE)  # what says least is asked first
+        if placing.pose is None:
+            likes = [one for one in found if one.kind == chosen.kind and one.place.is_like(chosen.place)]
+            likes.sort(key=lambda one: one.cost(extent))
+            refined = [
+                one._replace(place=_refined(one, samples, placing, moves=False, scales=False)) for one in likes[:2]
+            ]
+            other = min(refined, key=lambda one: one.cost(extent))
+            if other.cost(extent) < chosen.cost(extent) - _POSE_TOLERANCE or chosen.here.pose.any():
+                chosen = other
+        return _told(chosen.place, chosen.kind)
+    scales = [None] if placing.unit else [None, [size / extent for size in _TRIED_SIZES]]
+    tiers = [
+        _searched(mesh, samples, bodies, turns, tried or units, placing, scales=tried is not None) for tried in scales
+    ]
+    reached = [one for one in tiers if one is not None]
+    # A known unit, unless it fits much worse.
+    reached.sort(key=lambda one: (not one.place.fit.is_good, one.cost(extent) + _TOLERANCE * (one is not tiers[0])))
+    if reached and reached[0].place.fit.is_good:
+        return _told(reached[0].place, "searched")
+    best = min((one.place for one in reached or found), key=lambda place: place.fit.cost)
+    fit = best.fit
+    msg = (
+        f"the mesh doesn't surround the body {body.name}: where it fits best, {100 * fit.inside:.0f} % of it is "
+        f"inside the body, it is {1e3 * fit.distance:.0f} mm off on average, and {100 * fit.facing:.0f} % of it faces "
+        "outward; is it a garment for this body? Say its --unit, --up or --pose, or place it on the body first"
+    )
+    raise GarmentError(msg)
+
+
+class _Candidate(NamedTuple):
+    place: Place
+    kind: str
+    here: PosedBody
+
+    def cost(self, extent: float) -> float:
+        """As a share of the garment's size, or the smallest one would always be the nearest to the skin.
+
+        What nobody would do without need counts, too: to model a garment sideways, with spread legs or hanging arms.
+        """
+        place = self.place
+        arms, legs = place.pose[_RIGHT_SHOULDER, 2], place.pose[_LEFT_HIP, 2]
+        sideways = 1 - abs(place.turn[0, 0])
+        return place.fit.cost / (place.unit * extent) + 0.02 * sideways + 0.1 * abs(legs) + 0.005 * abs(arms)
+
+
+def _searched(
+    mesh: SurfaceMesh,
+    samples: Samples,
+    bodies: list[PosedBody],
+    turns: list[F64],
+    units: list[float],
+    placing: Placing,
+    *,
+    scales: bool,
+) -> _Candidate | None:
+    """The best of all heights along the body, moved on from there."""
+    if placing.is_placed:
+        return None
+    extent = float(np.ptp(mesh.vertices, axis=0).max())
+    few = Samples(*(array[::3] for array in samples))
+    found = [
+        _Candidate(_at(few, unit, turn, shift, here), "searched", here)
+        for here, turn, unit in itertools.product(bodies[::2], turns, units)
+        for shift in _heights(unit * mesh.vertices @ turn.T, here)
+    ]
+    found.sort(key=lambda one: one.cost(extent))
+    refined = [
+        one._replace(place=_refined(one, samples, placing, moves=True, scales=scales)) for one in found[:_N_REFINED]
+    ]
+    return min(refined, key=lambda one: (not one.place.fit.is_good, one.cost(extent)), default=None)
+
+
+def _at(samples: Samples, unit: float, turn: F64, shift: F64, body: PosedBody) -> Place:
+    turned = samples._replace(normals=samples.normals @ turn.T)
+    return Place(unit, turn, shift, body.pose, fit_of(unit * samples.points @ turn.T + shift, turned, body))
+
+
+def _turns(up: str | None) -> list[F64]:
+    """Rotations that may bring a mesh upright and to face z; the likeliest first."""
+    z_up = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    bases = {"y": [np.eye(3)], "z": [z_up], None: [np.eye(3), z_up]}[up]
+    about_y = [np.diag([np.cos(a), 1.0, np.cos(a)]) for a in (0.0, np.pi)]
+    for sign in (1.0, -1.0):
+        about_y.append(np.array([[0, 0, sign], [0, 1, 0], [-sign, 0, 0]]))
+    return [about @ base for about in about_y for base in bases]
+
+
+def _shifts(body: PosedBody, *, is_placed: bool) -> list[tuple[str, F64]]:
+    """Where a mesh may stand by convention: with the body's origin, or on a floor below its feet."""
+    floor = float(body.vertices[:, 1].min())
+    found = [("", np.zeros(3)), ("floor", np.array([0.0, floor, 0.0]))]
+    return found[:1] if is_placed else found
+
+
+def _heights(vertices: F64, body: PosedBody) -> list[F64]:
+    """Shifts that put a mesh (V, 3) [m] round the body's middle, at all heights."""
+    skin = body.vertices.double().numpy()
+    low, high = vertices.min(0), vertices.max(0)
+    middle = (low + high) / 2
+    found = []
+    for height in np.arange(skin[:, 1].min() - low[1], skin[:, 1].max() - high[1] + 0.02, 0.06):
+        near = np.abs(skin[:, 1] - (middle[1] + height)) < max(0.05, (high[1] - low[1]) / 4)
+        front, back = (skin[near, 2].max(), skin[near, 2].min()) if near.any() else (0.0, 0.0)
+        found.append(np.array([-middle[0], height, (front + back) / 2 - middle[2]]))
+    return found
+
+
+def _refined(start: _Candidate, samples: Samples, placing: Placing, *, moves: bool, scales: bool) -> Place:
+    """The best place near one, by a simplex over pose, and place and size if wanted."""
+    here = start.here
+    body = PosedBody(here.body, here.pose)
+    arms = float(here.pose[_RIGHT_SHOULDER, 2])
+    turn, place = start.place.turn, start.place
+    x0 = np.array([0.0, 0.0, 0.0, 0.0, arms, 0.02])
+    steps = np.array([0.06 * scales, *(0.03 * moves,) * 3, 0.1, 0.06])
+    if placing.pose is not None:
+        steps[4:] = 0
+    free = np.flatnonzero(steps)
+    middle = samples.points.mean(0) @ turn.T
+    floor = float(here.vertices[:, 1].min())
+    extent = float(np.ptp(samples.points, axis=0).max())
+
+    def at(values: F64) -> Place:
+        full = x0.copy()
+        full[free] += values * steps[free]
+        size, *shift, lowered, spread = full
+        if placing.pose is None:
+            body.move(standing_pose(float(np.clip(lowered, -0.2, 1.3)), float(np.clip(spread, 0.0, 0.35))))
+        unit = place.unit * float(np.exp(np.clip(size, -0.5, 0.5)))
+        moved = place.shift + np.array(shift) + (place.unit - unit) * middle  # the middle stays as the size changes
+        if start.kind == "floor":  # which is where the feet of this pose are
+            moved[1] += float(body.vertices[:, 1].min()) - floor
+        return _at(samples, unit, turn, moved, body)
+
+    if not len(free):
+        return place
+    simplex = np.concatenate((np.zeros((1, len(free))), np.eye(len(free))))
+    found = minimize(
+        lambda values: start._replace(place=at(values)).cost(extent),
+        np.zeros(len(free)),
+        method="Nelder-Mead",
+        options={"initial_simplex": simplex, "maxfev": 40 * len(free), "xatol": 0.02, "fatol": 1e-5},
+    )
+    return at(found.x)
+
+
+def _told(place: Place, kind: str) -> Place:
+    """With what was found out, in words."""
+    notes = []
+    name = next((name for name, unit in UNITS.items() if np.isclose(unit, place.unit)), None)
+    if name != "m":
+        notes.append(f"lengths are {name}" if name else f"scaled by {place.unit:.4g}, which is no unit")
+    turn = place.turn
+    if not np.allclose(turn, np.eye(3)):
+        up = "y" if np.isclose(turn[1, 1], 1) else "z"
+        front = turn.T @ [0.0, 0.0, 1.0]
+        axis = int(np.abs(front).argmax())
+        notes.append(f"{up} is up and {'+' if front[axis] > 0 else '-'}{'xyz'[axis]} is in front")
+    if kind == "floor":
+        notes.append("it stood with the floor at 0 and was moved to the body's feet")
+    elif np.abs(place.shift).max() > 1e-3:
+        notes.append("moved by ({:.0f}, {:.0f}, {:.0f}) mm".format(*(1e3 * place.shift)))
+    arms, legs = np.degrees(place.pose[_RIGHT_SHOULDER, 2]), np.degrees(place.pose[_LEFT_HIP, 2])
+    if abs(arms) > 3 or legs > 3:
+        notes.append(f"modelled with arms {arms:.0f}° down and legs {legs:.0f}° apart; brought into the T-pose")
+    return replace(place, notes=notes)
+
+
+def rest_joints(body: SmplBody) -> F64:
+    """Joints of the mean shape in the T-pose [m], shape (24, 3)."""
+    found: F64 = body.rest_joints(torch.zeros(1, N_BETAS))[0].double().numpy()
+    return found
+
+
+def _rim(f: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Vertices of edges of one face."""
+    pairs = np.sort(np.stack((f, np.roll(f, -1, 1)), -1).reshape(-1, 2), 1)
+    edges, count = np.unique(pairs, axis=0, return_counts=True)
+    return np.unique(edges[count == 1])
+
+
+def _barycentric(points: F64, corners: F64) -> F64:
+    """Of the projections of points (P, 3) onto triangles (P, 3, 3), clipped to them; shape (P, 3)."""
+    a, b, c = corners.transpose(1, 0, 2)
+    u, v, w = b - a, c - a, points - a
+    uu, uv, vv = (u * u).sum(1), (u * v).sum(1), (v * v).sum(1)
+    wu, wv = (w * u).sum(1), (w * v).sum(1)
+    det = np.maximum(uu * vv - uv * uv, 1e-30)
+    s, t = (vv * wu - uv * wv) / det, (uu * wv - uv * wu) / det
+    found = np.clip(np.stack((1 - s - t, s, t), 1), 0, None)
+    return found / found.sum(1, keepdims=True)
