@@ -15,7 +15,10 @@ PAPER_GARMENTS: tuple[str, ...] = ("shirt-male", "tshirt-male", "short-pant-male
 BUILTIN_GARMENTS: tuple[str, ...] = (
     *PAPER_GARMENTS,
     *sorted(
-        {path.stem.removeprefix("garment_") for path in (Path(__file__).parent / "assets").glob(GARMENT_FILE.format("*"))}
+        {
+            path.stem.removeprefix("garment_")
+            for path in (Path(__file__).parent / "assets").glob(GARMENT_FILE.format("*"))
+        }
         - set(PAPER_GARMENTS)
     ),
 )
@@ -63,6 +66,8 @@ class SdfMode(Choice):
 class BackboneName(Choice):
     """What predicts a garment."""
 
+    AUTO = "auto"
+    """`tailornet` for a garment whose weights of it ship, `skinned` for one that has none yet."""
     SKINNED = "skinned"
     """No network: the template follows the skin."""
     TAILORNET = "tailornet"

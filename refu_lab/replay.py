@@ -19,7 +19,7 @@ import msg_adapters as adapters
 from refu_core import FrameError, GarmentPipeline, SmplFrame
 from refu_core._device import one_thread
 from refu_core.metrics import CollisionChecker, Figures, GarmentMetrics
-from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN
+from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN, BackboneName
 from refu_lab.truth import GroundTruth
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ class ReplayOptions:
     input: Path
     garments: tuple[str, ...] = DEFAULT_GARMENTS
     output: Path | None = None
-    backbone: str = "tailornet"
+    backbone: str = BackboneName.AUTO
     sdf: str = "hybrid"
     weights: Path | None = None
     margin: float = DEFAULT_MARGIN
@@ -151,7 +151,7 @@ class ReplayResult:
             "input": str(self.options.input),
             "source": self.source,
             "output": None if self.options.output is None else str(self.options.output),
-            "backbone": self.options.backbone,
+            "backbone": str(self.options.backbone),
             "sdf": self.options.sdf,
             "margin_m": self.options.margin,
             "device": self.options.device,
@@ -342,6 +342,8 @@ def replay(options: ReplayOptions, *, pipeline: GarmentPipeline | None = None, p
     with ExitStack() as stack:
         source = stack.enter_context(open_source(options))
         result = ReplayResult(options, source.description)
+        if options.backbone == BackboneName.AUTO:
+            result.warnings += [f"{name} has no trained weights: worn by skinning" for name in pipeline.untrained]
         replayer = _Replayer(options, pipeline, source, result)
         writer = replayer.open_writer()
         if writer is not None:

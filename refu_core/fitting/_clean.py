@@ -41,7 +41,7 @@ def clean(mesh: SurfaceMesh) -> tuple[SurfaceMesh, list[str]]:
         raise GarmentError(msg)
     mesh = _welded(mesh, notes)
     partner, n_crowded = _partners(mesh)
-    mesh = replace(mesh, **_as_arrays(mesh, _oriented(mesh.faces, partner, notes)))
+    mesh = turned_over(mesh, _oriented(mesh.faces, partner, notes))
     partner, _ = _partners(mesh)
     mesh = _cut_apart(mesh, partner)
     if n_crowded:
@@ -234,14 +234,14 @@ def _oriented(f: Ints, pairs: Ints, notes: list[str]) -> NDArray[np.bool_]:
     return flipped
 
 
-def _as_arrays(mesh: SurfaceMesh, flipped: NDArray[np.bool_]) -> dict[str, object]:
-    uv = mesh.uv if mesh.uv is None else replace(mesh.uv, faces=turned_over(mesh.uv.faces, flipped))
-    return {"faces": turned_over(mesh.faces, flipped), "uv": uv}
+def turned_over(mesh: SurfaceMesh, flipped: NDArray[np.bool_]) -> SurfaceMesh:
+    """The mesh with some of its faces seen from the other side; each still begins at its first corner."""
 
+    def turned(f: Ints) -> Ints:
+        return np.where(flipped[:, None], f[:, [0, 2, 1]], f)
 
-def turned_over(f: Ints, flipped: NDArray[np.bool_]) -> Ints:
-    """Faces (F, 3) of which some are seen from the other side; each still begins at its first corner."""
-    return np.where(flipped[:, None], f[:, [0, 2, 1]], f)
+    uv = None if mesh.uv is None else replace(mesh.uv, faces=turned(mesh.uv.faces))
+    return replace(mesh, faces=turned(mesh.faces), uv=uv)
 
 
 def _cut_apart(mesh: SurfaceMesh, pairs: Ints) -> SurfaceMesh:

@@ -38,14 +38,13 @@ _SKIN_LENGTH = 0.012
 _SHAPE_LENGTH = 0.03
 """As much for what β moves [m]."""
 _DEEP, _MOST_DEEP = 0.03, 0.04
-"""A garment of which so much is so deep in the body, once it is in the T-pose, was made for another body or pose [m]."""
+"""A garment of which such a share is so deep in the body [m], in the T-pose, was made for another body or pose."""
 _FARTHEST = 0.06
 """No vertex has to move farther to be outside of the body [m]: a limb went through it, and out on which side?"""
 _FELT = 0.02
 """A joint is felt where it has this share at some vertex."""
 _SHOULDERS = tuple(
-    JOINT_NAMES.index(name)
-    for name in ("neck", "left_collar", "right_collar", "left_shoulder", "right_shoulder")
+    JOINT_NAMES.index(name) for name in ("neck", "left_collar", "right_collar", "left_shoulder", "right_shoulder")
 )
 _ROUNDS = 40
 
@@ -165,9 +164,8 @@ def _outward(mesh: SurfaceMesh, body: PosedBody) -> SurfaceMesh:
     vote = np.where(is_open[label[f[:, 0]]], (normals * gradient).sum(1) / (0.02 + np.abs(distance)), 0)
     vote += np.where(is_open[label[f[:, 0]]], 0, (normals * (centres - v.mean(0))).sum(1))
     side = np.bincount(label[f[:, 0]], vote, n_pieces)
-    flipped = side[label[f[:, 0]]] < 0
-    uv = mesh.uv if mesh.uv is None else replace(mesh.uv, faces=turned_over(mesh.uv.faces, flipped))
-    return replace(mesh, faces=turned_over(f, flipped), uv=uv)
+    flipped: NDArray[np.bool_] = side[label[f[:, 0]]] < 0
+    return turned_over(mesh, flipped)
 
 
 def _unposed(mesh: SurfaceMesh, posed: PosedBody) -> F64:
@@ -201,8 +199,8 @@ def _cleared(mesh: SurfaceMesh, body: PosedBody, notes: list[str]) -> F64:
     if deep > _MOST_DEEP:
         near = _near(v[distance < -_DEEP], body)
         msg = (
-            f"{100 * deep:.0f} % of the garment is more than {1e3 * _DEEP:.0f} mm inside the body {body.body.name}, most "
-            f"of it near the {near}: it was made for another body or pose; say its --pose, or try --body"
+            f"{100 * deep:.0f} % of the garment is more than {1e3 * _DEEP:.0f} mm inside the body {body.body.name}, "
+            f"most of it near the {near}: it was made for another body or pose; say its --pose, or try --body"
         )
         raise GarmentError(msg)
     for _ in range(_ROUNDS):
@@ -247,5 +245,3 @@ def _near(points: F64, body: PosedBody) -> str:
     face, _ = body.closest(points)
     corners = body.body.faces[torch.from_numpy(face)].flatten()
     return JOINT_NAMES[int(body.body.weights[corners].sum(0).argmax())].replace("_", " ")
-
-

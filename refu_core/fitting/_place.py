@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -78,7 +78,8 @@ class Place:
 
     def __call__(self, vertices: F64) -> F64:
         """Vertices (V, 3) on the body [m]."""
-        return self.unit * vertices @ self.turn.T + self.shift
+        found: F64 = self.unit * vertices @ self.turn.T + self.shift
+        return found
 
 
 class Fit(NamedTuple):
@@ -257,7 +258,8 @@ class _Candidate(NamedTuple):
         place = self.place
         arms, legs = place.pose[_RIGHT_SHOULDER, 2], place.pose[_LEFT_HIP, 2]
         sideways = 1 - abs(place.turn[0, 0])
-        return place.fit.cost / (place.unit * extent) + 0.02 * sideways + 0.1 * abs(legs) + 0.005 * abs(arms)
+        without_need = 0.02 * sideways + 0.1 * abs(legs) + 0.005 * abs(arms)
+        return float(place.fit.cost / (place.unit * extent) + without_need)
 
 
 def _searched(
@@ -274,7 +276,7 @@ def _searched(
     if placing.is_placed:
         return None
     extent = float(np.ptp(mesh.vertices, axis=0).max())
-    few = Samples(*(array[::3] for array in samples))
+    few = Samples(samples.points[::3], samples.normals[::3], samples.piece[::3])
     found = [
         _Candidate(_at(few, unit, turn, shift, here), "searched", here)
         for here, turn, unit in itertools.product(bodies[::2], turns, units)
@@ -297,8 +299,7 @@ def _turns(up: str | None) -> list[F64]:
     z_up = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     bases = {"y": [np.eye(3)], "z": [z_up], None: [np.eye(3), z_up]}[up]
     about_y = [np.diag([np.cos(a), 1.0, np.cos(a)]) for a in (0.0, np.pi)]
-    for sign in (1.0, -1.0):
-        about_y.append(np.array([[0, 0, sign], [0, 1, 0], [-sign, 0, 0]]))
+    about_y += [np.array([[0, 0, sign], [0, 1, 0], [-sign, 0, 0]]) for sign in (1.0, -1.0)]
     return [about @ base for about in about_y for base in bases]
 
 
@@ -352,11 +353,10 @@ def _refined(start: _Candidate, samples: Samples, placing: Placing, *, moves: bo
     if not len(free):
         return place
     simplex = np.concatenate((np.zeros((1, len(free))), np.eye(len(free))))
+    options: Any = {"initial_simplex": simplex, "maxfev": 40 * len(free), "xatol": 0.02, "fatol": 1e-5}
+    start_from = np.zeros(len(free))
     found = minimize(
-        lambda values: start._replace(place=at(values)).cost(extent),
-        np.zeros(len(free)),
-        method="Nelder-Mead",
-        options={"initial_simplex": simplex, "maxfev": 40 * len(free), "xatol": 0.02, "fatol": 1e-5},
+        lambda values: start._replace(place=at(values)).cost(extent), start_from, method="Nelder-Mead", options=options
     )
     return at(found.x)
 
@@ -405,4 +405,5 @@ def _barycentric(points: F64, corners: F64) -> F64:
     det = np.maximum(uu * vv - uv * uv, 1e-30)
     s, t = (vv * wu - uv * wv) / det, (uu * wv - uv * wu) / det
     found = np.clip(np.stack((1 - s - t, s, t), 1), 0, None)
-    return found / found.sum(1, keepdims=True)
+    shares: F64 = found / found.sum(1, keepdims=True)
+    return shares

@@ -84,7 +84,7 @@ class Transfer:
         rigid = tuple(np.flatnonzero(label == k) for k in range(n_pieces) if is_small[k] and not is_small.all())
         laplacian = _laplacian(vertices, faces, _seams(vertices, label, rim, n_pieces))
         area = np.linalg.norm(face_normals(vertices, faces), axis=1) / 6
-        mass = np.bincount(faces.ravel(), np.repeat(area, 3), len(vertices))
+        mass = np.bincount(faces.ravel(), weights=np.repeat(area, 3), minlength=len(vertices)).astype(np.float64)
         body_faces = body.body.faces.numpy()
         return cls(face, barycentric, distance, is_trusted, body_faces, mass, laplacian, rigid)
 
@@ -134,7 +134,7 @@ def _seams(v: F64, label: NDArray[np.int64], rim: NDArray[np.int64], n_pieces: i
         return np.empty((0, 2), np.int64)
     found = [np.empty((0, 2), np.int64)]
     if len(rim):
-        close = cKDTree(v).query_ball_point(v[rim], _SEAM)
+        close: Any = cKDTree(v).query_ball_point(v[rim], _SEAM)
         near = [(a, b) for a, others in zip(rim.tolist(), close, strict=True) for b in others if label[a] != label[b]]
         found.append(np.array(near, np.int64).reshape(-1, 2))
     order = np.argsort(np.bincount(label))[::-1]
@@ -142,9 +142,8 @@ def _seams(v: F64, label: NDArray[np.int64], rim: NDArray[np.int64], n_pieces: i
     for piece in order[1:]:
         own = np.flatnonzero(label == piece)
         others = np.flatnonzero(joined)
-        distance, nearest = cKDTree(v[others]).query(v[own])
+        distance, nearest = (np.asarray(one) for one in cKDTree(v[others]).query(v[own]))
         few = np.argsort(distance)[:3]
         found.append(np.stack((own[few], others[nearest[few]]), 1))
         joined |= label == piece
     return np.unique(np.sort(np.concatenate(found), 1), axis=0)
-

@@ -131,7 +131,9 @@ def save_garment(template: GarmentTemplate, path: str | os.PathLike[str]) -> Pat
 
 def _rounded(tensor: torch.Tensor, bits: int) -> NDArray[np.float32]:
     """To multiples of 2^-bits: the bits that say nothing are zeros, which take no room when packed."""
-    return np.ldexp(np.rint(np.ldexp(tensor.cpu().double().numpy(), bits)), -bits).astype(np.float32)
+    scale = float(1 << bits)
+    found: NDArray[np.float32] = (np.rint(tensor.cpu().double().numpy() * scale) / scale).astype(np.float32)
+    return found
 
 
 def _check(data: dict[str, NDArray[Any]]) -> GarmentCard:

@@ -17,11 +17,12 @@ import torch
 from torch import Tensor
 
 from refu_core._device import checked_device
+from refu_core.backbones import Skinned
 from refu_core.body import Collider, SmplBody, load_body
 from refu_core.errors import FrameError, GarmentError, RefuError, require_type
 from refu_core.frames import SmplFrame
 from refu_core.garments import N_STYLES, GarmentTemplate, load_garment
-from refu_core.modes import DEFAULT_MARGIN, MAX_MARGIN, SdfMode
+from refu_core.modes import DEFAULT_MARGIN, MAX_MARGIN, BackboneName, SdfMode
 from refu_core.realtime._contact import ContactStage
 from refu_core.realtime._frame import FrameStep, StageClock
 from refu_core.realtime._graph import StepGraphs
@@ -114,7 +115,7 @@ class GarmentPipeline:
         garments: Sequence[str | PathLike[str] | GarmentTemplate],
         *,
         sdf: str = "hybrid",
-        backbone: str = "tailornet",
+        backbone: str = BackboneName.AUTO,
         style: ArrayLike | None = None,
         margin: float | None = None,
         weights: str | PathLike[str] | None = None,
@@ -129,7 +130,8 @@ class GarmentPipeline:
         Args:
             garments: of one body: names of built-in ones, paths of garment files, or templates.
             sdf: `hybrid`, `approx`, `accurate` or `none`.
-            backbone: `tailornet`, `mlp`, `gcnn`, or `skinned`, which needs no weights.
+            backbone: `tailornet`, `mlp`, `gcnn`, or `skinned`, which needs no weights; by default (`auto`) `tailornet`
+                for garments whose weights ship, `skinned` for others.
             style: γ of all garments, shape (4,); the mean style if not given.
             margin: clearance ε that is kept from the skin [m]; by default what the weights were trained with.
             weights: folder with a folder a garment of weights of one's own (`refu train`); those that ship by default.
@@ -195,6 +197,11 @@ class GarmentPipeline:
     def garments(self) -> dict[str, GarmentTemplate]:
         """The loaded garments by name."""
         return {name: wearable.template for name, wearable in self.outfit.wearables.items()}
+
+    @property
+    def untrained(self) -> tuple[str, ...]:
+        """Names of the garments that no network drapes: they follow the skin."""
+        return tuple(name for name, one in self.outfit.wearables.items() if isinstance(one.backbone, Skinned))
 
     @overload
     def __call__(self, frames: SmplFrame) -> PipelineOutput: ...

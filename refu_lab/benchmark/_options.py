@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from refu_core import GarmentPipeline, RefuError
-from refu_core.garments import BUILTIN_GARMENTS
+from refu_core.garments import PAPER_GARMENTS
 
 OUTPUT = Path("docs/results")
 BAGS = Path("bags")
@@ -35,9 +35,9 @@ class BenchmarkOptions:
 
     def __post_init__(self) -> None:
         """Raises `RefuError` for options of which nothing can be measured."""
-        unknown = [name for name in self.garments or () if name not in BUILTIN_GARMENTS]
+        unknown = [name for name in self.garments or () if name not in PAPER_GARMENTS]
         if unknown:
-            msg = f"no garment {unknown[0]!r}: wanted some of {', '.join(BUILTIN_GARMENTS)}"
+            msg = f"no garment {unknown[0]!r}: wanted some of {', '.join(PAPER_GARMENTS)}"
             raise RefuError(msg)
         if self.device not in (None, "cpu", "cuda"):
             msg = f"no device {self.device!r}: wanted cpu or cuda"
@@ -54,7 +54,7 @@ class BenchmarkOptions:
         """The garments that are measured, the main one first."""
         if self.garments is not None:
             return self.garments
-        others = () if self.quick else tuple(name for name in BUILTIN_GARMENTS if name != MAIN_GARMENT)
+        others = () if self.quick else tuple(name for name in PAPER_GARMENTS if name != MAIN_GARMENT)
         return (MAIN_GARMENT, *others)
 
     @property
