@@ -11,7 +11,7 @@ import torch
 from refu_core.body import JOINT_NAMES, blend_transforms, unapply_transforms
 from refu_core.errors import GarmentError
 from refu_core.fitting._clean import MAX_VERTICES, clean, components, face_normals, split_long_edges, turned_over
-from refu_core.fitting._place import Placing, PosedBody, find_place
+from refu_core.fitting._place import Place, Placing, PosedBody, find_places
 from refu_core.fitting._transfer import Transfer
 from refu_core.frames import N_BETAS, N_JOINTS
 from refu_core.garments import GarmentCard, GarmentTemplate
@@ -96,15 +96,27 @@ def fit_garment(
     if details.held_at not in (None, *HOLDS):
         msg = f"a garment is held at {' or '.join(HOLDS)}, got {details.held_at!r}"
         raise GarmentError(msg)
-    mesh, notes = clean(mesh)
-    place = find_place(mesh, body, placing or Placing())
-    notes += place.notes
-    mesh = replace(mesh, vertices=place(mesh.vertices))
-    if len(mesh.vertices) > MAX_VERTICES:
-        msg = f"it has {len(mesh.vertices)} vertices, at most {MAX_VERTICES} are worn: decimate the mesh"
+    cleaned, notes = clean(mesh)
+    if len(cleaned.vertices) > MAX_VERTICES:
+        msg = f"it has {len(cleaned.vertices)} vertices, at most {MAX_VERTICES} are worn: decimate the mesh"
         raise GarmentError(msg)
+    fault: GarmentError | None = None
+    for place in find_places(cleaned, body, placing or Placing()):
+        try:
+            mesh, found = _put_on(cleaned, place, body, longest_edge)
+        except GarmentError as error:  # a limb goes through it there: is there another place?
+            fault = fault or error
+            continue
+        return _bound(mesh, body, name, details, notes + found)
+    assert fault is not None
+    raise fault
+
+
+def _put_on(mesh: SurfaceMesh, place: Place, body: SmplBody, longest_edge: float) -> tuple[SurfaceMesh, list[str]]:
+    """The mesh on the body in the T-pose, and what was done to it. Raises `GarmentError` where it can't be there."""
+    notes = list(place.notes)
     n = len(mesh.vertices)
-    mesh = split_long_edges(mesh, longest_edge)
+    mesh = split_long_edges(replace(mesh, vertices=place(mesh.vertices)), longest_edge)
     if len(mesh.vertices) > n:
         added = len(mesh.vertices) - n
         notes.append(f"edges longer than {1e3 * longest_edge:.0f} mm were split: {added} vertices were added to {n}")
@@ -113,7 +125,12 @@ def fit_garment(
     if place.pose.any():
         mesh = replace(mesh, vertices=_unposed(mesh, posed))
         posed = PosedBody(body, np.zeros((N_JOINTS, 3)))
-    vertices = _cleared(mesh, posed, notes)
+    return replace(mesh, vertices=_cleared(mesh, posed, notes)), notes
+
+
+def _bound(mesh: SurfaceMesh, body: SmplBody, name: str, details: GarmentDetails, notes: list[str]) -> FittedGarment:
+    """The garment of a mesh that is on the body: what it follows, and what is known of it."""
+    vertices, posed = mesh.vertices, PosedBody(body, np.zeros((N_JOINTS, 3)))
     transfer = Transfer.of(vertices, mesh.faces, posed)
     weights = _few(transfer(body.weights.double().numpy(), length=_SKIN_LENGTH))
     shapedirs = transfer(_shapedirs(body), length=_SHAPE_LENGTH)

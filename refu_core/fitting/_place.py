@@ -17,6 +17,8 @@ from refu_core.frames import N_BETAS, N_JOINTS
 from refu_core.sdf import ExactSdf
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from numpy.typing import NDArray
 
     from refu_core.body import SmplBody
@@ -97,12 +99,17 @@ class Fit(NamedTuple):
     @property
     def cost(self) -> float:
         """Smaller is better [m]: cloth is outside, near, and faces away from the body."""
-        return 4 * self.depth + self.distance + 0.1 * (1 - self.facing)
+        return 8 * self.depth + self.distance + 0.1 * (1 - self.facing)
 
     @property
     def is_good(self) -> bool:
         """Whether it may be worn like that. Garments that were made for a body have 0.00–0.05, < 0.08 and > 0.93."""
-        return self.inside < 0.08 and self.distance < 0.13 and self.facing > 0.85
+        return self.inside < 0.05 and self.distance < 0.16 and self.facing > 0.85
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether nothing else need be tried."""
+        return self.is_good and self.facing > 0.93
 
 
 class PosedBody:
@@ -188,8 +195,8 @@ def standing_pose(arms: float, legs: float = 0.0) -> F64:
     return pose
 
 
-def find_place(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Place:
-    """Where a mesh belongs on a body of mean shape.
+def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator[Place]:
+    """Where a mesh may belong on a body of mean shape, the likeliest first; what isn't asked for isn't searched.
 
     As it is, if it surrounds the body like that, or in another unit, with another axis up, standing on the floor, in an
     A-pose. Else it is moved until it does; and if that doesn't help, scaled by what is no unit.
@@ -212,7 +219,7 @@ def find_place(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Place:
         for here, turn, unit in itertools.product(bodies, turns, units)
         for kind, shift in _shifts(here, is_placed=placing.is_placed)
     ]
-    good = [one for one in found if one.place.fit.is_good]
+    good = [one for one in found if one.place.fit.is_plain]
     if good:
         least = min(one.cost(extent) for one in good)
         chosen = next(one for one in good if one.cost(extent) < least + _TOLERANCE)  # what says least is asked first
@@ -225,18 +232,21 @@ def find_place(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Place:
             other = min(refined, key=lambda one: one.cost(extent))
             if other.cost(extent) < chosen.cost(extent) - _POSE_TOLERANCE or chosen.here.pose.any():
                 chosen = other
-        return _told(chosen.place, chosen.kind)
-    scales = [None] if placing.unit else [None, [size / extent for size in _TRIED_SIZES]]
-    tiers = [
-        _searched(mesh, samples, bodies, turns, tried or units, placing, scales=tried is not None) for tried in scales
-    ]
-    reached = [one for one in tiers if one is not None]
-    # A known unit, unless it fits much worse.
-    reached.sort(key=lambda one: (not one.place.fit.is_good, one.cost(extent) + _TOLERANCE * (one is not tiers[0])))
-    if reached and reached[0].place.fit.is_good:
-        return _told(reached[0].place, "searched")
-    best = min((one.place for one in reached or found), key=lambda place: place.fit.cost)
-    fit = best.fit
+        yield _told(chosen.place, chosen.kind)
+    found.sort(key=lambda one: (not one.place.fit.is_good, one.cost(extent)))
+    tiers = [found[0]]
+    for tried in [None] if placing.unit else [None, [size / extent for size in _TRIED_SIZES]]:
+        if not placing.is_placed:
+            tiers += _searched(mesh, samples, bodies, turns, tried or units, placing, scales=tried is not None)
+    # What was modelled by convention, or else in a known unit, unless it fits much worse.
+    ranked = sorted(range(len(tiers)), key=lambda k: tiers[k].cost(extent) + k * _TOLERANCE)
+    for k in ranked:
+        if tiers[k].place.fit.is_good:
+            yield _told(tiers[k].place, tiers[k].kind)
+    if good or any(one.place.fit.is_good for one in tiers):
+        return
+    place = min((one.place for one in tiers), key=lambda one: one.fit.cost)
+    fit = place.fit
     msg = (
         f"the mesh doesn't surround the body {body.name}: where it fits best, {100 * fit.inside:.0f} % of it is "
         f"inside the body, it is {1e3 * fit.distance:.0f} mm off on average, and {100 * fit.facing:.0f} % of it faces "
@@ -271,10 +281,8 @@ def _searched(
     placing: Placing,
     *,
     scales: bool,
-) -> _Candidate | None:
-    """The best of all heights along the body, moved on from there."""
-    if placing.is_placed:
-        return None
+) -> list[_Candidate]:
+    """The best of all heights along the body, moved on from there; none of no heights."""
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     few = Samples(samples.points[::3], samples.normals[::3], samples.piece[::3])
     found = [
@@ -286,7 +294,7 @@ def _searched(
     refined = [
         one._replace(place=_refined(one, samples, placing, moves=True, scales=scales)) for one in found[:_N_REFINED]
     ]
-    return min(refined, key=lambda one: (not one.place.fit.is_good, one.cost(extent)), default=None)
+    return sorted(refined, key=lambda one: (not one.place.fit.is_good, one.cost(extent)))[:1]
 
 
 def _at(samples: Samples, unit: float, turn: F64, shift: F64, body: PosedBody) -> Place:
@@ -353,11 +361,12 @@ def _refined(start: _Candidate, samples: Samples, placing: Placing, *, moves: bo
     if not len(free):
         return place
     simplex = np.concatenate((np.zeros((1, len(free))), np.eye(len(free))))
+
+    def cost(values: F64) -> float:
+        return start._replace(place=at(values)).cost(extent)
+
     options: Any = {"initial_simplex": simplex, "maxfev": 40 * len(free), "xatol": 0.02, "fatol": 1e-5}
-    start_from = np.zeros(len(free))
-    found = minimize(
-        lambda values: start._replace(place=at(values)).cost(extent), start_from, method="Nelder-Mead", options=options
-    )
+    found = minimize(cost, np.zeros(len(free)), method="Nelder-Mead", options=options)
     return at(found.x)
 
 
