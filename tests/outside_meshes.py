@@ -7,7 +7,7 @@ stands on a floor at 0 and looks along z. Cloth is the level of its distance whe
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import igl
@@ -87,8 +87,9 @@ def _smooth_min(a: F64, b: F64, k: float = 0.03) -> F64:
 
 def cloth(wanted: Wanted) -> tuple[F64, Ints]:
     """Vertices [m], y up, on a floor at 0, and triangles."""
-    low = np.array([-0.8, wanted.low - 0.08, -0.55])
-    high = np.array([0.8, 1.62, 0.65])
+    wide = wanted.flare * (1.02 - wanted.low)
+    low = np.array([-0.8, wanted.low - 0.08, -0.15 - wide])
+    high = np.array([0.8, 1.6 if wanted.high > 1.3 else wanted.high + 0.1, 0.25 + wide])
     counts = np.ceil((high - low) / wanted.step).astype(int)
     axes = [low[k] + wanted.step * np.arange(counts[k]) for k in range(3)]
     grid = np.stack(np.meshgrid(*axes[::-1], indexing="ij")[::-1], -1).reshape(-1, 3)
@@ -191,23 +192,23 @@ def write_obj(path: Path, mesh: Outside) -> Path:
     return path
 
 
-def _dress(folder: Path) -> Path:
+def _dress(folder: Path, coarser: float) -> Path:
     wanted = Wanted(low=0.50, sleeve=0.3, flare=0.25, step=0.034, turn=("y", 100))
-    v, f = cloth(wanted)
+    v, f = cloth(replace(wanted, step=coarser * wanted.step))
     return write_obj(folder / "dress.obj", Outside(placed(v, wanted), f.tolist()))
 
 
-def _coat(folder: Path) -> Path:
+def _coat(folder: Path, coarser: float) -> Path:
     wanted = Wanted(low=0.55, sleeve=0.97, arms=0.7, ease=0.028, is_open=True, flare=0.1, step=0.014, turn=("z", 1000))
-    v, f = cloth(wanted)
+    v, f = cloth(replace(wanted, step=coarser * wanted.step))
     front = [np.array([0.03, y, float(v[np.abs(v[:, 1] - y) < 0.03, 2].max()) + 0.004]) for y in (1.2, 1.1, 1.0, 0.9)]
     v, f = together([(v, f), *(button(at) for at in front)])
     return write_obj(folder / "coat.obj", Outside(placed(v, wanted), f.tolist()))
 
 
-def _trousers(folder: Path) -> Path:
+def _trousers(folder: Path, coarser: float) -> Path:
     wanted = Wanted(low=0.13, high=0.99, legs=True, ease=0.014, step=0.016)
-    v, f = cloth(wanted)
+    v, f = cloth(replace(wanted, step=coarser * wanted.step))
     uv, uv_f = unwrapped(v, f)
     # Cut open along the seam of its texture, as exporters do: a vertex for each pair of place and coordinates.
     pairs, local = np.unique(np.stack((f, uv_f), -1).reshape(-1, 2), axis=0, return_inverse=True)
@@ -216,28 +217,28 @@ def _trousers(folder: Path) -> Path:
     return write_obj(folder / "trousers.obj", split)
 
 
-def _skirt(folder: Path) -> Path:
-    v, quads = quads_of_a_skirt()
+def _skirt(folder: Path, coarser: float) -> Path:
+    v, quads = quads_of_a_skirt(round(40 / coarser), round(120 / coarser))
     return write_obj(folder / "skirt.obj", Outside(placed(v, Wanted(turn=("y", 39.37))), quads))
 
 
-def _tunic(folder: Path) -> Path:
+def _tunic(folder: Path, coarser: float) -> Path:
     wanted = Wanted(low=0.66, sleeve=0.6, step=0.0085, turn=("z", 1))
-    v, f = cloth(wanted)
+    v, f = cloth(replace(wanted, step=coarser * wanted.step))
     trimesh.Trimesh(placed(v, wanted), f, process=False).export(folder / "tunic.ply")
     return folder / "tunic.ply"
 
 
-def _jacket(folder: Path) -> Path:
+def _jacket(folder: Path, coarser: float) -> Path:
     wanted = Wanted(low=0.80, sleeve=0.95, arms=0.95, ease=0.022, is_open=True, turn=("y", 100))
-    v, f = cloth(wanted)
+    v, f = cloth(replace(wanted, step=coarser * wanted.step))
     trimesh.Trimesh(placed(v, wanted), f, process=False).export(folder / "jacket.stl")  # a soup of triangles
     return folder / "jacket.stl"
 
 
-def _top(folder: Path) -> Path:
+def _top(folder: Path, coarser: float) -> Path:
     wanted = Wanted(low=0.88, ease=0.012, step=0.018)
-    v, f = cloth(wanted)
+    v, f = cloth(replace(wanted, step=coarser * wanted.step))
     uv, uv_f = unwrapped(v, f)
     pairs, local = np.unique(np.stack((f, uv_f), -1).reshape(-1, 2), axis=0, return_inverse=True)
     visual = trimesh.visual.TextureVisuals(uv=uv[pairs[:, 1]])
@@ -246,10 +247,10 @@ def _top(folder: Path) -> Path:
     return folder / "top.glb"
 
 
-def _vest(folder: Path) -> Path:
+def _vest(folder: Path, coarser: float) -> Path:
     """Cloth with a thickness: an outer and an inner side, closed along its hems."""
     wanted = Wanted(low=0.86, ease=0.022, step=0.02, turn=("y", 10))
-    v, f = cloth(wanted)
+    v, f = cloth(replace(wanted, step=coarser * wanted.step))
     mesh = trimesh.Trimesh(v, f, process=False)
     inner = v - 0.006 * mesh.vertex_normals
     edges = mesh.edges[trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)]
@@ -260,10 +261,10 @@ def _vest(folder: Path) -> Path:
     return write_obj(folder / "vest.obj", Outside(placed(np.concatenate((v, inner)), wanted), faces.tolist()))
 
 
-def _damaged(folder: Path) -> Path:
+def _damaged(folder: Path, coarser: float) -> Path:
     """Faces that are turned over, there twice, or without area, and vertices that nothing uses."""
     wanted = Wanted(low=0.40, high=0.99, legs=True, ease=0.016, step=0.019, turn=("y", 1000))
-    v, f = cloth(wanted)
+    v, f = cloth(replace(wanted, step=coarser * wanted.step))
     rng = np.random.default_rng(0)
     turned = rng.random(len(f)) < 0.2
     f = np.where(turned[:, None], f[:, ::-1], f)
@@ -274,15 +275,15 @@ def _damaged(folder: Path) -> Path:
     return write_obj(folder / "shorts.obj", Outside(placed(v, wanted), faces.tolist()))
 
 
-def _gown(folder: Path) -> Path:
+def _gown(folder: Path, coarser: float) -> Path:
     """No unit, no floor: scaled to a size of 1 and centred, as data sets of shapes are."""
     wanted = Wanted(low=0.16, sleeve=0.2, flare=0.3, step=0.024)
-    v, f = cloth(wanted)
+    v, f = cloth(replace(wanted, step=coarser * wanted.step))
     v = (v - (v.min(0) + v.max(0)) / 2) / np.ptp(v, axis=0).max()
     return write_obj(folder / "gown.obj", Outside(v, f.tolist()))
 
 
-MESHES: dict[str, Callable[[Path], Path]] = {
+MESHES: dict[str, Callable[[Path, float], Path]] = {
     "dress, cm, long edges": _dress,
     "coat, mm, z up, arms down, open, buttons": _coat,
     "trousers, m, cut open along texture seams": _trousers,
@@ -294,4 +295,4 @@ MESHES: dict[str, Callable[[Path], Path]] = {
     "shorts, mm, damaged": _damaged,
     "gown of size one": _gown,
 }
-"""Ten meshes: each is written into a folder; the path of its file."""
+"""Ten meshes: each is written into a folder, some times coarser than it should be; the path of its file."""

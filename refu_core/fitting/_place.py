@@ -43,6 +43,8 @@ _POSE_TOLERANCE = 0.002
 """It is taken to be in the T-pose unless another pose fits this much better, likewise."""
 _TRIED_SIZES = (0.25, 0.4, 0.6, 0.85, 1.2, 1.7)
 """Largest extents that a mesh of no known unit is tried with [m]."""
+_ACROSS = 0.5
+"""Cosine of an angle to the way off the skin from which on cloth lies across it."""
 _N_REFINED = 3
 
 
@@ -148,7 +150,9 @@ class Samples(NamedTuple):
     points: F64
     """In the mesh's own unit and axes, shape (P, 3)."""
     normals: F64
-    """Unit, shape (P, 3); zero for those of closed pieces, which have cloth's both sides."""
+    """Unit, shape (P, 3)."""
+    is_open: NDArray[np.bool_]
+    """Whether of a piece with a rim; a closed one is cloth with both its sides, shape (P,)."""
     piece: NDArray[np.int64]
     """Of which piece, shape (P,)."""
 
@@ -167,22 +171,21 @@ def sample(mesh: SurfaceMesh, count: int, seed: int = 0) -> Samples:
     _, label = components(mesh.faces, len(mesh.vertices))
     open_pieces = np.unique(label[_rim(mesh.faces)])
     is_open = np.isin(label[mesh.faces[face, 0]], open_pieces)
-    unit = normals[face] / np.maximum(area[face], 1e-300)[:, None] * is_open[:, None]
-    return Samples(points, unit, label[mesh.faces[face, 0]])
+    unit = normals[face] / np.maximum(area[face], 1e-300)[:, None]
+    return Samples(points, unit, is_open, label[mesh.faces[face, 0]])
 
 
 def fit_of(points: F64, samples: Samples, body: PosedBody) -> Fit:
     """How well samples that are at `points` [m] surround the body; `samples.normals` in the same axes."""
     distance, gradient = body(points)
     outward = (samples.normals * gradient).sum(1)
-    has_side = samples.normals.any(1)
-    facing = 1.0
-    if has_side.any():
-        # A piece faces one way or the other: what is asked is whether all of it does.
-        votes = np.zeros((2, samples.piece.max() + 1))
-        np.add.at(votes[0], samples.piece[has_side], outward[has_side] > 0)
-        np.add.at(votes[1], samples.piece[has_side], outward[has_side] <= 0)
-        facing = float(votes.max(0).sum() / has_side.sum())
+    # An open piece faces one way or the other: what is asked is whether all of it does. One side of a closed one faces
+    # the body, the other one away from it, and little of it anything else.
+    votes = np.zeros((2, samples.piece.max() + 1))
+    np.add.at(votes[0], samples.piece[samples.is_open], outward[samples.is_open] > 0)
+    np.add.at(votes[1], samples.piece[samples.is_open], outward[samples.is_open] <= 0)
+    n_facing = votes.max(0).sum() + (np.abs(outward[~samples.is_open]) > _ACROSS).sum()
+    facing = float(n_facing / len(points))
     depth = np.clip(0.01 - distance, 0, 0.05)
     return Fit(float((distance < -0.01).mean()), float(depth.mean()), float(np.clip(distance, 0, 0.2).mean()), facing)
 
@@ -284,7 +287,9 @@ def _searched(
 ) -> list[_Candidate]:
     """The best of all heights along the body, moved on from there; none of no heights."""
     extent = float(np.ptp(mesh.vertices, axis=0).max())
-    few = Samples(samples.points[::3], samples.normals[::3], samples.piece[::3])
+    few = Samples(*(array[::4] for array in samples))  # type: ignore[arg-type]
+    if scales:  # there is much to try: what nobody does isn't
+        bodies, turns = bodies[:3], turns[: len(turns) // 2]
     found = [
         _Candidate(_at(few, unit, turn, shift, here), "searched", here)
         for here, turn, unit in itertools.product(bodies[::2], turns, units)
@@ -365,7 +370,7 @@ def _refined(start: _Candidate, samples: Samples, placing: Placing, *, moves: bo
     def cost(values: F64) -> float:
         return start._replace(place=at(values)).cost(extent)
 
-    options: Any = {"initial_simplex": simplex, "maxfev": 40 * len(free), "xatol": 0.02, "fatol": 1e-5}
+    options: Any = {"initial_simplex": simplex, "maxfev": 30 * len(free), "xatol": 0.02, "fatol": 1e-5}
     found = minimize(cost, np.zeros(len(free)), method="Nelder-Mead", options=options)
     return at(found.x)
 

@@ -100,6 +100,10 @@ class GarmentTemplate:
             offset = offset + style @ self.styledirs.T
         return self.v_template + offset.view(len(offset), -1, 3)
 
+    def own(self, style: Tensor | None) -> Tensor | None:
+        """The style γ as it is; None for a garment of one style, whose samples have a γ all the same."""
+        return None if self.styledirs is None else style
+
     def vertex_transforms(self, transforms: RigidTransforms) -> RigidTransforms:
         """The body's transforms (leading shape (B, 24)) blended at the garment's vertices (leading shape (B, V))."""
         return blend_transforms(self.weights, transforms)

@@ -112,7 +112,7 @@ def read_samples(
 
     def displacement(units: NDArray[np.int16], pose: Tensor, betas: Tensor, style: Tensor) -> Tensor:
         posed = torch.as_tensor(units.astype(np.float32) * float(dataset.card["quantum_m"]))
-        return garment.unpose(posed, body(pose, betas).transforms) - garment.rest(betas, style)
+        return garment.unpose(posed, body(pose, betas).transforms) - garment.rest(betas, garment.own(style))
 
     with torch.no_grad():
         found = in_chunks(displacement, vertices, column["pose"], column["betas"], column["style"])
@@ -154,15 +154,16 @@ def split_validation(samples: TrainingSamples, *, share: float, seed: int) -> tu
 
 
 def output_basis(displacement: Tensor, *, rank: int) -> BasisDecoder:
-    """The `rank` principal components of displacements (N, V, 3) [m].
+    """The `rank` principal components of displacements (N, V, 3) [m], or N - 1 of few samples: there are no more.
 
     Raises:
-        RefuError: there are fewer samples than components.
+        RefuError: a single sample.
     """
     n = len(displacement)
-    if n <= rank:
-        msg = f"an output basis of {rank} components needs more samples than that, got {n}: simulate more"
+    if n < 2:
+        msg = f"an output basis needs two samples at least, got {n}: simulate more"
         raise RefuError(msg)
+    rank = min(rank, n - 1)
     mean = displacement.mean(0)
     centred = (displacement - mean).flatten(1)
     # The samples' products instead of the vertices': N is smaller than 3 V.
