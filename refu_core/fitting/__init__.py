@@ -2,7 +2,8 @@
 
 from refu_core.fitting._fit import CLEARANCE, HOLDS, LONGEST_EDGE, FittedGarment, GarmentDetails, fit_garment
 from refu_core.fitting._mesh_file import MESH_SUFFIXES, SurfaceMesh, read_surface
-from refu_core.fitting._place import UNITS, UP_AXES, Placing, PosedBody, standing_pose
+from refu_core.fitting._place import UNITS, UP_AXES, Placing
+from refu_core.fitting._posed import PosedBody, standing_pose
 from refu_core.fitting._transfer import Transfer
 
 __all__ = [

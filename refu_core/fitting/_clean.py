@@ -65,6 +65,13 @@ def face_normals(v: NDArray[np.float64], f: Ints) -> NDArray[np.float64]:
     return found
 
 
+def rim_of(f: Ints) -> Ints:
+    """Vertices of edges of one face."""
+    pairs = np.sort(np.stack((f, np.roll(f, -1, 1)), -1).reshape(-1, 2), 1)
+    edges, count = np.unique(pairs, axis=0, return_counts=True)
+    return np.unique(edges[count == 1])
+
+
 def split_long_edges(mesh: SurfaceMesh, longest: float) -> SurfaceMesh:
     """The same surface with edges of at most `longest`: long ones are halved until none is left."""
     while True:

@@ -11,7 +11,8 @@ import torch
 from refu_core.body import JOINT_NAMES, blend_transforms, unapply_transforms
 from refu_core.errors import GarmentError
 from refu_core.fitting._clean import MAX_VERTICES, clean, components, face_normals, split_long_edges, turned_over
-from refu_core.fitting._place import Place, Placing, PosedBody, find_places
+from refu_core.fitting._place import Place, Placing, find_places
+from refu_core.fitting._posed import PosedBody
 from refu_core.fitting._transfer import Transfer
 from refu_core.frames import N_BETAS, N_JOINTS
 from refu_core.garments import GarmentCard, GarmentTemplate

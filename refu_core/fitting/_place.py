@@ -7,14 +7,11 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import torch
 from scipy.optimize import minimize
 
-from refu_core.body import JOINT_NAMES, RigidTransforms
 from refu_core.errors import GarmentError
-from refu_core.fitting._clean import components, face_normals
-from refu_core.frames import N_BETAS, N_JOINTS
-from refu_core.sdf import ExactSdf
+from refu_core.fitting._posed import LEFT_HIP, RIGHT_SHOULDER, PosedBody, standing_pose
+from refu_core.fitting._surround import Fit, Samples, fit_of, sample
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -30,8 +27,6 @@ UNITS: dict[str, float] = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "in": 0
 """Metres of a unit."""
 UP_AXES: tuple[str, ...] = ("y", "z")
 
-_LEFT_SHOULDER, _RIGHT_SHOULDER = (JOINT_NAMES.index(f"{side}_shoulder") for side in ("left", "right"))
-_LEFT_HIP, _RIGHT_HIP = (JOINT_NAMES.index(f"{side}_hip") for side in ("left", "right"))
 _SIZES = (0.12, 2.1)
 """The largest extent of a garment [m]: from a sock to a gown with a train."""
 _ARMS = (0.0, 0.35, 0.6, 0.85, 1.1)
@@ -43,8 +38,6 @@ _POSE_TOLERANCE = 0.002
 """It is taken to be in the T-pose unless another pose fits this much better, likewise."""
 _TRIED_SIZES = (0.25, 0.4, 0.6, 0.85, 1.2, 1.7)
 """Largest extents that a mesh of no known unit is tried with [m]."""
-_ACROSS = 0.5
-"""Cosine of an angle to the way off the skin from which on cloth lies across it."""
 _N_REFINED = 3
 
 
@@ -84,118 +77,6 @@ class Place:
         """Vertices (V, 3) on the body [m]."""
         found: F64 = self.unit * vertices @ self.turn.T + self.shift
         return found
-
-
-class Fit(NamedTuple):
-    """How well a mesh surrounds a body, lengths in metres."""
-
-    inside: float
-    """Share of the surface deeper than 1 cm in the body."""
-    depth: float
-    """Mean of what it lacks of 1 cm off the skin, at most 5 cm: what is worn neither touches nor is far off."""
-    distance: float
-    """Mean distance outside, at most 20 cm."""
-    facing: float
-    """Share of it that faces away from the body; half of what stands beside it does not."""
-
-    @property
-    def cost(self) -> float:
-        """Smaller is better [m]: cloth is outside, near, and faces away from the body."""
-        return 8 * self.depth + self.distance + 0.1 * (1 - self.facing)
-
-    @property
-    def is_good(self) -> bool:
-        """Whether it may be worn like that. Garments that were made for a body have 0.00–0.05, < 0.08 and > 0.93."""
-        return self.inside < 0.05 and self.distance < 0.16 and self.facing > 0.85
-
-    @property
-    def is_plain(self) -> bool:
-        """Whether nothing else need be tried."""
-        return self.is_good and self.facing > 0.93
-
-
-class PosedBody:
-    """A body of mean shape in some pose, and how far from it things are."""
-
-    def __init__(self, body: SmplBody, pose: F64) -> None:
-        self.body, self.pose = body, pose
-        posed = body(torch.as_tensor(pose, dtype=torch.float32)[None])
-        self.vertices = posed.vertices[0]
-        self.transforms: RigidTransforms = posed.transforms
-        self._sdf = ExactSdf(body.faces)
-        self._sdf.update(self.vertices)
-
-    def move(self, pose: F64) -> None:
-        """Takes another pose."""
-        self.pose = pose
-        posed = self.body(torch.as_tensor(pose, dtype=torch.float32)[None])
-        self.vertices, self.transforms = posed.vertices[0], posed.transforms
-        self._sdf.update(self.vertices)
-
-    def __call__(self, points: F64) -> tuple[F64, F64]:
-        """Signed distance [m], shape (P,), and its unit gradient, (P, 3)."""
-        found = self._sdf.query(torch.as_tensor(points, dtype=torch.float32))
-        return found.distance.double().numpy(), found.gradient.double().numpy()
-
-    def closest(self, points: F64) -> tuple[NDArray[np.int64], F64]:
-        """The closest face of each point (P, 3), and where in it that is, as barycentric coordinates (P, 3)."""
-        face = self._sdf.closest(torch.as_tensor(points, dtype=torch.float32)).face.long().numpy()
-        corners = self.vertices.double().numpy()[self.body.faces.numpy()[face]]
-        return face, _barycentric(points, corners)
-
-
-class Samples(NamedTuple):
-    """Points all over a mesh, as many a square metre."""
-
-    points: F64
-    """In the mesh's own unit and axes, shape (P, 3)."""
-    normals: F64
-    """Unit, shape (P, 3)."""
-    is_open: NDArray[np.bool_]
-    """Whether of a piece with a rim; a closed one is cloth with both its sides, shape (P,)."""
-    piece: NDArray[np.int64]
-    """Of which piece, shape (P,)."""
-
-
-def sample(mesh: SurfaceMesh, count: int, seed: int = 0) -> Samples:
-    """`count` points drawn by area."""
-    rng = np.random.default_rng(seed)
-    normals = face_normals(mesh.vertices, mesh.faces)
-    area = np.linalg.norm(normals, axis=1)
-    face = np.searchsorted(np.cumsum(area), (np.arange(count) + rng.random(count)) / count * area.sum())
-    face = np.minimum(face, len(area) - 1)
-    u, v = rng.random((2, count))
-    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-    a, b, c = (mesh.vertices[mesh.faces[face, k]] for k in range(3))
-    points = a + u[:, None] * (b - a) + v[:, None] * (c - a)
-    _, label = components(mesh.faces, len(mesh.vertices))
-    open_pieces = np.unique(label[_rim(mesh.faces)])
-    is_open = np.isin(label[mesh.faces[face, 0]], open_pieces)
-    unit = normals[face] / np.maximum(area[face], 1e-300)[:, None]
-    return Samples(points, unit, is_open, label[mesh.faces[face, 0]])
-
-
-def fit_of(points: F64, samples: Samples, body: PosedBody) -> Fit:
-    """How well samples that are at `points` [m] surround the body; `samples.normals` in the same axes."""
-    distance, gradient = body(points)
-    outward = (samples.normals * gradient).sum(1)
-    # An open piece faces one way or the other: what is asked is whether all of it does. One side of a closed one faces
-    # the body, the other one away from it, and little of it anything else.
-    votes = np.zeros((2, samples.piece.max() + 1))
-    np.add.at(votes[0], samples.piece[samples.is_open], outward[samples.is_open] > 0)
-    np.add.at(votes[1], samples.piece[samples.is_open], outward[samples.is_open] <= 0)
-    n_facing = votes.max(0).sum() + (np.abs(outward[~samples.is_open]) > _ACROSS).sum()
-    facing = float(n_facing / len(points))
-    depth = np.clip(0.01 - distance, 0, 0.05)
-    return Fit(float((distance < -0.01).mean()), float(depth.mean()), float(np.clip(distance, 0, 0.2).mean()), facing)
-
-
-def standing_pose(arms: float, legs: float = 0.0) -> F64:
-    """The T-pose with arms lowered and legs spread by some angles [rad], shape (24, 3)."""
-    pose = np.zeros((N_JOINTS, 3))
-    pose[_LEFT_SHOULDER, 2], pose[_RIGHT_SHOULDER, 2] = -arms, arms
-    pose[_LEFT_HIP, 2], pose[_RIGHT_HIP, 2] = legs, -legs
-    return pose
 
 
 def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator[Place]:
@@ -269,7 +150,7 @@ class _Candidate(NamedTuple):
         What nobody would do without need counts, too: to model a garment sideways, with spread legs or hanging arms.
         """
         place = self.place
-        arms, legs = place.pose[_RIGHT_SHOULDER, 2], place.pose[_LEFT_HIP, 2]
+        arms, legs = place.pose[RIGHT_SHOULDER, 2], place.pose[LEFT_HIP, 2]
         sideways = 1 - abs(place.turn[0, 0])
         without_need = 0.02 * sideways + 0.1 * abs(legs) + 0.005 * abs(arms)
         return float(place.fit.cost / (place.unit * extent) + without_need)
@@ -340,7 +221,7 @@ def _refined(start: _Candidate, samples: Samples, placing: Placing, *, moves: bo
     """The best place near one, by a simplex over pose, and place and size if wanted."""
     here = start.here
     body = PosedBody(here.body, here.pose)
-    arms = float(here.pose[_RIGHT_SHOULDER, 2])
+    arms = float(here.pose[RIGHT_SHOULDER, 2])
     turn, place = start.place.turn, start.place
     x0 = np.array([0.0, 0.0, 0.0, 0.0, arms, 0.02])
     steps = np.array([0.06 * scales, *(0.03 * moves,) * 3, 0.1, 0.06])
@@ -391,33 +272,7 @@ def _told(place: Place, kind: str) -> Place:
         notes.append("it stood with the floor at 0 and was moved to the body's feet")
     elif np.abs(place.shift).max() > 1e-3:
         notes.append("moved by ({:.0f}, {:.0f}, {:.0f}) mm".format(*(1e3 * place.shift)))
-    arms, legs = np.degrees(place.pose[_RIGHT_SHOULDER, 2]), np.degrees(place.pose[_LEFT_HIP, 2])
+    arms, legs = np.degrees(place.pose[RIGHT_SHOULDER, 2]), np.degrees(place.pose[LEFT_HIP, 2])
     if abs(arms) > 3 or legs > 3:
         notes.append(f"modelled with arms {arms:.0f}° down and legs {legs:.0f}° apart; brought into the T-pose")
     return replace(place, notes=notes)
-
-
-def rest_joints(body: SmplBody) -> F64:
-    """Joints of the mean shape in the T-pose [m], shape (24, 3)."""
-    found: F64 = body.rest_joints(torch.zeros(1, N_BETAS))[0].double().numpy()
-    return found
-
-
-def _rim(f: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Vertices of edges of one face."""
-    pairs = np.sort(np.stack((f, np.roll(f, -1, 1)), -1).reshape(-1, 2), 1)
-    edges, count = np.unique(pairs, axis=0, return_counts=True)
-    return np.unique(edges[count == 1])
-
-
-def _barycentric(points: F64, corners: F64) -> F64:
-    """Of the projections of points (P, 3) onto triangles (P, 3, 3), clipped to them; shape (P, 3)."""
-    a, b, c = corners.transpose(1, 0, 2)
-    u, v, w = b - a, c - a, points - a
-    uu, uv, vv = (u * u).sum(1), (u * v).sum(1), (v * v).sum(1)
-    wu, wv = (w * u).sum(1), (w * v).sum(1)
-    det = np.maximum(uu * vv - uv * uv, 1e-30)
-    s, t = (vv * wu - uv * wv) / det, (uu * wv - uv * wu) / det
-    found = np.clip(np.stack((1 - s - t, s, t), 1), 0, None)
-    shares: F64 = found / found.sum(1, keepdims=True)
-    return shares

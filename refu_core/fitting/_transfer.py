@@ -21,14 +21,13 @@ from scipy.sparse import coo_array, csc_array, diags_array
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
-from refu_core.fitting._clean import components, face_normals
-from refu_core.fitting._place import _rim
+from refu_core.fitting._clean import components, face_normals, rim_of
 from refu_core.mesh import vertex_normals
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from refu_core.fitting._place import PosedBody
+    from refu_core.fitting._posed import PosedBody
 
     F64 = NDArray[np.float64]
 
@@ -72,7 +71,7 @@ class Transfer:
         normals = vertex_normals(vertices, faces.astype(np.int32))
         agrees = (normals * gradient).sum(1)
         n_pieces, label = components(faces, len(vertices))
-        rim = _rim(faces)
+        rim = rim_of(faces)
         is_open = np.isin(np.arange(n_pieces), label[rim])
         # A closed piece is cloth with a thickness: its inner side faces the skin and follows it no less.
         agrees = np.where(is_open[label], agrees, np.abs(agrees))
