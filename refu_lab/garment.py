@@ -29,6 +29,8 @@ from refu_lab.render import Camera, RenderMesh, render, save_png
 from refu_lab.tables import format_table
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
 _TILE = (260, 400)
@@ -168,7 +170,7 @@ def try_on(made: FittedGarment) -> dict[str, dict[str, Any]]:
     return found
 
 
-def picture(garments: list[str], *, size: tuple[int, int] = _TILE, samples: int = 4) -> NDArray[np.uint8]:
+def picture(garments: Sequence[str], *, size: tuple[int, int] = _TILE, samples: int = 4) -> NDArray[np.uint8]:
     """Garments worn together, a picture a pose; sRGB, shape (height, poses width, 3). Raises `RefuError`."""
     pipeline = GarmentPipeline.load(garments)
     faces = pipeline.body.faces.numpy()

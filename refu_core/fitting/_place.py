@@ -88,6 +88,9 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
     Raises:
         GarmentError: in no unit is it as large as a garment, or it surrounds the body nowhere.
     """
+    if placing.up not in (None, *UP_AXES):
+        msg = f"no axis {placing.up!r} that is up: wanted {' or '.join(UP_AXES)}, or None to find out"
+        raise GarmentError(msg)
     samples = sample(mesh, _N_POINTS)
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     units = [placing.unit] if placing.unit else [u for u in UNITS.values() if _SIZES[0] <= u * extent <= _SIZES[1]]
