@@ -40,14 +40,15 @@ _SHAPE_LENGTH = 0.03
 """As much for what β moves [m]."""
 _DEEP, _MOST_DEEP = 0.03, 0.04
 """A garment of which such a share is so deep in the body [m], in the T-pose, was made for another body or pose."""
-_FARTHEST = 0.06
-"""No vertex has to move farther to be outside of the body [m]: a limb went through it, and out on which side?"""
+_FARTHEST, _MOST_FAR = 0.06, 0.003
+"""No more than such a share of the vertices has to move so far [m] to be outside of the body: else a limb went through
+the cloth. The few are between toes or fingers, where there is no room for it."""
 _FELT = 0.02
 """A joint is felt where it has this share at some vertex."""
 _SHOULDERS = tuple(
     JOINT_NAMES.index(name) for name in ("neck", "left_collar", "right_collar", "left_shoulder", "right_shoulder")
 )
-_ROUNDS = 40
+_ROUNDS = 20
 
 
 @dataclass(frozen=True)
@@ -233,7 +234,7 @@ def _cleared(mesh: SurfaceMesh, body: PosedBody, notes: list[str]) -> F64:
             break
         v = v + _larger(lift, 0.9 * (adjacent @ lift) / degree)
     moved = np.linalg.norm(v - start, axis=1)
-    if moved.max() > _FARTHEST:
+    if (moved > _FARTHEST).mean() > _MOST_FAR:
         near = _near(v[moved > _FARTHEST], body)
         msg = (
             f"to be outside the body {body.body.name} the garment had to move by {1e3 * moved.max():.0f} mm near the "

@@ -121,7 +121,9 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
                 chosen = other
         yield _told(chosen.place, chosen.kind)
     found.sort(key=lambda one: (not one.place.fit.is_good, one.cost(extent)))
-    tiers = [found[0]]
+    tiers = found[:1]
+    if tiers[0].place.fit.is_good and not tiers[0].is_sideways:  # gloves, ruffles: of much of it either side is outer
+        yield _told(tiers[0].place, tiers[0].kind)
     for tried in [None] if placing.unit else [None, [size / extent for size in _TRIED_SIZES]]:
         if not placing.is_placed:
             tiers += _searched(mesh, samples, bodies, turns, tried or units, placing, scales=tried is not None)
@@ -147,6 +149,11 @@ class _Candidate(NamedTuple):
     kind: str
     here: PosedBody
 
+    @property
+    def is_sideways(self) -> bool:
+        """Whether the mesh would have been modelled facing x, as nobody does."""
+        return abs(float(self.place.turn[0, 0])) < 0.5
+
     def cost(self, extent: float) -> float:
         """As a share of the garment's size, or the smallest one would always be the nearest to the skin.
 
@@ -154,8 +161,7 @@ class _Candidate(NamedTuple):
         """
         place = self.place
         arms, legs = place.pose[RIGHT_SHOULDER, 2], place.pose[LEFT_HIP, 2]
-        sideways = 1 - abs(place.turn[0, 0])
-        without_need = 0.02 * sideways + 0.1 * abs(legs) + 0.005 * abs(arms)
+        without_need = 0.02 * self.is_sideways + 0.1 * abs(legs) + 0.005 * abs(arms)
         return float(place.fit.cost / (place.unit * extent) + without_need)
 
 
