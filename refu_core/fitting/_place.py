@@ -34,10 +34,14 @@ _ARMS = (0.0, 0.35, 0.6, 0.85, 1.1)
 _N_POINTS = 400
 _TOLERANCE = 0.015
 """A mesh is taken as it is unless something else fits this much better, as a share of its size."""
+_UNIT_TOLERANCE = 0.005
+"""What had to be moved is of a known unit unless another size fits this much better, likewise."""
 _POSE_TOLERANCE = 0.002
 """It is taken to be in the T-pose unless another pose fits this much better, likewise."""
 _TRIED_SIZES = (0.25, 0.4, 0.6, 0.85, 1.2, 1.7)
 """Largest extents that a mesh of no known unit is tried with [m]."""
+_NOTHING = 0.01
+"""A mesh that fits like a glove has less than this share of it inside the body, and is less than 6 cm off on average."""
 _N_REFINED = 3
 
 
@@ -122,13 +126,18 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
         yield _told(chosen.place, chosen.kind)
     found.sort(key=lambda one: (not one.place.fit.is_good, one.cost(extent)))
     tiers = found[:1]
-    if tiers[0].place.fit.is_good and not tiers[0].is_sideways:  # gloves, ruffles: of much of it either side is outer
+    first = tiers[0].place.fit
+    if (
+        first.is_good and max(first.inside, first.distance / 6) < _NOTHING and not tiers[0].is_sideways
+    ):  # of gloves much faces other fingers
         yield _told(tiers[0].place, tiers[0].kind)
     for tried in [None] if placing.unit else [None, [size / extent for size in _TRIED_SIZES]]:
         if not placing.is_placed:
             tiers += _searched(mesh, samples, bodies, turns, tried or units, placing, scales=tried is not None)
     # What was modelled by convention, or else in a known unit, unless it fits much worse.
-    ranked = sorted(range(len(tiers)), key=lambda k: tiers[k].cost(extent) + k * _TOLERANCE)
+    ranked = sorted(
+        range(len(tiers)), key=lambda k: tiers[k].cost(extent) + (k > 0) * _TOLERANCE + (k > 1) * _UNIT_TOLERANCE
+    )
     for k in ranked:
         if tiers[k].place.fit.is_good:
             yield _told(tiers[k].place, tiers[k].kind)
@@ -247,7 +256,7 @@ def _refined(start: _Candidate, samples: Samples, placing: Placing, *, moves: bo
         size, *shift, lowered, spread = full
         if placing.pose is None:
             body.move(standing_pose(float(np.clip(lowered, -0.2, 1.3)), float(np.clip(spread, 0.0, 0.35))))
-        unit = place.unit * float(np.exp(np.clip(size, -0.5, 0.5)))
+        unit = min(place.unit * float(np.exp(np.clip(size, -0.5, 0.5))), _SIZES[1] / extent)
         moved = place.shift + np.array(shift) + (place.unit - unit) * middle  # the middle stays as the size changes
         if start.kind == "floor":  # which is where the feet of this pose are
             moved[1] += float(body.vertices[:, 1].min()) - floor

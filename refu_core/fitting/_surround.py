@@ -28,14 +28,14 @@ class Fit(NamedTuple):
     depth: float
     """Mean of what it lacks of 1 cm off the skin, at most 5 cm: what is worn neither touches nor is far off."""
     distance: float
-    """Mean distance outside, at most 20 cm."""
+    """Mean distance outside, at most 60 cm."""
     facing: float
     """Share of it that faces away from the body; half of what stands beside it does not."""
 
     @property
     def cost(self) -> float:
         """Smaller is better [m]: cloth is outside, near, and faces away from the body."""
-        return 8 * self.depth + self.distance + 0.1 * (1 - self.facing)
+        return 8 * self.depth + 0.3 * self.inside + self.distance + 0.1 * (1 - self.facing)
 
     @property
     def is_good(self) -> bool:
@@ -91,4 +91,4 @@ def fit_of(points: F64, samples: Samples, body: PosedBody) -> Fit:
     n_facing = votes.max(0).sum() + (np.abs(outward[~samples.is_open]) > _ACROSS).sum()
     facing = float(n_facing / len(points))
     depth = np.clip(0.01 - distance, 0, 0.05)
-    return Fit(float((distance < -0.01).mean()), float(depth.mean()), float(np.clip(distance, 0, 0.2).mean()), facing)
+    return Fit(float((distance < -0.01).mean()), float(depth.mean()), float(np.clip(distance, 0, 0.6).mean()), facing)
