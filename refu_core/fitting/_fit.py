@@ -103,19 +103,29 @@ def fit_garment(
         msg = f"it has {len(cleaned.vertices)} vertices, at most {MAX_VERTICES} are worn: decimate the mesh"
         raise GarmentError(msg)
     fault: GarmentError | None = None
+    makeshift: tuple[SurfaceMesh, list[str]] | None = None
     for place in find_places(cleaned, body, placing or Placing()):
         try:
-            mesh, found = _put_on(cleaned, place, body, longest_edge)
+            mesh, found, moved = _put_on(cleaned, place, body, longest_edge)
         except GarmentError as error:  # a limb goes through it there: is there another place?
             fault = fault or error
             continue
-        return _bound(mesh, body, name, details, notes + found)
-    assert fault is not None
+        if moved <= _FARTHEST:
+            return _bound(mesh, body, name, details, notes + found)
+        makeshift = makeshift or (mesh, found)
+    if makeshift is not None:
+        return _bound(makeshift[0], body, name, details, notes + makeshift[1])
+    assert fault is not None  # there is a place, or `find_places` has said that there is none
     raise fault
 
 
-def _put_on(mesh: SurfaceMesh, place: Place, body: SmplBody, longest_edge: float) -> tuple[SurfaceMesh, list[str]]:
-    """The mesh on the body in the T-pose, and what was done to it. Raises `GarmentError` where it can't be there."""
+def _put_on(
+    mesh: SurfaceMesh, place: Place, body: SmplBody, longest_edge: float
+) -> tuple[SurfaceMesh, list[str], float]:
+    """The mesh on the body in the T-pose, what was done to it, and how far vertices had to move to be outside [m].
+
+    Raises `GarmentError` where it can't be there.
+    """
     notes = list(place.notes)
     n = len(mesh.vertices)
     mesh = split_long_edges(replace(mesh, vertices=place(mesh.vertices)), longest_edge)
@@ -127,7 +137,8 @@ def _put_on(mesh: SurfaceMesh, place: Place, body: SmplBody, longest_edge: float
     if place.pose.any():
         mesh = replace(mesh, vertices=_unposed(mesh, posed))
         posed = PosedBody(body, np.zeros((N_JOINTS, 3)))
-    return replace(mesh, vertices=_cleared(mesh, posed, notes)), notes
+    cleared = _cleared(mesh, posed, notes)
+    return replace(mesh, vertices=cleared), notes, float(np.linalg.norm(cleared - mesh.vertices, axis=1).max())
 
 
 def _bound(mesh: SurfaceMesh, body: SmplBody, name: str, details: GarmentDetails, notes: list[str]) -> FittedGarment:

@@ -35,14 +35,14 @@ _N_POINTS = 400
 _TOLERANCE = 0.015
 """A mesh is taken as it is unless something else fits this much better, as a share of its size."""
 _UNIT_TOLERANCE = 0.005
-"""What had to be moved is of a known unit unless another size fits this much better, likewise."""
+"""What had to be moved is of a known unit, if it fits, unless another size fits this much better, likewise."""
 _POSE_TOLERANCE = 0.002
 """It is taken to be in the T-pose unless another pose fits this much better, likewise."""
 _TRIED_SIZES = (0.25, 0.4, 0.6, 0.85, 1.2, 1.7)
 """Largest extents that a mesh of no known unit is tried with [m]."""
 _NOTHING = 0.01
-"""A mesh that fits like a glove has less than this share of it inside the body, and is less than 6 cm off on average."""
-_N_REFINED = 3
+"""What fits has less than this share of it inside the body; like a glove, if it is less than 6 cm off, too."""
+_N_REFINED = 2
 
 
 @dataclass(frozen=True)
@@ -135,9 +135,11 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
         if not placing.is_placed:
             tiers += _searched(mesh, samples, bodies, turns, tried or units, placing, scales=tried is not None)
     # What was modelled by convention, or else in a known unit, unless it fits much worse.
-    ranked = sorted(
-        range(len(tiers)), key=lambda k: tiers[k].cost(extent) + (k > 0) * _TOLERANCE + (k > 1) * _UNIT_TOLERANCE
-    )
+    handicap = [
+        (k > 0) * _TOLERANCE + (k > 1 or one.place.fit.inside > _NOTHING) * _UNIT_TOLERANCE
+        for k, one in enumerate(tiers)
+    ]
+    ranked = sorted(range(len(tiers)), key=lambda k: tiers[k].cost(extent) + handicap[k])
     for k in ranked:
         if tiers[k].place.fit.is_good:
             yield _told(tiers[k].place, tiers[k].kind)
@@ -228,7 +230,7 @@ def _heights(vertices: F64, body: PosedBody) -> list[F64]:
     low, high = vertices.min(0), vertices.max(0)
     middle = (low + high) / 2
     found = []
-    for height in np.arange(skin[:, 1].min() - low[1], skin[:, 1].max() - high[1] + 0.02, 0.06):
+    for height in np.arange(skin[:, 1].min() - low[1], skin[:, 1].max() - high[1] + 0.02, 0.08):
         near = np.abs(skin[:, 1] - (middle[1] + height)) < max(0.05, (high[1] - low[1]) / 4)
         front, back = (skin[near, 2].max(), skin[near, 2].min()) if near.any() else (0.0, 0.0)
         found.append(np.array([-middle[0], height, (front + back) / 2 - middle[2]]))
