@@ -3,11 +3,25 @@
 from __future__ import annotations
 
 from enum import Enum
+from pathlib import Path
 from typing import TypeVar
 
 from refu_core.errors import RefuError
 
-BUILTIN_GARMENTS: tuple[str, ...] = ("shirt-male", "tshirt-male", "short-pant-male", "skirt-female")
+GARMENT_FILE = "garment_{}.npz"
+"""How a garment's file is called in a folder of them."""
+PAPER_GARMENTS: tuple[str, ...] = ("shirt-male", "tshirt-male", "short-pant-male", "skirt-female")
+"""The garments of the paper's tables; trained weights of these ship."""
+BUILTIN_GARMENTS: tuple[str, ...] = (
+    *PAPER_GARMENTS,
+    *sorted(
+        {
+            path.stem.removeprefix("garment_")
+            for path in (Path(__file__).parent / "assets").glob(GARMENT_FILE.format("*"))
+        }
+        - set(PAPER_GARMENTS)
+    ),
+)
 """Garments that ship."""
 DEFAULT_GARMENTS: tuple[str, ...] = ("tshirt-male", "short-pant-male")
 """What a person wears of whom nothing else is said."""
@@ -52,6 +66,8 @@ class SdfMode(Choice):
 class BackboneName(Choice):
     """What predicts a garment."""
 
+    AUTO = "auto"
+    """`tailornet` for a garment whose weights of it ship, `skinned` for one that has none yet."""
     SKINNED = "skinned"
     """No network: the template follows the skin."""
     TAILORNET = "tailornet"

@@ -23,7 +23,13 @@ _TILE = (128, 160)
 
 
 def contact_sheet(
-    dataset: GarmentDataset, *, count: int = 24, columns: int = 6, seed: int = 0, body: str | Path | None = None
+    dataset: GarmentDataset,
+    *,
+    count: int = 24,
+    columns: int = 6,
+    seed: int = 0,
+    body: str | Path | None = None,
+    garment: str | Path | None = None,
 ) -> NDArray[np.uint8]:
     """Draws random samples of a set side by side, each from the front and from behind.
 
@@ -33,6 +39,7 @@ def contact_sheet(
         columns: samples in a row.
         seed: of their choice.
         body: name or file of the body that the set was made for; None for the one that the garment was cut for.
+        garment: name or file of the set's garment; None for the one that has the name which the set says.
 
     Returns:
         sRGB, shape (height, width, 3).
@@ -43,8 +50,8 @@ def contact_sheet(
     if not len(dataset) or count < 1 or columns < 1:
         msg = f"wanted a sample, a count and columns of 1 at least, got {len(dataset)}, {count} and {columns}"
         raise SimulationError(msg)
-    garment = load_garment(dataset.card["garment"])
-    model = load_body(garment.body if body is None else body)
+    template = load_garment(dataset.card["garment"] if garment is None else garment)
+    model = load_body(template.body if body is None else body)
     if model.fingerprint != dataset.card["body_fingerprint"]:
         msg = f"the set was made for the body {dataset.card['body']!r}, got {model.name!r}: name its file as `body`"
         raise SimulationError(msg)
@@ -59,7 +66,7 @@ def contact_sheet(
         (posed,) = colliders(model, collider, sample.pose[None], sample.betas)
         meshes = [
             RenderMesh(posed, model.faces),
-            RenderMesh(sample.vertices, garment.faces, colour=_CLOTH[sample.pair % len(_CLOTH)]),
+            RenderMesh(sample.vertices, template.faces, colour=_CLOTH[sample.pair % len(_CLOTH)]),
         ]
         top, left = k // columns * height, k % columns * 2 * width
         for side, yaw in enumerate((20.0, 200.0)):

@@ -9,7 +9,7 @@ from typing import Any
 
 from refu_core import BodyError, MeshError, __version__
 from refu_core.body import BUILTIN_BODIES, POOR_FIT, load_body, load_fit
-from refu_core.garments import BUILTIN_GARMENTS, load_garment
+from refu_core.garments import garment_files, load_garment
 from refu_core.mesh import Connectivity
 from refu_core.modes import BackboneName, SdfMode
 from refu_lab.bodies import fit_facts
@@ -56,7 +56,7 @@ def collect() -> dict[str, Any]:
         [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())] if torch.cuda.is_available() else []
     )
     bodies = (load_body(name) for name in BUILTIN_BODIES)
-    garments = (load_garment(name) for name in BUILTIN_GARMENTS)
+    garments = (load_garment(name) for name in garment_files())
     return {
         "refu": __version__,
         "python": platform.python_version(),

@@ -19,7 +19,7 @@ import msg_adapters as adapters
 from refu_core import GarmentPipeline, SmplFrame
 from refu_core._device import one_thread
 from refu_core.metrics import CollisionChecker, Figures, GarmentMetrics
-from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN, BetasSource
+from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN, BackboneName, BetasSource
 from refu_core.recordings import axis_of, upright_share
 from refu_lab.bodies import betas_warnings, body_facts, body_warnings
 from refu_lab.sources import Source, open_source
@@ -46,7 +46,7 @@ class ReplayOptions:
     betas_from: str | None = None
     betas_source: str = BetasSource.MESSAGE
     output: Path | None = None
-    backbone: str = "tailornet"
+    backbone: str = BackboneName.AUTO
     sdf: str = "hybrid"
     weights: Path | None = None
     margin: float = DEFAULT_MARGIN
@@ -169,7 +169,7 @@ class ReplayResult:
             "input": str(self.options.input),
             "source": self.source,
             "output": None if self.options.output is None else str(self.options.output),
-            "backbone": self.options.backbone,
+            "backbone": str(self.options.backbone),
             "sdf": self.options.sdf,
             "margin_m": self.options.margin,
             "device": self.options.device,
@@ -316,6 +316,8 @@ def replay(options: ReplayOptions, *, pipeline: GarmentPipeline | None = None, p
         source = stack.enter_context(open_source(options, pipeline.body))
         result = ReplayResult(options, source.description, body=body_facts(pipeline))
         result.warnings += body_warnings(pipeline, gender=source.gender)
+        if options.backbone == BackboneName.AUTO:
+            result.warnings += [f"{name} has no trained weights: worn by skinning" for name in pipeline.untrained]
         replayer = _Replayer(options, pipeline, source, result)
         writer = replayer.open_writer()
         if writer is not None:

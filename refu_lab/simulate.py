@@ -64,7 +64,7 @@ def simulate(
             return simulate_sequences(garment, count, output, shapes=shapes, seconds=seconds, **options)
         card = simulate_dataset(garment, count, output, **options)
     if not card["counts"]["to_do"]:
-        save_png(contact_sheet(GarmentDataset(output), body=body), output / SHEET)
+        save_png(contact_sheet(GarmentDataset(output), body=body, garment=garment), output / SHEET)
     return card
 
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from refu_core import GarmentError, RefuError, load_garment
+from refu_core import RefuError, load_garment
 from refu_core._device import checked_device
 from refu_core.backbones import PRESETS
 from refu_core.body import load_fit
-from refu_core.garments import BUILTIN_GARMENTS, worn_on
+from refu_core.garments import worn_on
 from refu_core.modes import MAX_MARGIN
 from refu_core.sdf import SDF_PRESETS
 from refu_core.simulation import GarmentDataset, open_dataset
@@ -57,7 +57,7 @@ class TrainOptions:
     @property
     def folder(self) -> Path:
         """Where the weights are written."""
-        return Path("weights") / self.garment if self.output is None else self.output
+        return Path("weights") / load_garment(self.garment).name if self.output is None else self.output
 
 
 def train(options: TrainOptions, *, progress: bool) -> dict[str, Any]:
@@ -95,9 +95,6 @@ def _check(options: TrainOptions) -> None:
     if options.margin is not None and not 0 <= options.margin <= MAX_MARGIN:
         msg = f"the margin must be between 0 and {MAX_MARGIN} m, got {options.margin}"
         raise RefuError(msg)
-    if options.garment not in BUILTIN_GARMENTS:
-        msg = f"no garment {options.garment!r}: wanted one of {', '.join(BUILTIN_GARMENTS)}"
-        raise GarmentError(msg)
     for name, value, choices in (
         ("network", options.network, NETWORKS),
         ("mode", options.mode, TRAIN_MODES),

@@ -71,11 +71,15 @@ class PipelineKey:
     def check(self) -> None:
         """Raises `RefuError` for what can't be loaded, as far as that shows without loading it."""
         checked_device(self.device)
-        for name in self.garments if self.backbone != "skinned" else ():
-            folder = weights_folder(name, self.weights or None)
-            path = folder / f"{self.backbone}-{self.sdf}.safetensors"
+        is_auto = self.backbone == BackboneName.AUTO
+        for name in self.garments if self.backbone != BackboneName.SKINNED else ():
+            folder = weights_folder(_template(name).name, self.weights or None)
+            if is_auto and not self.weights and not folder.exists():
+                continue  # it is worn by skinning
+            backbone = BackboneName.TAILORNET if is_auto else self.backbone
+            path = folder / f"{backbone}-{self.sdf}.safetensors"
             if not path.is_file():
-                msg = f"no weights of {self.backbone} {self.sdf} for {name}: {path} is missing; train them (refu train)"
+                msg = f"no weights of {backbone} {self.sdf} for {name}: {path} is missing; train them (refu train)"
                 raise SettingsError(msg)
 
     def load(self) -> GarmentPipeline:
@@ -101,7 +105,7 @@ class NodeSettings:
     body: str = _parameter("", "Who wears them: an SMPL file, or a built-in name; empty for the garments' own.")
     betas_from: str = _parameter("", "An SMPL file whose betas arrive: the built-in mesh follows them; empty for none.")
     backbone: str = _parameter(
-        "tailornet", "What predicts the garment before collisions are handled.", choices=tuple(BackboneName)
+        "auto", "What predicts the garment before collisions are handled.", choices=tuple(BackboneName)
     )
     weights: str = _parameter(
         "", "Folder with a folder a garment of weights of one's own (refu train); empty for those that ship."

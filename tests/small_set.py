@@ -40,7 +40,7 @@ def write_set(
     pose = rng.normal(0, spread, (n, 24, 3)).astype("<f4")
     with torch.no_grad():
         b, p = torch.as_tensor(betas), torch.as_tensor(pose)
-        unposed = garment.rest(b, torch.as_tensor(style))
+        unposed = garment.rest(b, garment.own(torch.as_tensor(style)))
         if displacement is not None:
             unposed = unposed + displacement(p)
         posed = garment.pose(unposed, body(p, b).transforms).numpy()

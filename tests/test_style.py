@@ -26,7 +26,7 @@ CORE = (
     {"body"},
     {"garments"},
     {"backbones", "sdf"},
-    {"refu"},
+    {"refu", "fitting"},
     {"contact"},
     {"realtime"},
     {"metrics"},

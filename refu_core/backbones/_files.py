@@ -125,8 +125,8 @@ def load_backbone(
     """The trained backbone `name` of a garment.
 
     Args:
-        name: `skinned`, `tailornet`, `mlp` or `gcnn`.
-        garment: name of a built-in garment, or a template.
+        name: `skinned`, `tailornet`, `mlp`, `gcnn`, or `auto`: `tailornet` where it ships, else `skinned`.
+        garment: name of a garment, or a template.
         mode: what it was trained with: `none`, `approx`, `accurate` or `hybrid`.
         body_fingerprint: `SmplBody.fingerprint` of the body that wears it; weights for another body are refused.
         folder: where its files lie; the shipped weights if not given.
@@ -146,16 +146,21 @@ def load_backbone(
 def backbone_weights(
     name: str, garment: str, *, mode: str, body_fingerprint: str | None = None, folder: Path | None = None
 ) -> Weights | None:
-    """What `load_backbone` makes its backbone of; None for `skinned`, which needs none. Raises as it does."""
+    """What `load_backbone` makes its backbone of, None for `skinned`, and `auto` where none ship. Raises as it does."""
     kind = BackboneName.of(name, "backbone", error=WeightsError)
     mode = SdfMode.of(mode, "mode of a backbone", error=WeightsError)
     if kind is BackboneName.SKINNED:
         return None
+    shipped = weights_folder(garment)
+    folder = shipped if folder is None else folder
+    if kind is BackboneName.AUTO:
+        if folder == shipped and not shipped.exists():  # weights that were named have to be there
+            return None
+        kind = BackboneName.TAILORNET
     expect = {"garment": garment}
     if body_fingerprint is not None:
         expect["body_fingerprint"] = body_fingerprint
-    folder = weights_folder(garment) if folder is None else folder
-    return load_weights(folder / f"{name}-{mode}", expect=expect)
+    return load_weights(folder / f"{kind}-{mode}", expect=expect)
 
 
 def _tensor(weights: Weights, name: str) -> Tensor:

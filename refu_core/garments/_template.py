@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from refu_core.body import RigidTransforms, Skinning, blend_transforms, unapply_transforms
@@ -21,6 +22,16 @@ _TENSOR = "a torch.Tensor, such as torch.as_tensor(array) gives"
 def inner_first(garments: Mapping[str, GarmentTemplate]) -> list[str]:
     """Names of garments worn together, from the skin outwards (`GarmentCard.layer`)."""
     return sorted(garments, key=lambda name: garments[name].card.layer)
+
+
+@dataclass(frozen=True, eq=False)
+class UvMap:
+    """Texture coordinates, which have seams where the mesh has none."""
+
+    coordinates: NDArray[np.float32]
+    """Shape (T, 2)."""
+    faces: NDArray[np.int64]
+    """Which of them each corner of each face has, shape (F, 3)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +58,8 @@ class GarmentTemplate:
     """Displacement a unit of each beta [m], shape (V * 3, 10)."""
     styledirs: Tensor | None
     """Displacement a unit of each style component γ [m], shape (V * 3, 4); None for a garment of one style."""
+    uv: UvMap | None = None
+    """Texture coordinates; None for a garment without."""
 
     @property
     def n_vertices(self) -> int:
@@ -89,6 +102,10 @@ class GarmentTemplate:
                 raise GarmentError(msg)
             offset = offset + style @ self.styledirs.T
         return self.v_template + offset.view(len(offset), self.n_vertices, 3)
+
+    def own(self, style: Tensor | None) -> Tensor | None:
+        """The style γ as it is; None for a garment of one style, whose samples have a γ all the same."""
+        return None if self.styledirs is None else style
 
     def vertex_transforms(self, transforms: RigidTransforms) -> RigidTransforms:
         """The body's transforms (leading shape (B, 24)) blended at the garment's vertices (leading shape (B, V))."""

@@ -16,11 +16,12 @@ import torch
 from torch import Tensor
 
 from refu_core._device import checked_device
+from refu_core.backbones import Skinned
 from refu_core.body import BodyFit, SmplBody
 from refu_core.errors import FrameError, GarmentError, RefuError, require_type
 from refu_core.frames import SmplFrame
 from refu_core.garments import N_STYLES, GarmentTemplate
-from refu_core.modes import MAX_MARGIN, SdfMode
+from refu_core.modes import MAX_MARGIN, BackboneName, SdfMode
 from refu_core.realtime._contact import ContactStage
 from refu_core.realtime._frame import FrameStep, StageClock
 from refu_core.realtime._graph import StepGraphs
@@ -124,7 +125,7 @@ class GarmentPipeline:
         body: str | PathLike[str] | SmplBody | None = None,
         betas_from: str | PathLike[str] | SmplBody | None = None,
         sdf: str = "hybrid",
-        backbone: str = "tailornet",
+        backbone: str = BackboneName.AUTO,
         style: ArrayLike | None = None,
         margin: float | None = None,
         weights: str | PathLike[str] | None = None,
@@ -144,7 +145,8 @@ class GarmentPipeline:
             betas_from: the path of an SMPL file whose betas frames have, in place of `body`: the built-in mesh follows
                 them, and the file's own mesh isn't used.
             sdf: `hybrid`, `approx`, `accurate` or `none`.
-            backbone: `tailornet`, `mlp`, `gcnn`, or `skinned`, which needs no weights.
+            backbone: `tailornet`, `mlp`, `gcnn`, or `skinned`, which needs no weights; by default (`auto`) `tailornet`
+                for garments whose weights ship, `skinned` for others.
             style: γ of all garments, shape (4,); the mean style if not given.
             margin: clearance ε that is kept from the skin [m]; by default what the weights were trained with.
             weights: folder with a folder a garment of weights of one's own (`refu train`); those that ship by default.
@@ -194,6 +196,11 @@ class GarmentPipeline:
     def garments(self) -> dict[str, GarmentTemplate]:
         """The loaded garments by name."""
         return {name: wearable.template for name, wearable in self.outfit.wearables.items()}
+
+    @property
+    def untrained(self) -> tuple[str, ...]:
+        """Names of the garments that no network drapes: they follow the skin."""
+        return tuple(name for name, one in self.outfit.wearables.items() if isinstance(one.backbone, Skinned))
 
     @overload
     def __call__(self, frames: SmplFrame) -> PipelineOutput: ...

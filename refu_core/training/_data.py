@@ -115,7 +115,7 @@ def read_samples(
 
     def displacement(units: NDArray[np.int16], pose: Tensor, betas: Tensor, style: Tensor) -> Tensor:
         posed = torch.as_tensor(units.astype(np.float32) * float(dataset.card["quantum_m"]))
-        return garment.unpose(posed, body(pose, betas).transforms) - garment.rest(betas, style)
+        return garment.unpose(posed, body(pose, betas).transforms) - garment.rest(betas, garment.own(style))
 
     with torch.no_grad():
         found = in_chunks(displacement, vertices, column["pose"], column["betas"], column["style"])

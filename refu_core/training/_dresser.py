@@ -70,7 +70,7 @@ class Dresser(nn.Module):
         self._network.is_low, self._network.dtype = torch.is_autocast_enabled(kind), torch.get_autocast_dtype(kind)
         # Millimetres need float32, whatever precision the networks are run in.
         with torch.autocast(kind, enabled=False):
-            wearer = Wearer.of(self._outfit, betas, None if self._garment.styledirs is None else style)
+            wearer = Wearer.of(self._outfit, betas, self._garment.own(style))
             dressed = dress(pose, wearer)
             drape = dressed.drapes[name]
             vertices = drape.vertices

@@ -212,7 +212,7 @@ def finetune(
 def _tensors(samples: TrainingSamples, body: SmplBody, garment: GarmentTemplate) -> tuple[Tensor, ...]:
     """What the loop draws from: β, θ, γ and the posed true garments [m], shape (N, V, 3)."""
     posed = torch.empty_like(samples.displacement)
-    style = None if garment.styledirs is None else samples.style
+    style = garment.own(samples.style)
     with torch.no_grad():
         for start in range(0, len(samples), _CHUNK):
             chunk = slice(start, start + _CHUNK)

@@ -277,7 +277,7 @@ def low_frequency_code(
         smoothed = smooth.transposed(decoder.components)
 
     def code(betas: Tensor, style: Tensor, displacement: Tensor) -> Tensor:
-        rest = garment.rest(betas, style)
+        rest = garment.rest(betas, garment.own(style))
         whole = rest + displacement
         if isinstance(decoder, BasisDecoder):
             return whole.flatten(1) @ smoothed.T - (rest.flatten(1) + decoder.mean) @ decoder.components.T

@@ -9,7 +9,7 @@ import torch
 
 from refu_core import GarmentPipeline, GarmentTemplate, RefuError, SmplBody, load_garment
 from refu_core.body import load_fit
-from refu_core.garments import BUILTIN_GARMENTS, worn_on
+from refu_core.garments import PAPER_GARMENTS, worn_on
 
 OUTPUT = Path("docs/results")
 BAGS = Path("bags")
@@ -38,9 +38,9 @@ class BenchmarkOptions:
 
     def __post_init__(self) -> None:
         """Raises `RefuError` for options of which nothing can be measured."""
-        unknown = [name for name in self.garments or () if name not in BUILTIN_GARMENTS]
+        unknown = [name for name in self.garments or () if name not in PAPER_GARMENTS]
         if unknown:
-            msg = f"no garment {unknown[0]!r}: wanted some of {', '.join(BUILTIN_GARMENTS)}"
+            msg = f"no garment {unknown[0]!r}: wanted some of {', '.join(PAPER_GARMENTS)}"
             raise RefuError(msg)
         if self.device not in (None, "cpu", "cuda"):
             msg = f"no device {self.device!r}: wanted cpu or cuda"
@@ -57,7 +57,7 @@ class BenchmarkOptions:
         """The garments that are measured, the main one first."""
         if self.garments is not None:
             return self.garments
-        others = () if self.quick else tuple(name for name in BUILTIN_GARMENTS if name != MAIN_GARMENT)
+        others = () if self.quick else tuple(name for name in PAPER_GARMENTS if name != MAIN_GARMENT)
         return (MAIN_GARMENT, *others)
 
     @property

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from refu_core.keypoints import LAYOUTS
-from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN
+from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN, BackboneName
 from refu_lab.commands._common import (
     EXIT_INTERRUPTED,
     add_axes,
@@ -51,10 +51,13 @@ def add(commands: Any) -> None:
         type=names,
         default=DEFAULT_GARMENTS,
         metavar="A,B",
-        help=f"garments of one body (default: {','.join(DEFAULT_GARMENTS)})",
+        help=f"garments of one body, by name or .npz (default: {','.join(DEFAULT_GARMENTS)})",
     )
     parser.add_argument(
-        "--backbone", default="tailornet", metavar="NAME", help="tailornet (default), mlp, gcnn, or skinned: no network"
+        "--backbone",
+        default=BackboneName.AUTO,
+        metavar="NAME",
+        help="tailornet, mlp, gcnn, or skinned: no network; auto (default): tailornet where its weights ship",
     )
     parser.add_argument(
         "--sdf", default="hybrid", metavar="MODE", help="hybrid (default), approx, accurate, or none for no ReFU"

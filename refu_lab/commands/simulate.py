@@ -30,7 +30,7 @@ def add(commands: Any) -> None:
         description="Simulate collision-free garments on bodies of many poses, shapes and styles. An interrupted run "
         "goes on when the same command is given again.",
     )
-    parser.add_argument("garment", metavar="GARMENT", help="tshirt-male or another built-in garment")
+    parser.add_argument("garment", metavar="GARMENT", help="a garment's name (refu garment list), or its .npz")
     parser.add_argument(
         "--count", type=positive, required=True, metavar="N", help="samples (or sequences), training and test together"
     )

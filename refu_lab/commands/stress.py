@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from refu_core.modes import BUILTIN_GARMENTS
+from refu_core.modes import PAPER_GARMENTS
 from refu_lab.commands._common import (
     EXIT_CHECK_FAILED,
     add_collider,
@@ -43,7 +43,7 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--garments",
         type=names,
-        default=BUILTIN_GARMENTS,
+        default=PAPER_GARMENTS,
         metavar="A,B",
         help="garments of any body (default: all four)",
     )

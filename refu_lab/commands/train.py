@@ -29,7 +29,7 @@ def add(commands: Any) -> None:
         description="Train a backbone on a data set of refu simulate, alone or together with ReFU. An interrupted run "
         "goes on when the same command is given again; torchrun shares it among GPUs.",
     )
-    parser.add_argument("garment", metavar="GARMENT", help="tshirt-male or another built-in garment")
+    parser.add_argument("garment", metavar="GARMENT", help="a garment's name (refu garment list), or its .npz")
     parser.add_argument("--data", type=in_path, required=True, metavar="DIR", help="the garment's data set")
     parser.add_argument(
         "--mode",

@@ -15,7 +15,7 @@ import numpy as np
 from tqdm import tqdm
 
 from refu_core._device import one_thread
-from refu_core.garments import BUILTIN_GARMENTS, load_garment
+from refu_core.garments import PAPER_GARMENTS, load_garment
 from refu_core.weights import weights_folder
 from refu_lab.stress._checks import CHECKS, PARTS
 from refu_lab.stress._soak import SoakResult, soak
@@ -33,7 +33,7 @@ class StressOptions:
     """What to try; the fields are options of `refu stress`."""
 
     parts: tuple[str, ...] = PARTS
-    garments: tuple[str, ...] = BUILTIN_GARMENTS
+    garments: tuple[str, ...] = PAPER_GARMENTS
     backbone: str | None = None
     sdf: str | None = None
     weights: Path | None = None

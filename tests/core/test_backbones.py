@@ -45,7 +45,7 @@ from refu_core.backbones._graph import MeshGraph
 from refu_core.backbones._perceptron import StackedPerceptrons
 from refu_core.body import rotvec_to_rotmat
 from refu_core.errors import RefuError
-from refu_core.garments import BUILTIN_GARMENTS, GarmentTemplate
+from refu_core.garments import PAPER_GARMENTS, GarmentTemplate
 from refu_core.modes import BackboneName
 from refu_core.weights import load_weights
 
@@ -236,7 +236,7 @@ def test_tilt_is_the_root_without_its_heading() -> None:
 
 
 @pytest.mark.parametrize("encoding", ["matrix", "rotvec"])
-@pytest.mark.parametrize("name", sorted(BUILTIN_GARMENTS))
+@pytest.mark.parametrize("name", sorted(PAPER_GARMENTS))
 def test_only_the_garments_joints_are_seen(name: str, encoding: str) -> None:
     features = PoseFeatures(load_garment(name).card.joints, encoding)
     _, pose, _ = bodies(1)
@@ -482,7 +482,7 @@ def test_unknown_names_are_refused(garment: GarmentTemplate) -> None:
         backbone_config("mlp", garment, preset="tiny")
     with pytest.raises(WeightsError, match="needs pivots"):
         build_backbone(backbone_config("tailornet", garment), garment)
-    assert set(TRAINABLE) | {"skinned"} == set(BackboneName)
+    assert set(TRAINABLE) | {"skinned", "auto"} == set(BackboneName)
 
 
 def _rotvec(rotation: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from refu_core.body import load_body
 from refu_core.errors import MeshError
-from refu_core.garments import BUILTIN_GARMENTS, load_garment
+from refu_core.garments import PAPER_GARMENTS, load_garment
 from refu_core.mesh import Adjacency, Connectivity
 from refu_core.metrics._self_contact import SelfContactDetector
 from refu_core.sdf import ExactSdf
@@ -57,7 +57,7 @@ def smooth_noise(garment_edges: Tensor, n: int, size: float, generator: torch.Ge
     return noise * (size / noise.norm(dim=1).square().mean().sqrt())
 
 
-@pytest.mark.parametrize("name", BUILTIN_GARMENTS)
+@pytest.mark.parametrize("name", PAPER_GARMENTS)
 def test_clipped_is_exact_and_sees_all_that_is_inside(name: str, motions: list[Path]) -> None:
     """Frames of every motion in a row: each is a jump from the last one."""
     garment = load_garment(name)

@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from refu_core.errors import WeightsError
-from refu_core.garments import BUILTIN_GARMENTS
+from refu_core.garments import PAPER_GARMENTS
 from refu_core.weights import load_weights, save_weights, weights_folder
 
 TENSORS = {"low.0.weight": torch.arange(6.0).view(2, 3), "basis": torch.randn(4, 5).half(), "mask": torch.tensor([1])}
@@ -173,7 +173,7 @@ def test_what_is_no_difference_is_refused(
         load_weights(tmp_path / "other")
 
 
-@pytest.mark.parametrize("garment", BUILTIN_GARMENTS)
+@pytest.mark.parametrize("garment", PAPER_GARMENTS)
 def test_what_ships_shares_the_defaults_backbone_where_it_can(garment: str) -> None:
     """Fine-tuning brings T-shirt, shirt and skirt to the same backbone by either distance, the shorts it doesn't."""
     folder = weights_folder(garment)

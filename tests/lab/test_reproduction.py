@@ -21,7 +21,7 @@ from refu_core import GarmentPipeline
 from refu_core.backbones import Prediction, WithoutWearerCode
 from refu_core.body import Collider, load_body
 from refu_core.errors import RefuError, WeightsError
-from refu_core.garments import BUILTIN_GARMENTS, GarmentTemplate, load_garment
+from refu_core.garments import PAPER_GARMENTS, GarmentTemplate, load_garment
 from refu_core.modes import DEFAULT_GARMENTS
 from refu_core.realtime import Wearable
 from refu_core.refu import SCALE_PRESETS, Refu
@@ -379,7 +379,7 @@ def motion_table(walk: Motion) -> rp.ResultTable:
 def test_motion_table_weighs_clips_by_their_frames(motion_table: rp.ResultTable) -> None:
     assert not motion_table.missing  # the weights of what it shows ship
     groups = list(dict.fromkeys(row.garment for row in motion_table.rows))
-    names = (*BUILTIN_GARMENTS, "male body", "female body")
+    names = (*PAPER_GARMENTS, "male body", "female body")
     assert set(groups) == {f"{name}, {clip}" for name in names for clip in ("all clips", "long", "short")}
     for method in ("node-hybrid", "node-accurate"):
         for metric, of in (("vfcp_percent", np.average), ("self_crossings", np.average), ("jump_max_mm", None)):

@@ -1,0 +1,272 @@
+"""Makes one orientable manifold surface of a file's triangles, or says why there is none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import breadth_first_order, connected_components
+from scipy.spatial import cKDTree
+
+from refu_core.errors import GarmentError
+from refu_core.fitting._mesh_file import SurfaceMesh
+from refu_core.garments import UvMap
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Ints = NDArray[np.int64]
+
+_SAME_PLACE = 1e-5
+"""Vertices nearer than this are one, as a share of the mesh's extent: 10 µm of a dress."""
+MAX_VERTICES = 60_000
+"""Of a garment that is worn: at 10 mm a frame has a tenth of that many."""
+
+
+def clean(mesh: SurfaceMesh) -> tuple[SurfaceMesh, list[str]]:
+    """The mesh welded, without double faces, manifold and consistently oriented, and what was done to it.
+
+    Vertices that no face uses are left out. Seams along which UVs cut a mesh open are closed; its UVs stay as they are.
+    Where more than two faces meet at an edge, the two that continue each other stay together.
+
+    Raises:
+        GarmentError: no surface is left, or it has one side only (a Möbius strip).
+    """
+    notes: list[str] = []
+    mesh = _without_double_faces(mesh, notes)
+    if not len(mesh.faces):
+        msg = "the mesh has no faces that enclose an area"
+        raise GarmentError(msg)
+    mesh = _welded(mesh, notes)
+    partner, n_crowded = _partners(mesh)
+    mesh = turned_over(mesh, _oriented(mesh.faces, partner, notes))
+    partner, _ = _partners(mesh)
+    mesh = _cut_apart(mesh, partner)
+    if n_crowded:
+        notes.append(
+            f"{n_crowded} edges had more than two faces and were cut open; simulated cloth would come apart there"
+        )
+    return mesh, notes
+
+
+def components(faces: Ints, n: int) -> tuple[int, Ints]:
+    """The number of pieces, and the piece of each of the n vertices."""
+    pairs = np.concatenate((faces[:, :2], faces[:, 1:]))
+    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+    count, label = connected_components(graph, directed=False)
+    return count, label.astype(np.int64)
+
+
+def face_normals(v: NDArray[np.float64], f: Ints) -> NDArray[np.float64]:
+    """Normals of faces, twice their area long, shape (F, 3)."""
+    found: NDArray[np.float64] = np.cross(v[f[:, 1]] - v[f[:, 0]], v[f[:, 2]] - v[f[:, 0]])
+    return found
+
+
+def rim_of(f: Ints) -> Ints:
+    """Vertices of edges of one face."""
+    pairs = np.sort(np.stack((f, np.roll(f, -1, 1)), -1).reshape(-1, 2), 1)
+    edges, count = np.unique(pairs, axis=0, return_counts=True)
+    return np.unique(edges[count == 1])
+
+
+def split_long_edges(mesh: SurfaceMesh, longest: float) -> SurfaceMesh:
+    """The same surface with edges of at most `longest`: long ones are halved until none is left."""
+    while True:
+        v, f = mesh.vertices, mesh.faces
+        edges, of_corner = _edges(f)
+        long = np.linalg.norm(v[edges[:, 0]] - v[edges[:, 1]], axis=1) > longest
+        if not long.any():
+            return mesh
+        uv = mesh.uv
+        new_v = np.concatenate((v, v[edges[long]].mean(1)))
+        if len(new_v) > MAX_VERTICES:
+            msg = f"with edges of at most {1e3 * longest:.0f} mm the garment has more than {MAX_VERTICES} vertices; "
+            msg += "is it larger than a garment? (--unit), or allow longer edges (--longest-edge)"
+            raise GarmentError(msg)
+        middle = np.where(long, len(v) + np.cumsum(long) - 1, -1)
+        faces = _split(f, middle[of_corner])
+        if uv is not None:
+            uv_edges, uv_of_corner = _edges(uv.faces)
+            is_long = np.zeros(len(uv_edges), bool)
+            is_long[uv_of_corner[long[of_corner]]] = True
+            uv_middle = np.where(is_long, len(uv.coordinates) + np.cumsum(is_long) - 1, -1)
+            # An edge of the texture may be that of two edges of the mesh: split where the face is, and only there.
+            corners = np.where(long[of_corner], uv_middle[uv_of_corner], -1)
+            coordinates = np.concatenate((uv.coordinates, uv.coordinates[uv_edges[is_long]].mean(1)))
+            uv = UvMap(coordinates.astype(np.float32), _split(uv.faces, corners))
+        mesh = SurfaceMesh(new_v, faces, uv)
+
+
+def _split(f: Ints, middle: Ints) -> Ints:
+    """Faces (F, 3) whose edges (0, 1), (1, 2), (2, 0) have a vertex in the middle, or -1, as triangles in order."""
+    count = (middle >= 0).sum(1)
+    parts = [np.empty((0, 5), np.int64)]
+    rows = np.arange(len(f))
+
+    def add(which: NDArray[np.intp], *corners: Ints) -> None:
+        parts.append(np.stack((rows[which], np.full(len(which), len(parts)), *corners), 1))
+
+    add(np.flatnonzero(count == 0), *f[count == 0].T)
+    for k in range(3):
+        (a, b, c), (ab, bc, ca) = np.roll(f, -k, 1).T, np.roll(middle, -k, 1).T
+        one = np.flatnonzero((count == 1) & (ab >= 0))
+        add(one, a[one], ab[one], c[one])
+        add(one, ab[one], b[one], c[one])
+        two = np.flatnonzero((count == 2) & (ca < 0))
+        add(two, ab[two], b[two], bc[two])
+        add(two, a[two], ab[two], bc[two])
+        add(two, a[two], bc[two], c[two])
+    (a, b, c), (ab, bc, ca) = f.T, middle.T
+    three = np.flatnonzero(count == 3)
+    for corners in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)):
+        add(three, *(corner[three] for corner in corners))
+    found = np.concatenate(parts)
+    # By face and by part: UVs, which are split apart from the mesh, come out in the same order.
+    result: Ints = found[np.lexsort((found[:, 1], found[:, 0])), 2:]
+    return result
+
+
+def _edges(f: Ints) -> tuple[Ints, Ints]:
+    """Each edge once (E, 2), and those of the corners (0, 1), (1, 2), (2, 0) of each face (F, 3)."""
+    pairs = np.sort(np.stack((f, np.roll(f, -1, 1)), -1).reshape(-1, 2), 1)
+    edges, of_corner = np.unique(pairs, axis=0, return_inverse=True)
+    return edges, of_corner.reshape(-1, 3)
+
+
+def _groups_of_place(v: NDArray[np.float64]) -> Ints:
+    """The first vertex at the same place as each, shape (V,)."""
+    extent = float(np.linalg.norm(np.ptp(v, axis=0)))
+    pairs = cKDTree(v).query_pairs(_SAME_PLACE * extent, output_type="ndarray")
+    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(v), len(v)))
+    _, label = connected_components(graph, directed=False)
+    _, first = np.unique(label, return_index=True)
+    found: Ints = first[label].astype(np.int64)
+    return found
+
+
+def _without_double_faces(mesh: SurfaceMesh, notes: list[str]) -> SurfaceMesh:
+    used, local = np.unique(mesh.faces, return_inverse=True)
+    mesh = replace(mesh, vertices=mesh.vertices[used], faces=local.reshape(-1, 3).astype(np.int64))
+    place = _groups_of_place(mesh.vertices)[mesh.faces]
+    extent = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
+    is_flat = (place == np.roll(place, 1, 1)).any(1)
+    is_flat |= np.linalg.norm(face_normals(mesh.vertices, mesh.faces), axis=1) < (1e-7 * extent) ** 2
+    _, first = np.unique(np.sort(place, 1), axis=0, return_index=True)
+    kept = np.zeros(len(place), bool)
+    kept[first] = True
+    kept &= ~is_flat
+    n_double = int((~kept & ~is_flat).sum())
+    if n_double:
+        notes.append(f"{n_double} faces were there twice and are there once")
+    if is_flat.any():
+        notes.append(f"{int(is_flat.sum())} faces without area were left out")
+    uv = None if mesh.uv is None else replace(mesh.uv, faces=mesh.uv.faces[kept])
+    return SurfaceMesh(mesh.vertices, mesh.faces[kept], uv)
+
+
+def _welded(mesh: SurfaceMesh, notes: list[str]) -> SurfaceMesh:
+    """Vertices of open edges that are at one place become one; sheets that only touch stay apart."""
+    edges, of_corner = _edges(mesh.faces)
+    n_faces = np.bincount(of_corner.ravel(), minlength=len(edges))
+    on_rim = np.unique(edges[n_faces == 1])
+    target = np.arange(len(mesh.vertices))
+    if len(on_rim):
+        # Places are found among the rim's vertices alone, by the whole mesh's extent.
+        v = np.concatenate((mesh.vertices[on_rim], mesh.vertices.min(0)[None], mesh.vertices.max(0)[None]))
+        same = _groups_of_place(v)[: len(on_rim)]
+        inside = same < len(on_rim)
+        target[on_rim[inside]] = on_rim[same[inside]]
+    n_welded = int((target != np.arange(len(target))).sum())
+    if n_welded:
+        notes.append(f"{n_welded} vertices lay on others, along seams, and were welded to them")
+    used, local = np.unique(target[mesh.faces], return_inverse=True)
+    return replace(mesh, vertices=mesh.vertices[used], faces=local.reshape(-1, 3).astype(np.int64))
+
+
+def _partners(mesh: SurfaceMesh) -> tuple[Ints, int]:
+    """Pairs of corners, 3 f + k for the edge from corner k of face f, across which faces continue; (P, 2).
+
+    And how many edges have more than two faces. Of those the two faces that fold least stay together.
+    """
+    edges, of_corner = _edges(mesh.faces)
+    order = np.argsort(of_corner.ravel(), kind="stable")
+    count = np.bincount(of_corner.ravel(), minlength=len(edges))
+    start = np.concatenate(([0], np.cumsum(count)))[:-1]
+    plain = start[count == 2]
+    pairs = [np.stack((order[plain], order[plain + 1]), 1)]
+    centre = mesh.vertices[mesh.faces].mean(1)
+    crowded = np.flatnonzero(count > 2)
+    for edge in crowded:
+        corners = order[start[edge] : start[edge] + count[edge]]
+        a, b = mesh.vertices[edges[edge]]
+        along = (b - a) / np.linalg.norm(b - a)
+        away = centre[corners // 3] - a
+        away -= (away @ along)[:, None] * along
+        away /= np.linalg.norm(away, axis=1, keepdims=True) + 1e-300
+        i, j = np.unravel_index(np.argmin(away @ away.T), (len(corners),) * 2)
+        pairs.append(np.array([[corners[i], corners[j]]]))
+    return np.concatenate(pairs), len(crowded)
+
+
+def _oriented(f: Ints, pairs: Ints, notes: list[str]) -> NDArray[np.bool_]:
+    """Which faces have to be turned over for each piece to face one way, shape (F,)."""
+    start = f.ravel()[pairs]
+    agrees = start[:, 0] != start[:, 1]  # the shared edge is run through in opposite directions
+    a, b = (pairs // 3).T
+    n = len(f)
+    graph = coo_array((np.ones(2 * len(a)), (np.r_[a, b], np.r_[b, a])), shape=(n, n)).tocsr()
+    sign_of = {}
+    for x, y, good in zip(a.tolist(), b.tolist(), agrees.tolist(), strict=True):
+        sign_of[x, y] = sign_of[y, x] = 1 if good else -1
+    sign = np.zeros(n, np.int64)
+    for seed in range(n):
+        if sign[seed]:
+            continue
+        sign[seed] = 1
+        reached, before = breadth_first_order(graph, seed, directed=True)
+        for face in reached[1:].tolist():
+            sign[face] = sign[before[face]] * sign_of[face, int(before[face])]
+        turned = int((sign[reached] < 0).sum())
+        if 2 * turned > len(reached):  # as most of them were
+            sign[reached] *= -1
+    if (sign[a] * sign[b] != np.where(agrees, 1, -1)).any():
+        msg = "the mesh has one side only: following it round (a Möbius strip), inside becomes outside; cut it open"
+        raise GarmentError(msg)
+    flipped: NDArray[np.bool_] = sign < 0
+    if flipped.any():
+        notes.append(f"{int(flipped.sum())} faces faced the other way than their neighbours and were turned over")
+    return flipped
+
+
+def turned_over(mesh: SurfaceMesh, flipped: NDArray[np.bool_]) -> SurfaceMesh:
+    """The mesh with some of its faces seen from the other side; each still begins at its first corner."""
+
+    def turned(f: Ints) -> Ints:
+        return np.where(flipped[:, None], f[:, [0, 2, 1]], f)
+
+    uv = None if mesh.uv is None else replace(mesh.uv, faces=turned(mesh.uv.faces))
+    return replace(mesh, faces=turned(mesh.faces), uv=uv)
+
+
+def _cut_apart(mesh: SurfaceMesh, pairs: Ints) -> SurfaceMesh:
+    """A vertex for each fan of faces that edges hold together."""
+    f = mesh.faces
+    n = f.size
+    following = np.arange(n).reshape(-1, 3)[:, [1, 2, 0]].ravel()
+    one, other = pairs.T
+    # Oriented alike, an edge begins in one face where it ends in the other.
+    links = np.concatenate((np.stack((one, following[other]), 1), np.stack((following[one], other), 1)))
+    graph = coo_array((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(n, n))
+    count, label = connected_components(graph, directed=False)
+    vertices = np.empty((count, 3))
+    vertices[label] = mesh.vertices[f.ravel()]
+    order = np.full(count, n, np.int64)
+    np.minimum.at(order, label, f.ravel())  # as in the file, where nothing was cut
+    rank = np.empty(count, np.int64)
+    rank[np.argsort(order, kind="stable")] = np.arange(count)
+    placed = np.empty_like(vertices)
+    placed[rank] = vertices
+    return replace(mesh, vertices=placed, faces=rank[label].reshape(-1, 3).astype(np.int64))

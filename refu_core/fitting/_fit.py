@@ -1,0 +1,277 @@
+"""From a mesh to a garment: placed, cleared of the body, bound to its joints and to its shapes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from refu_core.body import JOINT_NAMES, blend_transforms, unapply_transforms
+from refu_core.errors import GarmentError
+from refu_core.fitting._clean import MAX_VERTICES, clean, components, face_normals, split_long_edges, turned_over
+from refu_core.fitting._place import Place, Placing, find_places
+from refu_core.fitting._posed import PosedBody
+from refu_core.fitting._transfer import Transfer
+from refu_core.frames import N_BETAS, N_JOINTS
+from refu_core.garments import GarmentCard, GarmentTemplate
+from refu_core.mesh import Connectivity
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from refu_core.body import SmplBody
+    from refu_core.fitting._mesh_file import SurfaceMesh
+
+    F64 = NDArray[np.float64]
+    Ints = NDArray[np.int64]
+
+HOLDS: tuple[str, ...] = ("waist", "shoulders")
+LONGEST_EDGE = 0.02
+"""Longer edges are split [m]: between their ends the body comes through. Those of the paper's garments are shorter."""
+CLEARANCE = 0.005
+"""Least distance from the mean body in the T-pose [m]; the styles of the paper's garments keep as much."""
+
+_INFLUENCES = 6
+_SKIN_LENGTH = 0.012
+"""Skinning weights are smooth over this length at least [m]; in the paper's garments over 12 rings, 3 cm."""
+_SHAPE_LENGTH = 0.03
+"""As much for what β moves [m]."""
+_DEEP, _MOST_DEEP = 0.03, 0.04
+"""A garment of which such a share is so deep in the body [m], in the T-pose, was made for another body or pose."""
+_FARTHEST, _MOST_FAR = 0.06, 0.003
+"""No more than such a share of the vertices has to move so far [m] to be outside of the body: else a limb went through
+the cloth. The few are between toes or fingers, where there is no room for it."""
+_FELT = 0.02
+"""A joint is felt where it has this share at some vertex."""
+_SHOULDERS = tuple(
+    JOINT_NAMES.index(name) for name in ("neck", "left_collar", "right_collar", "left_shoulder", "right_shoulder")
+)
+_ROUNDS = 20
+
+
+@dataclass(frozen=True)
+class GarmentDetails:
+    """What a mesh doesn't say of a garment; None for what follows from its place on the body."""
+
+    layer: int = 1
+    color: tuple[float, float, float] = (0.55, 0.52, 0.62)
+    """sRGB, 0 to 1."""
+    held_at: str | None = None
+    """`waist` or `shoulders`."""
+    provenance: str = "a mesh of the user's"
+
+
+@dataclass(frozen=True, eq=False)
+class FittedGarment:
+    """A garment, and what was done to the mesh."""
+
+    template: GarmentTemplate
+    notes: list[str] = field(default_factory=list)
+    """What was found out about the mesh, and changed in it, a sentence each."""
+
+
+def fit_garment(
+    mesh: SurfaceMesh,
+    body: SmplBody,
+    *,
+    name: str,
+    placing: Placing | None = None,
+    details: GarmentDetails | None = None,
+    longest_edge: float = LONGEST_EDGE,
+) -> FittedGarment:
+    """Makes a garment of a mesh that was made for about this body: it can be worn at once, without networks.
+
+    Args:
+        mesh: as `read_surface` reads it.
+        body: one of the built-in bodies, on the CPU.
+        name: what the garment shall be called.
+        placing: what is known of the mesh's unit, axes, place and pose; by default all of it is found out.
+        details: what is known of the garment besides.
+        longest_edge: longer edges are split [m].
+
+    Raises:
+        GarmentError: the mesh can't be worn; the message says why, and what to do.
+    """
+    details = GarmentDetails() if details is None else details
+    if details.held_at not in (None, *HOLDS):
+        msg = f"a garment is held at {' or '.join(HOLDS)}, got {details.held_at!r}"
+        raise GarmentError(msg)
+    cleaned, notes = clean(mesh)
+    if len(cleaned.vertices) > MAX_VERTICES:
+        msg = f"it has {len(cleaned.vertices)} vertices, at most {MAX_VERTICES} are worn: decimate the mesh"
+        raise GarmentError(msg)
+    fault: GarmentError | None = None
+    makeshift: tuple[SurfaceMesh, list[str]] | None = None
+    for place in find_places(cleaned, body, placing or Placing()):
+        try:
+            mesh, found, moved = _put_on(cleaned, place, body, longest_edge)
+        except GarmentError as error:  # a limb goes through it there: is there another place?
+            fault = fault or error
+            continue
+        if moved <= _FARTHEST:
+            return _bound(mesh, body, name, details, notes + found)
+        makeshift = makeshift or (mesh, found)
+    if makeshift is not None:
+        return _bound(makeshift[0], body, name, details, notes + makeshift[1])
+    assert fault is not None  # there is a place, or `find_places` has said that there is none
+    raise fault
+
+
+def _put_on(
+    mesh: SurfaceMesh, place: Place, body: SmplBody, longest_edge: float
+) -> tuple[SurfaceMesh, list[str], float]:
+    """The mesh on the body in the T-pose, what was done to it, and how far vertices had to move to be outside [m].
+
+    Raises `GarmentError` where it can't be there.
+    """
+    notes = list(place.notes)
+    n = len(mesh.vertices)
+    mesh = split_long_edges(replace(mesh, vertices=place(mesh.vertices)), longest_edge)
+    if len(mesh.vertices) > n:
+        added = len(mesh.vertices) - n
+        notes.append(f"edges longer than {1e3 * longest_edge:.0f} mm were split: {added} vertices were added to {n}")
+    posed = PosedBody(body, place.pose)
+    mesh = _outward(mesh, posed)
+    if place.pose.any():
+        mesh = replace(mesh, vertices=_unposed(mesh, posed))
+        posed = PosedBody(body, np.zeros((N_JOINTS, 3)))
+    cleared = _cleared(mesh, posed, notes)
+    return replace(mesh, vertices=cleared), notes, float(np.linalg.norm(cleared - mesh.vertices, axis=1).max())
+
+
+def _bound(mesh: SurfaceMesh, body: SmplBody, name: str, details: GarmentDetails, notes: list[str]) -> FittedGarment:
+    """The garment of a mesh that is on the body: what it follows, and what is known of it."""
+    vertices, posed = mesh.vertices, PosedBody(body, np.zeros((N_JOINTS, 3)))
+    transfer = Transfer.of(vertices, mesh.faces, posed)
+    weights = _few(transfer(body.weights.double().numpy(), length=_SKIN_LENGTH))
+    shapedirs = transfer(_shapedirs(body), length=_SHAPE_LENGTH)
+    share = (transfer.mass @ weights) / transfer.mass.sum()
+    at_shoulders = share[list(_SHOULDERS)].sum() > 0.04
+    held_at = details.held_at or ("shoulders" if at_shoulders else "waist")
+    if details.held_at is None:
+        notes.append(f"held at the {held_at}")
+    if held_at == "waist" and not len(Connectivity.of(mesh.faces, len(vertices)).boundary):
+        msg = "a garment that is held at the waist needs an open rim there: its mesh is closed"
+        raise GarmentError(msg)
+    joints = tuple(int(j) for j in np.flatnonzero(weights.max(0) > _FELT))
+    try:
+        card = GarmentCard(details.layer, details.color, joints, held_at == "waist", (), details.provenance)
+    except ValueError as error:
+        raise GarmentError(str(error)) from error
+    template = GarmentTemplate(
+        name=name,
+        body=body.name,
+        card=card,
+        faces=torch.from_numpy(mesh.faces.copy()),
+        weights=torch.from_numpy(weights).float(),
+        v_template=torch.from_numpy(vertices).float(),
+        shapedirs=torch.from_numpy(shapedirs).float().view(-1, N_BETAS),
+        styledirs=None,
+        uv=mesh.uv,
+    )
+    return FittedGarment(template, notes)
+
+
+def _shapedirs(body: SmplBody) -> F64:
+    """Displacement a unit of each beta of the body's vertices [m], shape (N, 30)."""
+    shaped = body.rest_vertices(torch.eye(N_BETAS)) - body.v_template
+    found: F64 = shaped.permute(1, 2, 0).reshape(body.n_vertices, -1).double().numpy()
+    return found
+
+
+def _outward(mesh: SurfaceMesh, body: PosedBody) -> SurfaceMesh:
+    """With faces that are counter-clockwise from outside: away from the body, or out of a closed piece."""
+    v, f = mesh.vertices, mesh.faces
+    n_pieces, label = components(f, len(v))
+    connectivity = Connectivity.of(f, len(v))
+    is_open = np.isin(np.arange(n_pieces), label[connectivity.boundary])
+    normals = face_normals(v, f)
+    centres = v[f].mean(1)
+    distance, gradient = body(centres)
+    # Cloth near the skin says more: of a wide hem either side may be nearer to a leg.
+    vote = np.where(is_open[label[f[:, 0]]], (normals * gradient).sum(1) / (0.02 + np.abs(distance)), 0)
+    vote += np.where(is_open[label[f[:, 0]]], 0, (normals * (centres - v.mean(0))).sum(1))
+    side = np.bincount(label[f[:, 0]], vote, n_pieces)
+    flipped: NDArray[np.bool_] = side[label[f[:, 0]]] < 0
+    return turned_over(mesh, flipped)
+
+
+def _unposed(mesh: SurfaceMesh, posed: PosedBody) -> F64:
+    """The mesh brought from the pose of a body to its T-pose [m], shape (V, 3)."""
+    transfer = Transfer.of(mesh.vertices, mesh.faces, posed)
+    weights = torch.from_numpy(_few(transfer(posed.body.weights.double().numpy(), length=_SKIN_LENGTH)))
+    transforms = type(posed.transforms)(*(part.double() for part in posed.transforms))
+    points = torch.from_numpy(mesh.vertices)[None]
+    found: F64 = unapply_transforms(points, blend_transforms(weights, transforms))[0].numpy()
+    return found
+
+
+def _few(weights: F64) -> F64:
+    """At most six joints a vertex, none of them for next to nothing."""
+    kept = weights.clip(0).copy()
+    np.put_along_axis(kept, np.argsort(-kept, axis=1)[:, _INFLUENCES:], 0.0, axis=1)
+    kept[kept < 2e-3] = 0.0
+    found: F64 = kept / kept.sum(1, keepdims=True)
+    return found
+
+
+def _cleared(mesh: SurfaceMesh, body: PosedBody, notes: list[str]) -> F64:
+    """Vertices off the mean body by `CLEARANCE`, middles of edges too; their neighbours give way by less."""
+    connectivity = Connectivity.of(mesh.faces, len(mesh.vertices))
+    edges = connectivity.edges
+    adjacent = connectivity.adjacency_matrix()
+    degree = np.maximum(adjacent.sum(axis=1), 1)[:, None]
+    start = v = mesh.vertices
+    distance, _ = body(v)
+    deep = float((distance < -_DEEP).mean())
+    if deep > _MOST_DEEP:
+        near = _near(v[distance < -_DEEP], body)
+        msg = (
+            f"{100 * deep:.0f} % of the garment is more than {1e3 * _DEEP:.0f} mm inside the body {body.body.name}, "
+            f"most of it near the {near}: it was made for another body or pose; say its --pose, or try --body"
+        )
+        raise GarmentError(msg)
+    for _ in range(_ROUNDS):
+        lift = _shortfall(v, body)
+        middles = _shortfall(v[edges].mean(1), body)
+        order = np.argsort(np.linalg.norm(middles, axis=1))
+        for end in (0, 1):
+            most = np.zeros_like(v)
+            most[edges[order, end]] = middles[order]  # the last one written to a vertex is its longest
+            lift = _larger(lift, most)
+        if np.linalg.norm(lift, axis=1).max() < 1e-4:
+            break
+        v = v + _larger(lift, 0.9 * (adjacent @ lift) / degree)
+    moved = np.linalg.norm(v - start, axis=1)
+    if (moved > _FARTHEST).mean() > _MOST_FAR:
+        near = _near(v[moved > _FARTHEST], body)
+        msg = (
+            f"to be outside the body {body.body.name} the garment had to move by {1e3 * moved.max():.0f} mm near the "
+            f"{near}: it was made for another body or pose; say its --pose, or try another --body"
+        )
+        raise GarmentError(msg)
+    if moved.max() > 1e-3:
+        notes.append(
+            f"{100 * float((moved > 1e-3).mean()):.0f} % of the vertices were brought {1e3 * CLEARANCE:.0f} mm off the "
+            f"skin, by {1e3 * moved.max():.0f} mm at most"
+        )
+    return v
+
+
+def _shortfall(points: F64, body: PosedBody) -> F64:
+    distance, gradient = body(points)
+    return np.maximum(CLEARANCE - distance, 0)[:, None] * gradient
+
+
+def _larger(a: F64, b: F64) -> F64:
+    """Row by row the longer of two vectors."""
+    return np.where((np.linalg.norm(a, axis=1) >= np.linalg.norm(b, axis=1))[:, None], a, b)
+
+
+def _near(points: F64, body: PosedBody) -> str:
+    """The joint that the skin near these points follows most, in words."""
+    face, _ = body.closest(points)
+    corners = body.body.faces[torch.from_numpy(face)].flatten()
+    return JOINT_NAMES[int(body.body.weights[corners].sum(0).argmax())].replace("_", " ")

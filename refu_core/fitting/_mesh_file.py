@@ -1,0 +1,163 @@
+"""Reads a garment's mesh from the files that modelling programs write, with its UVs."""
+
+from __future__ import annotations
+
+import io
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from refu_core._files import read_file
+from refu_core.errors import GarmentError
+from refu_core.garments import UvMap
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from numpy.typing import NDArray
+
+MESH_SUFFIXES: tuple[str, ...] = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
+"""Files that are read."""
+_MAX_FILE_BYTES = 256 << 20
+_MAX_FACES = 400_000
+"""A larger mesh is refused before anything is computed: no garment that is worn in real time is as fine."""
+_MAX_CORNERS = 64
+"""Of one polygon."""
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceMesh:
+    """Triangles as a file has them: in any unit and axes, perhaps cut open along the seams of its UVs."""
+
+    vertices: NDArray[np.float64]
+    """Shape (V, 3)."""
+    faces: NDArray[np.int64]
+    """Shape (F, 3)."""
+    uv: UvMap | None = None
+
+
+def read_surface(path: str | os.PathLike[str]) -> SurfaceMesh:
+    """The mesh of a Wavefront OBJ (polygons become triangles), or of what trimesh reads: PLY, STL, OFF, GLB, glTF.
+
+    Raises:
+        GarmentError: the file can't be read, or holds no mesh.
+    """
+    source = Path(path)
+    suffix = source.suffix.lower()
+    if suffix not in MESH_SUFFIXES:
+        msg = f"{source}: wanted a mesh ({', '.join(MESH_SUFFIXES)}), got {suffix or 'a name without suffix'}"
+        raise GarmentError(msg)
+    content = read_file(source, most=_MAX_FILE_BYTES, error=GarmentError, wanted="a garment's mesh")
+    try:
+        mesh = _parse_obj(content) if suffix == ".obj" else _by_trimesh(content, suffix)
+        _check(mesh)
+    except ImportError:
+        raise
+    except Exception as error:  # trimesh raises whatever a damaged file makes of it
+        msg = f"{source}: not a mesh that can be read: {error or type(error).__name__}"
+        raise GarmentError(msg) from error
+    return mesh
+
+
+def _check(mesh: SurfaceMesh) -> None:
+    v, f = mesh.vertices, mesh.faces
+    if not len(f):
+        msg = "it has no faces"
+        raise ValueError(msg)
+    if len(f) > _MAX_FACES:
+        msg = f"it has {len(f)} triangles, at most {_MAX_FACES} are read: decimate it"
+        raise ValueError(msg)
+    if f.min() < 0 or f.max() >= len(v):
+        msg = f"a face names vertex {f.max() + 1} of {len(v)}"
+        raise ValueError(msg)
+    if not np.isfinite(v[f]).all():
+        msg = "it has vertices that are NaN or infinite"
+        raise ValueError(msg)
+    if mesh.uv is not None and (mesh.uv.faces.min() < 0 or mesh.uv.faces.max() >= len(mesh.uv.coordinates)):
+        msg = "a face names texture coordinates that there aren't"
+        raise ValueError(msg)
+
+
+def _parse_obj(content: bytes) -> SurfaceMesh:
+    vertices: list[list[float]] = []
+    coordinates: list[list[float]] = []
+    corners: list[list[tuple[int, int]]] = []
+    text = content.decode("utf-8", errors="replace").replace("\\\n", " ")
+    for number, line in enumerate(text.splitlines(), 1):
+        kind, _, rest = line.strip().partition(" ")
+        try:
+            if kind == "v":
+                vertices.append([float(x) for x in rest.split()[:3]])
+            elif kind == "vt":
+                coordinates.append([float(x) for x in (*rest.split()[:2], "0")[:2]])
+            elif kind == "f":
+                corners.append([_corner(word, len(vertices), len(coordinates)) for word in rest.split()])
+        except (ValueError, IndexError) as error:
+            msg = f"line {number}: {line[:60]!r}"
+            raise ValueError(msg) from error
+    points = np.array(vertices, dtype=np.float64).reshape(-1, 3)
+    triangles = np.array(list(_triangles(corners, points)), dtype=np.int64).reshape(-1, 3, 2)
+    uv = None
+    if coordinates and len(triangles) and (triangles[..., 1] >= 0).all():
+        uv = UvMap(np.array(coordinates, dtype=np.float32), triangles[..., 1].copy())
+    return SurfaceMesh(points, triangles[..., 0].copy(), uv)
+
+
+def _corner(word: str, n_vertices: int, n_coordinates: int) -> tuple[int, int]:
+    """Vertex and texture coordinates of `v`, `v/vt`, `v/vt/vn` or `v//vn`, from 0; negative ones count backwards."""
+    numbers = word.split("/")
+    found = []
+    for text, count in zip((*numbers, "")[:2], (n_vertices, n_coordinates), strict=True):
+        index = int(text) if text else 0
+        found.append(index - 1 if index >= 0 else count + index)
+        if index and found[-1] < 0:
+            raise IndexError(word)
+    if found[0] < 0:
+        raise IndexError(word)
+    return found[0], found[1]
+
+
+def _triangles(
+    polygons: Iterable[list[tuple[int, int]]], points: NDArray[np.float64]
+) -> Iterable[tuple[tuple[int, int], ...]]:
+    """Polygons as triangles: quads are cut along the shorter diagonal, others as fans."""
+    for polygon in polygons:
+        n = len(polygon)
+        if n < 3 or n > _MAX_CORNERS:
+            if n > _MAX_CORNERS:
+                msg = f"a polygon of {n} corners"
+                raise ValueError(msg)
+            continue
+        if n == 4 and max(corner[0] for corner in polygon) < len(points):
+            a, b, c, d = (points[corner[0]] for corner in polygon)
+            if np.square(b - d).sum() < np.square(a - c).sum():
+                polygon = polygon[1:] + polygon[:1]
+        yield from ((polygon[0], polygon[k], polygon[k + 1]) for k in range(1, n - 1))
+
+
+def _by_trimesh(content: bytes, suffix: str) -> SurfaceMesh:
+    import trimesh
+
+    scene = trimesh.load_scene(io.BytesIO(content), file_type=suffix[1:], process=False)
+    parts = [mesh for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
+    if not parts:
+        msg = "it has no faces"
+        raise ValueError(msg)
+    vertices, faces, coordinates, start = [], [], [], 0
+    for part in parts:
+        vertices.append(np.asarray(part.vertices, dtype=np.float64))
+        faces.append(np.asarray(part.faces, dtype=np.int64) + start)
+        coordinates.append(_uv_of(part))
+        start += len(part.vertices)
+    uv = None
+    if all(one is not None for one in coordinates):
+        uv = UvMap(np.concatenate(coordinates).astype(np.float32), np.concatenate(faces))  # type: ignore[arg-type]
+    return SurfaceMesh(np.concatenate(vertices), np.concatenate(faces), uv)
+
+
+def _uv_of(part: Any) -> NDArray[np.float64] | None:
+    found = getattr(part.visual, "uv", None)
+    return None if found is None or len(found) != len(part.vertices) else np.asarray(found, dtype=np.float64)[:, :2]

@@ -1,0 +1,298 @@
+"""Where a mesh of unknown unit, axes, place and pose belongs on a body."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import minimize
+
+from refu_core.errors import GarmentError
+from refu_core.fitting._posed import LEFT_HIP, RIGHT_SHOULDER, PosedBody, standing_pose
+from refu_core.fitting._surround import Fit, Samples, fit_of, sample
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    from refu_core.body import SmplBody
+    from refu_core.fitting._mesh_file import SurfaceMesh
+
+    F64 = NDArray[np.float64]
+
+UNITS: dict[str, float] = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+"""Metres of a unit."""
+UP_AXES: tuple[str, ...] = ("y", "z")
+
+_SIZES = (0.12, 2.1)
+"""The largest extent of a garment [m]: from a sock to a gown with a train."""
+_ARMS = (0.0, 0.35, 0.6, 0.85, 1.1)
+"""How far arms may hang when a search begins [rad]: T-pose to arms nearly down."""
+_N_POINTS = 400
+_TOLERANCE = 0.015
+"""A mesh is taken as it is unless something else fits this much better, as a share of its size."""
+_UNIT_TOLERANCE = 0.005
+"""What had to be moved is of a known unit, if it fits, unless another size fits this much better, likewise."""
+_POSE_TOLERANCE = 0.002
+"""It is taken to be in the T-pose unless another pose fits this much better, likewise."""
+_TRIED_SIZES = (0.25, 0.4, 0.6, 0.85, 1.2, 1.7)
+"""Largest extents that a mesh of no known unit is tried with [m]."""
+_NOTHING = 0.01
+"""What fits has less than this share of it inside the body; like a glove, if it is less than 6 cm off, too."""
+_N_REFINED = 2
+
+
+@dataclass(frozen=True)
+class Placing:
+    """What is known of a mesh; None for what is to be found out."""
+
+    unit: float | None = None
+    """Metres of the mesh's unit."""
+    up: str | None = None
+    """`y` or `z`."""
+    pose: F64 | None = None
+    """That the mesh was modelled in: rotation vectors [rad], shape (24, 3); zeros for the T-pose."""
+    is_placed: bool = False
+    """Whether the mesh's origin is the body's; otherwise it may be moved."""
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """x_body = unit · turn x + shift, on the body in `pose`."""
+
+    unit: float
+    turn: F64
+    """Rotation, shape (3, 3)."""
+    shift: F64
+    """[m], shape (3,)."""
+    pose: F64
+    """Rotation vectors [rad], shape (24, 3)."""
+    fit: Fit
+    notes: list[str] = field(default_factory=list)
+
+    def is_like(self, other: Place) -> bool:
+        """Whether it has the same unit and axes."""
+        return self.unit == other.unit and bool(np.array_equal(self.turn, other.turn))
+
+    def __call__(self, vertices: F64) -> F64:
+        """Vertices (V, 3) on the body [m]."""
+        found: F64 = self.unit * vertices @ self.turn.T + self.shift
+        return found
+
+
+def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator[Place]:
+    """Where a mesh may belong on a body of mean shape, the likeliest first; what isn't asked for isn't searched.
+
+    As it is, if it surrounds the body like that, or in another unit, with another axis up, standing on the floor, in an
+    A-pose. Else it is moved until it does; and if that doesn't help, scaled by what is no unit.
+
+    Raises:
+        GarmentError: in no unit is it as large as a garment, or it surrounds the body nowhere.
+    """
+    if placing.up not in (None, *UP_AXES):
+        msg = f"no axis {placing.up!r} that is up: wanted {' or '.join(UP_AXES)}, or None to find out"
+        raise GarmentError(msg)
+    samples = sample(mesh, _N_POINTS)
+    extent = float(np.ptp(mesh.vertices, axis=0).max())
+    units = [placing.unit] if placing.unit else [u for u in UNITS.values() if _SIZES[0] <= u * extent <= _SIZES[1]]
+    if not units or (placing.unit and not _SIZES[0] <= placing.unit * extent <= _SIZES[1]):
+        size = f"{extent:.3g} units" + (f" = {placing.unit * extent:.3g} m" if placing.unit else "")
+        msg = f"the mesh is {size} large: wanted a garment of {_SIZES[0]} to {_SIZES[1]} m; say its unit (--unit)"
+        raise GarmentError(msg)
+    poses = [placing.pose] if placing.pose is not None else [standing_pose(arms) for arms in _ARMS]
+    bodies = [PosedBody(body, pose) for pose in poses]
+    turns = _turns(placing.up)
+    found = [
+        _Candidate(_at(samples, unit, turn, shift, here), kind, here)
+        for here, turn, unit in itertools.product(bodies, turns, units)
+        for kind, shift in _shifts(here, is_placed=placing.is_placed)
+    ]
+    good = [one for one in found if one.place.fit.is_plain]
+    if good:
+        least = min(one.cost(extent) for one in good)
+        chosen = next(one for one in good if one.cost(extent) < least + _TOLERANCE)  # what says least is asked first
+        if placing.pose is None:
+            likes = [one for one in found if one.kind == chosen.kind and one.place.is_like(chosen.place)]
+            likes.sort(key=lambda one: one.cost(extent))
+            refined = [
+                one._replace(place=_refined(one, samples, placing, moves=False, scales=False)) for one in likes[:2]
+            ]
+            other = min(refined, key=lambda one: one.cost(extent))
+            if other.cost(extent) < chosen.cost(extent) - _POSE_TOLERANCE or chosen.here.pose.any():
+                chosen = other
+        yield _told(chosen.place, chosen.kind)
+    found.sort(key=lambda one: (not one.place.fit.is_good, one.cost(extent)))
+    tiers = found[:1]
+    first = tiers[0].place.fit
+    if (
+        first.is_good and max(first.inside, first.distance / 6) < _NOTHING and not tiers[0].is_sideways
+    ):  # of gloves much faces other fingers
+        yield _told(tiers[0].place, tiers[0].kind)
+    for tried in [None] if placing.unit else [None, [size / extent for size in _TRIED_SIZES]]:
+        if not placing.is_placed:
+            tiers += _searched(mesh, samples, bodies, turns, tried or units, placing, scales=tried is not None)
+    # What was modelled by convention, or else in a known unit, unless it fits much worse.
+    handicap = [
+        (k > 0) * _TOLERANCE + (k > 1 or one.place.fit.inside > _NOTHING) * _UNIT_TOLERANCE
+        for k, one in enumerate(tiers)
+    ]
+    ranked = sorted(range(len(tiers)), key=lambda k: tiers[k].cost(extent) + handicap[k])
+    for k in ranked:
+        if tiers[k].place.fit.is_good:
+            yield _told(tiers[k].place, tiers[k].kind)
+    if good or any(one.place.fit.is_good for one in tiers):
+        return
+    place = min((one.place for one in tiers), key=lambda one: one.fit.cost)
+    fit = place.fit
+    msg = (
+        f"the mesh doesn't surround the body {body.name}: where it fits best, {100 * fit.inside:.0f} % of it is "
+        f"inside the body, it is {1e3 * fit.distance:.0f} mm off on average, and {100 * fit.facing:.0f} % of it faces "
+        "outward; is it a garment for this body? Say its --unit, --up or --pose, or place it on the body first"
+    )
+    raise GarmentError(msg)
+
+
+class _Candidate(NamedTuple):
+    place: Place
+    kind: str
+    here: PosedBody
+
+    @property
+    def is_sideways(self) -> bool:
+        """Whether the mesh would have been modelled facing x, as nobody does."""
+        return abs(float(self.place.turn[0, 0])) < 0.5
+
+    def cost(self, extent: float) -> float:
+        """As a share of the garment's size, or the smallest one would always be the nearest to the skin.
+
+        What nobody would do without need counts, too: to model a garment sideways, with spread legs or hanging arms.
+        """
+        place = self.place
+        arms, legs = place.pose[RIGHT_SHOULDER, 2], place.pose[LEFT_HIP, 2]
+        without_need = 0.02 * self.is_sideways + 0.1 * abs(legs) + 0.005 * abs(arms)
+        return float(place.fit.cost / (place.unit * extent) + without_need)
+
+
+def _searched(
+    mesh: SurfaceMesh,
+    samples: Samples,
+    bodies: list[PosedBody],
+    turns: list[F64],
+    units: list[float],
+    placing: Placing,
+    *,
+    scales: bool,
+) -> list[_Candidate]:
+    """The best of all heights along the body, moved on from there; none of no heights."""
+    extent = float(np.ptp(mesh.vertices, axis=0).max())
+    few = Samples(*(array[::4] for array in samples))  # type: ignore[arg-type]
+    if scales:  # there is much to try: what nobody does isn't
+        bodies, turns = bodies[:3], turns[: len(turns) // 2]
+    found = [
+        _Candidate(_at(few, unit, turn, shift, here), "searched", here)
+        for here, turn, unit in itertools.product(bodies[::2], turns, units)
+        for shift in _heights(unit * mesh.vertices @ turn.T, here)
+    ]
+    found.sort(key=lambda one: one.cost(extent))
+    refined = [
+        one._replace(place=_refined(one, samples, placing, moves=True, scales=scales)) for one in found[:_N_REFINED]
+    ]
+    return sorted(refined, key=lambda one: (not one.place.fit.is_good, one.cost(extent)))[:1]
+
+
+def _at(samples: Samples, unit: float, turn: F64, shift: F64, body: PosedBody) -> Place:
+    turned = samples._replace(normals=samples.normals @ turn.T)
+    return Place(unit, turn, shift, body.pose, fit_of(unit * samples.points @ turn.T + shift, turned, body))
+
+
+def _turns(up: str | None) -> list[F64]:
+    """Rotations that may bring a mesh upright and to face z; the likeliest first."""
+    z_up = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    bases = {"y": [np.eye(3)], "z": [z_up], None: [np.eye(3), z_up]}[up]
+    about_y = [np.diag([np.cos(a), 1.0, np.cos(a)]) for a in (0.0, np.pi)]
+    about_y += [np.array([[0, 0, sign], [0, 1, 0], [-sign, 0, 0]]) for sign in (1.0, -1.0)]
+    return [about @ base for about in about_y for base in bases]
+
+
+def _shifts(body: PosedBody, *, is_placed: bool) -> list[tuple[str, F64]]:
+    """Where a mesh may stand by convention: with the body's origin, or on a floor below its feet."""
+    floor = float(body.vertices[:, 1].min())
+    found = [("", np.zeros(3)), ("floor", np.array([0.0, floor, 0.0]))]
+    return found[:1] if is_placed else found
+
+
+def _heights(vertices: F64, body: PosedBody) -> list[F64]:
+    """Shifts that put a mesh (V, 3) [m] round the body's middle, at all heights."""
+    skin = body.vertices.double().numpy()
+    low, high = vertices.min(0), vertices.max(0)
+    middle = (low + high) / 2
+    found = []
+    for height in np.arange(skin[:, 1].min() - low[1], skin[:, 1].max() - high[1] + 0.02, 0.08):
+        near = np.abs(skin[:, 1] - (middle[1] + height)) < max(0.05, (high[1] - low[1]) / 4)
+        front, back = (skin[near, 2].max(), skin[near, 2].min()) if near.any() else (0.0, 0.0)
+        found.append(np.array([-middle[0], height, (front + back) / 2 - middle[2]]))
+    return found
+
+
+def _refined(start: _Candidate, samples: Samples, placing: Placing, *, moves: bool, scales: bool) -> Place:
+    """The best place near one, by a simplex over pose, and place and size if wanted."""
+    here = start.here
+    body = PosedBody(here.body, here.pose)
+    arms = float(here.pose[RIGHT_SHOULDER, 2])
+    turn, place = start.place.turn, start.place
+    x0 = np.array([0.0, 0.0, 0.0, 0.0, arms, 0.02])
+    steps = np.array([0.06 * scales, *(0.03 * moves,) * 3, 0.1, 0.06])
+    if placing.pose is not None:
+        steps[4:] = 0
+    free = np.flatnonzero(steps)
+    middle = samples.points.mean(0) @ turn.T
+    floor = float(here.vertices[:, 1].min())
+    extent = float(np.ptp(samples.points, axis=0).max())
+
+    def at(values: F64) -> Place:
+        full = x0.copy()
+        full[free] += values * steps[free]
+        size, *shift, lowered, spread = full
+        if placing.pose is None:
+            body.move(standing_pose(float(np.clip(lowered, -0.2, 1.3)), float(np.clip(spread, 0.0, 0.35))))
+        unit = min(place.unit * float(np.exp(np.clip(size, -0.5, 0.5))), _SIZES[1] / extent)
+        moved = place.shift + np.array(shift) + (place.unit - unit) * middle  # the middle stays as the size changes
+        if start.kind == "floor":  # which is where the feet of this pose are
+            moved[1] += float(body.vertices[:, 1].min()) - floor
+        return _at(samples, unit, turn, moved, body)
+
+    if not len(free):
+        return place
+    simplex = np.concatenate((np.zeros((1, len(free))), np.eye(len(free))))
+
+    def cost(values: F64) -> float:
+        return start._replace(place=at(values)).cost(extent)
+
+    options: Any = {"initial_simplex": simplex, "maxfev": 30 * len(free), "xatol": 0.02, "fatol": 1e-5}
+    found = minimize(cost, np.zeros(len(free)), method="Nelder-Mead", options=options)
+    return at(found.x)
+
+
+def _told(place: Place, kind: str) -> Place:
+    """With what was found out, in words."""
+    notes = []
+    name = next((name for name, unit in UNITS.items() if np.isclose(unit, place.unit)), None)
+    if name != "m":
+        notes.append(f"lengths are {name}" if name else f"scaled by {place.unit:.4g}, which is no unit")
+    turn = place.turn
+    if not np.allclose(turn, np.eye(3)):
+        up = "y" if np.isclose(turn[1, 1], 1) else "z"
+        front = turn.T @ [0.0, 0.0, 1.0]
+        axis = int(np.abs(front).argmax())
+        notes.append(f"{up} is up and {'+' if front[axis] > 0 else '-'}{'xyz'[axis]} is in front")
+    if kind == "floor":
+        notes.append("it stood with the floor at 0 and was moved to the body's feet")
+    elif np.abs(place.shift).max() > 1e-3:
+        notes.append("moved by ({:.0f}, {:.0f}, {:.0f}) mm".format(*(1e3 * place.shift)))
+    arms, legs = np.degrees(place.pose[RIGHT_SHOULDER, 2]), np.degrees(place.pose[LEFT_HIP, 2])
+    if abs(arms) > 3 or legs > 3:
+        notes.append(f"modelled with arms {arms:.0f}° down and legs {legs:.0f}° apart; brought into the T-pose")
+    return replace(place, notes=notes)

@@ -1,0 +1,73 @@
+"""Bodies of mean shape in the poses that garments are modelled in."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from refu_core.body import JOINT_NAMES, RigidTransforms
+from refu_core.frames import N_JOINTS
+from refu_core.sdf import ExactSdf
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from refu_core.body import SmplBody
+
+    F64 = NDArray[np.float64]
+
+LEFT_SHOULDER, RIGHT_SHOULDER = (JOINT_NAMES.index(f"{side}_shoulder") for side in ("left", "right"))
+LEFT_HIP, RIGHT_HIP = (JOINT_NAMES.index(f"{side}_hip") for side in ("left", "right"))
+
+
+class PosedBody:
+    """A body of mean shape in some pose, and how far from it things are."""
+
+    def __init__(self, body: SmplBody, pose: F64) -> None:
+        self.body, self.pose = body, pose
+        posed = body(torch.as_tensor(pose, dtype=torch.float32)[None])
+        self.vertices = posed.vertices[0]
+        self.transforms: RigidTransforms = posed.transforms
+        self._sdf = ExactSdf(body.faces)
+        self._sdf.update(self.vertices)
+
+    def move(self, pose: F64) -> None:
+        """Takes another pose."""
+        self.pose = pose
+        posed = self.body(torch.as_tensor(pose, dtype=torch.float32)[None])
+        self.vertices, self.transforms = posed.vertices[0], posed.transforms
+        self._sdf.update(self.vertices)
+
+    def __call__(self, points: F64) -> tuple[F64, F64]:
+        """Signed distance [m], shape (P,), and its unit gradient, (P, 3)."""
+        found = self._sdf.query(torch.as_tensor(points, dtype=torch.float32))
+        return found.distance.double().numpy(), found.gradient.double().numpy()
+
+    def closest(self, points: F64) -> tuple[NDArray[np.int64], F64]:
+        """The closest face of each point (P, 3), and where in it that is, as barycentric coordinates (P, 3)."""
+        face = self._sdf.closest(torch.as_tensor(points, dtype=torch.float32)).face.long().numpy()
+        corners = self.vertices.double().numpy()[self.body.faces.numpy()[face]]
+        return face, _barycentric(points, corners)
+
+
+def standing_pose(arms: float, legs: float = 0.0) -> F64:
+    """The T-pose with arms lowered and legs spread by some angles [rad], shape (24, 3)."""
+    pose = np.zeros((N_JOINTS, 3))
+    pose[LEFT_SHOULDER, 2], pose[RIGHT_SHOULDER, 2] = -arms, arms
+    pose[LEFT_HIP, 2], pose[RIGHT_HIP, 2] = legs, -legs
+    return pose
+
+
+def _barycentric(points: F64, corners: F64) -> F64:
+    """Of the projections of points (P, 3) onto triangles (P, 3, 3), clipped to them; shape (P, 3)."""
+    a, b, c = corners.transpose(1, 0, 2)
+    u, v, w = b - a, c - a, points - a
+    uu, uv, vv = (u * u).sum(1), (u * v).sum(1), (v * v).sum(1)
+    wu, wv = (w * u).sum(1), (w * v).sum(1)
+    det = np.maximum(uu * vv - uv * uv, 1e-30)
+    s, t = (vv * wu - uv * wv) / det, (uu * wv - uv * wu) / det
+    found = np.clip(np.stack((1 - s - t, s, t), 1), 0, None)
+    shares: F64 = found / found.sum(1, keepdims=True)
+    return shares

@@ -1,0 +1,94 @@
+"""How well a mesh surrounds a body."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from refu_core.fitting._clean import components, face_normals, rim_of
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from refu_core.fitting._mesh_file import SurfaceMesh
+    from refu_core.fitting._posed import PosedBody
+
+    F64 = NDArray[np.float64]
+
+_ACROSS = 0.5
+"""Cosine of an angle to the way off the skin from which on cloth lies across it."""
+
+
+class Fit(NamedTuple):
+    """How well a mesh surrounds a body, lengths in metres."""
+
+    inside: float
+    """Share of the surface deeper than 1 cm in the body."""
+    depth: float
+    """Mean of what it lacks of 1 cm off the skin, at most 5 cm: what is worn neither touches nor is far off."""
+    distance: float
+    """Mean distance outside, at most 60 cm."""
+    facing: float
+    """Share of it that faces away from the body; half of what stands beside it does not."""
+
+    @property
+    def cost(self) -> float:
+        """Smaller is better [m]: cloth is outside, near, and faces away from the body."""
+        return 8 * self.depth + 0.3 * self.inside + self.distance + 0.1 * (1 - self.facing)
+
+    @property
+    def is_good(self) -> bool:
+        """Whether it may be worn like that. Garments that were made for a body have 0.00–0.05, < 0.08 and > 0.93."""
+        return self.inside < 0.05 and self.distance < 0.16 and self.facing > 0.85
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether nothing else need be tried."""
+        return self.is_good and self.facing > 0.93
+
+
+class Samples(NamedTuple):
+    """Points all over a mesh, as many a square metre."""
+
+    points: F64
+    """In the mesh's own unit and axes, shape (P, 3)."""
+    normals: F64
+    """Unit, shape (P, 3)."""
+    is_open: NDArray[np.bool_]
+    """Whether of a piece with a rim; a closed one is cloth with both its sides, shape (P,)."""
+    piece: NDArray[np.int64]
+    """Of which piece, shape (P,)."""
+
+
+def sample(mesh: SurfaceMesh, count: int, seed: int = 0) -> Samples:
+    """`count` points drawn by area."""
+    rng = np.random.default_rng(seed)
+    normals = face_normals(mesh.vertices, mesh.faces)
+    area = np.linalg.norm(normals, axis=1)
+    face = np.searchsorted(np.cumsum(area), (np.arange(count) + rng.random(count)) / count * area.sum())
+    face = np.minimum(face, len(area) - 1)
+    u, v = rng.random((2, count))
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    a, b, c = (mesh.vertices[mesh.faces[face, k]] for k in range(3))
+    points = a + u[:, None] * (b - a) + v[:, None] * (c - a)
+    _, label = components(mesh.faces, len(mesh.vertices))
+    open_pieces = np.unique(label[rim_of(mesh.faces)])
+    is_open = np.isin(label[mesh.faces[face, 0]], open_pieces)
+    unit = normals[face] / np.maximum(area[face], 1e-300)[:, None]
+    return Samples(points, unit, is_open, label[mesh.faces[face, 0]])
+
+
+def fit_of(points: F64, samples: Samples, body: PosedBody) -> Fit:
+    """How well samples that are at `points` [m] surround the body; `samples.normals` in the same axes."""
+    distance, gradient = body(points)
+    outward = (samples.normals * gradient).sum(1)
+    # An open piece faces one way or the other: what is asked is whether all of it does. One side of a closed one faces
+    # the body, the other one away from it, and little of it anything else.
+    votes = np.zeros((2, samples.piece.max() + 1))
+    np.add.at(votes[0], samples.piece[samples.is_open], outward[samples.is_open] > 0)
+    np.add.at(votes[1], samples.piece[samples.is_open], outward[samples.is_open] <= 0)
+    n_facing = votes.max(0).sum() + (np.abs(outward[~samples.is_open]) > _ACROSS).sum()
+    facing = float(n_facing / len(points))
+    depth = np.clip(0.01 - distance, 0, 0.05)
+    return Fit(float((distance < -0.01).mean()), float(depth.mean()), float(np.clip(distance, 0, 0.6).mean()), facing)

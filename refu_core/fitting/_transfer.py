@@ -1,0 +1,148 @@
+"""What a body's skin knows (skinning weights, shape directions) on a garment round it.
+
+After Abdrashitov, Raichstat, Monsen and Hill, *Robust Skin Weights Transfer via Weight Inpainting* (SIGGRAPH Asia 2023
+Technical Communications): where the closest skin is near and faces the way the cloth does, its values are trusted; from
+there they spread over the cloth. Here both are one equation. Trusted values count the more the nearer they are:
+
+    minimise  Σ mᵢ/ℓᵢ² ‖xᵢ - yᵢ‖² (trusted i) + xᵀ L x,    ℓᵢ = ℓ + dᵢ
+
+with m a vertex's area, L the Laplacian of the cloth, y the skin's value and d the distance to it. So values are smooth
+over a length ℓᵢ that grows with the distance: cloth on the skin follows it, a wide hem follows what it hangs round. L
+has no negative weights: what lies between 0 and 1 stays there, and sums of 1 stay 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.sparse import coo_array, csc_array, diags_array
+from scipy.sparse.linalg import splu
+from scipy.spatial import cKDTree
+
+from refu_core.fitting._clean import components, face_normals, rim_of
+from refu_core.mesh import vertex_normals
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from refu_core.fitting._posed import PosedBody
+
+    F64 = NDArray[np.float64]
+
+_FARTHEST = 0.15
+"""Skin farther off says nothing [m]."""
+_FACING = 0.7
+"""Least cosine between the cloth's normal and the way off the skin: 45°."""
+_SEAM = 0.01
+"""Rims of two pieces this near are sewn together [m]."""
+_RIGID = 0.06
+"""A piece no larger than this beside larger ones doesn't bend: a button, a buckle [m]."""
+_LEAST_TRUST = 1e-6
+"""Of every vertex, so that the equation has one solution."""
+
+
+@dataclass(frozen=True, eq=False)
+class Transfer:
+    """From the skin to a garment's V vertices."""
+
+    face: NDArray[np.int64]
+    """The closest face of the body, shape (V,)."""
+    barycentric: F64
+    """Where in it, shape (V, 3)."""
+    distance: F64
+    """How far off the skin, negative inside [m], shape (V,)."""
+    is_trusted: NDArray[np.bool_]
+    """Whether that skin is near and faces the way the cloth does, shape (V,)."""
+    body_faces: NDArray[np.int64]
+    mass: F64
+    """Area of each vertex [m²], shape (V,)."""
+    laplacian: csc_array
+    """Shape (V, V)."""
+    rigid: tuple[NDArray[np.intp], ...]
+    """Vertices of the pieces that don't bend."""
+
+    @classmethod
+    def of(cls, vertices: F64, faces: NDArray[np.int64], body: PosedBody) -> Transfer:
+        """For a garment of vertices (V, 3) [m] and faces (F, 3), outward, on a posed body."""
+        distance, gradient = body(vertices)
+        face, barycentric = body.closest(vertices)
+        normals = vertex_normals(vertices, faces.astype(np.int32))
+        agrees = (normals * gradient).sum(1)
+        n_pieces, label = components(faces, len(vertices))
+        rim = rim_of(faces)
+        is_open = np.isin(np.arange(n_pieces), label[rim])
+        # A closed piece is cloth with a thickness: its inner side faces the skin and follows it no less.
+        agrees = np.where(is_open[label], agrees, np.abs(agrees))
+        is_trusted = (agrees > _FACING) & (distance < _FARTHEST)
+        if is_trusted.mean() < 0.05:  # ruffles all over, or a single strap: the nearest skin is all there is
+            is_trusted = np.abs(distance) <= max(np.quantile(np.abs(distance), 0.5), 0.02)
+        sizes = [np.linalg.norm(np.ptp(vertices[label == k], axis=0)) for k in range(n_pieces)]
+        is_small = np.array(sizes) < _RIGID
+        rigid = tuple(np.flatnonzero(label == k) for k in range(n_pieces) if is_small[k] and not is_small.all())
+        laplacian = _laplacian(vertices, faces, _seams(vertices, label, rim, n_pieces))
+        area = np.linalg.norm(face_normals(vertices, faces), axis=1) / 6
+        mass = np.bincount(faces.ravel(), weights=np.repeat(area, 3), minlength=len(vertices)).astype(np.float64)
+        body_faces = body.body.faces.numpy()
+        return cls(face, barycentric, distance, is_trusted, body_faces, mass, laplacian, rigid)
+
+    def __call__(self, values: F64, *, length: float) -> F64:
+        """Values of the body's vertices, shape (N, K), on the garment's, (V, K), smooth over `length` [m] at least."""
+        corners = values[self.body_faces[self.face]]
+        there = (self.barycentric[:, :, None] * corners).sum(1)
+        reach = length + np.abs(self.distance)
+        trust = np.where(self.is_trusted, 1.0, _LEAST_TRUST) * np.maximum(self.mass, 1e-12) / reach**2
+        matrix = csc_array(self.laplacian + diags_array(trust))
+        # What only few joints have is solved for those alone.
+        some = np.flatnonzero(there.any(0))
+        found = np.zeros((len(there), values.shape[1]))
+        if len(some):
+            # The matrix is symmetric and its diagonal dominates: no pivoting, which takes forty times as long.
+            options = {"SymmetricMode": True}
+            solver = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+            found[:, some] = solver.solve(trust[:, None] * there[:, some])
+        for piece in self.rigid:
+            found[piece] = found[piece].mean(0)
+        return found
+
+
+def _laplacian(v: F64, f: NDArray[np.int64], seams: NDArray[np.int64]) -> csc_array:
+    """Cotangents where they are positive, a tenth of an equilateral triangle's elsewhere; seams as firm as edges."""
+    n = len(v)
+    rows: list[NDArray[Any]] = []
+    weights = []
+    for k in range(3):
+        a, b, c = f[:, k], f[:, (k + 1) % 3], f[:, (k + 2) % 3]
+        u, w = v[a] - v[c], v[b] - v[c]
+        cross = np.linalg.norm(np.cross(u, w), axis=1)
+        cotangent = (u * w).sum(1) / np.maximum(cross, 1e-12)
+        rows.append(np.stack((a, b), 1))
+        weights.append(0.5 * np.clip(cotangent, 0.06, 10.0))
+    rows.append(seams)
+    weights.append(np.ones(len(seams)))
+    pairs, weight = np.concatenate(rows), np.concatenate(weights)
+    adjacent = coo_array((weight, (pairs[:, 0], pairs[:, 1])), shape=(n, n)).tocsr()
+    adjacent = adjacent + adjacent.T
+    return csc_array(diags_array(adjacent.sum(axis=1)) - adjacent)
+
+
+def _seams(v: F64, label: NDArray[np.int64], rim: NDArray[np.int64], n_pieces: int) -> NDArray[np.int64]:
+    """Pairs of vertices that move together: rims of two pieces that touch, and each piece with what is nearest."""
+    if n_pieces == 1:
+        return np.empty((0, 2), np.int64)
+    found = [np.empty((0, 2), np.int64)]
+    if len(rim):
+        close: Any = cKDTree(v).query_ball_point(v[rim], _SEAM)
+        near = [(a, b) for a, others in zip(rim.tolist(), close, strict=True) for b in others if label[a] != label[b]]
+        found.append(np.array(near, np.int64).reshape(-1, 2))
+    order = np.argsort(np.bincount(label))[::-1]
+    joined = label == order[0]
+    for piece in order[1:]:
+        own = np.flatnonzero(label == piece)
+        others = np.flatnonzero(joined)
+        distance, nearest = (np.asarray(one) for one in cKDTree(v[others]).query(v[own]))
+        few = np.argsort(distance)[:3]
+        found.append(np.stack((own[few], others[nearest[few]]), 1))
+        joined |= label == piece
+    return np.unique(np.sort(np.concatenate(found), 1), axis=0)

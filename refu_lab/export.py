@@ -1,0 +1,205 @@
+"""Dressed persons as files of other programs: GLB, OBJ and USD, with the garments' texture coordinates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from refu_core.errors import RefuError
+from refu_lab.render import SKIN
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from refu_core import GarmentPipeline, PipelineOutput
+    from refu_core.garments import UvMap
+    from refu_lab.replay import ReplayOptions
+
+FORMATS: tuple[str, ...] = (".glb", ".obj", ".usda", ".usdc", ".usd")
+"""Suffixes of what is written."""
+_USD = (".usda", ".usdc", ".usd")
+
+
+@dataclass(frozen=True, eq=False)
+class ExportMesh:
+    """A mesh that may move."""
+
+    name: str
+    vertices: NDArray[np.float32]
+    """SMPL axes (y up, z forward), which are those of glTF [m], shape (T, V, 3)."""
+    faces: NDArray[np.int64]
+    """Counter-clockwise from outside, shape (F, 3)."""
+    color: tuple[float, float, float]
+    """sRGB, 0 to 1."""
+    uv: UvMap | None = None
+
+
+def meshes_of(
+    pipeline: GarmentPipeline, outputs: Sequence[PipelineOutput], *, with_body: bool = True
+) -> list[ExportMesh]:
+    """The body and the garments of T outputs of a pipeline, which are of one person; the translation is added."""
+    transl = [next(iter(output.values())).transl for output in outputs]
+    found = []
+    if with_body:
+        bodies = np.stack([output.body + shift for output, shift in zip(outputs, transl, strict=True)])
+        found.append(ExportMesh("body", bodies.astype(np.float32), pipeline.body.faces.cpu().numpy(), SKIN))
+    for name, template in pipeline.garments.items():
+        vertices = np.stack([output[name].vertices for output in outputs]).astype(np.float32)
+        found.append(ExportMesh(name, vertices, template.faces.cpu().numpy(), template.card.color, template.uv))
+    return found
+
+
+def write_meshes(meshes: Sequence[ExportMesh], path: Path, *, fps: float = 30.0) -> list[Path]:
+    """Writes meshes of T frames: one USD stage that moves, or a GLB or OBJ file a frame, numbered if there are several.
+
+    OBJ and USD keep the order of vertices, and texture coordinates apart from them. GLB has one of each: vertices on
+    the seams of a texture are there twice.
+
+    Returns:
+        The files.
+
+    Raises:
+        RefuError: another suffix, no frame, a package that is missing, or a file that can't be written.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in FORMATS:
+        msg = f"{path}: wanted a file of {', '.join(FORMATS)}, got {suffix or 'no suffix'}"
+        raise RefuError(msg)
+    count = len(meshes[0].vertices) if meshes else 0
+    if not count:
+        msg = f"{path}: there is no frame to write"
+        raise RefuError(msg)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if suffix in _USD:
+            _write_usd(meshes, path, fps)
+            return [path]
+        digits = len(str(count - 1))
+        paths = [path if count == 1 else path.with_name(f"{path.stem}_{k:0{digits}}{suffix}") for k in range(count)]
+        for k, one in enumerate(paths):
+            one.write_bytes(_glb(meshes, k) if suffix == ".glb" else _obj(meshes, k))
+    except OSError as error:
+        msg = f"{path}: can't be written: {error.strerror or error}"
+        raise RefuError(msg) from error
+    return paths
+
+
+def export(options: ReplayOptions, path: Path, *, first: int, count: int, with_body: bool) -> list[Path]:
+    """What `refu export` does: some frames of a bag or motion file, dressed, as files. Raises `RefuError`."""
+    from refu_lab.sources import open_source
+
+    if path.suffix.lower() not in FORMATS:  # said before the work is done
+        write_meshes((), path)
+    pipeline = options.load_pipeline()
+    with open_source(options, pipeline.body) as source:
+        frames = [r.frame for r in islice(source.records, first, first + count) if r.frame is not None]
+    if not frames:
+        msg = f"{options.input}: has no frame that can be dressed from number {first} on"
+        raise RefuError(msg)
+    outputs = [pipeline(frame) for frame in frames]
+    stamps = np.array([frame.stamp_ns for frame in frames])
+    step = 1e-9 * float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
+    return write_meshes(
+        meshes_of(pipeline, outputs, with_body=with_body), path, fps=round(1 / step, 3) if step > 0 else 30.0
+    )
+
+
+def _glb(meshes: Sequence[ExportMesh], frame: int) -> bytes:
+    import trimesh
+
+    scene = trimesh.Scene()
+    for mesh in meshes:
+        vertices, faces, coordinates = mesh.vertices[frame], mesh.faces, None
+        if mesh.uv is not None:
+            # A vertex for each pair of place and texture coordinates.
+            pairs = np.stack((mesh.faces, mesh.uv.faces), -1).reshape(-1, 2)
+            unique, local = np.unique(pairs, axis=0, return_inverse=True)
+            vertices, coordinates = vertices[unique[:, 0]], mesh.uv.coordinates[unique[:, 1]]
+            faces = local.reshape(-1, 3)
+        material = trimesh.visual.material.PBRMaterial(
+            name=mesh.name,
+            baseColorFactor=(*mesh.color, 1.0),
+            roughnessFactor=0.9,
+            metallicFactor=0.0,
+            doubleSided=True,
+        )
+        visual = trimesh.visual.TextureVisuals(uv=coordinates, material=material)
+        scene.add_geometry(
+            trimesh.Trimesh(vertices, faces, visual=visual, process=False), geom_name=mesh.name, node_name=mesh.name
+        )
+    data: bytes = scene.export(file_type="glb")
+    return data
+
+
+def _obj(meshes: Sequence[ExportMesh], frame: int) -> bytes:
+    lines = ["# metres, y up, z forward"]
+    n_vertices = n_coordinates = 1
+    for mesh in meshes:
+        lines.append(f"o {mesh.name}")
+        lines += ["v {:.6f} {:.6f} {:.6f}".format(*point) for point in mesh.vertices[frame].tolist()]
+        corners = (mesh.faces + n_vertices).tolist()
+        if mesh.uv is None:
+            lines += ["f {} {} {}".format(*face) for face in corners]
+        else:
+            lines += ["vt {:.6f} {:.6f}".format(*point) for point in mesh.uv.coordinates.tolist()]
+            textured = (mesh.uv.faces + n_coordinates).tolist()
+            lines += [
+                "f " + " ".join(f"{v}/{t}" for v, t in zip(face, texture, strict=True))
+                for face, texture in zip(corners, textured, strict=True)
+            ]
+            n_coordinates += len(mesh.uv.coordinates)
+        n_vertices += mesh.vertices.shape[1]
+    return ("\n".join(lines) + "\n").encode()
+
+
+def _write_usd(meshes: Sequence[ExportMesh], path: Path, fps: float) -> None:
+    try:
+        from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+    except ImportError as error:
+        msg = f'{path}: to write USD, install its library: pip install "refu-ros[usd]" (usd-core)'
+        raise RefuError(msg) from error
+    stage: Any = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    root = UsdGeom.Xform.Define(stage, "/person")
+    stage.SetDefaultPrim(root.GetPrim())
+    frames = len(meshes[0].vertices)
+    if frames > 1:
+        stage.SetTimeCodesPerSecond(fps)
+        stage.SetStartTimeCode(0)
+        stage.SetEndTimeCode(frames - 1)
+    for mesh in meshes:
+        prim = UsdGeom.Mesh.Define(stage, f"/person/{_identifier(mesh.name)}")
+        prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+        prim.CreateDoubleSidedAttr(True)
+        prim.CreateFaceVertexCountsAttr(Vt.IntArray([3] * len(mesh.faces)))
+        prim.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(mesh.faces.ravel().astype(np.int32)))
+        linear = tuple(channel**2.2 for channel in mesh.color)  # display colours are linear
+        prim.CreateDisplayColorAttr(Vt.Vec3fArray([Gf.Vec3f(*linear)]))
+        points, extent = prim.CreatePointsAttr(), prim.CreateExtentAttr()
+        for k, vertices in enumerate(mesh.vertices):
+            time = Usd.TimeCode(k) if frames > 1 else Usd.TimeCode.Default()
+            points.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(vertices)), time)
+            bounds = np.stack((vertices.min(0), vertices.max(0)))
+            extent.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(bounds)), time)
+        if mesh.uv is not None:
+            texture = UsdGeom.PrimvarsAPI(prim).CreatePrimvar(
+                "st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying
+            )
+            texture.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(mesh.uv.coordinates)))
+            texture.SetIndices(Vt.IntArray.FromNumpy(mesh.uv.faces.ravel().astype(np.int32)))
+    if not stage.GetRootLayer().Export(str(path)):
+        msg = f"{path}: can't be written"
+        raise RefuError(msg)
+
+
+def _identifier(name: str) -> str:
+    """A name as USD wants it: letters, digits and underscores."""
+    found = "".join(c if c.isascii() and c.isalnum() else "_" for c in name)
+    return found if not found[:1].isdigit() else f"_{found}"

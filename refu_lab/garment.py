@@ -1,0 +1,226 @@
+"""What `refu garment` does: makes garments of meshes, tries them on, lists those that there are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from refu_core import GarmentError, GarmentPipeline, SmplFrame, load_body, load_garment
+from refu_core.fitting import (
+    LONGEST_EDGE,
+    UNITS,
+    FittedGarment,
+    GarmentDetails,
+    Placing,
+    fit_garment,
+    read_surface,
+    standing_pose,
+)
+from refu_core.frames import N_JOINTS
+from refu_core.garments import garment_files, garments_folder, save_garment
+from refu_core.metrics import CollisionChecker
+from refu_core.modes import BUILTIN_GARMENTS
+from refu_core.recordings import SUFFIXES, read_recording
+from refu_core.weights import weights_folder
+from refu_lab.render import Camera, RenderMesh, render, save_png
+from refu_lab.tables import format_table
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+_TILE = (260, 400)
+"""Width and height of one picture [pixels]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AddOptions:
+    """The options of `refu garment add`."""
+
+    mesh: Path
+    body: str = "neutral"
+    name: str | None = None
+    output: Path | None = None
+    layer: int = 1
+    color: tuple[float, ...] | None = None
+    held_at: str | None = None
+    unit: str | None = None
+    up: str | None = None
+    pose: str | None = None
+    as_placed: bool = False
+    longest_edge: float = LONGEST_EDGE
+    source: str = "a mesh of the user's"
+    picture: Path | None = None
+    overwrite: bool = False
+
+    @property
+    def target(self) -> Path:
+        """Where the garment's file goes: into the user's folder, unless it is told otherwise."""
+        if self.output is not None:
+            return self.output
+        return garments_folder() / f"{self.name or self.mesh.stem}.npz"
+
+
+def try_on_poses() -> dict[str, NDArray[np.float32]]:
+    """A few poses that people take, by name: rotation vectors [rad], shape (24, 3)."""
+    stand, walk, reach = (standing_pose(arms) for arms in (1.0, 1.1, -0.9))
+    walk[1, 0], walk[2, 0], walk[4, 0], walk[5, 0] = -0.45, 0.35, 0.25, 0.55
+    walk[16, 1], walk[17, 1] = 0.3, 0.3
+    reach[3, 0] = -0.1
+    return {name: pose.astype(np.float32) for name, pose in (("stand", stand), ("walk", walk), ("reach", reach))}
+
+
+def add_garment(options: AddOptions) -> dict[str, Any]:
+    """Makes a garment's file of a mesh, and tries it on; what was done, as plain values.
+
+    Raises `RefuError` for a mesh that can't be worn, and for a file that is there already.
+    """
+    target = options.target
+    name = target.stem.removeprefix("garment_")
+    if name in BUILTIN_GARMENTS:
+        msg = f"{name} is a garment that ships: call this one otherwise (--name)"
+        raise GarmentError(msg)
+    if target.exists() and not options.overwrite:
+        msg = f"{target} is there already: give it another --name, or --overwrite it"
+        raise GarmentError(msg)
+    body = load_body(options.body)
+    made = fit_garment(
+        read_surface(options.mesh),
+        body,
+        name=name,
+        placing=_placing(options),
+        details=_details(options),
+        longest_edge=options.longest_edge,
+    )
+    save_garment(made.template, target)
+    worn = try_on(made)
+    template = made.template
+    if options.picture is not None:
+        save_png(picture([str(target)]), options.picture)
+    return {
+        "garment": name,
+        "file": str(target),
+        "body": template.body,
+        "layer": template.card.layer,
+        "held_at": "waist" if template.card.held_at_waist else "shoulders",
+        "vertices": template.n_vertices,
+        "faces": len(template.faces),
+        "uv": template.uv is not None,
+        "joints": list(template.card.joints),
+        "notes": made.notes,
+        "worn": worn,
+    }
+
+
+def _placing(options: AddOptions) -> Placing:
+    unit = None
+    if options.unit is not None:
+        try:
+            unit = UNITS[options.unit] if options.unit in UNITS else float(options.unit)
+        except ValueError:
+            unit = float("nan")
+        if not 1e-6 < unit < 1e6:
+            msg = f"no unit {options.unit!r}: wanted {', '.join(UNITS)}, or how many metres it is"
+            raise GarmentError(msg)
+    return Placing(unit, options.up, _pose(options.pose), options.as_placed)
+
+
+def _pose(text: str | None) -> NDArray[np.float64] | None:
+    """`t`, degrees that both arms hang down, or the first pose of a motion file."""
+    if text is None:
+        return None
+    if text == "t":
+        return standing_pose(0.0)
+    if Path(text).suffix.lower() in SUFFIXES:
+        pose = np.array(read_recording(text, error=GarmentError, fps=30.0).poses[0], np.float64).reshape(N_JOINTS, 3)
+        pose[0] = 0  # the mesh stands upright; where it faces is --up's business
+        return pose
+    try:
+        angle = float(text)
+    except ValueError:
+        angle = float("nan")
+    if not -90 <= angle <= 90:
+        msg = f"no pose {text!r}: wanted t, the angle in degrees that the arms hang down (45), or a motion .npz"
+        raise GarmentError(msg)
+    return standing_pose(np.radians(angle))
+
+
+def _details(options: AddOptions) -> GarmentDetails:
+    plain = GarmentDetails()
+    red, green, blue = options.color or plain.color
+    source = f"{options.source} ({options.mesh.name}), by refu garment add"
+    return GarmentDetails(options.layer, (red, green, blue), options.held_at, source)
+
+
+def try_on(made: FittedGarment) -> dict[str, dict[str, Any]]:
+    """What is left of collisions with the body in each of a few poses, worn by skinning."""
+    pipeline = GarmentPipeline.load([made.template], backbone="skinned")
+    checker = CollisionChecker(pipeline.body.faces.numpy())
+    found = {}
+    for pose_name, pose in try_on_poses().items():
+        output = pipeline(SmplFrame(pose=pose))
+        checker.update(output.body)
+        mesh = output[made.template.name]
+        left = checker.check(mesh.local, mesh.faces)
+        found[pose_name] = {"inside": left.n_inside, "pairs": left.n_pairs}
+    return found
+
+
+def picture(garments: Sequence[str], *, size: tuple[int, int] = _TILE, samples: int = 4) -> NDArray[np.uint8]:
+    """Garments worn together, a picture a pose; sRGB, shape (height, poses width, 3). Raises `RefuError`."""
+    pipeline = GarmentPipeline.load(garments)
+    faces = pipeline.body.faces.numpy()
+    views = []
+    for yaw, pose in zip((25.0, 40.0, -160.0), try_on_poses().values(), strict=True):
+        output = pipeline(SmplFrame(pose=pose))
+        worn = [RenderMesh(mesh.local, mesh.faces, pipeline.garments[name].card.color) for name, mesh in output.items()]
+        camera = Camera.framing(output.body, size=size, yaw=yaw)
+        views.append(render([RenderMesh(output.body, faces), *worn], camera=camera, size=size, samples=samples))
+    return np.concatenate(views, axis=1)
+
+
+def list_garments() -> list[dict[str, Any]]:
+    """All garments that have a name; one whose file is damaged has its `fault`."""
+    rows: list[dict[str, Any]] = []
+    for name, path in garment_files().items():
+        row: dict[str, Any] = {"garment": name, "from": "refu" if name in BUILTIN_GARMENTS else str(path)}
+        try:
+            template = load_garment(name)
+        except GarmentError as error:
+            rows.append({**row, "fault": str(error)})
+            continue
+        networks = sorted(file.stem for file in weights_folder(name).glob("*-hybrid.json"))
+        row |= {"body": template.body, "layer": template.card.layer, "vertices": template.n_vertices}
+        rows.append(
+            {**row, "styles": template.styledirs is not None, "uv": template.uv is not None, "networks": networks}
+        )
+    return rows
+
+
+def garments_table(rows: list[dict[str, Any]]) -> str:
+    """What `refu garment list` prints."""
+    cells = []
+    for row in rows:
+        if "fault" in row:
+            cells.append((row["garment"], "-", "-", "-", "-", "-", "-", row["fault"]))
+            continue
+        networks = ", ".join(row["networks"]) or "none: worn by skinning"
+        flags = ("yes" if row[key] else "no" for key in ("styles", "uv"))
+        cells.append(
+            (row["garment"], row["body"], str(row["layer"]), str(row["vertices"]), *flags, networks, row["from"])
+        )
+    return format_table(("garment", "body", "layer", "vertices", "styles", "UVs", "networks", "from"), cells)
+
+
+def added_text(result: dict[str, Any]) -> str:
+    """What `refu garment add` prints."""
+    lines = [f"{result['garment']}: {result['vertices']} vertices, for the body {result['body']}"]
+    lines += [f"  - {note}" for note in result["notes"]]
+    for pose, left in result["worn"].items():
+        lines.append(f"  worn in the pose {pose}: {left['inside']} vertices inside, {left['pairs']} triangles cut it")
+    lines.append(f"wrote {result['file']}")
+    return "\n".join(lines)

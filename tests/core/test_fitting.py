@@ -1,0 +1,280 @@
+"""Garments of one's own: reading and cleaning meshes, finding their place, what they take over from the skin."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from outside_meshes import Outside, Wanted, cloth, quads_of_a_skirt, write_obj
+
+from refu_core import GarmentError, GarmentPipeline, SmplFrame, load_body, load_garment
+from refu_core.fitting import (
+    GarmentDetails,
+    Placing,
+    PosedBody,
+    SurfaceMesh,
+    Transfer,
+    fit_garment,
+    read_surface,
+    standing_pose,
+)
+from refu_core.fitting._clean import clean, components, split_long_edges
+from refu_core.fitting._place import find_places
+from refu_core.garments import save_garment
+from refu_core.mesh import Connectivity
+
+
+def tube(rows: int = 12, columns: int = 24) -> tuple[np.ndarray, np.ndarray]:
+    """An open cylinder of triangles, its faces outward."""
+    angle, height = np.meshgrid(2 * np.pi * np.arange(columns) / columns, np.linspace(0, 1, rows))
+    v = np.stack((0.2 * np.sin(angle), height, 0.2 * np.cos(angle)), -1).reshape(-1, 3)
+    a = np.arange((rows - 1) * columns).reshape(rows - 1, columns)
+    b = np.roll(a, -1, 1)
+    quads = np.stack((a, b, b + columns, a + columns), -1).reshape(-1, 4)
+    return v, np.concatenate((quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]))
+
+
+def volume_of_edges(f: np.ndarray) -> int:
+    """How many edges two faces run through in the same direction."""
+    pairs = np.stack((f, np.roll(f, -1, 1)), -1).reshape(-1, 2)
+    return len(pairs) - len(np.unique(pairs, axis=0))
+
+
+AS_IS = Placing(1.0, "y", standing_pose(0.0), is_placed=True)
+
+
+# -- cleaning
+
+
+@settings(max_examples=15)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_a_mesh_that_was_taken_apart_is_put_together(seed: int) -> None:
+    """A soup of faces, some turned over, some double, in any order, at any size, is the surface that it was."""
+    rng = np.random.default_rng(seed)
+    v, f = tube()
+    scale = 10.0 ** rng.uniform(-3, 3)
+    soup = v[f] * scale
+    turned = rng.random(len(f)) < 0.4
+    soup[turned] = soup[turned][:, ::-1]
+    soup = np.concatenate((soup, soup[rng.choice(len(f), 9, replace=False)]))[rng.permutation(len(f) + 9)]
+    mesh, notes = clean(SurfaceMesh(soup.reshape(-1, 3), np.arange(3 * len(soup)).reshape(-1, 3)))
+    assert len(mesh.vertices) == len(v)
+    assert len(mesh.faces) == len(f)
+    assert volume_of_edges(mesh.faces) == 0
+    connectivity = Connectivity.of(mesh.faces)
+    assert connectivity.n_faces_of_edge.max() == 2
+    assert len(connectivity.boundary) == 2 * 24
+    assert any("9 faces were there twice" in note for note in notes)
+
+
+def test_a_clean_mesh_is_left_alone() -> None:
+    garment = load_garment("short-pant-male")
+    v, f = garment.v_template.double().numpy(), garment.faces.numpy()
+    mesh, notes = clean(SurfaceMesh(v, f))
+    assert notes == []
+    np.testing.assert_array_equal(mesh.vertices, v)
+    np.testing.assert_array_equal(mesh.faces, f)
+
+
+def test_edges_of_three_faces_are_cut_open() -> None:
+    v, f = tube()
+    ruffle = np.array([[v[60, 0] * 2, v[60, 1], v[60, 2] * 2]])
+    mesh, notes = clean(SurfaceMesh(np.concatenate((v, ruffle)), np.concatenate((f, [[60, 61, len(v)]]))))
+    assert Connectivity.of(mesh.faces).n_faces_of_edge.max() == 2
+    assert components(mesh.faces, len(mesh.vertices))[0] == 2
+    assert len(mesh.vertices) == len(v) + 3
+    assert any("more than two faces" in note for note in notes)
+
+
+def test_what_has_one_side_is_refused() -> None:
+    n = 30
+    t = 2 * np.pi * np.arange(n) / n
+    along = np.stack((np.cos(t), np.sin(t), 0 * t), 1)
+    across = 0.2 * np.stack((np.cos(t / 2) * np.cos(t), np.cos(t / 2) * np.sin(t), np.sin(t / 2)), 1)
+    v = np.concatenate((along - across, along + across))
+    a, b = np.arange(n), (np.arange(n) + 1) % n
+    c, d = a + n, b + n
+    b[-1], d[-1] = n, 0  # half a turn
+    f = np.concatenate((np.stack((a, b, d), 1), np.stack((a, d, c), 1)))
+    with pytest.raises(GarmentError, match="one side only"):
+        clean(SurfaceMesh(v, f))
+
+
+def test_long_edges_are_split_with_their_texture() -> None:
+    v, f = tube(4, 12)
+    uv = v[:, :2].astype(np.float32)  # linear in the place: it must stay so
+    mesh = SurfaceMesh(v, f, type(load_uv(v, f))(uv, f))
+    fine = split_long_edges(mesh, 0.04)
+    assert fine.uv is not None
+    ends = fine.vertices[Connectivity.of(fine.faces).edges]
+    assert np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).max() <= 0.04
+    np.testing.assert_allclose(fine.uv.coordinates[fine.uv.faces], fine.vertices[fine.faces][..., :2], atol=1e-6)
+    assert volume_of_edges(fine.faces) == 0
+
+    def area(m: SurfaceMesh) -> float:
+        return float(trimesh.Trimesh(m.vertices, m.faces, process=False).area)
+
+    assert area(fine) == pytest.approx(area(mesh), rel=1e-9)
+
+
+def load_uv(v: np.ndarray, f: np.ndarray):
+    """Texture coordinates of each vertex."""
+    from refu_core.garments import UvMap
+
+    return UvMap(v[:, :2].astype(np.float32), f)
+
+
+# -- files
+
+
+def test_polygons_and_textures_of_an_obj(tmp_path: Path) -> None:
+    places = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 2 0 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
+    text = places + "f 1/1 2/2 3/3 4/4\nf -4/2 -1/1 -3/3\n"
+    (tmp_path / "a.obj").write_text(text)
+    mesh = read_surface(tmp_path / "a.obj")
+    assert len(mesh.faces) == 3
+    assert mesh.faces[2].tolist() == [1, 4, 2]
+    assert mesh.uv is not None
+    np.testing.assert_allclose(mesh.uv.coordinates[mesh.uv.faces[:2]], mesh.vertices[mesh.faces[:2]][..., :2])
+
+
+@pytest.mark.parametrize(
+    ("content", "wanted"),
+    [
+        ("", "an empty file"),
+        ("v 0 0 0\n", "it has no faces"),
+        ("v 0 0 0\nv 1 0 0\nf 1 2 3\n", "a face names vertex 3 of 2"),
+        ("v 0 0 x\n", "line 1"),
+        ("v 0 0 0\nv 1 0 0\nv nan 1 0\nf 1 2 3\n", "NaN or infinite"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 -9\n", "line 4"),
+    ],
+)
+def test_files_that_hold_no_mesh_are_refused(content: str, wanted: str, tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_text(content)
+    with pytest.raises(GarmentError, match=wanted):
+        read_surface(tmp_path / "a.obj")
+    (tmp_path / "a.ply").write_text("ply\n" + content)
+    with pytest.raises(GarmentError, match=r"a\.ply"):
+        read_surface(tmp_path / "a.ply")
+    with pytest.raises(GarmentError, match=r"wanted a mesh \(\.obj"):
+        read_surface(tmp_path / "a.txt")
+
+
+# -- what is taken over
+
+
+@pytest.fixture(scope="module")
+def at_rest() -> dict[str, PosedBody]:
+    return {name: PosedBody(load_body(name), np.zeros((24, 3))) for name in ("male", "female")}
+
+
+@pytest.mark.parametrize("name", ["tshirt-male", "skirt-female"])
+def test_weights_and_shapes_are_those_of_garments_that_were_made_by_hand(name: str, at_rest) -> None:
+    garment = load_garment(name)
+    posed = at_rest[garment.body]
+    transfer = Transfer.of(garment.v_template.double().numpy(), garment.faces.numpy(), posed)
+    weights = transfer(posed.body.weights.double().numpy(), length=0.012)
+    assert weights.min() > -1e-9
+    np.testing.assert_allclose(weights.sum(1), 1, atol=1e-9)
+    differs = np.abs(weights - garment.weights.numpy()).sum(1)
+    assert differs.mean() < 0.15
+    assert np.quantile(differs, 0.95) < 0.35
+    shaped = (posed.body.rest_vertices(torch.eye(10)) - posed.body.v_template).permute(1, 2, 0).double().numpy()
+    found = transfer(shaped.reshape(len(shaped), -1), length=0.03).reshape(-1, 3, 10)
+    wanted = garment.shapedirs.view(-1, 3, 10).numpy()
+    assert np.linalg.norm(found - wanted, axis=1).mean() < 0.002  # [m]
+    # No arm moves the trunk more than the tailor lets it.
+    arms = weights[:, 16:].sum(1) - garment.weights[:, 16:].sum(1).numpy()
+    assert arms[np.abs(garment.v_template[:, 0].numpy()) < 0.15].max(initial=0) < 0.15
+
+
+def test_what_is_constant_stays_so_and_what_is_linear_is_followed(at_rest) -> None:
+    posed = at_rest["female"]
+    garment = load_garment("tshirt-female")
+    transfer = Transfer.of(garment.v_template.double().numpy(), garment.faces.numpy(), posed)
+    skin = posed.vertices.double().numpy()
+    np.testing.assert_allclose(transfer(np.ones((len(skin), 1)), length=0.02), 1, atol=1e-9)
+    height = transfer(skin[:, 1:2], length=0.012)[:, 0]
+    assert np.abs(height - garment.v_template[:, 1].numpy()).mean() < 0.01
+
+
+# -- placing
+
+
+@pytest.mark.parametrize(("unit", "up", "arms"), [(100.0, "z", 0.0), (1000.0, "y", 0.75), (39.37, "z", 0.75)])
+def test_unit_axes_floor_and_pose_are_found(unit: float, up: str, arms: float) -> None:
+    garment, body = load_garment("tshirt-male"), load_body("male")
+    posed = body(torch.as_tensor(standing_pose(arms), dtype=torch.float32)[None])
+    there = garment.pose(garment.v_template[None], posed.transforms)[0].double().numpy()
+    v = there - [0, float(posed.vertices[0, :, 1].min()), 0]
+    if up == "z":
+        v = np.stack((v[:, 0], -v[:, 2], v[:, 1]), 1)
+    mesh = SurfaceMesh(unit * v, garment.faces.numpy())
+    place = next(find_places(mesh, body, Placing()))
+    np.testing.assert_allclose(place(mesh.vertices), there, atol=0.004)
+    assert place.pose[17, 2] == pytest.approx(arms, abs=0.12)
+
+
+def test_a_mesh_that_says_what_it_is_isnt_moved() -> None:
+    garment, body = load_garment("tshirt-male"), load_body("male")
+    mesh = SurfaceMesh(garment.v_template.double().numpy(), garment.faces.numpy())
+    fitted = fit_garment(mesh, body, name="mine", details=GarmentDetails(layer=3, held_at="shoulders"))
+    assert fitted.notes == []
+    torch.testing.assert_close(fitted.template.v_template, garment.v_template, atol=1e-6, rtol=0)
+    assert (fitted.template.card.layer, fitted.template.card.held_at_waist) == (3, False)
+
+
+@pytest.mark.parametrize(
+    ("mesh", "placing", "wanted"),
+    [
+        (trimesh.creation.box(extents=(0.3, 0.3, 0.3)), AS_IS, "surround the body|had to move|mm inside"),
+        (trimesh.creation.icosphere(radius=0.4), AS_IS, "surround the body male|had to move by"),
+        (trimesh.creation.icosphere(radius=50), Placing(unit=1.0), "100 units = 100 m large: wanted a garment of"),
+    ],
+    ids=["box", "ball", "huge"],
+)
+def test_what_is_no_garment_is_refused(mesh: trimesh.Trimesh, placing: Placing, wanted: str) -> None:
+    surface = SurfaceMesh(np.asarray(mesh.vertices), np.asarray(mesh.faces, dtype=np.int64))
+    with pytest.raises(GarmentError, match=wanted):
+        fit_garment(surface, load_body("male"), name="ball", placing=placing)
+
+
+def test_a_pose_that_it_isnt_in_is_refused() -> None:
+    v, f = cloth(Wanted(sleeve=0.9, arms=1.0, step=0.025))
+    body = load_body("neutral")
+    v = v + np.array([0, float(body.v_template[:, 1].min()), 0])
+    with pytest.raises(GarmentError, match="--pose"):
+        fit_garment(SurfaceMesh(v, f), body, name="coat", placing=Placing(1.0, "y", standing_pose(0.0), is_placed=True))
+
+
+# -- the whole way
+
+
+def test_a_skirt_of_quads_is_worn_saved_and_loaded(tmp_path: Path) -> None:
+    v, quads = quads_of_a_skirt(24, 72)
+    angle = np.arctan2(v[:, 0], v[:, 2])
+    uv = np.stack((angle, v[:, 1]), 1)
+    path = write_obj(tmp_path / "kilt.obj", Outside(v, quads, uv, quads))
+    fitted = fit_garment(read_surface(path), load_body("female"), name="kilt", longest_edge=0.03)
+    template = fitted.template
+    assert template.card.held_at_waist
+    assert template.uv is not None
+    saved = save_garment(template, tmp_path / "kilt.npz")
+    loaded = load_garment(saved)
+    np.testing.assert_allclose(loaded.v_template, template.v_template, atol=1e-6)
+    np.testing.assert_allclose(loaded.weights, template.weights, atol=3e-5)
+    np.testing.assert_array_equal(loaded.uv.faces, template.uv.faces)
+    assert loaded.card == template.card
+    worn = GarmentPipeline.load([loaded, "tshirt-female"])
+    assert worn.untrained == ("kilt", "tshirt-female")
+    output = worn(SmplFrame(pose=standing_pose(0.9)))
+    assert {stats.n_unresolved for stats in output.stats.garments.values()} == {0}
+    assert np.isfinite(output["kilt"].local).all()
+    with pytest.raises(GarmentError, match=r"wanted the path of an \.npz"):
+        save_garment(replace(template, name="x"), tmp_path / "kilt.obj")

@@ -1,0 +1,220 @@
+"""`refu garment` and `refu export`: from a mesh to a garment that is worn, simulated, trained and exported."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from outside_meshes import MESHES, Outside, quads_of_a_skirt, write_obj
+from small_set import write_set
+
+from refu_core import GarmentError, GarmentPipeline, RefuError, SmplFrame, load_body, load_garment
+from refu_core.fitting import fit_garment, read_surface
+from refu_core.garments import garment_files, save_garment
+from refu_core.simulation import open_dataset, simulate_dataset
+from refu_core.training import PretrainSettings, pretrain
+from refu_lab.cli import main
+from refu_lab.export import ExportMesh, meshes_of, write_meshes
+from refu_lab.garment import AddOptions, add_garment, list_garments
+from refu_ros._settings import NodeSettings
+
+ROOT = Path(__file__).parents[2]
+WALK = ROOT / "bags" / "walk"
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder of the user's garments."""
+    monkeypatch.setenv("REFU_GARMENTS", str(tmp_path / "mine"))
+    return tmp_path / "mine"
+
+
+@pytest.fixture(scope="module")
+def kilt(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A mesh file: a coarse skirt of quads with texture coordinates, in metres, on a floor."""
+    v, quads = quads_of_a_skirt(12, 40)
+    uv = np.stack((np.arctan2(v[:, 0], v[:, 2]), v[:, 1]), 1)
+    return write_obj(tmp_path_factory.mktemp("mesh") / "kilt.obj", Outside(v, quads, uv, quads))
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_meshes_from_elsewhere_are_worn(name: str, tmp_path: Path) -> None:
+    """Whatever their unit, axes, place, pose and faults: nothing of them is inside the body in any of three poses."""
+    mesh = MESHES[name](tmp_path, 1.5)
+    result = add_garment(AddOptions(mesh=mesh, output=tmp_path / "worn.npz", longest_edge=0.035))
+    inside = sum(pose["inside"] for pose in result["worn"].values())
+    assert inside <= 0.002 * result["vertices"]  # an armhole's rim
+    assert result["uv"] == ("texture" in name)
+    garment = load_garment(tmp_path / "worn.npz")
+    body = load_body("neutral")
+    posed = body(torch.zeros(1, 24, 3), torch.tensor([[1.5, 1.0] + 8 * [0.0]]))
+    rest = garment.rest(torch.tensor([[1.5, 1.0] + 8 * [0.0]]))
+    assert posed.vertices.isfinite().all()
+    # It grows with the body, and its triangles don't tear as it moves.
+    assert float((rest - garment.v_template).norm(dim=-1).mean()) > 0.01
+    edges = garment.edges
+    was = (garment.v_template[edges[:, 0]] - garment.v_template[edges[:, 1]]).norm(dim=-1)
+    pipeline = GarmentPipeline.load([garment], sdf="none")
+    pose = np.zeros((24, 3), np.float32)
+    pose[16, 2], pose[17, 2], pose[1, 0], pose[2, 0] = -1.0, 1.0, -0.5, 0.4
+    now = torch.from_numpy(pipeline(SmplFrame(pose=pose))["worn"].local)
+    stretch = (now[edges[:, 0]] - now[edges[:, 1]]).norm(dim=-1) / was
+    assert float(stretch.quantile(0.99)) < 1.8
+
+
+def test_a_garment_is_added_listed_and_worn_by_name(folder: Path, kilt: Path, tmp_path: Path, capsys) -> None:
+    arguments = ["garment", "add", str(kilt), "--body", "female", "--layer", "2", "--color", "0.1,0.2,0.9"]
+    assert main([*arguments, "--longest-edge", "0.05", "--picture", str(tmp_path / "kilt.png")]) == 0
+    said = capsys.readouterr().out
+    assert "it stood with the floor at 0" in said
+    assert "worn in the pose walk: 0 vertices inside" in said
+    assert (tmp_path / "kilt.png").stat().st_size > 10_000
+    assert garment_files()["kilt"] == folder / "kilt.npz"
+    card = load_garment("kilt").card
+    assert (card.layer, card.color, card.held_at_waist) == (2, (0.1, 0.2, 0.9), True)
+    assert main(["garment", "list", "--json", str(tmp_path / "list.json")]) == 0
+    rows = {row["garment"]: row for row in json.loads((tmp_path / "list.json").read_text())["garments"]}
+    assert rows["kilt"]["body"] == "female"
+    assert (rows["kilt"]["networks"], rows["kilt"]["uv"], rows["tshirt-male"]["uv"]) == ([], True, False)
+    assert rows["tshirt-male"]["networks"] == ["tailornet-hybrid"]
+    arguments = ["replay", str(WALK), "--garments", "kilt,tshirt-female", "--max-frames", "2", "--quiet"]
+    assert main([*arguments, "--json", str(tmp_path / "replay.json"), "--output", str(tmp_path / "out.mcap")]) == 0
+    result = json.loads((tmp_path / "replay.json").read_text())
+    assert set(result["garments"]) == {"kilt", "tshirt-female"}
+    assert "kilt has no trained weights: worn by skinning" in result["warnings"]
+    assert main(["garment", "add", str(kilt)]) == 2
+    assert "is there already" in capsys.readouterr().err
+    (folder / "torn.npz").write_bytes(b"no garment")
+    assert [row["garment"] for row in list_garments() if "fault" in row] == ["torn"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "wanted"),
+    [
+        (["--name", "tshirt-male"], "is a garment that ships"),
+        (["--unit", "furlong"], "no unit 'furlong': wanted m, dm"),
+        (["--unit", "mm"], "wanted a garment of"),
+        (["--pose", "sitting"], "no pose 'sitting': wanted t, the angle"),
+        (["--body", "robot"], "no body 'robot'"),
+        (["--color", "2,0,0"], "color: wanted three numbers"),
+        (["--layer", "-1"], "layer: wanted a whole number"),
+    ],
+)
+def test_what_makes_no_garment_is_said(arguments: list[str], wanted: str, folder: Path, kilt: Path, capsys) -> None:
+    assert main(["garment", "add", str(kilt), "--longest-edge", "0.1", *arguments]) == 2
+    assert wanted in capsys.readouterr().err
+    assert not folder.exists()
+
+
+def test_a_node_takes_a_garment_by_its_path(kilt: Path, tmp_path: Path) -> None:
+    result = add_garment(AddOptions(mesh=kilt, body="female", longest_edge=0.1, output=tmp_path / "kilt.npz"))
+    settings = NodeSettings(garments=(result["file"],))
+    settings.pipeline.check()
+    assert settings.pipeline.load().untrained == ("kilt",)
+    with pytest.raises(RefuError, match="no weights of tailornet hybrid"):
+        replace(settings, backbone="tailornet").pipeline.check()
+
+
+def test_a_garment_of_ones_own_is_simulated_and_trained(kilt: Path, tmp_path: Path) -> None:
+    """The whole journey with few samples: a mesh, cloth, networks, and those in the pipeline."""
+    body = load_body("female")
+    template = fit_garment(read_surface(kilt), body, name="kilt", longest_edge=0.1).template
+    path = save_garment(template, tmp_path / "kilt.npz")
+    card = simulate_dataset(str(path), 2, tmp_path / "simulated", test_share=0.5)
+    assert card["counts"]["to_do"] == 0
+    data = write_set(tmp_path / "set", template, body)
+    settings = PretrainSettings.of("mlp", "realtime")
+    settings = replace(settings, style_shape_steps=2, low_steps=2, steps=2)
+    pretrain(
+        load_garment(path),
+        open_dataset(data),
+        tmp_path / "weights" / "kilt",
+        backbone="mlp",
+        settings=settings,
+        quiet=True,
+    )
+    pipeline = GarmentPipeline.load([path], backbone="mlp", sdf="none", weights=tmp_path / "weights")
+    assert pipeline.untrained == ()
+    assert np.isfinite(pipeline(SmplFrame(pose=np.zeros((24, 3))))["kilt"].local).all()
+
+
+# -- export
+
+
+@pytest.fixture(scope="module")
+def dressed(kilt: Path) -> list[ExportMesh]:
+    """A body in a textured skirt, two frames."""
+    template = fit_garment(read_surface(kilt), load_body("female"), name="kilt", longest_edge=0.1).template
+    pipeline = GarmentPipeline.load([template])
+    frames = [SmplFrame(pose=np.zeros((24, 3)), transl=[0, k, 0]) for k in range(2)]
+    return meshes_of(pipeline, pipeline(frames))
+
+
+def test_a_glb_has_names_places_colours_and_textures(dressed: list[ExportMesh], tmp_path: Path) -> None:
+    paths = write_meshes(dressed, tmp_path / "a.glb")
+    assert [path.name for path in paths] == ["a_0.glb", "a_1.glb"]
+    scene = trimesh.load_scene(paths[1], process=False)
+    assert set(scene.geometry) == {"body", "kilt"}
+    kilt = dressed[1]
+    read = scene.geometry["kilt"]
+    corners = kilt.vertices[1][kilt.faces]
+    np.testing.assert_allclose(read.vertices[read.faces], corners, atol=1e-6)
+    np.testing.assert_allclose(read.visual.uv[read.faces], kilt.uv.coordinates[kilt.uv.faces], atol=1e-6)
+    np.testing.assert_allclose(np.array(read.visual.material.baseColorFactor[:3]) / 255, kilt.color, atol=0.01)
+
+
+def test_an_obj_comes_back_as_it_was(dressed: list[ExportMesh], tmp_path: Path) -> None:
+    kilt = replace(dressed[1], vertices=dressed[1].vertices[:1])
+    (path,) = write_meshes([kilt], tmp_path / "kilt.obj")
+    mesh = read_surface(path)
+    np.testing.assert_allclose(mesh.vertices, kilt.vertices[0], atol=1e-6)
+    np.testing.assert_array_equal(mesh.faces, kilt.faces)
+    assert mesh.uv is not None
+    np.testing.assert_array_equal(mesh.uv.faces, kilt.uv.faces)
+    both = read_surface(
+        write_meshes([replace(dressed[0], vertices=dressed[0].vertices[:1]), kilt], tmp_path / "b.obj")[0]
+    )
+    np.testing.assert_array_equal(both.faces[-len(kilt.faces) :] - dressed[0].vertices.shape[1], kilt.faces)
+
+
+def test_a_usd_stage_moves(dressed: list[ExportMesh], tmp_path: Path) -> None:
+    usd = pytest.importorskip("pxr.Usd", reason="needs the extra usd")
+    from pxr import UsdGeom
+
+    (path,) = write_meshes(dressed, tmp_path / "a.usda", fps=25)
+    stage = usd.Stage.Open(str(path))
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode(), stage.GetTimeCodesPerSecond()) == (0, 1, 25)
+    assert (UsdGeom.GetStageUpAxis(stage), UsdGeom.GetStageMetersPerUnit(stage)) == ("Y", 1.0)
+    kilt = dressed[1]
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/person/kilt"))
+    np.testing.assert_allclose(mesh.GetPointsAttr().Get(1), kilt.vertices[1], atol=1e-6)
+    np.testing.assert_array_equal(np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3), kilt.faces)
+    texture = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").ComputeFlattened()
+    np.testing.assert_allclose(texture, kilt.uv.coordinates[kilt.uv.faces].reshape(-1, 2), atol=1e-6)
+
+
+def test_usd_without_its_library_is_said(dressed: list[ExportMesh], tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "pxr", None)
+    with pytest.raises(RefuError, match=r"refu-ros\[usd\]"):
+        write_meshes(dressed, tmp_path / "a.usdc")
+
+
+def test_frames_of_a_bag_are_exported(tmp_path: Path, capsys) -> None:
+    out = tmp_path / "walk.glb"
+    assert main(["export", str(WALK), "--output", str(out), "--first", "3", "--garments", "short-pant-male"]) == 0
+    assert set(trimesh.load_scene(out).geometry) == {"body", "short-pant-male"}
+    assert main(["export", str(WALK), "--output", str(tmp_path / "walk.stl")]) == 2
+    assert "wanted a file of .glb, .obj" in capsys.readouterr().err
+    assert main(["export", str(WALK), "--output", str(out), "--first", "100000"]) == 2
+    assert "has no frame that can be dressed" in capsys.readouterr().err
+
+
+def test_damaged_meshes_are_one_line(tmp_path: Path) -> None:
+    (tmp_path / "a.glb").write_bytes(b"glTF" + bytes(40))
+    with pytest.raises(GarmentError, match="not a mesh that can be read"):
+        read_surface(tmp_path / "a.glb")

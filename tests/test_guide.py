@@ -1,0 +1,34 @@
+"""What the guide's pages show in Python runs, word for word, in the order of the page."""
+
+from __future__ import annotations
+
+import re
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+from outside_meshes import Outside, quads_of_a_skirt, write_obj
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.mark.parametrize("page", ["python", "garments"])
+def test_a_pages_python_runs(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = (ROOT / "docs" / "guide" / f"{page}.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"^```python\n(.*?)^```$", text, flags=re.DOTALL | re.MULTILINE)
+    assert blocks
+    # What they read lies beside them.
+    (tmp_path / "bags").symlink_to(ROOT / "bags")
+    write_obj(tmp_path / "kilt.obj", Outside(*quads_of_a_skirt(16, 50)))
+    np.savez(tmp_path / "clip.npz", poses=np.zeros((3, 72)), trans=np.zeros((3, 3)), mocap_framerate=30.0)
+    (tmp_path / "page.py").write_text("\n".join(blocks), encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    names = runpy.run_path("page.py")
+    if page == "python":
+        assert names["pose"].shape == (1, 24, 3)
+        assert float(names["sdf"].query(names["done"].vertices).distance.min()) > 0
+        assert (tmp_path / "person.glb").stat().st_size > 100_000
+    else:
+        assert names["pipeline"].untrained == ("kilt", "tshirt-female")
+        assert (tmp_path / "kilt.npz").exists()
