@@ -31,6 +31,9 @@ class Layer:
     slides by a few edges only, so that takes half the time of a tree. On a folded sheet the search may end in the wrong
     fold, and in another one in the next frame. So a vertex also looks at what its neighbours found; and one that ends
     more than a centimetre below the sheet asks a tree.
+
+    What isn't near the sheet at rest (a sleeve beside shorts) is a stranger to it: a tree is asked where one comes to
+    it, and its outside may face the sheet's.
     """
 
     def __init__(
@@ -58,21 +61,24 @@ class Layer:
         above_mesh = Connectivity.of(above_faces.cpu(), len(above))
         below_mesh = Connectivity.of(below_faces.cpu(), len(below))
         rest, rest_below = self._above.cpu().numpy(), self._below.cpu().numpy()
-        meets = np.flatnonzero(cKDTree(rest_below).query(rest)[0] < settings.layer_meets)
-        rows, ring_start, ring = _region(above_mesh.ring, meets, settings.layer_rounds)
-        self._n_candidates, self._n_region = len(meets), len(rows)
+        is_near = cKDTree(rest_below).query(rest)[0] < settings.layer_meets
+        meets, candidates = np.flatnonzero(is_near), np.argsort(~is_near, kind="stable")  # those that meet first
+        rows, ring_start, ring = _region(above_mesh.ring, candidates, settings.layer_rounds)
+        self._n_candidates, self._n_region = len(candidates), len(rows)
         self._normals = torch.empty_like(self._below)
-        self._push = torch.zeros(len(meets), 3, device=self.device)
+        self._push = torch.zeros(len(candidates), 3, device=self.device)
+        self._extent = torch.zeros(2, 3, device=self.device)
         self._fields = torch.zeros(2, len(rows) + 1, 3, device=self.device)
         self._count = torch.zeros(1, dtype=torch.int32, device=self.device)
         self._n_doubtful = torch.zeros(1, dtype=torch.int32, device=self.device)
         self._tree: Any = None
         self._tree_is_late = True
         self._commands: dict[str, Any] = {}
-        if len(meets):
+        if len(candidates):
             cuts = [_cut(mesh, self.device) for mesh in (above_mesh, below_mesh)]
-            places = _starts(rest[meets], rest_below, settings)
-            lists = [_ints(values, self.device) for values in (*places, rows, ring_start, ring)]
+            start, places = _starts(rest[meets], rest_below, settings)
+            start = np.append(start, np.full(len(rest) - len(meets), start[-1]))  # strangers know of no place
+            lists = [_ints(values, self.device) for values in (start, places, rows, ring_start, ring)]
             rules, later = (
                 _rules(settings, reach, self._below, below_mesh) for reach in (farthest, settings.layer_later_reach)
             )
@@ -118,6 +124,7 @@ class Layer:
         """Takes over a frame."""
         self._above.copy_(above)
         self._below.copy_(below)
+        torch.aminmax(self._below, dim=0, out=(self._extent[0], self._extent[1]))
         self._commands["normals"].launch()
         self._tree_is_late = True
 
@@ -171,15 +178,31 @@ class Layer:
         pushed = [closest, push, as_warp(self._count, wp.int32)]
         doubts = [doubtful, as_warp(self._n_doubtful, wp.int32)]
         blend = [push, self._n_candidates, start, ring]
-        again = [start, ring, found, later, *pushed, *doubts]
+        extent = as_warp(self._extent, wp.vec3)
+        again = [start, ring, found, extent, later, *pushed, *doubts]
         for name, kernel, size, arguments in (
             ("normals", kernels.normals_kernel, len(self._below), [below, below_cut, normals]),
             ("search", kernels.search_kernel, self._n_candidates, [*search, near_start, near, found]),
             ("search again", kernels.search_kernel, self._n_candidates, [*search, itself, closest, found]),
-            ("lift", kernels.lift_kernel, self._n_candidates, [*garments, start, ring, found, rules, *pushed, *doubts]),
+            (
+                "lift",
+                kernels.lift_kernel,
+                self._n_candidates,
+                [*garments, start, ring, found, extent, rules, *pushed, *doubts],
+            ),
             ("lift again", kernels.lift_kernel, self._n_candidates, [*garments, *again]),
-            ("ask again", kernels.tree_kernel, self._n_candidates, [self._tree.id, *garments, later, *doubts, *pushed]),
-            ("ask", kernels.tree_kernel, self._n_candidates, [self._tree.id, *garments, rules, *doubts, *pushed]),
+            (
+                "ask again",
+                kernels.tree_kernel,
+                self._n_candidates,
+                [self._tree.id, *garments, found, later, *doubts, *pushed],
+            ),
+            (
+                "ask",
+                kernels.tree_kernel,
+                self._n_candidates,
+                [self._tree.id, *garments, found, rules, *doubts, *pushed],
+            ),
             ("spread0", kernels.spread_kernel, self._n_region, [*blend, fields[0], fields[1]]),
             ("spread1", kernels.spread_kernel, self._n_region, [*blend, fields[1], fields[0]]),
             ("move", kernels.move_kernel, self._n_region, [rows, fields[0], above]),
@@ -226,7 +249,8 @@ def _starts(
     closest = np.asarray(tree.query(above)[1])
     around = cKDTree(below[places]).query_ball_point(above, settings.layer_slides)
     each = [np.append(first, np.array(places)[others]) for first, others in zip(closest, around, strict=True)]
-    return np.append(0, np.cumsum([len(one) for one in each])), np.concatenate(each).astype(np.int64)
+    found = np.concatenate((*each, np.zeros(0, np.int64))).astype(np.int64)
+    return np.append(0, np.cumsum([len(one) for one in each])).astype(np.int64), found
 
 
 def _rim(mesh: Connectivity) -> NDArray[np.int64]:

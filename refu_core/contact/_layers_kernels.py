@@ -6,6 +6,8 @@ from refu_core.sdf._closest_kernels import closest_on_face, mean_normal
 
 # Nothing is so far from where it was at rest; it is a limit to what a sheet crumpled into itself may take.
 MOST_STEPS = wp.constant(64)
+# In place of the vertex that a candidate comes to: it isn't near the sheet at rest, as a sleeve isn't near shorts.
+STRANGER = wp.constant(-2)
 
 
 @wp.struct
@@ -95,6 +97,14 @@ def nearest_face(p: wp.vec3, start: int, points: wp.array[wp.vec3], cut: Cut) ->
     return face, feature, w, offset
 
 
+@wp.func
+def is_within(p: wp.vec3, extent: wp.array[wp.vec3], room: float) -> bool:
+    """Whether p is no farther than `room` outside of the box between the corners `extent`."""
+    above_low = p - extent[0]
+    below_high = extent[1] - p
+    return wp.min(wp.min(above_low), wp.min(below_high)) >= -room
+
+
 @wp.kernel(enable_backward=False)
 def normals_kernel(
     points: wp.array[wp.vec3],
@@ -121,8 +131,12 @@ def search_kernel(
     """Which vertex of the sheet below each candidate comes to, downhill.
 
     From the nearest of those to look from, which are `near[near_start[k]:near_start[k + 1]]`; or -1, if they are -1.
+    `STRANGER` where there are none.
     """
     k = wp.tid()
+    if near_start[k] == near_start[k + 1]:
+        found[k] = STRANGER
+        return
     p = above[candidates[k]]
     v = int(near[near_start[k]])
     if v >= 0:  # else too far away the last time
@@ -156,6 +170,7 @@ def lift_off(
     below_cut: Cut,
     above: wp.array[wp.vec3],
     above_cut: Cut,
+    faces_it: bool,
     rules: LayerRules,
     # outputs, by candidate
     push: wp.array[wp.vec3],
@@ -166,7 +181,10 @@ def lift_off(
     far = wp.length(offset)
     if height >= rules.gap or far > rules.reach:
         return
-    share = wp.clamp(wp.dot(normal_at(i, above, above_cut), normal) / rules.agreement, 0.0, 1.0)
+    agreement = wp.dot(normal_at(i, above, above_cut), normal)
+    # A stranger's outside may face the sheet's: a sleeve that hangs beside shorts.
+    agreement = wp.where(faces_it, wp.abs(agreement), agreement)
+    share = wp.clamp(agreement / rules.agreement, 0.0, 1.0)
     # Whatever ends does so gradually, or cloth would jump from frame to frame.
     share *= wp.min(1.0, 4.0 * (1.0 - far / rules.reach))
     if (below_cut.rim[face] >> feature) & 1 != 0:
@@ -190,6 +208,7 @@ def lift_kernel(
     ring_start: wp.array[int],
     ring: wp.array[int],
     found: wp.array[int],
+    extent: wp.array[wp.vec3],
     rules: LayerRules,
     # outputs, by candidate
     closest: wp.array[int],
@@ -210,6 +229,10 @@ def lift_kernel(
     push[k] = wp.vec3(0.0, 0.0, 0.0)
     v = int(found[k])
     closest[k] = -1
+    if v == STRANGER:
+        if is_within(p, extent, rules.gap):
+            doubtful[wp.atomic_add(n_doubtful, 0, 1)] = k
+        return
     if v < 0:
         return
     squared = wp.length_sq(below[v] - p)
@@ -235,7 +258,7 @@ def lift_kernel(
     if wp.length(offset) > rules.doubt:
         doubtful[wp.atomic_add(n_doubtful, 0, 1)] = k
         return
-    lift_off(k, i, face, feature, offset, normal, below_cut, above, above_cut, rules, push, count)
+    lift_off(k, i, face, feature, offset, normal, below_cut, above, above_cut, False, rules, push, count)
 
 
 @wp.kernel(enable_backward=False)
@@ -249,6 +272,7 @@ def tree_kernel(
     above: wp.array[wp.vec3],
     above_cut: Cut,
     candidates: wp.array[int],
+    found: wp.array[int],
     rules: LayerRules,
     doubtful: wp.array[int],
     n_doubtful: wp.array[int],
@@ -264,14 +288,14 @@ def tree_kernel(
     k = doubtful[n]
     i = candidates[k]
     p = above[i]
-    found = wp.mesh_query_point_no_sign(tree, p, rules.reach)
-    if not found.result:
+    hit = wp.mesh_query_point_no_sign(tree, p, rules.reach)
+    if not hit.result:
         return
-    face = found.face
+    face = hit.face
     w, feature, offset = closest_on_face(p, face, below, below_cut.faces)
     normal = normal_on(face, w, below_normals, below_cut)
     closest[k] = below_cut.faces[face, heaviest(w)]
-    lift_off(k, i, face, feature, offset, normal, below_cut, above, above_cut, rules, push, count)
+    lift_off(k, i, face, feature, offset, normal, below_cut, above, above_cut, found[k] == STRANGER, rules, push, count)
 
 
 @wp.kernel(enable_backward=False)

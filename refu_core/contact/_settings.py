@@ -68,7 +68,8 @@ class ContactSettings:
     layer_later_reach: float = 0.02
     """The same of the second push, which is a correction [m]."""
     layer_meets: float = 0.1
-    """Vertices farther than this from the other garment at rest don't meet it in any pose [m]."""
+    """Vertices farther than this from the other garment at rest don't lie on it in any pose [m]. They may come beside
+    it, as a sleeve does beside shorts: a tree is asked for what of them is near."""
     layer_fade: float = 0.02
     """How far beyond its open rims a sheet is still felt, less and less [m]: cloth runs smoothly over a waistband."""
     layer_agreement: float = 0.25

@@ -138,15 +138,29 @@ def test_only_cloth_that_faces_the_same_way_is_pushed(is_flipped: bool) -> None:
 
 def test_what_does_not_meet_is_left_alone() -> None:
     below, faces = sheet(6)
-    far = below + torch.tensor([0.0, 1.0, 0.0])
-    layer = Layer(faces, far, faces, below)
-    assert layer(below - 0.001, below)[1] == 0  # was made for garments that are worn elsewhere
     near = Layer(faces, below, faces, below)
     for height in (LAYER_GAP + 1e-4, 0.02, -LAYER_REACH - 0.001):
         moved = below + torch.tensor([0.0, height, 0.0])
         found, n_low = near(moved, below)
         assert n_low == 0
         assert found is moved
+
+
+@pytest.mark.parametrize("faces_it", [False, True])
+@pytest.mark.parametrize("height", [-0.004, 0.003])
+def test_a_sleeve_that_comes_beside_is_a_stranger_and_brought_off(height: float, faces_it: bool) -> None:
+    below, faces = sheet(12)
+    sleeve, sleeve_faces = sheet(5)
+    sleeve = sleeve + below.mean(0) - sleeve.mean(0)
+    sleeve_faces = sleeve_faces.flip(1) if faces_it else sleeve_faces
+    stranger = Layer(sleeve_faces, sleeve + torch.tensor([0.0, 0.5, 0.0]), faces, below)
+    comes = sleeve + torch.tensor([0.0, height, 0.0])
+    found, n_low = stranger(comes, below)
+    assert n_low == len(sleeve)
+    np.testing.assert_allclose((found - below.mean(0))[:, 1], LAYER_GAP, atol=1e-5)
+    # Where it lies on the sheet at rest, cloth that faces it is a fold's.
+    friend = Layer(sleeve_faces, sleeve, faces, below)
+    assert bool(friend(comes, below)[1] == 0) is faces_it
 
 
 @pytest.mark.parametrize("height", [-0.004, 0.002, 0.5])
@@ -161,9 +175,7 @@ def test_unasked_it_does_the_same(height: float) -> None:
     unasked, number = layer(above, below)
     assert torch.equal(lifted, unasked)
     assert torch.equal(number, n_low)
-    apart = Layer(faces, below + 1.0, faces, below)
-    apart._is_serial = False
-    assert torch.equal(apart(above, below)[0], above)
+    assert torch.equal(layer(above + 1.0, below)[0], above + 1.0)
 
 
 def test_refuses_what_it_was_not_made_for() -> None:
