@@ -2,7 +2,7 @@
 
 from refu_core.contact._blend import Blend as Blend
 from refu_core.contact._layers import Layer as Layer
-from refu_core.contact._press import Limbs as Limbs
+from refu_core.contact._press import LimbMeshes as LimbMeshes
 from refu_core.contact._press import Press as Press
 from refu_core.contact._resolution import Resolution as Resolution
 from refu_core.contact._resolver import Resolver as Resolver

@@ -20,7 +20,7 @@ _LIMBS = (joints_of("trunk", "head"), *ARMS, LEGS[0] + LEGS[1])
 """Joints of each limb; both legs are one, as a skirt lies on either."""
 
 
-class Limbs:
+class LimbMeshes:
     """The limbs of one posed body, each a mesh of its own: one for all garments on it."""
 
     def __init__(self, body: SmplBody) -> None:
@@ -53,7 +53,9 @@ class Press:
     is drawn back from where its neighbours are already.
     """
 
-    def __init__(self, garment: GarmentTemplate, limbs: Limbs, *, settings: ContactSettings = DEFAULT_CONTACT) -> None:
+    def __init__(
+        self, garment: GarmentTemplate, limbs: LimbMeshes, *, settings: ContactSettings = DEFAULT_CONTACT
+    ) -> None:
         """For a garment and the limbs of the body that it is worn on, on one device."""
         self._limbs = limbs  # their memory is read
         n, self.device = garment.n_vertices, garment.v_template.device

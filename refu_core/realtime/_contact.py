@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from refu_core.contact import DEFAULT_CONTACT, ContactSettings, Layer, Limbs, Press, Resolution, Resolver
+from refu_core.contact import DEFAULT_CONTACT, ContactSettings, Layer, LimbMeshes, Press, Resolution, Resolver
 from refu_core.garments import inner_first
 from refu_core.modes import SdfMode
 from refu_core.realtime._wearer import Outfit
@@ -77,7 +77,7 @@ class ContactStage:
         }
         self._limbs, self._press = None, {}
         if outfit.collider is not None:  # or there is no room
-            self._limbs = limbs = Limbs(body)
+            self._limbs = limbs = LimbMeshes(body)
             self._press = {name: Press(one, limbs, settings=settings) for name, one in garments.items()}
         self._outfit, self._farthest = outfit, settings.max_displacement
         self._below = {

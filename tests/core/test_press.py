@@ -15,7 +15,7 @@ from torch import Tensor
 
 from refu_core import GarmentPipeline
 from refu_core.body import ARMS, joints_of, part_of_faces
-from refu_core.contact import DEFAULT_CONTACT, Limbs, Press
+from refu_core.contact import DEFAULT_CONTACT, LimbMeshes, Press
 from refu_core.metrics import CollisionChecker
 from refu_core.modes import SdfMode
 from refu_core.realtime import ContactStage, Outfit, Wearer, dress
@@ -37,7 +37,7 @@ def beside(lower: float) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def made(body: Tensor, sweeps: int = DEFAULT_CONTACT.press_sweeps) -> Press:
-    limbs = Limbs(outfit().body)
+    limbs = LimbMeshes(outfit().body)
     limbs.update(body)
     return Press(outfit().wearables[SKIRT].template, limbs, settings=replace(DEFAULT_CONTACT, press_sweeps=sweeps))
 
