@@ -21,7 +21,7 @@ from tqdm import tqdm
 from msg_adapters import read_motion
 from refu_core import GarmentPipeline
 from refu_core.contact import DEFAULT_CONTACT, ContactSettings
-from refu_core.metrics import CollisionChecker
+from refu_core.metrics import CollisionChecker, SheetChecker
 from refu_core.modes import SdfMode
 from refu_core.realtime import ContactStage, Outfit, Wearer
 from refu_core.realtime._frame import FrameStep
@@ -38,6 +38,8 @@ class Figures(NamedTuple):
     """Frames free of body-garment collisions, by garment [%]."""
     inside: float
     """Vertices inside the body, both garments [%]."""
+    cut: float
+    """Frames in which the garments cut each other [%]."""
     jumps: float
     """Pairs of frames in which a vertex jumps [%]."""
     shift: float
@@ -62,6 +64,7 @@ class Sweep:
         self.poses = [tuple(torch.tensor(pose)[None] for pose in pair) for pair in pairs]
         self.checker = CollisionChecker(self.outfit.body.faces)
         self.faces = {name: one.template.faces.numpy() for name, one in self.outfit.wearables.items()}
+        self.sheet = SheetChecker(self.faces[GARMENTS[1]])
         self.margins = [one.margin for one in self.outfit.wearables.values()]
         self.default: list[NDArray[np.float32]] = []
 
@@ -69,7 +72,7 @@ class Sweep:
     def run(self, settings: ContactSettings) -> Figures:
         """The figures of some settings; those of the default ones have to be the first."""
         step = FrameStep(self.outfit, ContactStage(self.outfit, sdf=SdfMode.HYBRID, certify=False, settings=settings))
-        free, n_inside, n_vertices, n_jumps, shifts = dict.fromkeys(GARMENTS, 0), 0, 0, 0, []
+        free, n_inside, n_vertices, n_cut, n_jumps, shifts = dict.fromkeys(GARMENTS, 0), 0, 0, 0, 0, []
         is_default = not self.default
         for i, pair in enumerate(self.poses):
             (first,), (second,) = (step(pose, self.wearer, self.margins) for pose in pair)
@@ -84,6 +87,9 @@ class Sweep:
                 jump = max(jump, float(moved.norm(dim=1).max()))
                 worn.append(one.vertices.numpy())
             n_jumps += jump > JUMP
+            outer, inner = (first.garments[name].vertices.numpy() for name in GARMENTS)
+            self.sheet.update(inner)
+            n_cut += len(self.sheet.with_other(outer, self.faces[GARMENTS[0]])) > 0
             together = np.concatenate(worn)
             if is_default:
                 self.default.append(together)
@@ -92,6 +98,7 @@ class Sweep:
         return Figures(
             tuple(100 * free[name] / n for name in GARMENTS),
             100 * n_inside / n_vertices,
+            100 * n_cut / n,
             100 * n_jumps / n,
             1e3 * float(np.mean(shifts)),
         )
@@ -131,17 +138,18 @@ def main() -> None:
         f"T-shirt over shorts, mode `hybrid`, β = 0, {args.pairs} frames of recorded motion and the frame after each.",
         "None is left out. Against the collider. By `benchmarks/contact.py`.",
         "",
-        "CFMP: frames free of body-garment collisions. Jumps: pairs of frames in which a vertex moves more than 20 mm",
-        "farther than the network's. Shift: mean distance of the vertices from those of the default settings.",
+        "CFMP: frames free of body-garment collisions. Cut: frames in which the garments cut each other. Jumps: pairs",
+        "of frames in which a vertex moves more than 20 mm farther than the network's. Shift: mean distance of the",
+        "vertices from those of the default settings.",
         "",
-        "| setting | value | CFMP T-shirt % | CFMP shorts % | inside % | jumps % | shift mm |",
-        "| --- | --- | ---: | ---: | ---: | ---: | ---: |",
+        "| setting | value | CFMP T-shirt % | CFMP shorts % | inside % | cut % | jumps % | shift mm |",
+        "| --- | --- | ---: | ---: | ---: | ---: | ---: | ---: |",
     ]
     for name, change, found in rows:
         if found is None:
-            lines.append(f"| {name} | {change} | | | | | |")
+            lines.append(f"| {name} | {change} | | | | | | |")
             continue
-        numbers = [f"{one:.1f}" for one in (*found.cfmp, found.jumps)]
+        numbers = [f"{one:.1f}" for one in (*found.cfmp, found.cut, found.jumps)]
         numbers[2:2] = [f"{found.inside:.3f}"]
         lines.append(f"| {name} | {change} | {' | '.join(numbers)} | {found.shift:.3f} |")
     args.output.mkdir(parents=True, exist_ok=True)
