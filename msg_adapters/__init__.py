@@ -5,6 +5,7 @@ Nothing here imports rclpy or torch.
 
 from msg_adapters.axes import InputAxes, vertices_ros_from_smpl, vertices_smpl_from_ros
 from msg_adapters.bags import (
+    BAG_SUFFIXES,
     BagMessage,
     BagReader,
     BagWriter,
@@ -50,6 +51,7 @@ from msg_adapters.people import KeypointStream
 from msg_adapters.rotations import quaternion_from_rotvec, rotvec_from_quaternion, slerp
 
 __all__ = [
+    "BAG_SUFFIXES",
     "DIAGNOSTIC_ARRAY",
     "INPUT_TYPES",
     "KEYPOINT_TYPES",

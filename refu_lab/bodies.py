@@ -8,9 +8,7 @@ from refu_core.body import BUILTIN_BODIES
 from refu_core.modes import FOREIGN_BETAS, BetasSource
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from refu_core import GarmentPipeline, SmplFrame
+    from refu_core import GarmentPipeline
     from refu_core.body import BodyFit
 
 
@@ -39,8 +37,6 @@ def body_warnings(pipeline: GarmentPipeline, *, gender: str = "") -> list[str]:
     return warnings
 
 
-def betas_warnings(pipeline: GarmentPipeline, frames: Iterable[SmplFrame], *, source: str) -> list[str]:
-    """Whether nothing says what the betas of frames are of."""
-    if pipeline.fit is not None or source != BetasSource.MESSAGE or not any(one.betas.any() for one in frames):
-        return []
-    return [FOREIGN_BETAS]
+def betas_warnings(pipeline: GarmentPipeline, *, source: str) -> list[str]:
+    """Whether nothing says what recorded betas are of."""
+    return [FOREIGN_BETAS] if pipeline.fit is None and source == BetasSource.MESSAGE else []

@@ -15,6 +15,7 @@ from tqdm import tqdm
 import msg_adapters as adapters
 from refu_core import RefuError
 from refu_core._device import one_thread
+from refu_core._engine import Engine
 from refu_lab import reproduction as rp
 from refu_lab.tables import RESULT_TABLES
 
@@ -53,14 +54,16 @@ class EvaluateOptions:
         return " ".join(parts)
 
 
-def evaluate(options: EvaluateOptions, *, progress: bool) -> list[rp.ResultTable]:
+def evaluate(options: EvaluateOptions, *, progress: bool, engine: Engine | None = None) -> list[rp.ResultTable]:
     """Makes and writes the tables that were asked for.
+
+    Methods are run by `engine`, a block of samples a task; the tables sdf, time and motion by this process alone.
 
     Raises:
         RefuError: there is nothing to make them of, a data set or motion can't be read, or the results can't be
         written.
     """
-    maker = _Maker(options, progress)
+    maker = _Maker(options, progress, engine)
     tables = [maker.make(name) for name in maker.wanted]
     rp.write_summary(options.output)
     return tables
@@ -69,7 +72,8 @@ def evaluate(options: EvaluateOptions, *, progress: bool) -> list[rp.ResultTable
 class _Maker:
     """Makes tables of what was opened; methods are run when the first table needs them."""
 
-    def __init__(self, options: EvaluateOptions, progress: bool) -> None:
+    def __init__(self, options: EvaluateOptions, progress: bool, engine: Engine | None) -> None:
+        self._engine = engine
         self._options = options
         self._progress = progress
         if not options.data and (options.table not in ("all", "motion") or options.motions is None):
@@ -137,7 +141,7 @@ class _Maker:
     def _run(self, study: rp.Study, samples: rp.SampleSet, methods: Sequence[str]) -> None:
         options: dict[str, Any] = {"library": self._library, "cache_folder": self._options.cache}
         with _bar(samples.garment, self._progress) as advance:
-            rp.run_methods(study, samples, methods, progress=advance, **options)
+            rp.run_methods(study, samples, methods, progress=advance, engine=self._engine, **options)
 
     def _motion(self) -> rp.ResultTable:
         clips = read_clips(self._options.motions or Path())

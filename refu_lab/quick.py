@@ -7,11 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from tqdm import tqdm
+
 import msg_adapters as adapters
 from refu_core import RefuError
+from refu_core._engine import Engine, InProcess, Lost
 from refu_core._files import read_json
 from refu_core.metrics import Figures
 from refu_core.modes import DEFAULT_GARMENTS
+from refu_lab.fleet import fetched, find_recordings, run_function
 from refu_lab.replay import ReplayOptions, replay
 from refu_lab.reproduction import METRICS, format_value, label_of
 from refu_lab.tables import format_table, write_json
@@ -84,23 +88,37 @@ class QuickResult:
 
 
 def quick_check(
-    data: Sequence[Path], *, reference: Path | None = None, renew: bool = False, progress: bool = False
+    data: Sequence[str | Path],
+    *,
+    reference: Path | None = None,
+    renew: bool = False,
+    progress: bool = False,
+    engine: Engine | None = None,
 ) -> QuickResult:
     """Replays bags by every pipeline there are weights for, and compares with the reference or writes it.
 
     Args:
-        data: Bags, or folders of bags; `bags` if empty.
+        data: Bags, folders and globs of bags, and URLs; `bags` if empty.
         reference: File of figures that were measured before; `docs/results/quick.json` by default.
         renew: Write that file instead.
-        progress: Show a bar for each replay.
+        progress: Show a bar.
+        engine: Who replays them, a bag a task; None for this process.
 
     Raises:
         RefuError: no bag, a bad one, or no reference.
     """
     file = reference or REFERENCE
-    bags = _find_bags(data or [BAGS])
+    bags = [one.source for one in find_recordings([str(path) for path in data or [BAGS]])]
     known, tolerances = ({}, TOLERANCES) if renew else _read(file)
-    found = {key: value for bag in bags for key, value in _measure(bag, progress=progress)}
+    figures: dict[int, list[tuple[FigureKey, float]]] = {}
+    with tqdm(total=len(bags), unit="bag", disable=None if progress else True) as bar:
+        for index, rows in (engine or InProcess()).run(run_function(_measure), bags):
+            if isinstance(rows, Lost):
+                msg = f"{bags[index]}: lost: {rows.reason}"
+                raise RefuError(msg)
+            figures[index] = rows
+            bar.update()
+    found = {key: value for index in sorted(figures) for key, value in figures[index]}
     if renew:
         _write(file, found)
         known = found
@@ -124,7 +142,13 @@ def quick_table(result: QuickResult) -> str:
     return f"{table}\n\n{verdict} (reference: {result.reference})"
 
 
-def _measure(bag: Path, *, progress: bool) -> Iterator[tuple[FigureKey, float]]:
+def _measure(source: str) -> list[tuple[FigureKey, float]]:
+    """The figures of a bag."""
+    with fetched(source) as bag:
+        return list(_figures(bag))
+
+
+def _figures(bag: Path) -> Iterator[tuple[FigureKey, float]]:
     true = _true_garments(bag)
     for backbone, sdf in _MODES:
         options = ReplayOptions(
@@ -134,7 +158,7 @@ def _measure(bag: Path, *, progress: bool) -> Iterator[tuple[FigureKey, float]]:
             pipeline = options.load_pipeline()
         except RefuError:  # no weights for one of the garments
             continue
-        result = replay(options, pipeline=pipeline, progress=progress)
+        result = replay(options, pipeline=pipeline)
         for garment in options.garments:
             yield from _rows(bag.stem, garment, backbone, result.before[garment])
             yield from _rows(bag.stem, garment, f"node, {backbone}, {sdf}", result.after[garment])
@@ -154,19 +178,6 @@ def _true_garments(bag: Path) -> tuple[str, ...]:
             return ()
         names = {m.ns: None for message in reader.messages([TOPIC]) for m in adapters.decode_marker_array(message.data)}
     return tuple(names)
-
-
-def _find_bags(data: Sequence[Path]) -> list[Path]:
-    bags: list[Path] = []
-    for path in data:
-        if path.suffix == ".mcap" or (path / "metadata.yaml").exists():
-            bags.append(path)
-        else:
-            bags += sorted(file.parent for file in path.glob("*/metadata.yaml")) + sorted(path.glob("*.mcap"))
-    if not bags:
-        msg = f"{', '.join(map(str, data))}: no bag in it; wanted .mcap files or rosbag2 folders, as in the repository"
-        raise RefuError(msg)
-    return bags
 
 
 def _read(file: Path) -> tuple[dict[FigureKey, float], dict[str, float]]:

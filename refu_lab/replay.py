@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import sys
 import time
+from array import array
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
@@ -64,6 +65,8 @@ class ReplayOptions:
     max_frames: int | None = None
     overwrite: bool = False
     collider: bool = True
+    evaluate: bool = True
+    """Whether collisions are checked; otherwise nothing is kept of a frame but its latency."""
 
     @property
     def axes(self) -> adapters.InputAxes:
@@ -132,6 +135,13 @@ class ReplayResult:
     source: str
     """What was read: a topic and its type, or a motion file."""
     frames: list[FrameResult] = field(default_factory=list)
+    """Those that were evaluated."""
+    latencies_ms: array[float] = field(default_factory=lambda: array("d"))
+    """Of each frame, from input bytes to output bytes."""
+    shift_sum: float = 0.0
+    """How far the collider is from the skin: the sum over frames of the mean of all vertices' ways [m]."""
+    shift_largest: float = 0.0
+    """The longest way of a vertex [m]."""
     skips: Counter[str] = field(default_factory=Counter)
     """Messages that were not replayed, by reason."""
     warnings: list[str] = field(default_factory=list)
@@ -145,15 +155,14 @@ class ReplayResult:
 
     def latency_ms(self, garment: str | None = None) -> dict[str, float]:
         """Percentiles of the latency of a garment (the frame without the others' own stages), or of the frame [ms]."""
-        values = [f.latency_ms if garment is None else f.garments[garment].latency_ms for f in self.frames]
-        p50, p95, p99 = np.percentile(values, (50, 95, 99)) if values else (0.0, 0.0, 0.0)
+        values = self.latencies_ms if garment is None else [f.garments[garment].latency_ms for f in self.frames]
+        p50, p95, p99 = np.percentile(values, (50, 95, 99)) if len(values) else (0.0, 0.0, 0.0)
         return {"p50": float(p50), "p95": float(p95), "p99": float(p99)}
 
     def skin_shift_mm(self) -> dict[str, float]:
         """How far the collider is from the skin, over all frames: the mean of all vertices' ways, the longest [mm]."""
-        shifts = [frame.shift for frame in self.frames]
-        mean = 1e3 * float(np.mean([one.mean for one in shifts])) if shifts else 0.0
-        return {"mean": mean, "largest": 1e3 * max((one.largest for one in shifts), default=0.0)}
+        mean = 1e3 * self.shift_sum / max(1, len(self.latencies_ms))
+        return {"mean": mean, "largest": 1e3 * self.shift_largest}
 
     def as_dict(self) -> dict[str, Any]:
         """The machine-readable result (`--json`)."""
@@ -173,7 +182,7 @@ class ReplayResult:
             "sdf": self.options.sdf,
             "margin_m": self.options.margin,
             "device": self.options.device,
-            "frames": len(self.frames),
+            "frames": len(self.latencies_ms),
             "skipped": dict(self.skips),
             "warnings": self.warnings,
             "interrupted": self.interrupted,
@@ -231,8 +240,12 @@ class _Replayer:
         self._source = source
         self._result = result
         faces = {name: garment.faces.cpu().numpy() for name, garment in pipeline.garments.items()}
-        truth = GroundTruth.of_bag(options.input, faces, axes=options.axes) if source.bag is not None else None
-        self._evaluator = Evaluator(pipeline, truth)
+        self._evaluator: Evaluator | None = None
+        if options.evaluate:
+            is_bag = source.bag is not None
+            truth = GroundTruth.of_bag(options.input, faces, axes=options.axes) if is_bag else None
+            self._evaluator = Evaluator(pipeline, truth)
+        self._has_betas = False
         self._betas = None if options.betas is None else np.asarray(options.betas, np.float32)
         meshes = [
             adapters.MarkerMesh(
@@ -278,8 +291,14 @@ class _Replayer:
         latency_ms = 1e3 * (time.perf_counter() - start)
         if writer is not None:
             writer.write(GARMENTS_TOPIC, data, log_time_ns=record.log_time_ns)
-        garments = self._evaluator.add(frame, output, latency_ms)
-        self._result.frames.append(FrameResult(frame, latency_ms, output.stats.stage_ms, output.stats.shift, garments))
+        result, shift = self._result, output.stats.shift
+        result.latencies_ms.append(latency_ms)
+        self._has_betas = self._has_betas or bool(frame.betas.any())
+        result.shift_sum += shift.mean
+        result.shift_largest = max(result.shift_largest, shift.largest)
+        if self._evaluator is not None:
+            garments = self._evaluator.add(frame, output, latency_ms)
+            result.frames.append(FrameResult(frame, latency_ms, output.stats.stage_ms, shift, garments))
 
     def _skip(self, reason: str) -> None:
         skips = self._result.skips
@@ -287,13 +306,16 @@ class _Replayer:
 
     def summarise(self) -> None:
         """Completes the result."""
+        is_told = self._betas is not None or self._options.input_type in adapters.KEYPOINT_TYPES
+        if self._evaluator is not None and self._evaluator.truth.garments:  # with it, of the built-in bodies
+            is_told = True
+        if self._has_betas and not is_told:
+            self._result.warnings += betas_warnings(self._pipeline, source=self._options.betas_source)
+        if self._evaluator is None:
+            return
         self._result.before = {name: metrics.summary() for name, metrics in self._evaluator.before.items()}
         self._result.after = {name: metrics.summary() for name, metrics in self._evaluator.after.items()}
         self._result.on_skin = {name: metrics.summary() for name, metrics in self._evaluator.on_skin.items()}
-        is_told = self._betas is not None or self._options.input_type in adapters.KEYPOINT_TYPES
-        if not is_told and not self._evaluator.truth.garments:  # with it, of the built-in bodies
-            frames = (one.frame for one in self._result.frames)
-            self._result.warnings += betas_warnings(self._pipeline, frames, source=self._options.betas_source)
 
 
 @one_thread()
@@ -334,7 +356,7 @@ def replay(options: ReplayOptions, *, pipeline: GarmentPipeline | None = None, p
         result.warnings += source.warnings
     result.warnings += _doubts(result, source)
     replayer.summarise()
-    if not result.frames and not result.interrupted:
+    if not result.latencies_ms and not result.interrupted:
         reasons = "; ".join(f"{count} x {reason}" for reason, count in result.skips.most_common(3))
         msg = f"{options.input}: no frame could be replayed: {reasons or 'the input is empty'}"
         raise adapters.BagError(msg)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from refu_core import GarmentPipeline
 
 _PICTURE = (420, 640)
-_STYLE = """
+STYLE = """
 :root { color-scheme: light dark; --line: color-mix(in srgb, currentColor 18%, transparent); }
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 1080px; margin: 2rem auto; padding: 0 1rem; }
 h1 { font-size: 1.5rem; margin-bottom: .2rem; } h2 { font-size: 1.1rem; margin-top: 2.2rem; }
@@ -168,7 +168,7 @@ def _page(result: ReplayResult, pictures: Sequence[_Pictured]) -> str:
     frame, shift = data["latency_ms"], data["skin_shift_mm"]
     return f"""<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>Replay of {html.escape(result.options.input.name)}</title><style>{_STYLE}</style></head><body>
+<title>Replay of {html.escape(result.options.input.name)}</title><style>{STYLE}</style></head><body>
 <h1>Replay of {html.escape(result.options.input.name)}</h1>
 <p class="note">{html.escape(result.source)}; backbone {html.escape(data["backbone"])}, signed distance
 {html.escape(data["sdf"])}, margin {1e3 * data["margin_m"]:g} mm, {html.escape(data["device"])}.

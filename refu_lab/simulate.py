@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
+from refu_core._engine import Engine
 from refu_core.simulation import GarmentDataset, Progress, load_clips, simulate_dataset, simulate_sequences
 from refu_lab.contact_sheet import contact_sheet
 from refu_lab.render import save_png
@@ -33,8 +34,7 @@ def simulate(
     fps: float | None = None,
     body: str | None,
     seed: int,
-    processes: int,
-    shard: tuple[int, int],
+    engine: Engine | None = None,
     sequences: bool,
     shapes: int,
     seconds: float,
@@ -59,7 +59,7 @@ def simulate(
             bar.update(state.done - bar.n)
 
         options: dict[str, Any] = {"motions": clips, "body": body, "seed": seed, "progress": show}
-        options |= {"processes": processes, "shard": shard}
+        options["engine"] = engine
         if sequences:
             return simulate_sequences(garment, count, output, shapes=shapes, seconds=seconds, **options)
         card = simulate_dataset(garment, count, output, **options)

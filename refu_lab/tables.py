@@ -79,7 +79,9 @@ def _write(path: Path, text: str) -> None:
 def replay_table(result: ReplayResult) -> str:
     """What `refu replay` prints."""
     rows = replay_rows(result.as_dict()["garments"])
-    lines = [f"{result.options.input}: {result.source}", "", format_table(REPLAY_HEADER, rows), ""]
+    table = ["", format_table(REPLAY_HEADER, rows), ""] if rows else []
+    lines = [f"{result.options.input}: {result.source}", *table]
+    lines += [] if rows else [f"{len(result.latencies_ms)} frames, not evaluated"]
     whole = result.latency_ms()
     lines.append(
         f"frame, bytes to bytes: p50 {whole['p50']:.1f} ms, p95 {whole['p95']:.1f} ms, p99 {whole['p99']:.1f} ms"

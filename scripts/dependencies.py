@@ -28,8 +28,8 @@ ROOT = Path(__file__).resolve().parents[1]
 LOCK = ROOT / "requirements" / "lock.txt"
 PYTHONS = ("3.10", "3.11", "3.12", "3.13")
 PROJECT = "refu-ros"
-EXTRAS = ("ros", "lab", "train", "test", "dev")
-USED_EXTRAS = ("", "ros", "lab", "train")
+EXTRAS = ("ros", "lab", "train", "cluster", "test", "dev")
+USED_EXTRAS = ("", "ros", "lab", "train", "cluster")
 """What users install; `test` and `dev` are for those who work on the project."""
 ALLOWED = (
     *(

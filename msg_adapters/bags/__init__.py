@@ -1,11 +1,12 @@
-"""rosbag2 bags in MCAP: written as ROS 2 Jazzy writes them, read as a stream, both without ROS."""
+"""rosbag2 bags: MCAP written as ROS 2 Jazzy writes it, MCAP and SQLite read as a stream, all without ROS."""
 
 from msg_adapters.bags._metadata import QosProfile
-from msg_adapters.bags._reader import BagMessage, BagReader, TopicInfo
+from msg_adapters.bags._reader import BAG_SUFFIXES, BagMessage, BagReader, TopicInfo
 from msg_adapters.bags._smpl import FrameRecord, SmplBag, iter_smpl_frames, open_smpl_bag
 from msg_adapters.bags._writer import BagWriter
 
 __all__ = [
+    "BAG_SUFFIXES",
     "BagMessage",
     "BagReader",
     "BagWriter",

@@ -36,6 +36,8 @@ _FOOTER = struct.Struct("<QQI")
 _MAX_CHANNELS = 1 << 16
 _FOOTER_BYTES = _RECORD_HEADER.size + _FOOTER.size + len(MAGIC)
 _LONGEST = 1 << 62
+_LONGEST_MAGIC = 16
+_WANTED_FILE = "a .mcap or .db3 file, a rosbag2 directory or an AMASS-style .npz"
 _NO_OPCODE = "zeros where a record should start"  # what many a disk makes of the end that it never got
 MAX_CHUNK_BYTES = 128 << 20
 """A chunk that claims to unpack to more is left out: a few kilobytes could otherwise claim all memory."""
@@ -263,25 +265,37 @@ def split_records(content: memoryview) -> Iterator[tuple[int, memoryview]]:
         at += length
 
 
+def starts_with(path: Path, magic: bytes) -> bool:
+    """Whether a file does. Raises `BagError` when it can't be opened."""
+    file, start = _open(path)
+    file.close()
+    return start.startswith(magic)
+
+
 def open_mcap(path: Path) -> BinaryIO:
     """The file, positioned after its magic bytes.
 
     Raises `BagError` when it can't be opened or isn't an MCAP file.
     """
-    wanted = "a .mcap file, a rosbag2 directory, or a file of motion (.npz, .pkl, .bvh …: docs/guide/inputs.md)"
-    file = open_file(path, most=_LONGEST, error=BagError, wanted=wanted)
+    file, start = _open(path)
+    if start.startswith(MAGIC):
+        file.seek(len(MAGIC))
+        return file
+    file.close()
+    hint = "convert it with `rosbags-convert`" if start.startswith(b"#ROSBAG") else f"wanted {_WANTED_FILE}"
+    msg = f"{path}: not an MCAP file; {hint}"
+    raise BagError(msg)
+
+
+def _open(path: Path) -> tuple[BinaryIO, bytes]:
+    """The file and its first bytes."""
+    file = open_file(path, most=_LONGEST, error=BagError, wanted=_WANTED_FILE)
     try:
-        start = file.read(len(MAGIC))
+        return file, file.read(_LONGEST_MAGIC)
     except OSError as error:
         file.close()
         msg = f"{path}: can't be read: {error.strerror}"
         raise BagError(msg) from error
-    if start != MAGIC:
-        file.close()
-        sqlite = start.startswith((b"SQLite", b"#ROSBAG"))
-        msg = f"{path}: not an MCAP file; {'convert it with `ros2 bag convert`' if sqlite else f'wanted {wanted}'}"
-        raise BagError(msg)
-    return file
 
 
 def read_summary(file: BinaryIO) -> Iterable[tuple[int, memoryview]]:

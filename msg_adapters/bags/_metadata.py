@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 METADATA_FILE = "metadata.yaml"
 VERSION = 9
+STORAGES = ("mcap", "sqlite3")
+"""That are read; what is written is MCAP."""
 MAX_TIME_NS = 2**63 - 1
 """rosbag2 keeps times in signed 64 bits."""
 _KEY = "rosbag2_bagfile_information"
@@ -172,7 +174,7 @@ def dump_metadata(*, file_name: str, topics: Sequence[TopicSummary], start_ns: i
 
 
 def read_file_paths(directory: Path) -> list[Path]:
-    """The MCAP files of a rosbag2 directory in order, as its metadata.yaml lists them.
+    """The files of a rosbag2 directory in order, as its metadata.yaml lists them.
 
     Raises `BagError` where the metadata can't be read, or names another storage or rosbag2's own compression.
     """
@@ -185,10 +187,10 @@ def read_file_paths(directory: Path) -> list[Path]:
         # Only names count: bags of old versions list paths with the directory, and a bag is read from one place.
         names = [name.replace("\\", "/").rsplit("/", maxsplit=1)[-1] for name in information["relative_file_paths"]]
     except _UNREADABLE as error:
-        msg = f"{path}: not rosbag2 metadata ({type(error).__name__}); give one of the bag's .mcap files instead"
+        msg = f"{path}: not rosbag2 metadata ({type(error).__name__}); give one of the bag's files instead"
         raise BagError(msg) from error
-    if storage != "mcap" or compression != "none":
-        msg = f"{directory}: stored as {storage} with compression mode {compression}, only plain mcap is read; "
-        msg += "convert it with `ros2 bag convert`"
+    if storage not in STORAGES or compression != "none":
+        msg = f"{directory}: stored as {storage} with compression mode {compression}, only plain "
+        msg += f"{' or '.join(STORAGES)} is read; convert it with `ros2 bag convert`"
         raise BagError(msg)
     return [directory / name for name in dict.fromkeys(names)]

@@ -1,14 +1,17 @@
-"""Reading bags as a stream: an `.mcap` file or a rosbag2 directory, whole or cut short."""
+"""Reading bags as a stream: an `.mcap` or `.db3` file or a rosbag2 directory, whole or cut short."""
 
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from msg_adapters.bags import _mcap
 from msg_adapters.bags._metadata import MAX_TIME_NS, METADATA_FILE, read_file_paths
+from msg_adapters.bags._sqlite import MAGIC as SQLITE_MAGIC
+from msg_adapters.bags._sqlite import SqliteFile
 from msg_adapters.errors import BagError
 from refu_core.errors import printable
 
@@ -19,7 +22,9 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 
+BAG_SUFFIXES = (".mcap", ".db3")
 _MAX_WARNINGS = 20
+_IMPOSSIBLE_TIME = "a message on {} at a time that ROS can't hold"
 
 
 @dataclass(frozen=True)
@@ -115,7 +120,7 @@ class BagReader:
     is, `truncated` and `warnings` say what couldn't. What a pass may cost is bounded by the size of the bag, see
     `_mcap.Budget`.
 
-    Raises `BagError` when there is no such bag, or it isn't MCAP.
+    Raises `BagError` when there is no such bag, or it is neither MCAP nor rosbag2's SQLite.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -128,6 +133,8 @@ class BagReader:
         self._claimed = False
         """Whether a summary was asked how many messages there are."""
         self._size = 0
+        self._databases: dict[Path, SqliteFile] = {}
+        """Those of the files that are SQLite's."""
         self._files = self._find_files()
         self._topics: tuple[TopicInfo, ...] | None = None
 
@@ -156,17 +163,21 @@ class BagReader:
             files = read_file_paths(self.path)
         else:
             try:
-                files = sorted(self.path.glob("*.mcap"))
+                files = sorted((f for f in self.path.iterdir() if f.suffix in BAG_SUFFIXES), key=_by_number)
             except OSError as error:
                 msg = f"{self.path}: can't be read: {error.strerror}"
                 raise BagError(msg) from error
             self._notes.append(
-                f"{self.path}: no {METADATA_FILE} (was the recording interrupted?); its .mcap files are read by name"
+                f"{self.path}: no {METADATA_FILE} (was the recording interrupted?); its files are read by name"
             )
         if not files:
-            msg = f"{self.path}: no .mcap file in this directory"
+            msg = f"{self.path}: no {' or '.join(BAG_SUFFIXES)} file in this directory"
             raise BagError(msg)
         for path in files:
+            if _mcap.starts_with(path, SQLITE_MAGIC):
+                self._databases[path] = SqliteFile(path)
+                self._size += path.stat().st_size
+                continue
             with _mcap.open_mcap(path) as file:
                 self._size += os.fstat(file.fileno()).st_size
         return files
@@ -216,15 +227,16 @@ class BagReader:
         """
         budget = self._begin()
         for path in self._files:
+            if path in self._databases:
+                yield from self._database_messages(path, budget, topics)
+                continue
             catalogue, _ = self._summary(path, budget)
             for message in self._file_messages(path, catalogue, budget):
                 channel = catalogue.channels.get(message.channel_id)
                 if channel is None:
                     self._damage(path, _mcap.DamageError("a message of the undeclared channel {}", message.channel_id))
                 elif max(message.log_time_ns, message.publish_time_ns) > MAX_TIME_NS:
-                    self._damage(
-                        path, _mcap.DamageError("a message on {} at a time that ROS can't hold", channel.topic)
-                    )
+                    self._damage(path, _mcap.DamageError(_IMPOSSIBLE_TIME, channel.topic))
                 elif topics is None or channel.topic in topics:
                     yield BagMessage(
                         topic=channel.topic,
@@ -233,6 +245,46 @@ class BagReader:
                         publish_time_ns=message.publish_time_ns,
                         data=bytes(message.data),
                     )
+
+    def _database_topics(self, path: Path, budget: _mcap.Budget) -> dict[str, TopicInfo]:
+        topics: dict[str, TopicInfo] = {}
+        try:
+            counts = self._databases[path].counts()
+            for number, found in self._databases[path].topics(budget).items():
+                known = topics.get(found["name"])
+                topics[found["name"]] = TopicInfo(
+                    name=found["name"],
+                    message_type=found["type"],
+                    encoding=found["serialization_format"],
+                    message_count=counts.get(number, 0) + (known.message_count if known else 0),
+                    definition=found["definition"],
+                    type_hash=found.get("type_description_hash", ""),
+                    qos=found.get("offered_qos_profiles", ""),
+                )
+        except _mcap.DamageError as damage:
+            self._damage(path, damage)
+        return topics
+
+    def _database_messages(
+        self, path: Path, budget: _mcap.Budget, wanted: Collection[str] | None
+    ) -> Iterator[BagMessage]:
+        try:
+            topics = self._databases[path].topics(budget)
+            for message in self._databases[path].messages(budget):
+                if isinstance(message, _mcap.DamageError):
+                    self._damage(path, message)
+                    continue
+                number, stamp_ns, data = message
+                if number not in topics:
+                    self._damage(path, _mcap.DamageError("a message of the undeclared topic {}", number))
+                    continue
+                name, kind = topics[number]["name"], topics[number]["type"]
+                if not 0 <= stamp_ns <= MAX_TIME_NS:
+                    self._damage(path, _mcap.DamageError(_IMPOSSIBLE_TIME, name))
+                elif wanted is None or name in wanted:
+                    yield BagMessage(name, kind, stamp_ns, stamp_ns, data)
+        except _mcap.DamageError as damage:
+            self._damage(path, damage)
 
     def _summary(self, path: Path, budget: _mcap.Budget) -> tuple[_Catalogue, dict[int, int] | None]:
         """What the file's end says of its channels, and how many messages each has (None: it doesn't)."""
@@ -251,6 +303,8 @@ class BagReader:
         return catalogue, counts
 
     def _file_topics(self, path: Path, budget: _mcap.Budget, *, claimed: bool) -> dict[str, TopicInfo]:
+        if path in self._databases:
+            return self._database_topics(path, budget)
         catalogue, counts = self._summary(path, budget)
         if claimed and counts is not None and catalogue.channels.keys() >= counts.keys():
             self._claimed = True
@@ -288,6 +342,11 @@ class BagReader:
                 catalogue.add(record.opcode, record.content)
         except _mcap.DamageError as damage:
             self._damage(path, damage, f", in the record at byte {record.offset}")
+
+
+def _by_number(path: Path) -> list[Any]:
+    """Orders bag_2.mcap before bag_10.mcap, as they were recorded."""
+    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)]
 
 
 def _unreadable(path: Path, error: OSError) -> BagError:

@@ -93,7 +93,7 @@ class SamplePlan:
     def blocks(self) -> list[range]:
         """The slots in runs of one style-shape pair and at most `block` slots, in an order that mixes all kinds.
 
-        So a set is representative from its first hour on, and each shard of it is, too.
+        So a set is representative from its first hour on.
         """
         runs: list[range] = []
         start = 0

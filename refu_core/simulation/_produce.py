@@ -1,25 +1,22 @@
-"""Making a set, whatever is in it: a directory that is its own, shards, processes, resuming, progress."""
+"""Making a set, whatever is in it: a directory that is its own, an engine that shares it, resuming, progress."""
 
 from __future__ import annotations
 
 import hashlib
 import platform
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
-from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
+from refu_core._engine import Engine, InProcess, Lost
 from refu_core.simulation._errors import SimulationError
 from refu_core.simulation._selection import CAUSES
-from refu_core.simulation._store import QUANTUM, TO_DO, Shard, locked, read_card, write_card
+from refu_core.simulation._store import QUANTUM, TO_DO, locked, read_card, write_card
 
 if TYPE_CHECKING:
     from refu_core.simulation._worker import Simulator
@@ -27,50 +24,66 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a shard is."""
+    """How far a set is."""
 
     done: int
-    """Slots (samples, or whole sequences) of this shard that are finished."""
+    """Slots (samples, or whole sequences) that are finished."""
     total: int
-    """Slots of this shard."""
+    """Slots of the set."""
     seconds_left: float
     """By the pace of this run; infinite before its first slot."""
     dropped: dict[str, int]
     """What failed in the finished slots, by cause: attempts at a sample, frames of a sequence."""
 
 
+ROWS = "shard-0-of-1"
+"""Folder of the rows. Sets of former versions may have several, of which each has a part."""
+
+
+@dataclass
+class _RowMaker:
+    """Makes a process's function from slots to their rows."""
+
+    make: Callable[[], Simulator]
+    _made: Simulator | None = None
+
+    def __call__(self) -> Callable[[list[int]], list[dict[str, Any]]]:
+        simulator = self._made or self.make()
+        return lambda slots: [simulator.simulate(slot) for slot in slots]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Another process makes its own: what it is made of is small."""
+        return _RowMaker, (self.make,)
+
+
 def produce(
     make: Callable[[], Simulator],
     output: Path,
     *,
-    processes: int,
-    shard: tuple[int, int],
+    engine: Engine | None,
     progress: Callable[[Progress], None] | None,
     **card: Any,
 ) -> Simulator:
-    """Simulates what is left of one shard of the set in `output`; returns this process's simulator.
+    """Simulates what is left of the set in `output`; returns this process's simulator.
+
+    Rows are written here alone, whoever has simulated them: other machines need not see the folder.
 
     Args:
         make: makes a process's simulator; it is sent to each process, so it is small.
         output: directory of the set.
-        processes: how many.
-        shard: which of how many.
+        engine: who simulates; None for this process.
         progress: called after each slot.
         card: what the set's card says besides.
 
     Raises:
         SimulationError: see `simulate_dataset`.
     """
-    index, n_shards = shard
-    if not 0 <= index < n_shards or processes < 1:
-        msg = f"wanted a shard (i, n) with 0 <= i < n and at least one process, got {shard} and {processes}"
-        raise SimulationError(msg)
     # Made here although workers make their own: a body or garment that won't do is refused before anything is written.
     simulator = make()
-    mine = simulator.plan.blocks()[index::n_shards]
-    slots = np.array([slot for block in mine for slot in block], np.int32)
+    blocks = [list(block) for block in simulator.plan.blocks()]
+    slots = np.array([slot for block in blocks for slot in block], np.int32)
     _open_set(output, _card_of(simulator) | card)
-    directory = output / f"shard-{index}-of-{n_shards}"
+    directory = output / ROWS
     if not directory.exists():
         simulator.rows.create(directory, slots, simulator.shape)
     with locked(directory):
@@ -78,66 +91,32 @@ def produce(
         if not np.array_equal(rows.arrays["slot"], slots):
             msg = f"{directory}: holds other slots than this plan's; give another output directory"
             raise SimulationError(msg)
-        state = rows.arrays["state"]
-        ends = np.cumsum([len(block) for block in mine])
-        left = [
-            [row for row in range(end - len(b), end) if state[row] == TO_DO] for b, end in zip(mine, ends, strict=True)
-        ]
+        state, row_of = rows.arrays["state"], {int(slot): row for row, slot in enumerate(slots)}
+        left = [[slot for slot in block if state[row_of[slot]] == TO_DO] for block in blocks]
+        if engine is None or isinstance(engine, InProcess):  # a slot at a time is on disk soonest
+            left = [[slot] for block in left for slot in block]
         left = [block for block in left if block]
-        started, done, total = time.monotonic(), 0, sum(map(len, left))
-        for n in _simulate(simulator, rows, make, left, processes):
-            done += n
+        # A whole block goes to one process, for the sake of its common canonical drape.
+        started, done, total, lost = time.monotonic(), 0, sum(map(len, left)), 0
+        for index, made in (engine or InProcess()).run(_RowMaker(make, simulator), left):
+            if isinstance(made, Lost):
+                lost += len(left[index])
+                continue
+            for slot, values in zip(left[index], made, strict=True):
+                rows.write(row_of[slot], values)
+            done += len(made)
             if progress is not None:
                 pace = (time.monotonic() - started) / done
                 dropped = rows.arrays["dropped"][state != TO_DO].sum(0, dtype=np.int64).tolist()
                 causes = dict(zip(CAUSES, dropped, strict=True))
                 progress(Progress(len(slots) - total + done, len(slots), pace * (total - done), causes))
+        if lost:
+            msg = (
+                f"{lost} of {total} slots were lost with their processes (out of memory?): finished samples are kept, "
+            )
+            msg += "run the same command to go on"
+            raise SimulationError(msg)
     return simulator
-
-
-def _simulate(
-    simulator: Simulator, shard: Shard, make: Callable[[], Simulator], blocks: list[list[int]], processes: int
-) -> Iterator[int]:
-    """Simulates blocks of rows and writes them; yields how many are new, again and again."""
-    if processes == 1:
-        for row in (row for block in blocks for row in block):
-            shard.write(row, simulator.simulate(int(shard.arrays["slot"][row])))
-            yield 1
-        return
-    pool = ProcessPoolExecutor(
-        processes, mp_context=get_context("spawn"), initializer=_start_process, initargs=(make, shard.directory)
-    )
-    try:
-        # A whole block goes to one process, for the sake of its common canonical drape.
-        for future in as_completed([pool.submit(_simulate_block, block) for block in blocks]):
-            yield future.result()
-    except BrokenProcessPool as error:
-        msg = (
-            "a simulating process was killed (out of memory?): finished samples are kept, run the same command to go on"
-        )
-        raise SimulationError(msg) from error
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-
-
-_state: tuple[Simulator, Shard] | None = None
-
-
-def _start_process(make: Callable[[], Simulator], directory: Path) -> None:
-    """Prepares this process, once. One thread: the processes are the parallelism."""
-    global _state
-    torch.set_num_threads(1)
-    simulator = make()
-    _state = simulator, simulator.rows(directory, mode="r+")
-
-
-def _simulate_block(rows: list[int]) -> int:
-    """Simulates and writes some rows of this process's shard; their number."""
-    assert _state is not None
-    simulator, shard = _state
-    for row in rows:
-        shard.write(row, simulator.simulate(int(shard.arrays["slot"][row])))
-    return len(rows)
 
 
 def _card_of(simulator: Simulator) -> dict[str, Any]:

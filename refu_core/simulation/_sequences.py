@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from refu_core._engine import Engine
 from refu_core.frames import N_BETAS
 from refu_core.garments import N_STYLES
 from refu_core.simulation._drape import GRAVITY, SettledDrape
@@ -189,8 +190,7 @@ def simulate_sequences(
     seconds: float = 10.0,
     body: str | Path | None = None,
     seed: int = 0,
-    processes: int = 1,
-    shard: tuple[int, int] = (0, 1),
+    engine: Engine | None = None,
     settings: SequenceSettings | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> dict[str, Any]:
@@ -200,15 +200,14 @@ def simulate_sequences(
 
     Args:
         garment: `tshirt-male` or another built-in garment.
-        count: sequences in the set, training and test together, over all shards; best a multiple of `shapes`.
+        count: sequences in the set, training and test together; best a multiple of `shapes`.
         output: directory of the set; it is made, or must hold the beginning of the same set.
         motions: a folder of motion files, or what `load_clips` has read, two at least, of `seconds` or more.
         shapes: body shapes in the set.
         seconds: length of each sequence.
         body: name or file of a body; None for the one the garment was cut for.
         seed: of everything that is drawn.
-        processes: how many processes share the work, one thread each.
-        shard: (i, n): this run makes the i-th of n parts of the set, counted from 0.
+        engine: what shares the work among processes (`refu_lab.fleet.open_engine`); None for this one alone.
         settings: of simulation and selection.
         progress: called in this process after each sequence.
 
@@ -226,5 +225,5 @@ def simulate_sequences(
     plan = SequencePlan(garment, count, shapes=shapes, seconds=seconds, seed=seed)
     clips = split_clips(as_clips(motions))
     make = partial(SequenceSimulator, plan, clips, settings or SequenceSettings(), body)
-    produce(make, Path(output), processes=processes, shard=shard, progress=progress, fps=FPS)
+    produce(make, Path(output), engine=engine, progress=progress, fps=FPS)
     return summarise_sequences(output)

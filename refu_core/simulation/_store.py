@@ -268,7 +268,7 @@ def locked(directory: Path) -> Iterator[None]:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
-            msg = f"{directory}: another run writes this shard; wait for it, or give another --shard"
+            msg = f"{directory}: another run writes this set; wait for it"
             raise SimulationError(msg) from error
         yield
 

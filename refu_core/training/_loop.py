@@ -142,8 +142,12 @@ class Loop:
             if self._log is not None:
                 self._log.step(step)
             if step % settings.check_every == 0 or step == stage.steps:
-                train_loss = float(torch.stack(losses).mean())
+                mean_loss = torch.stack(losses).mean()
                 losses.clear()
+                if world > 1:  # each process has seen its share of the batches
+                    dist.all_reduce(mean_loss)
+                    mean_loss /= world
+                train_loss = float(mean_loss)
                 if not math.isfinite(train_loss):
                     msg = f"the loss of {stage.name} is {train_loss} at step {step}: try a smaller learning rate"
                     raise RefuError(msg)

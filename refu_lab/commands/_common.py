@@ -145,15 +145,6 @@ def word(text: str) -> str:
     return text
 
 
-def shard(text: str) -> tuple[int, int]:
-    """`I/N`: the I-th of N parts, from 0."""
-    index, _, count = text.partition("/")
-    if not (index.isdigit() and count.isdigit() and int(index) < int(count)):
-        msg = f"wanted I/N with 0 <= I < N, such as 0/4, got {text!r}"
-        raise argparse.ArgumentTypeError(msg)
-    return int(index), int(count)
-
-
 def add_common(parser: argparse.ArgumentParser) -> None:
     """What every command has."""
     parser.add_argument("--json", type=out_file, metavar="FILE", help="write the results as JSON")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from refu_lab.commands._cluster import add_cluster, place
 from refu_lab.commands._common import (
     EXIT_CHECK_FAILED,
     add_body,
@@ -31,7 +32,12 @@ def add(commands: Any) -> None:
         "A method whose networks aren't trained stays in its table, with the command that trains it.",
     )
     parser.add_argument(
-        "--data", type=in_path, nargs="+", default=[], metavar="DIR", help="data sets of refu simulate, one a garment"
+        "--data",
+        type=place,
+        nargs="+",
+        default=[],
+        metavar="DIR",
+        help="data sets of refu simulate, one a garment, or folders and globs of them; with --quick: bags",
     )
     parser.add_argument("--table", choices=(*RESULT_TABLES, "all"), default="all", help="one table (default: all)")
     parser.add_argument(
@@ -63,6 +69,7 @@ def add(commands: Any) -> None:
         help="figures that --quick holds its own against (docs/results/quick.json)",
     )
     parser.add_argument("--set-reference", action="store_true", help="write that file instead of comparing with it")
+    add_cluster(parser)
     add_common(parser)
     parser.set_defaults(run=run)
 
@@ -71,10 +78,19 @@ def run(args: argparse.Namespace) -> int:
     """Does what was asked; returns the exit code."""
     for path in (args.json, args.output, args.cache):
         check_writable(path)
+    from refu_lab.fleet import find_data_sets, open_engine
+
     if args.quick:
         from refu_lab.quick import quick_check, quick_table
 
-        result = quick_check(args.data, reference=args.reference, renew=args.set_reference, progress=not args.quiet)
+        with open_engine(args.jobs, args.scheduler) as engine:
+            result = quick_check(
+                args.data,
+                reference=args.reference,
+                renew=args.set_reference,
+                progress=not args.quiet,
+                engine=engine,
+            )
         print(quick_table(result))
         write_json(args.json, result.as_dict())
         return 0 if result.is_passed else EXIT_CHECK_FAILED
@@ -82,7 +98,7 @@ def run(args: argparse.Namespace) -> int:
 
     output = args.output or OUTPUT
     options = EvaluateOptions(
-        data=tuple(args.data),
+        data=tuple(find_data_sets(args.data)),
         table=args.table,
         weights=tuple(args.weights),
         motions=args.motions,
@@ -93,7 +109,8 @@ def run(args: argparse.Namespace) -> int:
         collider=args.collider,
         body=args.body,
     )
-    tables = evaluate(options, progress=not args.quiet)
+    with open_engine(args.jobs, args.scheduler) as engine:
+        tables = evaluate(options, progress=not args.quiet, engine=engine)
     print(results_text(tables, output))
     write_json(args.json, results_dict(tables))
     return 0

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from refu_core import RefuError
 from refu_core.keypoints import LAYOUTS
 from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN, BackboneName
+from refu_lab.commands._cluster import add_cluster, place, place_for
 from refu_lab.commands._common import (
+    EXIT_BAD_INPUT,
     EXIT_INTERRUPTED,
     add_axes,
     add_body,
@@ -38,14 +42,24 @@ def add(commands: Any) -> None:
     )
     parser.add_argument(
         "input",
-        type=in_path,
+        type=place,
+        nargs="+",
         metavar="INPUT",
-        help="an .mcap, a rosbag2 directory, or a file of motion: AMASS, pose estimators', BVH (docs/guide/inputs.md)",
+        help="an .mcap or .db3, a rosbag2 directory, or a file of motion: AMASS, pose estimators', BVH "
+        "(docs/guide/inputs.md); several of them, folders, globs, URLs",
     )
     parser.add_argument(
-        "--output", type=out_bag, metavar="OUT", help="bag to write: OUT.mcap, or a directory for rosbag2"
+        "--output",
+        type=place_for(out_bag),
+        metavar="OUT",
+        help="bag to write: OUT.mcap, or a directory for rosbag2; of several inputs: a folder or URL for NAME.mcap",
     )
-    parser.add_argument("--report", type=out_folder, metavar="DIR", help="write DIR/index.html with plots and pictures")
+    parser.add_argument(
+        "--report",
+        type=place_for(out_folder),
+        metavar="DIR",
+        help="write DIR/index.html with plots and pictures; of several inputs: a row each, and a page of its own",
+    )
     parser.add_argument(
         "--garments",
         type=names,
@@ -109,25 +123,63 @@ def add(commands: Any) -> None:
         "meaning, which is warned of; builtin: the built-in body's own",
     )
     add_collider(parser)
+    parser.add_argument(
+        "--no-evaluate", dest="evaluate", action="store_false", help="convert alone: no collision is looked for"
+    )
     parser.add_argument("--overwrite", action="store_true", help="replace an output that is there already")
+    parser.add_argument("--again", action="store_true", help="of several inputs: also those that are finished")
+    add_cluster(parser)
     add_common(parser)
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Does what was asked; returns the exit code."""
+    from refu_lab.fleet import is_plain
+
+    if args.report is not None:
+        if not args.evaluate:
+            msg = "a report is of evaluated frames: leave out --report or --no-evaluate"
+            raise RefuError(msg)
+        import matplotlib  # noqa: F401, ICN001  (what is missing is said before the replay, not after it)
+    check_writable(args.json)
+    urls = [text for text in (args.output, args.report) if text is not None and "://" in text]
+    if is_plain(args.input) and not urls and args.jobs is None and args.scheduler is None:
+        return _replay_one(args)
+    return _replay_many(args)
+
+
+def _replay_one(args: argparse.Namespace) -> int:
     from refu_lab.replay import ReplayOptions, replay
     from refu_lab.tables import replay_table
 
-    if args.report is not None:
-        import matplotlib  # noqa: F401, ICN001  (what is missing is said before the replay, not after it)
-    for path in (args.json, args.report):
-        check_writable(path)
-    result = replay(ReplayOptions(**given(args, ReplayOptions)), progress=not args.quiet)
+    report = None if args.report is None else Path(args.report)
+    check_writable(report)
+    output = None if args.output is None else Path(args.output)
+    options = ReplayOptions(**given(args, ReplayOptions) | {"input": Path(args.input[0]), "output": output})
+    result = replay(options, progress=not args.quiet)
     print(replay_table(result))
     write_json(args.json, result.as_dict())
-    if args.report is not None and result.frames:
+    if report is not None and result.frames:
         from refu_lab.report import write_report
 
-        print(f"report: {write_report(result, args.report, progress=not args.quiet)}")
+        print(f"report: {write_report(result, report, progress=not args.quiet)}")
     return EXIT_INTERRUPTED if result.interrupted else 0
+
+
+def _replay_many(args: argparse.Namespace) -> int:
+    from refu_lab.fleet import FleetOptions, find_recordings, fleet_table, open_engine, replay_fleet
+    from refu_lab.replay import ReplayOptions
+
+    recordings = find_recordings(args.input)
+    each = ReplayOptions(**given(args, ReplayOptions) | {"input": Path(), "output": None})
+    options = FleetOptions(replay=each, output=args.output, report=args.report, again=args.again or args.overwrite)
+    with open_engine(args.jobs, args.scheduler) as engine:
+        result = replay_fleet(recordings, options, engine=engine, progress=not args.quiet)
+    print(fleet_table(result))
+    write_json(args.json, result.as_dict())
+    if args.report is not None:
+        print(f"report: {args.report.rstrip('/')}/index.html")
+    if result.interrupted:
+        return EXIT_INTERRUPTED
+    return EXIT_BAD_INPUT if result.failed else 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from refu_lab.commands._cluster import add_cluster
 from refu_lab.commands._common import (
     add_axes,
     add_body,
@@ -14,7 +15,6 @@ from refu_lab.commands._common import (
     out_folder,
     positive,
     seed,
-    shard,
     write_json,
 )
 
@@ -44,8 +44,7 @@ def add(commands: Any) -> None:
     add_axes(parser, "motions'", "z up, as ROS has it")
     add_body(parser)
     parser.add_argument("--seed", type=seed, default=0, metavar="S", help="of everything that is drawn (0)")
-    parser.add_argument("--processes", type=positive, default=1, metavar="P", help="processes, a thread each (1)")
-    parser.add_argument("--shard", type=shard, default=(0, 1), metavar="I/N", help="make the I-th of N parts, from 0")
+    add_cluster(parser)
     parser.add_argument(
         "--sequences", action="store_true", help="continuous motions at 30 Hz with dynamics, instead of poses at rest"
     )
@@ -59,25 +58,26 @@ def add(commands: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Does what was asked; returns the exit code."""
+    from refu_lab.fleet import open_engine
     from refu_lab.simulate import simulate, simulation_table
 
     check_writable(args.json)
-    card = simulate(
-        args.garment,
-        args.count,
-        args.output,
-        motions=args.motions,
-        axes=args.input_axes,
-        fps=args.fps,
-        body=args.body,
-        seed=args.seed,
-        processes=args.processes,
-        shard=args.shard,
-        sequences=args.sequences,
-        shapes=args.shapes,
-        seconds=args.seconds,
-        progress=not args.quiet,
-    )
+    with open_engine(args.jobs, args.scheduler) as engine:
+        card = simulate(
+            args.garment,
+            args.count,
+            args.output,
+            motions=args.motions,
+            axes=args.input_axes,
+            fps=args.fps,
+            body=args.body,
+            seed=args.seed,
+            engine=engine,
+            sequences=args.sequences,
+            shapes=args.shapes,
+            seconds=args.seconds,
+            progress=not args.quiet,
+        )
     print(simulation_table(card, args.output))
     write_json(args.json, card)
     return 0

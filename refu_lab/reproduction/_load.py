@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from refu_core._files import read_json
 from refu_core.body import SmplBody, load_fit
@@ -28,6 +30,11 @@ class Library:
         self._folders = tuple(folders)
         self.collider = collider
         self.fit = None if body is None else load_fit(body)
+        self._named = body
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Another process loads the body itself."""
+        return partial(Library, collider=self.collider, body=self._named), (self._folders,)
 
     @property
     def body(self) -> str:

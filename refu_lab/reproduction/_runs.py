@@ -7,24 +7,27 @@ import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from refu_core._engine import Engine, InProcess, Lost
 from refu_core._files import read_json
 from refu_core.errors import RefuError
 from refu_core.metrics import CollisionChecker, Figures, FrameMetrics, GarmentMetrics
 from refu_lab.reproduction._load import Library
 from refu_lab.reproduction._methods import METHODS, Method
 from refu_lab.reproduction._predict import GarmentSetup, MethodOutput, Predictor, SampleScene
-from refu_lab.reproduction._samples import SampleSet
+from refu_lab.reproduction._samples import Sample, SampleSet
 from refu_lab.reproduction._tables import Missing
 
 RATIO_EDGES: tuple[float, ...] = (0.0, 0.25, 0.75, 1.25, 1.75, 2.25, 2.75, 3.25, 3.75, 4.25, 4.75, float("inf"))
 """Groups of the ratio of approximate to accurate distance, as in the supplement's bar plot."""
+_BLOCK = 8
+"""Samples of a task: some seconds' work."""
 _CODE = (
     *("refu_core/**/*.py", "refu_core/assets/*.npz", "refu_lab/baselines.py"),
     *("refu_lab/reproduction/_runs.py", "refu_lab/reproduction/_predict.py"),
@@ -40,6 +43,11 @@ class ScaleByRatio:
     """Vertices a group, shape (11,)."""
     total: NDArray[np.float64] = field(default_factory=lambda: np.zeros(len(RATIO_EDGES) - 1))
     """Sum of α a group, shape (11,)."""
+
+    def join(self, other: ScaleByRatio) -> None:
+        """Takes in another one."""
+        self.count += other.count
+        self.total += other.total
 
     def add(self, output: MethodOutput) -> None:
         """Takes in the vertices that both distances see inside the body (the supplement's "collision-resolved")."""
@@ -78,6 +86,14 @@ class MethodRun:
         if not self.samples or not set(components) <= set(self.ms):
             return None
         return float(np.median(np.sum([self.ms[component] for component in components], axis=0)))
+
+    def join(self, other: MethodRun) -> None:
+        """Takes in the samples that follow."""
+        self.samples += other.samples
+        self.unseen += other.unseen
+        for component, ms in other.ms.items():
+            self.ms.setdefault(component, []).extend(ms)
+        self.scales.join(other.scales)
 
     def as_dict(self) -> dict[str, Any]:
         """The run, ready for JSON."""
@@ -122,6 +138,7 @@ def run_methods(
     library: Library,
     cache_folder: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
+    engine: Engine | None = None,
 ) -> None:
     """Runs methods on the test samples of one garment, into `study`.
 
@@ -132,6 +149,9 @@ def run_methods(
         library: Where trained networks are.
         cache_folder: Where runs are kept, and found again while samples, weights and code are the same.
         progress: Called with (samples done, samples in all).
+        engine: Who runs them, a block of samples a task; None for this process. Figures don't depend on it, times do.
+
+    Raises `RefuError` where blocks are lost with their processes, or those are out of reach.
     """
     garment = samples.garment
     study.n_samples[garment] = len(samples)
@@ -159,25 +179,76 @@ def run_methods(
         if base not in ready and (garment, base) not in study.missing:
             ready[base] = Predictor(METHODS[base], setup, library)
     bases_first = dict(sorted(ready.items(), key=lambda item: METHODS[item[0]].base != item[0]))
-    runs = _run_samples(bases_first, setup, samples, progress)
+    runner = _Runner(garment, library, tuple(bases_first), (setup, bases_first))
+    runs = _run_blocks(runner, samples, engine or InProcess(), progress)
     for name in wanted:
         study.runs[garment, name] = runs[name]
         if name in files:
             _write_cached(files[name], runs[name])
 
 
+@dataclass
+class _Runner:
+    """Makes a process's function from samples to their runs."""
+
+    garment: str
+    library: Library
+    methods: tuple[str, ...]
+    """Bases first."""
+    made: tuple[GarmentSetup, Mapping[str, Predictor]] | None = None
+    """Of this process, where it has them already; another one makes its own."""
+
+    def __call__(self) -> Callable[[list[Sample]], dict[str, MethodRun]]:
+        if self.made is None:
+            setup = GarmentSetup.of(self.garment, collider=self.library.collider, fit=self.library.fit)
+            self.made = setup, {name: Predictor(METHODS[name], setup, self.library) for name in self.methods}
+        return partial(_run_samples, *self.made, self.garment)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _Runner, (self.garment, self.library, self.methods)
+
+
+class _Blocks(Sequence[list[Sample]]):
+    """Samples in blocks, read when they are asked for."""
+
+    def __init__(self, samples: SampleSet) -> None:
+        self._samples = samples
+
+    def __len__(self) -> int:
+        return -(-len(self._samples) // _BLOCK)
+
+    def __getitem__(self, index: Any) -> Any:
+        first = index * _BLOCK
+        return [self._samples.read(number) for number in range(first, min(first + _BLOCK, len(self._samples)))]
+
+
+def _run_blocks(
+    runner: _Runner, samples: SampleSet, engine: Engine, progress: Callable[[int, int], None] | None
+) -> dict[str, MethodRun]:
+    """The runs, joined in the samples' order whoever was first."""
+    parts: dict[int, dict[str, MethodRun]] = {}
+    for index, part in engine.run(runner, _Blocks(samples)):
+        if isinstance(part, Lost):
+            msg = f"{runner.garment}: samples {index * _BLOCK} and following are lost: {part.reason}"
+            raise RefuError(msg)
+        parts[index] = part
+        if progress is not None:
+            progress(sum(len(next(iter(runs.values())).samples) for runs in parts.values()), len(samples))
+    joined = {name: MethodRun(runner.garment, name) for name in runner.methods}
+    for index in sorted(parts):
+        for name, run in joined.items():
+            run.join(parts[index][name])
+    return joined
+
+
 def _run_samples(
-    predictors: Mapping[str, Predictor],
-    setup: GarmentSetup,
-    samples: SampleSet,
-    progress: Callable[[int, int], None] | None,
+    setup: GarmentSetup, predictors: Mapping[str, Predictor], garment: str, samples: Sequence[Sample]
 ) -> dict[str, MethodRun]:
     faces = setup.template.faces.numpy()
     checker = CollisionChecker(setup.body.faces)
     metrics = {name: GarmentMetrics(faces) for name in predictors}
-    runs = {name: MethodRun(samples.garment, name) for name in predictors}
-    for number in range(len(samples)):
-        sample = samples.read(number)
+    runs = {name: MethodRun(garment, name) for name in predictors}
+    for sample in samples:
         scene = SampleScene.of(setup, sample.pose, sample.betas, sample.style)
         checker.update(scene.vertices)
         colliding = dict.fromkeys(METHODS, np.zeros(setup.template.n_vertices, np.bool_))
@@ -194,8 +265,6 @@ def _run_samples(
             run.scales.add(output)
             for component, ms in output.ms.items():
                 run.ms.setdefault(component, []).append(ms)
-        if progress is not None:
-            progress(number + 1, len(samples))
     return runs
 
 

@@ -287,9 +287,9 @@ def make_sqlite(path: Path) -> None:
     path.write_bytes(b"SQLite format 3\0" + bytes(100))
 
 
-def make_sqlite_bag(path: Path) -> None:
+def make_other_storage(path: Path) -> None:
     path.mkdir()
-    metadata = {"storage_identifier": "sqlite3", "relative_file_paths": ["a.db3"], "compression_mode": ""}
+    metadata = {"storage_identifier": "my_storage", "relative_file_paths": ["a.own"], "compression_mode": ""}
     (path / "metadata.yaml").write_text(yaml.safe_dump({"rosbag2_bagfile_information": metadata}))
 
 
@@ -307,12 +307,15 @@ def make_odd_metadata(path: Path) -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda _: None, "No such file or directory; wanted a .mcap file"),
+        (lambda _: None, "No such file or directory; wanted a .mcap or .db3 file"),
         (Path.touch, "an empty file"),
-        (Path.mkdir, "no .mcap file in this directory"),
-        (lambda path: path.write_text("hello, world"), "not an MCAP file; wanted a .mcap file, a rosbag2 directory"),
-        (make_sqlite, "not an MCAP file; convert it with `ros2 bag convert`"),
-        (make_sqlite_bag, "stored as sqlite3 .* only plain mcap is read; convert it"),
+        (Path.mkdir, "no .mcap or .db3 file in this directory"),
+        (
+            lambda path: path.write_text("hello, world"),
+            "not an MCAP file; wanted a .mcap or .db3 file, a rosbag2 directory",
+        ),
+        (make_sqlite, "the database can.t be read"),
+        (make_other_storage, "stored as my_storage .* only plain mcap or sqlite3 is read; convert it"),
         (make_missing_file_bag, "gone.mcap: can.t be .*: No such file"),
         (make_odd_metadata, "not rosbag2 metadata"),
     ],

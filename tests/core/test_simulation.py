@@ -5,13 +5,14 @@ from __future__ import annotations
 import errno
 import importlib.util
 import json
-import multiprocessing
 import os
 import shutil
+import signal
 import sys
-import time
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 import refu_core
+from refu_core._engine import Engine
 from refu_core.body import Collider, SmplBody, load_body
 from refu_core.errors import MeshError
 from refu_core.garments import load_garment
@@ -53,6 +55,7 @@ from refu_core.simulation._selection import Selector
 from refu_core.simulation._store import DONE, QUANTUM, TO_DO, Shard, dequantise, locked, quantise
 from refu_lab.cli import main
 from refu_lab.contact_sheet import contact_sheet
+from refu_lab.fleet import open_engine
 
 GARMENT = "short-pant-male"
 COUNT = 5
@@ -80,11 +83,24 @@ def simulate(output: Path, clips: Path, **options: Any) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def simulated(tmp_path_factory: pytest.TempPathFactory, clips: Path) -> Path:
-    """A set made as two shards, one after the other."""
+def whole(tmp_path_factory: pytest.TempPathFactory, clips: Path) -> Path:
+    """A set made by one process."""
+    output = tmp_path_factory.mktemp("sets") / "whole"
+    simulate(output, clips)
+    return output
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory, whole: Path) -> Path:
+    """The same set in two shards, as former versions made them."""
     output = tmp_path_factory.mktemp("sets") / "in-shards"
-    simulate(output, clips, shard=(0, 2))
-    simulate(output, clips, shard=(1, 2))
+    shutil.copytree(whole, output)
+    shard = output / "shard-0-of-1"
+    for i in range(2):
+        (output / f"shard-{i}-of-2").mkdir()
+        for file in shard.glob("*.npy"):
+            np.save(output / f"shard-{i}-of-2" / file.name, np.load(file)[i::2])
+    shutil.rmtree(shard)
     return output
 
 
@@ -287,37 +303,18 @@ def test_two_shards_are_all_slots(simulated: Path) -> None:
     assert (columns(simulated)["state"] == DONE).all()
 
 
-def first_block_only(rows: list[int]) -> int:
-    """Simulates rows, where no other process has begun with any; otherwise waits to be killed."""
-    assert _produce._state is not None
-    try:
-        _produce._state[1].directory.parent.with_name("begun").mkdir()
-    except FileExistsError:
-        time.sleep(600)
-    return _SIMULATE_BLOCK(rows)
+def test_interrupted_run_goes_on_to_the_same_samples(simulated: Path, clips: Path, tmp_path: Path) -> None:
+    output = tmp_path / "interrupted"
 
+    def stop(state: Progress) -> None:
+        if state.done == 2:
+            raise KeyboardInterrupt
 
-_SIMULATE_BLOCK = _produce._simulate_block
-
-
-def test_killed_run_goes_on_to_the_same_samples(
-    simulated: Path, clips: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    output = tmp_path / "killed"
-    monkeypatch.setattr(_produce, "_simulate_block", first_block_only)
-    kept: list[dict[str, NDArray[Any]]] = []
-
-    def kill(_: Progress) -> None:
-        if not kept:
-            for process in multiprocessing.active_children():
-                process.kill()
-            kept.append(columns(output))
-
-    with pytest.raises(SimulationError, match="killed"):
-        simulate(output, clips, processes=2, progress=kill)
+    with pytest.raises(KeyboardInterrupt):
+        simulate(output, clips, progress=stop)
     shard = Shard(output / "shard-0-of-1", mode="r+")
-    survivors = kept[0]["state"] == DONE
-    assert 0 < survivors.sum() < COUNT
+    survivors = np.asarray(shard.arrays["state"] == DONE)
+    assert survivors.sum() == 2
     half_written = int(np.flatnonzero(shard.arrays["state"] == TO_DO)[0])
     shard.arrays["vertices"][half_written] = 12345
     del shard
@@ -339,6 +336,41 @@ def test_killed_run_goes_on_to_the_same_samples(
     before = {path.name: path.read_bytes() for path in (output / "shard-0-of-1").glob("*.npy")}
     simulate(output, clips, progress=lambda _: pytest.fail("a finished set has nothing left to simulate"))
     assert {path.name: path.read_bytes() for path in (output / "shard-0-of-1").glob("*.npy")} == before
+
+
+def _dying(make: Callable[[], Any], mark: Path) -> Callable[[list[int]], Any]:
+    """The function of a worker that is killed after its first block, once among all workers."""
+    function = make()
+
+    def work(slots: list[int]) -> Any:
+        made = function(slots)
+        with suppress(FileExistsError):
+            mark.mkdir()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return made
+
+    return work
+
+
+class Deadly:
+    """An engine whose workers die."""
+
+    def __init__(self, engine: Engine, mark: Path) -> None:
+        self._engine, self._mark = engine, mark
+
+    def run(self, make: Callable[[], Any], tasks: Any) -> Any:
+        return self._engine.run(partial(_dying, make, self._mark), tasks)
+
+
+def test_workers_that_are_killed_make_the_same_samples(simulated: Path, clips: Path, tmp_path: Path) -> None:
+    pytest.importorskip("distributed")
+    with open_engine(2) as engine:
+        card = simulate(tmp_path / "set", clips, engine=Deadly(engine, tmp_path / "killed"))
+    assert (tmp_path / "killed").exists()
+    assert card["counts"]["to_do"] == 0
+    made = columns(tmp_path / "set")
+    for name, array in columns(simulated).items():
+        np.testing.assert_array_equal(made[name], array, err_msg=name)
 
 
 def test_card_counts_what_is_there(simulated: Path, samples: list[GarmentSample]) -> None:
@@ -481,9 +513,9 @@ plans = st.builds(
 )
 
 
-@given(plans, st.integers(1, 4))
-def test_blocks_of_all_shards_cover_each_slot_once(plan: SamplePlan, n_shards: int) -> None:
-    blocks = [block for i in range(n_shards) for block in plan.blocks()[i::n_shards]]
+@given(plans)
+def test_blocks_cover_each_slot_once(plan: SamplePlan) -> None:
+    blocks = plan.blocks()
     assert sorted(slot for block in blocks for slot in block) == list(range(plan.count))
     assert all(1 <= len(block) <= plan.block for block in blocks)
     assert all(len({plan.pair_of(slot) for slot in block}) == 1 for block in blocks)
@@ -575,7 +607,7 @@ def test_set_without_motions_has_drawn_poses(tmp_path: Path) -> None:
         return iter(())
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(_produce, "_simulate", nothing_is_simulated)
+        patch.setattr(_produce.InProcess, "run", nothing_is_simulated)
         card = simulate_dataset(GARMENT, 7, tmp_path / "set")
     assert card["plan"]["recorded_share"] == 0
     assert card["clips"] == {"train": [], "test": []}
@@ -625,10 +657,10 @@ def test_other_set_in_the_directory_is_left_alone(simulated: Path, clips: Path, 
     assert {path: path.read_bytes() for path in simulated.rglob("*.npy")} == before
 
 
-def test_shard_is_written_by_one_run_at_a_time(simulated: Path, clips: Path) -> None:
-    with locked(simulated / "shard-0-of-2"), pytest.raises(SimulationError, match="another run"):
-        simulate(simulated, clips, shard=(0, 2))
-    simulate(simulated, clips, shard=(0, 2))  # free again
+def test_set_is_written_by_one_run_at_a_time(whole: Path, clips: Path) -> None:
+    with locked(whole / "shard-0-of-1"), pytest.raises(SimulationError, match="another run"):
+        simulate(whole, clips)
+    simulate(whole, clips)  # free again
 
 
 def test_full_disk_is_said_before_anything_is_simulated(
@@ -643,12 +675,6 @@ def test_full_disk_is_said_before_anything_is_simulated(
     assert not list((tmp_path / "set").glob("shard-*"))
 
 
-@pytest.mark.parametrize("options", [{"shard": (2, 2)}, {"shard": (-1, 2)}, {"processes": 0}])
-def test_impossible_divisions_are_refused(options: dict[str, Any], clips: Path, tmp_path: Path) -> None:
-    with pytest.raises(SimulationError, match="shard"):
-        simulate(tmp_path / "set", clips, **options)
-
-
 @pytest.mark.parametrize("numbers", [{"count": 0}, {"pivots": 0}, {"block": 0}, {"test_share": 1.0}, {"spread": 0.0}])
 def test_impossible_plans_are_refused(numbers: dict[str, Any]) -> None:
     with pytest.raises(SimulationError, match="got"):
@@ -657,9 +683,7 @@ def test_impossible_plans_are_refused(numbers: dict[str, Any]) -> None:
 
 def test_command_makes_a_set_and_its_picture(clips: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["simulate", GARMENT, "--count", "2", "--motions", str(clips), "--output", str(tmp_path / "set")]
-    assert main([*arguments, "--shard", "0/2", "--quiet"]) == 0
-    assert not (tmp_path / "set" / "samples.png").exists()
-    assert main([*arguments, "--shard", "1/2", "--quiet", "--json", str(tmp_path / "card.json")]) == 0
+    assert main([*arguments, "--quiet", "--json", str(tmp_path / "card.json")]) == 0
     assert "yield" in capsys.readouterr().out
     card = json.loads((tmp_path / "card.json").read_text())
     assert card["counts"]["train"] + card["counts"]["test"] == 2

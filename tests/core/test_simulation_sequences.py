@@ -71,10 +71,9 @@ def simulate(output: Path, clips: Path, **options: Any) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory: pytest.TempPathFactory, clips: Path) -> Path:
-    """A training and a test sequence, made as two shards."""
+    """A training and a test sequence."""
     output = tmp_path_factory.mktemp("sets") / "sequences"
-    simulate(output, clips, shard=(0, 2))
-    simulate(output, clips, shard=(1, 2))
+    simulate(output, clips)
     return output
 
 
@@ -109,9 +108,9 @@ def test_sequences_are_what_was_planned(sequences: list[GarmentSequence], simula
 def test_training_reads_the_good_frames(simulated: Path, tmp_path: Path) -> None:
     copy = tmp_path / "set"
     shutil.copytree(simulated, copy)
-    (shard,) = [path for path in copy.glob("shard-*") if (np.load(path / "split.npy") != TEST).all()]
+    shard = copy / "shard-0-of-1"
     cause = np.load(shard / "cause.npy")
-    cause[0, 2] = 1
+    cause[np.load(shard / "split.npy") != TEST, 2] = 1
     np.save(shard / "cause.npy", cause)
     found = open_dataset(copy)
     assert isinstance(found, GarmentSequences)
@@ -201,7 +200,7 @@ def test_command_accepts_the_finished_set(
     plan = ["--count", "2", "--sequences", "--shapes", "1", "--seconds", str(SECONDS)]
     paths = ["--output", str(simulated), "--motions", str(clips), "--json", str(tmp_path / "card.json")]
     before = arrays(simulated)
-    assert main(["simulate", GARMENT, *plan, *paths, "--shard", "1/2", "--quiet"]) == 0
+    assert main(["simulate", GARMENT, *plan, *paths, "--quiet"]) == 0
     assert "frames kept" in capsys.readouterr().out
     assert json.loads((tmp_path / "card.json").read_text()) == json.loads((simulated / "card.json").read_text())
     for name, column in arrays(simulated).items():

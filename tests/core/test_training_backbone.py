@@ -330,6 +330,17 @@ def test_two_processes_make_the_training_of_one(tmp_path: Path, dataset: Path) -
     done = subprocess.run(command, capture_output=True, text=True, timeout=1200, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
     runpy.run_path(str(script))["train"](str(dataset), str(tmp_path / "one"))
+    curves = [
+        [json.loads(line) for line in next((tmp_path / folder).glob("*.jsonl")).read_text().splitlines()]
+        for folder in ("one", "two")
+    ]
+    for alone, shared in zip(*curves, strict=True):
+        assert {k: v for k, v in shared.items() if isinstance(v, (str, int))} == {
+            k: v for k, v in alone.items() if isinstance(v, (str, int))
+        }
+        for name in ("train", "validation"):
+            assert shared[name] == pytest.approx(alone[name], rel=2e-3)
+    assert curves[0][-1]["train"] < curves[0][0]["train"]
     one, two = (load_weights(tmp_path / folder / "mlp-none").tensors for folder in ("one", "two"))
     assert set(one) == set(two)
     for name, tensor in one.items():

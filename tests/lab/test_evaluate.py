@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import msg_adapters as adapters
 from refu_core import SmplFrame, load_body, load_garment
 from refu_lab import quick
 from refu_lab.cli import main
-from refu_lab.reproduction import _pictures
+from refu_lab.reproduction import Library, SampleSet, Study, _pictures, _runs, run_methods
 from refu_lab.truth import TOPIC
 
 BAGS = Path(__file__).parents[2] / "bags"
@@ -103,6 +104,27 @@ def test_tables_of_a_data_set(
     assert f"over these numbers of test samples: {GARMENT} 2." in page
     assert {path.name for path in out.iterdir()} >= {"comparison.md", "comparison.json", "README.md", f"{GARMENT}.png"}
     assert len(list(cache.iterdir())) >= 2
+
+
+class Elsewhere:
+    """An engine as one of other machines: all is sent, and the last task is done first."""
+
+    def run(self, make: Any, tasks: Any) -> Any:
+        function = pickle.loads(pickle.dumps(make))()
+        for index in reversed(range(len(tasks))):
+            yield index, pickle.loads(pickle.dumps(function(pickle.loads(pickle.dumps(tasks[index])))))
+
+
+def test_figures_are_the_same_whoever_runs_the_samples(dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_runs, "_BLOCK", 1)
+    samples, found = SampleSet.open(dataset), []
+    assert len(samples) == 2
+    for engine in (None, Elsewhere()):
+        study = Study()
+        run_methods(study, samples, ["skinned-naive", "node-skinned"], library=Library(), engine=engine)
+        found.append({name: run.as_dict() | {"ms": sorted(run.ms)} for name, run in study.runs.items()})
+    assert found[0] == found[1]
+    assert all(len(run["samples"]) == 2 for run in found[0].values())
 
 
 def test_motion_of_a_folder(tmp_path: Path) -> None:
@@ -203,7 +225,7 @@ def test_tolerances_are_one_sided() -> None:
         (["--data", "nowhere"], "nowhere"),
         (["--table", "beauty"], "invalid choice"),
         (["--data", "x", "--every", "0"], "above zero"),
-        (["--quick", "--data", "nowhere"], "no bag in it"),
+        (["--quick", "--data", "nowhere"], "no recording there"),
         (["--quick", "--data", str(BAGS), "--reference", "nowhere.json"], "no reference there"),
     ],
 )

@@ -1,0 +1,47 @@
+"""What spreads independent tasks over processes; the core has the one that doesn't, `refu_lab.fleet` one that does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True)
+class Lost:
+    """In the place of a task's result: what became of the processes that tried it."""
+
+    reason: str
+
+
+class Engine(Protocol):
+    """Runs tasks, each a function of its own content: done again, or elsewhere, it gives the same."""
+
+    def run(
+        self, make: Callable[[], Callable[[Task], Result]], tasks: Sequence[Task]
+    ) -> Iterator[tuple[int, Result | Lost]]:
+        """Yields each task's number and result as they come, each once.
+
+        Args:
+            make: makes a process's function, once for all its tasks; it is sent to each process.
+            tasks: what the function is called with; sent, too, and so are the results. Each is asked for when its time
+                has come, so that a sequence may read it then.
+
+        Raises what a task raises; `RefuError` when the processes are out of reach.
+        """
+        ...
+
+
+class InProcess:
+    """One task after another, in this process."""
+
+    def run(
+        self, make: Callable[[], Callable[[Task], Result]], tasks: Sequence[Task]
+    ) -> Iterator[tuple[int, Result | Lost]]:
+        """Yields each task's number and result, in order."""
+        function = make()
+        for index in range(len(tasks)):
+            yield index, function(tasks[index])

@@ -1,0 +1,258 @@
+"""Replays many recordings: each is a task whose results, once in their place, are never made again."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, fields, replace
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tqdm import tqdm
+
+from refu_core import RefuError, __version__
+from refu_core._engine import Engine, Lost
+from refu_core.errors import printable
+from refu_lab.fleet._engine import run_function
+from refu_lab.fleet._inputs import Input
+from refu_lab.fleet._storage import Folder, fetched, filesystem, is_url
+from refu_lab.fleet._summary import FleetResult
+from refu_lab.replay import ReplayOptions, ReplayResult, replay
+
+if TYPE_CHECKING:
+    from refu_core import GarmentPipeline
+
+WORST = 5
+"""Frames of a recording that its record names, the worst first."""
+_NOT_CONTENT = ("input", "output", "overwrite", "speed")
+"""Options that results don't depend on, or by what is read alone."""
+_CODE = (
+    "refu_core/**/*.py",
+    "refu_core/assets/*.npz",
+    "refu_core/weights/**/*",
+    "msg_adapters/**/*.py",
+    "refu_lab/*.py",
+)
+"""Files of the project that results depend on."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FleetOptions:
+    """How recordings are replayed, and where their results go."""
+
+    replay: ReplayOptions
+    """For each of them; input and output are left out of account."""
+    output: str | None = None
+    """Folder or URL of the bags: NAME.mcap."""
+    report: str | None = None
+    """Folder or URL of the reports: index.html over all, NAME/index.html."""
+    again: bool = False
+    """Whether what is finished is made again."""
+
+    @property
+    def records(self) -> str | None:
+        """Folder of the records, NAME.json: what makes a recording finished."""
+        return self.output or self.report
+
+
+@dataclass(frozen=True)
+class _Job:
+    recording: Input
+    options: FleetOptions
+
+
+def replay_fleet(
+    recordings: list[Input], options: FleetOptions, *, engine: Engine, progress: bool = False
+) -> FleetResult:
+    """Replays what isn't finished; a recording that can't be replayed is a row that says why.
+
+    An interrupt (Ctrl-C) ends the run early: what is finished is kept and returned.
+
+    Raises:
+        RefuError: options that make no pipeline, a folder that can't be written or that another run writes to, or an
+            engine that is out of reach.
+    """
+    options.replay.load_pipeline()  # what no recording could be replayed with is said once, and now
+    result = FleetResult(with_report=options.report is not None)
+    rows: dict[int, dict[str, Any]] = {}
+    folders = {place: Folder(place) for place in (options.output, options.report) if place is not None}
+    with ExitStack() as stack:
+        for folder in folders.values():
+            stack.enter_context(folder.locked())
+        jobs = [_Job(recording, options) for recording in recordings]
+        bar = tqdm(total=len(jobs), unit="recording", disable=None if progress else True)
+        try:
+            for index, row in engine.run(run_function(_replay_job), jobs):
+                lost = {"error": row.reason} if isinstance(row, Lost) else row
+                rows[index] = {"name": recordings[index].name, "input": recordings[index].source, **lost}
+                bar.update()
+        except KeyboardInterrupt:
+            result.interrupted = True
+        finally:
+            bar.close()
+            for folder in folders.values():
+                folder.tidy()
+        result.rows = [rows[index] for index in sorted(rows)]
+        result.n_left = len(recordings) - len(rows)
+        if options.report is not None:
+            Folder(options.report).put_text(result.page(), "index.html")
+            Folder(options.report).tidy()
+    return result
+
+
+def _replay_job(job: _Job) -> dict[str, Any]:
+    """The record of a recording: the one that there is, or a new one. What is wrong with it is in it."""
+    try:
+        with fetched(job.recording.source) as path:
+            return _finished_or_new(job, path)
+    except RefuError as error:
+        return {"error": str(error)}
+    except (OSError, UnicodeError, MemoryError, RecursionError) as error:
+        return {"error": printable(str(error) or type(error).__name__)}
+
+
+def _finished_or_new(job: _Job, path: Path) -> dict[str, Any]:
+    options, name = job.options, job.recording.name
+    key = _key(job, path)
+    records = None if options.records is None else Folder(options.records)
+    if records is not None and not options.again:
+        known = records.read_json(f"{name}.json")
+        if isinstance(known, dict) and known.get("key") == key and _is_there(known, job):
+            return known | {"kept": True}
+    record = {"key": key, **_make(job, path)}
+    if records is not None:
+        records.put_json(record, f"{name}.json")
+    return record
+
+
+def _is_there(record: dict[str, Any], job: _Job) -> bool:
+    options, name = job.options, job.recording.name
+    if options.output is not None and Folder(options.output).size(f"{name}.mcap") != record.get("output_bytes", -1):
+        return False
+    return options.report is None or Folder(options.report).size(f"{name}/index.html") is not None
+
+
+def _make(job: _Job, path: Path) -> dict[str, Any]:
+    options, name = job.options, job.recording.name
+    pipeline = _pipeline(replace(options.replay, input=Path(), output=None))
+    if options.output is None:
+        result, size = _replayed(replace(options.replay, input=path, output=None), pipeline), None
+    else:
+        folder = Folder(options.output)
+        with folder.scratch() as scratch:
+            bag = scratch / f"{Path(name).name}.mcap"  # a bag holds its own name
+            result = _replayed(replace(options.replay, input=path, output=bag), pipeline)
+            size = bag.stat().st_size
+            folder.put(bag, f"{name}.mcap")
+    if options.report is not None and result.frames:
+        from refu_lab.report import write_report
+
+        folder = Folder(options.report)
+        with folder.scratch() as scratch:
+            write_report(result, scratch / "page")
+            folder.put(scratch / "page", name)
+    record = result.as_dict() | _over_all(result)
+    record["input"] = job.recording.source
+    record["output"] = None if options.output is None else Folder(options.output).at(f"{name}.mcap")
+    return record | {"output_bytes": size}
+
+
+def _replayed(options: ReplayOptions, pipeline: GarmentPipeline) -> ReplayResult:
+    result = replay(options, pipeline=pipeline)
+    if result.interrupted:  # a part isn't what this is a record of
+        raise KeyboardInterrupt
+    return result
+
+
+_loaded: dict[ReplayOptions, GarmentPipeline] = {}
+
+
+def _pipeline(options: ReplayOptions) -> GarmentPipeline:
+    """This process's pipeline; loading takes as long as many frames."""
+    if options not in _loaded:
+        _loaded.clear()
+        _loaded[options] = options.load_pipeline()
+    return _loaded[options]
+
+
+def _over_all(result: ReplayResult) -> dict[str, Any]:
+    """A recording's figures over all garments, and its worst frames."""
+    if not result.frames:
+        return {"free_percent": None, "vfcp_percent": None, "max_depth_mm": None, "worst": []}
+    free = [all(not (g.n_inside or g.n_pairs) for g in one.garments.values()) for one in result.frames]
+    shares = [one.vfcp_percent for one in result.after.values() if one.vfcp_percent is not None]
+    start = result.frames[0].frame.stamp_ns
+    order = sorted(range(len(free)), key=lambda i: result.frames[i].badness, reverse=True)[:WORST]
+    worst = [
+        {
+            "frame": i,
+            "time_s": 1e-9 * (result.frames[i].frame.stamp_ns - start),
+            "stamp_ns": result.frames[i].frame.stamp_ns,
+            "n_inside": sum(g.n_inside for g in result.frames[i].garments.values()),
+            "n_pairs": sum(g.n_pairs for g in result.frames[i].garments.values()),
+            "max_depth_mm": 1e3 * max(g.max_depth for g in result.frames[i].garments.values()),
+            "badness": [float(x) for x in result.frames[i].badness],
+        }
+        for i in order
+    ]
+    return {
+        "free_percent": 100 * sum(free) / len(free),
+        "vfcp_percent": sum(shares) / len(shares) if shares else None,
+        "max_depth_mm": max((one.max_depth_mm or 0.0) for one in result.after.values()),
+        "worst": worst,
+    }
+
+
+def _key(job: _Job, path: Path) -> str:
+    """Of what is read, how it is replayed, and with what code and weights."""
+    told: list[Any] = [__version__, _code_hash(), job.recording.name, _recording_hash(job.recording.source, path)]
+    names = [option.name for option in fields(ReplayOptions) if option.name not in _NOT_CONTENT]
+    told += [[name, _told(getattr(job.options.replay, name))] for name in names]
+    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+
+
+def _told(value: Any) -> Any:
+    """An option by its content: files and folders by what is in them."""
+    if isinstance(value, (list, tuple)):
+        return [_told(one) for one in value]
+    if isinstance(value, Path) or (isinstance(value, str) and Path(value).is_file()):
+        return _tree_hash(Path(value)) if Path(value).exists() else str(value)
+    return value if value is None or isinstance(value, (bool, int, float)) else str(value)
+
+
+def _recording_hash(source: str, path: Path) -> str:
+    if is_url(source):
+        fs, there = filesystem(source)
+        if not fs.isdir(there):
+            return str(fs.ukey(there))  # what a store says of a file's version, without reading it again
+    return _tree_hash(path)
+
+
+def _tree_hash(path: Path) -> str:
+    """Of a file, or of a folder's files by their names; of nothing where there is nothing."""
+    digest = hashlib.sha256()
+    for file in _files(path):
+        digest.update(b"" if file == path else file.relative_to(path).as_posix().encode() + b"\0")
+        with file.open("rb") as stream:
+            while block := stream.read(1 << 20):
+                digest.update(block)
+    return digest.hexdigest()
+
+
+def _files(path: Path) -> Iterator[Path]:
+    if path.is_dir():
+        yield from sorted(file for file in path.rglob("*") if file.is_file())
+    elif path.is_file():
+        yield path
+
+
+@cache
+def _code_hash() -> str:
+    root = Path(__file__).parents[2]
+    digest = hashlib.sha256()
+    for file in sorted({file for pattern in _CODE for file in root.glob(pattern) if file.is_file()}):
+        digest.update(file.relative_to(root).as_posix().encode() + file.read_bytes())
+    return digest.hexdigest()

@@ -1,0 +1,158 @@
+"""What a fleet's recordings come to: a table, JSON, and a page that leads to each one's report."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+from urllib.parse import quote
+
+from refu_lab.tables import REPLAY_HEADER, format_table, replay_rows
+
+_HEADER = ("recording", "frames", "skipped", "p50 ms", "p95 ms", "VFCP %", "free %", "depth mm", "")
+_WORST_HEADER = ("recording", "frame", "time s", "inside", "pairs", "depth mm")
+_SHOWN = 10
+"""Worst frames over all recordings that are shown."""
+
+
+@dataclass(eq=False)
+class FleetResult:
+    """The records of recordings in the order of the command."""
+
+    with_report: bool = False
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    """Each with `name` and `input`, and what `ReplayResult.as_dict` gives, or `error`."""
+    n_left: int = 0
+    """Recordings that weren't come to."""
+    interrupted: bool = False
+
+    @property
+    def failed(self) -> list[dict[str, Any]]:
+        """Recordings that couldn't be replayed."""
+        return [row for row in self.rows if "error" in row]
+
+    def worst(self) -> list[dict[str, Any]]:
+        """The worst frames of all recordings, the worst first."""
+        found = [{"name": row["name"], **frame} for row in self.rows for frame in row.get("worst", ())]
+        return sorted(found, key=lambda frame: list(frame["badness"]), reverse=True)[:_SHOWN]
+
+    def garments(self) -> dict[str, dict[str, Any]]:
+        """Figures of each garment over all frames of all recordings, in the form of a replay's JSON."""
+        names = {name: None for row in self.rows for name in row.get("garments", ())}
+        return {
+            name: _merged([row["garments"][name] for row in self.rows if name in row.get("garments", ())])
+            for name in names
+        }
+
+    def as_dict(self) -> dict[str, Any]:
+        """The machine-readable result (`--json`)."""
+        return {
+            "recordings": len(self.rows) + self.n_left,
+            "failed": len(self.failed),
+            "left": self.n_left,
+            "interrupted": self.interrupted,
+            "frames": sum(row.get("frames", 0) for row in self.rows),
+            "garments": self.garments(),
+            "worst": self.worst(),
+            "rows": self.rows,
+        }
+
+    def page(self) -> str:
+        """The page over all of them, `index.html` of the reports' folder."""
+        from refu_lab.report import STYLE
+
+        garments = _html_table(REPLAY_HEADER, [[html.escape(cell) for cell in row] for row in _garment_rows(self)])
+        rows = [[self._link(row), *(html.escape(cell) for cell in _cells(row)[1:])] for row in self.rows]
+        worst = [
+            [self._link(frame), *(html.escape(cell) for cell in _worst_cells(frame)[1:])] for frame in self.worst()
+        ]
+        frames = sum(row.get("frames", 0) for row in self.rows)
+        left = f"; {self.n_left} not come to" if self.n_left else ""
+        return f"""<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<title>Replay of {len(self.rows)} recordings</title><style>{STYLE}</style></head><body>
+<h1>Replay of {len(self.rows)} recordings</h1>
+<p class="note">{frames} frames; {len(self.failed)} recordings couldn't be replayed{left}.</p>
+<h2>Garments, over all frames</h2>{garments}
+<h2>Recordings</h2>{_html_table(_HEADER, rows)}
+<p class="note">Free: frames in which no garment has a vertex inside the body or a triangle that cuts it.</p>
+<h2>Worst frames of all</h2>{_html_table(_WORST_HEADER, worst)}
+</body></html>
+"""
+
+    def _link(self, row: Mapping[str, Any]) -> str:
+        text = html.escape(row["name"])
+        return text if "error" in row else f'<a href="{quote(row["name"])}/index.html">{text}</a>'
+
+
+def fleet_table(result: FleetResult) -> str:
+    """What `refu replay` prints of several recordings."""
+    lines = [format_table(_HEADER, [_cells(row) for row in result.rows])] if result.rows else []
+    if garments := _garment_rows(result):
+        lines += ["", format_table(REPLAY_HEADER, garments)]
+    if worst := [_worst_cells(frame) for frame in result.worst() if frame["n_inside"] or frame["n_pairs"]]:
+        lines += ["", "worst frames", format_table(_WORST_HEADER, worst)]
+    done, kept = len(result.rows) - len(result.failed), sum(bool(row.get("kept")) for row in result.rows)
+    lines += ["", f"{done} of {len(result.rows) + result.n_left} recordings replayed, {kept} of them before"]
+    lines += [f"{row['name']}: {row['error']}" for row in result.failed]
+    if result.interrupted:
+        lines.append("interrupted: give the same command again to go on")
+    return "\n".join(lines)
+
+
+def _cells(row: Mapping[str, Any]) -> tuple[str, ...]:
+    if "error" in row:
+        return (row["name"], *["-"] * (len(_HEADER) - 2), "failed")
+    latency = [f"{row['latency_ms'][p]:.1f}" for p in ("p50", "p95")]
+    figures = [_number(row.get(name), digits) for name, digits in _FIGURES]
+    skipped = str(sum(row["skipped"].values()))
+    return (row["name"], str(row["frames"]), skipped, *latency, *figures, "before" if row.get("kept") else "done")
+
+
+_FIGURES = (("vfcp_percent", 3), ("free_percent", 1), ("max_depth_mm", 1))
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _worst_cells(frame: Mapping[str, Any]) -> tuple[str, ...]:
+    counts = (str(frame["frame"]), f"{frame['time_s']:.2f}", str(frame["n_inside"]), str(frame["n_pairs"]))
+    return (frame["name"], *counts, f"{frame['max_depth_mm']:.1f}")
+
+
+def _garment_rows(result: FleetResult) -> list[tuple[str, ...]]:
+    return replay_rows(result.garments())
+
+
+def _merged(parts: list[Mapping[str, Any]]) -> dict[str, Any]:
+    """Figures over all frames: means weigh by frames, depths are the largest, percentiles of latency the largest."""
+    merged: dict[str, Any] = {"n_frames": sum(part["n_frames"] for part in parts)}
+    for name in parts[0]:
+        if name == "latency_ms":
+            merged[name] = {p: max(part[name][p] for part in parts) for p in parts[0][name]}
+        elif name == "before":
+            merged[name] = _merged([part[name] for part in parts])
+        elif name != "n_frames":
+            values = list(_weighed(parts, name))
+            total = sum(n for _, n in values)
+            if not values:
+                merged[name] = None
+            elif name == "max_depth_mm":
+                merged[name] = max(value for value, _ in values)
+            else:
+                merged[name] = sum(value * n for value, n in values) / total
+    return merged
+
+
+def _weighed(parts: list[Mapping[str, Any]], name: str) -> Iterator[tuple[float, int]]:
+    for part in parts:
+        if part[name] is not None and part["n_frames"]:
+            yield part[name], part["n_frames"]
+
+
+def _html_table(header: tuple[str, ...], rows: list[list[str]]) -> str:
+    lines = ["<tr>" + "".join(f"<th>{name}</th>" for name in header) + "</tr>"]
+    lines += ["<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows]
+    return f"<table>{''.join(lines)}</table>"

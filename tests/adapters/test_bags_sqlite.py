@@ -1,0 +1,142 @@
+"""Bags in rosbag2's SQLite storage: as another program writes them, in several files, damaged and hostile."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from msg_adapters import BagError, BagReader, decoder_for, encoder_for, open_smpl_bag
+from refu_core import SmplFrame
+
+TOPIC = "/smpl_params"
+TYPE = "sensor_msgs/msg/JointState"
+START_NS = 1_700_000_000_000_000_000
+PAYLOADS = [encoder_for("joint_state")(SmplFrame(np.full(72, 0.01 * i), stamp_ns=START_NS + i)) for i in range(12)]
+TOPICS = "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)"
+MESSAGES = "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB)"
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A directory that rosbags has written."""
+    path = tmp_path_factory.mktemp("bags") / "recorded"
+    with Writer(path, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        store = get_typestore(Stores.ROS2_JAZZY)
+        other = writer.add_connection("/chatter", "std_msgs/msg/String", typestore=store)
+        connection = writer.add_connection(TOPIC, TYPE, typestore=store)
+        for i, data in enumerate(PAYLOADS):
+            writer.write(connection, START_NS + i, data)
+            writer.write(other, START_NS + i, b"\x00\x01\x00\x00\x02\x00\x00\x00a\x00")
+    return path
+
+
+def handmade(path: Path, *statements: str, messages: list[tuple[object, ...]] | None = None) -> Path:
+    """A database of these statements, as Foxy lays it out by default, with rows (topic, time, bytes)."""
+    with sqlite3.connect(path) as database:
+        for statement in statements or (TOPICS, MESSAGES):
+            database.execute(statement)
+        if messages is not None:
+            database.execute("INSERT INTO topics VALUES (1, ?, ?, 'cdr')", (TOPIC, TYPE))
+            database.executemany("INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)", messages)
+    database.close()
+    return path
+
+
+def rows(first: int, last: int) -> list[tuple[object, ...]]:
+    return [(1, START_NS + i, PAYLOADS[i]) for i in range(first, last)]
+
+
+def payloads(path: Path) -> list[bytes]:
+    return [message.data for message in BagReader(path).messages([TOPIC])]
+
+
+def test_directory_and_file_of_another_writer(bag: Path) -> None:
+    for path in (bag, bag / "recorded.db3"):
+        reader = BagReader(path)
+        topics = {topic.name: (topic.message_type, topic.message_count) for topic in reader.topics}
+        assert topics == {TOPIC: (TYPE, len(PAYLOADS)), "/chatter": ("std_msgs/msg/String", len(PAYLOADS))}
+        assert [message.data for message in reader.messages([TOPIC])] == PAYLOADS
+        assert [m.log_time_ns for m in reader.messages()] == [START_NS + i // 2 for i in range(2 * len(PAYLOADS))]
+        assert not reader.truncated
+        assert not reader.warnings
+    decode = decoder_for("joint_state").from_bytes
+    for record, data in zip(open_smpl_bag(bag), PAYLOADS, strict=True):
+        assert record.frame is not None
+        np.testing.assert_array_equal(record.frame.pose, decode(data).pose)
+
+
+def test_files_of_an_interrupted_recording_are_read_in_their_order(tmp_path: Path) -> None:
+    folder = tmp_path / "long"
+    folder.mkdir()
+    for i in range(len(PAYLOADS)):  # 0 to 11: by the alphabet, 10 comes before 2
+        handmade(folder / f"long_{i}.db3", messages=rows(i, i + 1))
+    reader = BagReader(folder)
+    assert [message.data for message in reader.messages()] == PAYLOADS
+    assert "was the recording interrupted" in reader.warnings[0]
+
+
+def test_log_that_a_killed_recorder_left_is_read(tmp_path: Path) -> None:
+    handmade(tmp_path / "live.db3", messages=rows(0, 3))
+    recorder = sqlite3.connect(tmp_path / "live.db3")
+    recorder.execute("PRAGMA journal_mode = WAL")
+    recorder.executemany("INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)", rows(3, 5))
+    recorder.commit()
+    for name in ("live.db3", "live.db3-wal"):  # as they are on the disk while the recorder is alive
+        shutil.copy(tmp_path / name, tmp_path / f"killed{name[4:]}")
+    recorder.close()
+    assert payloads(tmp_path / "killed.db3") == PAYLOADS[:5]
+
+
+def test_bad_rows_are_left_out(tmp_path: Path) -> None:
+    odd = [(1, START_NS, "text"), (1, -5, b"early"), (1, None, b"never"), (77, START_NS, b"whose?")]
+    path = handmade(tmp_path / "odd.db3", messages=[*rows(0, 1), *odd, *rows(1, 2)])
+    reader = BagReader(path)
+    assert [message.data for message in reader.messages()] == PAYLOADS[:2]
+    assert reader.truncated
+    assert len(reader.warnings) == 3
+    assert "(and 1 more like it)" in reader.warnings[0]
+
+
+@pytest.mark.parametrize(
+    "statements",
+    [
+        (TOPICS, "CREATE TABLE other(id INTEGER)"),
+        (TOPICS, "CREATE VIEW messages AS SELECT 1 AS topic_id, 2 AS timestamp, zeroblob(999999999) AS data"),
+        (
+            TOPICS,
+            "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp, data AS (zeroblob(999999999)) VIRTUAL)",
+        ),
+        (TOPICS, "CREATE VIRTUAL TABLE messages USING fts4(topic_id, timestamp, data)"),
+        (TOPICS.replace(", serialization_format TEXT", ""), MESSAGES),
+    ],
+)
+def test_programs_in_the_place_of_tables_are_refused(tmp_path: Path, statements: tuple[str, ...]) -> None:
+    path = handmade(tmp_path / "program.db3", *statements)
+    with pytest.raises(BagError, match=r"program\.db3: not a bag: wanted rosbag2's table"):
+        BagReader(path)
+
+
+@given(st.data())
+def test_damage_is_a_warning_or_one_clear_error(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
+    folder = tmp_path_factory.mktemp("damaged")
+    whole = handmade(folder / "whole.db3", messages=rows(0, 12)).read_bytes()
+    cut = whole[: data.draw(st.integers(20, len(whole)))]
+    changed = bytearray(cut)
+    for at in data.draw(st.lists(st.integers(16, len(cut) - 1), max_size=20)):
+        changed[at] = data.draw(st.integers(0, 255))
+    path = folder / "damaged.db3"
+    path.write_bytes(bytes(changed))
+    found: list[bytes] = []
+    with suppress(BagError):  # and nothing else
+        found = [message.data for message in BagReader(path).messages()]
+    assert len(found) <= 100
+    assert all(isinstance(payload, bytes) for payload in found)

@@ -1,0 +1,297 @@
+"""Many recordings and many processes: found, replayed once each, whatever dies; the same bytes whoever does it."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from refu_core import RefuError, SmplFrame
+from refu_core._engine import InProcess, Lost
+from refu_lab.cli import main
+from refu_lab.fleet import FleetError, find_recordings, is_plain, open_engine
+from refu_lab.fleet._engine import run_function
+from tests.lab.test_replay import motion, write_bag
+
+FAST = ["--garments", "short-pant-male", "--backbone", "skinned", "--sdf", "none", "--no-collider", "--quiet"]
+
+
+def frames(shift: float = 0.0) -> list[SmplFrame]:
+    return [replace(frame, transl=frame.transl + shift) for frame in motion(2)]
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three bags in two folders, and a file that isn't one."""
+    folder = tmp_path_factory.mktemp("fleet") / "bags"
+    for i, name in enumerate(("a/walk.mcap", "a/turn.mcap", "b/walk.mcap")):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        write_bag(folder / name, frames(0.1 * i))
+    (folder / "b" / "broken.mcap").write_bytes(b"not a bag at all")
+    return folder
+
+
+def run(*arguments: object) -> int:
+    return main([*map(str, ("replay", *arguments)), *FAST])
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    """Every bag, and every record without what no two runs share."""
+    found = {}
+    for file in sorted(folder.rglob("*")):
+        if file.suffix == ".mcap":
+            found[str(file.relative_to(folder))] = file.read_bytes()
+        elif file.suffix == ".json":
+            found[str(file.relative_to(folder))] = json.dumps(_timeless(json.loads(file.read_text()))).encode()
+    return found
+
+
+def _timeless(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _timeless(v) for k, v in value.items() if k not in ("latency_ms", "output", "kept")}
+    return [_timeless(one) for one in value] if isinstance(value, list) else value
+
+
+# ---- what is found ---------------------------------------------------------------------------------------------------
+
+
+def names(*inputs: object) -> list[str]:
+    return [recording.name for recording in find_recordings([str(one) for one in inputs])]
+
+
+def test_folders_globs_and_urls_stand_for_the_same(bags: Path) -> None:
+    wanted = ["a/turn", "a/walk", "b/broken", "b/walk"]
+    assert names(bags) == wanted
+    assert names(f"{bags}/**/*.mcap") == wanted
+    assert names(f"file://{bags}") == wanted
+    assert names(f"file://{bags}/*/*.mcap") == wanted
+    assert names(bags / "a", bags / "b", bags) == wanted
+    assert names(bags / "a" / "walk.mcap") == ["walk"]
+    with pytest.raises(RefuError, match="no recording there"):
+        names(f"{bags}/*.mcap")
+
+
+def test_one_recording_is_one_replay_as_ever(bags: Path, tmp_path: Path) -> None:
+    split = tmp_path / "long"
+    split.mkdir()
+    for i in range(2):
+        shutil.copy(bags / "a" / "walk.mcap", split / f"long_{i}.mcap")
+    assert names(split) == ["long"]
+    assert is_plain([str(split)])
+    assert is_plain([str(bags / "a" / "walk.mcap")])
+    assert is_plain(["bags/walk"])
+    assert is_plain(["there/is/none.mcap"])  # said by its reader
+    for several in ([str(bags)], [str(bags / "a"), str(split)], [f"{bags}/a/*.mcap"], ["s3://bucket/walk.mcap"]):
+        assert not is_plain(several)
+
+
+@given(st.sets(st.from_regex(r"[ab]{1,2}(/[ab]{1,2}){0,2}\.(mcap|npz|db3)", fullmatch=True), min_size=1, max_size=8))
+def test_no_two_recordings_have_one_name(tmp_path_factory: pytest.TempPathFactory, paths: set[str]) -> None:
+    folder = tmp_path_factory.mktemp("names")
+    for path in paths:
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        (folder / path).touch()
+    found = find_recordings([str(folder / path) for path in sorted(paths)])
+    assert len({recording.name for recording in found}) == len(paths)
+    assert not any(recording.name.startswith(("/", "..")) for recording in found)
+
+
+# ---- what is done ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def alone(bags: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The results of one process."""
+    folder = tmp_path_factory.mktemp("alone") / "out"
+    assert run(bags, "--output", folder) == 2
+    return folder
+
+
+def test_a_bad_bag_is_reported_and_the_rest_is_done(bags: Path, alone: Path, tmp_path: Path, capsys: Any) -> None:
+    assert {path for path in content(alone) if path.endswith(".mcap")} == {"a/turn.mcap", "a/walk.mcap", "b/walk.mcap"}
+    assert run(bags, "--output", alone, "--json", tmp_path / "all.json") == 2
+    printed = capsys.readouterr().out
+    assert "3 of 4 recordings replayed" in printed
+    assert "b/broken: " in printed
+    assert "not an MCAP file" in printed
+    summary = json.loads((tmp_path / "all.json").read_text())
+    assert (summary["recordings"], summary["failed"], summary["frames"]) == (4, 1, 6)
+    rows = [row for row in summary["rows"] if "error" not in row]
+    (garment,) = summary["garments"].values()
+    shares = [row["garments"]["short-pant-male"]["vfcp_percent"] for row in rows]
+    assert garment["vfcp_percent"] == pytest.approx(sum(shares) / 3)
+    assert garment["n_frames"] == 6
+    order = [frame["badness"] for frame in summary["worst"]]
+    assert len(order) == 6
+    assert order == sorted(order, reverse=True)
+
+
+def test_page_over_all_leads_to_each_report(bags: Path, tmp_path: Path) -> None:
+    assert run(bags / "b", "--report", tmp_path / "report") == 2
+    page = (tmp_path / "report" / "index.html").read_text()
+    assert 'href="walk/index.html"' in page
+    assert (tmp_path / "report" / "walk" / "index.html").stat().st_size > 1000
+    assert "broken" in page
+    assert not list((tmp_path / "report").rglob(".partial"))
+    assert not list((tmp_path / "report").rglob(".lock"))
+
+
+def test_what_is_finished_is_not_done_again(bags: Path, alone: Path, tmp_path: Path, capsys: Any) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(alone, out)
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("*.mcap")}
+    (out / "a" / "walk.mcap").write_bytes(b"cut")  # its bag is gone: it isn't finished
+    write_bag(tmp_path / "new.mcap", frames(0.7))
+    changed = tmp_path / "bags"
+    shutil.copytree(bags, changed)
+    shutil.copy(tmp_path / "new.mcap", changed / "b" / "walk.mcap")  # another recording under the old name
+    assert run(changed, "--output", out) == 2
+    assert "1 of them before" in capsys.readouterr().out
+    again = {path for path, stamp in before.items() if path.stat().st_mtime_ns != stamp}
+    assert again == {out / "a" / "walk.mcap", out / "b" / "walk.mcap"}
+    assert (out / "a" / "walk.mcap").read_bytes() == (alone / "a" / "walk.mcap").read_bytes()
+    assert run(changed, "--output", out, "--frame-id", "world") == 2  # other options, other results
+    assert "0 of them before" in capsys.readouterr().out
+    assert run(changed, "--output", out, "--frame-id", "world", "--again") == 2
+    assert "0 of them before" in capsys.readouterr().out
+
+
+def test_results_by_url_are_those_by_path(bags: Path, alone: Path, tmp_path: Path, capsys: Any) -> None:
+    arguments = [f"file://{bags}/a", "--output", f"file://{tmp_path}/out", "--no-evaluate"]
+    assert run(*arguments) == 0
+    assert run(*arguments) == 0
+    assert "2 of 2 recordings replayed, 2 of them before" in capsys.readouterr().out
+    for name in ("walk", "turn"):
+        assert (tmp_path / "out" / f"{name}.mcap").read_bytes() == (alone / "a" / f"{name}.mcap").read_bytes()
+    record = json.loads((tmp_path / "out" / "walk.json").read_text())
+    assert (record["frames"], record["garments"], record["worst"]) == (2, {}, [])
+
+
+def test_conversion_alone_gives_the_same_bag(bags: Path, alone: Path, tmp_path: Path, capsys: Any) -> None:
+    bag = bags / "a" / "walk.mcap"
+    assert run(bag, "--no-evaluate", "--output", tmp_path / "walk.mcap", "--json", tmp_path / "out.json") == 0
+    assert "2 frames, not evaluated" in capsys.readouterr().out
+    assert (tmp_path / "walk.mcap").read_bytes() == (alone / "a" / "walk.mcap").read_bytes()
+    assert json.loads((tmp_path / "out.json").read_text())["frames"] == 2
+    assert run(bag, "--no-evaluate", "--report", tmp_path / "report") == 2
+
+
+def test_dask_is_not_imported_unless_asked_for(bags: Path) -> None:
+    code = (
+        "import sys; from refu_lab.cli import main\n"
+        f"code = main(['replay', {str(bags / 'a')!r}, *{FAST!r}])\n"
+        "assert code == 0 and not {'dask', 'distributed', 'tornado'} & set(sys.modules), sorted(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+
+
+def test_without_dask_one_line_says_what_to_install(bags: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    monkeypatch.setattr("refu_lab.fleet._engine.find_spec", lambda _: None)
+    assert run(bags, "--jobs", "2") == 2
+    error = capsys.readouterr().err
+    assert 'pip install "refu-ros[cluster]"' in error
+    assert error.count("\n") == 1
+
+
+# ---- many processes --------------------------------------------------------------------------------------------------
+
+
+def _slow_square(number: int) -> int:
+    if number == 3 and not Path(os.environ["REFU_TEST_MARK"]).exists():
+        Path(os.environ["REFU_TEST_MARK"]).touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number * number
+
+
+def _deadly(number: int) -> int:
+    if number == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+@pytest.fixture
+def scheduler(tmp_path: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
+    """A scheduler and two workers, as a cluster has them: processes of their own."""
+    pytest.importorskip("distributed")
+    file = tmp_path / "scheduler.json"
+    path = os.pathsep.join([str(Path(__file__).parents[2]), str(Path(__file__).parent)])
+    environment = os.environ | {"REFU_TEST_MARK": str(tmp_path / "mark"), "PYTHONPATH": path}
+    started = [
+        subprocess.Popen(
+            [sys.executable, "-m", f"distributed.cli.{kind}", "--scheduler-file", str(file), *options],
+            env=environment,
+            cwd=tmp_path,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        for kind, options in (
+            ("dask_scheduler", ["--no-dashboard", "--host", "127.0.0.1", "--port", "0"]),
+            ("dask_worker", ["--nworkers", "2", "--nthreads", "1", "--no-dashboard", "--death-timeout", "60"]),
+        )
+    ]
+    try:
+        deadline = time.monotonic() + 120
+        while not file.exists() and time.monotonic() < deadline:
+            time.sleep(0.05)
+        yield json.loads(file.read_text())["address"], started[0]
+    finally:
+        for process in started:
+            os.killpg(process.pid, signal.SIGKILL)  # with what they have started
+            process.wait(60)
+
+
+def test_killed_workers_lose_and_double_nothing(
+    scheduler: tuple[str, subprocess.Popen[bytes]], bags: Path, alone: Path, tmp_path: Path, capsys: Any
+) -> None:
+    """One worker dies with a task, then others with a task that ends each; the same cluster replays on."""
+    address, process = scheduler
+    with open_engine(None, address) as engine:
+        found = sorted(engine.run(run_function(_slow_square), list(range(20))))
+        assert found == [(n, n * n) for n in range(20)]
+        lost = dict(engine.run(run_function(_deadly), [0, 1, 2]))
+        assert (lost[0], lost[2]) == (0, 2)
+        assert isinstance(lost[1], Lost)
+        assert "out of memory?" in lost[1].reason
+    out = tmp_path / "out"
+    assert run(bags, "--scheduler", address, "--output", out) == 2
+    assert "3 of 4 recordings replayed, 0 of them before" in capsys.readouterr().out
+    assert content(out) == content(alone)
+
+    with open_engine(None, address) as engine:
+        results = engine.run(run_function(time.sleep), [0.0, 600.0, 600.0])
+        assert next(results) == (0, None)
+        process.kill()
+        with pytest.raises(FleetError, match="same command again"):
+            list(results)
+    assert run(bags, "--output", out) == 2  # goes on, here without any
+    assert "3 of 4 recordings replayed, 3 of them before" in capsys.readouterr().out
+
+
+def test_no_scheduler_at_the_address_is_one_line(bags: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("distributed")
+    monkeypatch.setattr("refu_lab.fleet._engine.CONNECT_S", 0.5)
+    assert run(bags, "--scheduler", "tcp://127.0.0.1:9") == 2
+    error = capsys.readouterr().err
+    assert "no Dask scheduler at tcp://127.0.0.1:9" in error
+    assert error.count("\n") == 1
+    assert run(bags, "--scheduler", "tcp://127.0.0.1:9", "--jobs", "2") == 2
+
+
+def test_engine_in_this_process_keeps_the_order() -> None:
+    assert list(InProcess().run(run_function(_square), [3, 1])) == [(0, 9), (1, 1)]
+
+
+def _square(number: int) -> int:
+    return number * number
