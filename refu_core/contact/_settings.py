@@ -60,7 +60,7 @@ class ContactSettings:
     that lacks more runs through a hand, and raising it would throw its ends centimetres away."""
 
     # Garments over each other
-    layer_gap: float = 0.005
+    layer_gap: float = 0.004
     """How far apart two garments are kept [m]: their triangles cut the corners between vertices."""
     layer_reach: float = 0.03
     """How far the sheet below is felt [m], less and less in the last quarter. Only cloth in a fold is deeper, and which

@@ -29,7 +29,7 @@ from PIL import Image
 import refu_core
 from refu_core._engine import Engine
 from refu_core.body import Collider, SmplBody, load_body
-from refu_core.errors import MeshError
+from refu_core.errors import BodyError
 from refu_core.garments import load_garment
 from refu_core.metrics import CollisionChecker, SheetChecker
 from refu_core.simulation import (
@@ -597,7 +597,7 @@ def test_body_with_a_hole_is_refused(clips: Path, tmp_path: Path) -> None:
         arrays = {key: data[key] for key in data.files}
     arrays["f"] = arrays["f"][1:]
     np.savez(tmp_path / "open.npz", **arrays)
-    with pytest.raises(MeshError, match="watertight"):
+    with pytest.raises(BodyError, match="watertight"):
         simulate(tmp_path / "set", clips, body=tmp_path / "open.npz")
     assert not (tmp_path / "set").exists()
 

@@ -88,7 +88,9 @@ def bare(body: str | None = None) -> GarmentPipeline:
 
 def warnings_of(path: Path, pipeline: GarmentPipeline, **options: Any) -> list[str]:
     """What a replay warns of."""
-    return replay(ReplayOptions(input=path, garments=(GARMENT,), **options), pipeline=pipeline).warnings
+    return replay(
+        ReplayOptions(input=path, garments=(GARMENT,), backbone="skinned", **options), pipeline=pipeline
+    ).warnings
 
 
 def test_betas_of_unknown_meaning_are_warned_of_once(tmp_path: Path) -> None:
