@@ -62,6 +62,9 @@ class ContactSettings:
     # Garments over each other
     layer_gap: float = 0.004
     """How far apart two garments are kept [m]: their triangles cut the corners between vertices."""
+    layer_margin: float = 0.5
+    """Share of the body's margin that is left once a garment was brought off those below it again: what pushes a vertex
+    off the body may push it into a layer, and the other way round. Both have this much to give."""
     layer_reach: float = 0.03
     """How far the sheet below is felt [m], less and less in the last quarter. Only cloth in a fold is deeper, and which
     side of the fold is closest changes from frame to frame."""

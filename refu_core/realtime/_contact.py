@@ -17,9 +17,6 @@ from refu_core.sdf import ApproxSdf, MeshSdf, Winding, exact_sdf
 
 _ASKED_FROM = 2e-3
 """Vertices are asked exactly up to this far beyond the margin [m]."""
-_KEPT = 0.5
-"""Share of the margin that is left once a garment was brought off those below it again: what pushes a vertex off the
-body may push it into a layer, and the other way round. Both have this much to give."""
 
 
 class Worn(NamedTuple):
@@ -79,7 +76,7 @@ class ContactStage:
         if outfit.collider is not None:  # or there is no room
             self._limbs = limbs = LimbMeshes(body)
             self._press = {name: Press(one, limbs, settings=settings) for name, one in garments.items()}
-        self._outfit, self._farthest = outfit, settings.max_displacement
+        self._outfit, self._farthest, self._kept = outfit, settings.max_displacement, settings.layer_margin
         self._below = {
             name: {
                 inner: Layer(
@@ -130,7 +127,7 @@ class ContactStage:
         vertices, numbers = done.vertices, done.numbers
         if worn:
             vertices, _ = self._off_layers(name, vertices, worn)
-            again, _ = self._off_body(name, vertices, on_mean=on_mean, margin=_KEPT * margin, scale=1.0)
+            again, _ = self._off_body(name, vertices, on_mean=on_mean, margin=self._kept * margin, scale=1.0)
             vertices, numbers[_N_UNRESOLVED] = again.vertices, again.numbers[_N_UNRESOLVED]
         if name in self._press or worn:  # what goes several ways
             away = vertices - raw
