@@ -11,13 +11,11 @@ from msg_adapters.cdr import NS_PER_S
 from msg_adapters.errors import MotionFileError
 from msg_adapters.rotations import quaternion_from_rotvec, rotvec_from_quaternion, slerp
 from refu_core.frames import N_JOINTS, SmplFrame
-from refu_core.recordings import MAX_FRAMES, n_resampled, read_recording
+from refu_core.recordings import MAX_FRAMES, Recording, n_resampled, read_recording
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
-
-    from numpy.typing import NDArray
 
     from refu_core.recordings import Axes
 
@@ -25,20 +23,8 @@ _BLOCK = 10_000  # frames that are resampled at once: a clip of hours would take
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
-    """One person moving, sampled evenly."""
-
-    poses: NDArray[np.float32]
-    """Rotation vectors of SMPL's joints [rad], shape (T, 24, 3)."""
-    transl: NDArray[np.float64]
-    """Translations [m], shape (T, 3)."""
-    betas: NDArray[np.float32]
-    """Shape coefficients, shape (10,)."""
-    fps: float
-    """Frames a second."""
-    gender: str = "neutral"
-    notes: tuple[str, ...] = ()
-    """What the reader took for granted, left out or turned: to be shown to whoever gave the file."""
+class Motion(Recording):
+    """A recording as frames."""
 
     def __len__(self) -> int:
         """Number of frames."""
