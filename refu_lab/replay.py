@@ -23,6 +23,7 @@ from refu_core.metrics import CollisionChecker, Figures, GarmentMetrics
 from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN, BackboneName, BetasSource
 from refu_core.recordings import axis_of, upright_share
 from refu_lab.bodies import betas_warnings, body_facts, body_warnings
+from refu_lab.dressed_bag import DressedBag, garment_encoder
 from refu_lab.sources import Source, open_source
 from refu_lab.truth import GroundTruth
 
@@ -31,10 +32,9 @@ if TYPE_CHECKING:
     from refu_core.realtime import PipelineOutput, SkinShift
     from refu_core.recordings import Axes
 
-GARMENTS_TOPIC = "/garments"
 _MAX_REASONS = 20
-_LONGEST_PAUSE_S = 60.0
 """Reasons of skips that are counted apart."""
+_LONGEST_PAUSE_S = 60.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,6 +65,8 @@ class ReplayOptions:
     max_frames: int | None = None
     overwrite: bool = False
     collider: bool = True
+    with_body: bool = True
+    """Whether the output carries the body, too."""
     evaluate: bool = True
     """Whether collisions are checked; otherwise nothing is kept of a frame but its latency."""
 
@@ -247,34 +249,14 @@ class _Replayer:
             self._evaluator = Evaluator(pipeline, truth)
         self._has_betas = False
         self._betas = None if options.betas is None else np.asarray(options.betas, np.float32)
-        meshes = [
-            adapters.MarkerMesh(
-                ns=adapters.garment_namespace(name),
-                faces=garment.faces.cpu().numpy(),
-                n_vertices=garment.n_vertices,
-                color=(*garment.card.color, 1.0),
-            )
-            for name, garment in pipeline.garments.items()
-        ]
-        self._encoder = adapters.MarkerArrayEncoder(meshes, frame_id=options.frame_id, axes=options.axes)
+        self._encoder = garment_encoder(pipeline, options)
 
-    def open_writer(self) -> adapters.BagWriter | None:
-        """The output bag with its topics, None where no output was asked for."""
-        if self._options.output is None:
-            return None
-        writer = adapters.BagWriter(self._options.output, overwrite=self._options.overwrite)
-        given = self._source.bag.topic if self._source.bag is not None else None
-        own = {} if given is None else {"definition": given.definition, "type_hash": given.type_hash}
-        writer.add_topic(self._source.topic, self._source.message_type, **own)
-        writer.add_topic(GARMENTS_TOPIC, adapters.MARKER_ARRAY)
-        return writer
-
-    def run(self, record: FrameRecord, writer: adapters.BagWriter | None) -> None:
-        """Bytes to bytes (timed), then the bag and the metrics (not timed)."""
-        if writer is not None and (record.raw or self._source.bag is not None):
-            writer.write(self._source.topic, record.raw, log_time_ns=record.log_time_ns)
+    def run(self, record: FrameRecord, bag: DressedBag | None) -> None:
+        """Bytes to bytes (timed), then the metrics and the bag (not timed)."""
+        if bag is not None:
+            bag.add_input(record)
         if record.error is not None:
-            self._skip(str(record.error))
+            self._skip(record, str(record.error), bag)
             return
         start = time.perf_counter()
         try:
@@ -286,21 +268,24 @@ class _Replayer:
                 [mesh.local for mesh in output.values()], stamp_ns=frame.stamp_ns, transl=frame.transl
             )
         except (adapters.DecodeError, adapters.EncodeError) as error:
-            self._skip(str(error))
+            self._skip(record, str(error), bag)
             return
         latency_ms = 1e3 * (time.perf_counter() - start)
-        if writer is not None:
-            writer.write(GARMENTS_TOPIC, data, log_time_ns=record.log_time_ns)
         result, shift = self._result, output.stats.shift
         result.latencies_ms.append(latency_ms)
         self._has_betas = self._has_betas or bool(frame.betas.any())
         result.shift_sum += shift.mean
         result.shift_largest = max(result.shift_largest, shift.largest)
+        garments = None
         if self._evaluator is not None:
             garments = self._evaluator.add(frame, output, latency_ms)
             result.frames.append(FrameResult(frame, latency_ms, output.stats.stage_ms, shift, garments))
+        if bag is not None:
+            bag.add_frame(record, frame, output, data, garments)
 
-    def _skip(self, reason: str) -> None:
+    def _skip(self, record: FrameRecord, reason: str, bag: DressedBag | None) -> None:
+        if bag is not None:
+            bag.add_skip(record, reason)
         skips = self._result.skips
         skips[reason if reason in skips or len(skips) < _MAX_REASONS else "other reasons"] += 1
 
@@ -341,16 +326,14 @@ def replay(options: ReplayOptions, *, pipeline: GarmentPipeline | None = None, p
         if options.backbone == BackboneName.AUTO:
             result.warnings += [f"{name} has no trained weights: worn by skinning" for name in pipeline.untrained]
         replayer = _Replayer(options, pipeline, source, result)
-        writer = replayer.open_writer()
-        if writer is not None:
-            stack.enter_context(writer)
+        bag = None if options.output is None else stack.enter_context(DressedBag(options, pipeline, source))
         records = itertools.islice(source.records, options.max_frames)
         total = source.count if options.max_frames is None else min(source.count or sys.maxsize, options.max_frames)
         try:
             for record in tqdm(
                 _paced(records, options.speed), total=total, unit="frame", disable=None if progress else True
             ):
-                replayer.run(record, writer)
+                replayer.run(record, bag)
         except KeyboardInterrupt:
             result.interrupted = True
         result.warnings += source.warnings

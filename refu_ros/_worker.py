@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from msg_adapters import EncodeError, MarkerArrayEncoder, MarkerMesh, encode_delete, garment_namespace
+from msg_adapters.markers import SKIN
 from refu_core._device import is_device_loss
 from refu_core.modes import BetasSource
 
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     from refu_ros._settings import NodeSettings
     from refu_ros._statistics import Statistics
 
-_SKIN = (0.80, 0.67, 0.58, 1.0)
 _IDLE_S = 0.1
 """How often the thread looks for persons who have left when nobody sends [s]."""
 _EMPTY_S = 2.0
@@ -263,7 +263,7 @@ class Worker:
     def _body_mesh(self, person: str) -> list[MarkerMesh]:
         body = self._pipeline.body
         name = garment_namespace("body", person)
-        return [MarkerMesh(name, body.faces.cpu().numpy(), len(body.v_template), color=_SKIN)]
+        return [MarkerMesh(name, body.faces.cpu().numpy(), len(body.v_template), color=SKIN)]
 
     def _remove(self, persons: Iterable[str]) -> None:
         """Takes persons out of viewers' scenes."""

@@ -4,16 +4,19 @@ from msg_adapters.markers._decoder import Marker, decode_marker_array, vertices_
 from msg_adapters.markers._encoder import (
     MARKER_ARRAY,
     POINTS,
+    TRIANGLE_LIST,
     MarkerArrayEncoder,
     encode_delete,
     encode_delete_all,
     encode_points,
 )
-from msg_adapters.markers._mesh import MarkerMesh, garment_namespace
+from msg_adapters.markers._mesh import SKIN, MarkerMesh, garment_namespace
 
 __all__ = [
     "MARKER_ARRAY",
     "POINTS",
+    "SKIN",
+    "TRIANGLE_LIST",
     "Marker",
     "MarkerArrayEncoder",
     "MarkerMesh",

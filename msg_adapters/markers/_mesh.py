@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 Rgba = tuple[float, float, float, float]
 CLOTH: Rgba = (0.55, 0.63, 0.75, 1.0)
+SKIN: Rgba = (0.80, 0.67, 0.58, 1.0)
 
 
 def numbers(what: str, values: Any) -> NDArray[Any]:

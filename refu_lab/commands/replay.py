@@ -126,6 +126,12 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--no-evaluate", dest="evaluate", action="store_false", help="convert alone: no collision is looked for"
     )
+    parser.add_argument(
+        "--no-body",
+        dest="with_body",
+        action="store_false",
+        help="leave the body out of the output, which is 40 %% smaller then",
+    )
     parser.add_argument("--overwrite", action="store_true", help="replace an output that is there already")
     parser.add_argument("--again", action="store_true", help="of several inputs: also those that are finished")
     add_cluster(parser)

@@ -69,19 +69,17 @@ def run(*arguments: object) -> int:
 # ---- what comes out --------------------------------------------------------------------------------------------------
 
 
-def decoded(path: Path) -> list[tuple[str, int, Any]]:
-    """Topic, log time and message of everything in an .mcap, read by another decoder than ours."""
+def decoded(path: Path, *topics: str) -> list[tuple[str, int, Any]]:
+    """Topic, log time and message of everything in an .mcap (of some topics), read by another decoder than ours."""
     with path.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        return [(channel.topic, m.log_time, ros) for _, channel, m, ros in reader.iter_decoded_messages()]
+        return [(channel.topic, m.log_time, ros) for _, channel, m, ros in reader.iter_decoded_messages(topics or None)]
 
 
 def test_as_many_garments_as_frames_and_stamps_kept(small_bag: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     assert run(small_bag, "--output", out, "--garments", "tshirt-male,short-pant-male") == 0
-    messages = decoded(out)
-    arrays = [ros for topic, _, ros in messages if topic == "/garments"]
-    inputs = [ros for topic, _, ros in messages if topic == "/smpl_params"]
+    arrays, inputs = ([ros for _, _, ros in decoded(out, name)] for name in ("/garments", "/smpl_params"))
     assert len(arrays) == len(inputs) == len(motion())
     for array, frame in zip(arrays, motion(), strict=True):
         assert [m.ns for m in array.markers] == ["tshirt-male", "short-pant-male"]
@@ -108,6 +106,33 @@ def test_the_output_is_what_the_pipeline_says_in_ros_axes(small_bag: Path, tmp_p
         np.testing.assert_allclose(found, wanted, atol=1e-6)
 
 
+def test_the_output_shows_who_wears_it_and_says_how_it_fits(small_bag: Path, tmp_path: Path) -> None:
+    out, bare = tmp_path / "out.mcap", tmp_path / "bare.mcap"
+    assert run(small_bag, "--output", out, "--garments", "short-pant-male") == 0
+    pipeline = GarmentPipeline.load(["short-pant-male"])
+    bodies, reports = ([ros for _, _, ros in decoded(out, name)] for name in ("/body", "/diagnostics"))
+    for array, report, frame in zip(bodies, reports, motion(), strict=True):
+        (marker,) = array.markers
+        wanted = pipeline(frame)
+        corners = np.array([(p.x, p.y, p.z) for p in marker.points[:3000]])
+        at = (wanted.body + wanted.transl)[pipeline.body.faces.numpy().reshape(-1)[:3000]]
+        np.testing.assert_allclose(corners, at[:, [2, 0, 1]], atol=1e-6)
+        assert str(marker.header.stamp) == str(report.header.stamp)
+        received, shorts = report.status
+        assert (received.name, received.message) == ("refu replay: input", "/smpl_params")
+        assert shorts.name == "refu replay: short-pant-male"
+        said = {pair.key: pair.value for pair in shorts.values}
+        assert int(said["vertices inside before"]) > 0
+        assert said["vertices inside"] == "0"
+        is_free = said["intersecting pairs of triangles"] == "0"
+        assert (shorts.level, shorts.message == "free of collisions") == (0 if is_free else 1, is_free)
+    assert run(small_bag, "--output", bare, "--garments", "short-pant-male", "--no-body", "--no-evaluate") == 0
+    kept = [message for message in raw_messages(out) if message[0] in ("/garments", "/smpl_params")]
+    assert [message for message in raw_messages(bare) if message[0] != "/diagnostics"] == kept
+    said = {ros.status[1].message for _, _, ros in decoded(bare, "/diagnostics")}
+    assert said == {"no vertex inside the body"}
+
+
 @pytest.mark.parametrize("bag", SHIPPED, ids=lambda path: path.name)
 def test_shipped_bags_replay_and_open_as_rosbag2(bag: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
@@ -126,7 +151,7 @@ def test_shipped_bags_replay_and_open_as_rosbag2(bag: Path, tmp_path: Path) -> N
 def test_motion_files_replay(motions: list[Path], tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     assert run(motions[0], "--output", out, "--max-frames", 3, "--garments", "skirt-female") == 0
-    assert [topic for topic, _, _ in decoded(out)] == ["/smpl_params", "/garments"] * 3
+    assert [topic for topic, _, _ in raw_messages(out)] == ["/smpl_params", "/garments", "/body", "/diagnostics"] * 3
 
 
 @pytest.mark.parametrize("backbone", ["skinned", "tailornet"])
@@ -225,6 +250,9 @@ def test_bad_messages_are_counted_and_skipped(tmp_path: Path, capsys: pytest.Cap
     topics = [topic for topic, _, _ in raw_messages(out)]
     assert topics.count("/smpl_params") == 6
     assert topics.count("/garments") == 3
+    said = [ros.status[0] for _, _, ros in decoded(out, "/diagnostics")]
+    assert [status.level for status in said] == [0, 2, 2, 0, 2, 0]
+    assert "NaN" in said[4].message
 
 
 def raw_messages(path: Path) -> list[tuple[str, int, bytes]]:
@@ -345,7 +373,7 @@ def test_an_output_that_is_there_is_not_overwritten_unasked(
     assert_one_line(run(small_bag, "--output", out), capsys.readouterr().err, "out.mcap")
     assert out.read_bytes() == b"precious"
     assert run(small_bag, "--output", out, "--overwrite", "--garments", "short-pant-male") == 0
-    assert len(raw_messages(out)) == 2 * len(motion())
+    assert len(raw_messages(out)) == 4 * len(motion())
 
 
 @pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM])

@@ -1,0 +1,135 @@
+"""The bag that a replay writes: what came in, the garments, the body that they are on, and diagnostics."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import msg_adapters as adapters
+from msg_adapters.diagnostics import ERROR, OK, WARN
+from msg_adapters.markers import SKIN
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from types import TracebackType
+
+    from typing_extensions import Self
+
+    from msg_adapters import FrameRecord
+    from refu_core import GarmentPipeline, SmplFrame
+    from refu_core.realtime import PipelineOutput
+    from refu_lab.replay import GarmentRecord, ReplayOptions
+    from refu_lab.sources import Source
+
+GARMENTS_TOPIC, BODY_TOPIC, DIAGNOSTICS_TOPIC = "/garments", "/body", "/diagnostics"
+
+
+def garment_encoder(pipeline: GarmentPipeline, options: ReplayOptions) -> adapters.MarkerArrayEncoder:
+    """Of the pipeline's garments, in their order, each in its own colour."""
+    meshes = [
+        adapters.MarkerMesh(
+            ns=adapters.garment_namespace(name),
+            faces=garment.faces.cpu().numpy(),
+            n_vertices=garment.n_vertices,
+            color=(*garment.card.color, 1.0),
+        )
+        for name, garment in pipeline.garments.items()
+    ]
+    return adapters.MarkerArrayEncoder(meshes, frame_id=options.frame_id, axes=options.axes)
+
+
+class DressedBag:
+    """The topics of the node, without the node: a viewer that shows the one shows the other.
+
+    Diagnostics hold nothing that a clock has measured, so that a replay writes the same bag again.
+
+    Raises `BagError` when `options.output` can't be written.
+    """
+
+    def __init__(self, options: ReplayOptions, pipeline: GarmentPipeline, source: Source) -> None:
+        assert options.output is not None
+        self._source = source
+        self._skipped = 0
+        self._settings = {"sdf": str(options.sdf), "backbone": str(options.backbone)}
+        self._writer = adapters.BagWriter(options.output, overwrite=options.overwrite)
+        given = None if source.bag is None else source.bag.topic
+        own = {} if given is None else {"definition": given.definition, "type_hash": given.type_hash}
+        self._writer.add_topic(source.topic, source.message_type, **own)
+        self._writer.add_topic(GARMENTS_TOPIC, adapters.MARKER_ARRAY)
+        self._writer.add_topic(DIAGNOSTICS_TOPIC, adapters.DIAGNOSTIC_ARRAY)
+        self._body: adapters.MarkerArrayEncoder | None = None
+        if options.with_body:
+            self._writer.add_topic(BODY_TOPIC, adapters.MARKER_ARRAY)
+            faces = pipeline.body.faces.cpu().numpy()
+            mesh = adapters.MarkerMesh("body", faces, len(pipeline.body.v_template), color=SKIN)
+            self._body = adapters.MarkerArrayEncoder([mesh], frame_id=options.frame_id, axes=options.axes)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Finishes the bag, also after an exception."""
+        self._writer.__exit__(kind, error, trace)
+
+    def add_input(self, record: FrameRecord) -> None:
+        """A message as it came."""
+        if record.raw or self._source.bag is not None:
+            self._writer.write(self._source.topic, record.raw, log_time_ns=record.log_time_ns)
+
+    def add_skip(self, record: FrameRecord, reason: str) -> None:
+        """Why a message was not replayed."""
+        self._skipped += 1
+        self._say(record, record.stamp_ns, [self._input(ERROR, reason)])
+
+    def add_frame(
+        self,
+        record: FrameRecord,
+        frame: SmplFrame,
+        output: PipelineOutput,
+        garments: bytes,
+        exact: Mapping[str, GarmentRecord] | None,
+    ) -> None:
+        """A dressed frame: its garments as bytes, and what exact checks have found, where there were any."""
+        self._writer.write(GARMENTS_TOPIC, garments, log_time_ns=record.log_time_ns)
+        if self._body is not None:
+            data = self._body.encode([output.body], stamp_ns=frame.stamp_ns, transl=frame.transl)
+            self._writer.write(BODY_TOPIC, data, log_time_ns=record.log_time_ns)
+        found = [self._garment(name, output, None if exact is None else exact[name]) for name in output]
+        self._say(record, frame.stamp_ns, [self._input(OK, self._source.topic), *found])
+
+    def _say(self, record: FrameRecord, stamp_ns: int, statuses: list[adapters.DiagnosticStatus]) -> None:
+        data = adapters.encode_diagnostics(statuses, stamp_ns=stamp_ns)
+        self._writer.write(DIAGNOSTICS_TOPIC, data, log_time_ns=record.log_time_ns)
+
+    def _input(self, level: int, message: str) -> adapters.DiagnosticStatus:
+        values = {"input type": self._source.message_type, "skipped": str(self._skipped)}
+        return adapters.DiagnosticStatus(level, "refu replay: input", message, values=values)
+
+    def _garment(self, name: str, output: PipelineOutput, exact: GarmentRecord | None) -> adapters.DiagnosticStatus:
+        """By exact checks of this frame where it was evaluated, otherwise by what collision handling says of itself."""
+        stats = output.stats.garments[name]
+        n_inside, n_pairs = (stats.n_unresolved, 0) if exact is None else (exact.n_inside, exact.n_pairs)
+        values = {
+            "vertices inside before": str(stats.n_inside if exact is None else exact.n_inside_before),
+            "vertices inside": str(n_inside),
+            "vertices that were moved": str(stats.n_pushed),
+        }
+        if exact is not None:
+            values |= {
+                "intersecting pairs of triangles before": str(exact.n_pairs_before),
+                "intersecting pairs of triangles": str(n_pairs),
+                "deepest before [mm]": f"{1e3 * exact.max_depth_before:.1f}",
+                "deepest [mm]": f"{1e3 * exact.max_depth:.1f}",
+            }
+        values |= {
+            "skin moved by the collider, at most [mm]": f"{1e3 * output.stats.shift.largest:.1f}",
+            "within the promised poses and shapes": "yes" if output.stats.within_promise else "no",
+            **self._settings,
+        }
+        level, message = OK, "free of collisions"
+        if n_inside or n_pairs:
+            level, message = WARN, f"{n_inside} vertices inside the body, {n_pairs} pairs of triangles intersect"
+        elif exact is None:
+            message = "no vertex inside the body" if self._settings["sdf"] != "none" else "not looked at"
+        return adapters.DiagnosticStatus(level, f"refu replay: {name}", message, values=values)
