@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 SKIN = (0.86, 0.70, 0.61)
 """sRGB colour that suits a body."""
-_COLLIDING = (0.90, 0.10, 0.10)
+COLLIDING = (0.90, 0.10, 0.10)
 """sRGB colour of what collides."""
 
 _SUN_RAYS, _SKY_RAYS = 40, 96
@@ -146,8 +146,8 @@ def collision_mesh(
 ) -> RenderMesh:
     """A garment of one sRGB `colour` whose colliding triangles and vertices inside the body are red."""
     colours = np.tile(np.array(colour), (len(vertices), 1))
-    colours[faces[np.unique(found.pairs[:, 0])].reshape(-1)] = _COLLIDING
-    colours[found.inside] = _COLLIDING
+    colours[faces[np.unique(found.pairs[:, 0])].reshape(-1)] = COLLIDING
+    colours[found.inside] = COLLIDING
     return RenderMesh(vertices, faces, colours)
 
 

@@ -3,9 +3,9 @@
 What a command needs is imported when it runs, so that `refu --help` doesn't wait for torch.
 """
 
-from refu_lab.commands import benchmark, evaluate, export, garment, info, replay, simulate, stress, train
+from refu_lab.commands import benchmark, evaluate, export, garment, info, replay, simulate, stress, train, view
 
-COMMANDS = (replay, garment, export, simulate, train, evaluate, benchmark, stress, info)
+COMMANDS = (replay, view, garment, export, simulate, train, evaluate, benchmark, stress, info)
 """In the order of the help."""
 
 __all__ = ["COMMANDS"]

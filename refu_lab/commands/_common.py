@@ -74,6 +74,11 @@ def seed(text: str) -> int:
     return _number(int, text, 0, _MOST)
 
 
+def port(text: str) -> int:
+    """A number that something may listen at."""
+    return _number(int, text, 1, 65_535)
+
+
 def between(low: float, high: float) -> Callable[[str], float]:
     """A number from `low` to `high`."""
     return lambda text: _number(float, text, low, high)

@@ -1,0 +1,223 @@
+"""A film of recorded motion that is dressed while one looks."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+import msg_adapters as adapters
+from refu_core import RefuError
+from refu_core.garments import BUILTIN_GARMENTS, load_garment
+from refu_core.recordings import SUFFIXES, upright_turn
+from refu_lab.bodies import betas_warnings, body_warnings
+from refu_lab.render import SKIN as SKIN_COLOUR
+from refu_lab.sources import open_source
+from refu_lab.view._film import BODY, SKIN, Cache, Shape
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from refu_core import SmplFrame
+    from refu_core.realtime import PipelineOutput
+    from refu_lab.replay import ReplayOptions
+
+_AWAY_S = 0.25
+"""Somebody whose nearest frame is farther off in time isn't there [s]."""
+_USUAL = "smpl_params"
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """One person's motion."""
+
+    person: str
+    frames: list[SmplFrame]
+    times: NDArray[np.float64]
+    """[s], shape (T,), rising."""
+    turn: NDArray[np.float64]
+    """From its axes to z up, shape (3, 3)."""
+
+    def at(self, moment: float) -> SmplFrame | None:
+        """The frame nearest to a time [s]; None where none is near."""
+        after = int(np.searchsorted(self.times, moment))
+        index = min((max(after - 1, 0), min(after, len(self.times) - 1)), key=lambda i: abs(self.times[i] - moment))
+        return self.frames[index] if abs(self.times[index] - moment) <= _AWAY_S else None
+
+
+class DressedFilm:
+    """People in files of motion and bags of SMPL parameters, in garments that can be changed.
+
+    Raises `RefuError` for inputs that can't be read, and options that make no pipeline.
+    """
+
+    def __init__(self, inputs: Sequence[Path], options: ReplayOptions) -> None:
+        self._options = options
+        self._pipeline = options.load_pipeline()
+        self.notes: list[str] = []
+        """What there is to warn of, for people."""
+        self._tracks = [track for path in inputs for track in self._read(path, several=len(inputs) > 1)]
+        longest = max(self._tracks, key=lambda track: len(track.frames))
+        self._moments = longest.times
+        first = self._tracks[0]
+        self._origin = first.turn @ first.frames[0].transl
+        self._cache, self._facts = Cache(), dict[int, list[str]]()
+        if any(frame.betas.any() for track in self._tracks for frame in track.frames[:1]):
+            self.notes += betas_warnings(self._pipeline, source=options.betas_source)
+        self.title = ", ".join(path.name for path in inputs)
+
+    @property
+    def times(self) -> NDArray[np.float64]:
+        """Of the person of most frames, from the first on [s], shape (T,)."""
+        times: NDArray[np.float64] = self._moments - self._moments[0]
+        return times
+
+    @property
+    def front(self) -> float:
+        """Where the first person faces at the beginning: the angle from x towards y [rad]."""
+        track = self._tracks[0]
+        forward = track.turn @ Rotation.from_rotvec(track.frames[0].pose[0]).apply([0.0, 0.0, 1.0])
+        return float(np.arctan2(forward[1], forward[0]))
+
+    @property
+    def garments(self) -> tuple[str, ...]:
+        """What is worn."""
+        return tuple(self._pipeline.garments)
+
+    @property
+    def sdf(self) -> str:
+        """How collisions are found."""
+        return str(self._options.sdf)
+
+    @property
+    def wardrobe(self) -> tuple[str, ...]:
+        """Garments that can be worn: those of this body and, where one was named, all."""
+        if self._options.body is not None:
+            return BUILTIN_GARMENTS
+        fitting = [name for name in BUILTIN_GARMENTS if load_garment(name).body == self._pipeline.body.name]
+        return tuple(dict.fromkeys((*fitting, *self.garments)))
+
+    def wear(self, garments: Sequence[str], sdf: str) -> None:
+        """Other garments, another signed distance. Raises `RefuError`, and nothing has changed then."""
+        paths = dict(zip(self.garments, self._options.garments, strict=False))  # those that were given as files
+        names = tuple(paths.get(name, name) for name in garments)
+        options = replace(self._options, garments=names, sdf=sdf)
+        self._pipeline, self._options = options.load_pipeline(), options
+        self._cache.clear()
+        self._facts.clear()
+
+    def shapes(self, index: int) -> Sequence[Shape]:
+        """Everybody in a frame, dressed. Raises `RefuError`."""
+        return self._cache.get(index, self._dress)
+
+    def facts(self, index: int) -> list[str]:
+        """What collision handling says of a frame, and how long it took."""
+        return self._facts.get(index, [])
+
+    def _dress(self, index: int) -> Sequence[Shape]:
+        present = [(track, frame) for track in self._tracks if (frame := track.at(self._moments[index])) is not None]
+        begun = time.perf_counter()
+        outputs = self._pipeline([frame for _, frame in present])
+        took = time.perf_counter() - begun
+        self._facts[index] = [f"dressed in {1e3 * took:.0f} ms", *self._said(outputs)]
+        return [shape for (track, _), output in zip(present, outputs, strict=True) for shape in self._of(track, output)]
+
+    def _said(self, outputs: Sequence[PipelineOutput]) -> list[str]:
+        lines = []
+        for name in self.garments:
+            stats = [output.stats.garments[name] for output in outputs]
+            inside, left = sum(one.n_inside for one in stats), sum(one.n_unresolved for one in stats)
+            lines.append(f"{name}: {inside} vertices inside, {left} afterwards")
+        return lines if self.sdf != "none" else [f"{name}: as the network says" for name in self.garments]
+
+    def _of(self, track: Track, output: PipelineOutput) -> list[Shape]:
+        shift = track.turn @ output.transl - self._origin
+        turn = track.turn.astype(np.float32)
+
+        def placed(vertices: NDArray[np.float32]) -> NDArray[np.float32]:
+            there: NDArray[np.float32] = vertices @ turn.T + shift.astype(np.float32)
+            return there
+
+        faces = self._pipeline.body.faces.cpu().numpy()
+        shapes = [
+            Shape(BODY, track.person, placed(output.body), faces, SKIN_COLOUR),
+            Shape(SKIN, track.person, placed(output.skin), faces, SKIN_COLOUR),
+        ]
+        for name, mesh in output.items():
+            color = self._pipeline.garments[name].card.color
+            shapes.append(Shape(name, track.person, placed(mesh.local), mesh.faces, color))
+        return shapes
+
+    def _read(self, path: Path, *, several: bool) -> list[Track]:
+        options = replace(self._options, input=path)
+        topics = _topics_of_people(path) if options.topic is None and options.input_type is None else []
+        if len(topics) < 2:
+            found = {path.stem if several else "": self._frames(options)}
+        else:
+            found = {
+                f"{path.stem}/{_person(topic)}" if several else _person(topic): self._frames(
+                    replace(options, topic=topic)
+                )
+                for topic in topics
+            }
+        start = min(frames[0].stamp_ns for frames in found.values())  # of several files, each begins at zero
+        return [
+            Track(
+                person, frames, np.array([1e-9 * (frame.stamp_ns - start) for frame in frames]), _turn(options, frames)
+            )
+            for person, frames in found.items()
+        ]
+
+    def _frames(self, options: ReplayOptions) -> list[SmplFrame]:
+        """In the order of their stamps, one at least."""
+        frames: list[SmplFrame] = []
+        n_bad = 0
+        with open_source(options, self._pipeline.body) as source:
+            for record in source.records:
+                try:
+                    if record.error is not None:
+                        raise record.error
+                    frame = replace(source.decoder.from_bytes(record.raw), stamp_ns=record.stamp_ns)
+                except adapters.DecodeError:
+                    n_bad += 1
+                    continue
+                frames.append(frame if options.betas is None else replace(frame, betas=np.array(options.betas)))
+            self.notes += source.warnings + body_warnings(self._pipeline, gender=source.gender)
+        if n_bad:
+            self.notes.append(f"{options.input}: {n_bad} messages are no frame and are left out")
+        if not frames:
+            msg = f"{options.input}: no frame that can be shown"
+            raise RefuError(msg)
+        return sorted(frames, key=lambda frame: frame.stamp_ns)
+
+
+def _person(topic: str) -> str:
+    return topic.strip("/").removesuffix(_USUAL).rstrip("/") or "person"
+
+
+def _topics_of_people(path: Path) -> list[str]:
+    """Topics of several people: `<person>/smpl_params`."""
+    if path.suffix.lower() in SUFFIXES:
+        return []
+    with adapters.BagReader(path) as reader:
+        return [
+            topic.name
+            for topic in reader.topics
+            if topic.message_type in adapters.INPUT_TYPES.values()
+            and topic.message_count
+            and topic.name.rsplit("/", maxsplit=1)[-1] == _USUAL
+        ]
+
+
+def _turn(options: ReplayOptions, frames: Sequence[SmplFrame]) -> NDArray[np.float64]:
+    """From the axes of frames to z up: the permutation of markers, of people who stand."""
+    to_ros = np.roll(np.eye(3), 1, axis=0)
+    if options.axes != "frame":
+        return to_ros
+    return to_ros @ upright_turn(np.array([frame.pose[0] for frame in frames], np.float64))

@@ -1,0 +1,88 @@
+"""What a viewer shows: shapes at times, whoever makes them."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+BODY, SKIN = "body", "skin"
+"""Names of shapes that aren't garments: the collider, and the posed body as it is."""
+_CACHE_BYTES = 512 << 20
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """A mesh of one person in one frame."""
+
+    name: str
+    """Of the garment, or `BODY` or `SKIN`."""
+    person: str
+    """Empty where there is one person."""
+    vertices: NDArray[np.float32]
+    """[m], shape (V, 3): z up, from an origin that stays, so that whoever is far off keeps precision."""
+    faces: NDArray[np.int64]
+    """Counter-clockwise from outside, shape (F, 3)."""
+    color: tuple[float, float, float]
+    """sRGB, 0 to 1."""
+
+    @property
+    def is_garment(self) -> bool:
+        """Whether somebody wears it."""
+        return self.name not in (BODY, SKIN)
+
+
+class Film(Protocol):
+    """Frames that can be asked for in any order, from one thread."""
+
+    @property
+    def times(self) -> NDArray[np.float64]:
+        """When each frame was, from the first on [s], shape (T,), T > 0."""
+
+    @property
+    def title(self) -> str:
+        """What is shown, for people."""
+
+    @property
+    def front(self) -> float:
+        """Where the first person faces at the beginning: the angle from x towards y [rad]."""
+
+    def shapes(self, index: int) -> Sequence[Shape]:
+        """Everything in a frame; somebody who isn't there has no shapes. Raises `RefuError`."""
+
+    def facts(self, index: int) -> list[str]:
+        """What there is to say of a frame, a line each."""
+
+
+class Cache:
+    """The shapes of frames that were made last, up to half a gigabyte of vertices."""
+
+    def __init__(self) -> None:
+        self._shapes: OrderedDict[int, Sequence[Shape]] = OrderedDict()
+        self._bytes = 0
+
+    def get(self, index: int, make: Callable[[int], Sequence[Shape]]) -> Sequence[Shape]:
+        """Those of a frame, made unless they are known."""
+        found = self._shapes.get(index)
+        if found is None:
+            found = self._shapes[index] = make(index)
+            self._bytes += _size(found)
+            while self._bytes > _CACHE_BYTES and len(self._shapes) > 1:
+                self._bytes -= _size(self._shapes.popitem(last=False)[1])
+        self._shapes.move_to_end(index)
+        return found
+
+    def clear(self) -> None:
+        """Forgets all."""
+        self._shapes.clear()
+        self._bytes = 0
+
+
+def _size(shapes: Sequence[Shape]) -> int:
+    return sum(shape.vertices.nbytes for shape in shapes)

@@ -1,0 +1,100 @@
+"""Colours that say something: what collides, and how far cloth is from the skin."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from refu_core.metrics import CollisionChecker
+from refu_core.modes import Choice
+from refu_core.sdf import ExactSdf
+from refu_lab.render import COLLIDING
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from refu_lab.view._film import Shape
+
+Colour = tuple[float, float, float]
+
+
+class Marking(Choice):
+    """What garments are coloured by."""
+
+    CLOTH = "cloth"
+    """Their own colours."""
+    COLLISIONS = "collisions"
+    """The same, and what collides with the body is red: exactly checked."""
+    CLEARANCE = "clearance"
+    """Distance to the body."""
+
+
+CLEARANCE: tuple[tuple[float, Colour], ...] = (
+    (0.0, COLLIDING),
+    (0.003, (0.27, 0.13, 0.42)),
+    (0.006, (0.22, 0.36, 0.56)),
+    (0.012, (0.13, 0.56, 0.55)),
+    (0.025, (0.36, 0.73, 0.40)),
+    (0.050, (0.70, 0.84, 0.26)),
+    (np.inf, (0.99, 0.91, 0.30)),
+)
+"""Bands of distance to the body: up to how far [m], and the colour. Nothing says which of two neighbours is farther off
+where a scale is smooth; a margin of 4 mm lies in the middle of a band."""
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """Faces of a garment that have one colour."""
+
+    faces: NDArray[np.int64]
+    """Shape (K, 3), K may be 0."""
+    color: Colour
+
+
+class Marker:
+    """Finds the bands of garments on one person's body after the other; what it prepares for a topology it keeps."""
+
+    def __init__(self) -> None:
+        self._checkers: dict[int, tuple[NDArray[np.int64], CollisionChecker, ExactSdf]] = {}
+
+    def bands(self, marking: Marking, garments: Sequence[Shape], body: Shape | None) -> list[list[Band]]:
+        """The bands of each garment of a person: always as many for one marking.
+
+        Raises `MeshError` for a body that isn't a closed surface.
+        """
+        if marking == Marking.CLOTH or body is None:
+            return [[Band(one.faces, one.color)] for one in garments]
+        checker, sdf = self._prepared(body.faces)
+        if marking == Marking.COLLISIONS:
+            checker.update(body.vertices)
+            return [_colliding(checker, one) for one in garments]
+        sdf.update(torch.from_numpy(body.vertices))
+        return [_clearance(sdf, one) for one in garments]
+
+    def _prepared(self, faces: NDArray[np.int64]) -> tuple[CollisionChecker, ExactSdf]:
+        # A film hands out the same array again and again: its identity is asked before its content.
+        known = self._checkers.get(id(faces))
+        if known is None or known[0] is not faces:
+            known = faces, CollisionChecker(faces), ExactSdf(faces, sign="winding")
+            self._checkers = {**dict(list(self._checkers.items())[-3:]), id(faces): known}
+        return known[1:]
+
+
+def _colliding(checker: CollisionChecker, garment: Shape) -> list[Band]:
+    found = checker.check(garment.vertices, garment.faces)
+    bad: NDArray[np.bool_] = np.zeros(len(garment.faces), bool)
+    bad[found.pairs[:, 0]] = True
+    bad |= found.inside[garment.faces].any(1)
+    return [Band(garment.faces[~bad], garment.color), Band(garment.faces[bad], COLLIDING)]
+
+
+def _clearance(sdf: ExactSdf, garment: Shape) -> list[Band]:
+    distance = sdf.query(torch.from_numpy(garment.vertices)).distance.numpy()
+    limits = [limit for limit, _ in CLEARANCE[:-1]]
+    band = np.searchsorted(limits, distance[garment.faces].min(1))
+    return [Band(garment.faces[band == k], color) for k, (_, color) in enumerate(CLEARANCE)]

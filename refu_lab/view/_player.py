@@ -1,0 +1,227 @@
+"""Plays a film: a clock, a panel, and what of the shapes is shown."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from refu_core import RefuError
+from refu_core.errors import printable
+from refu_core.modes import SdfMode
+from refu_lab.view._dressed import DressedFilm
+from refu_lab.view._film import BODY, SKIN
+from refu_lab.view._marks import CLEARANCE, Band, Marker, Marking
+from refu_lab.view._stage import Stage
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    import viser
+
+    from refu_lab.view._film import Film, Shape
+
+_SPEEDS = {"¼ ×": 0.25, "½ ×": 0.5, "1 ×": 1.0, "2 ×": 2.0, "4 ×": 4.0}
+_HIDDEN = "hidden"
+_BODIES = {"collider": BODY, "skin": SKIN, _HIDDEN: ""}
+_GROUND_FRAMES = 5
+"""Frames whose lowest point is the ground."""
+_IDLE_S = 0.5
+"""How often a player that rests looks whether it is to end [s]."""
+
+
+class Player:
+    """One film in one server. What the panel's callbacks ask for is done by the thread that runs `run`."""
+
+    def __init__(self, server: viser.ViserServer, film: Film, *, playing: bool = True) -> None:
+        self._server, self._film = server, film
+        self._stage, self._marker = Stage(server), Marker()
+        self._times = film.times
+        self._moment, self._index = 0.0, 0
+        self._playing = playing and len(self._times) > 1
+        self._changed = threading.Event()
+        self._seek: int | None = None
+        self._failed = ""
+        picked = np.unique(np.linspace(0, len(self._times) - 1, _GROUND_FRAMES).astype(int))
+        lowest = [float(shape.vertices[:, 2].min()) for i in picked for shape in film.shapes(int(i))]
+        first = film.shapes(0)
+        self._stage.set(first, ground=min(lowest), front=film.front)
+        self._build(first)
+        self._show(0)
+
+    def run(self, *, until: Callable[[], bool] = lambda: False) -> None:
+        """Plays until an interrupt, or until asked after each frame."""
+        last = time.monotonic()
+        while not until():
+            now = time.monotonic()
+            past, last = now - last, now
+            asked = self._changed.is_set()
+            self._changed.clear()
+            if asked:
+                self._rewear()
+            seek, self._seek = self._seek, None
+            index = self._index if seek is None else seek
+            if seek is not None:
+                self._moment = float(self._times[seek])
+            elif self._playing:
+                self._moment += past * _SPEEDS[self._speed.value]
+                if self._moment >= self._length:
+                    self._moment %= self._length
+                index = int(np.searchsorted(self._times, self._moment, side="right")) - 1
+            if asked or index != self._index:
+                self._show(index)
+                last = max(last, time.monotonic() - 1.0)  # a frame that took long isn't made up for by a leap
+            self._changed.wait(self._pause())
+
+    def _pause(self) -> float:
+        """Until the next frame is due [s]."""
+        if not self._playing:
+            return _IDLE_S
+        following = self._times[self._index + 1] if self._index + 1 < len(self._times) else self._length
+        return float(np.clip((following - self._moment) / _SPEEDS[self._speed.value], 0.001, _IDLE_S))
+
+    @property
+    def _length(self) -> float:
+        """Of the film, the last frame shown as long as the others [s]."""
+        steps = len(self._times) - 1
+        return float(self._times[-1]) * (steps + 1) / steps if steps and self._times[-1] > 0 else 1.0
+
+    # ---- what is shown -----------------------------------------------------------------------------------------------
+
+    def _show(self, index: int) -> None:
+        self._index = index
+        try:
+            shapes = self._film.shapes(index)
+            bands = self._bands(shapes)
+        except RefuError as error:
+            self._tell(str(error))
+            return
+        if self._follows.value:
+            person = shapes[0].person if shapes else ""
+            self._stage.follow([shape for shape in shapes if shape.person == person])
+        self._stage.draw(bands, wireframe=self._wire.value)
+        if len(self._times) > 1:
+            self._frame.value = index
+        facts = [f"frame {index} of {len(self._times)}, {self._times[index]:.2f} s", *self._film.facts(index)]
+        self._said.content = "  \n".join(facts)
+
+    def _bands(self, shapes: Sequence[Shape]) -> list[tuple[Shape, Sequence[Band]]]:
+        shown = _BODIES[self._body.value]
+        marking = Marking(self._marking.value)
+        found: list[tuple[Shape, Sequence[Band]]] = []
+        for person in dict.fromkeys(shape.person for shape in shapes):
+            own = [shape for shape in shapes if shape.person == person]
+            garments = [shape for shape in own if shape.is_garment and self._is_shown(shape.name)]
+            body = next((shape for shape in own if shape.name == BODY), None)
+            found += zip(garments, self._marker.bands(marking, garments, body), strict=True)
+            found += [(shape, [Band(shape.faces, shape.color)]) for shape in own if shape.name == shown]
+        return found
+
+    def _is_shown(self, garment: str) -> bool:
+        box = self._boxes.get(garment)
+        return box is None or isinstance(self._film, DressedFilm) or bool(box.value)
+
+    def _rewear(self) -> None:
+        """Other garments or another distance, if that was asked for."""
+        film = self._film
+        if not isinstance(film, DressedFilm):
+            return
+        wanted = tuple(name for name, box in self._boxes.items() if box.value)
+        if (set(wanted), self._sdf.value) == (set(film.garments), film.sdf) or (
+            wanted,
+            self._sdf.value,
+        ) == self._refused:
+            return
+        if not wanted:
+            self._tell("wear one garment at least")
+        else:
+            try:
+                film.wear(wanted, self._sdf.value)
+            except RefuError as error:
+                self._tell(str(error))
+                self._refused = wanted, self._sdf.value
+
+    _refused: tuple[tuple[str, ...], str] | None = None
+
+    def _tell(self, what: str) -> None:
+        """Once, to everybody who looks."""
+        if what != self._failed:
+            self._failed = what
+            for client in self._server.get_clients().values():
+                client.add_notification("refu", printable(what), color="red", auto_close_seconds=8.0)
+
+    # ---- the panel ---------------------------------------------------------------------------------------------------
+
+    def _build(self, first: Sequence[Shape]) -> None:
+        gui, film = self._server.gui, self._film
+        gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(44, 98, 150))
+        gui.set_panel_label(f"refu view: {printable(film.title)}")
+        names = list(dict.fromkeys(shape.name for shape in first if shape.is_garment))
+        last = max(len(self._times) - 1, 1)
+        with gui.add_folder("Play"):
+            self._frame = gui.add_slider("frame", 0, last, 1, 0, disabled=len(self._times) < 2)
+            self._button = gui.add_button(self._verb(), icon=None)
+            self._speed = gui.add_dropdown("speed", tuple(_SPEEDS), initial_value="1 ×")
+            self._follows = gui.add_checkbox("follow", initial_value=True, hint="the camera goes with the first person")
+        with gui.add_folder("Show"):
+            has_skin = any(shape.name == SKIN for shape in first)
+            has_body = any(shape.name == BODY for shape in first)
+            bodies = tuple(_BODIES) if has_skin else ("collider", _HIDDEN) if has_body else (_HIDDEN,)
+            self._body = gui.add_dropdown("body", bodies, initial_value=bodies[0])
+            markings = tuple(str(one) for one in Marking) if has_body else (str(Marking.CLOTH),)
+            self._marking = gui.add_dropdown("colours", markings, initial_value=str(Marking.CLOTH))
+            self._legend = gui.add_markdown(_legend(), visible=False)
+            self._wire = gui.add_checkbox("wireframe", initial_value=False)
+        with gui.add_folder("Wear"):
+            is_dressed = isinstance(film, DressedFilm)
+            wardrobe = film.wardrobe if isinstance(film, DressedFilm) else names
+            self._boxes = {name: gui.add_checkbox(name, initial_value=name in names) for name in wardrobe}
+            modes = tuple(str(mode) for mode in SdfMode)
+            sdf = film.sdf if isinstance(film, DressedFilm) else modes[0]
+            self._sdf = gui.add_dropdown("distance", modes, initial_value=sdf, visible=is_dressed)
+        self._said = gui.add_markdown("")
+        self._connect()
+
+    def _connect(self) -> None:
+        inputs = (self._speed, self._follows, self._body, self._marking, self._wire, self._sdf, *self._boxes.values())
+        for one in inputs:
+            one.on_update(self._ask)
+        self._frame.on_update(self._sought)
+        self._button.on_click(self._toggle)
+
+    def _ask(self, _event: Any) -> None:
+        self._legend.visible = self._marking.value == Marking.CLEARANCE
+        self._failed = ""
+        self._changed.set()
+
+    def _sought(self, event: Any) -> None:
+        if event.client is not None:  # somebody moved it; the player's own moves come back, too
+            self._seek = int(self._frame.value)
+            self._changed.set()
+
+    def _toggle(self, _event: Any) -> None:
+        self._playing = not self._playing and len(self._times) > 1
+        self._button.label = self._verb()
+        self._changed.set()
+
+    def _verb(self) -> str:
+        return "pause" if self._playing else "play"
+
+
+def _legend() -> str:
+    """The colours of the bands of clearance."""
+    lines, below = [], 0.0
+    for limit, color in CLEARANCE:
+        shade = "#" + "".join(f"{round(255 * channel):02x}" for channel in color)
+        what = (
+            "inside"
+            if limit == 0
+            else f"{1e3 * below:g}–{1e3 * limit:g} mm"
+            if limit < np.inf
+            else f"> {1e3 * below:g} mm"
+        )
+        lines.append(f'<span style="color:{shade}">■</span> {what}')
+        below = limit
+    return "  \n".join(lines)

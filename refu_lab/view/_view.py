@@ -1,0 +1,133 @@
+"""What `refu view` does: opens the inputs, serves the scene, plays until it is interrupted."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import socket
+import sys
+import webbrowser
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from refu_core import RefuError
+from refu_core._device import one_thread
+from refu_core.recordings import SUFFIXES
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    import viser
+
+    from refu_lab.replay import ReplayOptions
+    from refu_lab.view._dressed import DressedFilm
+    from refu_lab.view._recorded import RecordedFilm
+
+DEFAULT_PORT = 8080
+_PORTS = 20
+"""Ports that are tried from the default one on."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewOptions:
+    """What is shown, and where; the fields are the options of `refu view`."""
+
+    inputs: tuple[Path, ...]
+    replay: ReplayOptions
+    """How motion is dressed; its input is left out of account."""
+    dress: bool = False
+    """Dress motion anew, even where the bag has garments."""
+    host: str = "localhost"
+    port: int | None = None
+    """None: the first one free from 8080 on."""
+    browser: bool = True
+
+
+@one_thread()
+def view(
+    options: ViewOptions,
+    *,
+    progress: bool = False,
+    say: Callable[[str], None] = print,
+    until: Callable[[], bool] | None = None,
+) -> None:
+    """Shows the inputs until it is interrupted (Ctrl-C, which ends it), or until `until` says so.
+
+    Raises `RefuError` for inputs that can't be shown, a port that is taken, and where viser isn't installed.
+    """
+    _require_viser()
+    from refu_lab.view._player import Player
+
+    film = open_film(options, progress=progress)
+    for note in film.notes:
+        say(f"warning: {note}")
+    server = _serve(options)
+    try:
+        player = Player(server, film)
+        host = "localhost" if options.host in ("0.0.0.0", "::") else options.host
+        url = f"http://{host}:{server.get_port()}"
+        say(f"{film.title}: {len(film.times)} frames at {url} (Ctrl-C ends it)")
+        if options.browser and _has_display():
+            webbrowser.open(url)
+        elif "SSH_CONNECTION" in os.environ and options.host == "localhost":
+            port = server.get_port()
+            say(f"from your own machine: ssh -L {port}:localhost:{port} {socket.gethostname()}, then open {url} there")
+        player.run(until=until or (lambda: False))
+    except KeyboardInterrupt:
+        say("viewer closed")
+    finally:
+        server.stop()
+
+
+def open_film(options: ViewOptions, *, progress: bool = False) -> DressedFilm | RecordedFilm:
+    """What the inputs are: a bag of garments is shown as it is, motion is dressed. Raises `RefuError`."""
+    from refu_lab.view._dressed import DressedFilm
+    from refu_lab.view._recorded import RecordedFilm, has_markers
+
+    first = options.inputs[0]
+    if not options.dress and first.suffix.lower() not in SUFFIXES and has_markers(first):
+        if len(options.inputs) > 1:
+            msg = f"{first}: has garments, and is shown alone; --dress dresses the motion of several"
+            raise RefuError(msg)
+        return RecordedFilm(first, progress=progress)
+    return DressedFilm(options.inputs, options.replay)
+
+
+def _require_viser() -> None:
+    try:
+        import viser  # noqa: F401
+    except ImportError as error:
+        msg = 'the viewer needs viser: pip install "refu-ros[view]"'
+        raise RefuError(msg) from error
+
+
+def _serve(options: ViewOptions) -> viser.ViserServer:
+    """A server at the port that was asked for, or at a free one."""
+    import viser
+
+    port = options.port
+    if port is None:
+        port = next((p for p in range(DEFAULT_PORT, DEFAULT_PORT + _PORTS) if _is_free(options.host, p)), DEFAULT_PORT)
+    if not _is_free(options.host, port):
+        msg = f"{options.host}:{port} can't be listened on: it is taken, or no address of this machine (--port, --host)"
+        raise RefuError(msg)
+    with contextlib.redirect_stdout(io.StringIO()):  # it greets in a box of its own
+        return viser.ViserServer(host=options.host, port=port, verbose=False)
+
+
+def _is_free(host: str, port: int) -> bool:
+    try:
+        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+        with socket.socket(found[0][0], socket.SOCK_STREAM) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(found[0][4])
+    except OSError:
+        return False
+    return True
+
+
+def _has_display() -> bool:
+    """Whether a browser would open on a screen: without one, some open in the terminal."""
+    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
