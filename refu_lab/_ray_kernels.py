@@ -100,6 +100,8 @@ def pixel_kernel(
     ground_colour: wp.vec3,
     background: wp.vec3,
     to_sun: wp.vec3,
+    sun_strength: float,
+    sky_strength: float,
     eye: wp.vec3,
     right: wp.vec3,
     up: wp.vec3,
@@ -138,10 +140,10 @@ def pixel_kernel(
                 direct = 0.0
                 ambient = 0.35
             lambert = wp.max(wp.dot(n, to_sun), 0.0) * direct
-            dome = wp.vec3(0.56, 0.58, 0.62) * (0.62 + 0.38 * n[1]) * ambient
+            dome = wp.vec3(0.56, 0.58, 0.62) * (0.62 + 0.38 * n[1]) * (ambient * sky_strength)
             # Rays that leave at a grazing angle look a little paler, as cloth and skin do.
             rim = wp.pow(1.0 - wp.clamp(-wp.dot(n, ray), 0.0, 1.0), 4.0) * 0.16 * ambient
-            light = wp.vec3(1.02, 0.97, 0.90) * (0.95 * lambert) + dome
+            light = wp.vec3(1.02, 0.97, 0.90) * (sun_strength * lambert) + dome
             colour = wp.cw_mul(albedo, light) + wp.vec3(rim, rim, rim)
         elif ray[1] < -1e-6 and eye[1] > ground_y and ground_radius > 0.0:
             t = (ground_y - eye[1]) / ray[1]

@@ -39,7 +39,8 @@ _SUN_RAYS, _SKY_RAYS = 40, 96
 _SUN_SPREAD = 0.012  # 1 - cos of the disc's half angle: 9 degrees, an overcast sun
 _SKY_REACH = 0.8  # [m] what is farther off doesn't dim the sky
 _COVERED = 0.3  # share of the sky under which a vertex counts as covered
-_GROUND_CELLS = 112
+_GROUND_STEP, _GROUND_CELLS = 0.022, 400
+"""How finely light on the ground is found [m]: a foot's shadow ends at its sole; and how many steps a side at most."""
 _CREASE = math.cos(math.radians(55.0))
 
 
@@ -146,9 +147,15 @@ def collision_mesh(
 ) -> RenderMesh:
     """A garment of one sRGB `colour` whose colliding triangles and vertices inside the body are red."""
     colours = np.tile(np.array(colour), (len(vertices), 1))
-    colours[faces[np.unique(found.pairs[:, 0])].reshape(-1)] = COLLIDING
-    colours[found.inside] = COLLIDING
+    colours[colliding_vertices(faces, found)] = COLLIDING
     return RenderMesh(vertices, faces, colours)
+
+
+def colliding_vertices(faces: NDArray[np.int64], found: Collisions) -> NDArray[np.bool_]:
+    """Vertices of a garment that are inside the body, or of a triangle that collides, shape (V,)."""
+    colliding: NDArray[np.bool_] = found.inside.copy()
+    colliding[faces[np.unique(found.pairs[:, 0])].reshape(-1)] = True
+    return colliding
 
 
 @dataclass(frozen=True)
@@ -159,6 +166,10 @@ class Backdrop:
     """sRGB."""
     ground: tuple[float, float, float] = (0.90, 0.90, 0.90)
     """sRGB of the ground in full light; it fades into the background with distance."""
+    sun: float = 0.95
+    """How bright the sun is, of 1; less sky and more sun make harder light."""
+    sky: float = 1.0
+    """How bright the sky is, of 1."""
     ground_height: float | None = None
     """Height y of the ground [m]; None for right under the lowest vertex."""
     show_ground: bool = True
@@ -225,8 +236,9 @@ def render(
     # The grid reaches as far as the shadow does; beyond it the ground lies in full light.
     shadow = np.abs(to_sun[[0, 2]] / max(to_sun[1], 0.2)) * max(float(high[1]) - ground_y, 0.0)
     grid_low = low[[0, 2]] - shadow - _SKY_REACH / 2
-    cells = _GROUND_CELLS if backdrop.show_ground else 2
-    step = float((high[[0, 2]] + shadow + _SKY_REACH / 2 - grid_low).max()) / (cells - 1)
+    extent = float((high[[0, 2]] + shadow + _SKY_REACH / 2 - grid_low).max())
+    cells = int(np.clip(np.ceil(extent / _GROUND_STEP) + 1, 2, _GROUND_CELLS)) if backdrop.show_ground else 2
+    step = extent / (cells - 1)
     centre = (low[[0, 2]] + high[[0, 2]]) / 2
     radius = 3.0 * float(np.linalg.norm(high - low)) if backdrop.show_ground else 0.0
     grid = np.stack(np.meshgrid(*[np.arange(cells)] * 2, indexing="ij"), -1).reshape(-1, 2) * step + grid_low
@@ -253,6 +265,8 @@ def render(
             vec3(_to_linear(backdrop.ground)),
             vec3(_to_linear(backdrop.background)),
             vec3(to_sun),
+            backdrop.sun,
+            backdrop.sky,
             vec3(camera.eye),
             vec3(right),
             vec3(up),
@@ -266,6 +280,26 @@ def render(
         device="cpu",
     )
     return _to_srgb(image.numpy())
+
+
+def sky_light(meshes: Sequence[tuple[NDArray[np.float32], NDArray[np.int64]]]) -> list[NDArray[np.float32]]:
+    """The share of the sky that vertices see past all meshes, of each mesh (V,); meshes are vertices (V, 3) [m], faces.
+
+    Under cloth, it is that of the uncovered neighbours, as in a picture.
+    """
+    import warp as wp
+
+    from refu_lab import _ray_kernels as shading
+
+    scene = _Scene.of([RenderMesh(vertices, faces) for vertices, faces in meshes])
+    points = wp.array(scene.vertices, dtype=wp.vec3, device="cpu")
+    mesh = wp.Mesh(points, wp.array(scene.faces.ravel().astype(np.int32), dtype=wp.int32, device="cpu"))
+    normals = wp.array(_normals(scene.vertices, scene.faces)[1], dtype=wp.vec3, device="cpu")
+    sun, sky = (wp.zeros(len(scene.vertices), dtype=wp.float32, device="cpu") for _ in range(2))
+    inputs = [mesh.id, points, normals, wp.vec3(0.0, 1.0, 0.0), _SUN_SPREAD, 1, _SKY_RAYS, _SKY_REACH]
+    wp.launch(shading.light_kernel, dim=len(scene.vertices), inputs=inputs, outputs=[sun, sky], device="cpu")
+    found = _uncovered(sky.numpy(), sky.numpy() < _COVERED, scene.faces)
+    return np.split(found, np.cumsum([len(vertices) for vertices, _ in meshes])[:-1])
 
 
 def save_png(image: NDArray[np.uint8], path: str | os.PathLike[str]) -> None:

@@ -1,4 +1,4 @@
-"""The HTML report of a replay: latency, penetration over time, pictures of the worst, a median and the best frame."""
+"""The HTML report of a replay: the worst, a median and the best frame to be turned, and all frames in curves."""
 
 from __future__ import annotations
 
@@ -15,13 +15,16 @@ from refu_core import RefuError
 from refu_core.metrics import CollisionChecker
 from refu_core.recordings import upright_turn
 from refu_lab.plots import new_axes, save_svg
-from refu_lab.render import Camera, RenderMesh, collision_mesh, render, save_png
+from refu_lab.render import SKIN, Camera, RenderMesh, colliding_vertices, collision_mesh, render, save_png
 from refu_lab.replay import FrameResult, ReplayResult
 from refu_lab.tables import REPLAY_HEADER, replay_rows
+from refu_lab.turntable import STYLE as TURNTABLE_STYLE
+from refu_lab.turntable import Frame, Mesh, Pose, turntable
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from matplotlib.axes import Axes
     from numpy.typing import NDArray
 
     from refu_core import GarmentPipeline
@@ -35,8 +38,13 @@ p.note, figcaption { opacity: .75; font-size: .9rem; }
 table { border-collapse: collapse; width: 100%; } th, td { padding: .3rem .6rem; border-bottom: 1px solid var(--line); }
 td, th { text-align: right; font-variant-numeric: tabular-nums; } td:first-child, th:first-child { text-align: left; }
 img { max-width: 100%; border-radius: 6px; } img.plot { background: #fff; width: 100%; }
-.pictures { display: grid; grid-template-columns: repeat(auto-fit, minmax(300px, 1fr)); gap: 1rem; }
-figure { margin: 0; } .warn { border-left: 4px solid #d33; padding-left: .8rem; }
+.wide { overflow-x: auto; } .wide img.plot { min-width: 620px; } th { vertical-align: bottom; }
+td:first-child { white-space: nowrap; }
+.pictures { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 480px), 1fr)); gap: 1.6rem 1.2rem; }
+.pair { display: grid; grid-template-columns: 1fr 1fr; gap: .4rem; } .pair span { position: relative; display: block; }
+.pair span::after { content: attr(title); position: absolute; left: .6rem; top: .4rem; font-size: .85rem; color: #444; }
+figure { margin: 0; } .warn { border-left: 4px solid #d33; padding-left: .8rem; overflow-wrap: anywhere; }
+@media (prefers-color-scheme: dark) { img.plot { filter: invert(.9) hue-rotate(180deg); } }
 """
 
 
@@ -44,10 +52,16 @@ figure { margin: 0; } .warn { border-left: 4px solid #d33; padding-left: .8rem; 
 class _Pictured:
     """A frame that is shown."""
 
+    name: str
+    """Worst, median or best."""
     title: str
-    index: int
-    file: str
-    caption: str
+    captions: tuple[str, str]
+    """What collided before and after."""
+
+    @property
+    def files(self) -> tuple[str, str]:
+        """Its pictures, before and after."""
+        return f"{self.name}_before.png", f"{self.name}_after.png"
 
 
 def write_report(result: ReplayResult, folder: Path, *, progress: bool = False) -> Path:
@@ -63,9 +77,9 @@ def write_report(result: ReplayResult, folder: Path, *, progress: bool = False) 
         folder.mkdir(parents=True, exist_ok=True)
         pipeline = result.options.load_pipeline()
         _plot(result, pipeline, folder)
-        pictures = _draw_frames(result, pipeline, folder, progress=progress)
+        pictures, turned = _draw_frames(result, pipeline, folder, progress=progress)
         page = folder / "index.html"
-        page.write_text(_page(result, pictures), encoding="utf-8")
+        page.write_text(_page(result, pictures, turned), encoding="utf-8")
     except OSError as error:
         msg = f"{folder}: the report can't be written: {error.strerror or error}"
         raise RefuError(msg) from error
@@ -94,7 +108,7 @@ def _plot(result: ReplayResult, pipeline: GarmentPipeline, folder: Path) -> None
     for ax in (inside, pairs):
         ax.set_yscale("symlog", linthresh=1)
         ax.set_ylim(bottom=0)
-    inside.legend(loc="upper right", fontsize=8, ncols=len(result.after))
+    _legend(inside, columns=len(result.after))
     save_svg(drawn, folder / "penetration.svg")
 
     drawn, (latency,) = new_axes(size=(10.8, 2.5))
@@ -104,39 +118,56 @@ def _plot(result: ReplayResult, pipeline: GarmentPipeline, folder: Path) -> None
     latency.stackplot(times, [*values, rest], labels=[*stages, "decode and encode"], alpha=0.75, lw=0)
     latency.set(xlabel="time [s]", ylabel="latency [ms]")
     latency.set_ylim(0, 1.3 * float(np.percentile([f.latency_ms for f in result.frames], 99)))
-    latency.legend(loc="upper right", fontsize=8, ncols=len(stages) + 1)
+    _legend(latency, columns=len(stages) + 1)
     save_svg(drawn, folder / "latency.svg")
 
 
-def _draw_frames(result: ReplayResult, pipeline: GarmentPipeline, folder: Path, *, progress: bool) -> list[_Pictured]:
-    """Renders the worst, a median and the best frame, before and after, from their parameters."""
+def _legend(axes: Axes, *, columns: int) -> None:
+    """Above the axes, where it covers no curve."""
+    axes.legend(
+        loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2, fontsize=8, ncols=columns, frameon=False
+    )
+
+
+def _draw_frames(
+    result: ReplayResult, pipeline: GarmentPipeline, folder: Path, *, progress: bool
+) -> tuple[list[_Pictured], str]:
+    """Renders the worst, a median and the best frame, before and after, from their parameters; and all as HTML."""
     order = sorted(range(len(result.frames)), key=lambda i: result.frames[i].badness)
     chosen = {"worst": order[-1], "median": order[len(order) // 2], "best": order[0]}
     body_faces = pipeline.body.faces.cpu().numpy()
     checker = CollisionChecker(body_faces)
-    pictures = []
+    meshes = [Mesh("body", body_faces, SKIN)]
+    meshes += [Mesh(name, one.faces.cpu().numpy(), one.card.color) for name, one in pipeline.garments.items()]
+    pictures, frames = [], []
+    start = result.frames[0].frame.stamp_ns
     # A frame has axes of its own (a camera's, or z up); the pictures have y up.
     roots = np.array([one.frame.pose[0] for one in result.frames], np.float64)
     turn = (upright_turn(roots) if result.options.axes == "frame" else np.eye(3)).astype(np.float32)
     with tqdm(total=2 * len(chosen), desc="pictures", unit="picture", disable=None if progress else True) as bar:
-        for title, index in chosen.items():
+        for name, index in chosen.items():
             frame = result.frames[index]
             output = pipeline(frame.frame)
             checker.update(output.body)
-            body = output.body @ turn.T
-            camera = Camera.framing(body, size=_PICTURE, yaw=_front(frame, turn))
-            for when in ("before", "after"):
-                meshes = [RenderMesh(body, body_faces)]
-                for name, mesh in output.items():
+            body, yaw = output.body @ turn.T, _front(frame, turn)
+            camera = Camera.framing(body, size=_PICTURE, yaw=yaw)
+            title = f"{name.capitalize()} frame, number {index}, {1e-9 * (frame.frame.stamp_ns - start):.2f} s"
+            picture = _Pictured(name, title, (_caption(frame, "before"), _caption(frame, "after")))
+            poses = []
+            for when, file in zip(("before", "after"), picture.files, strict=True):
+                drawn, posed = [RenderMesh(body, body_faces)], [Pose(body)]
+                for garment, mesh in output.items():
                     vertices = mesh.raw if when == "before" else mesh.local
                     found = checker.check(vertices, mesh.faces)
-                    colour = pipeline.garments[name].card.color
-                    meshes.append(collision_mesh(vertices @ turn.T, mesh.faces, found, colour=colour))
-                file = f"{title}_{when}.png"
-                save_png(render(meshes, camera=camera, size=_PICTURE), folder / file)
-                pictures.append(_Pictured(f"{title} frame, {when}", index, file, _caption(frame, when)))
+                    colour = pipeline.garments[garment].card.color
+                    drawn.append(collision_mesh(vertices @ turn.T, mesh.faces, found, colour=colour))
+                    posed.append(Pose(vertices @ turn.T, colliding_vertices(mesh.faces, found)))
+                save_png(render(drawn, camera=camera, size=_PICTURE), folder / file)
+                poses.append(posed)
                 bar.update()
-    return pictures
+            pictures.append(picture)
+            frames.append(Frame(name, title, poses[0], poses[1], *picture.captions, yaw))
+    return pictures, turntable(meshes, frames)
 
 
 def _front(frame: FrameResult, turn: NDArray[np.float32]) -> float:
@@ -153,22 +184,16 @@ def _caption(frame: FrameResult, when: str) -> str:
     return "; ".join(parts)
 
 
-def _page(result: ReplayResult, pictures: Sequence[_Pictured]) -> str:
+def _page(result: ReplayResult, pictures: Sequence[_Pictured], turned: str) -> str:
     data = result.as_dict()
-    start = result.frames[0].frame.stamp_ns
     notes = [f"{count} messages skipped: {reason}" for reason, count in result.skips.most_common()]
     notes += result.warnings + (["The replay was interrupted."] if result.interrupted else [])
     warning = "".join(f'<p class="warn">{html.escape(note)}</p>' for note in notes)
-    figures = "".join(
-        f'<figure><img src="{p.file}" alt="{html.escape(p.caption)}"><figcaption><b>{html.escape(p.title)}</b>, '
-        f"number {p.index}, {1e-9 * (result.frames[p.index].frame.stamp_ns - start):.2f} s: {html.escape(p.caption)}"
-        "</figcaption></figure>"
-        for p in pictures
-    )
+    figures = "".join(map(_figure, pictures))
     frame, shift = data["latency_ms"], data["skin_shift_mm"]
     return f"""<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>Replay of {html.escape(result.options.input.name)}</title><style>{STYLE}</style></head><body>
+<title>Replay of {html.escape(result.options.input.name)}</title><style>{STYLE}{TURNTABLE_STYLE}</style></head><body>
 <h1>Replay of {html.escape(result.options.input.name)}</h1>
 <p class="note">{html.escape(result.source)}; backbone {html.escape(data["backbone"])}, signed distance
 {html.escape(data["sdf"])}, margin {1e3 * data["margin_m"]:g} mm, {html.escape(data["device"])}.
@@ -179,16 +204,31 @@ A whole frame, bytes to bytes: p50 {frame["p50"]:.1f}, p95 {frame["p95"]:.1f}, p
 <p class="note">VFCP: vertices inside the body. CFMP: frames without any collision, vertices and triangles.
 Both by exact checks of every frame and every vertex, against the collider: the posed body with its overlaps (an arm in
 the flank, thighs in a squat) pulled apart. The last column is against the skin, which runs through itself there.</p>
-<h2>Penetration over time</h2><img class="plot" src="penetration.svg" alt="penetration over time">
-<h2>Latency</h2><img class="plot" src="latency.svg" alt="latency over time">
-<h2>Worst, median and best frame</h2><div class="pictures">{figures}</div>
-<p class="note">Red: colliding triangles and vertices inside the body.</p>
+<h2>Worst, median and best frame</h2>{turned}
+<p class="note">Drag to turn; click, then the wheel to come nearer; a double click goes back. Red: colliding triangles
+and vertices inside the body.</p>
+<h2>Penetration over time</h2>
+<div class="wide"><img class="plot" src="penetration.svg" alt="penetration over time"></div>
+<h2>Latency</h2>
+<div class="wide"><img class="plot" src="latency.svg" alt="latency over time"></div>
+<h2>Pictures</h2><div class="pictures">{figures}</div>
 </body></html>
 """
+
+
+def _figure(picture: _Pictured) -> str:
+    """A frame before and after, side by side, under one caption."""
+    images = "".join(
+        f'<span title="{when}"><img src="{file}" alt="{html.escape(f"{when}: {caption}")}"></span>'
+        for when, file, caption in zip(("before", "after"), picture.files, picture.captions, strict=True)
+    )
+    before, after = map(html.escape, picture.captions)
+    return f"""<figure><div class="pair">{images}</div><figcaption><b>{html.escape(picture.title)}</b><br>
+Before: {before}.<br>After: {after}.</figcaption></figure>"""
 
 
 def _table(data: dict[str, Any]) -> str:
     lines = ["<tr>" + "".join(f"<th>{name}</th>" for name in REPLAY_HEADER) + "</tr>"]
     for row in replay_rows(data["garments"]):
         lines += ["<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>"]
-    return f"<table>{''.join(lines)}</table>"
+    return f"<div class='wide'><table>{''.join(lines)}</table></div>"
