@@ -39,7 +39,7 @@ table { border-collapse: collapse; width: 100%; } th, td { padding: .3rem .6rem;
 td, th { text-align: right; font-variant-numeric: tabular-nums; } td:first-child, th:first-child { text-align: left; }
 img { max-width: 100%; border-radius: 6px; } img.plot { background: #fff; width: 100%; }
 .wide { overflow-x: auto; } .wide img.plot { min-width: 620px; } th { vertical-align: bottom; }
-td:first-child { white-space: nowrap; }
+td { white-space: nowrap; }
 .pictures { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 480px), 1fr)); gap: 1.6rem 1.2rem; }
 .pair { display: grid; grid-template-columns: 1fr 1fr; gap: .4rem; } .pair span { position: relative; display: block; }
 .pair span::after { content: attr(title); position: absolute; left: .6rem; top: .4rem; font-size: .85rem; color: #444; }

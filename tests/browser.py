@@ -63,8 +63,10 @@ class Browser:
     def close(self) -> None:
         """Ends it."""
         self._socket.close()
-        self._process.terminate()
-        self._process.communicate(timeout=_LONG_S)
+        self._process.kill()  # it would tidy up for seconds, and its profile is thrown away
+        self._process.wait(timeout=_LONG_S)
+        assert self._process.stderr is not None
+        self._process.stderr.close()
 
     def resize(self, size: tuple[int, int], *, dark: bool = False) -> None:
         """The window [pixels], and what colours its owner likes."""
@@ -82,8 +84,11 @@ class Browser:
         )
 
     def open(self, url: str) -> None:
-        """Goes there."""
+        """Goes there; returns when the page is loaded."""
         self._call("Page.navigate", url=url)
+        end = time.monotonic() + _LONG_S
+        while self.run("document.readyState") != "complete" and time.monotonic() < end:
+            time.sleep(0.1)
 
     def run(self, script: str) -> Any:
         """The value of an expression in the page."""

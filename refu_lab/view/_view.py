@@ -78,7 +78,8 @@ def view(
     except KeyboardInterrupt:
         say("viewer closed")
     finally:
-        server.stop()
+        with contextlib.redirect_stdout(io.StringIO()):
+            server.stop()
 
 
 def open_film(options: ViewOptions, *, progress: bool = False) -> DressedFilm | RecordedFilm:

@@ -1,0 +1,355 @@
+"""`refu view`: films of motion and of bags, what is marked, the player, and what a real browser shows of it."""
+
+from __future__ import annotations
+
+import re
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import browser
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial import cKDTree
+
+import msg_adapters as adapters
+from refu_core import GarmentPipeline, RefuError, SmplFrame
+from refu_core.metrics import CollisionChecker
+from refu_lab.cli import main
+from refu_lab.replay import ReplayOptions
+from refu_lab.view import ViewOptions, view
+from refu_lab.view._dressed import DressedFilm, Track
+from refu_lab.view._film import BODY, SKIN, Cache, Shape
+from refu_lab.view._marks import CLEARANCE, Marker, Marking
+from refu_lab.view._player import Player
+from refu_lab.view._recorded import RecordedFilm, Topology
+from refu_lab.view._view import open_film
+
+ROOT = Path(__file__).parents[2]
+SHORTS = ("short-pant-male",)
+
+
+def motion(n: int = 5, *, left: float = 0.0) -> list[SmplFrame]:
+    """Somebody who lifts a knee, far from the origin."""
+    frames = []
+    for i in range(n):
+        pose = np.zeros((24, 3), np.float32)
+        pose[16, 2], pose[17, 2], pose[1, 0] = -1.1, 1.1, -0.3 * i
+        frames.append(SmplFrame(pose, transl=np.array([5000 + left, 1.0, 0.1 * i]), stamp_ns=10**18 + i * 10**8))
+    return frames
+
+
+def write_bag(path: Path, people: dict[str, list[SmplFrame]]) -> Path:
+    encode = adapters.encoder_for("multiarray")
+    with adapters.BagWriter(path) as writer:
+        for topic, frames in people.items():
+            writer.add_topic(topic, adapters.INPUT_TYPES["multiarray"])
+            for frame in frames:
+                writer.write(topic, encode(frame), log_time_ns=frame.stamp_ns)
+    return path
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_bag(tmp_path_factory.mktemp("bag") / "knee.mcap", {"/smpl_params": motion()})
+
+
+@pytest.fixture(scope="module")
+def film(bag: Path) -> DressedFilm:
+    return DressedFilm([bag], ReplayOptions(input=Path(), garments=SHORTS))
+
+
+def by_name(shapes: Any, person: str = "") -> dict[str, Shape]:
+    return {shape.name: shape for shape in shapes if shape.person == person}
+
+
+# ---- films -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_dressed_film_shows_what_the_pipeline_says(film: DressedFilm) -> None:
+    pipeline = GarmentPipeline.load(SHORTS)
+    np.testing.assert_allclose(film.times, 0.1 * np.arange(5), atol=1e-9)
+    for index, frame in enumerate(motion()):
+        shapes, wanted = by_name(film.shapes(index)), pipeline(frame)
+        origin = motion()[0].transl
+        for name, local in ((BODY, wanted.body), (SKIN, wanted.skin), (SHORTS[0], wanted[SHORTS[0]].local)):
+            there = adapters.vertices_ros_from_smpl(local + (frame.transl - origin))
+            np.testing.assert_allclose(shapes[name].vertices, there, atol=1e-5)
+    assert film.front == pytest.approx(0.0)  # along z of SMPL, which is x here
+
+
+def test_a_recorded_film_shows_the_same_as_the_dressed_one(film: DressedFilm, bag: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.mcap"
+    assert main(["replay", str(bag), "--output", str(out), "--garments", SHORTS[0], "--no-evaluate", "--quiet"]) == 0
+    recorded = open_film(ViewOptions(inputs=(out,), replay=ReplayOptions(input=Path())))
+    assert isinstance(recorded, RecordedFilm)
+    np.testing.assert_allclose(recorded.times, film.times, atol=1e-9)
+    shift = None
+    for index in (3, 0, 4):
+        kept, dressed = by_name(recorded.shapes(index)), by_name(film.shapes(index))
+        assert set(kept) == {BODY, *SHORTS}
+        for name, shape in kept.items():
+            corners, wanted = (one.vertices[one.faces.reshape(-1)] for one in (shape, dressed[name]))
+            shift = corners[0] - wanted[0] if shift is None else shift  # each has an origin of its own
+            np.testing.assert_allclose(corners, wanted + shift, atol=2e-5)
+            assert len(shape.vertices) == len(dressed[name].vertices)
+            assert shape.color == pytest.approx(dressed[name].color, abs=0.1)
+    recorded.close()
+    again = open_film(ViewOptions(inputs=(out,), replay=ReplayOptions(input=Path(), garments=SHORTS), dress=True))
+    assert isinstance(again, DressedFilm)
+
+
+def test_people_of_a_bag_are_shown_together_while_they_are_there(tmp_path: Path) -> None:
+    late = [SmplFrame(f.pose, transl=f.transl, stamp_ns=f.stamp_ns + 10**9) for f in motion(2, left=1.0)]
+    both = write_bag(
+        tmp_path / "two.mcap", {"/anna/smpl_params": motion(14), "/ben/smpl_params": late, "/robot": motion(1)}
+    )
+    film = DressedFilm([both], ReplayOptions(input=Path(), garments=SHORTS))
+    assert {shape.person for shape in film.shapes(0)} == {"anna"}
+    shapes = film.shapes(10)
+    middles = [by_name(shapes, person)[BODY].vertices[:, 1].mean() for person in ("anna", "ben")]
+    assert middles[1] - middles[0] == pytest.approx(1.0, abs=0.05)
+    assert {shape.person for shape in film.shapes(13)} == {"anna", "ben"}  # a tenth of a second after ben's last
+
+
+def test_files_are_a_person_each_and_garments_can_be_changed(bag: Path, tmp_path: Path) -> None:
+    clip = tmp_path / "clip.npz"
+    np.savez(clip, poses=np.zeros((3, 72)), trans=np.tile([0.0, 1.0, 0.0], (3, 1)), mocap_framerate=10.0)
+    film = DressedFilm([bag, clip], ReplayOptions(input=Path(), garments=SHORTS))
+    assert {shape.person for shape in film.shapes(0)} == {"knee", "clip"}
+    assert {*SHORTS, "tshirt-male"} <= set(film.wardrobe)
+    assert "skirt-female" not in film.wardrobe
+    film.wear(["tshirt-male"], "none")
+    assert {shape.name for shape in film.shapes(0)} == {BODY, SKIN, "tshirt-male"}
+    with pytest.raises(RefuError, match="of one body"):
+        film.wear(["tshirt-male", "skirt-female"], "hybrid")
+    assert film.garments == ("tshirt-male",)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 40), st.integers(3, 12))
+def test_topology_is_found_from_corners(seed: int, n_faces: int, n_vertices: int) -> None:
+    rng = np.random.default_rng(seed)
+    faces = rng.integers(0, n_vertices, (n_faces, 3))
+    first, later = rng.normal(size=(2, n_vertices, 3))
+    found = Topology.of(first[faces.reshape(-1)])
+    assert len(found.first) == len(np.unique(faces))
+    for vertices in (first, later):
+        points = vertices[faces.reshape(-1)]
+        assert found.fits(points)
+        np.testing.assert_array_equal(points[found.first][found.faces.reshape(-1)], points)
+    assert not found.fits(rng.normal(size=(3 * n_faces + 3, 3)))
+
+
+@given(st.lists(st.integers(0, 5000), min_size=1, max_size=20, unique=True), st.integers(-1000, 6000))
+def test_the_nearest_frame_of_a_person_is_shown_if_it_is_near(stamps: list[int], at: int) -> None:
+    times = np.sort(stamps) / 1000
+    track = Track("", [SmplFrame(np.zeros((24, 3)), stamp_ns=int(1e9 * t)) for t in times], times, np.eye(3))
+    found, gaps = track.at(at / 1000), np.abs(times - at / 1000)
+    if gaps.min() > 0.2501:
+        assert found is None
+    elif gaps.min() < 0.2499:
+        assert found is not None
+        assert abs(found.stamp_ns / 1e9 - at / 1000) == pytest.approx(gaps.min(), abs=1e-6)
+
+
+def test_the_cache_forgets_what_was_shown_longest_ago(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("refu_lab.view._film._CACHE_BYTES", 3 * 120)
+    cache, made = Cache(), []
+
+    def make(index: int) -> list[Shape]:
+        made.append(index)
+        return [Shape(BODY, "", np.zeros((10, 3), np.float32), np.zeros((1, 3), np.int64), (0, 0, 0))]
+
+    for index in (0, 1, 2, 0, 3, 0, 1):
+        cache.get(index, make)
+    assert made == [0, 1, 2, 3, 1]
+
+
+# ---- marks -----------------------------------------------------------------------------------------------------------
+
+
+def test_bands_have_each_face_once_and_say_what_is_so(film: DressedFilm) -> None:
+    shapes = by_name(film.shapes(2))
+    body, shorts = shapes[BODY], shapes[SHORTS[0]]
+    middle = shorts.vertices.mean(0)
+    shorts = replace(shorts, vertices=middle + np.float32(0.93) * (shorts.vertices - middle))  # some of it is inside
+    marker = Marker()
+    for marking in Marking:
+        (bands,) = marker.bands(marking, [shorts], body)
+        joined = np.concatenate([band.faces for band in bands])
+        np.testing.assert_array_equal(np.unique(joined, axis=0), np.unique(shorts.faces, axis=0))
+        assert len(joined) == len(shorts.faces)
+    checker = CollisionChecker(body.faces)
+    checker.update(body.vertices)
+    found = checker.check(shorts.vertices, shorts.faces)
+    (_, red), *_ = marker.bands(Marking.COLLISIONS, [shorts], body)
+    assert len(red.faces) > 20
+    assert set(map(tuple, shorts.faces[np.unique(found.pairs[:, 0])])) <= set(map(tuple, red.faces))
+    (bands,) = marker.bands(Marking.CLEARANCE, [shorts], body)
+    assert found.inside[bands[0].faces].any(1).all()
+    assert not found.inside[np.concatenate([band.faces for band in bands[1:]])].any()
+    # The surface is never farther off than the nearest of many points on it, and less than a face's size nearer.
+    corners = body.vertices[body.faces]
+    middles = [(corners[:, k] + corners[:, (k + 1) % 3]) / 2 for k in range(3)]
+    near = cKDTree(np.concatenate([body.vertices, corners.mean(1), *middles]))
+    above = 0.0
+    for band, (limit, _) in zip(bands, CLEARANCE, strict=True):
+        if above > 0 and len(band.faces):
+            distance = near.query(shorts.vertices)[0][band.faces].min(1)
+            assert distance.min() >= above - 1e-6
+            assert distance.max() <= limit + 0.02
+        above = limit
+
+
+# ---- the player ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def server() -> Iterator[Any]:
+    viser = pytest.importorskip("viser", reason="viser isn't installed (extra view)")
+    with socket.socket() as probe:
+        probe.bind(("localhost", 0))
+        port = probe.getsockname()[1]
+    found = viser.ViserServer(host="localhost", port=port, verbose=False)
+    yield found
+    found.stop()
+
+
+def until(n: int) -> Callable[[], bool]:
+    """Ends a player after n rounds."""
+    rounds = iter(range(n))
+    return lambda: next(rounds, None) is None
+
+
+def test_the_player_plays_seeks_and_dresses_anew(film: DressedFilm, server: Any) -> None:
+    player = Player(server, film)
+    for index in range(5):
+        film.shapes(index)
+    seen = []
+    player.run(until=lambda: seen.append(player._index) or len(set(seen)) == 5 or len(seen) > 2000)
+    assert set(seen) == set(range(5))
+    player._toggle(None)
+    assert player._verb() == "play"
+    player._seek = 3
+    player._changed.set()
+    player.run(until=until(1))
+    assert player._index == 3
+    assert "frame 3 of 5" in player._said.content
+    assert set(player._stage._drawn) == {("", BODY, 0), ("", SHORTS[0], 0)}
+    player._body.value, player._marking.value = "hidden", "collisions"
+    player._boxes["tshirt-male"].value = True
+    player.run(until=until(1))
+    assert set(film.garments) == {*SHORTS, "tshirt-male"}
+    assert {name for _, name, _ in player._stage._drawn} == {*SHORTS, "tshirt-male"}
+    for box in player._boxes.values():
+        box.value = False
+    player.run(until=until(1))  # nothing to wear: said, and left as it is
+    assert set(film.garments) == {*SHORTS, "tshirt-male"}
+    film.wear(SHORTS, "hybrid")
+
+
+# ---- the command -----------------------------------------------------------------------------------------------------
+
+
+def test_without_viser_one_line_says_how_to_get_it(bag: Path, tmp_path: Path) -> None:
+    (tmp_path / "viser.py").write_text("raise ModuleNotFoundError(name='viser')")
+    code = f"import sys; sys.path[:0] = [{str(tmp_path)!r}, {str(ROOT)!r}]; from refu_lab.cli import main; "
+    code += "sys.exit(main())"
+    done = subprocess.run(
+        [sys.executable, "-c", code, "view", str(bag)], capture_output=True, text=True, check=False, cwd=tmp_path
+    )
+    assert done.returncode == 2
+    assert done.stderr.splitlines() == ['refu: error: the viewer needs viser: pip install "refu-ros[view]"']
+
+
+def test_a_port_that_is_taken_is_said(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("viser", reason="viser isn't installed (extra view)")
+    with socket.socket() as taken:
+        taken.bind(("localhost", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        assert main(["view", str(bag), "--port", str(port), "--no-browser", "--garments", SHORTS[0]]) == 2
+    assert f"localhost:{port}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("where", ["nowhere.mcap", "empty"])
+def test_what_cannot_be_shown_is_said(where: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("viser", reason="viser isn't installed (extra view)")
+    if where == "empty":
+        with adapters.BagWriter(tmp_path / where):
+            pass
+    assert main(["view", str(tmp_path / where), "--no-browser", "--garments", SHORTS[0]]) == 2
+    assert where in capsys.readouterr().err
+
+
+# ---- what a browser shows --------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[browser.Browser]:
+    pytest.importorskip("viser", reason="viser isn't installed (extra view)")
+    if browser.PROGRAM is None:
+        pytest.skip("no Chromium: apt-get install chromium")
+    found = browser.Browser(tmp_path_factory.mktemp("chromium"), size=(640, 420))
+    yield found
+    found.close()
+
+
+def coloured(picture: np.ndarray, hue: tuple[float, float]) -> int:
+    """Pixels of saturated colours within these hues [degrees]."""
+    r, g, b = picture.reshape(-1, 3).astype(float).T / 255
+    high, low = np.maximum.reduce([r, g, b]), np.minimum.reduce([r, g, b])
+    span = np.maximum(high - low, 1e-9)
+    angle = np.where(high == r, (g - b) / span % 6, np.where(high == g, (b - r) / span + 2, (r - g) / span + 4)) * 60
+    return int(((span > 0.25) & (angle > hue[0]) & (angle < hue[1])).sum())
+
+
+GREEN = (150.0, 185.0)
+"""Hues of the T-shirt."""
+
+
+def test_a_browser_shows_somebody_in_a_green_t_shirt(chromium: browser.Browser, bag: Path) -> None:
+    chromium.open("about:blank")
+    assert coloured(chromium.picture(), GREEN) == 0
+    code = "import sys; from refu_lab.cli import main; sys.exit(main())"
+    command = [sys.executable, "-u", "-c", code, "view", str(bag), "--no-browser", "--garments", "tshirt-male"]
+    viewer = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        assert viewer.stdout is not None
+        said = re.search(r"knee.mcap: 5 frames at (http://localhost:\d+) ", viewer.stdout.readline())
+        assert said is not None
+        chromium.open(said[1])
+        seen = chromium.picture_when(lambda picture: coloured(picture, GREEN) > 3000)
+        assert coloured(seen, GREEN) > 3000  # of 268,800
+        rows, _ = np.nonzero((seen[..., 1].astype(int) - seen[..., 0]) > 60)
+        assert 60 < rows.mean() < 260  # on somebody who stands in the middle
+        assert chromium.errors == []
+    finally:
+        viewer.send_signal(signal.SIGINT)
+        out, err = viewer.communicate(timeout=60)
+    assert (viewer.returncode, out, err) == (0, "viewer closed\n", "")
+
+
+def test_an_empty_stage_has_no_colour(chromium: browser.Browser, film: DressedFilm, server: Any) -> None:
+    player = Player(server, film, playing=False)
+    player._body.value = "hidden"
+    player._stage.draw([], wireframe=False)
+    chromium.open(f"http://localhost:{server.get_port()}")
+    seen = chromium.picture_when(lambda picture: coloured(picture, (200, 220)) > 800)  # the panel's button
+    assert coloured(seen, (200, 220)) > 800
+    assert coloured(seen, GREEN) < 100
+
+
+def test_view_ends_when_it_is_told_to(bag: Path) -> None:
+    pytest.importorskip("viser", reason="viser isn't installed (extra view)")
+    lines: list[str] = []
+    options = ViewOptions(inputs=(bag,), replay=ReplayOptions(input=Path(), garments=SHORTS), browser=False)
+    view(options, say=lines.append, until=until(2))
+    assert any(re.search(r"http://localhost:\d+", line) for line in lines)
