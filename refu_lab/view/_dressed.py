@@ -60,9 +60,11 @@ class DressedFilm:
     def __init__(self, inputs: Sequence[Path], options: ReplayOptions) -> None:
         self._options = options
         self._pipeline = options.load_pipeline()
+        self._body_faces = self._pipeline.body.faces.cpu().numpy()  # one array: who draws it compares identities
         self.notes: list[str] = []
         """What there is to warn of, for people."""
-        self._tracks = [track for path in inputs for track in self._read(path, several=len(inputs) > 1)]
+        names = _different([path.stem for path in inputs]) if len(inputs) > 1 else [""]
+        self._tracks = [track for path, name in zip(inputs, names, strict=True) for track in self._read(path, name)]
         longest = max(self._tracks, key=lambda track: len(track.frames))
         self._moments = longest.times
         first = self._tracks[0]
@@ -109,6 +111,7 @@ class DressedFilm:
         names = tuple(paths.get(name, name) for name in garments)
         options = replace(self._options, garments=names, sdf=sdf)
         self._pipeline, self._options = options.load_pipeline(), options
+        self._body_faces = self._pipeline.body.faces.cpu().numpy()
         self._cache.clear()
         self._facts.clear()
 
@@ -144,35 +147,29 @@ class DressedFilm:
             there: NDArray[np.float32] = vertices @ turn.T + shift.astype(np.float32)
             return there
 
-        faces = self._pipeline.body.faces.cpu().numpy()
         shapes = [
-            Shape(BODY, track.person, placed(output.body), faces, SKIN_COLOUR),
-            Shape(SKIN, track.person, placed(output.skin), faces, SKIN_COLOUR),
+            Shape(BODY, track.person, placed(output.body), self._body_faces, SKIN_COLOUR),
+            Shape(SKIN, track.person, placed(output.skin), self._body_faces, SKIN_COLOUR),
         ]
         for name, mesh in output.items():
             color = self._pipeline.garments[name].card.color
             shapes.append(Shape(name, track.person, placed(mesh.local), mesh.faces, color))
         return shapes
 
-    def _read(self, path: Path, *, several: bool) -> list[Track]:
+    def _read(self, path: Path, name: str) -> list[Track]:
+        """Everybody in a file, who is called `name` where there are other files."""
         options = replace(self._options, input=path)
         topics = _topics_of_people(path) if options.topic is None and options.input_type is None else []
-        if len(topics) < 2:
-            found = {path.stem if several else "": self._frames(options)}
-        else:
-            found = {
-                f"{path.stem}/{_person(topic)}" if several else _person(topic): self._frames(
-                    replace(options, topic=topic)
-                )
-                for topic in topics
-            }
+        found = {name: self._frames(options)} if len(topics) < 2 else {}
+        for topic in topics if len(topics) > 1 else ():
+            person = topic.strip("/").removesuffix(_USUAL).rstrip("/") or "person"
+            found[f"{name}/{person}" if name else person] = self._frames(replace(options, topic=topic))
         start = min(frames[0].stamp_ns for frames in found.values())  # of several files, each begins at zero
-        return [
-            Track(
-                person, frames, np.array([1e-9 * (frame.stamp_ns - start) for frame in frames]), _turn(options, frames)
-            )
-            for person, frames in found.items()
-        ]
+        tracks = []
+        for person, frames in found.items():
+            times = np.array([1e-9 * (frame.stamp_ns - start) for frame in frames])
+            tracks.append(Track(person, frames, times, _turn(options, frames)))
+        return tracks
 
     def _frames(self, options: ReplayOptions) -> list[SmplFrame]:
         """In the order of their stamps, one at least."""
@@ -197,8 +194,9 @@ class DressedFilm:
         return sorted(frames, key=lambda frame: frame.stamp_ns)
 
 
-def _person(topic: str) -> str:
-    return topic.strip("/").removesuffix(_USUAL).rstrip("/") or "person"
+def _different(names: Sequence[str]) -> list[str]:
+    """The names; those that were there already get numbers."""
+    return [f"{name}-{k}" if (k := names[:i].count(name) + 1) > 1 else name for i, name in enumerate(names)]
 
 
 def _topics_of_people(path: Path) -> list[str]:

@@ -44,6 +44,7 @@ class Player:
         self._changed = threading.Event()
         self._seek: int | None = None
         self._failed = ""
+        self._refused: tuple[tuple[str, ...], str] | None = None
         picked = np.unique(np.linspace(0, len(self._times) - 1, _GROUND_FRAMES).astype(int))
         lowest = [float(shape.vertices[:, 2].min()) for i in picked for shape in film.shapes(int(i))]
         first = film.shapes(0)
@@ -129,21 +130,17 @@ class Player:
         if not isinstance(film, DressedFilm):
             return
         wanted = tuple(name for name, box in self._boxes.items() if box.value)
-        if (set(wanted), self._sdf.value) == (set(film.garments), film.sdf) or (
-            wanted,
-            self._sdf.value,
-        ) == self._refused:
+        sdf = self._sdf.value
+        if (set(wanted), sdf) == (set(film.garments), film.sdf) or (wanted, sdf) == self._refused:
             return
         if not wanted:
             self._tell("wear one garment at least")
         else:
             try:
-                film.wear(wanted, self._sdf.value)
+                film.wear(wanted, sdf)
             except RefuError as error:
                 self._tell(str(error))
-                self._refused = wanted, self._sdf.value
-
-    _refused: tuple[tuple[str, ...], str] | None = None
+                self._refused = wanted, sdf
 
     def _tell(self, what: str) -> None:
         """Once, to everybody who looks."""

@@ -119,11 +119,16 @@ def test_people_of_a_bag_are_shown_together_while_they_are_there(tmp_path: Path)
     assert {shape.person for shape in film.shapes(13)} == {"anna", "ben"}  # a tenth of a second after ben's last
 
 
+def test_what_stays_from_frame_to_frame_is_one_array(film: DressedFilm) -> None:
+    first, second = by_name(film.shapes(0)), by_name(film.shapes(1))
+    assert all(first[name].faces is second[name].faces for name in first)  # or faces would be sent again and again
+
+
 def test_files_are_a_person_each_and_garments_can_be_changed(bag: Path, tmp_path: Path) -> None:
     clip = tmp_path / "clip.npz"
     np.savez(clip, poses=np.zeros((3, 72)), trans=np.tile([0.0, 1.0, 0.0], (3, 1)), mocap_framerate=10.0)
-    film = DressedFilm([bag, clip], ReplayOptions(input=Path(), garments=SHORTS))
-    assert {shape.person for shape in film.shapes(0)} == {"knee", "clip"}
+    film = DressedFilm([bag, clip, bag], ReplayOptions(input=Path(), garments=SHORTS))
+    assert {shape.person for shape in film.shapes(0)} == {"knee", "clip", "knee-2"}
     assert {*SHORTS, "tshirt-male"} <= set(film.wardrobe)
     assert "skirt-female" not in film.wardrobe
     film.wear(["tshirt-male"], "none")
