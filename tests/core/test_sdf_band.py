@@ -20,7 +20,7 @@ from refu_core.mesh import Adjacency, Connectivity
 from refu_core.metrics._self_contact import SelfContactDetector
 from refu_core.sdf import ExactSdf
 from refu_core.sdf._band import BAND, BandSdf, Links
-from refu_core.sdf._box_tree import grouped
+from refu_core.mesh import grouped
 from refu_core.simulation import load_clips
 
 BALL = trimesh.creation.icosphere(subdivisions=3, radius=0.3)
