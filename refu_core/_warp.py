@@ -86,6 +86,18 @@ class Repeated(threading.local):
             command.launch()
 
 
+@functools.cache
+def strips(n: int, device: torch.device) -> tuple[int, Tensor]:
+    """Into how many strips a kernel's n items are cut, and how many each has, int32, shape (1,).
+
+    A thread takes a strip. A CPU's compiler keeps more in registers in a loop than from thread to thread, so it gets
+    one strip; a GPU as many as there are items.
+    """
+    n_strips = 1 if device.type == "cpu" else n
+    with torch.inference_mode(False):
+        return n_strips, torch.tensor([max(n, 1) // max(n_strips, 1)], dtype=torch.int32, device=device)
+
+
 _MOST_SIZES = 64
 """Sizes of a kernel's arguments that are remembered."""
 

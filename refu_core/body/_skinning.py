@@ -6,7 +6,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import Repeated, is_plain
+from refu_core._warp import Repeated, is_plain, strips
 from refu_core.body._kinematics import RigidTransforms
 from refu_core.body._pose_kernels import Transform, skin_kernel
 
@@ -14,7 +14,7 @@ _MIN_DETERMINANT = 1e-4
 """Blends of rotations almost half a turn apart collapse; below this determinant unposing is bounded, not exact."""
 
 
-_skin = Repeated(skin_kernel, (wp.vec3, wp.int32, wp.int32, wp.float32, Transform, wp.vec3))
+_skin = Repeated(skin_kernel, (wp.vec3, wp.int32, wp.int32, wp.float32, Transform, wp.int32, wp.vec3))
 
 
 def blend_transforms(weights: Tensor, transforms: RigidTransforms) -> RigidTransforms:
@@ -59,7 +59,8 @@ class Skinning:
         points, stacked = points.contiguous(), _stacked(transforms)
         posed = torch.empty(len(rotation), *points.shape[1:], device=points.device)
         if len(rotation):
-            _skin(posed.shape[:2], points, self._start, self._joint, self._weight, stacked, posed)
+            n_strips, each = strips(posed.shape[1], posed.device)
+            _skin((len(posed), n_strips), points, self._start, self._joint, self._weight, stacked, each, posed)
         return posed
 
 

@@ -58,12 +58,20 @@ def find_near(i: int, fabric: Fabric, bundles: Bundles, clearance: float) -> Non
             found |= 1 << k
     if found == 0:
         return
-    wp.atomic_or(fabric.counts, WANTED, found)
+    wanted = int(0)
     for c in range(first, last):
         v = fabric.vertex[c]
-        if (fabric.foreign[v] & found) != 0:
-            fabric.boxed[v] = fabric.foreign[v] & found
+        low = lesser(fabric.points[v], fabric.skin[v])
+        high = greater(fabric.points[v], fabric.skin[v])
+        boxed = int(0)
+        for k in range(bundles.group_low.shape[0]):
+            if ((fabric.foreign[v] & found) >> k) & 1 == 1 and is_near(low, high, k, clearance, bundles):
+                boxed |= 1 << k
+        if boxed != 0:
+            wanted |= boxed
+            fabric.boxed[v] = boxed
             fabric.near[wp.atomic_add(fabric.counts, NEAR, 1)] = v
+    wp.atomic_or(fabric.counts, WANTED, wanted)
 
 
 @wp.func

@@ -161,7 +161,7 @@ class Resolver:
     def _raise_edges(self) -> None:
         """Raises both ends of the edges that run too low."""
         n = self._n_edges
-        self._run("suspect", n)
+        self._run("suspect", self._n_vertices)
         if self._is_serial:
             self._run("raise edges", int(self._count(_state.CUTTING) > 0))
             return
@@ -270,6 +270,7 @@ def _cloth(mesh: Connectivity, device: str) -> Any:
     # The sums over neighbours are rounded in this order: those of a higher number first.
     ring = ring[np.lexsort((ring < mesh.ring.owner, mesh.ring.owner))]
     cloth = _state.Cloth()
-    for name, array in (("ring_start", ring_start), ("ring", ring), ("edges", mesh.edges)):
+    edge_start = np.searchsorted(mesh.edges[:, 0], np.arange(mesh.n_vertices + 1))
+    for name, array in (("ring_start", ring_start), ("ring", ring), ("edges", mesh.edges), ("edge_start", edge_start)):
         setattr(cloth, name, wp.array(array.astype(np.int32), dtype=wp.int32, device=device))
     return cloth
