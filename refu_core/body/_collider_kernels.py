@@ -106,8 +106,8 @@ class Work:
     steps: wp.array[wp.vec3]
     """Of each edge."""
     counts: wp.array[int]
-    """How many are in `moved`, `near`, `touching`, `hot` and `ends`, the segments that are asked for distances, the joints
-    that are bent, both as bits, and how many are in each row of `front`."""
+    """How many are in `moved`, `near`, `touching`, `hot` and `ends`; as bits the segments that are asked for distances,
+    and the joints that are bent; how many are in each row of `front`."""
 
 
 MOVED = wp.constant(0)

@@ -65,9 +65,9 @@ def find_near(i: int, work: Work, segments: Segments, bundles: Bundles, skins: S
     found = int(0)
     for k in range(segments.trees.shape[0]):
         # Where no joint is bent, segments are as far from each other as at rest.
-        if (segments.path[skins.of[i], k] & work.counts[BENT_JOINTS]) != 0 and skins.gap[i, k] > 0.0:
-            if is_near(bundles.low[i], bundles.high[i], k, skins.gap[i, k], bundles):
-                found |= 1 << k
+        may = (segments.path[skins.of[i], k] & work.counts[BENT_JOINTS]) != 0 and skins.gap[i, k] > 0.0
+        if may and is_near(bundles.low[i], bundles.high[i], k, skins.gap[i, k], bundles):
+            found |= 1 << k
     if found == 0:
         return
     wanted = int(0)

@@ -130,9 +130,7 @@ class ContactStage:
             again, _ = self._off_body(name, vertices, on_mean=on_mean, margin=self._kept * margin, scale=1.0)
             vertices, numbers[_N_UNRESOLVED] = again.vertices, again.numbers[_N_UNRESOLVED]
         if name in self._press or worn:  # what goes several ways
-            away = vertices - raw
-            length = torch.linalg.vector_norm(away, dim=1, keepdim=True)
-            vertices = torch.where(length > self._farthest, raw + self._farthest / length * away, vertices)
+            vertices = raw + torch.renorm(vertices - raw, 2, 0, self._farthest)
         if self.winding is not None:
             numbers[_N_UNRESOLVED] = torch.count_nonzero(self.winding(vertices))
         return Resolved(vertices, torch.cat((numbers, n_layered)), n_clipped)
