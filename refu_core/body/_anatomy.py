@@ -254,8 +254,8 @@ class Tensors:
         work.share = wp.zeros(n, dtype=wp.float32, device=str(self._device))
         work.hot = wp.zeros(n_edges, dtype=wp.int32, device=str(self._device))
         work.steps = wp.zeros(n_edges, dtype=wp.vec3, device=str(self._device))
-        for name, tensor in zip(_BY_VERTEX, self.ints[: len(_BY_VERTEX) * n].split(n), strict=True):
-            setattr(work, name, as_warp(tensor, wp.int32))
+        for i, name in enumerate(_BY_VERTEX):
+            setattr(work, name, as_warp(self.ints[i * n : (i + 1) * n], wp.int32))
         work.counts = as_warp(self.counts, wp.int32)
         return work
 

@@ -124,7 +124,9 @@ class Collider:
 
     def _levelled(self, sweeps: int) -> Tensor:
         """Where so many sweeps end."""
-        return self.anatomy.tensors.here if sweeps % 2 == 0 else self.anatomy.tensors.there
+        work = self.anatomy.tensors
+        at: Tensor = work.here if sweeps % 2 == 0 else work.there
+        return at
 
     def _run(self, name: str) -> None:
         if name not in self._commands:

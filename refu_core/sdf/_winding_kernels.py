@@ -121,9 +121,9 @@ def crossings_kernel(
                                 q = int(first[cell])
                                 while q >= 0:
                                     p = points[q]
-                                    if p[0] >= box_low[0] and p[0] <= box_high[0] and p[1] >= box_low[1]:
-                                        if p[1] <= box_high[1]:
-                                            found = crossing(a, b, c, p, half)
-                                            if found != 0:
-                                                wp.atomic_add(winding, q, found)
+                                    along = p[0] >= box_low[0] and p[0] <= box_high[0]
+                                    if along and p[1] >= box_low[1] and p[1] <= box_high[1]:
+                                        found = crossing(a, b, c, p, half)
+                                        if found != 0:
+                                            wp.atomic_add(winding, q, found)
                                     q = following[q]
