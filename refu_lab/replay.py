@@ -262,7 +262,7 @@ class _Replayer:
         """The output bag with its topics, None where no output was asked for."""
         if self._options.output is None:
             return None
-        writer = adapters.BagWriter(self._options.output, overwrite=self._options.overwrite)
+        writer = adapters.BagWriter(self._options.output, overwrite=self._options.overwrite, in_background=True)
         given = self._source.bag.topic if self._source.bag is not None else None
         own = {} if given is None else {"definition": given.definition, "type_hash": given.type_hash}
         writer.add_topic(self._source.topic, self._source.message_type, **own)
