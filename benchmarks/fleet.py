@@ -87,10 +87,11 @@ def _convert(folder: Path, frames: list[SmplFrame], rounds: int) -> None:
         )
 
 
-def _long(folder: Path, frames: list[SmplFrame], count: int, log: Path) -> None:
-    """Converts a recording of so many frames; a line of the log a half minute: s, frames written, memory."""
-    encode = adapters.encoder_for("multiarray")
-    options = ReplayOptions(input=folder / "long.mcap", output=folder / "long-out.mcap", evaluate=False, overwrite=True)
+def _long(folder: Path, frames: list[SmplFrame], count: int, garments: tuple[str, ...]) -> None:
+    """Converts a recording of so many frames; its log memory.txt gets a line each half minute."""
+    encode, log = adapters.encoder_for("multiarray"), folder / "memory.txt"
+    out = folder / "long-out.mcap"
+    options = ReplayOptions(input=folder / "long.mcap", output=out, garments=garments, evaluate=False, overwrite=True)
     with adapters.BagWriter(options.input, overwrite=True) as writer:
         writer.add_topic("/smpl_params", adapters.INPUT_TYPES["multiarray"])
         for i in range(count):
@@ -99,7 +100,7 @@ def _long(folder: Path, frames: list[SmplFrame], count: int, log: Path) -> None:
 
     def watch() -> None:
         while not done.wait(30):
-            size = options.output.stat().st_size / 1e6 if options.output and options.output.exists() else 0.0
+            size = out.stat().st_size / 1e6 if out.exists() else 0.0
             with log.open("a") as file:
                 file.write(f"{time.perf_counter() - start:.0f} s, bag {size:.0f} MB, memory {_resident():.1f} MB\n")
 
@@ -126,6 +127,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=60)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--long", type=int, default=108_000)
+    parser.add_argument("--garments", default="tshirt-male", help="of the long recording")
     parser.add_argument("--folder", type=Path, help="of the long recording, and its log memory.txt (a temporary one)")
     parser.add_argument("--only", choices=("workers", "convert", "long"))
     args = parser.parse_args()
@@ -137,7 +139,7 @@ def main() -> None:
         if args.only == "long":
             place = args.folder or folder
             place.mkdir(parents=True, exist_ok=True)
-            _long(place, frames, args.long, place / "memory.txt")
+            _long(place, frames, args.long, tuple(args.garments.split(",")))
             print((place / "memory.txt").read_text())
         if args.only in (None, "workers"):
             (folder / "bags").mkdir()
