@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
+from msg_adapters.bags import _mcap
 from msg_adapters.bags._mcap_writer import McapWriter
 from msg_adapters.bags._metadata import (
     MAX_TIME_NS,
@@ -112,11 +113,13 @@ class BagWriter:
         definition: str | None = None,
         type_hash: str | None = None,
         qos: QosProfile | str = _DEFAULT_QOS,
+        betas_of: str = "",
     ) -> None:
         """Declare a topic before its first message; a second time with the same type does nothing.
 
         `definition` (`ros2msg` text) and `type_hash` are built in for the types of this project. `qos` may also be the
-        YAML text of a bag that is copied from.
+        YAML text of a bag that is copied from. `betas_of` says whose shape space β in the messages are of:
+        `builtin`, or nothing. It is kept with the topic, where `TopicInfo.betas_of` has it; others don't mind.
 
         Raises `BagError` for a type that isn't built in without a definition, and for a second type on one topic.
         """
@@ -134,6 +137,7 @@ class BagWriter:
         with self._writing():
             schema_id = self._writer.add_schema(message_type, definition)
             metadata = {"offered_qos_profiles": profiles, "topic_type_hash": type_hash or ""}
+            metadata |= {_mcap.BETAS_OF: betas_of} if betas_of else {}
             channel_id = self._writer.add_channel(topic, schema_id, metadata)
         self._topics[topic] = _Topic(channel_id, message_type, type_hash or "", profiles)
 

@@ -238,6 +238,21 @@ def test_several_files_are_read_in_order(tmp_path: Path) -> None:
     assert times == [frame(i).stamp_ns + 5 for part in range(3) for i in range(part + 2)]
 
 
+def test_a_topic_says_whose_betas_it_has(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "bag.mcap") as bag:
+        bag.add_topic(TOPIC, INPUT_TYPES["joint_state"], betas_of="builtin")
+        bag.write(TOPIC, encoder_for("joint_state")(frame(0)), log_time_ns=1)
+    (topic,) = BagReader(tmp_path / "bag.mcap").topics
+    assert topic.betas_of == "builtin"
+    with RosbagsReader(tmp_path / "bag.mcap") as reader:  # others don't mind
+        assert reader.message_count == 1
+    assert all(
+        topic.betas_of == "builtin" for name in ("walk", "reach_squat") for topic in BagReader(BAGS / name).topics
+    )
+    (topic,) = BagReader(write_bag(tmp_path / "silent.mcap", count=1)).topics
+    assert topic.betas_of == ""
+
+
 def test_two_channels_of_one_topic_are_one(tmp_path: Path) -> None:
     data = encoder_for("joint_state")(frame(0))
     with (tmp_path / "two.mcap").open("wb") as file:
