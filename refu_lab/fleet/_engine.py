@@ -6,8 +6,10 @@ gives the same there: its result is a function of its content.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import logging
+import os
 import pickle
 import signal
 import sys
@@ -152,12 +154,13 @@ class DaskEngine:
         # A task like any other: whoever loses it gets it again, where scattered data would be gone with its worker.
         shared = self.client.submit(bytes, packed, key=f"refu-make-{digest}", pure=False)
         numbers: dict[Future[Any], int] = {}
+        folder = os.getcwd()  # noqa: PTH109
 
         def submit(index: int) -> Future[Any]:
             # Packed: a scheduler reads what it passes on, and would import torch for it.
             task = pickle.dumps(tasks[index])
             key = f"refu-task-{digest}-{index}-{hashlib.sha256(task).hexdigest()[:16]}"
-            future = self.client.submit(_work, shared, digest, task, __version__, key=key, pure=False)
+            future = self.client.submit(_work, shared, digest, task, __version__, folder, key=key, pure=False)
             numbers[future] = index
             return future
 
@@ -192,8 +195,13 @@ _made: dict[str, Callable[[Any], Any]] = {}
 """This process's function, by what it was made of; the last one alone, as it may hold networks."""
 
 
-def _work(packed: bytes, digest: str, task: bytes, version: str) -> Any:
-    """On a worker: makes the function, unless it has it, and calls it."""
+def _work(packed: bytes, digest: str, task: bytes, version: str, folder: str) -> Any:
+    """On a worker: makes the function, unless it has it, and calls it where the command was given.
+
+    A relative path is the command's then, wherever the disk is the same.
+    """
+    with contextlib.suppress(OSError):
+        os.chdir(folder)
     if version != __version__:
         msg = f"a worker has refu-ros {__version__}, this is {version}: install one version everywhere"
         raise FleetError(msg)

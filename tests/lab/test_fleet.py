@@ -241,7 +241,12 @@ def scheduler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple
 
 
 def test_killed_workers_lose_and_double_nothing(
-    scheduler: tuple[str, subprocess.Popen[bytes]], bags: Path, alone: Path, tmp_path: Path, capsys: Any
+    scheduler: tuple[str, subprocess.Popen[bytes]],
+    bags: Path,
+    alone: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: Any,
 ) -> None:
     """A worker dies with a task that then succeeds, one with a task that ends each; the same cluster replays on."""
     address, process = scheduler
@@ -256,8 +261,10 @@ def test_killed_workers_lose_and_double_nothing(
         ((_, lost),) = engine.run(run_function(fleet_tasks.die), [0])
         assert isinstance(lost, Lost)
         assert "out of memory?" in lost.reason
-    out = tmp_path / "out"
-    assert run(bags, "--scheduler", address, "--output", out) == 2
+    out = tmp_path / "elsewhere" / "out"
+    out.parent.mkdir()
+    monkeypatch.chdir(out.parent)  # where no worker is
+    assert run(bags, "--scheduler", address, "--output", "out") == 2
     assert "3 of 4 recordings replayed, 0 of them before" in capsys.readouterr().out
     assert content(out) == content(alone)
 
