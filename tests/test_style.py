@@ -29,6 +29,7 @@ CORE = (
     {"refu", "fitting"},
     {"contact"},
     {"realtime"},
+    {"outputs"},
     {"metrics"},
     {"simulation"},
     {"training"},

@@ -2,5 +2,6 @@
 
 from refu_core.outputs._normals import VertexNormals
 from refu_core.outputs._openings import Opening, Openings
+from refu_core.outputs._planner import HALF_THICKNESS, MAX_TRIANGLES, PlannerMesh
 
-__all__ = ["Opening", "Openings", "VertexNormals"]
+__all__ = ["HALF_THICKNESS", "MAX_TRIANGLES", "Opening", "Openings", "PlannerMesh", "VertexNormals"]
