@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import threading
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from msg_adapters import Placement
 from refu_core import FrameError
 from refu_core.frames import PLAUSIBLE_ANGLE, PLAUSIBLE_COEFFICIENT, PLAUSIBLE_TRANSL
 
@@ -28,6 +29,8 @@ class Arrival:
     frame: SmplFrame
     received: float
     """On the scene's clock [s]."""
+    placement: Placement = field(default_factory=Placement)
+    """From the sender's frame to that of the messages."""
 
 
 def check_plausible(frame: SmplFrame) -> None:
@@ -71,8 +74,8 @@ class Scene:
         self._held = False
         self._closed = False
 
-    def put(self, person: str, frame: SmplFrame) -> None:
-        """A person's new frame."""
+    def put(self, person: str, frame: SmplFrame, placement: Placement | None = None) -> None:
+        """A person's new frame, and where the sender's frame is; the messages' own if not given."""
         now = self._clock()
         with self._changed:
             if person in self._pending:
@@ -83,7 +86,7 @@ class Scene:
             if frame.stamp_ns < self._stamps.get(person, 0):
                 self._statistics.back_in_time()
             self._stamps[person] = frame.stamp_ns
-            self._pending[person] = Arrival(frame, now)
+            self._pending[person] = Arrival(frame, now, placement or Placement())
             self._seen[person] = now
             self._changed.notify()
 

@@ -248,23 +248,30 @@ class Viewer:
     def __init__(self) -> None:
         self.watching = True
         self.body_watching = False
+        self.others: set[str] = set()
+        self.sent: list[tuple[str, bytes]] = []
         self.messages: list[list[Marker]] = []
         self.bodies: list[list[Marker]] = []
 
-    def watched(self) -> bool:
-        return self.watching
+    def is_watched(self) -> bool:
+        return bool(self.wanted())
 
-    def body_watched(self) -> bool:
-        return self.body_watching
+    def wanted(self) -> set[str]:
+        return {*["garments"] * self.watching, *["body"] * self.body_watching, *self.others}
+
+    def watchers(self, topic: str) -> int:
+        return int(topic in self.wanted())
 
     def now_ns(self) -> int:
         return 99
 
-    def send_garments(self, data: bytes) -> None:
-        self.messages.append(decode_marker_array(data))
-
-    def send_body(self, data: bytes) -> None:
-        self.bodies.append(decode_marker_array(data))
+    def send(self, topic: str, data: bytes) -> None:
+        if topic == "garments":
+            self.messages.append(decode_marker_array(data))
+        elif topic == "body":
+            self.bodies.append(decode_marker_array(data))
+        else:
+            self.sent.append((topic, data))
 
 
 class Setup:

@@ -11,19 +11,25 @@ from msg_adapters.outputs._points import (
 )
 from msg_adapters.outputs._rims import POLYGON, Rim, encode_frames, encode_polygon, encode_rims
 from msg_adapters.outputs._scene import SCENE_UPDATE, Entity, encode_scene
+from msg_adapters.outputs._table import GARMENTS, make_outputs
+from msg_adapters.outputs._topics import Moment, Output, Wishes
 
 __all__ = [
     "COLLISION_OBJECT",
+    "GARMENTS",
     "MESH",
     "POINT_CLOUD",
     "POINT_FIELDS",
     "POLYGON",
     "SCENE_UPDATE",
     "Entity",
+    "Moment",
     "Operation",
+    "Output",
     "PointCloudEncoder",
     "PointField",
     "Rim",
+    "Wishes",
     "decode_point_cloud",
     "encode_collision_object",
     "encode_frames",
@@ -31,5 +37,6 @@ __all__ = [
     "encode_polygon",
     "encode_rims",
     "encode_scene",
+    "make_outputs",
     "points_of",
 ]
