@@ -1,6 +1,25 @@
 """What robots and planners ask of dressed people, besides meshes; nothing of it is computed unless it is asked for."""
 
+from refu_core.outputs._clearance import REACH, Clearance
+from refu_core.outputs._limbs import PRESSED, LimbContact, LimbContacts
 from refu_core.outputs._openings import Opening, Openings
 from refu_core.outputs._planner import HALF_THICKNESS, MAX_TRIANGLES, PlannerMesh
+from refu_core.outputs._visible import DepthImage, PinholeCamera, all_visible, depth_image, visible
 
-__all__ = ["HALF_THICKNESS", "MAX_TRIANGLES", "Opening", "Openings", "PlannerMesh"]
+__all__ = [
+    "HALF_THICKNESS",
+    "MAX_TRIANGLES",
+    "PRESSED",
+    "REACH",
+    "Clearance",
+    "DepthImage",
+    "LimbContact",
+    "LimbContacts",
+    "Opening",
+    "Openings",
+    "PinholeCamera",
+    "PlannerMesh",
+    "all_visible",
+    "depth_image",
+    "visible",
+]
