@@ -16,6 +16,7 @@ from msg_adapters.bags import (
     iter_smpl_frames,
     open_smpl_bag,
 )
+from msg_adapters.cameras import CAMERA_INFO, Camera, decode_camera_info
 from msg_adapters.definitions import MessageDefinition, message_definition
 from msg_adapters.diagnostics import DIAGNOSTIC_ARRAY, DiagnosticStatus, encode_diagnostics
 from msg_adapters.errors import (
@@ -94,6 +95,7 @@ from msg_adapters.transforms import (
 
 __all__ = [
     "BAG_SUFFIXES",
+    "CAMERA_INFO",
     "COLLISION_OBJECT",
     "DIAGNOSTIC_ARRAY",
     "IDS_LIST",
@@ -113,6 +115,7 @@ __all__ = [
     "BagMessage",
     "BagReader",
     "BagWriter",
+    "Camera",
     "DecodeError",
     "Decoder",
     "DiagnosticStatus",
@@ -141,6 +144,7 @@ __all__ = [
     "Transform",
     "TransformBuffer",
     "TransformError",
+    "decode_camera_info",
     "decode_ids",
     "decode_keypoints",
     "decode_marker_array",

@@ -12,6 +12,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 import msg_adapters as adapters
 from refu_core import FrameError, RefuError
 from refu_core.errors import printable
+from refu_core.outputs import PinholeCamera
 from refu_ros._decoding import InputDecoder
 from refu_ros._interfaces import interface, ros_qos
 
@@ -52,6 +53,7 @@ class Listener:
         self._tf = adapters.TransformBuffer()
         self._tf_asked_at: float | None = None
         self._is_warned = False
+        self._camera: adapters.Camera | None = None
 
     @property
     def _settings(self) -> NodeSettings:
@@ -92,6 +94,15 @@ class Listener:
             for person in self._settings.persons:
                 self._listen(person, f"{person}/smpl_params" if person else "smpl_params")
 
+        if self._settings.camera_info:
+            self._inputs["/camera"] = self._node.create_subscription(
+                interface(adapters.CAMERA_INFO),
+                self._settings.camera_info,
+                self._on_camera,
+                ros_qos(INPUT_QOS),
+                raw=True,
+            )
+
     def unsubscribe(self) -> None:
         """Listens no longer."""
         if self._inputs:
@@ -100,7 +111,7 @@ class Listener:
             self._node.destroy_subscription(subscription)
         self._inputs.clear()
         self._frames.clear()
-        self.since = self._tracked = self._tf_asked_at = None
+        self.since = self._tracked = self._tf_asked_at = self._camera = None
 
     def _listen(self, person: str, topic: str) -> None:
         full_name = self._node.resolve_topic_name(topic)
@@ -134,7 +145,7 @@ class Listener:
             return
         if doubt := self.decoder.doubt(frames.values()):
             node.get_logger().warning(f"{topic}: {doubt}")
-        self._compare_frames(topic, printable(given))
+        self.input_frame = printable(given) if self._need_transforms(topic, printable(given)) else ""
         for name, frame in frames.items():
             self._frames[name] = given
             if not self.decoder.is_steady:
@@ -153,12 +164,12 @@ class Listener:
         except adapters.TransformError as error:
             self._node.statistics.drop("transform", str(error))
             return
-        self.scene.put(person, frame, placement)
+        self.scene.put(person, frame, placement, self._camera_at(frame.stamp_ns))
 
     # Frames ---------------------------------------------------------------------------------------
 
     def _placement(self, given: str, stamp_ns: int) -> Placement | None:
-        """From the sender's frame to that of the messages; None where they are one, or nobody sends transforms.
+        """From a frame to that of the messages; None where they are one, or nobody sends transforms.
 
         Raises `TransformError` where there are transforms, but none of this frame at this time.
         """
@@ -177,6 +188,24 @@ class Listener:
             self._node.statistics.late_transform()
         return found
 
+    def _camera_at(self, stamp_ns: int) -> PinholeCamera | None:
+        """The camera, where it was; None where there is none, or no transform of it."""
+        camera = self._camera
+        if camera is None:
+            return None
+        try:
+            way = (self._placement(camera.frame_id, stamp_ns) or adapters.Placement()).inverse()
+        except adapters.TransformError as error:
+            self._node.statistics.skip("camera_without_transform")
+            self._node.get_logger().warning(f"camera: {error}", throttle_duration_sec=_LOG_PERIOD_S)
+            return None
+        numbers = camera.width, camera.height, camera.focal, camera.centre
+        return PinholeCamera(*numbers, way.rotation, way.translation)
+
+    def _on_camera(self, data: bytes) -> None:
+        self._camera = adapters.decode_camera_info(data)
+        self._need_transforms("the camera", self._camera.frame_id)
+
     @property
     def is_transformed(self) -> bool:
         """Whether anybody sends transforms."""
@@ -187,18 +216,18 @@ class Listener:
             self._is_warned = True
             self._node.get_logger().warning(f"{text}: set frame_id to the sender's frame if they are the same place")
 
-    def _compare_frames(self, topic: str, given: str) -> None:
-        """Asks for transforms as soon as a sender's frame isn't that of the messages."""
+    def _need_transforms(self, who: str, given: str) -> bool:
+        """Asks for transforms as soon as a frame isn't that of the messages; whether it isn't."""
         differs = given not in ("", self._settings.frame_id)
-        self.input_frame = given if differs else ""
         if differs and self._tf_asked_at is None:
             try:
                 self._listen_to_tf()
             except RefuError as error:
                 self._warn(
-                    f"{topic} is in the frame {given}, the garments are in {self._settings.frame_id}, and nothing is "
+                    f"{who} is in the frame {given}, the garments are in {self._settings.frame_id}, and nothing is "
                     f"transformed ({error})"
                 )
+        return differs
 
     def _listen_to_tf(self) -> None:
         kind = interface(adapters.TF_MESSAGE)

@@ -14,6 +14,7 @@ import msg_adapters as adapters
 from msg_adapters.outputs import GARMENTS, make_outputs
 from refu_core import RefuError
 from refu_core.errors import printable
+from refu_core.outputs import Fittings
 from refu_ros._bank import QOS, Bank
 from refu_ros._diagnostics import statuses
 from refu_ros._guard import GuardedNode, answer_no, transition
@@ -24,11 +25,10 @@ from refu_ros._parameters import declare_settings
 from refu_ros._recording import Recording
 from refu_ros._scene import Scene
 from refu_ros._settings import specs
-from refu_ros._worker import Worker, fittings_of
+from refu_ros._worker import Worker
 
 if TYPE_CHECKING:
     from refu_core import GarmentPipeline
-    from refu_core.outputs import Fittings
     from refu_ros._settings import PipelineKey
 
 NODE_NAME = "garment_node"
@@ -244,7 +244,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         return SetParametersResult(successful=True)
 
     def _take(self, pipeline: GarmentPipeline, key: PipelineKey) -> None:
-        self._pipeline, self._in_use, self._fittings = pipeline, key, fittings_of(pipeline)
+        self._pipeline, self._in_use, self._fittings = pipeline, key, Fittings(pipeline)
         self._listener.use(self.settings, pipeline.body)
         for text in pipeline.warnings:
             self.get_logger().warning(text)

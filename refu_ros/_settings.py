@@ -167,6 +167,11 @@ class NodeSettings:
     points_fields: tuple[str, ...] = _parameter(
         POINT_FIELDS, f"What the points have besides x, y and z: of {', '.join(POINT_FIELDS)}."
     )
+    camera_info: str = _parameter(
+        "",
+        "A camera's CameraInfo topic: points then say whether it sees them; empty for none.",
+        live=False,
+    )
     planner_rate: float = _parameter(
         5.0, "Meshes for planners: at most so many a second of each garment; 0 for no limit [Hz].", low=0.0, high=1000.0
     )

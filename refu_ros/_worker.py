@@ -85,7 +85,7 @@ class Worker:
         self._next_pipeline = self._pipeline = pipeline
         self._dressed: dict[str, _Known] = {}
         self._outputs = make_outputs() if outputs is None else outputs
-        self._fittings = fittings_of(pipeline)
+        self._fittings = Fittings(pipeline, weights=settings.weights or None)
         self._here: set[str] = set()
         self._is_lost = False
         self._stopping = threading.Event()
@@ -129,7 +129,7 @@ class Worker:
             self._pipeline = self._next_pipeline
             self._is_lost = False
             self._dressed.clear()
-            self._fittings = fittings_of(self._pipeline)
+            self._fittings = Fittings(self._pipeline, weights=settings.weights or None)
             for output in self._outputs:
                 output.forget()
         if settings.margin != self._pipeline.margin:
@@ -216,15 +216,14 @@ class Worker:
         axes = Placement(np.eye(3)[list(SMPL_COLUMNS[settings.axes])])
         worn = []
         for person, frame in frames.items():
-            there, known = arrivals[person].placement.after(axes), self._dressed[person].output
-            local = {name: mesh.local for name, mesh in known.items()}
+            arrival, output = arrivals[person], self._dressed[person].output
+            there = arrival.placement.after(axes)
             offset = there.rotation @ frame.transl + there.translation
-            made = person, frame.stamp_ns, local, known.posed_body, self._fittings, there.rotation, offset
-            worn.append(Dressed(*made))
+            worn.append(Dressed(person, frame, output, self._fittings, there.rotation, offset, arrival.camera))
         self._here.update(frames)
         moment = self._moment(settings)
-        for output in self._outputs:
-            self._publish(output.messages(worn, moment))
+        for row in self._outputs:
+            self._publish(row.messages(worn, moment))
 
     def _publish(self, messages: Iterable[tuple[str, bytes]]) -> None:
         try:
@@ -246,12 +245,6 @@ class Worker:
 
     def _moment(self, settings: NodeSettings) -> Moment:
         return Moment(settings, self._outlet.watchers, self._outlet.now_ns())
-
-
-def fittings_of(pipeline: GarmentPipeline) -> Fittings:
-    """Of what a pipeline dresses people in."""
-    body = pipeline.body
-    return Fittings(pipeline.garments, body.faces.cpu().numpy(), len(body.v_template))
 
 
 def _with_settings(frame: SmplFrame, settings: NodeSettings) -> SmplFrame:

@@ -35,12 +35,16 @@ class Obstacles:
         return [self.topic]
 
     def messages(self, worn: Sequence[Dressed], moment: Moment) -> Messages:
-        before, self._watchers = self._watchers, moment.watchers(self.topic)
-        if not self._watchers:
-            return
-        is_new = self._watchers > before
-        for one in worn:
-            if not (is_due(self._due, one.person, moment.wishes) or is_new):
+        before, watchers = self._watchers, moment.watchers(self.topic)
+        if watchers and not all(one.fittings.has_planner(name) for one in worn for name in one.fittings.names):
+            return  # soon
+        self._watchers = watchers
+        if watchers > before:
+            self._due.clear()
+            for sent in self._sent.values():
+                sent.update(dict.fromkeys(sent, b""))
+        for one in worn if watchers else ():
+            if not is_due(self._due, one.person, moment.wishes):
                 continue
             names = [garment_namespace(name, one.person) for name in one.fittings.names]
             sent = self._sent.setdefault(one.person, {})
@@ -48,8 +52,8 @@ class Obstacles:
                 del sent[name]
                 yield self.topic, self._remove(name, moment)
             for name, garment in zip(names, one.fittings.names, strict=True):
-                shape = one.local[garment].tobytes() + one.rotation.tobytes()
-                is_moved = sent.get(name) == shape and not is_new
+                shape = one.output[garment].local.tobytes() + one.rotation.tobytes()
+                is_moved = sent.get(name) == shape
                 sent[name] = shape
                 yield self.topic, self._put(one, name, garment, moment.wishes, is_moved=is_moved)
 

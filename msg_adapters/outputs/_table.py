@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from msg_adapters.diagnostics import DIAGNOSTIC_ARRAY, OK, DiagnosticStatus, encode_diagnostics
 from msg_adapters.markers import MARKER_ARRAY, MarkerArrayEncoder, MarkerMesh, encode_delete, garment_namespace
 from msg_adapters.outputs._meshes import MESH, encode_mesh
 from msg_adapters.outputs._obstacles import Obstacles
@@ -118,29 +119,40 @@ def _encode_tf(worn: Sequence[Dressed], wishes: Wishes, layouts: Layouts) -> byt
     return encode_frames([rim for one in worn for rim in _rims_of(one)], frame_id=wishes.frame_id)
 
 
-class Points:
-    """The one encoder that is laid out: a message of one person's garments."""
+class _Points:
+    """A message of one person's garments, laid out once."""
 
     def __init__(self) -> None:
         self._layouts = Layouts()
 
     def encode(self, one: Dressed, _: Any, wishes: Wishes) -> bytes:
-        fields = [
-            name for name in POINT_FIELDS if name in wishes.points_fields and name in ("normal", "vertex", "garment")
-        ]
+        fields = [name for name in POINT_FIELDS if name in wishes.points_fields and (name != "visible" or one.camera)]
         counts = tuple(len(points) for points in one.vertices.values())
         key = counts, wishes.frame_id, tuple(fields)
         encoder: PointCloudEncoder = self._layouts.get(
             key, lambda: PointCloudEncoder(counts, frame_id=wishes.frame_id, fields=fields)
         )
-        normals = [one.normals(name) for name in one.vertices] if "normal" in fields else None
+        ways: dict[str, Callable[[], Any]] = {"clearance": one.clearance, "sigma": one.sigma, "visible": one.visible}
         return encoder.encode(
             [*one.vertices.values()],
             stamp_ns=one.stamp_ns,
             offset=one.offset,
-            normals=normals,
-            values={},
+            normals=one.normals() if "normal" in fields else None,
+            values={name: make() for name, make in ways.items() if name in fields},
         )
+
+
+def _encode_contacts(one: Dressed, _: Any, wishes: Wishes) -> bytes:
+    """A status each two parts: geometry, from which no force follows."""
+    statuses = []
+    for contact in one.contacts():
+        x, y, z = one.turned(contact.centre) + one.offset
+        numbers = {"area [m2]": contact.area, "depth [m]": contact.depth, "mean depth [m]": contact.mean_depth}
+        numbers |= {"x [m]": x, "y [m]": y, "z [m]": z}
+        values = {name: f"{value:.6f}" for name, value in numbers.items()}
+        text = "cloth pressed between them, by geometry: not a force"
+        statuses.append(DiagnosticStatus(OK, " / ".join(contact.parts), text, one.person, values))
+    return encode_diagnostics(statuses, stamp_ns=one.stamp_ns, frame_id=wishes.frame_id)
 
 
 def _opening_places(fittings: Fittings) -> Iterator[tuple[str, tuple[str, int]]]:
@@ -175,7 +187,8 @@ def make_outputs(*, tf: bool = False) -> list[Output]:
         Together(BODY, MARKER_ARRAY, lambda one: [garment_namespace("body", one.person)], body, _delete_markers),
         Together(OPENINGS, MARKER_ARRAY, _rim_names, _encode_rims, _delete_markers),
         Together("scene", SCENE_UPDATE, _garment_names, _encode_scene, _delete_entities),
-        Apart(POINT_CLOUD, lambda _: [("points", None)], Points().encode),
+        Apart(POINT_CLOUD, lambda _: [("points", None)], _Points().encode),
+        Apart(DIAGNOSTIC_ARRAY, lambda _: [("contacts", None)], _encode_contacts),
         Apart(POLYGON, _opening_places, _encode_polygon),
         Apart(
             MESH, lambda fittings: [(f"mesh/{_token(name)}", name) for name in fittings.names], _encode_mesh, slow=True

@@ -138,7 +138,7 @@ class Apart:
         message_type: of the output.
         places: topics below the person's, each with what `encode` is told.
         encode: one message of one person.
-        slow: no more than `planner_rate` a second.
+        slow: of planners' meshes, what `encode` is told being the garment: no more than `planner_rate` a second.
     """
 
     message_type: str
@@ -158,8 +158,11 @@ class Apart:
         for one in worn:
             for place, what in self.places(one.fittings):
                 topic = _topic_of(one.person, place)
-                if moment.watchers(topic) and (not self.slow or is_due(self._due, topic, moment.wishes)):
+                if moment.watchers(topic) and (not self.slow or self._is_due(one, what, topic, moment)):
                     yield topic, self.encode(one, what, moment.wishes)
+
+    def _is_due(self, one: Dressed, garment: str, topic: str, moment: Moment) -> bool:
+        return one.fittings.has_planner(garment) and is_due(self._due, topic, moment.wishes)
 
     def gone(self, persons: Sequence[str], moment: Moment) -> Messages:  # noqa: ARG002
         return iter(())
