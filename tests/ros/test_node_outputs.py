@@ -19,13 +19,14 @@ from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
-from sensor_msgs.msg import CameraInfo, PointCloud2
+from sensor_msgs.msg import CameraInfo, JointState, PointCloud2
 from shape_msgs.msg import Mesh
 from std_msgs.msg import String
 from visualization_msgs.msg import MarkerArray
 
 from msg_adapters import (
     COLLISION_OBJECT,
+    IDS_LIST,
     SCENE_UPDATE,
     Transform,
     TransformBuffer,
@@ -36,6 +37,8 @@ from msg_adapters import (
     message_definition,
     points_of,
 )
+from msg_adapters.cdr import CdrWriter
+from msg_adapters.inputs._ros4hri import AXES
 from refu_core import GarmentPipeline, SmplFrame
 from refu_core.outputs import Openings
 from refu_ros import garment_node
@@ -375,3 +378,45 @@ def test_without_transforms_the_frame_is_warned_of(
     scene.peer.diagnostics.clear()
     scene.until(lambda: scene.peer.diagnostics, "the node says how it is")
     assert scene.peer.status("input")[2]["frame"] == "camera, shown as map"
+
+
+def test_who_is_tracked_is_followed(robot: Callable[..., Robot], foreign: Callable[..., Any]) -> None:
+    """REP-155: those on /humans/bodies/tracked, where somebody says so, and nobody else; in the frames of their bodies."""
+    kind = foreign(IDS_LIST, "tf2_msgs/msg/TFMessage")
+    people = Peer("ann", "bob", topic="/humans/bodies/{}/joint_states")
+    people.unwatch()
+    scene = robot(follow_humans=True, garments=[TSHIRT], person_timeout=30.0)
+    scene.hear("garments", MarkerArray, raw=True)
+    scene.until(lambda: people.listeners("ann") and people.listeners("bob"), "nobody says who is tracked")
+    tracked = people.node.create_publisher(kind, "/humans/bodies/tracked", 1)
+
+    def says(*ids: str) -> None:
+        writer = CdrWriter()
+        writer.header(0, "")
+        writer.strings(ids)
+        tracked.publish(writer.to_bytes())
+
+    def only_ann() -> bool:
+        says("ann", "eve")
+        return bool(people.listeners("ann")) and not people.listeners("bob")
+
+    scene.until(only_ann, "ann alone is tracked")
+    scene.until(lambda: scene.peer.node.count_publishers("ann/points"), "she has topics")
+    names = [f"{joint}_ann" for joint in AXES]
+    message = JointState(name=names, position=[0.0] * len(names))
+    message.header.stamp.sec = 5
+    moving = people.node.create_publisher(kind, "/tf", 10)
+    place = encode_transforms([Transform(5 * 10**9, "map", "body_ann", [4.0, 5.0, 1.0], [0, 0, 0, 1])])
+    people.fall_silent("bob")
+    sender = people.node.create_publisher(JointState, "/humans/bodies/ann/joint_states", 1)
+
+    def stands_there() -> bool:
+        moving.publish(place)
+        sender.publish(message)
+        came = [marker for data in scene.heard["garments"] for marker in decode_marker_array(data)]
+        return any(abs(marker.points.mean(0) - [4.0, 5.0, 1.25]).max() < 0.15 for marker in came if len(marker.points))
+
+    scene.until(stands_there, "she is dressed where tf has her body")
+    says()
+    scene.until(lambda: not people.listeners("ann"), "nobody is tracked")
+    people.close()
