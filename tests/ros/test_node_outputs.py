@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import gc
+import os
+import shutil
+import signal
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -13,8 +18,8 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy isn't installed (extra ros): the node isn't tested")
 
-from geometry_msgs.msg import PolygonStamped
-from harness import GARMENTS, Peer, frame, ros_arguments
+from geometry_msgs.msg import PolygonStamped, PoseStamped
+from harness import GARMENTS, PATIENCE_S, ROOT, Peer, frame, ros_arguments
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -39,7 +44,7 @@ from msg_adapters import (
 )
 from msg_adapters.cdr import CdrWriter
 from msg_adapters.inputs._ros4hri import AXES
-from refu_core import GarmentPipeline, SmplFrame
+from refu_core import GarmentPipeline, SmplFrame, load_garment
 from refu_core.outputs import Openings
 from refu_ros import garment_node
 from refu_ros._node import GarmentNode
@@ -381,7 +386,7 @@ def test_without_transforms_the_frame_is_warned_of(
 
 
 def test_who_is_tracked_is_followed(robot: Callable[..., Robot], foreign: Callable[..., Any]) -> None:
-    """REP-155: those on /humans/bodies/tracked, where somebody says so, and nobody else; in the frames of their bodies."""
+    """REP-155: those on /humans/bodies/tracked and nobody else, where somebody says so; in the frames of their bodies."""
     kind = foreign(IDS_LIST, "tf2_msgs/msg/TFMessage")
     people = Peer("ann", "bob", topic="/humans/bodies/{}/joint_states")
     people.unwatch()
@@ -420,3 +425,47 @@ def test_who_is_tracked_is_followed(robot: Callable[..., Robot], foreign: Callab
     says()
     scene.until(lambda: not people.listeners("ann"), "nobody is tracked")
     people.close()
+
+
+def test_the_example_in_python_hears_the_node(robot: Callable[..., Robot], tmp_path: Path) -> None:
+    scene = robot(garments=[TSHIRT])
+    scene.hear("gripper_target", PoseStamped)
+    log = tmp_path / "log.txt"
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{os.environ.get('PYTHONPATH', '')}"}
+    with log.open("wb") as file:
+        example = subprocess.Popen(
+            [sys.executable, str(ROOT / "examples" / "ros" / "sleeve_listener.py")],
+            env=environment,
+            stdout=file,
+            stderr=file,
+        )
+    try:
+
+        def came() -> bool:
+            assert example.poll() is None, log.read_text()
+            scene.peer.send(frame(1))
+            return bool(scene.heard["gripper_target"]) and "mm off the skin" in log.read_text()
+
+        scene.until(came, "the example says what it has heard")
+        example.send_signal(signal.SIGINT)
+        assert example.wait(timeout=PATIENCE_S) == 0, log.read_text()
+    finally:
+        example.kill()
+        example.wait()
+    target = scene.heard["gripper_target"][-1]
+    garment = load_garment(TSHIRT)
+    worn = GarmentPipeline.load([TSHIRT], backbone="skinned", sdf="none")(frame(1))[TSHIRT].vertices[:, [2, 0, 1]]
+    (sleeve,) = (one for one in Openings(garment).frames(worn) if one.name == "left_sleeve")
+    place = np.array([target.pose.position.x, target.pose.position.y, target.pose.position.z])
+    assert 0.1 < (place - sleeve.centre) @ sleeve.rotation[:, 2] < 0.2
+    q = target.pose.orientation
+    into = matrix_from_quaternion([q.x, q.y, q.z, q.w])[:, 2]
+    assert into @ sleeve.rotation[:, 2] < -0.9
+
+
+@pytest.mark.skipif(shutil.which("colcon") is None or shutil.which("ros2") is None, reason="there is no rclcpp here")
+def test_the_example_in_cpp_builds(tmp_path: Path) -> None:
+    source = ROOT / "examples" / "ros" / "refu_listener_cpp"
+    command = ["colcon", "build", "--paths", str(source)]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=PATIENCE_S)
+    assert done.returncode == 0, done.stdout + done.stderr
