@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import TYPE_CHECKING, Any
 
 from rclpy.event_handler import PublisherEventCallbacks
@@ -82,9 +83,6 @@ class Bank:
 
     def send(self, topic: str, data: bytes) -> None:
         """Publishes, where the topic still is."""
-        publisher = self._publishers.get(topic)
-        if publisher is not None:
-            try:
+        if (publisher := self._publishers.get(topic)) is not None:
+            with contextlib.suppress(InvalidHandle):
                 publisher.publish(data)
-            except InvalidHandle:
-                return

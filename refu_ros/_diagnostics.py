@@ -126,15 +126,14 @@ def _input(
         message = f"no input from {who}" if who else f"no input for {min(report.silent_for, listening_for):.1f} s"
     elif has_foreign_betas:
         level, message = WARN, FOREIGN_BETAS
+    way = "transformed to" if is_transformed else "shown as"
     values = {
         "subscribed": "no" if listening_for is None else "yes",
         "rate [Hz]": f"{report.rate('received'):.1f}",
         "received": str(report.total["received"]),
         "persons": ", ".join(filter(None, persons)) or str(len(persons)),
         "input type": settings.input_type,
-        "frame": f"{input_frame}, {'transformed to' if is_transformed else 'shown as'} {settings.frame_id}"
-        if input_frame
-        else settings.frame_id,
+        "frame": f"{input_frame}, {way} {settings.frame_id}" if input_frame else settings.frame_id,
         "late transforms": str(report.total["late_transform"]),
         "stamps that went back": str(report.total["back_in_time"]),
     }

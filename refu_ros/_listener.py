@@ -18,7 +18,6 @@ from refu_ros._interfaces import interface, ros_qos
 
 if TYPE_CHECKING:
     from msg_adapters import Placement
-    from refu_core import SmplBody
     from refu_ros._node import GarmentNode
     from refu_ros._scene import Scene
     from refu_ros._settings import NodeSettings
@@ -29,6 +28,7 @@ _TRACKED = "/humans/bodies/tracked"
 _LOG_PERIOD_S = 5.0
 _GRACE_S = 5.0
 """How long the inputs stay subscribed to when nobody is left: many a viewer is only restarted [s]."""
+_OVERRIDABLE = QoSOverridingOptions.with_default_policies()
 _TF_DEPTH = 100
 _FIRST_TF_S = 1.0
 """How long the first transform is waited for; then people are shown as if their frame were that of the messages [s]."""
@@ -52,7 +52,7 @@ class Listener:
         self._tracked: list[str] | None = None
         self._tf = adapters.TransformBuffer()
         self._tf_asked_at: float | None = None
-        self._is_warned = False
+        self._is_warned = self._is_refused = False
         self._camera: adapters.Camera | None = None
 
     @property
@@ -64,10 +64,6 @@ class Listener:
         """Everybody who may come, as far as that is known."""
         named = [*self._bodies()] if self._settings.follow_humans else self._settings.persons
         return [*dict.fromkeys([*named, *(self.scene.persons if self.scene is not None else ())])]
-
-    def use(self, settings: NodeSettings, body: SmplBody) -> None:
-        """Other settings or another body."""
-        self.decoder.use(settings, body)
 
     def attend(self, *, is_wanted: bool) -> None:
         """Listens while somebody wants what comes of it, and some seconds longer.
@@ -93,15 +89,9 @@ class Listener:
         else:
             for person in self._settings.persons:
                 self._listen(person, f"{person}/smpl_params" if person else "smpl_params")
-
-        if self._settings.camera_info:
-            self._inputs["/camera"] = self._node.create_subscription(
-                interface(adapters.CAMERA_INFO),
-                self._settings.camera_info,
-                self._on_camera,
-                ros_qos(INPUT_QOS),
-                raw=True,
-            )
+        if topic := self._settings.camera_info:
+            kind, qos = interface(adapters.CAMERA_INFO), ros_qos(INPUT_QOS)
+            self._inputs["/camera"] = self._node.create_subscription(kind, topic, self._on_camera, qos, raw=True)
 
     def unsubscribe(self) -> None:
         """Listens no longer."""
@@ -122,9 +112,7 @@ class Listener:
             lambda data: self._on_input(person, full_name, data),
             ros_qos(INPUT_QOS),
             # Overrides are parameters, which never go: only topics that don't come and go have them.
-            qos_overriding_options=None
-            if self._settings.follow_humans
-            else QoSOverridingOptions.with_default_policies(),
+            qos_overriding_options=None if self._settings.follow_humans else _OVERRIDABLE,
             raw=True,
         )
 
@@ -143,9 +131,10 @@ class Listener:
             node.statistics.drop("invalid", str(error))
             node.get_logger().warning(f"{topic}: {printable(error)}", throttle_duration_sec=_LOG_PERIOD_S)
             return
+        given = printable(given.lstrip("/"))
         if doubt := self.decoder.doubt(frames.values()):
             node.get_logger().warning(f"{topic}: {doubt}")
-        self.input_frame = printable(given) if self._need_transforms(topic, printable(given)) else ""
+        self.input_frame = given if self._need_transforms(topic, given) else ""
         for name, frame in frames.items():
             self._frames[name] = given
             if not self.decoder.is_steady:
@@ -180,7 +169,7 @@ class Listener:
             if time.monotonic() < self._tf_asked_at + _FIRST_TF_S:
                 msg = f"no transform has come yet, and the input is in {given}"
                 raise adapters.TransformError(msg)
-            self._warn(f"the input is in the frame {given}, the garments are in {target}, and nobody sends transforms")
+            self._warn(f"the input is in {given}, the garments are in {target}, and nobody sends transforms")
             return None
         tolerance = round(1e9 * self._settings.transform_tolerance)
         found = self._tf.lookup(target, given, stamp_ns, tolerance_ns=tolerance)
@@ -204,7 +193,7 @@ class Listener:
 
     def _on_camera(self, data: bytes) -> None:
         self._camera = adapters.decode_camera_info(data)
-        self._need_transforms("the camera", self._camera.frame_id)
+        self._need_transforms("the camera", self._camera.frame_id.lstrip("/"))
 
     @property
     def is_transformed(self) -> bool:
@@ -218,15 +207,14 @@ class Listener:
 
     def _need_transforms(self, who: str, given: str) -> bool:
         """Asks for transforms as soon as a frame isn't that of the messages; whether it isn't."""
-        differs = given not in ("", self._settings.frame_id)
-        if differs and self._tf_asked_at is None:
+        target = self._settings.frame_id
+        differs = given not in ("", target)
+        if differs and self._tf_asked_at is None and not self._is_refused:
             try:
                 self._listen_to_tf()
             except RefuError as error:
-                self._warn(
-                    f"{who} is in the frame {given}, the garments are in {self._settings.frame_id}, and nothing is "
-                    f"transformed ({error})"
-                )
+                self._is_refused = True
+                self._warn(f"{who} is in {given}, the garments are in {target}, nothing is transformed ({error})")
         return differs
 
     def _listen_to_tf(self) -> None:

@@ -236,7 +236,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         self.settings = settings
         self._attend()  # a recording may have begun
         if self._pipeline is not None:
-            self._listener.use(settings, self._pipeline.body)
+            self._listener.decoder.use(settings, self._pipeline.body)
         if self._worker is not None:
             self._worker.settings = settings
         if reload and self._loader is not None:
@@ -245,7 +245,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
 
     def _take(self, pipeline: GarmentPipeline, key: PipelineKey) -> None:
         self._pipeline, self._in_use, self._fittings = pipeline, key, Fittings(pipeline)
-        self._listener.use(self.settings, pipeline.body)
+        self._listener.decoder.use(self.settings, pipeline.body)
         for text in pipeline.warnings:
             self.get_logger().warning(text)
 
