@@ -30,6 +30,11 @@ class Camera:
     centre: tuple[float, float]
     """cx and cy [pixels]."""
 
+    @property
+    def numbers(self) -> tuple[int, int, tuple[float, float], tuple[float, float]]:
+        """All but its place."""
+        return self.width, self.height, self.focal, self.centre
+
 
 def decode_camera_info(data: Buffer) -> Camera:
     """The camera of a `sensor_msgs/CameraInfo` in CDR. Raises `DecodeError` for one that isn't calibrated."""

@@ -20,11 +20,9 @@ QOS = adapters.QosProfile(reliability="reliable", depth=5)
 
 
 class Bank:
-    """Publishers by topic. `hold` belongs to the executor's thread, what else there is to any.
+    """Publishers of a lifecycle node. `hold` belongs to the executor's thread, what else there is to any.
 
-    Args:
-        node: a lifecycle node.
-        on_match: called when somebody subscribes, or does so no longer.
+    `on_match` is called when somebody subscribes, or does so no longer.
     """
 
     def __init__(self, node: Any, on_match: Callable[[], object]) -> None:

@@ -153,7 +153,7 @@ class Listener:
         except adapters.TransformError as error:
             self._node.statistics.drop("transform", str(error))
             return
-        self.scene.put(person, frame, placement, self._camera_at(frame.stamp_ns))
+        self.scene.put(person, frame, placement, self._camera_at(person, frame.stamp_ns))
 
     # Frames ---------------------------------------------------------------------------------------
 
@@ -177,19 +177,20 @@ class Listener:
             self._node.statistics.late_transform()
         return found
 
-    def _camera_at(self, stamp_ns: int) -> PinholeCamera | None:
-        """The camera, where it was; None where there is none, or no transform of it."""
+    def _camera_at(self, person: str, stamp_ns: int) -> PinholeCamera | None:
+        """The camera, where it was as this person was seen; None where there is none, or no transform of it."""
         camera = self._camera
         if camera is None:
             return None
         try:
-            way = (self._placement(camera.frame_id, stamp_ns) or adapters.Placement()).inverse()
+            way = self._placement(camera.frame_id, stamp_ns)
         except adapters.TransformError as error:
             self._node.statistics.skip("camera_without_transform")
-            self._node.get_logger().warning(f"camera: {error}", throttle_duration_sec=_LOG_PERIOD_S)
             return None
-        numbers = camera.width, camera.height, camera.focal, camera.centre
-        return PinholeCamera(*numbers, way.rotation, way.translation)
+        if way is None and camera.frame_id not in (self._settings.frame_id, self._frames.get(person)):
+            return None
+        back = (way or adapters.Placement()).inverse()
+        return PinholeCamera(*camera.numbers, back.rotation, back.translation)
 
     def _on_camera(self, data: bytes) -> None:
         self._camera = adapters.decode_camera_info(data)

@@ -78,11 +78,7 @@ class Scene:
         self._closed = False
 
     def put(
-        self,
-        person: str,
-        frame: SmplFrame,
-        placement: Placement | None = None,
-        camera: PinholeCamera | None = None,
+        self, person: str, frame: SmplFrame, placement: Placement | None = None, camera: PinholeCamera | None = None
     ) -> None:
         """A person's new frame, where the sender's frame is (the messages' own if not given), and who looks."""
         now = self._clock()

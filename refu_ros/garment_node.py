@@ -22,8 +22,8 @@ topics:
   garments, body, openings                      out: visualization_msgs/MarkerArray
   <person>/points                               out: sensor_msgs/PointCloud2
   <person>/openings/<garment>/<opening>         out: geometry_msgs/PolygonStamped, and frames on /tf with publish_tf
-  <person>/mesh/<garment>                       out: shape_msgs/Mesh; collision_object, scene: for MoveIt, Foxglove
-  <person>/contacts                             out: diagnostic_msgs/DiagnosticArray
+  <person>/mesh/<garment>, <person>/contacts    out: shape_msgs/Mesh, diagnostic_msgs/DiagnosticArray
+  collision_object, scene                       out: for MoveIt and Foxglove
   /diagnostics  out: diagnostic_msgs/DiagnosticArray, once a second
 services:
   ~/record      std_srvs/SetBool: starts and stops a recording to the parameter record

@@ -386,7 +386,7 @@ def test_without_transforms_the_frame_is_warned_of(
 
 
 def test_who_is_tracked_is_followed(robot: Callable[..., Robot], foreign: Callable[..., Any]) -> None:
-    """REP-155: those on /humans/bodies/tracked and nobody else, where somebody says so; in the frames of their bodies."""
+    """REP-155: where somebody says who is tracked, nobody else; each in the frame of their body."""
     kind = foreign(IDS_LIST, "tf2_msgs/msg/TFMessage")
     people = Peer("ann", "bob", topic="/humans/bodies/{}/joint_states")
     people.unwatch()
