@@ -40,7 +40,7 @@ def decode_camera_info(data: Buffer) -> Camera:
     """The camera of a `sensor_msgs/CameraInfo` in CDR. Raises `DecodeError` for one that isn't calibrated."""
     reader = CdrReader(data)
     reader.stamp_ns()
-    frame_id = reader.string()
+    frame_id = reader.string().lstrip("/")
     height, width = reader.numbers("II")
     reader.string()
     reader.array("f8", reader.length(item_bytes=8))

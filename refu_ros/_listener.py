@@ -194,7 +194,7 @@ class Listener:
 
     def _on_camera(self, data: bytes) -> None:
         self._camera = adapters.decode_camera_info(data)
-        self._need_transforms("the camera", self._camera.frame_id.lstrip("/"))
+        self._need_transforms("the camera", self._camera.frame_id)
 
     @property
     def is_transformed(self) -> bool:

@@ -10,10 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from reference import deserialise, serialise, stamps, texts, typestore
+from reference import deserialise, header, serialise, stamps, texts, typestore
 from rosbags.typesys import get_types_from_msg
 
 from msg_adapters import (
+    CAMERA_INFO,
     COLLISION_OBJECT,
     IDS_LIST,
     MESH,
@@ -29,6 +30,7 @@ from msg_adapters import (
     Placement,
     PointCloudEncoder,
     Rim,
+    decode_camera_info,
     decode_ids,
     decode_marker_array,
     decode_point_cloud,
@@ -336,3 +338,24 @@ def test_quaternions_of_matrices(rotation: Any) -> None:
     quaternion = quaternion_from_matrix(rotation)
     assert quaternion[3] >= 0
     np.testing.assert_allclose(matrix_from_quaternion(quaternion), rotation, atol=1e-12)
+
+
+# Cameras ------------------------------------------------------------------------------------------
+
+
+@given(texts, st.integers(1, 5000), st.integers(1, 5000), st.floats(1, 1e4), st.lists(st.floats(-1, 1), max_size=8))
+def test_cameras(frame_id: str, width: int, height: int, focal: float, distortion: list[float]) -> None:
+    make = typestore().types
+    region = make["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+    k = np.array([focal, 0, 3.5, 0, 2 * focal, 2.5, 0, 0, 1])
+    numbers = np.array(distortion), k, np.eye(3).ravel(), np.zeros(12)
+    message = make[CAMERA_INFO](header(5, frame_id), height, width, "plumb_bob", *numbers, 0, 0, region)
+    camera = decode_camera_info(serialise(message, CAMERA_INFO))
+    assert camera == decode_camera_info(serialise(message, CAMERA_INFO, little_endian=False))
+    assert camera.numbers == (width, height, (focal, 2 * focal), (3.5, 2.5))
+    assert camera.frame_id == frame_id.lstrip("/")
+    k[0] = 0
+    with pytest.raises(DecodeError, match="isn't calibrated"):
+        decode_camera_info(serialise(message, CAMERA_INFO))
+    with pytest.raises(DecodeError):
+        decode_camera_info(serialise(message, CAMERA_INFO)[:-40])
