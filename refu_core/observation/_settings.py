@@ -14,14 +14,15 @@ class ObservationSettings:
 
     modes: int = 192
     """Smooth fields of the displacement along the normal."""
-    style: float = 0.5
-    """How far the style γ may be from what it is said to be [standard deviations, each]."""
-    shape: float = 0.2
+    style: float = 0.15
+    """How far the style γ may be from what it is said to be [standard deviations, each]. More than
+    this lets a displacement that isn't understood pass for a wider cut, which throws off what nobody sees."""
+    shape: float = 0.05
     """The same of β, as the garment follows it: the body itself stays as it is."""
     amplitude: float = 0.009
     """Standard deviation of that displacement [m]: the networks' errors along the normal."""
-    wave: float = 21.0
-    """Wave number up to which fields are as large as the widest [rad/m]: waves of 30 cm. Shorter ones are smaller by its
+    wave: float = 30.0
+    """Wave number up to which fields are as large as the widest [rad/m]: waves of 20 cm. Shorter ones are smaller by its
     square."""
     bound: float = 3.0
     """Each number stays within so many of its standard deviations, whatever is measured."""
