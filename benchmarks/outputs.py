@@ -1,4 +1,4 @@
-"""How true and how fast the outputs for robots are, on held-out simulated cloth (docs/guide/outputs.md has the figures).
+"""How true and how fast the outputs for robots are, on held-out simulated cloth; docs/guide/outputs.md has the figures.
 
     python benchmarks/outputs.py                  # all parts, some minutes
     python benchmarks/outputs.py openings times   # some of them
@@ -64,8 +64,10 @@ def openings() -> None:
             centre, turn = np.array(rows).T
             within = 100 * np.mean(centre <= 10)
             print(
-                f"openings   {garment:16} {name:13} centre {centre.mean():4.1f} mm (p95 {np.percentile(centre, 95):4.1f}; "
-                f"within 10 mm: {within:3.0f} %), normal {turn.mean():3.1f}° (p95 {np.percentile(turn, 95):3.1f}°)"
+                f"openings   {garment:16} {name:13} centre {centre.mean():4.1f} mm "
+                f"(p95 {np.percentile(centre, 95):4.1f}; "
+                f"within 10 mm: {within:3.0f} %), normal {turn.mean():3.1f}° "
+                f"(p95 {np.percentile(turn, 95):3.1f}°)"
             )
     steadiness()
 
@@ -162,7 +164,7 @@ def _follow(pipeline: GarmentPipeline, garment: str, moments: list[Moment], *, k
         out = pipeline(moment.frame)
         way = 0.4 if keeps else rng.uniform(-np.pi, np.pi)
         middle = moment.truth.mean(0)
-        eye = middle + [2 * np.sin(way), 0.5, 2 * np.cos(way)]
+        eye = middle + np.array([2 * np.sin(way), 0.5, 2 * np.cos(way)])
         camera = PinholeCamera.looking_at(middle, eye, width=320, height=240)
         skin = (out.skin, skin_faces)
         points = measured(depth_image([(moment.truth, faces), skin], camera).depth, camera, rng)

@@ -23,10 +23,14 @@ from refu_lab.held_out import coverage, held_out
 def main() -> None:
     """Fit, check, and write."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("bag", type=Path, help="SMPL parameters and /ground_truth, as bags/make_evaluation_bags.py writes")
+    parser.add_argument(
+        "bag", type=Path, help="SMPL parameters and /ground_truth, as bags/make_evaluation_bags.py writes"
+    )
     parser.add_argument("--garment", required=True)
     parser.add_argument("--weights", type=Path, help="folder of weights of one's own; those that ship by default")
-    parser.add_argument("--output", type=Path, help="folder that has or gets the garment's folder; --weights by default")
+    parser.add_argument(
+        "--output", type=Path, help="folder that has or gets the garment's folder; --weights by default"
+    )
     arguments = parser.parse_args()
     try:
         first, second = (held_out(arguments.bag, arguments.garment, half=i, weights=arguments.weights) for i in (0, 1))
@@ -40,7 +44,9 @@ def main() -> None:
         path = save_sigma(first.garment, found, card, folder=arguments.output or arguments.weights)
     except RefuError as error:
         parser.exit(2, f"{error}\n")
-    print(f"{path}: σ {1e3 * float(np.mean(found.sigma)):.1f} mm, the 90 % interval holds {100 * share:.1f} % of the rest")
+    print(
+        f"{path}: σ {1e3 * float(np.mean(found.sigma)):.1f} mm, the 90 % interval holds {100 * share:.1f} % of the rest"
+    )
 
 
 if __name__ == "__main__":

@@ -34,7 +34,11 @@ def match_kernel(
     if has_eye and wp.dot(n, eye - place) <= 0.0:
         return
     edges = rim[query.face]  # bit k: the edge from corner k to the next is on the boundary
-    if (edges & 1) != 0 and w < 1.0e-4 or (edges & 2) != 0 and query.u < 1.0e-4 or (edges & 4) != 0 and query.v < 1.0e-4:
+    if (
+        ((edges & 1) != 0 and w < 1.0e-4)
+        or ((edges & 2) != 0 and query.u < 1.0e-4)
+        or ((edges & 4) != 0 and query.v < 1.0e-4)
+    ):
         return
     nearer = wp.length(way) - slack
     if nearer > 0.0:

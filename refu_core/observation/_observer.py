@@ -86,9 +86,7 @@ class Observer:
             else:
                 cloth.estimate.reset()
 
-    def _adjusted(
-        self, dressed: Dressed, points: NDArray[np.float64], eye: NDArray[np.float64] | None
-    ) -> Dressed:
+    def _adjusted(self, dressed: Dressed, points: NDArray[np.float64], eye: NDArray[np.float64] | None) -> Dressed:
         turn = dressed.turns[0]
         seen = thinned(_to_root(turn, points).astype(np.float32), self._settings.most_points * len(self._cloths))
         camera = None if eye is None else _to_root(turn, eye[None])[0]

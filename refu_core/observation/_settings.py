@@ -22,8 +22,8 @@ class ObservationSettings:
     amplitude: float = 0.009
     """Standard deviation of that displacement [m]: the networks' errors along the normal."""
     wave: float = 30.0
-    """Wave number up to which fields are as large as the widest [rad/m]: waves of 20 cm. Shorter ones are smaller by its
-    square."""
+    """Wave number up to which fields are as large as the widest [rad/m]: waves of 20 cm. Shorter ones are smaller by
+    its square."""
     bound: float = 3.0
     """Each number stays within so many of its standard deviations, whatever is measured."""
     noise: float = 0.004

@@ -63,9 +63,7 @@ def beside(p: wp.vec3, parts: Parts, within: float, other: int, facing: wp.vec3,
                 u = query.u
                 v = query.v
                 w = 1.0 - u - v
-                normal = wp.normalize(
-                    wp.cross(parts.points[b] - parts.points[a], parts.points[c] - parts.points[a])
-                )
+                normal = wp.normalize(wp.cross(parts.points[b] - parts.points[a], parts.points[c] - parts.points[a]))
                 place = u * parts.points[a] + v * parts.points[b] + w * parts.points[c]
                 distance = wp.length(p - place)
                 if distance < found.distance and (other < 0 or wp.dot(normal, facing) < opposed):

@@ -7,6 +7,7 @@ from pathlib import Path
 import igl
 import numpy as np
 import pytest
+import torch
 
 from refu_core import FrameError, GarmentPipeline, SmplFrame
 from refu_core.observation import DEFAULT_OBSERVATION, Observer
@@ -55,7 +56,7 @@ def test_the_visible_error_is_a_third_less(
         observer.reset()
         plain = pipeline(moment.frame)
         middle, way = moment.truth.mean(0), rng.uniform(-np.pi, np.pi)
-        eye = middle + [2 * np.sin(way), 0.4, 2 * np.cos(way)]
+        eye = middle + np.array([2 * np.sin(way), 0.4, 2 * np.cos(way)])
         camera = PinholeCamera.looking_at(middle, eye, width=240, height=180)
         skin = (plain.skin, skin_faces)
         points = seen_by(camera, [(moment.truth, faces), skin], rng) + moment.frame.transl
@@ -69,7 +70,9 @@ def test_the_visible_error_is_a_third_less(
     assert np.mean(after) < 0.7 * np.mean(before)
 
 
-def test_without_points_it_is_the_prediction(pipeline: GarmentPipeline, observer: Observer, moments: list[Moment]) -> None:
+def test_without_points_it_is_the_prediction(
+    pipeline: GarmentPipeline, observer: Observer, moments: list[Moment]
+) -> None:
     observer.reset()
     plain, out = pipeline(moments[0].frame), observer(moments[0].frame)
     assert np.abs(out[NAME].local - plain[NAME].local).max() < 1e-5
@@ -87,21 +90,15 @@ def test_it_follows_whichever_way_the_person_faces(
         pose[0] = root
         turned = SmplFrame(pose=pose, betas=frame.betas, style=frame.style, transl=[1.0, 2.0, 3.0])
         still = SmplFrame(pose=np.concatenate((np.zeros((1, 3)), pose[1:])), betas=frame.betas, style=frame.style)
-        goal = pipeline(still)[NAME].local + [0, 0, 0.01]
+        goal = pipeline(still)[NAME].local + np.array([0, 0, 0.01])
         angle = root[1]
         spin = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
-        origin = pipeline.body.shape(_tensor(frame.betas)).joints[0, 0].numpy()
+        origin = pipeline.body.shape(torch.tensor(frame.betas)[None]).joints[0, 0].numpy()
         observer.reset()
         out = observer(turned, (goal - origin) @ spin.T + origin + turned.transl)
         found.append((out[NAME].local - origin) @ spin + origin)
     assert len(truth) == len(found[0])
     assert np.abs(found[0] - found[1]).max() < 5e-4
-
-
-def _tensor(betas: np.ndarray):
-    import torch
-
-    return torch.tensor(betas)[None]
 
 
 def test_points_inside_the_body_do_not_bring_cloth_into_it(pipeline: GarmentPipeline, observer: Observer) -> None:
@@ -122,10 +119,8 @@ def test_it_fades_and_stays_within_bounds(pipeline: GarmentPipeline, observer: O
     observer.reset()
     frame = SmplFrame(pose=np.zeros(72))
     plain = pipeline(frame)[NAME].local
-    wrong = plain + [0.0, 0.0, 0.03]
-    way = []
-    for _ in range(12):
-        way.append(np.abs(observer(frame, wrong)[NAME].local - plain).max())
+    wrong = plain + np.array([0.0, 0.0, 0.03])
+    way = [np.abs(observer(frame, wrong)[NAME].local - plain).max() for _ in range(12)]
     assert way[0] > 0.01
     assert max(way) < 0.1
     assert abs(way[-1] - way[-2]) < 1e-3  # it has come to rest
