@@ -5,16 +5,25 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from msg_adapters import INPUT_TYPES, KEYPOINT_TYPES, KeypointStream, decoder_for, frame_id_of
 from refu_core.keypoints import Proportions
 from refu_core.modes import FOREIGN_BETAS
+from refu_core.recordings import axis_of, upright_share
 from refu_ros._scene import check_plausible
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from numpy.typing import NDArray
+
     from refu_core import SmplBody, SmplFrame
     from refu_ros._settings import NodeSettings
+
+
+_LOOKED_AT = 100
+"""Frames that have come before people are said to lie."""
 
 
 class InputDecoder:
@@ -26,7 +35,8 @@ class InputDecoder:
         self._decoder = decoder_for(self._layout) if settings.input_type in INPUT_TYPES else None
         self._stream: KeypointStream | None = None
         self._body: SmplBody | None = None
-        self._is_doubted = False
+        self._is_doubted = self._lie = False
+        self._roots: list[NDArray[np.float32]] = []
 
     @property
     def is_steady(self) -> bool:
@@ -66,12 +76,32 @@ class InputDecoder:
         return self._is_doubted and not self._settings.betas_are_told
 
     def doubt(self, frames: Iterable[SmplFrame]) -> str:
-        """What is to be said of the betas of frames, once; keypoints' are measured on the body that is dressed."""
-        is_told = self._decoder is None or self._is_doubted or self._settings.betas_are_told
-        if is_told or not any(frame.betas.any() for frame in frames):
+        """What is to be said of frames, each thing once: nobody says whose the betas are, or people lie.
+
+        Keypoints' betas are measured on the body that is dressed, and their axes those of `frame_id`.
+        """
+        if self._decoder is None:
             return ""
-        self._is_doubted = True
-        return FOREIGN_BETAS
+        frames = [*frames]
+        if not (self._is_doubted or self._settings.betas_are_told) and any(frame.betas.any() for frame in frames):
+            self._is_doubted = True
+            return FOREIGN_BETAS
+        return "" if self._lie or self._settings.axes != "smpl" else self._doubt_of_axes(frames)
+
+    def _doubt_of_axes(self, frames: Iterable[SmplFrame]) -> str:
+        self._roots += [frame.pose[0] for frame in frames]
+        if len(self._roots) < _LOOKED_AT:
+            return ""
+        roots, self._roots = np.array(self._roots, np.float64), []
+        share, axis = upright_share(roots), axis_of(roots)
+        self._lie = share < 0.5  # as of a recording
+        if not self._lie:
+            return ""
+        along = f", and their heads are towards {axis}" if axis else ""
+        return (
+            f"people were upright in {100 * share:.0f} % of {len(roots)} frames{along}: input_axes is smpl (y up). "
+            "Where it isn't, set input_axes to frame, and frame_id to the sender's frame"
+        )
 
     def predicted(self, now_ns: int) -> dict[str, SmplFrame]:
         """Everybody who is followed, by now."""

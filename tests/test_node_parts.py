@@ -565,6 +565,19 @@ def test_betas_of_unknown_meaning_are_warned_of() -> None:
         assert NodeSettings().changed({"betas_source": source}).betas_are_told is (source != "message")
 
 
+@pytest.mark.parametrize(("root", "words"), [((0.0, 1.0, 0.0), ""), ((np.pi / 2, 0.0, 0.0), "towards +z")])
+def test_people_who_lie_are_warned_of_once(root: tuple[float, ...], words: str) -> None:
+    """Of a sender whose z is up, everybody lies; who turns round stands."""
+    decoder = InputDecoder(NodeSettings())
+    pose = np.zeros((24, 3), np.float32)
+    pose[0] = root
+    said = [doubt for _ in range(300) if (doubt := decoder.doubt([SmplFrame(pose)]))]
+    assert len(said) == bool(words)
+    assert words in "".join(said)
+    of_frame = InputDecoder(NodeSettings().changed({"input_axes": "frame"}))
+    assert not any(of_frame.doubt([SmplFrame(pose)]) for _ in range(300))
+
+
 @pytest.mark.parametrize("collider", [True, False])
 def test_the_collider_is_a_parameter_that_needs_another_pipeline(collider: bool) -> None:
     plain = NodeSettings().changed({"garments": ["short-pant-male"], "backbone": "skinned", "sdf": "none"})

@@ -100,15 +100,19 @@ class ContactStage:
         if self._limbs is not None:
             self._limbs.update(body)
 
-    def lift(self, name: str, vertices: Tensor, worn: Mapping[str, Worn]) -> tuple[Tensor, Tensor]:
-        """Vertices (V, 3) [m] on their own side of other limbs and off the `worn` inner garments.
+    def press(self, name: str, vertices: Tensor) -> Tensor:
+        """Vertices (V, 3) [m] on their own side of other limbs: between where they were and the skin they lie on."""
+        if name not in self._press:
+            return vertices
+        return self._press[name](vertices, self._outfit.below[name](self._body[None])[0])
 
-        Also how many were too near one of those, shape (1,).
-        """
-        if name in self._press:
-            lies_on = self._outfit.below[name](self._body[None])[0]
-            vertices = self._press[name](vertices, lies_on)
-        return self._off_layers(name, vertices, worn)
+    def lift(self, name: str, vertices: Tensor, worn: Mapping[str, Worn]) -> tuple[Tensor, Tensor]:
+        """Vertices (V, 3) [m] off the `worn` inner garments, and how many were too near one of those, shape (1,)."""
+        n_layered = torch.zeros(1, dtype=torch.int32, device=vertices.device)
+        for inner, garment in worn.items():
+            vertices, n_low = self._below[name][inner](vertices, garment.vertices)
+            n_layered = n_layered + n_low
+        return vertices, n_layered
 
     def resolve(
         self,
@@ -116,34 +120,26 @@ class ContactStage:
         vertices: Tensor,
         worn: Mapping[str, Worn],
         *,
-        raw: Tensor,
+        pressed: Tensor,
         on_mean: Tensor,
         margin: float,
         scale: float | VertexScale,
         n_layered: Tensor,
     ) -> Resolved:
-        """Vertices (V, 3) [m] off the body, which has the last word, and within reach of where they were, `raw`."""
+        """Vertices (V, 3) [m] off the body, which has the last word, and within reach of where limbs `pressed` them."""
         done, n_clipped = self._off_body(name, vertices, on_mean=on_mean, margin=margin, scale=scale)
         vertices, numbers = done.vertices, done.numbers
         if worn:
-            vertices, _ = self._off_layers(name, vertices, worn)
+            vertices, _ = self.lift(name, vertices, worn)
             again, _ = self._off_body(name, vertices, on_mean=on_mean, margin=self._kept * margin, scale=1.0)
-            vertices, numbers[_N_UNRESOLVED] = again.vertices, again.numbers[_N_UNRESOLVED]
-        if name in self._press or worn:  # what goes several ways
-            away = vertices - raw
+            away = again.vertices - pressed  # each step goes no farther than that; together they may
             length = torch.linalg.vector_norm(away, dim=1, keepdim=True)
-            vertices = torch.where(length > self._farthest, raw + self._farthest / length * away, vertices)
+            bounded = pressed + self._farthest / length * away
+            vertices = torch.where(length > self._farthest, bounded, again.vertices)
+            numbers[_N_UNRESOLVED] = again.numbers[_N_UNRESOLVED]
         if self.winding is not None:
             numbers[_N_UNRESOLVED] = torch.count_nonzero(self.winding(vertices))
         return Resolved(vertices, torch.cat((numbers, n_layered)), n_clipped)
-
-    def _off_layers(self, name: str, vertices: Tensor, worn: Mapping[str, Worn]) -> tuple[Tensor, Tensor]:
-        """Off the inner garments, and how many were too near one of those, shape (1,)."""
-        n_layered = torch.zeros(1, dtype=torch.int32, device=vertices.device)
-        for inner, garment in worn.items():
-            vertices, n_low = self._below[name][inner](vertices, garment.vertices)
-            n_layered = n_layered + n_low
-        return vertices, n_layered
 
     def _off_body(
         self, name: str, vertices: Tensor, *, on_mean: Tensor, margin: float, scale: float | VertexScale

@@ -114,14 +114,15 @@ class FrameStep:
                 raw = vertices = drape.vertices[person]
                 numbers, n_clipped = raw.new_zeros(N_NUMBERS), raw.new_zeros(())
                 if self.contact is not None:
-                    vertices, n_layered = self.contact.lift(name, raw, garments)
+                    pressed = self.contact.press(name, raw)
+                    vertices, n_layered = self.contact.lift(name, pressed, garments)
                     if len(self._order) > 1:
                         clock.lap("layers", name)
                     vertices, numbers, n_clipped = self.contact.resolve(
                         name,
                         vertices,
                         garments,
-                        raw=raw,
+                        pressed=pressed,
                         on_mean=drape.on_mean[person],
                         margin=margin_of[name],
                         scale=scale_of(self._outfit.wearables[name], drape, person),

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from refu_core.frames import SmplFrame
     from refu_core.realtime import GarmentMesh, GarmentPipeline, PipelineOutput
     from refu_lab.stress._subject import Subject
 
@@ -81,7 +82,7 @@ def buried(subject: Subject, trial: Trial) -> Iterator[Measurement]:
                 name,
                 points,
                 {},
-                raw=points,
+                pressed=points,
                 on_mean=drape.on_mean[0],
                 margin=skinned[name].margin,
                 scale=1.0,
@@ -101,18 +102,20 @@ def not_thrown(subject: Subject, trial: Trial) -> Iterator[Measurement]:
         moved = np.linalg.norm(mesh.local - mesh.raw, axis=1)
         lack = np.maximum(DEFAULT_MARGIN - sdf.query(torch.from_numpy(mesh.raw)).distance.numpy(), 0)
         near = _largest_near(lack, pipeline.garments[name].edges.numpy())
-        limit = np.minimum(MAX_DISPLACEMENT, MULTIPLE * (near + DEFAULT_MARGIN))
+        limit = (
+            np.minimum(MAX_DISPLACEMENT, MULTIPLE * (near + DEFAULT_MARGIN)) + _pressed(subject, trial.frames[0])[name]
+        )
         yield _finite(out)
         yield _farthest(moved, limit + _BOUND_SLACK)
 
 
 def bounded(subject: Subject, trial: Trial) -> Iterator[Measurement]:
-    """The largest displacement against `MAX_DISPLACEMENT`, whatever the frame."""
+    """The largest displacement, from where limbs press the cloth, against `MAX_DISPLACEMENT`, whatever the frame."""
     for name, pipeline in subject.one_by_one.items():
         (out,) = pipeline(trial.frames)
         moved = np.linalg.norm(out[name].local - out[name].raw, axis=1)
         yield _finite(out)
-        yield _farthest(moved, np.full(len(moved), MAX_DISPLACEMENT + _BOUND_SLACK))
+        yield _farthest(moved, _pressed(subject, trial.frames[0])[name] + MAX_DISPLACEMENT + _BOUND_SLACK)
 
 
 def no_jumps(subject: Subject, trial: Trial) -> Iterator[Measurement]:
@@ -146,12 +149,27 @@ def _jumps(subject: Subject, pipeline: GarmentPipeline, trial: Trial) -> Iterato
 
 def bounded_jumps(subject: Subject, trial: Trial) -> Iterator[Measurement]:
     """As limbs go through each other: from one bound of the displacement to the other, and no farther."""
-    for last, out in _pairs(subject.pipeline, trial):
+    before: dict[str, NDArray[np.floating]] = {}
+    for frame, (last, out) in zip(trial.frames, _pairs(subject.pipeline, trial), strict=True):
         yield _finite(out)
+        pressed = _pressed(subject, frame)
         for name, mesh in out.items() if last is not None else ():
-            limit = PACE * float(np.linalg.norm(out.body - last.body, axis=1).max()) + 2 * MAX_DISPLACEMENT
+            pace = PACE * float(np.linalg.norm(out.body - last.body, axis=1).max())
             way = np.linalg.norm(mesh.local - last[name].local, axis=1)
-            yield _farthest(way, np.full(len(way), limit))
+            yield _farthest(way, pace + 2 * MAX_DISPLACEMENT + before[name] + pressed[name])
+        before = pressed
+
+
+def _pressed(subject: Subject, frame: SmplFrame) -> dict[str, NDArray[np.floating]]:
+    """How far limbs press the vertices of each garment towards the skin that it lies on [m], (N,)."""
+    stage, outfit = subject.contact_stage, subject.pipeline.outfit
+    pose, betas = torch.tensor(frame.pose)[None], torch.tensor(frame.betas)[None]
+    style = None if frame.style is None else torch.tensor(frame.style)[None]
+    with torch.no_grad():
+        dressed = dress(pose, Wearer.of(outfit, betas, style))
+        stage.update(dressed.body[0])
+        ways = {name: stage.press(name, one.vertices[0]) - one.vertices[0] for name, one in dressed.drapes.items()}
+    return {name: np.linalg.norm(way.numpy(), axis=1) for name, way in ways.items()}
 
 
 def _pairs(pipeline: GarmentPipeline, trial: Trial) -> Iterator[tuple[Any, PipelineOutput]]:

@@ -24,7 +24,7 @@ def test_hostile_peers_do_not_end_it(ros: None, tmp_path: Path) -> None:  # noqa
     with NodeProcess(tmp_path / "log.txt", **CHEAP, use_sim_time=True) as node:
         peers = HostilePeers(tmp_path, seed=0)
         peers.wait()
-        peers.attack(tries=2000, alive=lambda: node.process.poll() is None)
+        peers.attack(tries=500, alive=lambda: node.process.poll() is None)
         peers.recover(alive=lambda: node.process.poll() is None)
         peers.close()
         assert not peers.result.problems, (peers.result, node.log)
