@@ -17,7 +17,7 @@ import numpy as np
 
 from refu_core import RefuError
 from refu_core.outputs import fit_sigma, save_sigma
-from refu_lab.held_out import coverage, halves, held_out
+from refu_lab.held_out import coverage, held_out
 
 
 def main() -> None:
@@ -33,16 +33,15 @@ def main() -> None:
     )
     arguments = parser.parse_args()
     try:
-        samples = held_out(arguments.bag, arguments.garment, weights=arguments.weights)
-        first, second = halves(samples)
-        found = fit_sigma(samples.garment, first.errors, first.poses)
-        share = coverage(samples.garment, found, second)
+        first, second = (held_out(arguments.bag, arguments.garment, half=i, weights=arguments.weights) for i in (0, 1))
+        found = fit_sigma(first.garment, first.errors, first.poses)
+        share = coverage(found, second)
         card = {
             "fitted_on": f"{arguments.bag.name}: {len(first.poses)} samples, every other style-shape pair",
             "checked_on": f"the other {len(second.poses)} samples",
             "coverage_90": round(share, 4),
         }
-        path = save_sigma(samples.garment, found, card, folder=arguments.output or arguments.weights)
+        path = save_sigma(first.garment, found, card, folder=arguments.output or arguments.weights)
     except RefuError as error:
         parser.exit(2, f"{error}\n")
     print(

@@ -30,6 +30,7 @@ CORE = (
     {"contact"},
     {"realtime"},
     {"outputs"},
+    {"observation"},
     {"metrics"},
     {"simulation"},
     {"training"},

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from refu_core.garments import GarmentTemplate
 
 HALF_THICKNESS = 0.005
-"""How far either side of the solid is from the middle of the cloth [m]: about as far as the coarse cloth may be from the
-garment, which so lies within the solid nearly everywhere."""
+"""How far either side of the solid is from the middle of the cloth [m]: about as far as the coarse cloth may be from
+the garment, which so lies within the solid nearly everywhere."""
 MAX_TRIANGLES = 2000
 _LEAST_TRIANGLES = 100
 _VERSION = 1

@@ -24,8 +24,10 @@ _LEAST_ARC = 0.15
 that is open in front."""
 _WINDOW = 0.05
 """Length over which the direction of a rim is averaged [m]: boundaries of outside meshes are stairs."""
-_STEEP = 0.5
-"""Upward part of a rim's direction from which on it is an upper one: the sine of 30 degrees."""
+_LOW = -0.5
+"""Upward part of the way out of the cloth below which a rim is a lower one: the sine of 30 degrees."""
+_UPRIGHT = 0.8
+"""Upward part of a rim's own direction above which it is the edge of a front: a neckline is less steep."""
 _TOP, _SIDE, _BOTTOM = 1, 0, -1
 _UPPER = (*joints_of("head"), 9, 13, 14)
 """Joints of what is above the chest, without the arms."""
@@ -118,8 +120,9 @@ def _parts(
     place = np.cumsum(length) - 0.5 * length
     gap = np.abs(place[:, None] - place)
     near = np.minimum(gap, length.sum() - gap) <= 0.5 * _WINDOW
-    up = (near * length) @ out[:, 1] / (near @ length)
-    kind = np.where(up > _STEEP, _TOP, np.where(up < -_STEEP, _BOTTOM, _SIDE))
+    mean = near * length / (near @ length)[:, None]
+    up, upright = mean @ out[:, 1], mean @ np.abs(along[:, 1])
+    kind = np.where(up < _LOW, _BOTTOM, np.where(upright > _UPRIGHT, _SIDE, _TOP))
     top, bottom = (_longest_run(kind == which, length) for which in (_TOP, _BOTTOM))
     if min(length[top].sum(), length[bottom].sum()) < _LEAST_ARC:
         return [(loop, inner, False)]

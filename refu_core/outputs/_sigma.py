@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from refu_core.realtime import GarmentPipeline, PipelineOutput
 
 UNKNOWN_SIGMA = 0.03
-"""Of every vertex of a garment whose network has no `sigma` file, or that has none and follows the skin [m]. Followed by
-the skin alone, the T-shirt, the shirt, and the shorts are off by 24 to 27 mm a standard deviation, the skirt by 43."""
+"""Of every vertex of a garment whose network has no `sigma` file, or that has none and follows the skin [m]. By the
+skin alone, the T-shirt, the shirt, and the shorts are off by 24 to 27 mm a standard deviation, the skirt by 43."""
 RADIUS_90 = 2.5003
 """A ball of so many σ around a vertex holds the true one in 90 % of cases: the quantile of χ with three degrees."""
 REGIONS = 3

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from refu_core.mesh import Connectivity
 
 _EVEN = 0.1
-"""How far a triangle's plane may be missed for an edge of length 1: cloth folds elsewhere in each pose, so triangles are
-to be of one size, and only sharp shapes are worth small ones."""
+"""How far a triangle's plane may be missed for an edge of length 1: cloth folds elsewhere in each pose, so triangles
+are to be of one size, and only sharp shapes are worth small ones."""
 _RIM = 3.0
 """How much more a boundary's line counts than a plane as far off."""
 _LEAST_COSINE = 0.3

@@ -198,13 +198,13 @@ def _draw(meshes: Sequence[Mesh], camera: PinholeCamera) -> _Drawn:
     ends = np.cumsum([len(own) for own in points])
     starts = [0, *ends[:-1].tolist()]
     # About the camera, in float64: a person may be far from the origin.
-    every = (np.concatenate(points) - camera.eye).astype(np.float32)
+    there = (np.concatenate(points) - camera.eye) @ camera.rotation.T
+    depth = there[:, 2]
+    there[:, :2] *= np.array(camera.focal) / np.maximum(depth, 1e-6)[:, None]
+    there[:, :2] += camera.centre
     corners = np.concatenate([own + np.int32(start) for own, start in zip(checked, starts, strict=True)])
     faces = wp.array(corners, dtype=wp.int32, device="cpu", copy=False)
-    seen = wp.empty(len(every), dtype=wp.vec3, device="cpu")
-    where = wp.array(every, dtype=wp.vec3, device="cpu", copy=False)
-    view = [wp.mat33(camera.rotation.ravel().tolist()), wp.vec3(), wp.vec2(*camera.focal), wp.vec2(*camera.centre)]
-    wp.launch(kernels.project_kernel, len(every), [where, *view], [seen], device="cpu")
+    seen = wp.array(there.astype(np.float32), dtype=wp.vec3, device="cpu", copy=False)
     buffer = wp.full((camera.height, camera.width), np.iinfo(np.int64).max, dtype=wp.int64, device="cpu")
     wp.launch(kernels.raster_kernel, len(corners), [seen, faces, NEAR], [buffer], device="cpu")
     return _Drawn(seen, faces, buffer, ends, np.cumsum([len(own) for own in checked]))

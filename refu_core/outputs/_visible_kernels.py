@@ -13,23 +13,6 @@ def edge(a: wp.vec2, b: wp.vec2, x: float, y: float) -> float:
 
 
 @wp.kernel(enable_backward=False)
-def project_kernel(
-    points: wp.array[wp.vec3],
-    rotation: wp.mat33,
-    shift: wp.vec3,
-    focal: wp.vec2,
-    centre: wp.vec2,
-    # output
-    seen: wp.array[wp.vec3],
-) -> None:
-    """Column and row [pixels] and depth [m]."""
-    i = wp.tid()
-    p = rotation * points[i] + shift
-    z = wp.max(p[2], 1.0e-6)
-    seen[i] = wp.vec3(focal[0] * p[0] / z + centre[0], focal[1] * p[1] / z + centre[1], p[2])
-
-
-@wp.kernel(enable_backward=False)
 def raster_kernel(
     seen: wp.array[wp.vec3],
     faces: wp.array2d[wp.int32],
@@ -37,7 +20,7 @@ def raster_kernel(
     # output
     buffer: wp.array2d[wp.int64],
 ) -> None:
-    """The nearest triangle and its depth at the middle of each pixel."""
+    """The nearest triangle and its depth at the middle of each pixel; vertices are column, row and depth [m]."""
     f = wp.tid()
     a, b, c = seen[faces[f, 0]], seen[faces[f, 1]], seen[faces[f, 2]]
     if wp.min(a[2], wp.min(b[2], c[2])) < near:
