@@ -28,7 +28,7 @@ class Bank:
     def __init__(self, node: Any, on_match: Callable[[], object]) -> None:
         self._node, self._on_match = node, on_match
         self._publishers: dict[str, Any] = {}
-        self._refused: dict[str, str] = {}
+        self._refused: set[str] = set()
 
     def hold(self, wanted: Mapping[str, str], *, lasting: bool = False) -> None:
         """Has publishers of these topics, by message type, and no others but those that were `lasting`.
@@ -36,14 +36,13 @@ class Bank:
         Only those have overrides of their QoS: they are parameters, which never go. A type whose package isn't there is
         left out, and said once.
         """
-        missing = {topic: kind for topic, kind in wanted.items() if topic not in self._publishers}
-        for topic, kind in missing.items():
-            if kind in self._refused:
+        for topic, kind in wanted.items():
+            if topic in self._publishers or kind in self._refused:
                 continue
             try:
                 message_class = interface(kind)
             except RefuError as error:
-                self._refused[kind] = str(error)
+                self._refused.add(kind)
                 self._node.get_logger().info(f"no {topic}: {error}")
                 continue
             self._publishers[topic] = self._make(message_class, topic, lasting=lasting)

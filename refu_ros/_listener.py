@@ -90,8 +90,8 @@ class Listener:
             for person in self._settings.persons:
                 self._listen(person, f"{person}/smpl_params" if person else "smpl_params")
         if topic := self._settings.camera_info:
-            kind, qos = interface(adapters.CAMERA_INFO), ros_qos(INPUT_QOS)
-            self._inputs["/camera"] = self._node.create_subscription(kind, topic, self._on_camera, qos, raw=True)
+            given = interface(adapters.CAMERA_INFO), topic, self._on_camera, ros_qos(INPUT_QOS)
+            self._inputs["/camera"] = self._node.create_subscription(*given, raw=True)
 
     def unsubscribe(self) -> None:
         """Listens no longer."""
@@ -179,12 +179,11 @@ class Listener:
 
     def _camera_at(self, person: str, stamp_ns: int) -> PinholeCamera | None:
         """The camera, where it was as this person was seen; None where there is none, or no transform of it."""
-        camera = self._camera
-        if camera is None:
+        if (camera := self._camera) is None:
             return None
         try:
             way = self._placement(camera.frame_id, stamp_ns)
-        except adapters.TransformError as error:
+        except adapters.TransformError:
             self._node.statistics.skip("camera_without_transform")
             return None
         if way is None and camera.frame_id not in (self._settings.frame_id, self._frames.get(person)):
