@@ -50,9 +50,11 @@ class DressedBag:
         self._source = source
         self._skipped = 0
         self._settings = {"sdf": str(options.sdf), "backbone": str(options.backbone)}
-        self._writer = adapters.BagWriter(options.output, overwrite=options.overwrite)
+        self._writer = adapters.BagWriter(options.output, overwrite=options.overwrite, in_background=True)
         given = None if source.bag is None else source.bag.topic
-        own = {} if given is None else {"definition": given.definition, "type_hash": given.type_hash}
+        own = {}
+        if given is not None:
+            own = {"definition": given.definition, "type_hash": given.type_hash, "betas_of": given.betas_of}
         self._writer.add_topic(source.topic, source.message_type, **own)
         self._writer.add_topic(GARMENTS_TOPIC, adapters.MARKER_ARRAY)
         self._writer.add_topic(DIAGNOSTICS_TOPIC, adapters.DIAGNOSTIC_ARRAY)

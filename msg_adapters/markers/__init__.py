@@ -9,6 +9,7 @@ from msg_adapters.markers._encoder import (
     encode_delete,
     encode_delete_all,
     encode_points,
+    encode_strips,
 )
 from msg_adapters.markers._mesh import SKIN, MarkerMesh, garment_namespace
 
@@ -24,6 +25,7 @@ __all__ = [
     "encode_delete",
     "encode_delete_all",
     "encode_points",
+    "encode_strips",
     "garment_namespace",
     "vertices_from_points",
 ]

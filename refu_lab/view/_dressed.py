@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from refu_core import SmplFrame
     from refu_core.realtime import PipelineOutput
     from refu_lab.replay import ReplayOptions
+    from refu_lab.sources import Source
 
 _AWAY_S = 0.25
 """Somebody whose nearest frame is farther off in time isn't there [s]."""
@@ -70,8 +71,6 @@ class DressedFilm:
         first = self._tracks[0]
         self._origin = first.turn @ first.frames[0].transl
         self._cache, self._facts = Cache(), dict[int, list[str]]()
-        if any(frame.betas.any() for track in self._tracks for frame in track.frames[:1]):
-            self.notes += betas_warnings(self._pipeline, source=options.betas_source)
         self.title = ", ".join(path.name for path in inputs)
 
     @property
@@ -173,18 +172,13 @@ class DressedFilm:
 
     def _frames(self, options: ReplayOptions) -> list[SmplFrame]:
         """In the order of their stamps, one at least."""
-        frames: list[SmplFrame] = []
-        n_bad = 0
         with open_source(options, self._pipeline.body) as source:
-            for record in source.records:
-                try:
-                    if record.error is not None:
-                        raise record.error
-                    frame = replace(source.decoder.from_bytes(record.raw), stamp_ns=record.stamp_ns)
-                except adapters.DecodeError:
-                    n_bad += 1
-                    continue
-                frames.append(frame if options.betas is None else replace(frame, betas=np.array(options.betas)))
+            found = [_frame_of(source, record, options) for record in source.records]
+            frames = [frame for frame in found if frame is not None]
+            n_bad = len(found) - len(frames)
+            is_told = options.betas is not None or source.betas_are_known
+            if not is_told and any(frame.betas.any() for frame in frames):
+                self.notes += betas_warnings(self._pipeline, source=options.betas_source)
             self.notes += source.warnings + body_warnings(self._pipeline, gender=source.gender)
         if n_bad:
             self.notes.append(f"{options.input}: {n_bad} messages are no frame and are left out")
@@ -192,6 +186,13 @@ class DressedFilm:
             msg = f"{options.input}: no frame that can be shown"
             raise RefuError(msg)
         return sorted(frames, key=lambda frame: frame.stamp_ns)
+
+
+def _frame_of(source: Source, record: adapters.FrameRecord, options: ReplayOptions) -> SmplFrame | None:
+    try:
+        return source.frame_of(record, options.betas)
+    except adapters.DecodeError:
+        return None
 
 
 def _different(names: Sequence[str]) -> list[str]:
