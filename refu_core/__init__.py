@@ -2,8 +2,9 @@
 
 Start with `GarmentPipeline.load(["tshirt-male"])` and call it with a `SmplFrame`. The parts can be used alone, each
 from the package it is in: `keypoints` and `recordings` (what comes in), `body`, `garments`, `backbones`, `sdf`, `refu`
-(the paper's layer), `contact` (what brings a garment off the body), `realtime`, `metrics`, `simulation`, `training`.
-The names most often needed are here, too.
+(the paper's layer), `contact` (what brings a garment off the body), `realtime`, `outputs` (what robots ask of dressed
+people), `observation` (fitting to a camera's points), `metrics`, `simulation`, `training`. The names most often needed
+are here, too.
 
 Most names are imported when they are first used: code that needs `SmplFrame` alone doesn't wait for torch and warp.
 """

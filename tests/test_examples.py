@@ -91,3 +91,25 @@ def test_export_glb(run, tmp_path: Path) -> None:
     assert set(scene.geometry) == {"body", "tshirt-male", "short-pant-male"}
     assert len(scene.geometry["body"].faces) == len(load_body("male").faces)
     assert scene.extents == pytest.approx([1.0, 1.7, 0.4], abs=0.4)
+
+
+def test_robot_outputs(run) -> None:
+    said = run("robot_outputs")
+    for name in ("waist", "left_leg", "right_leg"):
+        assert f"{name}: at " in said
+    assert numbers(r"nearest to the skin: (\S+) mm", said)[0] > 0
+    assert "between ('trunk', 'left_thigh')" in said
+    assert numbers(r"planner: (\d+) triangles", said)[0] <= 2000
+    seen, sigma = numbers(r"seen: (\d+)%; sigma (\S+) mm", said)
+    assert 10 < seen < 80
+    assert 5 < sigma < 30
+
+
+def test_follow_camera(run) -> None:
+    said = re.findall(r"(\d+) points, (\S+) mm → (\S+) mm, (\d+) inside", run("follow_camera"))
+    frames = [[float(number) for number in row] for row in said]
+    assert len(frames) == 4
+    for points, before, after, inside in frames:
+        assert points > 100
+        assert after < 0.7 * before
+        assert inside == 0

@@ -13,7 +13,7 @@ from outside_meshes import Outside, quads_of_a_skirt, write_obj
 ROOT = Path(__file__).parents[1]
 
 
-@pytest.mark.parametrize("page", ["python", "garments"])
+@pytest.mark.parametrize("page", ["python", "garments", "outputs"])
 def test_a_pages_python_runs(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     text = (ROOT / "docs" / "guide" / f"{page}.md").read_text(encoding="utf-8")
     blocks = re.findall(r"^```python\n(.*?)^```$", text, flags=re.DOTALL | re.MULTILINE)
@@ -29,6 +29,9 @@ def test_a_pages_python_runs(page: str, tmp_path: Path, monkeypatch: pytest.Monk
         assert names["pose"].shape == (1, 24, 3)
         assert float(names["sdf"].query(names["done"].vertices).distance.min()) > 0
         assert (tmp_path / "person.glb").stat().st_size > 100_000
+    elif page == "outputs":
+        assert np.abs(names["out"]["short-pant-male"].vertices - names["mesh"].vertices).max() < 0.002
+        assert names["openings"].names == ("waist", "left_leg", "right_leg")
     else:
         assert names["pipeline"].untrained == ("kilt", "tshirt-female")
         assert (tmp_path / "kilt.npz").exists()

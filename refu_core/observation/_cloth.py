@@ -114,7 +114,9 @@ class ObservedCloth:
         along = np.einsum("mi,mkij->mkj", found.normal, blend[corner], optimize=True) * found.weight[:, :, None]
         cut = np.einsum("mkj,mkjc->mc", along, self._cut[corner], optimize=True)
         lift = (along * self._out[corner]).sum(2)
-        fields = (lift[:, :, None] * self._fields[corner]).sum(1)
+        fields = np.zeros((len(corner), self._fields.shape[1]), np.float32)
+        for k in range(3):  # all three at once would be larger than a processor's cache
+            fields += lift[:, k, None] * self._fields[corner[:, k]]
         return np.concatenate((cut, fields), axis=1)
 
 

@@ -161,7 +161,7 @@ def _means(
     double = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     area = np.bincount(mesh.faces.ravel(), weights=np.repeat(double / 6, 3), minlength=len(rest))
     weighed = (place.T * area).toarray()
-    normal = weighed @ place
+    normal = np.asarray(weighed @ place)
     own = csr_array((np.ones(len(kept)), (np.arange(len(kept)), kept)), shape=(len(kept), len(rest)))
     firm = _FIRM * float(np.trace(normal)) / len(kept)
     factor = cho_factor(normal + firm * np.eye(len(kept)))

@@ -50,7 +50,8 @@ class SigmaMap:
 
     def at(self, bend: float) -> NDArray[np.float32]:
         """σ in a pose [m], shape (V,): between the regions' middles it is interpolated, so that nothing leaps."""
-        return self.sigma * np.float32(np.interp(bend, self.bend, self.factor))
+        found: NDArray[np.float32] = self.sigma * np.float32(np.interp(bend, self.bend, self.factor))
+        return found
 
     @classmethod
     def unknown(cls, n_vertices: int) -> SigmaMap:

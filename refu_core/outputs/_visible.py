@@ -83,7 +83,7 @@ class PinholeCamera:
         away = np.asarray(target, np.float64) - np.asarray(eye, np.float64)
         right = np.cross(away, [0.0, 1.0, 0.0])
         if not np.linalg.norm(right) > 1e-6 * np.linalg.norm(away):
-            msg = f"a camera at {eye} can't have {target} in the middle and the y axis up: give its rotation"
+            msg = f"a camera at {eye!r} can't have {target!r} in the middle and the y axis up: give its rotation"
             raise MeshError(msg)
         forward, right = away / np.linalg.norm(away), right / np.linalg.norm(right)
         rotation = np.stack((right, np.cross(forward, right), forward))
