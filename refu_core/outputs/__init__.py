@@ -1,7 +1,9 @@
 """What robots and planners ask of dressed people, besides meshes; nothing of it is computed unless it is asked for."""
 
 from refu_core.outputs._clearance import REACH, Clearance
+from refu_core.outputs._dressed import Dressed, Fittings
 from refu_core.outputs._limbs import PRESSED, LimbContact, LimbContacts
+from refu_core.outputs._normals import VertexNormals
 from refu_core.outputs._openings import Opening, Openings
 from refu_core.outputs._planner import HALF_THICKNESS, MAX_TRIANGLES, PlannerMesh
 from refu_core.outputs._sigma import (
@@ -25,6 +27,8 @@ __all__ = [
     "UNKNOWN_SIGMA",
     "Clearance",
     "DepthImage",
+    "Dressed",
+    "Fittings",
     "LimbContact",
     "LimbContacts",
     "Opening",
@@ -33,6 +37,7 @@ __all__ = [
     "PlannerMesh",
     "Sigma",
     "SigmaMap",
+    "VertexNormals",
     "all_visible",
     "bend_of",
     "depth_image",
