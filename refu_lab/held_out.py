@@ -61,13 +61,16 @@ class HeldOut(NamedTuple):
     """Number of each sample's style-shape pair, shape (N,)."""
 
 
-def held_out(bag: Path, garment: str, *, half: int | None = None, weights: Path | None = None) -> HeldOut:
+def held_out(
+    bag: Path, garment: str, *, half: int | None = None, every: int = 1, weights: Path | None = None
+) -> HeldOut:
     """Predicts the frames of a bag that have their truth.
 
     Args:
         bag: with ground truth.
         garment: whose.
         half: 0 for every other style-shape pair, which σ is fitted to; 1 for the rest; None for all.
+        every: takes every so-many-th of these frames.
         weights: a folder of one's own; those that ship by default.
 
     Raises:
@@ -75,7 +78,7 @@ def held_out(bag: Path, garment: str, *, half: int | None = None, weights: Path 
     """
     pipeline = GarmentPipeline.load([garment], weights=weights)
     (template,) = pipeline.garments.values()
-    moments = [one for one in moments_of(bag, template) if half is None or one.pair % 2 == half]
+    moments = [one for one in moments_of(bag, template) if half is None or one.pair % 2 == half][::every]
     errors = [np.linalg.norm(pipeline(one.frame)[template.name].local - one.truth, axis=1) for one in moments]
     pairs = np.array([one.pair for one in moments])
     return HeldOut(template, np.stack(errors), np.stack([one.frame.pose for one in moments]), pairs)

@@ -15,8 +15,8 @@ from refu_core.observation._estimate import Estimate
 from refu_core.outputs import Clearance, PinholeCamera, depth_image, visible
 from refu_lab.held_out import Moment, moments_of
 
-BAG = Path(__file__).parents[2] / "bags" / "eval_skirt_female"
-NAME = "skirt-female"
+BAG = Path(__file__).parents[2] / "bags" / "eval_short_pant_male"
+NAME = "short-pant-male"
 
 
 @pytest.fixture(scope="module")
@@ -120,10 +120,10 @@ def test_it_fades_and_stays_within_bounds(pipeline: GarmentPipeline, observer: O
     frame = SmplFrame(pose=np.zeros(72))
     plain = pipeline(frame)[NAME].local
     wrong = plain + np.array([0.0, 0.0, 0.03])
-    way = [np.abs(observer(frame, wrong)[NAME].local - plain).max() for _ in range(12)]
-    assert way[0] > 0.01
-    assert max(way) < 0.1
-    assert abs(way[-1] - way[-2]) < 1e-3  # it has come to rest
+    way = [observer(frame, wrong)[NAME].local - plain for _ in range(20)]
+    assert np.abs(way[0]).max() > 0.01
+    assert np.abs(way).max() < 0.1
+    assert np.abs(way[-1] - way[-2]).mean() < 2e-4  # it has come to rest
     later = SmplFrame(pose=np.zeros(72), stamp_ns=3_000_000_000)
     observer(SmplFrame(pose=np.zeros(72), stamp_ns=1))
     assert np.abs(observer(later)[NAME].local - plain).mean() < 0.2 * np.abs(wrong - plain).max()

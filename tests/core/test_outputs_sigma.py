@@ -24,7 +24,7 @@ def pipeline() -> GarmentPipeline:
 @pytest.mark.parametrize("garment", ["tshirt-male", "shirt-male", "short-pant-male", "skirt-female"])
 def test_nine_in_ten_true_vertices_are_within_the_interval(garment: str) -> None:
     """Of the style-shape pairs that σ wasn't fitted to."""
-    rest = held_out(BAGS / f"eval_{garment.replace('-', '_')}", garment, half=1)
+    rest = held_out(BAGS / f"eval_{garment.replace('-', '_')}", garment, half=1, every=3)
     shipped = load_sigma(rest.garment)
     assert shipped.is_measured
     assert 0.85 <= coverage(shipped, rest) <= 0.95
