@@ -1,9 +1,10 @@
 """What a fleet costs, on a quiet machine: two workers beside one, conversion beside the pipeline, memory over time.
 
-    python benchmarks/fleet.py [--bags 20] [--frames 60] [--long 3000]
+    python benchmarks/fleet.py [--only convert | workers | long] [--bags 20] [--frames 60] [--long 108000]
 
-Prints seconds a recording with one worker and with two, whether results are the same bit for bit, the share of the
-pipeline's speed that conversion reaches, and the largest memory after a tenth and after all of a long recording.
+Prints the share of the pipeline's speed that conversion reaches on the cores that it is given (taskset -c 0 for one);
+seconds a recording with one worker and with two, and whether results are the same bit for bit; and, with `--only long`,
+the memory of a conversion over time.
 """
 
 from __future__ import annotations
@@ -11,8 +12,9 @@ from __future__ import annotations
 import argparse
 import hashlib
 import itertools
-import resource
+import os
 import tempfile
+import threading
 import time
 from pathlib import Path
 
@@ -58,31 +60,64 @@ def _workers(folder: Path, jobs: int) -> tuple[float, str]:
         return time.perf_counter() - start, _digest(out)
 
 
-def _megabytes() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-
-
-def _convert(folder: Path, frames: list[SmplFrame], count: int) -> None:
-    options = ReplayOptions(input=folder / "long.mcap", evaluate=False)
+def _convert(folder: Path, frames: list[SmplFrame], rounds: int) -> None:
+    """The pipeline alone and a conversion of the same frames, turn by turn: a machine's mood is shared by both."""
+    options = ReplayOptions(input=folder / "part.mcap", output=folder / "out.mcap", evaluate=False, overwrite=True)
     pipeline = options.load_pipeline()
-    few = frames[: min(len(frames), count)]
-    for frame in few[:10]:
-        pipeline(frame)
-    start = time.perf_counter()
-    for frame in few:
-        pipeline(frame)
-    alone = len(few) / (time.perf_counter() - start)
-    _write(folder / "long.mcap", frames, count // 10, 0)
-    replay(ReplayOptions(input=folder / "long.mcap", output=folder / "a.mcap", evaluate=False), pipeline=pipeline)
-    before = _megabytes()
-    (folder / "long.mcap").unlink()
-    _write(folder / "long.mcap", frames, count, 0)
-    start = time.perf_counter()
-    replay(ReplayOptions(input=folder / "long.mcap", output=folder / "b.mcap", evaluate=False), pipeline=pipeline)
-    speed = count / (time.perf_counter() - start)
-    print(f"pipeline alone      {alone:8.1f} frames/s")
-    print(f"conversion          {speed:8.1f} frames/s, {100 * speed / alone:.0f} %")
-    print(f"largest memory      {before:8.0f} MB after {count // 10} frames, {_megabytes():.0f} MB after {count}")
+    part = frames[:150]
+    _write(options.input, part, len(part), 0)
+    clocks = {"wall": time.perf_counter, "all threads' CPU": time.process_time, "this thread's CPU": time.thread_time}
+    seconds = []
+    for _ in range(rounds + 1):
+        before = [clock() for clock in clocks.values()]
+        for frame in part:
+            pipeline(frame)
+        between = [clock() for clock in clocks.values()]
+        replay(options, pipeline=pipeline)
+        after = [clock() for clock in clocks.values()]
+        seconds.append((np.subtract(between, before), np.subtract(after, between)))
+    ms = 1e3 / len(part) * np.array(seconds[1:])  # the first round is for kernels and caches
+    print(f"{len(os.sched_getaffinity(0))} cores, ms a frame, medians of {rounds} rounds (smallest share, largest)")
+    for i, name in enumerate(clocks):
+        alone, converted = ms[:, 0, i], ms[:, 1, i]
+        share = 100 * alone / converted
+        print(
+            f"{name:18} pipeline {np.median(alone):5.1f}  conversion {np.median(converted):5.1f}  "
+            f"{np.median(share):.0f} % of its speed ({share.min():.0f}, {share.max():.0f})"
+        )
+
+
+def _long(folder: Path, frames: list[SmplFrame], count: int, garments: tuple[str, ...]) -> None:
+    """Converts a recording of so many frames; its log memory.txt gets a line each half minute."""
+    encode, log = adapters.encoder_for("multiarray"), folder / "memory.txt"
+    out = folder / "long-out.mcap"
+    options = ReplayOptions(input=folder / "long.mcap", output=out, garments=garments, evaluate=False, overwrite=True)
+    with adapters.BagWriter(options.input, overwrite=True) as writer:
+        writer.add_topic("/smpl_params", adapters.INPUT_TYPES["multiarray"])
+        for i in range(count):
+            writer.write("/smpl_params", encode(frames[i % len(frames)]), log_time_ns=10**18 + i * 33_333_333)
+    start, done = time.perf_counter(), threading.Event()
+
+    def watch() -> None:
+        while not done.wait(30):
+            size = out.stat().st_size / 1e6 if out.exists() else 0.0
+            with log.open("a") as file:
+                file.write(f"{time.perf_counter() - start:.0f} s, bag {size:.0f} MB, memory {_resident():.1f} MB\n")
+
+    watcher = threading.Thread(target=watch, daemon=True)
+    watcher.start()
+    result = replay(options)
+    done.set()
+    watcher.join()
+    took = time.perf_counter() - start
+    with log.open("a") as file:
+        file.write(f"{len(result.latencies_ms)} frames in {took:.0f} s, memory {_resident():.1f} MB at the end\n")
+
+
+def _resident() -> float:
+    """Memory of this process [MB]."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 def main() -> None:
@@ -90,15 +125,23 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--bags", type=int, default=20)
     parser.add_argument("--frames", type=int, default=60)
-    parser.add_argument("--long", type=int, default=3000)
-    parser.add_argument("--only", choices=("workers", "convert"))
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--long", type=int, default=108_000)
+    parser.add_argument("--garments", default="tshirt-male", help="of the long recording")
+    parser.add_argument("--folder", type=Path, help="of the long recording, and its log memory.txt (a temporary one)")
+    parser.add_argument("--only", choices=("workers", "convert", "long"))
     args = parser.parse_args()
     frames = _frames()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        if args.only != "workers":
-            _convert(folder, frames, args.long)
-        if args.only != "convert":
+        if args.only in (None, "convert"):
+            _convert(folder, frames, args.rounds)
+        if args.only == "long":
+            place = args.folder or folder
+            place.mkdir(parents=True, exist_ok=True)
+            _long(place, frames, args.long, tuple(args.garments.split(",")))
+            print((place / "memory.txt").read_text())
+        if args.only in (None, "workers"):
             (folder / "bags").mkdir()
             for i in range(args.bags):
                 _write(

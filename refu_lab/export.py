@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -9,11 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from msg_adapters import DecodeError
 from refu_core.errors import RefuError
 from refu_lab.render import SKIN
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -90,24 +92,50 @@ def write_meshes(meshes: Sequence[ExportMesh], path: Path, *, fps: float = 30.0)
     return paths
 
 
-def export(options: ReplayOptions, path: Path, *, first: int, count: int, with_body: bool) -> list[Path]:
-    """What `refu export` does: some frames of a bag or motion file, dressed, as files. Raises `RefuError`."""
+def export(
+    options: ReplayOptions, path: Path, *, first: int, count: int, with_body: bool
+) -> tuple[list[Path], list[str]]:
+    """What `refu export` does: some frames of a bag or motion file, dressed, as files.
+
+    Frames are numbered as they were recorded; those that can't be read are left out, and said.
+
+    Returns:
+        The files, and what there is to warn of.
+
+    Raises:
+        RefuError: as `write_meshes`; options that make no pipeline, an input that can't be read, or no frame.
+    """
+    from refu_lab.bodies import betas_warnings, body_warnings
     from refu_lab.sources import open_source
 
     if path.suffix.lower() not in FORMATS:  # said before the work is done
         write_meshes((), path)
     pipeline = options.load_pipeline()
     with open_source(options, pipeline.body) as source:
-        frames = [r.frame for r in islice(source.records, first, first + count) if r.frame is not None]
+        frames, warnings = [], body_warnings(pipeline, gender=source.gender)
+        for number, record in enumerate(islice(source.records, first, first + count), first):
+            with _left_out(number, warnings):
+                frames.append(source.frame_of(record, options.betas))
+        if options.betas is None and any(frame.betas.any() for frame in frames) and not source.betas_are_known:
+            warnings += betas_warnings(pipeline, source=options.betas_source)
+        warnings += source.warnings
     if not frames:
         msg = f"{options.input}: has no frame that can be dressed from number {first} on"
         raise RefuError(msg)
     outputs = [pipeline(frame) for frame in frames]
     stamps = np.array([frame.stamp_ns for frame in frames])
     step = 1e-9 * float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
-    return write_meshes(
-        meshes_of(pipeline, outputs, with_body=with_body), path, fps=round(1 / step, 3) if step > 0 else 30.0
-    )
+    fps = round(1 / step, 3) if step > 0 else 30.0
+    return write_meshes(meshes_of(pipeline, outputs, with_body=with_body), path, fps=fps), warnings
+
+
+@contextmanager
+def _left_out(number: int, warnings: list[str]) -> Iterator[None]:
+    """Says of a frame that can't be read that it can't."""
+    try:
+        yield
+    except DecodeError as error:
+        warnings.append(f"frame {number} is left out: {error}")
 
 
 def _glb(meshes: Sequence[ExportMesh], frame: int) -> bytes:

@@ -9,7 +9,7 @@ from array import array
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -246,7 +246,6 @@ class _Replayer:
             truth = GroundTruth.of_bag(options.input, faces, axes=options.axes) if is_bag else None
             self._evaluator = Evaluator(pipeline, truth)
         self._has_betas = False
-        self._betas = None if options.betas is None else np.asarray(options.betas, np.float32)
         meshes = [
             adapters.MarkerMesh(
                 ns=adapters.garment_namespace(name),
@@ -262,9 +261,11 @@ class _Replayer:
         """The output bag with its topics, None where no output was asked for."""
         if self._options.output is None:
             return None
-        writer = adapters.BagWriter(self._options.output, overwrite=self._options.overwrite)
+        writer = adapters.BagWriter(self._options.output, overwrite=self._options.overwrite, in_background=True)
         given = self._source.bag.topic if self._source.bag is not None else None
-        own = {} if given is None else {"definition": given.definition, "type_hash": given.type_hash}
+        own = {}
+        if given is not None:
+            own = {"definition": given.definition, "type_hash": given.type_hash, "betas_of": given.betas_of}
         writer.add_topic(self._source.topic, self._source.message_type, **own)
         writer.add_topic(GARMENTS_TOPIC, adapters.MARKER_ARRAY)
         return writer
@@ -273,14 +274,9 @@ class _Replayer:
         """Bytes to bytes (timed), then the bag and the metrics (not timed)."""
         if writer is not None and (record.raw or self._source.bag is not None):
             writer.write(self._source.topic, record.raw, log_time_ns=record.log_time_ns)
-        if record.error is not None:
-            self._skip(str(record.error))
-            return
         start = time.perf_counter()
         try:
-            frame = replace(self._source.decoder.from_bytes(record.raw), stamp_ns=record.stamp_ns)
-            if self._betas is not None:
-                frame = replace(frame, betas=self._betas)
+            frame = self._source.frame_of(record, self._options.betas)
             output = self._pipeline(frame)
             data = self._encoder.encode(
                 [mesh.local for mesh in output.values()], stamp_ns=frame.stamp_ns, transl=frame.transl
@@ -306,11 +302,13 @@ class _Replayer:
 
     def summarise(self) -> None:
         """Completes the result."""
-        is_told = self._betas is not None or self._options.input_type in adapters.KEYPOINT_TYPES
+        options = self._options
+        is_told = options.betas is not None or options.input_type in adapters.KEYPOINT_TYPES
+        is_told = is_told or self._source.betas_are_known
         if self._evaluator is not None and self._evaluator.truth.garments:  # with it, of the built-in bodies
             is_told = True
         if self._has_betas and not is_told:
-            self._result.warnings += betas_warnings(self._pipeline, source=self._options.betas_source)
+            self._result.warnings += betas_warnings(self._pipeline, source=options.betas_source)
         if self._evaluator is None:
             return
         self._result.before = {name: metrics.summary() for name, metrics in self._evaluator.before.items()}

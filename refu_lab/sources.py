@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 import msg_adapters as adapters
 from refu_core import FrameError, RefuError
 from refu_core.keypoints import Proportions
+from refu_core.modes import BetasSource
 from refu_core.recordings import SUFFIXES
 
 if TYPE_CHECKING:
@@ -39,6 +42,21 @@ class Source:
     """What the reader of a motion file took for granted."""
     gender: str = "neutral"
     """Whose motion it is, where the file says it."""
+
+    @property
+    def betas_are_known(self) -> bool:
+        """Whether the file itself says that its betas are the built-in body's."""
+        return self.bag is not None and self.bag.topic.betas_of == BetasSource.BUILTIN
+
+    def frame_of(self, record: FrameRecord, betas: Sequence[float] | None = None) -> SmplFrame:
+        """A record's frame, with `betas` in place of its own where they are given.
+
+        Raises `DecodeError` for a record that has none.
+        """
+        if record.error is not None:
+            raise record.error
+        frame = replace(self.decoder.from_bytes(record.raw), stamp_ns=record.stamp_ns)
+        return frame if betas is None else replace(frame, betas=np.asarray(betas, np.float32))
 
     @property
     def warnings(self) -> list[str]:

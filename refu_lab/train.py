@@ -85,7 +85,7 @@ def train(options: TrainOptions, *, progress: bool) -> dict[str, Any]:
     if options.backbone == "gcnn":
         source = None
     elif not (options.folder / f"{options.backbone}-none.json").exists():
-        pretrain(template, dataset, options.folder, settings=_pretraining(replace(options, steps=None)), **common)
+        pretrain(template, dataset, options.folder, settings=_pretraining(options), **common)
     settings = _finetuning(options)
     return finetune(template, dataset, source, options.folder, mode=options.mode, settings=settings, **common)
 

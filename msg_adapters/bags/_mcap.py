@@ -39,6 +39,8 @@ _LONGEST = 1 << 62
 _LONGEST_MAGIC = 16
 _WANTED_FILE = "a .mcap or .db3 file, a rosbag2 directory or an AMASS-style .npz"
 _NO_OPCODE = "zeros where a record should start"  # what many a disk makes of the end that it never got
+BETAS_OF = "betas_of"
+"""Key in the metadata of a topic that says whose shape space its betas are of."""
 MAX_CHUNK_BYTES = 128 << 20
 """A chunk that claims to unpack to more is left out: a few kilobytes could otherwise claim all memory."""
 

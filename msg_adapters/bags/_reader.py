@@ -42,6 +42,8 @@ class TopicInfo:
     type_hash: str
     qos: str
     """Offered profiles in YAML, as recorded."""
+    betas_of: str = ""
+    """Whose shape space β in the messages are of: `builtin`, or (empty) the bag doesn't say."""
 
 
 @dataclass(frozen=True)
@@ -109,6 +111,7 @@ class _Catalogue:
                 definition=schema.definition if schema else "",
                 type_hash=channel.metadata.get("topic_type_hash", ""),
                 qos=channel.metadata.get("offered_qos_profiles", ""),
+                betas_of=channel.metadata.get(_mcap.BETAS_OF, ""),
             )
         return topics
 

@@ -7,10 +7,10 @@ import os
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, Literal
+from typing import TYPE_CHECKING, BinaryIO
 
-from mcap.writer import CompressionType, Writer
-
+from msg_adapters.bags import _mcap
+from msg_adapters.bags._mcap_writer import McapWriter
 from msg_adapters.bags._metadata import (
     MAX_TIME_NS,
     METADATA_FILE,
@@ -28,7 +28,8 @@ if TYPE_CHECKING:
 
     from typing_extensions import Self
 
-_COMPRESSION = {"zstd": CompressionType.ZSTD, "none": CompressionType.NONE}
+    from msg_adapters.bags._mcap_writer import Compression
+
 _DEFAULT_QOS = QosProfile()
 
 
@@ -48,6 +49,9 @@ class BagWriter:
     there. What must survive a power cut as well is what came before the last `sync`, or a bag that is finished. Leaving
     the `with` block finishes the bag, also after an exception.
 
+    `in_background` packs and writes each full chunk in a thread of its own, while the caller goes on: a kill takes the
+    chunk that is in its hands, too, and an error of the disk is raised by a later call.
+
     Raises `BagError` when the path can't be written, or holds something and `overwrite` isn't set; nothing is left
     behind then.
     """
@@ -56,9 +60,10 @@ class BagWriter:
         self,
         path: str | Path,
         *,
-        compression: Literal["zstd", "none"] = "zstd",
+        compression: Compression = "zstd",
         chunk_bytes: int = 1 << 20,
         overwrite: bool = False,
+        in_background: bool = False,
     ) -> None:
         self.path = Path(path)
         self._directory = None if self.path.suffix == ".mcap" else self.path
@@ -73,11 +78,10 @@ class BagWriter:
         try:
             with self._writing():
                 self._stream = self._open(made, overwrite=overwrite)
-                self._writer = Writer(self._stream, chunk_size=chunk_bytes, compression=_COMPRESSION[compression])
+                self._writer = McapWriter(
+                    self._stream, compression=compression, chunk_bytes=chunk_bytes, in_background=in_background
+                )
                 self._writer.start(profile="ros2", library="refu-ros")
-                self._stream.flush()
-                self._whole = self._stream.tell()
-                """Where the last complete record ends."""
         except BagError:
             for path in reversed(made):
                 with suppress(OSError):  # a directory that somebody else has put something into
@@ -109,11 +113,13 @@ class BagWriter:
         definition: str | None = None,
         type_hash: str | None = None,
         qos: QosProfile | str = _DEFAULT_QOS,
+        betas_of: str = "",
     ) -> None:
         """Declare a topic before its first message; a second time with the same type does nothing.
 
         `definition` (`ros2msg` text) and `type_hash` are built in for the types of this project. `qos` may also be the
-        YAML text of a bag that is copied from.
+        YAML text of a bag that is copied from. `betas_of` says whose shape space β in the messages are of:
+        `builtin`, or nothing. It is kept with the topic, where `TopicInfo.betas_of` has it; others don't mind.
 
         Raises `BagError` for a type that isn't built in without a definition, and for a second type on one topic.
         """
@@ -129,9 +135,10 @@ class BagWriter:
             definition, type_hash = builtin.text, type_hash or builtin.type_hash
         profiles = (qos if read_profiles(qos) else "") if isinstance(qos, str) else qos.to_yaml()
         with self._writing():
-            schema_id = self._writer.register_schema(message_type, "ros2msg", definition.encode())
+            schema_id = self._writer.add_schema(message_type, definition)
             metadata = {"offered_qos_profiles": profiles, "topic_type_hash": type_hash or ""}
-            channel_id = self._writer.register_channel(topic, "cdr", schema_id, metadata)
+            metadata |= {_mcap.BETAS_OF: betas_of} if betas_of else {}
+            channel_id = self._writer.add_channel(topic, schema_id, metadata)
         self._topics[topic] = _Topic(channel_id, message_type, type_hash or "", profiles)
 
     def write(self, topic: str, data: bytes, *, log_time_ns: int, publish_time_ns: int | None = None) -> None:
@@ -149,12 +156,12 @@ class BagWriter:
             raise BagError(msg)
         with self._writing():
             self._writer.add_message(
-                channel.channel_id, log_time_ns, data, publish_time_ns, sequence=channel.message_count & 0xFFFFFFFF
+                channel.channel_id,
+                data,
+                log_time_ns=log_time_ns,
+                publish_time_ns=publish_time_ns,
+                sequence=channel.message_count & 0xFFFFFFFF,
             )
-            end = self._stream.tell()
-            if end != self._whole:  # a chunk was completed
-                self._stream.flush()
-                self._whole = end
         channel.message_count += 1
         self._start_ns = min(self._start_ns, log_time_ns)
         self._end_ns = max(self._end_ns, log_time_ns)
@@ -168,7 +175,6 @@ class BagWriter:
         """
         with self._writing():
             self._writer.flush()
-            self._whole = self._stream.tell()
             self._sync_stream()
 
     def finish(self) -> None:
@@ -180,10 +186,8 @@ class BagWriter:
             return
         text, record = self._metadata()
         with self._writing():
-            self._writer.flush()
             self._writer.add_metadata("rosbag2", {"serialized_metadata": record})
             self._writer.finish()
-            self._stream.flush()
             self._sync_stream()
             self._finished = True
             self._stream.close()
@@ -267,13 +271,15 @@ class BagWriter:
     def _abandon(self) -> None:
         """Cut the file back to its last whole chunk: the writer's state isn't known any more."""
         self._finished = True
-        stream = getattr(self, "_stream", None)
+        stream, writer = getattr(self, "_stream", None), getattr(self, "_writer", None)
         if stream is None:
             return
+        if writer is not None:
+            writer.close()
         with suppress(OSError):  # it tries to write what it has buffered
             stream.close()
         with suppress(OSError):  # readers cope with a torn end as well
-            os.truncate(self.file_path, getattr(self, "_whole", 0))
+            os.truncate(self.file_path, 0 if writer is None else writer.whole)
 
 
 def _to_disk(descriptor: int) -> None:

@@ -10,8 +10,8 @@ import torch
 from numpy.typing import NDArray
 
 from refu_core.mesh import Connectivity
-from refu_core.metrics._intersect import EdgeGraph, as_vertices, crossings, pierced_edges
-from refu_core.sdf import ExactSdf
+from refu_core.metrics._intersect import Triangles, as_vertices, crossings
+from refu_core.sdf import ExactSdf, Winding
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,12 +72,15 @@ class CollisionChecker:
 
         Raises `MeshError` when they aren't a closed, consistently oriented surface.
         """
-        self._body = ExactSdf(body_faces, device=device, sign="winding")
-        self._graphs: dict[tuple[int, int], EdgeGraph] = {}
+        self._body = ExactSdf(body_faces, device=device)
+        self._winding = Winding(self._body.faces)
+        self._triangles: dict[tuple[int, int], Triangles] = {}
 
     def update(self, body_vertices: Any) -> None:
         """Takes over a new pose: the body's vertices [m], shape (V, 3). Raises `MeshError` as `ExactSdf.update`."""
-        self._body.update(torch.from_numpy(as_vertices("the body's vertices", body_vertices)))
+        vertices = torch.from_numpy(as_vertices("the body's vertices", body_vertices))
+        self._body.update(vertices)
+        self._winding.update(vertices)
 
     def check(self, garment_vertices: Any, garment_faces: Any) -> Collisions:
         """The collisions of a garment, vertices [m], shape (N, 3), and faces (G, 3), with the body last set.
@@ -85,25 +88,20 @@ class CollisionChecker:
         Raises `MeshError` for wrong shapes, values that aren't finite, or where no body was set.
         """
         vertices = as_vertices("the garment's vertices", garment_vertices)
-        graph = self._graph_of(len(vertices), garment_faces)
-        found = crossings(self._body, vertices, graph.faces)
-        inside = graph.inside(
-            pierced_edges(graph.faces, found.pairs[:, 0], found.edge_of_face),
-            lambda rows: self._is_inside(vertices[rows]),
-        )
+        found = crossings(self._body, vertices, self._triangles_of(garment_faces, vertices))
+        points = torch.from_numpy(vertices)
+        # 2 where limbs are in each other; where skin is turned inside out it is -1, and nobody's inside.
+        inside = (self._winding(points) > 0).cpu().numpy()
         depth = np.zeros(len(vertices), np.float32)
-        depth[inside] = self._body.closest(torch.from_numpy(vertices[inside])).distance.cpu().numpy()
+        depth[inside] = self._body.query(points[inside]).distance.abs().cpu().numpy()
         is_vf = (found.edge_of_face.sum(axis=1) >= 2) | (found.edge_of_body.sum(axis=1) >= 2)
         return Collisions(found.pairs, is_vf, inside, depth)
 
-    def _graph_of(self, n_vertices: int, faces: Any) -> EdgeGraph:
-        # The same few garments frame after frame: comparing faces is a thousandth of the work of preparing them.
-        size = (n_vertices, len(faces))
-        graph = self._graphs.get(size)
-        if graph is None or not np.array_equal(graph.faces, faces):
-            graph = self._graphs[size] = EdgeGraph(Connectivity.of(faces, n_vertices))
-        return graph
-
-    def _is_inside(self, points: NDArray[np.float32]) -> NDArray[np.bool_]:
-        inside: NDArray[np.bool_] = (self._body.closest(torch.from_numpy(points)).sign < 0).cpu().numpy()
-        return inside
+    def _triangles_of(self, faces: Any, vertices: NDArray[np.float32]) -> Triangles:
+        # The same few garments frame after frame: comparing faces is a tenth of the work of preparing them.
+        size = (len(vertices), len(faces))
+        known = self._triangles.get(size)
+        if known is None or not np.array_equal(known.faces, faces):
+            checked = Connectivity.of(faces, len(vertices)).faces
+            known = self._triangles[size] = Triangles(checked, vertices, self._body.device)
+        return known

@@ -1,5 +1,7 @@
 """Triangle-triangle intersections in double precision, candidates from a BVH."""
 
+from typing import TYPE_CHECKING
+
 import warp as wp
 
 from refu_core import _warp  # noqa: F401  (quiets Warp before it starts)
@@ -8,6 +10,15 @@ from refu_core import _warp  # noqa: F401  (quiets Warp before it starts)
 wp.set_module_options({"fuse_fp": False, "enable_backward": False})
 
 FLOAT0 = wp.constant(wp.float64(0.0))
+BLOCK = wp.constant(8)
+"""Faces that look for others together."""
+if TYPE_CHECKING:
+    _Corners = wp.Matrix[float]
+else:
+    _Corners = wp.types.matrix(shape=(8, 3), dtype=wp.float32)
+APART = wp.constant(wp.float64(1e-9))
+"""Triangles on one side of the other's plane, by more than this [m], don't meet, whatever is rounded: computed heights
+are off by some 1e-15 m."""
 
 
 @wp.func
@@ -43,6 +54,19 @@ def pierces(a: wp.vec3d, b: wp.vec3d, p: wp.vec3d, q: wp.vec3d, r: wp.vec3d) -> 
 
 
 @wp.func
+def is_beside(normal: wp.vec3d, origin: wp.vec3d, p: wp.vec3d, q: wp.vec3d, r: wp.vec3d) -> bool:
+    """Whether triangle pqr is on one side of a plane for certain: most pairs whose boxes overlap are, of one or the
+    other."""
+    least = APART * (wp.abs(normal[0]) + wp.abs(normal[1]) + wp.abs(normal[2]))
+    height_p = wp.dot(normal, p - origin)
+    height_q = wp.dot(normal, q - origin)
+    height_r = wp.dot(normal, r - origin)
+    lowest = wp.min(wp.min(height_p, height_q), height_r)
+    highest = wp.max(wp.max(height_p, height_q), height_r)
+    return lowest > least or highest + least < FLOAT0
+
+
+@wp.func
 def edge_pierces(i: int, j: int, a: wp.vec3d, b: wp.vec3d, p: wp.vec3d, q: wp.vec3d, r: wp.vec3d) -> bool:
     """`pierces` for the edge between vertices i and j, the same from both of the edge's faces."""
     if i < j:
@@ -50,11 +74,53 @@ def edge_pierces(i: int, j: int, a: wp.vec3d, b: wp.vec3d, p: wp.vec3d, q: wp.ve
     return pierces(b, a, p, q, r)
 
 
+@wp.func
+def meeting_edges(
+    triangle: wp.vec3i,
+    a: wp.vec3d,
+    b: wp.vec3d,
+    c: wp.vec3d,
+    other: wp.vec3i,
+    p: wp.vec3d,
+    q: wp.vec3d,
+    r: wp.vec3d,
+    share: bool,
+) -> int:
+    """Which edges of triangle abc pierce pqr (bits 0 to 2), and which of pqr pierce abc (bits 3 to 5).
+
+    With `share` the vertex numbers are of one mesh: faces that share an edge aren't looked at.
+    """
+    if is_beside(wp.cross(b - a, c - a), a, p, q, r) or is_beside(wp.cross(q - p, r - p), p, a, b, c):
+        return 0
+    # Faces with a vertex in common meet there anyway, and only the edges that end elsewhere can tell more.
+    tested = 63
+    if share:
+        s0 = shared_corner(triangle[0], other[0], other[1], other[2])
+        s1 = shared_corner(triangle[1], other[0], other[1], other[2])
+        s2 = shared_corner(triangle[2], other[0], other[1], other[2])
+        n_shared = wp.where(s0 >= 0, 1, 0) + wp.where(s1 >= 0, 1, 0) + wp.where(s2 >= 0, 1, 0)
+        if n_shared > 1:
+            return 0
+        if n_shared == 1:
+            # Opposite corner k lies edge (k + 1) % 3.
+            own = wp.where(s0 >= 0, 2, wp.where(s1 >= 0, 4, 1))
+            corner = wp.max(s0, wp.max(s1, s2))
+            tested = own + wp.where(corner == 0, 16, wp.where(corner == 1, 32, 8))
+    edges = wp.where(edge_pierces(triangle[0], triangle[1], a, b, p, q, r), 1, 0)
+    edges += wp.where(edge_pierces(triangle[1], triangle[2], b, c, p, q, r), 2, 0)
+    edges += wp.where(edge_pierces(triangle[2], triangle[0], c, a, p, q, r), 4, 0)
+    edges += wp.where(edge_pierces(other[0], other[1], p, q, a, b, c), 8, 0)
+    edges += wp.where(edge_pierces(other[1], other[2], q, r, a, b, c), 16, 0)
+    edges += wp.where(edge_pierces(other[2], other[0], r, p, a, b, c), 32, 0)
+    return edges & tested
+
+
 @wp.kernel
 def intersect_kernel(
     body: wp.uint64,
     vertices: wp.array[wp.vec3],
-    faces: wp.array2d[int],
+    faces: wp.array[wp.vec3i],
+    numbers: wp.array[int],
     is_body: bool,
     # outputs
     count: wp.array[int],
@@ -62,51 +128,58 @@ def intersect_kernel(
 ) -> None:
     """Appends (face, body face, edges) for each face that meets a body face; counts on beyond the room in `pairs`.
 
-    Bits 0 to 2 of `edges`: the face's edges that pierce the body face; bits 3 to 5: the body face's that pierce the
-    face. With `is_body` the faces are the body's own: each pair once, none of two that share an edge.
+    A thread has `BLOCK` faces in a row, which lie together, so that the tree is walked once for them; `numbers` says
+    what they are called. `edges`: as `meeting_edges`. With `is_body` the faces are the body's own: each pair once, none
+    of two that share an edge.
     """
-    i = wp.tid()
-    i0 = faces[i, 0]
-    i1 = faces[i, 1]
-    i2 = faces[i, 2]
-    lower = wp.min(wp.min(vertices[i0], vertices[i1]), vertices[i2])
-    upper = wp.max(wp.max(vertices[i0], vertices[i1]), vertices[i2])
-    a = double(vertices[i0])
-    b = double(vertices[i1])
-    c = double(vertices[i2])
+    first = BLOCK * wp.tid()
+    end = wp.min(first + BLOCK, faces.shape[0])
+    lower = vertices[faces[first][0]]
+    upper = lower
+    lows = _Corners()
+    highs = _Corners()
+    for k in range(first, end):
+        a = vertices[faces[k][0]]
+        b = vertices[faces[k][1]]
+        c = vertices[faces[k][2]]
+        low = wp.min(wp.min(a, b), c)
+        high = wp.max(wp.max(a, b), c)
+        lows[k - first] = low
+        highs[k - first] = high
+        lower = wp.min(lower, low)
+        upper = wp.max(upper, high)
     query = wp.mesh_query_aabb(body, lower, upper)
     j = int(0)
     while wp.mesh_query_aabb_next(query, j):
-        j0 = wp.mesh_get_index(body, 3 * j)
-        j1 = wp.mesh_get_index(body, 3 * j + 1)
-        j2 = wp.mesh_get_index(body, 3 * j + 2)
-        # Faces with a vertex in common meet there anyway, and only the edges that end elsewhere can tell more.
-        tested = 63
-        if is_body:
-            if j <= i:
+        other = wp.vec3i(
+            wp.mesh_get_index(body, 3 * j), wp.mesh_get_index(body, 3 * j + 1), wp.mesh_get_index(body, 3 * j + 2)
+        )
+        p = wp.mesh_get_point(body, 3 * j)
+        q = wp.mesh_get_point(body, 3 * j + 1)
+        r = wp.mesh_get_point(body, 3 * j + 2)
+        low = wp.min(wp.min(p, q), r)
+        high = wp.max(wp.max(p, q), r)
+        for k in range(first, end):
+            i = k - first
+            if lows[i, 0] > high[0] or lows[i, 1] > high[1] or lows[i, 2] > high[2]:
                 continue
-            s0 = shared_corner(i0, j0, j1, j2)
-            s1 = shared_corner(i1, j0, j1, j2)
-            s2 = shared_corner(i2, j0, j1, j2)
-            n_shared = wp.where(s0 >= 0, 1, 0) + wp.where(s1 >= 0, 1, 0) + wp.where(s2 >= 0, 1, 0)
-            if n_shared > 1:
+            if highs[i, 0] < low[0] or highs[i, 1] < low[1] or highs[i, 2] < low[2]:
                 continue
-            if n_shared == 1:
-                # Opposite corner k lies edge (k + 1) % 3.
-                own = wp.where(s0 >= 0, 2, wp.where(s1 >= 0, 4, 1))
-                other = wp.max(s0, wp.max(s1, s2))
-                tested = own + wp.where(other == 0, 16, wp.where(other == 1, 32, 8))
-        p = double(wp.mesh_get_point(body, 3 * j))
-        q = double(wp.mesh_get_point(body, 3 * j + 1))
-        r = double(wp.mesh_get_point(body, 3 * j + 2))
-        edges = wp.where(edge_pierces(i0, i1, a, b, p, q, r), 1, 0)
-        edges += wp.where(edge_pierces(i1, i2, b, c, p, q, r), 2, 0)
-        edges += wp.where(edge_pierces(i2, i0, c, a, p, q, r), 4, 0)
-        edges += wp.where(edge_pierces(j0, j1, p, q, a, b, c), 8, 0)
-        edges += wp.where(edge_pierces(j1, j2, q, r, a, b, c), 16, 0)
-        edges += wp.where(edge_pierces(j2, j0, r, p, a, b, c), 32, 0)
-        edges = edges & tested
-        if edges > 0:
-            slot = wp.atomic_add(count, 0, 1)
-            if slot < pairs.shape[0]:
-                pairs[slot] = wp.vec3i(i, j, edges)
+            if is_body and j <= numbers[k]:
+                continue
+            triangle = faces[k]
+            edges = meeting_edges(
+                triangle,
+                double(vertices[triangle[0]]),
+                double(vertices[triangle[1]]),
+                double(vertices[triangle[2]]),
+                other,
+                double(p),
+                double(q),
+                double(r),
+                is_body,
+            )
+            if edges > 0:
+                slot = wp.atomic_add(count, 0, 1)
+                if slot < pairs.shape[0]:
+                    pairs[slot] = wp.vec3i(numbers[k], j, edges)

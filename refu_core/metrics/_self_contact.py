@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from refu_core._warp import as_warp
 from refu_core.errors import MeshError
 from refu_core.mesh import Connectivity, vertex_normals
-from refu_core.metrics._intersect import EdgeGraph, as_vertices, crossings, pierced_edges
+from refu_core.metrics._intersect import EdgeGraph, Triangles, as_vertices, crossings, pierced_edges
 from refu_core.metrics._self_contact_kernels import self_contact_kernel
 from refu_core.sdf import ExactSdf
 
@@ -89,6 +89,7 @@ class SelfContactDetector:
         self._body = ExactSdf(body_faces, sign="winding")
         self._faces = self._body.faces.numpy()
         rest = as_vertices("rest_vertices", rest_vertices)
+        self._triangles = Triangles(self._faces, rest, self._body.device)
         self._graph = EdgeGraph(Connectivity.of(self._faces, len(rest)))
         pairs, buried = self._contacts(rest)
         self._rest_pairs = self._keys(pairs)
@@ -109,7 +110,7 @@ class SelfContactDetector:
     def _contacts(self, vertices: NDArray[np.float32]) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
         """All intersecting pairs of faces, (K, 2), and the vertices inside another part of the body, (V,)."""
         self._body.update(torch.from_numpy(vertices))
-        found = crossings(self._body, vertices, self._faces, is_body=True)
+        found = crossings(self._body, vertices, self._triangles, is_body=True)
         if not len(found.pairs):
             return found.pairs, np.zeros(len(vertices), np.bool_)
         pierced = np.concatenate(

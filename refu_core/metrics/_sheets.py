@@ -10,7 +10,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from refu_core._warp import as_warp
-from refu_core.metrics._intersect import as_vertices, crossings
+from refu_core.metrics._intersect import Triangles, as_vertices, crossings
 
 
 class SheetChecker:
@@ -24,6 +24,7 @@ class SheetChecker:
         self._flat = torch.from_numpy(self.faces.reshape(-1).copy())
         self._points = torch.zeros(0, 3)
         self._mesh: Any = None
+        self._triangles: Triangles | None = None
 
     @property
     def mesh_id(self) -> int:
@@ -37,9 +38,12 @@ class SheetChecker:
 
     def with_itself(self) -> NDArray[np.int32]:
         """The pairs of its faces that intersect, shape (K, 2); neighbours may meet at an edge or vertex."""
-        return crossings(self, self._points.numpy(), self.faces, is_body=True).pairs
+        points = self._points.numpy()
+        self._triangles = self._triangles or Triangles(self.faces, points, self.device)
+        return crossings(self, points, self._triangles, is_body=True).pairs
 
     def with_other(self, vertices: Any, faces: Any) -> NDArray[np.int32]:
         """Intersecting (other's face, own face), shape (K, 2), of a garment (M, 3) [m] and (F, 3)."""
         other = as_vertices("the other garment's vertices", vertices)
-        return crossings(self, other, np.ascontiguousarray(faces, dtype=np.int32)).pairs
+        triangles = Triangles(np.ascontiguousarray(faces, dtype=np.int32), other, self.device)
+        return crossings(self, other, triangles).pairs

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN, BackboneName
 from refu_lab.commands._common import (
-    add_collider,
     add_common,
+    add_pipeline,
+    add_recording,
     check_writable,
     given,
     in_path,
-    names,
-    numbers,
     out_file,
     positive,
     seed,
-    word,
     write_json,
 )
 
@@ -39,22 +36,8 @@ def add(commands: Any) -> None:
     parser.add_argument("--first", type=seed, default=0, metavar="N", help="number of the first frame (0)")
     parser.add_argument("--count", type=positive, default=1, metavar="N", help="how many frames (1)")
     parser.add_argument("--no-body", dest="with_body", action="store_false", help="the garments alone")
-    parser.add_argument(
-        "--garments",
-        type=names,
-        default=DEFAULT_GARMENTS,
-        metavar="A,B",
-        help=f"garments of one body, by name or .npz (default: {','.join(DEFAULT_GARMENTS)})",
-    )
-    parser.add_argument("--backbone", default=BackboneName.AUTO, metavar="NAME", help="as of refu replay (auto)")
-    parser.add_argument("--sdf", default="hybrid", metavar="MODE", help="as of refu replay (hybrid)")
-    parser.add_argument("--weights", type=in_path, metavar="DIR", help="weights of one's own")
-    parser.add_argument("--margin", type=float, default=DEFAULT_MARGIN, metavar="M", help="clearance from the skin [m]")
-    parser.add_argument("--betas", type=numbers(10), metavar="B0,…", help="shape to use instead of the recorded one")
-    parser.add_argument("--style", type=numbers(4), metavar="G0,…", help="garment style γ")
-    parser.add_argument("--topic", type=word, metavar="NAME", help="input topic, where a bag has several")
-    parser.add_argument("--input-type", type=word, metavar="TYPE", help="as of refu replay")
-    add_collider(parser)
+    add_pipeline(parser)
+    add_recording(parser)
     add_common(parser)
     parser.set_defaults(run=run)
 
@@ -67,8 +50,10 @@ def run(args: argparse.Namespace) -> int:
     for path in (args.json, args.output):
         check_writable(path)
     options = ReplayOptions(**{**given(args, ReplayOptions), "output": None})
-    written = export(options, args.output, first=args.first, count=args.count, with_body=args.with_body)
+    written, warnings = export(options, args.output, first=args.first, count=args.count, with_body=args.with_body)
     for path in written:
         print(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB)")
-    write_json(args.json, {"files": [str(path) for path in written]})
+    for warning in warnings:
+        print(f"warning: {warning}")
+    write_json(args.json, {"files": [str(path) for path in written], "warnings": warnings})
     return 0

@@ -6,15 +6,19 @@ gives the same there: its result is a function of its content.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import logging
+import os
 import pickle
+import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from importlib.util import find_spec
 from itertools import islice
+from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING, Any
 
 from refu_core import RefuError, __version__
@@ -62,24 +66,16 @@ def open_engine(jobs: int | None = None, scheduler: str | None = None) -> Iterat
 @contextmanager
 def _client(jobs: int | None, scheduler: str | None) -> Iterator[Client]:
     import dask
-    from distributed import Client, LocalCluster
+    from distributed import Client
 
     settings = {
         "distributed.scheduler.allowed-failures": ALLOWED_FAILURES,
         "distributed.admin.log-format": "%(message)s",
     }
-    with dask.config.set(settings), ExitStack() as stack:
+    with dask.config.set(settings), _no_logs("distributed.client"), ExitStack() as stack:
         cluster: Any = scheduler
         if scheduler is None:
-            board = "127.0.0.1:0" if find_spec("bokeh") is not None else None
-            cluster = LocalCluster(
-                n_workers=jobs,
-                threads_per_worker=1,
-                processes=True,
-                dashboard_address=board,
-                silence_logs=logging.CRITICAL,
-            )
-            stack.enter_context(cluster)
+            cluster = stack.enter_context(_own_cluster(jobs))
         try:
             client = Client(cluster, timeout=CONNECT_S, set_as_default=False)
         except (OSError, ValueError, TimeoutError) as error:
@@ -88,16 +84,63 @@ def _client(jobs: int | None, scheduler: str | None) -> Iterator[Client]:
         yield stack.enter_context(client)
 
 
+@contextmanager
+def _no_logs(name: str) -> Iterator[None]:
+    """What goes wrong is said in one line by who gave the command; a scheduler that is gone would be a traceback."""
+    logger = logging.getLogger(name)
+    before = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
+
+
+@contextmanager
+def _own_cluster(jobs: int | None) -> Iterator[Any]:
+    """Processes of this machine, which end with the block.
+
+    Ctrl-C is for this process alone, which ends them: they, and whoever takes their place, inherit that it's blocked.
+    While they start and end it has to wait.
+    """
+    from distributed import LocalCluster
+
+    resource_tracker.ensure_running()  # else the first process to be started would start it, and unblock Ctrl-C
+    with _ctrl_c_waits():
+        cluster: Any = LocalCluster(
+            n_workers=jobs,
+            threads_per_worker=1,
+            processes=True,
+            dashboard_address="127.0.0.1:0",  # of bokeh, or (without it) a few pages of text
+            silence_logs=logging.CRITICAL,
+        )
+    try:
+        yield cluster
+    finally:
+        with _ctrl_c_waits():
+            cluster.close()
+
+
+@contextmanager
+def _ctrl_c_waits() -> Iterator[None]:
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 class DaskEngine:
     """Runs tasks on a client's workers."""
 
     def __init__(self, client: Client) -> None:
-        self._client = client
+        self.client = client
+        """Whose workers run them."""
 
     @property
     def dashboard(self) -> str | None:
         """Where the workers can be watched, if anywhere."""
-        link = self._client.dashboard_link
+        link = self.client.dashboard_link
         return link if link and find_spec("bokeh") is not None else None
 
     def run(
@@ -109,19 +152,21 @@ class DaskEngine:
         packed = pickle.dumps(make)
         digest = hashlib.sha256(packed).hexdigest()[:16]
         # A task like any other: whoever loses it gets it again, where scattered data would be gone with its worker.
-        shared = self._client.submit(bytes, packed, key=f"refu-make-{digest}", pure=False)
+        shared = self.client.submit(bytes, packed, key=f"refu-make-{digest}", pure=False)
         numbers: dict[Future[Any], int] = {}
+        folder = os.getcwd()  # noqa: PTH109
 
         def submit(index: int) -> Future[Any]:
-            task = tasks[index]
-            key = f"refu-task-{digest}-{index}-{hashlib.sha256(pickle.dumps(task)).hexdigest()[:16]}"
-            future = self._client.submit(_work, shared, digest, task, __version__, key=key, pure=False)
+            # Packed: a scheduler reads what it passes on, and would import torch for it.
+            task = pickle.dumps(tasks[index])
+            key = f"refu-task-{digest}-{index}-{hashlib.sha256(task).hexdigest()[:16]}"
+            future = self.client.submit(_work, shared, digest, task, __version__, folder, key=key, pure=False)
             numbers[future] = index
             return future
 
         waiting = iter(range(len(tasks)))
-        window = IN_FLIGHT * max(1, sum(self._client.nthreads().values()))
-        done = as_completed([submit(index) for index in islice(waiting, window)], loop=self._client.loop)
+        window = IN_FLIGHT * max(1, sum(self.client.nthreads().values()))
+        done = as_completed([submit(index) for index in islice(waiting, window)], loop=self.client.loop)
         for future in done:
             index = numbers.pop(future)
             result = self._result(future)
@@ -150,8 +195,13 @@ _made: dict[str, Callable[[Any], Any]] = {}
 """This process's function, by what it was made of; the last one alone, as it may hold networks."""
 
 
-def _work(packed: bytes, digest: str, task: Any, version: str) -> Any:
-    """On a worker: makes the function, unless it has it, and calls it."""
+def _work(packed: bytes, digest: str, task: bytes, version: str, folder: str) -> Any:
+    """On a worker: makes the function, unless it has it, and calls it where the command was given.
+
+    A relative path is the command's then, wherever the disk is the same.
+    """
+    with contextlib.suppress(OSError):
+        os.chdir(folder)
     if version != __version__:
         msg = f"a worker has refu-ros {__version__}, this is {version}: install one version everywhere"
         raise FleetError(msg)
@@ -160,7 +210,7 @@ def _work(packed: bytes, digest: str, task: Any, version: str) -> Any:
         make = pickle.loads(packed)
         _one_thread()
         _made[digest] = make()
-    return _made[digest](task)
+    return _made[digest](pickle.loads(task))
 
 
 def _one_thread() -> None:

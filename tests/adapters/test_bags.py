@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import resource
 import shutil
+import signal
 import struct
 import sys
 import tracemalloc
@@ -38,6 +41,8 @@ from msg_adapters import (
     open_smpl_bag,
     quaternion_from_rotvec,
 )
+from msg_adapters.bags._mcap_writer import McapWriter
+from msg_adapters.bags._metadata import TopicSummary, dump_metadata
 from refu_core import SmplFrame, load_body
 
 if TYPE_CHECKING:
@@ -134,6 +139,66 @@ def test_the_file_is_laid_out_as_rosbag2_lays_it_out(tmp_path: Path) -> None:
     assert information["duration"]["nanoseconds"] == 39 * STEP_NS
 
 
+def reference_bag(path: Path, *, compression: str, chunk_bytes: int, messages: list[tuple[int, int, int]]) -> None:
+    """As `BagWriter` writes it, by the mcap package."""
+    kinds = {"zstd": CompressionType.ZSTD, "none": CompressionType.NONE}
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=chunk_bytes, compression=kinds[compression])
+        writer.start(profile="ros2", library="refu-ros")
+        channels = []
+        for topic, message_type in TWO_TOPICS:
+            definition = message_definition(message_type)
+            schema = writer.register_schema(message_type, "ros2msg", definition.text.encode())
+            metadata = {"offered_qos_profiles": QosProfile().to_yaml(), "topic_type_hash": definition.type_hash}
+            channels.append(writer.register_channel(topic, "cdr", schema, metadata))
+        counts = [0, 0]
+        for topic_number, time_ns, size in messages:
+            data = content(time_ns, size)
+            writer.add_message(channels[topic_number], time_ns, data, time_ns, counts[topic_number])
+            counts[topic_number] += 1
+        writer.flush()
+        times = [time_ns for _, time_ns, _ in messages]
+        summaries = [
+            TopicSummary(topic, kind, message_definition(kind).type_hash, QosProfile().to_yaml(), count)
+            for (topic, kind), count in zip(TWO_TOPICS, counts, strict=True)
+        ]
+        end = max(times, default=0)
+        _, record = dump_metadata(file_name=path.name, topics=summaries, start_ns=min(times, default=end), end_ns=end)
+        writer.add_metadata("rosbag2", {"serialized_metadata": record})
+        writer.finish()
+
+
+TWO_TOPICS = [("/garments", MARKER_ARRAY), (TOPIC, INPUT_TYPES["joint_state"])]
+
+
+def content(seed: int, size: int) -> bytes:
+    return np.random.default_rng(seed).integers(0, 9, size, np.uint8).tobytes()
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.tuples(st.integers(0, 1), st.integers(0, 2**40), st.integers(0, 5000)), max_size=12),
+    st.sampled_from(["zstd", "none"]),
+    st.sampled_from([1, 3000, 1 << 20]),
+)
+def test_the_file_is_the_mcap_packages_own(
+    tmp_path_factory: pytest.TempPathFactory, messages: list[tuple[int, int, int]], compression: Any, chunk_bytes: int
+) -> None:
+    """Byte for byte, also where chunks are packed in the background."""
+    folder = tmp_path_factory.mktemp("own")
+    wanted = folder / "wanted" / "bag.mcap"
+    wanted.parent.mkdir()
+    reference_bag(wanted, compression=compression, chunk_bytes=chunk_bytes, messages=messages)
+    for in_background in (False, True):
+        path = folder / str(in_background) / "bag.mcap"
+        with BagWriter(path, compression=compression, chunk_bytes=chunk_bytes, in_background=in_background) as bag:
+            for topic, message_type in TWO_TOPICS:
+                bag.add_topic(topic, message_type)
+            for topic_number, time_ns, size in messages:
+                bag.write(TWO_TOPICS[topic_number][0], content(time_ns, size), log_time_ns=time_ns)
+        assert path.read_bytes() == wanted.read_bytes()
+
+
 # ------------------------------------------------------------------------------------------------ there and back
 
 
@@ -171,6 +236,21 @@ def test_several_files_are_read_in_order(tmp_path: Path) -> None:
     assert [topic.message_count for topic in reader.topics] == [9]
     times = [message.log_time_ns for message in reader.messages()]
     assert times == [frame(i).stamp_ns + 5 for part in range(3) for i in range(part + 2)]
+
+
+def test_a_topic_says_whose_betas_it_has(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "bag.mcap") as bag:
+        bag.add_topic(TOPIC, INPUT_TYPES["joint_state"], betas_of="builtin")
+        bag.write(TOPIC, encoder_for("joint_state")(frame(0)), log_time_ns=1)
+    (topic,) = BagReader(tmp_path / "bag.mcap").topics
+    assert topic.betas_of == "builtin"
+    with RosbagsReader(tmp_path / "bag.mcap") as reader:  # others don't mind
+        assert reader.message_count == 1
+    assert all(
+        topic.betas_of == "builtin" for name in ("walk", "reach_squat") for topic in BagReader(BAGS / name).topics
+    )
+    (topic,) = BagReader(write_bag(tmp_path / "silent.mcap", count=1)).topics
+    assert topic.betas_of == ""
 
 
 def test_two_channels_of_one_topic_are_one(tmp_path: Path) -> None:
@@ -504,10 +584,43 @@ def test_paths_that_cannot_be_written(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/dev/full is Linux's")
-def test_a_full_disk_is_one_line(tmp_path: Path) -> None:
+@pytest.mark.parametrize("in_background", [False, True])
+def test_a_full_disk_is_one_line(tmp_path: Path, in_background: bool) -> None:
     (tmp_path / "full.mcap").symlink_to("/dev/full")
     with pytest.raises(BagError, match=r"can't be written: No space left on device"):
-        write_bag(tmp_path / "full.mcap", overwrite=True)
+        write_bag(tmp_path / "full.mcap", overwrite=True, in_background=in_background)
+
+
+@pytest.mark.parametrize("in_background", [False, True])
+def test_a_disk_that_fills_up_leaves_what_it_took(tmp_path: Path, in_background: bool) -> None:
+    """Whichever call it is that says so."""
+    pid = os.fork()
+    if pid == 0:  # the limit is a process's own
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (9000, 9000))
+        try:
+            write_bag(tmp_path / "bag.mcap", count=400, chunk_bytes=4096, in_background=in_background)
+        except BagError as error:
+            os._exit(0 if "File too large" in str(error) else 1)
+        os._exit(2)
+    assert os.waitpid(pid, 0)[1] == 0
+    bag = open_smpl_bag(tmp_path / "bag.mcap")
+    assert len(list(bag)) > 10
+    assert bag.reader.truncated
+    assert "without its closing records" in bag.reader.warnings[0]  # nothing torn
+
+
+@pytest.mark.parametrize("in_background", [False, True])
+def test_a_kill_leaves_all_but_the_chunks_in_hand(tmp_path: Path, in_background: bool) -> None:
+    pid = os.fork()
+    if pid == 0:
+        with BagWriter(tmp_path / "bag.mcap", chunk_bytes=1, in_background=in_background) as bag:  # a chunk a message
+            bag.add_topic(TOPIC, INPUT_TYPES["joint_state"])
+            for i in range(30):
+                bag.write(TOPIC, encoder_for("joint_state")(frame(i)), log_time_ns=i)
+            os.kill(os.getpid(), signal.SIGKILL)
+    assert os.waitpid(pid, 0)[1] == signal.SIGKILL
+    assert len(list(open_smpl_bag(tmp_path / "bag.mcap"))) >= 30 - in_background
 
 
 def test_an_interrupted_run_leaves_a_whole_bag(tmp_path: Path) -> None:
@@ -525,16 +638,19 @@ def test_an_interrupted_run_leaves_a_whole_bag(tmp_path: Path) -> None:
     assert bag.reader.warnings == []
 
 
-def test_an_interrupt_within_a_write_leaves_what_is_before_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("in_background", [False, True])
+def test_an_interrupt_within_a_write_leaves_what_is_before_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, in_background: bool
+) -> None:
     def torn() -> None:
-        with BagWriter(tmp_path / "bag.mcap", chunk_bytes=4096) as bag:
+        with BagWriter(tmp_path / "bag.mcap", chunk_bytes=4096, in_background=in_background) as bag:
             bag.add_topic(TOPIC, INPUT_TYPES["joint_state"])
             for i in range(30):
                 if i == 20:
-                    monkeypatch.setattr(zstandard, "compress", interrupt)
+                    monkeypatch.setattr(McapWriter, "_end_chunk", interrupt)
                 bag.write(TOPIC, encoder_for("joint_state")(frame(i)), log_time_ns=i)
 
-    def interrupt(_: bytes) -> bytes:
+    def interrupt(_: McapWriter) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):

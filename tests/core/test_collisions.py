@@ -115,7 +115,6 @@ def test_equals_fcl_and_libigl_on_garments(name: str, seed: int) -> None:
     found = checker.check(vertices, faces)
     assert found.n_pairs > 0
     assert set(map(tuple, found.pairs.tolist())) == fcl_pairs(vertices, faces, skin, skin_faces)
-    # Every vertex is asked here, a few of each component there.
     winding = igl.fast_winding_number(skin.astype(np.float64), skin_faces.astype(np.int64), vertices.astype(np.float64))
     np.testing.assert_array_equal(found.inside, winding > 0.5)
 

@@ -22,7 +22,8 @@ from refu_core import RefuError, SmplFrame
 from refu_core._engine import InProcess, Lost
 from refu_lab.cli import main
 from refu_lab.fleet import FleetError, find_recordings, is_plain, open_engine
-from refu_lab.fleet._engine import run_function
+from refu_lab.fleet._engine import DaskEngine, run_function
+from tests.lab import fleet_tasks
 from tests.lab.test_replay import motion, write_bag
 
 FAST = ["--garments", "short-pant-male", "--backbone", "skinned", "--sdf", "none", "--no-collider", "--quiet"]
@@ -208,26 +209,13 @@ def test_without_dask_one_line_says_what_to_install(bags: Path, monkeypatch: pyt
 # ---- many processes --------------------------------------------------------------------------------------------------
 
 
-def _slow_square(number: int) -> int:
-    if number == 3 and not Path(os.environ["REFU_TEST_MARK"]).exists():
-        Path(os.environ["REFU_TEST_MARK"]).touch()
-        os.kill(os.getpid(), signal.SIGKILL)
-    return number * number
-
-
-def _deadly(number: int) -> int:
-    if number == 1:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return number
-
-
 @pytest.fixture
-def scheduler(tmp_path: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
+def scheduler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
     """A scheduler and two workers, as a cluster has them: processes of their own."""
     pytest.importorskip("distributed")
     file = tmp_path / "scheduler.json"
-    path = os.pathsep.join([str(Path(__file__).parents[2]), str(Path(__file__).parent)])
-    environment = os.environ | {"REFU_TEST_MARK": str(tmp_path / "mark"), "PYTHONPATH": path}
+    monkeypatch.setenv("REFU_TEST_MARK", str(tmp_path / "mark"))
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
     started = [
         subprocess.Popen(
             [sys.executable, "-m", f"distributed.cli.{kind}", "--scheduler-file", str(file), *options],
@@ -253,19 +241,30 @@ def scheduler(tmp_path: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
 
 
 def test_killed_workers_lose_and_double_nothing(
-    scheduler: tuple[str, subprocess.Popen[bytes]], bags: Path, alone: Path, tmp_path: Path, capsys: Any
+    scheduler: tuple[str, subprocess.Popen[bytes]],
+    bags: Path,
+    alone: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: Any,
 ) -> None:
-    """One worker dies with a task, then others with a task that ends each; the same cluster replays on."""
+    """A worker dies with a task that then succeeds, one with a task that ends each; the same cluster replays on."""
     address, process = scheduler
     with open_engine(None, address) as engine:
-        found = sorted(engine.run(run_function(_slow_square), list(range(20))))
+        found = sorted(engine.run(run_function(fleet_tasks.square_unless_first), list(range(20))))
         assert found == [(n, n * n) for n in range(20)]
-        lost = dict(engine.run(run_function(_deadly), [0, 1, 2]))
-        assert (lost[0], lost[2]) == (0, 2)
-        assert isinstance(lost[1], Lost)
-        assert "out of memory?" in lost[1].reason
-    out = tmp_path / "out"
-    assert run(bags, "--scheduler", address, "--output", out) == 2
+        assert Path(os.environ["REFU_TEST_MARK"]).exists()
+        assert isinstance(engine, DaskEngine)
+        engine.client.run_on_scheduler(
+            fleet_tasks.allow_no_failure
+        )  # else each of six workers would have to start and die
+        ((_, lost),) = engine.run(run_function(fleet_tasks.die), [0])
+        assert isinstance(lost, Lost)
+        assert "out of memory?" in lost.reason
+    out = tmp_path / "elsewhere" / "out"
+    out.parent.mkdir()
+    monkeypatch.chdir(out.parent)  # where no worker is
+    assert run(bags, "--scheduler", address, "--output", "out") == 2
     assert "3 of 4 recordings replayed, 0 of them before" in capsys.readouterr().out
     assert content(out) == content(alone)
 
@@ -276,7 +275,27 @@ def test_killed_workers_lose_and_double_nothing(
         with pytest.raises(FleetError, match="same command again"):
             list(results)
     assert run(bags, "--output", out) == 2  # goes on, here without any
-    assert "3 of 4 recordings replayed, 3 of them before" in capsys.readouterr().out
+    printed = capsys.readouterr()
+    assert "3 of 4 recordings replayed, 3 of them before" in printed.out
+    assert "Traceback" not in printed.err
+
+
+def test_ctrl_c_ends_the_processes_in_silence() -> None:
+    pytest.importorskip("distributed")
+    code = (
+        "import time; from refu_lab.fleet import open_engine, run_function\n"
+        "with open_engine(2) as engine:\n"
+        "    try:\n"
+        "        for _ in engine.run(run_function(time.sleep), [0.0, 600.0, 600.0]): print('up', flush=True)\n"
+        "    except KeyboardInterrupt: print('interrupted', flush=True)\n"
+    )
+    command = [sys.executable, "-c", code]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"up\n"
+        os.killpg(process.pid, signal.SIGINT)  # to all of them, as a terminal does
+        out, error = process.communicate()
+    assert (out, error, process.returncode) == (b"interrupted\n", b"", 0)
 
 
 def test_no_scheduler_at_the_address_is_one_line(bags: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -290,8 +309,4 @@ def test_no_scheduler_at_the_address_is_one_line(bags: Path, capsys: Any, monkey
 
 
 def test_engine_in_this_process_keeps_the_order() -> None:
-    assert list(InProcess().run(run_function(_square), [3, 1])) == [(0, 9), (1, 1)]
-
-
-def _square(number: int) -> int:
-    return number * number
+    assert list(InProcess().run(run_function(fleet_tasks.square), [3, 1])) == [(0, 9), (1, 1)]

@@ -214,6 +214,31 @@ def test_frames_of_a_bag_are_exported(tmp_path: Path, capsys) -> None:
     assert "has no frame that can be dressed" in capsys.readouterr().err
 
 
+def test_an_export_takes_the_options_of_a_replay(tmp_path: Path, capsys) -> None:
+    """Another shape, another body and others' axes change what is written; foreign betas are said."""
+    common = ["--garments", "short-pant-male", "--backbone", "skinned", "--sdf", "none", "--no-collider"]
+
+    def exported(source: Path, *options: str) -> dict[str, np.ndarray]:
+        out = tmp_path / "out.glb"
+        assert main(["export", str(source), "--output", str(out), *common, *options]) == 0
+        return {name: mesh.vertices for name, mesh in trimesh.load_scene(out, process=False).geometry.items()}
+
+    plain = exported(WALK)
+    heavy = exported(WALK, "--betas", "0,4")
+    female = exported(WALK, "--body", "female")
+    for other in (heavy, female):
+        assert np.abs(other["body"] - plain["body"]).max() > 0.01
+    assert "warning" not in capsys.readouterr().out
+    motion = tmp_path / "z_up.npz"
+    poses = np.zeros((90, 72))
+    poses[:, 0] = np.pi / 2  # z up, as AMASS has it
+    np.savez(motion, poses=poses, trans=np.zeros((90, 3)), betas=np.full(10, 0.5), mocap_framerate=30.0)
+    standing = exported(motion, "--input-axes", "z-up", "--first", "80", "--fps", "60")["body"]
+    assert np.ptp(standing[:, 1]) > 1.4
+    assert np.ptp(exported(motion, "--input-axes", "smpl")["body"][:, 1]) < 0.6  # lies, as it was asked to
+    assert "betas arrive" in capsys.readouterr().out
+
+
 def test_damaged_meshes_are_one_line(tmp_path: Path) -> None:
     (tmp_path / "a.glb").write_bytes(b"glTF" + bytes(40))
     with pytest.raises(GarmentError, match="not a mesh that can be read"):

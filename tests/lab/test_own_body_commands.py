@@ -101,6 +101,8 @@ def test_betas_of_unknown_meaning_are_warned_of_once(tmp_path: Path) -> None:
     assert not warnings_of(path, plain, betas=(0.0,) * 10)
     assert not warnings_of(path, bare("male"))
     assert not warnings_of(write_motion(tmp_path / "mean.npz", betas=np.zeros(16)), plain)
+    assert not warnings_of(BAGS / "reach_squat", plain, max_frames=1, output=tmp_path / "out.mcap")  # it says whose
+    assert not warnings_of(tmp_path / "out.mcap", plain, max_frames=1)  # and so does what is made of it
 
 
 def test_a_recording_of_another_gender_is_warned_of(tmp_path: Path) -> None:

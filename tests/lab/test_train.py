@@ -57,8 +57,8 @@ def test_variants(data: Path, weights: Path) -> None:
     common = ["train", GARMENT, "--data", str(data), "--output", str(weights / GARMENT), "--quiet", "--steps", "1"]
     for k, extra in enumerate((["--scale", "fixed"], ["--scale", "shared"], ["--margin", "0", "--unblended"])):
         folder = weights / f"variant{k}"
-        assert main([*common[:5], str(folder), *common[6:], "--mode", "none"]) == 0
         assert main([*common[:5], str(folder), *common[6:], "--mode", "approx", *extra]) == 0
+        assert (folder / "tailornet-none.json").exists()  # trained before, in as few steps
     cards = [json.loads((weights / f"variant{k}" / "tailornet-approx.json").read_text())["refu"] for k in range(3)]
     assert cards[0]["scale"] is None
     assert cards[1]["scale"]["kind"] == "shared"
