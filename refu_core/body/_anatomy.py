@@ -176,7 +176,7 @@ class Anatomy:
         segments.first_face = self._ints(np.cumsum([0, *map(len, solids.faces)]))
         softness = np.array([one for _, one in SOFTNESS])
         segments.ratio = self._floats(softness[None] / softness[:, None])
-        segments.path = self._ints(_paths())
+        segments.path = self._ints(_paths(weights, solids.of_vertex))
         clearance = wp.zeros((n, n_segments), dtype=wp.float32, device=device)
         segments.gap = clearance
         wp.launch(parting.clearance_kernel, (n, n_segments), [points, segments, clearance], device=device)
@@ -263,16 +263,18 @@ class Tensors:
 _BY_VERTEX = ("is_moved", "is_end", "is_front", "touched", "outside")
 
 
-def _paths() -> NDArray[np.int32]:
-    """The joints, as bits, that move any joint of segment i against any of segment k, shape (K, K)."""
+def _paths(weights: NDArray[np.float64], of_vertex: NDArray[np.int32]) -> NDArray[np.int32]:
+    """The joints, as bits, that move any skin of segment i against any of segment k, shape (K, K).
+
+    Of skinning weights (V, 24) and the segment of each vertex.
+    """
     above = np.zeros(len(PARENTS), np.int64)  # each joint and those that it hangs on, but the root, which moves all
     for joint in range(1, len(PARENTS)):
         above[joint] = above[PARENTS[joint]] | (1 << joint)
-    paths = [
-        [np.bitwise_or.reduce(above[list(one)][:, None] ^ above[list(other)], axis=None) for other, _ in SOFTNESS]
-        for one, _ in SOFTNESS
-    ]
-    return np.array(paths, np.int32)
+    move = [above[(weights[of_vertex == k] > 0).any(axis=0)] for k in range(len(SOFTNESS))]
+    return np.array(
+        [[np.bitwise_or.reduce(one[:, None] ^ other, axis=None) for other in move] for one in move], np.int32
+    )
 
 
 def _smooth_normals(vertices: NDArray[np.float64], mesh: Connectivity) -> NDArray[np.float64]:

@@ -52,10 +52,10 @@ def bound(i: int, points: wp.array[wp.vec3], bundles: Bundles) -> None:
 
 @wp.func
 def enclose(k: int, bundles: Bundles) -> None:
-    """The box of group k."""
-    low = bundles.low[bundles.first[k]]
-    high = bundles.high[bundles.first[k]]
-    for i in range(bundles.first[k] + 1, bundles.first[k + 1]):
+    """The box of group k; nothing is near one without faces."""
+    low = wp.vec3(wp.inf, wp.inf, wp.inf)
+    high = -low
+    for i in range(bundles.first[k], bundles.first[k + 1]):
         low = lesser(low, bundles.low[i])
         high = greater(high, bundles.high[i])
     bundles.group_low[k] = low

@@ -23,7 +23,9 @@ def bundled(rest: NDArray[np.floating[Any]], faces: Sequence[NDArray[np.integer[
     first = [0]
     for of_group in faces:
         order = grouped(rest[of_group].mean(1))
-        corners += [np.unique(of_group[some]) for some in np.array_split(order, max(1, round(len(order) / _SIZE)))]
+        corners += [
+            np.unique(of_group[some]) for some in np.array_split(order, max(1, len(order) // _SIZE)) if len(some)
+        ]
         first.append(len(corners))
     bundles = Bundles()
     bundles.first, bundles.start, bundles.corner = (

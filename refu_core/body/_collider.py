@@ -84,19 +84,19 @@ class Collider:
                     run(name)
                 self._smooth(how.smooth_first)
                 run("settle")
-            if self._touch():
-                if self._is_serial:
-                    run("part all")
-                else:
-                    run("part")
-                    self._smooth(how.smooth_last)
-                    for _ in range(how.edge_rounds):
-                        run("edge")
-                        run("follow")
+            self._touch()
+            if self._is_serial:
+                run("part all")
+            else:
+                run("part")
+                self._smooth(how.smooth_last)
+                for _ in range(how.edge_rounds):
+                    run("edge")
+                    run("follow")
         return self._levelled(how.smooth_last)
 
-    def _touch(self) -> bool:
-        """Which segments each vertex has to give way to, and whether there may be any."""
+    def _touch(self) -> None:
+        """Which segments each vertex has to give way to."""
         if self._is_serial:
             self._run("look")
             wanted = int(self.anatomy.tensors.counts[kernels.WANTED])
@@ -107,15 +107,13 @@ class Collider:
         for k, tree in enumerate(self.anatomy.trees):
             if (wanted >> k) & 1:
                 tree.refit()
-        if wanted == 0:
-            return False
         if self._is_serial:
-            self._run("touch all")
-            return int(self.anatomy.tensors.counts[kernels.TOUCHING]) > 0
+            if wanted:
+                self._run("touch all")
+            return
         self._run("touch")
         for r in range(self.settings.deepen_rounds):
             self._run(f"deepen {r}")
-        return True
 
     def _smooth(self, sweeps: int) -> None:
         self._run("share")
