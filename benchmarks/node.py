@@ -5,6 +5,7 @@
     python benchmarks/node.py --nobody                     # nobody listens: what the node costs then, and how long
                                                            # viewers wait that come late
     python benchmarks/node.py --nobody -p lazy:=false      # the same of a node that stays subscribed
+    python benchmarks/node.py --points                     # who subscribes reads points, typed, and not markers
 
 Prints how many frames came out, latencies from the sender's stamp to the subscriber, whether they grow, how long the
 node takes to answer parameter changes meanwhile, and its share of a core. Needs rclpy (extra `ros`).
@@ -14,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import json
 import os
 import subprocess
@@ -80,16 +82,27 @@ def pose(t: float) -> np.ndarray[Any, np.dtype[np.float64]]:
 
 
 def receive(options: argparse.Namespace) -> dict[str, Any]:
-    """The subscriber: raw bytes, looked at as arrays."""
+    """The subscriber: raw bytes of markers, or typed messages of points, looked at as arrays."""
     import rclpy
     from rclpy.qos import QoSProfile
+    from sensor_msgs.msg import PointCloud2
     from visualization_msgs.msg import MarkerArray
 
-    from msg_adapters import decode_marker_array
+    from msg_adapters import decode_marker_array, points_of
 
     node = start_ros("receiver")
     got: dict[str, dict[int, float]] = {person: {} for person in names(options.persons)}
-    bad = 0
+    bad, read_ms = 0, []
+
+    def take_points(person: str, message: PointCloud2) -> None:
+        nonlocal bad
+        now, start = time.time_ns(), time.perf_counter()
+        points = points_of(message)
+        where = np.stack([points["x"], points["y"], points["z"]], axis=1)
+        read_ms.append(1e3 * (time.perf_counter() - start))
+        stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+        got[person][stamp] = 1e-6 * (now - stamp)
+        bad += not np.isfinite(where.sum())
 
     def take(data: bytes) -> None:
         nonlocal bad
@@ -100,7 +113,12 @@ def receive(options: argparse.Namespace) -> dict[str, Any]:
                 got[person][marker.stamp_ns] = 1e-6 * (now - marker.stamp_ns)
                 bad += not np.isfinite(marker.points.sum())
 
-    node.create_subscription(MarkerArray, "garments", take, QoSProfile(depth=10), raw=True)
+    if options.points:
+        for person in got:
+            topic = f"{person}/points" if person else "points"
+            node.create_subscription(PointCloud2, topic, functools.partial(take_points, person), QoSProfile(depth=10))
+    else:
+        node.create_subscription(MarkerArray, "garments", take, QoSProfile(depth=10), raw=True)
     end = time.monotonic() + options.seconds + 30.0
     last = 0.0
     while time.monotonic() < end:
@@ -110,7 +128,7 @@ def receive(options: argparse.Namespace) -> dict[str, Any]:
             last = time.monotonic()
         if last and time.monotonic() - last > 4.0:
             break
-    return {"got": got, "not_finite": bad}
+    return {"got": got, "not_finite": bad, "read_ms": percentiles(read_ms)}
 
 
 def processor_seconds(process: subprocess.Popen[bytes]) -> dict[str, float]:
@@ -235,6 +253,7 @@ def main() -> None:
     parser.add_argument(
         "--reload", action="store_true", help="change a parameter that loads another pipeline each time"
     )
+    parser.add_argument("--points", action="store_true", help="subscribe to points, typed, in the place of markers")
     parser.add_argument("--nobody", action="store_true", help="leave out the subscriber, and changes of parameters")
     parser.add_argument("-p", "--parameter", action="append", default=[], help="name:=value of the node, besides those")
     parser.add_argument("--role", choices=("send", "receive"), help=argparse.SUPPRESS)
@@ -259,6 +278,7 @@ def main() -> None:
         f"--rate={options.rate}",
         f"--seconds={options.seconds if not options.nobody else UNTIL_KILLED_S}",
         *(["--nobody"] if options.nobody else []),
+        *(["--points"] if options.points else []),
     ]
     sender = subprocess.Popen([*same, "--role=send"], stdout=subprocess.PIPE)
     try:
@@ -274,7 +294,12 @@ def main() -> None:
         sender.wait()
         node.terminate()
         node.wait()
-    result = {**summary(sent, received["got"]), "not_finite": received["not_finite"], **operated}
+    result = {
+        **summary(sent, received["got"]),
+        "not_finite": received["not_finite"],
+        "read_ms": received["read_ms"],
+        **operated,
+    }
     print(json.dumps(result, indent=2))
 
 

@@ -103,6 +103,7 @@ def viewer(given: dict[str, str]) -> list[LaunchDescriptionEntity]:
     frame = ["--frame-id", given["frame_id"], "--child-frame-id", "refu_demo"]
     display = ["--display-config", str(SHARE / "rviz" / "refu.rviz"), "--fixed-frame", given["frame_id"]]
     topics = {"garments": given["output_topic"] or "garments", "body": given["body_topic"] or "body"}
+    topics |= {name: name for name in ("openings", "points")}
     return [
         Node(package="tf2_ros", executable="static_transform_publisher", arguments=frame),
         Node(

@@ -23,3 +23,7 @@ class BagError(AdapterError):
 
 class MotionFileError(AdapterError):
     """A file of motion that can't be read."""
+
+
+class TransformError(AdapterError):
+    """No transform leads from one frame to another, or none at the time asked for."""

@@ -59,3 +59,35 @@ def slerp(start: NDArray[np.float64], end: NDArray[np.float64], fraction: ArrayL
     q = a * start + b * end
     result: Float64Array = q / np.linalg.norm(q, axis=-1, keepdims=True)
     return result
+
+
+def matrix_from_quaternion(quaternion: ArrayLike) -> NDArray[np.float64]:
+    """Rotation matrices, shape (..., 3, 3), of unit quaternions xyzw, shape (..., 4)."""
+    x, y, z, w = np.moveaxis(np.asarray(quaternion, dtype=np.float64), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    matrix: Float64Array = np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+    return matrix
+
+
+def quaternion_from_matrix(matrix: ArrayLike) -> NDArray[np.float64]:
+    """Unit quaternions xyzw with w >= 0, shape (..., 4), of rotation matrices, shape (..., 3, 3)."""
+    m = np.asarray(matrix, dtype=np.float64)
+    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    # 4 q qᵀ, whose entries are sums of those of the matrix: its longest row is q times the largest component, so
+    # nothing small is divided by.
+    outer = np.empty((*m.shape[:-2], 4, 4))
+    outer[..., 0, 0], outer[..., 1, 1] = 1 + xx - yy - zz, 1 - xx + yy - zz
+    outer[..., 2, 2], outer[..., 3, 3] = 1 - xx - yy + zz, 1 + xx + yy + zz
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        outer[..., i, j] = outer[..., j, i] = m[..., i, j] + m[..., j, i]
+    for i, (j, k) in enumerate(((2, 1), (0, 2), (1, 0))):
+        outer[..., i, 3] = outer[..., 3, i] = m[..., j, k] - m[..., k, j]
+    best = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
+    q = np.take_along_axis(outer, best[..., None, None], axis=-2)[..., 0, :]
+    q = np.where(q[..., 3:] < 0, -q, q)
+    result: Float64Array = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return result

@@ -5,8 +5,9 @@ from __future__ import annotations
 import contextlib
 import functools
 import os
+import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
@@ -55,6 +56,50 @@ def as_warp(tensor: Tensor, dtype: Any) -> Any:
 def argument(tensor: Tensor, dtype: Any) -> Any:
     """`as_warp` for one launch, in half the time: the tensor must outlive the launch."""
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
+
+
+class Repeated(threading.local):
+    """A kernel that is launched with other arrays of the same shapes again and again.
+
+    Making a launch's arguments in Python takes as long as the work of a small one. So they are made once for each
+    size, and told where the memory is from then on. Every thread has its own.
+    """
+
+    def __init__(self, kernel: Any, kinds: Sequence[Any]) -> None:
+        """`kinds` are the Warp types of all of the kernel's arguments, arrays all of them, outputs included."""
+        self._kernel, self._kinds = kernel, kinds
+        self._known: dict[Any, tuple[Any, list[Any]]] = {}
+
+    def __call__(self, dim: Sequence[int], *tensors: Tensor) -> None:
+        """Launches with contiguous tensors of one device, which are kept until the next launch of their sizes."""
+        device = tensors[0].device
+        key = (device, *dim, *(tensor.shape for tensor in tensors))
+        if key not in self._known:
+            if len(self._known) >= _MOST_SIZES:
+                self._known.clear()
+            arrays = [argument(tensor, kind) for tensor, kind in zip(tensors, self._kinds, strict=True)]
+            self._known[key] = wp.launch(self._kernel, dim, arrays, device=str(device), record_cmd=True), arrays
+        command, arrays = self._known[key]
+        for array, tensor in zip(arrays, tensors, strict=True):
+            array.data, array._ref = tensor.data_ptr(), tensor
+        with torch_stream(device):
+            command.launch()
+
+
+@functools.cache
+def strips(n: int, device: torch.device) -> tuple[int, Tensor]:
+    """Into how many strips a kernel's n items are cut, and how many each has, int32, shape (1,).
+
+    A thread takes a strip. A CPU's compiler keeps more in registers in a loop than from thread to thread, so it gets
+    one strip; a GPU as many as there are items.
+    """
+    n_strips = 1 if device.type == "cpu" else n
+    with torch.inference_mode(False):
+        return n_strips, torch.tensor([max(n, 1) // max(n_strips, 1)], dtype=torch.int32, device=device)
+
+
+_MOST_SIZES = 64
+"""Sizes of a kernel's arguments that are remembered."""
 
 
 def is_plain(*tensors: Tensor) -> bool:

@@ -168,3 +168,24 @@ def _grouped(owner: NDArray[Any], items: NDArray[Any], n: int) -> Adjacency:
     order = np.argsort(owner, kind="stable")
     start = np.concatenate(([0], np.cumsum(np.bincount(owner, minlength=n))))
     return Adjacency(start.astype(np.int32), items[order].astype(np.int32))
+
+
+def grouped(places: NDArray[np.float32], width: int = 8) -> NDArray[np.int64]:
+    """An order of places (N, 3) in which each eight (or `width`), each 64, and so on are close together."""
+    n = len(places)
+    sizes_of_groups = width ** np.arange(20, dtype=np.int64)
+    order, bounds = np.arange(n), np.array([0, n])
+    while True:
+        starts, sizes = bounds[:-1], np.diff(bounds)
+        is_open = sizes > 1
+        if not is_open.any():
+            return order
+        here = places[order]
+        extent = np.maximum.reduceat(here, starts) - np.minimum.reduceat(here, starts)
+        group = np.repeat(np.arange(len(starts)), sizes)
+        along = here[np.arange(n), extent.argmax(1)[group]]
+        order = order[np.lexsort((along, group))]
+        # Into halves, of whole groups of the next smaller size: only the last one of all may have less.
+        unit = sizes_of_groups[np.searchsorted(sizes_of_groups, sizes[is_open]) - 1]
+        half = np.maximum(-(-sizes[is_open] // unit) // 2, 1) * unit
+        bounds = np.union1d(bounds, starts[is_open] + half)

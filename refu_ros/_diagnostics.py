@@ -37,13 +37,15 @@ def statuses(
     listening_for: float | None = math.inf,
     in_use: PipelineKey | None = None,
     input_frame: str = "",
+    is_transformed: bool = False,
     has_foreign_betas: bool = False,
     n_namesakes: int = 0,
 ) -> list[DiagnosticStatus]:
     """Node, input, output and recording; `state` is the lifecycle's, `persons` are those in the scene.
 
     `node` is the name with its namespace; `listening_for` is the time since the inputs were subscribed to [s], None
-    where they aren't; `in_use` is what is computed with; `input_frame` is the sender's, where it isn't the markers';
+    where they aren't; `in_use` is what is computed with; `input_frame` is the sender's, where it isn't the markers',
+    and `is_transformed` whether there are transforms of it;
     `has_foreign_betas`: nobody knows what the betas mean that came; `n_namesakes` are other nodes of this name.
     """
     active = state == "active"
@@ -57,6 +59,7 @@ def statuses(
             active=active,
             listening_for=listening_for,
             input_frame=input_frame,
+            is_transformed=is_transformed,
             has_foreign_betas=has_foreign_betas,
         ),
         _output(
@@ -94,6 +97,7 @@ def _input(
     active: bool,
     listening_for: float | None,
     input_frame: str,
+    is_transformed: bool,
     has_foreign_betas: bool,
 ) -> DiagnosticStatus:
     invalid, received = report.recent["drop.invalid"], report.recent["received"]
@@ -102,11 +106,13 @@ def _input(
     if not active:
         message = "not active"
     elif listening_for is None:
-        message = "not subscribed to: nobody listens to garments or body, and nothing is recorded"
+        message = "not subscribed to: nobody listens to anything, and nothing is recorded"
     elif invalid and invalid == received:
         level, message = ERROR, f"every message is invalid: {report.reasons.get('invalid', '')}"
     elif invalid:
         level, message = WARN, f"{invalid} of {received} messages are invalid: {report.reasons.get('invalid', '')}"
+    elif untransformed := report.recent["drop.transform"]:
+        level, message = WARN, f"{untransformed} of {received} have no transform: {report.reasons.get('transform', '')}"
     elif report.silent_for is None and listening_for > _FIRST_INPUT_S:
         level, message = WARN, "no input yet"
     elif report.recent["back_in_time"]:
@@ -120,13 +126,15 @@ def _input(
         message = f"no input from {who}" if who else f"no input for {min(report.silent_for, listening_for):.1f} s"
     elif has_foreign_betas:
         level, message = WARN, FOREIGN_BETAS
+    way = "transformed to" if is_transformed else "shown as"
     values = {
         "subscribed": "no" if listening_for is None else "yes",
         "rate [Hz]": f"{report.rate('received'):.1f}",
         "received": str(report.total["received"]),
         "persons": ", ".join(filter(None, persons)) or str(len(persons)),
         "input type": settings.input_type,
-        "frame": f"{input_frame}, shown as {settings.frame_id}" if input_frame else settings.frame_id,
+        "frame": f"{input_frame}, {way} {settings.frame_id}" if input_frame else settings.frame_id,
+        "late transforms": str(report.total["late_transform"]),
         "stamps that went back": str(report.total["back_in_time"]),
     }
     values |= {f"dropped: {cause}": str(n) for cause, n in sorted(report.group("drop").items())}

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import threading
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from msg_adapters import Placement
 from refu_core import FrameError
 from refu_core.frames import PLAUSIBLE_ANGLE, PLAUSIBLE_COEFFICIENT, PLAUSIBLE_TRANSL
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from refu_core import SmplFrame
+    from refu_core.outputs import PinholeCamera
     from refu_ros._statistics import Statistics
 
 _MAX_STAMP_NS = 2**31 * 10**9
@@ -28,6 +30,10 @@ class Arrival:
     frame: SmplFrame
     received: float
     """On the scene's clock [s]."""
+    placement: Placement = field(default_factory=Placement)
+    """From the sender's frame to that of the messages."""
+    camera: PinholeCamera | None = None
+    """Who looks, in the frame of the messages."""
 
 
 def check_plausible(frame: SmplFrame) -> None:
@@ -71,8 +77,10 @@ class Scene:
         self._held = False
         self._closed = False
 
-    def put(self, person: str, frame: SmplFrame) -> None:
-        """A person's new frame."""
+    def put(
+        self, person: str, frame: SmplFrame, placement: Placement | None = None, camera: PinholeCamera | None = None
+    ) -> None:
+        """A person's new frame, where the sender's frame is (the messages' own if not given), and who looks."""
         now = self._clock()
         with self._changed:
             if person in self._pending:
@@ -83,7 +91,7 @@ class Scene:
             if frame.stamp_ns < self._stamps.get(person, 0):
                 self._statistics.back_in_time()
             self._stamps[person] = frame.stamp_ns
-            self._pending[person] = Arrival(frame, now)
+            self._pending[person] = Arrival(frame, now, placement or Placement(), camera)
             self._seen[person] = now
             self._changed.notify()
 

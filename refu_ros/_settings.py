@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from msg_adapters import INPUT_TYPES, KEYPOINT_TYPES, InputAxes, InputType
+from msg_adapters import INPUT_TYPES, KEYPOINT_TYPES, POINT_FIELDS, InputAxes, InputType
 from refu_core import GarmentPipeline, RefuError, SmplFrame, load_garment
 from refu_core._device import checked_device
 from refu_core.frames import N_JOINTS
@@ -157,7 +157,27 @@ class NodeSettings:
         "Axes of root orientation and translation: smpl (y up; turned into ROS axes) or frame (those of frame_id).",
         choices=("smpl", "frame"),
     )
-    frame_id: str = _parameter("map", "Frame of the markers.")
+    frame_id: str = _parameter("map", "Frame of all that comes out; inputs of other frames are transformed (tf2).")
+    transform_tolerance: float = _parameter(
+        0.1,
+        "A transform may be so much older than the input [s]; without one the input is dropped.",
+        low=0.0,
+        high=10.0,
+    )
+    points_fields: tuple[str, ...] = _parameter(
+        POINT_FIELDS, f"What the points have besides x, y and z: of {', '.join(POINT_FIELDS)}."
+    )
+    camera_info: str = _parameter(
+        "",
+        "A camera's CameraInfo topic: points then say whether it sees them; empty for none.",
+        live=False,
+    )
+    planner_rate: float = _parameter(
+        5.0, "Meshes for planners: at most so many a second of each garment; 0 for no limit [Hz].", low=0.0, high=1000.0
+    )
+    publish_tf: bool = _parameter(
+        False, "Whether openings are frames on /tf, too; whoever listens there is then a reason to compute.", live=False
+    )
     persons: tuple[str, ...] = _parameter(
         ("",), "Persons, each with a topic <person>/smpl_params; one without a name listens to smpl_params.", live=False
     )
@@ -205,6 +225,9 @@ class NodeSettings:
             raise SettingsError(msg)
         if self.follow_humans and self.input_type != "joint_state":
             msg = f"follow_humans: REP-155 has bodies as joint_state, but input_type is {self.input_type}"
+            raise SettingsError(msg)
+        if unknown := sorted(set(self.points_fields) - {"", *POINT_FIELDS}):
+            msg = f"points_fields: wanted names of {', '.join(POINT_FIELDS)}, got {', '.join(unknown)}"
             raise SettingsError(msg)
         if not _FRAME.fullmatch(self.frame_id):
             msg = f"frame_id: wanted a name as tf2 has them, without a leading slash or spaces, got {self.frame_id!r}"

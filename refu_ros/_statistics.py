@@ -50,7 +50,7 @@ class Statistics:
     """Counters that any thread may raise.
 
     Keys: received, ticks, frames, drop.<cause>, skip.<kind>, fault.<where>, penetration.<found|unresolved>,
-    back_in_time, beyond_promise.
+    back_in_time, beyond_promise, late_transform.
     """
 
     def __init__(self, *, clock: Callable[[], float] = time.monotonic) -> None:
@@ -88,6 +88,11 @@ class Statistics:
         """A frame is older by its stamp than its person's frame before."""
         with self._lock:
             self._total["back_in_time"] += 1
+
+    def late_transform(self) -> None:
+        """A frame was placed by a transform older than itself."""
+        with self._lock:
+            self._total["late_transform"] += 1
 
     def beyond_promise(self) -> None:
         """A frame's joints or shape are outside of the range that "nothing inside" is promised for."""

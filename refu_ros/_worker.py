@@ -5,57 +5,56 @@ from __future__ import annotations
 import threading
 import time
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import torch
 
-from msg_adapters import EncodeError, MarkerArrayEncoder, MarkerMesh, encode_delete, garment_namespace
+from msg_adapters import Placement
+from msg_adapters.axes import SMPL_COLUMNS
+from msg_adapters.outputs import Moment, make_outputs
+from refu_core import RefuError
 from refu_core._device import is_device_loss
 from refu_core.modes import BetasSource
+from refu_core.outputs import Dressed, Fittings
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Mapping, Sequence
 
+    from msg_adapters.outputs import Output
     from refu_core import GarmentPipeline, SmplFrame
     from refu_core.realtime import PipelineOutput
     from refu_ros._scene import Arrival, Scene
     from refu_ros._settings import NodeSettings
     from refu_ros._statistics import Statistics
 
-_SKIN = (0.80, 0.67, 0.58, 1.0)
 _IDLE_S = 0.1
 """How often the thread looks for persons who have left when nobody sends [s]."""
 _EMPTY_S = 2.0
 """The same when nobody is there [s]; a new person wakes the thread at once."""
-_MAX_ENCODERS = 16
-"""Sets of persons whose message layout is kept; making one takes a millisecond."""
 
 
 class Outlet(Protocol):
     """Where the messages go."""
 
-    def watched(self) -> bool:
-        """Whether anybody wants garments."""
+    def is_watched(self) -> bool:
+        """Whether anybody wants anything."""
 
-    def body_watched(self) -> bool:
-        """Whether anybody wants bodies."""
+    def watchers(self, topic: str) -> int:
+        """How many want a topic."""
 
     def now_ns(self) -> int:
         """ROS time [ns]."""
 
-    def send_garments(self, data: bytes) -> None:
-        """A MarkerArray for `garments`."""
-
-    def send_body(self, data: bytes) -> None:
-        """A MarkerArray for `body`."""
+    def send(self, topic: str, data: bytes) -> None:
+        """A message for a topic."""
 
     def device_lost(self, reason: str) -> None:
         """The pipeline's device has failed: nothing comes before there is another pipeline."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Dressed:
+class _Known:
     """A person as last computed, without the translation."""
 
     inputs: bytes
@@ -70,17 +69,24 @@ class Worker:
     """
 
     def __init__(
-        self, scene: Scene, statistics: Statistics, outlet: Outlet, *, settings: NodeSettings, pipeline: GarmentPipeline
+        self,
+        scene: Scene,
+        statistics: Statistics,
+        outlet: Outlet,
+        *,
+        settings: NodeSettings,
+        pipeline: GarmentPipeline,
+        outputs: Sequence[Output] | None = None,
     ) -> None:
         self.settings = settings
         self._scene = scene
         self._statistics = statistics
         self._outlet = outlet
         self._next_pipeline = self._pipeline = pipeline
-        self._dressed: dict[str, _Dressed] = {}
-        self._encoders: dict[tuple[object, ...], MarkerArrayEncoder] = {}
-        self._shown: dict[str, tuple[str, ...]] = {}
-        self._bodies_shown: set[str] = set()
+        self._dressed: dict[str, _Known] = {}
+        self._outputs = make_outputs() if outputs is None else outputs
+        self._fittings = Fittings(pipeline, weights=settings.weights or None)
+        self._here: set[str] = set()
         self._is_lost = False
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="inference")
@@ -95,7 +101,7 @@ class Worker:
         self._scene.wake()
         if self._thread.ident is not None:
             self._thread.join()
-        self._remove([*self._shown])
+        self._remove([*self._here])
 
     def use(self, pipeline: GarmentPipeline) -> None:
         """Another pipeline from the next tick on."""
@@ -106,7 +112,7 @@ class Worker:
         last = -1e9
         while not self._stopping.is_set():
             period = 1.0 / self.settings.max_rate if self.settings.max_rate else 0.0
-            idle = _IDLE_S if self._shown or self._scene.persons else _EMPTY_S
+            idle = _IDLE_S if self._here or self._scene.persons else _EMPTY_S
             arrivals = self._scene.take(not_before=last + period, timeout=idle)
             now = time.monotonic()
             if arrivals:  # on the grid of the rate as long as the frames keep up with it
@@ -123,7 +129,9 @@ class Worker:
             self._pipeline = self._next_pipeline
             self._is_lost = False
             self._dressed.clear()
-            self._encoders.clear()
+            self._fittings = Fittings(self._pipeline, weights=settings.weights or None)
+            for output in self._outputs:
+                output.forget()
         if settings.margin != self._pipeline.margin:
             self._pipeline.margin = settings.margin
             self._dressed.clear()
@@ -131,7 +139,7 @@ class Worker:
         arrivals = self._near(arrivals, settings)
         if not arrivals:
             return
-        if not (self._outlet.watched() or self._outlet.body_watched()):
+        if not self._outlet.is_watched():
             for _ in arrivals:
                 self._statistics.skip("unwatched")
             return
@@ -140,7 +148,7 @@ class Worker:
         dressed = {person: frame for person, frame in frames.items() if person in self._dressed}
         if not dressed:
             return
-        self._send(dressed, settings)
+        self._send(dressed, arrivals, settings)
         done = time.monotonic()
         latencies = [1e3 * (done - arrivals[person].received) for person in dressed]
         self._statistics.publish(latencies, found=found, unresolved=unresolved)
@@ -148,7 +156,8 @@ class Worker:
     def _near(self, arrivals: Mapping[str, Arrival], settings: NodeSettings) -> dict[str, Arrival]:
         near = {}
         for person, arrival in arrivals.items():
-            if settings.max_distance and np.linalg.norm(arrival.frame.transl) > settings.max_distance:
+            place = arrival.placement.rotation @ arrival.frame.transl + arrival.placement.translation
+            if settings.max_distance and np.linalg.norm(place) > settings.max_distance:
                 self._statistics.skip("distance")
                 self._remove([person])
             else:
@@ -170,7 +179,7 @@ class Worker:
             if not all(np.isfinite(mesh.local).all() for mesh in output.values()):
                 self._statistics.drop("not_finite", f"{person or 'the person'}: a garment isn't finite")
                 continue
-            self._dressed[person] = _Dressed(_inputs(todo[person]), output)
+            self._dressed[person] = _Known(_inputs(todo[person]), output)
             found += sum(stats.n_inside for stats in output.stats.garments.values())
             unresolved += sum(stats.n_unresolved for stats in output.stats.garments.values())
             self._statistics.shift(output.stats.shift.largest)
@@ -202,83 +211,40 @@ class Worker:
             self._is_lost = True
             self._outlet.device_lost(str(error))
 
-    def _send(self, frames: Mapping[str, SmplFrame], settings: NodeSettings) -> None:
-        """One message with these persons, each marker with the stamp of its person's frame."""
-        persons = tuple(frames)
-        names = tuple(self._pipeline.garments)
+    def _send(self, frames: Mapping[str, SmplFrame], arrivals: Mapping[str, Arrival], settings: NodeSettings) -> None:
+        """What anybody wants to know of these people."""
+        axes = Placement(np.eye(3)[list(SMPL_COLUMNS[settings.axes])])
+        worn = []
+        for person, frame in frames.items():
+            arrival, output = arrivals[person], self._dressed[person].output
+            there = arrival.placement.after(axes)
+            offset = there.rotation @ frame.transl + there.translation
+            worn.append(Dressed(person, frame, output, self._fittings, there.rotation, offset, arrival.camera))
+        self._here.update(frames)
+        moment = self._moment(settings)
+        for row in self._outputs:
+            self._publish(row.messages(worn, moment))
+
+    def _publish(self, messages: Iterable[tuple[str, bytes]]) -> None:
         try:
-            data = self._encoder("garments", persons, settings).encode(
-                [self._dressed[person].output[name].local for person in persons for name in names],
-                stamp_ns=[frames[person].stamp_ns for person in persons for _ in names],
-                transl=[frames[person].transl for person in persons for _ in names],
-            )
-        except EncodeError as error:
+            for topic, data in messages:
+                self._outlet.send(topic, data)
+        except RefuError as error:
             self._statistics.drop("not_finite", str(error))
-            return
-        self._outlet.send_garments(data)
-        for person in persons:
-            shown = tuple(garment_namespace(name, person) for name in names)
-            left = set(self._shown.get(person, ())) - set(shown)
-            self._shown[person] = shown
-            if left:
-                self._outlet.send_garments(self._deletion(sorted(left)))
-        if self._outlet.body_watched():
-            data = self._encoder("body", persons, settings).encode(
-                [self._dressed[person].output.body for person in persons],
-                stamp_ns=[frames[person].stamp_ns for person in persons],
-                transl=[frames[person].transl for person in persons],
-            )
-            self._outlet.send_body(data)
-            self._bodies_shown.update(persons)
-
-    def _encoder(self, kind: str, persons: tuple[str, ...], settings: NodeSettings) -> MarkerArrayEncoder:
-        placed: dict[str, Any] = {
-            "frame_id": settings.frame_id,
-            "axes": settings.axes,
-            "lifetime_ns": settings.lifetime_ns,
-        }
-        key = (kind, persons, *placed.values())
-        if key not in self._encoders:
-            if len(self._encoders) >= _MAX_ENCODERS:
-                self._encoders.clear()
-            meshes = [
-                mesh
-                for person in persons
-                for mesh in (self._garment_meshes if kind == "garments" else self._body_mesh)(person)
-            ]
-            self._encoders[key] = MarkerArrayEncoder(meshes, **placed)
-        return self._encoders[key]
-
-    def _garment_meshes(self, person: str) -> list[MarkerMesh]:
-        return [
-            MarkerMesh(
-                ns=garment_namespace(name, person),
-                faces=garment.faces.cpu().numpy(),
-                n_vertices=garment.n_vertices,
-                color=(*garment.card.color, 1.0),
-            )
-            for name, garment in self._pipeline.garments.items()
-        ]
-
-    def _body_mesh(self, person: str) -> list[MarkerMesh]:
-        body = self._pipeline.body
-        name = garment_namespace("body", person)
-        return [MarkerMesh(name, body.faces.cpu().numpy(), len(body.v_template), color=_SKIN)]
 
     def _remove(self, persons: Iterable[str]) -> None:
         """Takes persons out of viewers' scenes."""
-        for person in persons:
+        everyone = [*persons]
+        for person in everyone:
             self._dressed.pop(person, None)
-            shown = self._shown.pop(person, ())
-            if shown:
-                self._outlet.send_garments(self._deletion(shown))
-            if person in self._bodies_shown:
-                self._bodies_shown.remove(person)
-                self._outlet.send_body(self._deletion([garment_namespace("body", person)]))
+        gone = [person for person in everyone if person in self._here]
+        self._here -= {*gone}
+        moment = self._moment(self.settings)
+        for output in self._outputs if gone else ():
+            self._publish(output.gone(gone, moment))
 
-    def _deletion(self, namespaces: Iterable[str]) -> bytes:
-        keys = [(namespace, 0) for namespace in namespaces]
-        return encode_delete(keys, stamp_ns=self._outlet.now_ns(), frame_id=self.settings.frame_id)
+    def _moment(self, settings: NodeSettings) -> Moment:
+        return Moment(settings, self._outlet.watchers, self._outlet.now_ns())
 
 
 def _with_settings(frame: SmplFrame, settings: NodeSettings) -> SmplFrame:

@@ -19,8 +19,11 @@ _LAST_WORDS_S = 0.3
 _TOPICS = """\
 topics:
   smpl_params   in: a person's body, of the type in input_type; <person>/smpl_params for each of persons
-  garments      out: visualization_msgs/MarkerArray
-  body          out: visualization_msgs/MarkerArray, when somebody listens
+  garments, body, openings                      out: visualization_msgs/MarkerArray
+  <person>/points                               out: sensor_msgs/PointCloud2
+  <person>/openings/<garment>/<opening>         out: geometry_msgs/PolygonStamped, and frames on /tf with publish_tf
+  <person>/mesh/<garment>, <person>/contacts    out: shape_msgs/Mesh, diagnostic_msgs/DiagnosticArray
+  collision_object, scene                       out: for MoveIt and Foxglove
   /diagnostics  out: diagnostic_msgs/DiagnosticArray, once a second
 services:
   ~/record      std_srvs/SetBool: starts and stops a recording to the parameter record

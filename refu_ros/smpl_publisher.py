@@ -12,9 +12,9 @@ import numpy as np
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from scipy.spatial.transform import Rotation
 
-from msg_adapters import INPUT_TYPES, SMPL_JOINTS, BagError, Motion, encoder_for, iter_smpl_frames, read_motion
+from msg_adapters import INPUT_TYPES, BagError, Motion, encoder_for, iter_smpl_frames, read_motion
+from msg_adapters.march import MARCH_FPS, march
 from refu_core import FrameError, RefuError, SmplFrame
 from refu_core.recordings import SUFFIXES, Axes
 from refu_ros._guard import GuardedNode
@@ -27,9 +27,6 @@ if TYPE_CHECKING:
     from msg_adapters import Encoder, InputType
 
 TOPIC = "smpl_params"
-_MARCH_FPS = 30.0
-_MARCH_STEPS_S = 1.2
-_ROOT_HEIGHT_M = 1.156  # of the built-in male body's root above its soles
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,23 +60,6 @@ DESCRIPTIONS = {
 """What each parameter is for."""
 
 
-def march() -> Motion:
-    """Steps on the spot with swinging arms, in SMPL axes; the end joins the beginning."""
-    t = np.arange(round(2 * _MARCH_STEPS_S * _MARCH_FPS)) / (2 * _MARCH_STEPS_S * _MARCH_FPS) * 2 * np.pi
-    pose = np.zeros((len(t), len(SMPL_JOINTS), 3))
-    for side, sign in (("left", 1.0), ("right", -1.0)):
-        lift = np.maximum(sign * np.sin(t), 0) ** 2  # one leg always stands, straight
-        pose[:, SMPL_JOINTS.index(f"{side}_hip"), 0] = -0.9 * lift
-        pose[:, SMPL_JOINTS.index(f"{side}_knee"), 0] = 1.3 * lift
-        pose[:, SMPL_JOINTS.index(f"{side}_ankle"), 0] = -0.4 * lift  # the sole stays level
-        down_then_swing = np.stack([np.full_like(t, -sign * 1.15), 0.5 * sign * np.sin(t)], axis=1)
-        pose[:, SMPL_JOINTS.index(f"{side}_shoulder")] = Rotation.from_euler("zx", down_then_swing).as_rotvec()
-        pose[:, SMPL_JOINTS.index(f"{side}_elbow"), 1] = -sign * 0.4
-    pose[:, SMPL_JOINTS.index("spine2"), 1] = 0.12 * np.sin(t)
-    transl = np.tile([0.0, _ROOT_HEIGHT_M, 0.0], (len(t), 1))
-    return Motion(pose.astype(np.float32), transl, np.zeros(10, np.float32), _MARCH_FPS)
-
-
 def load_motion(path: str, *, axes: Axes = "auto", fps: float = 0.0) -> Motion:
     """The motion of a file, of a bag (evenly spaced, with the betas of its first frame), or `march` for an empty path.
 
@@ -94,7 +74,7 @@ def load_motion(path: str, *, axes: Axes = "auto", fps: float = 0.0) -> Motion:
         msg = f"{path}: no frame of its SMPL topic can be decoded; `refu replay {path}` says why"
         raise BagError(msg)
     seconds = (frames[-1].stamp_ns - frames[0].stamp_ns) * 1e-9
-    fps = (len(frames) - 1) / seconds if seconds > 0 else _MARCH_FPS
+    fps = (len(frames) - 1) / seconds if seconds > 0 else MARCH_FPS
     poses, transl = (np.stack(arrays) for arrays in zip(*((f.pose, f.transl) for f in frames), strict=True))
     return Motion(poses, transl, frames[0].betas, fps)
 

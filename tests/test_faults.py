@@ -262,20 +262,17 @@ class Outlet:
         self.worker: Worker | None = None
         self.sent, self.losses = 0, []  # type: ignore[var-annotated]
 
-    def watched(self) -> bool:
+    def is_watched(self) -> bool:
         return True
 
-    def body_watched(self) -> bool:
-        return False
+    def watchers(self, topic: str) -> int:
+        return int(topic == "garments")
 
     def now_ns(self) -> int:
         return 0
 
-    def send_garments(self, data: bytes) -> None:  # noqa: ARG002
+    def send(self, topic: str, data: bytes) -> None:  # noqa: ARG002
         self.sent += 1
-
-    def send_body(self, data: bytes) -> None:
-        raise NotImplementedError
 
     def device_lost(self, reason: str) -> None:
         self.losses.append(reason)

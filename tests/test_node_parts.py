@@ -17,9 +17,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from msg_adapters import BagError, BagReader, BagWriter, DecodeError, Marker, QosProfile, decode_marker_array
+from msg_adapters import (
+    BagError,
+    BagReader,
+    BagWriter,
+    DecodeError,
+    Marker,
+    QosProfile,
+    decode_marker_array,
+    decode_point_cloud,
+)
 from msg_adapters.cdr import CdrWriter
-from refu_core import BodyError, FrameError, GarmentPipeline, SmplFrame, load_body
+from refu_core import BodyError, FrameError, GarmentPipeline, MeshError, SmplFrame, load_body
 from refu_core.keypoints import Proportions, Skeleton, keypoint_layout
 from refu_core.keypoints._pose import Pose
 from refu_core.modes import FOREIGN_BETAS
@@ -248,23 +257,30 @@ class Viewer:
     def __init__(self) -> None:
         self.watching = True
         self.body_watching = False
+        self.others: set[str] = set()
+        self.sent: list[tuple[str, bytes]] = []
         self.messages: list[list[Marker]] = []
         self.bodies: list[list[Marker]] = []
 
-    def watched(self) -> bool:
-        return self.watching
+    def is_watched(self) -> bool:
+        return bool(self.wanted())
 
-    def body_watched(self) -> bool:
-        return self.body_watching
+    def wanted(self) -> set[str]:
+        return {*["garments"] * self.watching, *["body"] * self.body_watching, *self.others}
+
+    def watchers(self, topic: str) -> int:
+        return int(topic in self.wanted())
 
     def now_ns(self) -> int:
         return 99
 
-    def send_garments(self, data: bytes) -> None:
-        self.messages.append(decode_marker_array(data))
-
-    def send_body(self, data: bytes) -> None:
-        self.bodies.append(decode_marker_array(data))
+    def send(self, topic: str, data: bytes) -> None:
+        if topic == "garments":
+            self.messages.append(decode_marker_array(data))
+        elif topic == "body":
+            self.bodies.append(decode_marker_array(data))
+        else:
+            self.sent.append((topic, data))
 
 
 class Setup:
@@ -630,3 +646,82 @@ def _of_ones(n: int) -> bytes:
     cdr.numbers("I", n)
     cdr.array("f8", np.ones((n, 7)))
     return cdr.to_bytes()
+
+
+# Outputs ------------------------------------------------------------------------------------------
+
+
+def test_each_output_comes_where_it_is_wanted_and_leaves_with_its_person(pipeline: GarmentPipeline) -> None:
+    setup = Setup(pipeline, person_timeout=1.0)
+    setup.viewer.watching = False
+    setup.viewer.others = {"ann/points", "openings", "bob/openings/short_pant_male/waist"}
+    setup.tick(ann=frame(stamp_ns=5), bob=frame(0.3, stamp_ns=6))
+    sent = dict(setup.viewer.sent)
+    assert len(sent) == len(setup.viewer.sent)
+    assert set(sent) == setup.viewer.others
+    points, stamp_ns, _ = decode_point_cloud(sent["ann/points"])
+    assert (len(points), stamp_ns) == (pipeline.garments[GARMENT].n_vertices, 5)
+    names = {f"{person}/{GARMENT}/{name}" for person in ("ann", "bob") for name in ("waist", "left_leg", "right_leg")}
+    assert {marker.ns for marker in decode_marker_array(sent["openings"])} == names
+    setup.viewer.sent.clear()
+    setup.clock.now = 2.0
+    setup.tick()
+    ((topic, data),) = setup.viewer.sent
+    assert topic == "openings"
+    assert {(marker.ns, marker.action) for marker in decode_marker_array(data)} == {(name, 2) for name in names}
+
+
+def test_one_outputs_failure_is_no_others(pipeline: GarmentPipeline, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: Any) -> None:
+        msg = "no openings today"
+        raise MeshError(msg)
+
+    monkeypatch.setattr("refu_core.outputs.Openings.frames", fails)
+    setup = Setup(pipeline)
+    setup.viewer.others = {"openings", "points"}
+    setup.tick(**{"": frame()})
+    assert len(setup.viewer.messages) == 1
+    assert [topic for topic, _ in setup.viewer.sent] == ["points"]
+    assert "no openings today" in setup.statistics.report().reasons["not_finite"]
+
+
+def test_obstacles_are_moved_only_where_everybody_has_them(pipeline: GarmentPipeline) -> None:
+    """Two persons who take turns: who subscribes later is told all of each, when it is their turn."""
+    setup = Setup(pipeline, planner_rate=0.0)
+    fittings, wanted = setup.worker._fittings, [1]
+    while not fittings.has_planner(GARMENT):
+        time.sleep(0.01)
+    setup.viewer.watchers = lambda topic: wanted[0] * (topic == "collision_object")  # type: ignore[method-assign]
+    setup.viewer.others = {"collision_object"}
+
+    def operations(*persons: str) -> list[int]:
+        setup.viewer.sent.clear()
+        setup.tick(**{person: frame() for person in persons})
+        return [data[-1] for _, data in setup.viewer.sent]
+
+    add, move = 0, 3
+    assert operations("ann", "bob") == [add, add]
+    assert operations("ann") == [move]
+    wanted[0] = 2
+    assert operations("ann") == [add]
+    assert operations("bob") == [add]
+    assert operations("ann", "bob") == [move, move]
+
+
+@pytest.mark.parametrize("fields", [["colour"], ["normal", "x"]])
+def test_points_have_fields_that_there_are(fields: list[str]) -> None:
+    assert NodeSettings().changed({"points_fields": ["normal"]}).points_fields == ("normal",)
+    with pytest.raises(SettingsError, match="points_fields: wanted names of normal, clearance"):
+        NodeSettings().changed({"points_fields": fields})
+
+
+def test_transforms_that_are_missing_are_reported() -> None:
+    statistics = Statistics()
+    statistics.receive()
+    statistics.late_transform()
+    assert report_of(statistics)["input"].values["late transforms"] == "1"
+    statistics.receive()
+    statistics.drop("transform", "no transform leads from camera to map")
+    status = report_of(statistics)["input"]
+    assert (status.level, status.message) == (1, "1 of 1 have no transform: no transform leads from camera to map")
+    assert status.values["dropped: transform"] == "1"

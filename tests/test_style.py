@@ -29,6 +29,8 @@ CORE = (
     {"refu", "fitting"},
     {"contact"},
     {"realtime"},
+    {"outputs"},
+    {"observation"},
     {"metrics"},
     {"simulation"},
     {"training"},

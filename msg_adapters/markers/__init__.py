@@ -8,6 +8,7 @@ from msg_adapters.markers._encoder import (
     encode_delete,
     encode_delete_all,
     encode_points,
+    encode_strips,
 )
 from msg_adapters.markers._mesh import MarkerMesh, garment_namespace
 
@@ -21,6 +22,7 @@ __all__ = [
     "encode_delete",
     "encode_delete_all",
     "encode_points",
+    "encode_strips",
     "garment_namespace",
     "vertices_from_points",
 ]

@@ -27,10 +27,11 @@ if TYPE_CHECKING:
 
 MARKER_ARRAY = "visualization_msgs/msg/MarkerArray"
 
-POINTS, TRIANGLE_LIST = 8, 11
+LINE_STRIP, POINTS, TRIANGLE_LIST = 4, 8, 11
 ADD, DELETE, DELETE_ALL = 0, 2, 3
 _IDENTITY_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 _LEAD_BYTES = 4  # before the header, so that the payload, and with it every float64, lies on a multiple of 8
+LINE: Rgba = (0.95, 0.55, 0.1, 1.0)
 _NO_COLOR: Rgba = (0.0, 0.0, 0.0, 0.0)
 
 
@@ -47,13 +48,14 @@ def _write_marker(
     kind: int = TRIANGLE_LIST,
     size: float = 1.0,
     lifetime_ns: int = 0,
+    pose: Sequence[float] = _IDENTITY_POSE,
 ) -> tuple[int, int, int]:
     """Append one visualization_msgs/Marker; returns the payload offsets of its stamp, points and colours."""
     ns, marker_id = key
     stamp_at = writer.header(stamp_ns, frame_id)
     writer.string(ns)
     writer.numbers("iii", marker_id, kind, action)
-    writer.numbers("ddddddd", *_IDENTITY_POSE)
+    writer.numbers("ddddddd", *pose)
     writer.numbers("ddd", size, size, size)
     writer.numbers("ffff", *color)
     writer.stamp(lifetime_ns)
@@ -228,6 +230,53 @@ class MarkerArrayEncoder:
             msg = f"{mesh.ns}: wanted finite vertex colours ({mesh.n_vertices}, 4), got {rgba.shape}"
             raise EncodeError(msg)
         np.take(rgba, slot.corners, axis=0, out=slot.colors, mode="clip")
+
+
+def encode_strips(
+    strips: Sequence[tuple[str, int, NDArray[np.float64], NDArray[np.float64]]],
+    *,
+    frame_id: str = "map",
+    lifetime_ns: int = 0,
+    color: Rgba = LINE,
+    width: float = 0.004,
+) -> bytes:
+    """A MarkerArray with a LINE_STRIP each.
+
+    Args:
+        strips: namespace (the id is 0), stamp [ns], pose (7,) as position [m] and quaternion xyzw, and the points of
+            the line in that pose [m], shape (K, 3).
+        frame_id: of the headers.
+        lifetime_ns: viewers forget a line that isn't renewed for so long; 0: never.
+        color: red, green, blue, alpha.
+        width: of the lines [m].
+
+    Raises:
+        EncodeError: points of another shape, not finite, none at all, or a stamp that doesn't fit a ROS time.
+    """
+    writer, points_at = CdrWriter(), []
+    writer.numbers("I", len(strips))
+    for ns, stamp_ns, pose, points in strips:
+        if points.ndim != 2 or points.shape[1] != 3 or not len(points) or not np.isfinite(points.sum() + pose.sum()):
+            msg = f"{ns}: wanted finite points of shape (K, 3), K > 0, in a finite pose, got {points.shape}"
+            raise EncodeError(msg)
+        _, at, _ = _write_marker(
+            writer,
+            key=(ns, 0),
+            action=ADD,
+            frame_id=frame_id,
+            stamp_ns=stamp_ns,
+            color=color,
+            n_points=len(points),
+            kind=LINE_STRIP,
+            size=width,
+            lifetime_ns=lifetime_ns,
+            pose=pose.tolist(),
+        )
+        points_at.append(at)
+    message = bytearray(writer.to_bytes())
+    for at, (*_, points) in zip(points_at, strips, strict=True):
+        message[HEADER_BYTES + at : HEADER_BYTES + at + points.nbytes] = points.astype("<f8").tobytes()
+    return bytes(message)
 
 
 def encode_points(

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from refu_core._warp import as_warp
 from refu_core.body import _collider_kernels as kernels
 from refu_core.body import _part_kernels as parting
+from refu_core.body._bundles import bundled
 from refu_core.body._creases import LEVELS, find_creases
 from refu_core.body._kinematics import PARENTS
 from refu_core.body._model import SmplBody
@@ -51,7 +52,7 @@ class ColliderSettings:
     """How often skin is brought to its side: at the groin several seams meet."""
     part_rounds: int = 4
     """Newton's steps to the surface between two segments."""
-    deepen_rounds: int = 4
+    deepen_rounds: int = 8
     """How far inside another segment skin is looked for [edges], from where its surface is within the gap."""
     smooth_first: int = 3
     """Sweeps over creases before segments are parted."""
@@ -83,7 +84,7 @@ class Anatomy:
         """Shape (E, 2)."""
         self.weights = torch.as_tensor(weights, device=self.device)
         """Skinning weights, shape (V, 24)."""
-        self.tensors = Tensors(len(rest), len(mesh.edges), self.device)
+        self.tensors = Tensors(len(rest), len(mesh.edges), settings.deepen_rounds, self.device)
         self.rings = self._bind_rings(mesh)
         self.bones = self._bind_bones(rest, mesh, weights)
         self.seams = self._bind_seams(rest, mesh, weights)
@@ -115,7 +116,7 @@ class Anatomy:
         bones.normal = self._vectors(normals)
         self.normals = torch.as_tensor(normals, device=self.device)
         """Unit normals of the skin in the rest pose, levelled, shape (V, 3)."""
-        self.chain = [self._ints([max(parent, 0) for parent in PARENTS]), self._floats(LEVELS)]
+        bones.parent, bones.levels = self._ints([max(parent, 0) for parent in PARENTS]), self._floats(LEVELS)
         return bones
 
     def _bind_seams(self, rest: NDArray[np.float64], mesh: Connectivity, weights: NDArray[np.float64]) -> Any:
@@ -135,14 +136,11 @@ class Anatomy:
         seams.weights = wp.array(
             found.weights.astype(np.float32), dtype=kernels.StationWeights, device=str(self.device)
         )
-        n_stations = len(found.station_start) - 1
-        stations = [
-            self._ints(found.station_start),
-            self._ints(found.station_vertex),
-            self._floats(found.station_weight),
-            wp.zeros(n_stations, dtype=wp.vec3, device=str(self.device)),
-        ]
-        self.held, self.stations = self._ints(held), stations
+        seams.vertex = self._ints(held)
+        self.stations = kernels.Means()
+        self.stations.start, self.stations.vertex = self._ints(found.station_start), self._ints(found.station_vertex)
+        self.stations.weight = self._floats(found.station_weight)
+        self.stations.mean = wp.zeros(len(found.station_start) - 1, dtype=wp.vec3, device=str(self.device))
         return seams
 
     def _thickness(self, rest: NDArray[np.float64], mesh: Connectivity) -> torch.Tensor:
@@ -162,33 +160,29 @@ class Anatomy:
         solids = cut(mesh.faces, share)
         n_segments, sizes = len(solids.faces), np.diff(solids.middle_start)
         work = self.tensors
-        work.add_points(len(sizes), n_segments)
+        work.add_points(len(sizes))
         work.points[:n] = torch.as_tensor(rest)
         points = as_warp(work.points, wp.vec3)
-        self.caps = [
-            self._ints(solids.middle_start),
-            self._ints(solids.middle_vertex),
-            self._floats(np.repeat(1 / np.maximum(sizes, 1), sizes)),
-            points[n:],
-        ]
+        self.caps = kernels.Means()
+        self.caps.start, self.caps.vertex = self._ints(solids.middle_start), self._ints(solids.middle_vertex)
+        self.caps.weight, self.caps.mean = self._floats(np.repeat(1 / np.maximum(sizes, 1), sizes)), points[n:]
         if len(sizes):
-            wp.launch(kernels.mean_kernel, len(sizes), [points, *self.caps], device=device)
+            wp.launch(kernels.mean_kernel, len(sizes), [points, self.caps], device=device)
         self.trees = [wp.Mesh(points, self._ints(faces.ravel())) for faces in solids.faces]
         segments = parting.Segments()
         segments.trees = wp.array([tree.id for tree in self.trees], dtype=wp.uint64, device=device)
         segments.own = self._ints(solids.of_vertex)
-        members = [np.unique(faces[faces < n]) for faces in solids.faces]
-        segments.member = self._ints(np.concatenate(members))
-        segments.member_of = self._ints(np.repeat(np.arange(n_segments), [len(one) for one in members]))
-        segments.low, segments.high = as_warp(work.low, wp.vec3), as_warp(work.high, wp.vec3)
         segments.faces = wp.array(np.concatenate(solids.faces), dtype=wp.vec3i, device=device)
         segments.first_face = self._ints(np.cumsum([0, *map(len, solids.faces)]))
         softness = np.array([one for _, one in SOFTNESS])
         segments.ratio = self._floats(softness[None] / softness[:, None])
+        segments.path = self._ints(_paths())
         clearance = wp.zeros((n, n_segments), dtype=wp.float32, device=device)
         segments.gap = clearance
         wp.launch(parting.clearance_kernel, (n, n_segments), [points, segments, clearance], device=device)
         segments.gap = self._floats(np.minimum(how.gap, how.segment_share * clearance.numpy()))
+        self.bundles = bundled(work.points.cpu().numpy(), solids.faces, self.device)
+        self.skins = self._bind_skins(segments.gap.numpy())
         self.own = torch.as_tensor(solids.of_vertex.astype(np.int64), device=self.device)
         """The segment of each vertex, shape (V,)."""
         self.faces = torch.as_tensor(np.concatenate(solids.faces).astype(np.int64), device=self.device)
@@ -196,6 +190,22 @@ class Anatomy:
         self.kept, self.ratio = wp.to_torch(segments.gap), wp.to_torch(segments.ratio)
         """What vertices keep from segments [m], shape (V, K), and how many times as soft segment k is as i, (K, K)."""
         return segments
+
+    def _bind_skins(self, gap: NDArray[np.float32]) -> Any:
+        """The vertices of the bundles; each vertex (V, K) that keeps a `gap` is in the first one that has it."""
+        start, corner = self.bundles.start.numpy(), self.bundles.corner.numpy()
+        is_free, own = np.ones(len(gap), np.bool_), []
+        for vertices in np.split(corner, start[1:-1]):
+            some = vertices[vertices < len(gap)]
+            some = some[is_free[some]]
+            is_free[some] = False
+            own.append(some)
+        skins = parting.Skins()
+        skins.start, skins.vertex = self._ints(np.cumsum([0, *map(len, own)])), self._ints(np.concatenate(own))
+        first = self.bundles.first.numpy()
+        skins.of = self._ints(np.repeat(np.arange(len(first) - 1), np.diff(first)))
+        skins.gap = self._floats(np.stack([gap[some].max(axis=0, initial=0.0) for some in own]))
+        return skins
 
     def _ints(self, values: ArrayLike) -> Any:
         return wp.array(np.ascontiguousarray(values, np.int32), dtype=wp.int32, device=str(self.device))
@@ -210,19 +220,27 @@ class Anatomy:
 class Tensors:
     """The memory of `kernels.Work`, as torch sees it."""
 
-    def __init__(self, n_vertices: int, n_edges: int, device: torch.device) -> None:
+    def __init__(self, n_vertices: int, n_edges: int, n_rounds: int, device: torch.device) -> None:
         self._device, self._sizes = device, (n_vertices, n_edges)
-        self.skin, self.here, self.there = (torch.zeros(n_vertices, 3, device=device) for _ in range(3))
+        self._rounds = n_rounds
         self.rotation = torch.zeros(len(PARENTS), 3, 3, device=device)
         self.between = torch.zeros(len(PARENTS) * len(LEVELS), 3, 3, device=device)
         # What every call begins with as zeros.
-        self.ints = torch.zeros(2 * n_vertices + kernels.N_COUNTS, dtype=torch.int32, device=device)
-        self.counts = self.ints[2 * n_vertices :]
+        self.ints = torch.zeros(
+            len(_BY_VERTEX) * n_vertices + kernels.FRONT + n_rounds + 1, dtype=torch.int32, device=device
+        )
+        self.counts = self.ints[len(_BY_VERTEX) * n_vertices :]
 
-    def add_points(self, n_middles: int, n_segments: int) -> None:
+    def add_points(self, n_middles: int) -> None:
         """Makes what depends on how the body is cut."""
-        self.points = torch.zeros(self._sizes[0] + n_middles, 3, device=self._device)
-        self.low, self.high = (torch.zeros(n_segments, 3, device=self._device) for _ in range(2))
+        n = self._sizes[0]
+        self.places = torch.zeros(4, n + n_middles, 3, device=self._device)
+        self.skin, self.here, self.there = (place[:n] for place in self.places[:3])
+        self.points = self.places[3]
+
+    def take(self, skin: torch.Tensor) -> None:
+        """Takes over a posed body (V, 3) [m]."""
+        self.places[:, : self._sizes[0]] = skin
 
     def bound(self) -> Any:
         """As the kernels take it."""
@@ -230,15 +248,31 @@ class Tensors:
         work = kernels.Work()
         for name in ("skin", "points", "here", "there"):
             setattr(work, name, as_warp(getattr(self, name), wp.vec3))
-        for name in ("moved", "near", "boxed", "ends", "touched", "outside"):
+        for name in ("moved", "near", "boxed", "ends", "touching"):
             setattr(work, name, wp.zeros(n, dtype=wp.int32, device=str(self._device)))
+        work.front = wp.zeros((self._rounds + 1, n), dtype=wp.int32, device=str(self._device))
         work.share = wp.zeros(n, dtype=wp.float32, device=str(self._device))
         work.hot = wp.zeros(n_edges, dtype=wp.int32, device=str(self._device))
         work.steps = wp.zeros(n_edges, dtype=wp.vec3, device=str(self._device))
-        work.meets = wp.zeros(len(self.low), dtype=wp.int32, device=str(self._device))
-        work.is_moved, work.is_end = as_warp(self.ints[:n], wp.int32), as_warp(self.ints[n : 2 * n], wp.int32)
+        for i, name in enumerate(_BY_VERTEX):
+            setattr(work, name, as_warp(self.ints[i * n : (i + 1) * n], wp.int32))
         work.counts = as_warp(self.counts, wp.int32)
         return work
+
+
+_BY_VERTEX = ("is_moved", "is_end", "is_front", "touched", "outside")
+
+
+def _paths() -> NDArray[np.int32]:
+    """The joints, as bits, that move any joint of segment i against any of segment k, shape (K, K)."""
+    above = np.zeros(len(PARENTS), np.int64)  # each joint and those that it hangs on, but the root, which moves all
+    for joint in range(1, len(PARENTS)):
+        above[joint] = above[PARENTS[joint]] | (1 << joint)
+    paths = [
+        [np.bitwise_or.reduce(above[list(one)][:, None] ^ above[list(other)], axis=None) for other, _ in SOFTNESS]
+        for one, _ in SOFTNESS
+    ]
+    return np.array(paths, np.int32)
 
 
 def _smooth_normals(vertices: NDArray[np.float64], mesh: Connectivity) -> NDArray[np.float64]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import torch
@@ -10,8 +9,11 @@ import warp as wp
 from torch import Tensor
 
 from refu_core._warp import as_warp, is_plain, torch_stream
+from refu_core.body import _bundle_kernels as bundling
 from refu_core.body import _collider_kernels as kernels
+from refu_core.body import _launch_kernels as launches
 from refu_core.body import _part_kernels as parting
+from refu_core.body import _serial_kernels as serial
 from refu_core.body._anatomy import DEFAULT_GAP, Anatomy, ColliderSettings
 from refu_core.body._collider_gradient import Closest, part_with_gradient
 from refu_core.body._kinematics import PARENTS, RigidTransforms
@@ -43,7 +45,7 @@ class Collider:
         self.anatomy = Anatomy(body, self.settings)
         self.device = body.device
         self._is_serial = body.device.type == "cpu"
-        self._commands = self._record()
+        self._commands: dict[str, Any] = {}
 
     @property
     def gap(self) -> float:
@@ -56,109 +58,158 @@ class Collider:
         `transforms` are those that they were posed with, leading shape (B, 24).
         """
         rotation = transforms.rotation
-        part = self._part if is_plain(skin, rotation) else partial(part_with_gradient, self)
-        if not len(skin):
-            return torch.zeros_like(skin)
-        return torch.stack([part(one, turn) for one, turn in zip(skin, rotation, strict=True)])
+        if not is_plain(skin, rotation):
+            apart = [part_with_gradient(self, one, turn) for one, turn in zip(skin, rotation, strict=True)]
+            return torch.stack(apart) if apart else torch.zeros_like(skin)
+        parted = torch.empty_like(skin)
+        for result, one, turn in zip(parted, skin, rotation, strict=True):
+            result.copy_(self._part(one, turn))
+        return parted
 
     @torch.no_grad()
     def _part(self, skin: Tensor, rotation: Tensor) -> Tensor:
+        """One body, in memory that the next one overwrites."""
         how, work, run = self.settings, self.anatomy.tensors, self._run
-        work.skin.copy_(skin)
-        work.here.copy_(skin)
-        work.there.copy_(skin)
         work.rotation.copy_(rotation)
         work.ints.zero_()
         with torch_stream(self.device):
             run("between")
-            run("stations")
-            run("crease")
-            at = self._smooth(work.here, work.there, how.smooth_first)
-            self._touch(at)
-            work.here.copy_(at)
-            work.there.copy_(at)
-            run("part", kernels.NEAR)
-            at = self._smooth(work.here, work.there, how.smooth_last)
-            which = "here" if at is work.here else "there"
-            for _ in range(how.edge_rounds):
-                run(f"edge {which}", kernels.HOT)
-                run(f"follow {which}", kernels.ENDS)
-        return at.clone()
+            if self._is_serial and not work.counts[kernels.BENT_JOINTS]:
+                return skin
+            work.take(skin)
+            if self._is_serial:
+                run("unfold")
+            else:
+                for name in ("stations", "hold"):
+                    run(name)
+                self._smooth(how.smooth_first)
+                run("settle")
+            if self._touch():
+                if self._is_serial:
+                    run("part all")
+                else:
+                    run("part")
+                    self._smooth(how.smooth_last)
+                    for _ in range(how.edge_rounds):
+                        run("edge")
+                        run("follow")
+        return self._levelled(how.smooth_last)
 
-    def _touch(self, at: Tensor) -> None:
-        """Which segments each vertex has to give way to, for the points (V, 3) [m]."""
-        work, run = self.anatomy.tensors, self._run
-        work.points[: len(at)] = at
-        run("caps")
-        work.low.fill_(torch.inf)
-        work.high.fill_(-torch.inf)
-        run("box")
-        run("meet")
-        run("near")
-        wanted = int(work.counts[kernels.WANTED]) if self._is_serial else -1
+    def _touch(self) -> bool:
+        """Which segments each vertex has to give way to, and whether there may be any."""
+        if self._is_serial:
+            self._run("look")
+            wanted = int(self.anatomy.tensors.counts[kernels.WANTED])
+        else:
+            for name in ("caps", "bound", "enclose", "near"):
+                self._run(name)
+            wanted = -1
         for k, tree in enumerate(self.anatomy.trees):
             if (wanted >> k) & 1:
                 tree.refit()
-        run("touch", kernels.NEAR)
-        for _ in range(self.settings.deepen_rounds):
-            work.counts[kernels.FOUND : kernels.FOUND + 1].zero_()
-            run("deepen", kernels.NEAR)
-            if self._is_serial and not work.counts[kernels.FOUND]:
-                break
+        if wanted == 0:
+            return False
+        if self._is_serial:
+            self._run("touch all")
+            return int(self.anatomy.tensors.counts[kernels.TOUCHING]) > 0
+        self._run("touch")
+        for r in range(self.settings.deepen_rounds):
+            self._run(f"deepen {r}")
+        return True
 
-    def _smooth(self, source: Tensor, target: Tensor, sweeps: int) -> Tensor:
-        self._run("share", kernels.MOVED)
+    def _smooth(self, sweeps: int) -> None:
+        self._run("share")
         for i in range(sweeps):
-            self._run("smooth" if i % 2 == 0 else "smooth back", kernels.MOVED)
-            source, target = target, source
-        return source
+            self._run("level" if i % 2 == 0 else "level back")
 
-    def _run(self, name: str, which: int | None = None) -> None:
-        """Launches a step: on a CPU for as many as its list has, on a GPU for as many as it could have."""
-        command = self._commands[name]
-        if which is not None and self._is_serial:
-            n = int(self.anatomy.tensors.counts[which])
-            if n == 0:
-                return
-            command.set_dim(n)
-        command.launch()
+    def _levelled(self, sweeps: int) -> Tensor:
+        """Where so many sweeps end."""
+        work = self.anatomy.tensors
+        at: Tensor = work.here if sweeps % 2 == 0 else work.there
+        return at
 
-    def _record(self) -> dict[str, Any]:
+    def _run(self, name: str) -> None:
+        if name not in self._commands:
+            self._commands |= self._of_cpu() if self._is_serial else self._of_gpu()
+        self._commands[name].launch()
+
+    def _of_cpu(self) -> dict[str, Any]:
         how, known = self.settings, self.anatomy
-        work, bones, segments, rings = known.work, known.bones, known.segments, known.rings
-        n, n_edges = len(work.skin), len(work.steps)
-        commands = {}
+        work, bones, segments, rings, bundles = known.work, known.bones, known.segments, known.rings, known.bundles
+        levelling = [how.smooth_full, how.smooth_step]
+        moved = as_warp(self._levelled(how.smooth_last), wp.vec3)
+        inputs = {
+            "between": [work, bones],
+            "unfold": [
+                work,
+                bones,
+                known.seams,
+                known.stations,
+                rings,
+                how.crease_rounds,
+                how.smooth_first,
+                *levelling,
+            ],
+            "look": [work, known.caps, segments, bundles, known.skins],
+            "touch all": [work, segments, rings, how.deepen_rounds],
+            "part all": [
+                *(work, segments, bones, rings, moved),
+                *(how.part_rounds, how.smooth_last, *levelling, how.edge_rounds, how.steep),
+            ],
+        }
+        of_step = {
+            "between": kernels.between_kernel,
+            "unfold": serial.unfold_kernel,
+            "look": serial.look_kernel,
+            "touch all": serial.touch_kernel,
+            "part all": serial.part_kernel,
+        }
+        return {
+            name: self._recorded(of_step[name], len(PARENTS) if name == "between" else 1, given)
+            for name, given in inputs.items()
+        }
 
-        def record(name: str, kernel: Any, most: int, inputs: list[Any]) -> None:
-            commands[name] = wp.launch(kernel, most, inputs, device=str(self.device), record_cmd=True)
+    def _of_gpu(self) -> dict[str, Any]:
+        how, known = self.settings, self.anatomy
+        work, bones, segments, rings, bundles = known.work, known.bones, known.segments, known.rings, known.bundles
+        n, n_bundles = len(work.skin), len(bundles.low)
+        moved = as_warp(self._levelled(how.smooth_last), wp.vec3)
+        steps: dict[str, tuple[Any, int, list[Any]]] = {
+            "between": (kernels.between_kernel, len(PARENTS), [work, bones]),
+            "stations": (kernels.mean_kernel, len(known.stations.mean), [work.skin, known.stations]),
+            "hold": (
+                launches.hold_kernel,
+                len(known.seams.vertex),
+                [work, bones, known.seams, known.stations, how.crease_rounds],
+            ),
+            "share": (launches.share_kernel, n, [work, how.smooth_full, how.smooth_step]),
+            "level": (launches.level_kernel, n, [work, rings, work.here, work.there]),
+            "level back": (launches.level_kernel, n, [work, rings, work.there, work.here]),
+            "settle": (launches.settle_kernel, n, [work, how.smooth_first]),
+            "caps": (kernels.mean_kernel, len(known.caps.mean), [work.points, known.caps]),
+            "bound": (bundling.bound_kernel, n_bundles, [work.points, bundles]),
+            "enclose": (bundling.enclose_kernel, len(known.trees), [bundles]),
+            "near": (launches.near_kernel, n_bundles, [work, segments, bundles, known.skins]),
+            "touch": (launches.touch_kernel, n, [work, segments]),
+            "part": (launches.part_kernel, n, [work, segments, bones, rings, how.part_rounds]),
+            "edge": (launches.edge_kernel, len(work.steps), [work, moved, rings, segments, bones, how.steep]),
+            "follow": (launches.follow_kernel, n, [work, moved, rings]),
+        }
+        for r in range(how.deepen_rounds):
+            steps[f"deepen {r}"] = (launches.deepen_kernel, n, [work, segments, rings, r])
+        return {name: self._recorded(*step) for name, step in steps.items()}
 
-        record(
-            "between", kernels.between_kernel, len(PARENTS), [bones.rotation, *known.chain, bones.between, bones.bent]
-        )
-        record("stations", kernels.mean_kernel, len(known.stations[-1]), [work.skin, *known.stations])
-        inputs = [work, known.held, known.stations[-1], bones, known.seams, how.crease_rounds]
-        record("crease", kernels.crease_kernel, len(known.held), inputs)
-        record("share", kernels.share_kernel, n, [work, how.smooth_full, how.smooth_step])
-        record("smooth", kernels.smooth_kernel, n, [work, rings, work.here, work.there])
-        record("smooth back", kernels.smooth_kernel, n, [work, rings, work.there, work.here])
-        record("caps", kernels.mean_kernel, len(known.caps[-1]), [work.points, *known.caps])
-        record("box", parting.box_kernel, len(segments.member), [work.points, segments])
-        record("meet", parting.meet_kernel, len(known.trees), [segments, how.gap, work.meets])
-        record("near", parting.near_kernel, n, [work, segments])
-        record("touch", parting.touch_kernel, n, [work, segments])
-        record("deepen", parting.deepen_kernel, n, [work, segments, rings])
-        record("part", parting.part_kernel, n, [work, segments, bones, rings, how.part_rounds])
-        for which, moved in (("here", work.here), ("there", work.there)):
-            record(f"edge {which}", parting.edge_kernel, n_edges, [work, moved, rings, segments, bones, how.steep])
-            record(f"follow {which}", parting.follow_kernel, n, [work, moved, rings])
-        return commands
+    def _recorded(self, kernel: Any, dim: int, inputs: list[Any]) -> Any:
+        return wp.launch(kernel, dim, inputs, device=str(self.device), record_cmd=True)
 
     @torch.no_grad()
     def touched(self, skin: Tensor) -> Tensor:
         """Which segments each vertex of `skin` (V, 3) [m] has to give way to, bool, shape (V, K)."""
         self.anatomy.tensors.ints.zero_()
+        self.anatomy.tensors.take(skin)
+        self.anatomy.tensors.counts[kernels.BENT_JOINTS] = -1  # any may be
         with torch_stream(self.device):
-            self._touch(skin.float())
+            self._touch()
         bits: Tensor = wp.to_torch(self.anatomy.work.touched)
         return (bits[:, None] >> torch.arange(len(self.anatomy.trees), device=bits.device)) & 1 == 1
 
@@ -181,7 +232,8 @@ class Collider:
 
     def with_caps(self, skin: Tensor) -> Tensor:
         """`skin` (V, 3) [m] and the middles of the caps after it. Differentiable."""
-        start, vertex, weight, _ = (wp.to_torch(one) for one in self.anatomy.caps)
+        caps = self.anatomy.caps
+        start, vertex, weight = (wp.to_torch(one) for one in (caps.start, caps.vertex, caps.weight))
         of_middle = torch.repeat_interleave(torch.arange(len(start) - 1, device=skin.device), start.long().diff())
         middles = skin.new_zeros(len(start) - 1, 3)
         return torch.cat((skin, middles.index_add(0, of_middle, skin[vertex.long()] * weight.to(skin)[:, None])))

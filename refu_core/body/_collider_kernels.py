@@ -1,4 +1,4 @@
-"""What pulls a posed body apart when no derivative is asked for: memory, creases and levelling, a vertex a thread.
+"""What pulls a posed body apart when no derivative is asked for: memory, creases and levelling, vertex by vertex.
 
 Segments are told apart by the bits of an integer. `touched` has the segments that a vertex has to give way to.
 """
@@ -41,12 +41,16 @@ class Bones:
     weight: wp.array[float]
     normal: wp.array[wp.vec3]
     """Of the skin in the rest pose, smoothed."""
+    parent: wp.array[int]
+    levels: wp.array[float]
+    """Of the seams of a joint."""
 
 
 @wp.struct
 class Seams:
-    """The rows of `Creases`, those of the i-th vertex that has any from `start[i]` on."""
+    """The rows of `Creases`, those of `vertex[i]` from `start[i]` on."""
 
+    vertex: wp.array[int]
     start: wp.array[int]
     rotation: wp.array[int]
     normal: wp.array[wp.vec3]
@@ -54,6 +58,16 @@ class Seams:
     """Height over the plane that skin keeps [m]."""
     stations: wp.array[Stations]
     weights: wp.array[StationWeights]
+
+
+@wp.struct
+class Means:
+    """Points that are weighted means of others, mean i of those from `start[i]` on."""
+
+    start: wp.array[int]
+    vertex: wp.array[int]
+    weight: wp.array[float]
+    mean: wp.array[wp.vec3]
 
 
 @wp.struct
@@ -72,33 +86,38 @@ class Work:
     """How much of a sweep each vertex of `moved` takes."""
     moved: wp.array[int]
     near: wp.array[int]
-    """Vertices in another segment's box."""
+    """Vertices in a bundle that another segment is near to."""
+    boxed: wp.array[int]
+    """Segments that are near the bundle of each of `near`."""
+    touching: wp.array[int]
+    """Vertices in `touched`."""
+    front: wp.array2d[int]
+    """Those of them that are new in each round that looks deeper."""
     hot: wp.array[int]
     """Edges with an end in `touched`."""
-    boxed: wp.array[int]
-    """Segments in whose boxes each of `near` is."""
     ends: wp.array[int]
     """Vertices of those edges."""
     is_moved: wp.array[int]
     is_end: wp.array[int]
+    is_front: wp.array[int]
+    """The last round in whose front a vertex was, counted from 1."""
     touched: wp.array[int]
     outside: wp.array[int]
-    meets: wp.array[int]
-    """Segments whose boxes meet that of each segment."""
     steps: wp.array[wp.vec3]
     """Of each edge."""
     counts: wp.array[int]
-    """How many are in `moved`, `near`, `hot` and `ends`, whether a round found a vertex that may be
-    inside, and the segments that are asked for distances."""
+    """How many are in `moved`, `near`, `touching`, `hot` and `ends`; as bits the segments that are asked for distances,
+    and the joints that are bent; how many are in each row of `front`."""
 
 
 MOVED = wp.constant(0)
 NEAR = wp.constant(1)
-HOT = wp.constant(2)
-ENDS = wp.constant(3)
-FOUND = wp.constant(4)
+TOUCHING = wp.constant(2)
+HOT = wp.constant(3)
+ENDS = wp.constant(4)
 WANTED = wp.constant(5)
-N_COUNTS = 6
+BENT_JOINTS = wp.constant(6)
+FRONT = wp.constant(7)
 
 
 @wp.struct
@@ -113,39 +132,33 @@ class Rings:
 
 
 @wp.kernel
-def between_kernel(
-    rotation: wp.array[wp.mat33],
-    parent: wp.array[int],
-    levels: wp.array[float],
-    between: wp.array[wp.mat33],
-    bent: wp.array[float],
-) -> None:
-    """The rotations on the way from each joint's parent to the joint, one a seam."""
+def between_kernel(work: Work, bones: Bones) -> None:
+    """The rotations on the way from each joint's parent to the joint, one a seam, and which joints are bent."""
     j = wp.tid()
-    above = rotation[parent[j]]
-    turn = wp.transpose(above) @ rotation[j]
+    above = bones.rotation[bones.parent[j]]
+    turn = wp.transpose(above) @ bones.rotation[j]
     w = 0.5 * wp.sqrt(wp.max(1.0 + wp.trace(turn), 1.0e-6))
     axis = wp.vec3(turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]) / (4.0 * w)
-    bent[j] = wp.clamp((STRAIGHT - w) / (STRAIGHT - BENT), 0.0, 1.0)
-    for i in range(levels.shape[0]):
-        t = levels[i]
+    bones.bent[j] = wp.clamp((STRAIGHT - w) / (STRAIGHT - BENT), 0.0, 1.0)
+    if bones.bent[j] > 0.0:
+        wp.atomic_or(work.counts, BENT_JOINTS, 1 << j)
+    for i in range(bones.levels.shape[0]):
+        t = bones.levels[i]
         q = wp.normalize(wp.quat(t * axis[0], t * axis[1], t * axis[2], t * w + 1.0 - t))
-        between[j * levels.shape[0] + i] = above @ wp.quat_to_matrix(q)
+        bones.between[j * bones.levels.shape[0] + i] = above @ wp.quat_to_matrix(q)
+
+
+@wp.func
+def find_mean(i: int, points: wp.array[wp.vec3], means: Means) -> None:
+    total = wp.vec3()
+    for k in range(means.start[i], means.start[i + 1]):
+        total += means.weight[k] * points[means.vertex[k]]
+    means.mean[i] = total
 
 
 @wp.kernel
-def mean_kernel(
-    points: wp.array[wp.vec3],
-    start: wp.array[int],
-    vertex: wp.array[int],
-    weight: wp.array[float],
-    mean: wp.array[wp.vec3],
-) -> None:
-    i = wp.tid()
-    total = wp.vec3()
-    for k in range(start[i], start[i + 1]):
-        total += weight[k] * points[vertex[k]]
-    mean[i] = total
+def mean_kernel(points: wp.array[wp.vec3], means: Means) -> None:
+    find_mean(wp.tid(), points, means)
 
 
 @wp.func
@@ -157,18 +170,10 @@ def within(p: wp.vec3, skin: wp.vec3, farthest: float) -> wp.vec3:
     return p
 
 
-@wp.kernel
-def crease_kernel(
-    work: Work,
-    held: wp.array[int],
-    stations: wp.array[wp.vec3],
-    bones: Bones,
-    seams: Seams,
-    rounds: int,
-) -> None:
+@wp.func
+def hold(i: int, work: Work, stations: wp.array[wp.vec3], bones: Bones, seams: Seams, rounds: int) -> None:
     """Brings skin back to its own side of the seams near by, most of all of those that it is far beyond."""
-    i = wp.tid()
-    v = held[i]
+    v = seams.vertex[i]
     p = work.skin[v]
     is_held = int(0)
     for _ in range(rounds):
@@ -200,23 +205,28 @@ def crease_kernel(
         work.moved[wp.atomic_add(work.counts, MOVED, 1)] = v
 
 
-@wp.kernel
-def share_kernel(work: Work, full: float, step: float) -> None:
+@wp.func
+def find_share(v: int, work: Work, full: float, step: float) -> None:
     """How much of a sweep a vertex takes: all of `step` where it was moved by `full` [m] or farther."""
-    i = wp.tid()
-    if i < work.counts[MOVED]:
-        v = work.moved[i]
-        work.share[v] = wp.min(wp.length(work.here[v] - work.skin[v]) / full, 1.0) * step
+    work.share[v] = wp.min(wp.length(work.here[v] - work.skin[v]) / full, 1.0) * step
 
 
-@wp.kernel
-def smooth_kernel(work: Work, rings: Rings, source: wp.array[wp.vec3], target: wp.array[wp.vec3]) -> None:
+@wp.func
+def level(v: int, work: Work, rings: Rings, source: wp.array[wp.vec3], target: wp.array[wp.vec3]) -> None:
     """Levels what was moved."""
-    i = wp.tid()
-    if i < work.counts[MOVED]:
-        v = work.moved[i]
-        total = wp.vec3()
-        for k in range(rings.start[v], rings.start[v + 1]):
-            total += source[rings.vertex[k]]
-        mean = total / float(rings.start[v + 1] - rings.start[v])
-        target[v] = within(source[v] + work.share[v] * (mean - source[v]), work.skin[v], work.farthest[v])
+    total = wp.vec3()
+    for k in range(rings.start[v], rings.start[v + 1]):
+        total += source[rings.vertex[k]]
+    mean = total / float(rings.start[v + 1] - rings.start[v])
+    target[v] = within(source[v] + work.share[v] * (mean - source[v]), work.skin[v], work.farthest[v])
+
+
+@wp.func
+def settle(v: int, sweeps: int, work: Work) -> None:
+    """Takes what was levelled by so many sweeps over for all that follows."""
+    p = work.here[v]
+    if sweeps % 2 == 1:
+        p = work.there[v]
+    work.points[v] = p
+    work.here[v] = p
+    work.there[v] = p

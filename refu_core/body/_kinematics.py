@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import argument, is_plain, torch_stream
+from refu_core._warp import Repeated, is_plain
 from refu_core.body._pose_kernels import chain_kernel, rotation_kernel
 from refu_core.skeleton import JOINT_NAMES as JOINT_NAMES
 from refu_core.skeleton import PARENTS as PARENTS
@@ -25,13 +25,7 @@ def rotvec_to_rotmat(rotvec: Tensor) -> Tensor:
         flat = rotvec.reshape(-1, 3).contiguous()
         matrices = torch.empty(*rotvec.shape, 3, device=rotvec.device)
         if len(flat):
-            with torch_stream(rotvec.device):
-                wp.launch(
-                    rotation_kernel,
-                    len(flat),
-                    [argument(flat, wp.vec3), argument(matrices.view(-1, 3, 3), wp.mat33)],
-                    device=str(rotvec.device),
-                )
+            _rotate((len(flat),), flat, matrices.view(-1, 3, 3))
         return matrices
     angle2 = (rotvec * rotvec).sum(-1)
     small = angle2 < 1e-4 if rotvec.dtype == torch.float32 else angle2 < 1e-8
@@ -90,22 +84,19 @@ def forward_kinematics(rotations: Tensor, joints: Tensor) -> tuple[Tensor, Rigid
 def _chained(rotations: Tensor, joints: Tensor) -> tuple[Tensor, RigidTransforms]:
     turned = torch.empty_like(rotations)
     translation, posed = torch.empty(2, *rotations.shape[:3], device=rotations.device).unbind(0)
-    outputs = [argument(turned, wp.mat33), argument(translation, wp.vec3), argument(posed, wp.vec3)]
     if len(rotations):
-        with torch_stream(rotations.device):
-            wp.launch(
-                chain_kernel,
-                len(rotations),
-                [argument(rotations, wp.mat33), argument(joints, wp.vec3), _parents(str(rotations.device))],
-                outputs,
-                device=str(rotations.device),
-            )
+        _chain((len(rotations),), rotations, joints, _parents(rotations.device), turned, translation, posed)
     return posed, RigidTransforms(turned, translation)
 
 
 @cache
-def _parents(device: str) -> Any:
-    return wp.array(PARENTS, dtype=wp.int32, device=device)
+def _parents(device: torch.device) -> Tensor:
+    with torch.inference_mode(False):
+        return torch.tensor(PARENTS, dtype=torch.int32, device=device)
+
+
+_rotate = Repeated(rotation_kernel, (wp.vec3, wp.mat33))
+_chain = Repeated(chain_kernel, (wp.mat33, wp.vec3, wp.int32, wp.mat33, wp.vec3, wp.vec3))
 
 
 @cache

@@ -2,12 +2,28 @@
 
 import warp as wp
 
-from refu_core.body._collider_kernels import ENDS, FOUND, HOT, MOVED, NEAR, WANTED, Bones, Rings, Work, within
+from refu_core.body._bundle_kernels import Bundles, is_near
+from refu_core.body._collider_kernels import (
+    BENT_JOINTS,
+    ENDS,
+    FRONT,
+    HOT,
+    MOVED,
+    NEAR,
+    TOUCHING,
+    WANTED,
+    Bones,
+    Rings,
+    Work,
+    within,
+)
 
 wp.set_module_options({"enable_backward": False})
 
 DEEPEST = wp.constant(0.1)
 """Deeper than this no vertex is in another segment [m]: the trunk's half."""
+# More than what rounding takes from a distance [m].
+ROUNDED = wp.constant(1e-5)
 # A ray along no axis of a mesh.
 _RAY = wp.constant(wp.vec3(0.5418, 0.6389, 0.5461))
 # A closest point with less than this of a corner lies on the edge across.
@@ -21,49 +37,56 @@ class Segments:
     trees: wp.array[wp.uint64]
     own: wp.array[int]
     """The segment of each vertex."""
-    member: wp.array[int]
-    member_of: wp.array[int]
-    """Each vertex of each segment's faces, and the segment."""
-    low: wp.array[wp.vec3]
-    high: wp.array[wp.vec3]
     faces: wp.array[wp.vec3i]
     first_face: wp.array[int]
     gap: wp.array2d[float]
     """What vertex v keeps from segment k [m]."""
     ratio: wp.array2d[float]
     """How many times as soft segment k is as segment i."""
+    path: wp.array2d[int]
+    """The joints, as bits, by which segment i moves against segment k."""
 
 
-@wp.kernel
-def box_kernel(points: wp.array[wp.vec3], segments: Segments) -> None:
-    """The boxes of the segments, the rims of those next to them included."""
-    i = wp.tid()
-    k = segments.member_of[i]
-    p = points[segments.member[i]]
-    wp.atomic_min(segments.low, k, p)
-    wp.atomic_max(segments.high, k, p)
+@wp.struct
+class Skins:
+    """The vertices of each bundle of segments; every vertex is listed once."""
+
+    start: wp.array[int]
+    vertex: wp.array[int]
+    of: wp.array[int]
+    """The segment of each bundle."""
+    gap: wp.array2d[float]
+    """The most that any of its vertices keeps from segment k [m]."""
 
 
 @wp.func
-def do_meet(low: wp.vec3, high: wp.vec3, other_low: wp.vec3, other_high: wp.vec3, gap: float) -> bool:
-    return (
-        low[0] - gap < other_high[0]
-        and low[1] - gap < other_high[1]
-        and low[2] - gap < other_high[2]
-        and other_low[0] < high[0] + gap
-        and other_low[1] < high[1] + gap
-        and other_low[2] < high[2] + gap
-    )
-
-
-@wp.kernel
-def meet_kernel(segments: Segments, gap: float, meets: wp.array[int]) -> None:
-    i = wp.tid()
+def find_near(i: int, work: Work, segments: Segments, bundles: Bundles, skins: Skins) -> None:
+    """Lists the vertices of bundle i that may be nearer to a segment than they may be, by boxes."""
     found = int(0)
     for k in range(segments.trees.shape[0]):
-        if k != i and do_meet(segments.low[i], segments.high[i], segments.low[k], segments.high[k], gap):
+        # Where no joint is bent, segments are as far from each other as at rest.
+        may = (segments.path[skins.of[i], k] & work.counts[BENT_JOINTS]) != 0 and skins.gap[i, k] > 0.0
+        if may and is_near(bundles.low[i], bundles.high[i], k, skins.gap[i, k], bundles):
             found |= 1 << k
-    meets[i] = found
+    if found == 0:
+        return
+    wanted = int(0)
+    for c in range(skins.start[i], skins.start[i + 1]):
+        v = skins.vertex[c]
+        p = work.points[v]
+        boxed = int(0)
+        left = int(found)
+        k = int(0)
+        while left != 0:
+            if left & 1 == 1 and segments.gap[v, k] > 0.0 and is_near(p, p, k, segments.gap[v, k], bundles):
+                boxed |= 1 << k
+            left = left >> 1
+            k += 1
+        if boxed != 0:
+            wanted |= boxed
+            work.boxed[v] = boxed
+            work.near[wp.atomic_add(work.counts, NEAR, 1)] = v
+    wp.atomic_or(work.counts, WANTED, wanted)
 
 
 @wp.func
@@ -79,36 +102,9 @@ def distance_of(tree: wp.uint64, p: wp.vec3, hit: wp.MeshQueryPoint) -> float:
     return distance
 
 
-@wp.kernel
-def near_kernel(work: Work, segments: Segments) -> None:
-    """Which vertices may touch which segments, by their boxes."""
-    v = wp.tid()
-    p = work.points[v]
-    found = int(0)
-    meets = work.meets[segments.own[v]]
-    k = int(0)
-    while meets != 0:
-        if meets & 1 == 1:
-            keeps = segments.gap[v, k]
-            if keeps > 0.0 and do_meet(p, p, segments.low[k], segments.high[k], keeps):
-                found |= 1 << k
-        meets = meets >> 1
-        k += 1
-    work.touched[v] = 0
-    work.outside[v] = 0
-    if found != 0:
-        work.counts[WANTED] = work.counts[WANTED] | found
-        work.boxed[v] = found
-        work.near[wp.atomic_add(work.counts, NEAR, 1)] = v
-
-
-@wp.kernel
-def touch_kernel(work: Work, segments: Segments) -> None:
-    """Which segments each vertex is nearer to than it may be, of those whose surface is that near."""
-    i = wp.tid()
-    if i >= work.counts[NEAR]:
-        return
-    v = work.near[i]
+@wp.func
+def touch(v: int, work: Work, segments: Segments) -> None:
+    """Which segments a vertex is nearer to than it may be, of those whose surface is that near."""
     p = work.points[v]
     mine = int(0)
     seen = int(0)
@@ -123,31 +119,34 @@ def touch_kernel(work: Work, segments: Segments) -> None:
                     seen |= 1 << k
         boxed = boxed >> 1
         k += 1
-    work.touched[v] = mine
-    work.outside[v] = seen
+    if mine != 0:
+        work.touched[v] = mine
+        work.outside[v] = seen
+        work.touching[wp.atomic_add(work.counts, TOUCHING, 1)] = v
+        work.front[0, wp.atomic_add(work.counts, FRONT, 1)] = v
 
 
-@wp.kernel
-def deepen_kernel(work: Work, segments: Segments, rings: Rings) -> None:
+@wp.func
+def deepen(v: int, rounds: int, work: Work, segments: Segments, rings: Rings) -> None:
     """A vertex next to one that is inside a segment is inside it, too, unless the surface runs between them."""
-    i = wp.tid()
-    if i >= work.counts[NEAR]:
+    inside = work.touched[v] & ~work.outside[v]
+    if inside == 0:
         return
-    v = work.near[i]
-    around = int(0)
-    for k in range(rings.start[v], rings.start[v + 1]):
-        w = rings.vertex[k]
-        around |= work.touched[w] & ~work.outside[w]
-    around &= ~(work.touched[v] | work.outside[v] | (1 << segments.own[v]))
-    if around == 0:
-        return
-    work.counts[FOUND] = 1
-    for k in range(segments.trees.shape[0]):
-        if (around >> k) & 1 == 1 and segments.gap[v, k] > 0.0:
-            if wp.mesh_query_ray_count_intersections(segments.trees[k], work.points[v], _RAY) % 2 == 1:
-                work.touched[v] = work.touched[v] | (1 << k)
-            else:
-                work.outside[v] = work.outside[v] | (1 << k)
+    for r in range(rings.start[v], rings.start[v + 1]):
+        w = rings.vertex[r]
+        ahead = inside & ~(work.touched[w] | work.outside[w] | (1 << segments.own[w]))
+        k = int(0)
+        while ahead != 0:
+            if ahead & 1 == 1 and segments.gap[w, k] > 0.0:
+                if wp.mesh_query_ray_count_intersections(segments.trees[k], work.points[w], _RAY) % 2 == 1:
+                    if wp.atomic_or(work.touched, w, 1 << k) == 0:
+                        work.touching[wp.atomic_add(work.counts, TOUCHING, 1)] = w
+                    if wp.atomic_exch(work.is_front, w, rounds + 1) != rounds + 1:
+                        work.front[rounds + 1, wp.atomic_add(work.counts, FRONT + rounds + 1, 1)] = w
+                else:
+                    wp.atomic_or(work.outside, w, 1 << k)
+            ahead = ahead >> 1
+            k += 1
 
 
 @wp.func
@@ -170,14 +169,18 @@ def way_out(
     farthest: float,
     segments: Segments,
     bones: Bones,
-) -> wp.vec3:
-    """How p, with its skin's `normal` and `sunk` below that skin [m], gives way to segment k within `farthest` [m]."""
+) -> tuple[wp.vec3, float]:
+    """How p, with its skin's `normal` and `sunk` below that skin [m], gives way to segment k within `farthest` [m].
+
+    Also how far its surface is, `farthest` at most.
+    """
     hit = wp.mesh_query_point_no_sign(segments.trees[k], p, farthest)
     if not hit.result:
-        return wp.vec3()
-    lacks = keeps - distance_of(segments.trees[k], p, hit) - ratio * sunk
+        return wp.vec3(), farthest
+    distance = distance_of(segments.trees[k], p, hit)
+    lacks = keeps - distance - ratio * sunk
     if lacks <= 0.0:
-        return wp.vec3()
+        return wp.vec3(), wp.abs(distance)
     corners = segments.faces[segments.first_face[k] + hit.face]
     other = wp.vec3()
     for c in range(3):
@@ -187,37 +190,37 @@ def way_out(
     other = wp.normalize(other)
     way = wp.normalize(other - wp.max(wp.dot(other, normal), 0.0) * normal - normal)
     rate = wp.dot(way, other) - ratio * wp.dot(way, normal)
-    return lacks / wp.clamp(rate, 0.5 + 0.5 * ratio, 1.0 + ratio) * way
+    return lacks / wp.clamp(rate, 0.5 + 0.5 * ratio, 1.0 + ratio) * way, wp.abs(distance)
 
 
-@wp.kernel
-def part_kernel(work: Work, segments: Segments, bones: Bones, rings: Rings, rounds: int) -> None:
-    """Moves each vertex to its own side of the surface between its segment and another one, in Newton's steps."""
-    i = wp.tid()
-    if i >= work.counts[NEAR]:
-        return
-    v = work.near[i]
+@wp.func
+def part(v: int, work: Work, segments: Segments, bones: Bones, rings: Rings, rounds: int) -> None:
+    """Moves a vertex to its own side of the surface between its segment and another one, in Newton's steps."""
     touched = work.touched[v]
-    if touched == 0:
-        return
     outside = work.outside[v]
     start = work.points[v]
     p = start
     own = segments.own[v]
     normal = normal_at(bones, v)
+    reach = float(DEEPEST)  # no surface is farther, which makes a query short
     for _ in range(rounds):
         step = wp.vec3()
         total = float(0.0)
+        most = float(0.0)
         sunk = wp.dot(start - p, normal)
         for k in range(segments.trees.shape[0]):
             if (touched >> k) & 1 == 1:
-                far = wp.where((outside >> k) & 1 == 1, segments.gap[v, k] + sunk, DEEPEST)
-                found = way_out(p, normal, sunk, k, segments.ratio[own, k], segments.gap[v, k], far, segments, bones)
+                far = wp.where((outside >> k) & 1 == 1, wp.min(segments.gap[v, k] + sunk, reach), reach)
+                ratio = segments.ratio[own, k]
+                found, away = way_out(p, normal, sunk, k, ratio, segments.gap[v, k], far, segments, bones)
                 step += wp.length_sq(found) * found
                 total += wp.length_sq(found)
+                most = wp.max(most, away)
         if total == 0.0:
             break
-        p += step / total
+        step /= total
+        p += step
+        reach = wp.min(most + wp.length(step) + ROUNDED, DEEPEST)
     if wp.length_sq(p - start) > 0.0:
         p = within(p, work.skin[v], work.farthest[v])
         work.here[v] = p
@@ -236,16 +239,12 @@ def part_kernel(work: Work, segments: Segments, bones: Bones, rings: Rings, roun
                     work.ends[wp.atomic_add(work.counts, ENDS, 1)] = end
 
 
-@wp.kernel
-def edge_kernel(
-    work: Work, moved: wp.array[wp.vec3], rings: Rings, segments: Segments, bones: Bones, steep: float
+@wp.func
+def raise_edge(
+    e: int, work: Work, moved: wp.array[wp.vec3], rings: Rings, segments: Segments, bones: Bones, steep: float
 ) -> None:
     """How the middle of a hot edge gives way, if its ends were moved by more than `steep` [m] apart from each other;
     in full from twice that on."""
-    i = wp.tid()
-    if i >= work.counts[HOT]:
-        return
-    e = work.hot[i]
     v = rings.ends[e][0]
     w = rings.ends[e][1]
     step = wp.vec3()
@@ -264,7 +263,7 @@ def edge_kernel(
             if (either >> k) & 1 == 1 and k != segments.own[v] and k != segments.own[w]:
                 keeps = wp.min(segments.gap[v, k], segments.gap[w, k])
                 ratio = segments.ratio[segments.own[v], k]
-                found = way_out(middle, normal, sunk, k, ratio, keeps, DEEPEST, segments, bones)
+                found, _ = way_out(middle, normal, sunk, k, ratio, keeps, DEEPEST, segments, bones)
                 step += wp.length_sq(found) * found
                 total += wp.length_sq(found)
     if total > 0.0:
@@ -272,13 +271,9 @@ def edge_kernel(
     work.steps[e] = step
 
 
-@wp.kernel
-def follow_kernel(work: Work, moved: wp.array[wp.vec3], rings: Rings) -> None:
-    """Vertices go with their edges, most of all with those that have far to go."""
-    i = wp.tid()
-    if i >= work.counts[ENDS]:
-        return
-    v = work.ends[i]
+@wp.func
+def follow(v: int, work: Work, moved: wp.array[wp.vec3], rings: Rings) -> None:
+    """A vertex goes with its edges, most of all with those that have far to go."""
     step = wp.vec3()
     total = float(0.0)
     for r in range(rings.start[v], rings.start[v + 1]):

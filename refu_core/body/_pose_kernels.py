@@ -66,17 +66,23 @@ def skin_kernel(
     joint: wp.array[int],
     weight: wp.array[float],
     transforms: wp.array2d[Transform],
+    each: wp.array[int],
     # output
     posed: wp.array2d[wp.vec3],
 ) -> None:
-    """Moves point v by the joints number `start[v]` to `start[v + 1]`; points of one shape do for all bodies."""
-    b, v = wp.tid()
-    t = Transform()
-    for k in range(start[v], start[v + 1]):
-        t += weight[k] * transforms[b, joint[k]]
-    p = points[wp.min(b, points.shape[0] - 1), v]
-    posed[b, v] = wp.vec3(
-        t[0] * p[0] + t[1] * p[1] + t[2] * p[2] + t[9],
-        t[3] * p[0] + t[4] * p[1] + t[5] * p[2] + t[10],
-        t[6] * p[0] + t[7] * p[1] + t[8] * p[2] + t[11],
-    )
+    """Moves point v by the joints number `start[v]` to `start[v + 1]`; points of one shape do for all bodies.
+
+    A thread moves `each` in number of one body.
+    """
+    b, strip = wp.tid()
+    shape = wp.min(b, points.shape[0] - 1)
+    for v in range(strip * each[0], wp.min((strip + 1) * each[0], posed.shape[1])):
+        t = Transform()
+        for k in range(start[v], start[v + 1]):
+            t += weight[k] * transforms[b, joint[k]]
+        p = points[shape, v]
+        posed[b, v] = wp.vec3(
+            t[0] * p[0] + t[1] * p[1] + t[2] * p[2] + t[9],
+            t[3] * p[0] + t[4] * p[1] + t[5] * p[2] + t[10],
+            t[6] * p[0] + t[7] * p[1] + t[8] * p[2] + t[11],
+        )

@@ -6,12 +6,15 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import argument, is_plain, torch_stream
+from refu_core._warp import Repeated, is_plain, strips
 from refu_core.body._kinematics import RigidTransforms
 from refu_core.body._pose_kernels import Transform, skin_kernel
 
 _MIN_DETERMINANT = 1e-4
 """Blends of rotations almost half a turn apart collapse; below this determinant unposing is bounded, not exact."""
+
+
+_skin = Repeated(skin_kernel, (wp.vec3, wp.int32, wp.int32, wp.float32, Transform, wp.int32, wp.vec3))
 
 
 def blend_transforms(weights: Tensor, transforms: RigidTransforms) -> RigidTransforms:
@@ -56,20 +59,8 @@ class Skinning:
         points, stacked = points.contiguous(), _stacked(transforms)
         posed = torch.empty(len(rotation), *points.shape[1:], device=points.device)
         if len(rotation):
-            with torch_stream(points.device):
-                wp.launch(
-                    skin_kernel,
-                    posed.shape[:2],
-                    [
-                        argument(points, wp.vec3),
-                        argument(self._start, wp.int32),
-                        argument(self._joint, wp.int32),
-                        argument(self._weight, wp.float32),
-                        argument(stacked, Transform),
-                    ],
-                    [argument(posed, wp.vec3)],
-                    device=str(points.device),
-                )
+            n_strips, each = strips(posed.shape[1], posed.device)
+            _skin((len(posed), n_strips), points, self._start, self._joint, self._weight, stacked, each, posed)
         return posed
 
 

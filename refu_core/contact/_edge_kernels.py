@@ -20,30 +20,27 @@ def middle_deficit(edge: int, state: State, cloth: Cloth, skin: Skin, rules: Rul
 
 
 @wp.kernel(enable_backward=False)
-def suspect_kernel(state: State, cloth: Cloth, rules: Rules) -> None:
+def suspect_kernel(each: int, state: State, cloth: Cloth, rules: Rules) -> None:
     """Lists the edges whose middle may be closer to the skin than half the margin (`_raise_edges`)."""
     if state.counts[NEAR] == 0:
         return  # nothing is moved then
-    edge = wp.tid()
-    a = cloth.edges[edge, 0]
-    b = cloth.edges[edge, 1]
-    first = state.distance[a]
-    second = state.distance[b]
-    if first < 0.0 or second < 0.0:
-        return
-    # Most edges are far off, which is to be seen from as few numbers as may be.
-    is_low = first + second < rules.margin
-    if not is_low and (state.face[a] < 0 or state.face[b] < 0):
-        return  # what bulges there isn't known
-    way = state.place[a] - state.place[b]
-    beyond = 2.0 * wp.where(first > second, first, second) - rules.margin
-    if beyond >= 0.0 and beyond * beyond >= wp.dot(way, way):
-        return
-    if not is_low:
-        bulge = rules.bulge * wp.length(way) * wp.length(state.gradient[a] - state.gradient[b])
-        is_low = first + second < rules.margin + 2.0 * bulge
-    if is_low:
-        state.suspects[wp.atomic_add(state.counts, CUTTING, 1)] = edge
+    # An edge's lower end has it. Most are far off, which is to be seen by few numbers, and without guesses between.
+    begin = wp.tid() * each
+    for a in range(begin, begin + each):
+        first = state.distance[a]
+        here = state.place[a]
+        for edge in range(cloth.edge_start[a], cloth.edge_start[a + 1]):
+            b = cloth.edges[edge, 1]
+            second = state.distance[b]
+            way = here - state.place[b]
+            beyond = 2.0 * wp.where(first > second, first, second) - rules.margin
+            if wp.where(beyond > 0.0, beyond * beyond, 0.0) < wp.dot(way, way) and first >= 0.0 and second >= 0.0:
+                is_low = first + second < rules.margin
+                if not is_low and state.face[a] >= 0 and state.face[b] >= 0:  # else what bulges there isn't known
+                    bulge = rules.bulge * wp.length(way) * wp.length(state.gradient[a] - state.gradient[b])
+                    is_low = first + second < rules.margin + 2.0 * bulge
+                if is_low:
+                    state.suspects[wp.atomic_add(state.counts, CUTTING, 1)] = edge
 
 
 @wp.func

@@ -144,7 +144,11 @@ class Layer:
             self._commands[ask].launch()
 
     def _move(self, blend_rounds: int) -> None:
-        """Pushes those with their neighbourhood."""
+        """Pushes those with their neighbourhood, in an even number of rounds."""
+        if self._is_serial:
+            self._commands["move all"].set_param_at_index(4, blend_rounds)
+            self._commands["move all"].launch()
+            return
         self._fields[0].zero_()
         self._fields[0, : self._n_candidates] = self._push
         for round_ in range(blend_rounds):
@@ -177,7 +181,8 @@ class Layer:
         garments = [below, normals, below_cut, above, above_cut, rows]
         pushed = [closest, push, as_warp(self._count, wp.int32)]
         doubts = [doubtful, as_warp(self._n_doubtful, wp.int32)]
-        blend = [push, self._n_candidates, start, ring]
+        blend = [push, start, ring]
+        reached = [wp.zeros(self._n_region, dtype=wp.int32, device=str(self.device)) for _ in range(2)]
         extent = as_warp(self._extent, wp.vec3)
         again = [start, ring, found, extent, later, *pushed, *doubts]
         for name, kernel, size, arguments in (
@@ -206,6 +211,7 @@ class Layer:
             ("spread0", kernels.spread_kernel, self._n_region, [*blend, fields[0], fields[1]]),
             ("spread1", kernels.spread_kernel, self._n_region, [*blend, fields[1], fields[0]]),
             ("move", kernels.move_kernel, self._n_region, [rows, fields[0], above]),
+            ("move all", kernels.move_all_kernel, 1, [*blend, rows, 0, *reached, *fields, above]),
         ):
             self._commands[name] = wp.launch(kernel, size, arguments, device=str(self.device), record_cmd=True)
 

@@ -11,10 +11,12 @@ from torch import Tensor
 
 from refu_core._warp import as_warp, torch_stream
 from refu_core.body import ARMS, LEGS, SmplBody, joints_of, part_of_faces, weight_of_parts
+from refu_core.body._bundle_kernels import bound_kernel, enclose_kernel
+from refu_core.body._bundles import bundled
 from refu_core.contact import _press_kernels as kernels
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
 from refu_core.garments import GarmentTemplate
-from refu_core.mesh import Connectivity
+from refu_core.mesh import Connectivity, grouped
 
 _LIMBS = (joints_of("trunk", "head"), *ARMS, LEGS[0] + LEGS[1])
 """Joints of each limb; both legs are one, as a skirt lies on either."""
@@ -27,20 +29,36 @@ class LimbMeshes:
         """For poses of this body, on its device."""
         self._device = str(body.device)
         self._vertices = torch.zeros_like(body.v_template).copy_(body.v_template)
+        self._is_late = np.zeros(len(_LIMBS), np.bool_)
         points = as_warp(self._vertices, wp.vec3)
         limb_of = part_of_faces(body.weights, body.faces, _LIMBS).cpu().numpy()
         faces = body.faces.cpu().numpy()
-        self.meshes = [
-            wp.Mesh(points, wp.array(faces[limb_of == k].ravel().astype(np.int32), dtype=wp.int32, device=self._device))
-            for k in range(len(_LIMBS))
+        of_limbs = [faces[limb_of == k].astype(np.int32) for k in range(len(_LIMBS))]
+        self.meshes = [wp.Mesh(points, wp.array(one.ravel(), dtype=wp.int32, device=self._device)) for one in of_limbs]
+        self.bundles = bundled(body.v_template.cpu().numpy(), of_limbs, body.device)
+        """Boxes around what is near together of them."""
+        self._fit = [
+            wp.launch(kernel, dim, inputs, device=self._device, record_cmd=True)
+            for kernel, dim, inputs in (
+                (bound_kernel, len(self.bundles.low), [points, self.bundles]),
+                (enclose_kernel, len(self.meshes), [self.bundles]),
+            )
         ]
 
     def update(self, body: Tensor) -> None:
         """Takes over a pose: vertices (V, 3) [m]. A GPU isn't waited for."""
         self._vertices.copy_(body)
+        self._is_late[:] = True
         with torch_stream(self._vertices.device):
-            for mesh in self.meshes:
+            for command in self._fit:
+                command.launch()
+
+    def pose(self, which: int) -> None:
+        """Refits the meshes of the limbs `which`, as bits, unless they are already."""
+        for k, mesh in enumerate(self.meshes):
+            if self._is_late[k] and (which >> k) & 1:
                 mesh.refit()
+                self._is_late[k] = False
 
 
 class Press:
@@ -57,42 +75,32 @@ class Press:
         self, garment: GarmentTemplate, limbs: LimbMeshes, *, settings: ContactSettings = DEFAULT_CONTACT
     ) -> None:
         """For a garment and the limbs of the body that it is worn on, on one device."""
+        self._settings = settings
         self._limbs = limbs  # their memory is read
         n, self.device = garment.n_vertices, garment.v_template.device
         self._is_serial = self.device.type == "cpu"
-        device = str(self.device)
-        ring = Connectivity.of(garment.faces.cpu(), n).ring
-        # Rows of one length: those of fewer neighbours name the vertex itself, too.
-        self._around = np.repeat(np.arange(n)[:, None], np.diff(ring.start).max(), axis=1)
-        self._around[ring.owner, np.arange(len(ring.items)) - ring.start[ring.owner]] = ring.items
-        self._rows = torch.arange(n, dtype=torch.int32, device=self.device)
         self._skin, self._points = torch.zeros(2, n, 3, device=self.device)
-        self._room = torch.zeros(2, n, device=self.device)
-        self._count = torch.zeros(1, dtype=torch.int32, device=self.device)
-
-        def command(kernel: Any, dim: int, inputs: list[Any]) -> Any:
-            return wp.launch(kernel, dim, inputs, device=device, record_cmd=True)
-
-        skin, points = as_warp(self._skin, wp.vec3), as_warp(self._points, wp.vec3)
-        room = [as_warp(one, wp.float32) for one in self._room]
-        count, rows = as_warp(self._count, wp.int32), as_warp(self._rows, wp.int32)
-        rings = [wp.array(one.astype(np.int32), dtype=wp.int32, device=device) for one in (ring.start, ring.items)]
-        own = (weight_of_parts(garment.weights, _LIMBS) > settings.own_weight).cpu().numpy()
-        self._looks = []
-        for k, mesh in enumerate(limbs.meshes):
-            foreign = np.flatnonzero(~own[:, k])
-            if len(foreign):
-                limb = kernels.Limb()
-                limb.mesh = mesh.id
-                limb.foreign = wp.array(foreign.astype(np.int32), dtype=wp.int32, device=device)
-                inputs = [limb, skin, points, settings.press_room, room[0], count]
-                self._looks.append(command(kernels.press_kernel, len(foreign), inputs))
-        self._sweeps = []
-        for sweep in range(settings.press_sweeps):
-            slope = 0.0 if sweep < settings.press_reach else settings.press_slope
-            fields = [room[sweep % 2], room[1 - sweep % 2]]
-            self._sweeps.append(command(kernels.spread_room_kernel, n, [rows, *rings, points, slope, *fields]))
-        self._lower = command(kernels.lower_kernel, n, [rows, skin, room[settings.press_sweeps % 2], points])
+        self._room = torch.full((2, n), torch.inf, device=self.device)
+        self._counts = torch.zeros(kernels.N_COUNTS, dtype=torch.int32, device=self.device)
+        self._commands: dict[str, Any] = {}
+        own = weight_of_parts(garment.weights, _LIMBS) > settings.own_weight
+        foreign = (~own).cpu().numpy() @ (1 << np.arange(len(_LIMBS)))
+        order = grouped(garment.v_template.cpu().numpy())
+        ring = Connectivity.of(garment.faces.cpu(), n).ring
+        self._fabric = fabric = kernels.Fabric()
+        fabric.skin, fabric.points = as_warp(self._skin, wp.vec3), as_warp(self._points, wp.vec3)
+        fabric.room, fabric.spread = (as_warp(one, wp.float32) for one in self._room)
+        fabric.counts = as_warp(self._counts, wp.int32)
+        lists = {
+            "start": [*range(0, n, _PIECE), n],
+            "vertex": order,
+            "foreign": foreign,
+            "ring_start": ring.start,
+            "ring": ring.items,
+            "rows": np.arange(n),
+        } | dict.fromkeys(("boxed", "near", "is_row"), np.zeros(n))
+        for name, values in lists.items():
+            setattr(fabric, name, wp.array(np.asarray(values, np.int32), dtype=wp.int32, device=str(self.device)))
 
     @torch.no_grad()
     def __call__(self, points: Tensor, skin: Tensor) -> Tensor:
@@ -102,30 +110,54 @@ class Press:
         """
         self._points.copy_(points)
         self._skin.copy_(skin)
-        self._room.fill_(torch.inf)
-        self._count.zero_()
+        self._counts.zero_()
         with torch_stream(self.device):
-            for look in self._looks:
-                look.launch()
+            self._run("look")
+            wanted = int(self._counts[kernels.WANTED]) if self._is_serial else -1
+            if not wanted:
+                return points
+            self._limbs.pose(wanted)
             if self._is_serial:
-                if not self._count:
+                self._run("press all")
+                if not self._counts[kernels.PRESSED]:
                     return points
-                self._list_reached()
-            for sweep in self._sweeps:
-                sweep.launch()
-            self._lower.launch()
+            else:
+                self._room.fill_(torch.inf)
+                self._run("press")
+                for sweep in range(self._settings.press_sweeps):
+                    self._run(f"spread {sweep}")
+                self._run("lower")
         pressed: Tensor = self._points.clone()
         return pressed
 
-    def _list_reached(self) -> None:
-        """What is pressed, and as far as sweeps reach; a GPU isn't waited for to know, and goes through all."""
-        reached = torch.isfinite(self._room[0]).numpy()
-        front = np.flatnonzero(reached)
-        for _ in self._sweeps:
-            around = self._around[front].ravel()
-            front = np.unique(around[~reached[around]])
-            reached[front] = True
-        rows = np.flatnonzero(reached)
-        self._rows[: len(rows)] = torch.from_numpy(rows)
-        for command in (*self._sweeps, self._lower):
-            command.set_dim(len(rows))
+    def _run(self, name: str) -> None:
+        if name not in self._commands:
+            self._commands |= self._record()
+        self._commands[name].launch()
+
+    def _record(self) -> dict[str, Any]:
+        how, fabric, n = self._settings, self._fabric, len(self._points)
+        device = str(self.device)
+        limbs = wp.array([mesh.id for mesh in self._limbs.meshes], dtype=wp.uint64, device=device)
+        room = [fabric.room, fabric.spread]
+        sweeps = how.press_sweeps
+        look = (kernels.look_kernel, len(fabric.start) - 1, [fabric, self._limbs.bundles, how.press_room])
+        steps: dict[str, tuple[Any, int, list[Any]]] = {"look": look}
+        if self._is_serial:
+            numbers = [how.press_room, how.press_slope, sweeps, how.press_reach]
+            steps["press all"] = (kernels.press_all_kernel, 1, [fabric, limbs, *numbers])
+        else:
+            steps["press"] = (kernels.press_kernel, n, [fabric, limbs, how.press_room])
+            for sweep in range(sweeps):
+                slope = 0.0 if sweep < how.press_reach else how.press_slope
+                fields = [room[sweep % 2], room[1 - sweep % 2]]
+                steps[f"spread {sweep}"] = (kernels.spread_kernel, n, [fabric, slope, *fields])
+            steps["lower"] = (kernels.lower_kernel, n, [fabric, room[sweeps % 2]])
+        return {
+            name: wp.launch(kernel, dim, inputs, device=device, record_cmd=True)
+            for name, (kernel, dim, inputs) in steps.items()
+        }
+
+
+_PIECE = 32
+"""Vertices of a garment that are looked at together."""

@@ -96,10 +96,10 @@ class Resolver:
         with torch_stream(self.device):
             self._take(points, start)
             self._record(sdf, margin)
-            self._run("begin", self._n_vertices)
+            self._run("begin", self._n_strips)
             if not sdf.is_exact:
                 self._reconcile()
-            self._run("list", self._n_vertices)
+            self._run("list", self._n_strips)
             n = self._length(_state.NEAR)
             if n:
                 self._push(n, scale)
@@ -126,7 +126,7 @@ class Resolver:
 
     def _reconcile(self) -> None:
         """Where distances contradict each other along an edge, a closest face was missed."""
-        self._run("compare", self._n_vertices)
+        self._run("compare", self._n_strips)
         for _ in range(self._settings.looks):
             n = self._length(_state.SUSPECTS)
             self._counts[_state.CHANGED].zero_()
@@ -161,7 +161,7 @@ class Resolver:
     def _raise_edges(self) -> None:
         """Raises both ends of the edges that run too low."""
         n = self._n_edges
-        self._run("suspect", n)
+        self._run("suspect", self._n_strips)
         if self._is_serial:
             self._run("raise edges", int(self._count(_state.CUTTING) > 0))
             return
@@ -172,6 +172,11 @@ class Resolver:
             self._counts[_state.RAISED].zero_()
             self._run(f"choose{round_ % 2}", n, (2, round_))
             self._run("lift", self._length(_state.RAISED))
+
+    @property
+    def _n_strips(self) -> int:
+        """Threads that go through all vertices: one where a loop is faster than threads (`strips`)."""
+        return 1 if self._is_serial else self._n_vertices
 
     def _length(self, which: int) -> int:
         """How long a launch over a list of vertices is: as long as the list; on a GPU, as long as it may become."""
@@ -211,14 +216,15 @@ class Resolver:
             return
         self._recorded_for = key
         state, cloth, rules = self._state, self._cloth, self._rules(margin)
-        self._command("begin", _resolver_kernels.begin_kernel, [state])
-        self._command("compare", _resolver_kernels.compare_kernel, [state, cloth, rules])
+        each = self._n_vertices // self._n_strips if self._n_vertices else 0
+        self._command("begin", _resolver_kernels.begin_kernel, [each, state])
+        self._command("compare", _resolver_kernels.compare_kernel, [each, state, cloth, rules])
         self._command("retry", _resolver_kernels.retry_kernel, [state, cloth, skin, rules])
         self._command("adopt", _resolver_kernels.adopt_kernel, [state, cloth])
-        self._command("list", _resolver_kernels.list_near_kernel, [state, rules])
+        self._command("list", _resolver_kernels.list_near_kernel, [each, state, rules])
         self._command("scale", _resolver_kernels.scale_kernel, [state, rules])
         self._command("settle", _resolver_kernels.settle_kernel, [state, skin, rules])
-        self._command("suspect", _edge_kernels.suspect_kernel, [state, cloth, rules])
+        self._command("suspect", _edge_kernels.suspect_kernel, [each, state, cloth, rules])
         self._command("tally", _resolver_kernels.tally_kernel, [state])
         long_step, short_step = self._settings.blend_steps
         if self._is_serial:
@@ -270,6 +276,7 @@ def _cloth(mesh: Connectivity, device: str) -> Any:
     # The sums over neighbours are rounded in this order: those of a higher number first.
     ring = ring[np.lexsort((ring < mesh.ring.owner, mesh.ring.owner))]
     cloth = _state.Cloth()
-    for name, array in (("ring_start", ring_start), ("ring", ring), ("edges", mesh.edges)):
+    edge_start = np.searchsorted(mesh.edges[:, 0], np.arange(mesh.n_vertices + 1))
+    for name, array in (("ring_start", ring_start), ("ring", ring), ("edges", mesh.edges), ("edge_start", edge_start)):
         setattr(cloth, name, wp.array(array.astype(np.int32), dtype=wp.int32, device=device))
     return cloth

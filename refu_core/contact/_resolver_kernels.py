@@ -59,25 +59,26 @@ def suspect(i: int, state: State) -> None:
 
 
 @wp.kernel(enable_backward=False)
-def begin_kernel(state: State) -> None:
-    """Everybody where it is."""
-    i = wp.tid()
-    keep(i, state.origin[i], state.first[i], state.first_gradient[i], state.first_face[i], state)
-    if state.first_face[i] < 0:
-        state.gradient[i] = wp.vec3()  # beyond a band nothing is known
+def begin_kernel(each: int, state: State) -> None:
+    """Everybody where it is; `each` vertices a thread, here and where else all are gone through (`strips`)."""
+    first = wp.tid() * each
+    for i in range(first, first + each):
+        keep(i, state.origin[i], state.first[i], state.first_gradient[i], state.first_face[i], state)
+        if state.first_face[i] < 0:
+            state.gradient[i] = wp.vec3()  # beyond a band nothing is known
 
 
 @wp.kernel(enable_backward=False)
-def compare_kernel(state: State, cloth: Cloth, rules: Rules) -> None:
+def compare_kernel(each: int, state: State, cloth: Cloth, rules: Rules) -> None:
     """Lists the ends of edges at the skin along which distances contradict each other."""
-    i = wp.tid()
-    if state.distance[i] >= rules.margin:
-        return
-    for k in range(cloth.ring_start[i], cloth.ring_start[i + 1]):
-        j = cloth.ring[k]
-        if contradict(i, j, state, rules):
-            suspect(i, state)
-            suspect(j, state)
+    first = wp.tid() * each
+    for i in range(first, first + each):
+        if state.distance[i] < rules.margin:
+            for k in range(cloth.ring_start[i], cloth.ring_start[i + 1]):
+                j = cloth.ring[k]
+                if contradict(i, j, state, rules):
+                    suspect(i, state)
+                    suspect(j, state)
 
 
 @wp.kernel(enable_backward=False)
@@ -113,12 +114,13 @@ def adopt_kernel(state: State, cloth: Cloth) -> None:
 
 
 @wp.kernel(enable_backward=False)
-def list_near_kernel(state: State, rules: Rules) -> None:
+def list_near_kernel(each: int, state: State, rules: Rules) -> None:
     """Lists who is nearer than the margin."""
-    i = wp.tid()
-    state.mark[i] = 0
-    if state.distance[i] < rules.margin:
-        state.near[wp.atomic_add(state.counts, NEAR, 1)] = i
+    first = wp.tid() * each
+    for i in range(first, first + each):
+        state.mark[i] = 0
+        if state.distance[i] < rules.margin:
+            state.near[wp.atomic_add(state.counts, NEAR, 1)] = i
 
 
 @wp.kernel(enable_backward=False)

@@ -32,6 +32,8 @@ class Cloth:
     ring: wp.array[wp.int32]
     """The neighbours of vertex i are `ring[ring_start[i]:ring_start[i + 1]]`."""
     edges: wp.array2d[wp.int32]
+    """Each edge once, lower vertex first; those of vertex i from `edge_start[i]` on."""
+    edge_start: wp.array[wp.int32]
 
 
 @wp.struct

@@ -2,16 +2,19 @@
 
 from refu_core.realtime._contact import ContactStage
 from refu_core.realtime._dress import Drape, Dressed, dress
+from refu_core.realtime._frame import Adjust
 from refu_core.realtime._load import wearable_of
 from refu_core.realtime._outputs import SKIPS, FrameStats, GarmentMesh, GarmentStats, PipelineOutput, SkinShift
 from refu_core.realtime._pipeline import GarmentPipeline
 from refu_core.realtime._promise import PROMISED_POSES, PROMISED_SIZE, within_promise
+from refu_core.realtime._turn import RootTurn
 from refu_core.realtime._wearer import Outfit, Wearable, Wearer
 
 __all__ = [
     "PROMISED_POSES",
     "PROMISED_SIZE",
     "SKIPS",
+    "Adjust",
     "ContactStage",
     "Drape",
     "Dressed",
@@ -21,6 +24,7 @@ __all__ = [
     "GarmentStats",
     "Outfit",
     "PipelineOutput",
+    "RootTurn",
     "SkinShift",
     "Wearable",
     "Wearer",

@@ -132,10 +132,8 @@ class ContactStage:
         if worn:
             vertices, _ = self.lift(name, vertices, worn)
             again, _ = self._off_body(name, vertices, on_mean=on_mean, margin=self._kept * margin, scale=1.0)
-            away = again.vertices - pressed  # each step goes no farther than that; together they may
-            length = torch.linalg.vector_norm(away, dim=1, keepdim=True)
-            bounded = pressed + self._farthest / length * away
-            vertices = torch.where(length > self._farthest, bounded, again.vertices)
+            # Each step goes no farther than that; together they may.
+            vertices = pressed + torch.renorm(again.vertices - pressed, 2, 0, self._farthest)
             numbers[_N_UNRESOLVED] = again.numbers[_N_UNRESOLVED]
         if self.winding is not None:
             numbers[_N_UNRESOLVED] = torch.count_nonzero(self.winding(vertices))

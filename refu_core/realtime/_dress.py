@@ -45,6 +45,8 @@ class Dressed(NamedTuple):
     drapes: Mapping[str, Drape]
     turns: list[RootTurn]
     """Bring each person to the world's axes."""
+    transforms: RigidTransforms
+    """Of the bodies' joints, that skin and garments were posed with, leading shape (B, 24)."""
 
 
 def dress(pose: Tensor, wearer: Wearer, *, lap: Lap = _no_lap) -> Dressed:
@@ -69,7 +71,7 @@ def dress(pose: Tensor, wearer: Wearer, *, lap: Lap = _no_lap) -> Dressed:
             drape = drape._replace(vertices=drape.vertices + outfit.below[name](body - posed.vertices))
         drapes[name] = drape
         lap("backbone", name)
-    return Dressed(body, posed.vertices, drapes, turns)
+    return Dressed(body, posed.vertices, drapes, turns, posed.transforms)
 
 
 def scale_of(wearable: Wearable, drape: Drape, person: int) -> float | VertexScale:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -20,6 +20,8 @@ from refu_core.realtime._wearer import Outfit, Wearer
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+Adjust = Callable[[Dressed], Dressed]
+"""Changes what was predicted: garments, not bodies."""
 N_SHIFT = 3
 _MOVED = 1e-4
 """Skin that was moved by more than this counts as moved [m]."""
@@ -80,14 +82,23 @@ class FrameStep:
 
     @torch.no_grad()
     def __call__(
-        self, pose: Tensor, wearer: Wearer, margins: Sequence[float], clocks: Sequence[StageClock] = ()
+        self,
+        pose: Tensor,
+        wearer: Wearer,
+        margins: Sequence[float],
+        clocks: Sequence[StageClock] = (),
+        adjust: Adjust | None = None,
     ) -> list[Person]:
         """Persons in poses (B, 24, 3) [rad]; `margins` [m] of the garments in the outfit's order.
 
-        `clocks`, one a person, are told how long the stages took; what is done for all at once is shared out.
+        `clocks`, one a person, are told how long the stages took; what is done for all at once is shared out. What was
+        predicted may be changed by `adjust` before anything is done about collisions.
         """
         shared = StageClock()
         dressed = dress(pose, wearer, lap=shared.lap)
+        if adjust is not None:
+            dressed = adjust(dressed)
+            shared.lap("adjust")
         margin_of = dict(zip(self._outfit.wearables, margins, strict=True))
         persons = []
         shifts = _shift(dressed)

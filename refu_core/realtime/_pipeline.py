@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike, NDArray
 
-    from refu_core.realtime._frame import Person
+    from refu_core.realtime._frame import Adjust, Person
 
 _MOST_WEARERS = 64
 """Persons whose (β, γ) are remembered, those seen last; each takes about half a megabyte a garment."""
@@ -226,6 +226,21 @@ class GarmentPipeline:
                 return self._dress_all([frames])[0]
             return self._dress_all(frames)
 
+    def adjusted(self, frame: SmplFrame, adjust: Adjust) -> PipelineOutput:
+        """Dresses one frame, and lets `adjust` change what was predicted before it is brought off the body.
+
+        It is given a `Dressed` of one person as the root sees them, and returns one whose garments may be elsewhere.
+        What it returns is handled like any prediction: nothing is inside the body afterwards. Nothing is remembered of
+        it. On a GPU no graph is used.
+
+        Raises:
+            FrameError: not a `SmplFrame`.
+            RefuError: as `__call__`, and what `adjust` raises.
+        """
+        require_type(frame, SmplFrame, "a SmplFrame", error=FrameError)
+        with self._lock:
+            return self._run([frame], adjust)[0]
+
     def _dress_all(self, frames: Sequence[SmplFrame]) -> list[PipelineOutput]:
         keys = [_key(frame) for frame in frames]
         known = self._last if "unchanged" in self._skips else {}
@@ -239,13 +254,13 @@ class GarmentPipeline:
             for key, frame in zip(keys, frames, strict=True)
         ]
 
-    def _run(self, frames: Sequence[SmplFrame]) -> list[PipelineOutput]:
+    def _run(self, frames: Sequence[SmplFrame], adjust: Adjust | None = None) -> list[PipelineOutput]:
         clocks = [StageClock() for _ in frames]
         found = [self._wearer(frame) for frame in frames]
         wearer = self._together(tuple(wearer for wearer, _ in found))
         pose = torch.as_tensor(np.stack([f.pose for f in frames]))
         margins = tuple(one.margin if self.margin is None else self.margin for one in self.outfit.wearables.values())
-        if self._graphs is not None:
+        if self._graphs is not None and adjust is None:
             packed = self._graphs({"pose": pose, **wearer.tensors()}, margins)
             outputs = [
                 self._unpacked(frame, parts) for frame, parts in zip(frames, self._step.unpacked(packed), strict=True)
@@ -253,7 +268,7 @@ class GarmentPipeline:
             clocks[0].lap("step")
             took = {"step": clocks[0].stages["step"] / len(frames)}
             return [replace(one, stats=replace(one.stats, stage_ms=took)) for one in outputs]
-        persons = self._step(pose.to(self.body.device), wearer, margins, clocks)
+        persons = self._step(pose.to(self.body.device), wearer, margins, clocks, adjust)
         return [
             self._output(frame, person, clock, skipped)
             for frame, person, clock, (_, skipped) in zip(frames, persons, clocks, found, strict=True)

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import torch
 import warp as wp
-from numpy.typing import NDArray
 from torch import Tensor
 
 from refu_core._warp import as_warp
 from refu_core.errors import MeshError
+from refu_core.mesh import grouped
 from refu_core.sdf._box_kernels import MAX_FACES, WIDTH, Boxes, Eight, fit_kernel
 
 _WIDTH = int(WIDTH)
@@ -36,7 +36,7 @@ class BoxTree:
             depth += 1
         n_above = sum(_WIDTH**level for level in range(depth))  # nodes whose children are nodes
         corners = rest.detach().cpu().numpy()[faces.numpy()]
-        self._order = torch.from_numpy(grouped(0.5 * (corners.min(1) + corners.max(1))).astype(np.int32))
+        self._order = torch.from_numpy(grouped(0.5 * (corners.min(1) + corners.max(1)), _WIDTH).astype(np.int32))
         self._bounds = torch.empty(n_above + -(-n // _WIDTH), 6, _WIDTH)
         self._bounds[:, :3], self._bounds[:, 3:] = torch.inf, -torch.inf
         self.boxes: Any = Boxes()
@@ -56,24 +56,3 @@ class BoxTree:
             self._fit = wp.launch(fit_kernel, 1, inputs, [bounds], device="cpu", record_cmd=True)
             self._fits = points
         self._fit.launch()
-
-
-def grouped(places: NDArray[np.float32]) -> NDArray[np.int64]:
-    """An order of places (N, 3) in which each eight, each 64, and so on from the first one are close together."""
-    n = len(places)
-    sizes_of_groups = _WIDTH ** np.arange(20, dtype=np.int64)
-    order, bounds = np.arange(n), np.array([0, n])
-    while True:
-        starts, sizes = bounds[:-1], np.diff(bounds)
-        is_open = sizes > 1
-        if not is_open.any():
-            return order
-        here = places[order]
-        extent = np.maximum.reduceat(here, starts) - np.minimum.reduceat(here, starts)
-        group = np.repeat(np.arange(len(starts)), sizes)
-        along = here[np.arange(n), extent.argmax(1)[group]]
-        order = order[np.lexsort((along, group))]
-        # Into halves, of whole groups of the next smaller size: only the last one of all may have less.
-        unit = sizes_of_groups[np.searchsorted(sizes_of_groups, sizes[is_open]) - 1]
-        half = np.maximum(-(-sizes[is_open] // unit) // 2, 1) * unit
-        bounds = np.union1d(bounds, starts[is_open] + half)

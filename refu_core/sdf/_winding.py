@@ -92,8 +92,10 @@ class _Launches:
             return wp.launch(kernel, dim, inputs, device=str(device), record_cmd=True)
 
         self.sort = record(bin_kernel, n, [points, grid, first, following, farthest_in])
+        # A CPU's compiler keeps more in registers within a loop than from call to call.
+        each = of._n_faces if of._device.type == "cpu" else 1
         self.cross = record(
             crossings_kernel,
-            of._n_faces,
-            [of._body_wp, of._faces, points, grid, first, following, farthest_in, winding],
+            of._n_faces // each,
+            [each, of._body_wp, of._faces, points, grid, first, following, farthest_in, winding],
         )

@@ -44,6 +44,20 @@ def turns(a: wp.vec3d, b: wp.vec3d) -> int:
     return wp.where(side < _ZERO, -1, 0)
 
 
+@wp.func
+def crossing(a: wp.vec3, b: wp.vec3, c: wp.vec3, p: wp.vec3, half: int) -> int:
+    """What a face adds to the winding number of p, which looks along +z, or along -z in the other half."""
+    to_a = difference(a, p)
+    normal = wp.cross(difference(b, a), difference(c, a))
+    ahead = wp.dot(normal, to_a) * normal[2]
+    if (half == 0 and ahead > _ZERO) or (half == 1 and ahead < _ZERO):
+        to_b = difference(b, p)
+        to_c = difference(c, p)
+        passes = turns(to_a, to_b) + turns(to_b, to_c) + turns(to_c, to_a)
+        return wp.where(half == 0, passes, -passes)
+    return 0
+
+
 @wp.kernel
 def bin_kernel(
     points: wp.array[wp.vec3],
@@ -66,6 +80,7 @@ def bin_kernel(
 
 @wp.kernel
 def crossings_kernel(
+    each: int,
     body: wp.array[wp.vec3],
     faces: wp.array[wp.vec3i],
     points: wp.array[wp.vec3],
@@ -76,42 +91,39 @@ def crossings_kernel(
     # output
     winding: wp.array[int],
 ) -> None:
-    """Each face adds itself to the winding numbers of the points that look through it."""
-    corners = faces[wp.tid()]
-    a = body[corners[0]]
-    b = body[corners[1]]
-    c = body[corners[2]]
+    """Each face adds itself to the winding numbers of the points that look through it; `each` faces a thread."""
     low = grid[0]
     high = grid[1]
-    box_low = lesser(lesser(a, b), c)
-    box_high = greater(greater(a, b), c)
-    if box_low[1] > high[1] or box_high[1] < low[1] or box_low[0] > high[0] or box_high[0] < low[0]:
-        return
     per_metre = grid[2]
     middle = grid[3][2]
-    front = box_high[2] - middle
-    back = middle - box_low[2]
-    i0 = cell_along(box_low[0], low[0], per_metre[0])
-    i1 = cell_along(box_high[0], low[0], per_metre[0])
-    j0 = cell_along(box_low[1], low[1], per_metre[1])
-    j1 = cell_along(box_high[1], low[1], per_metre[1])
-    normal = wp.cross(difference(b, a), difference(c, a))
-    for half in range(2):
-        reach = wp.where(half == 0, front, back)
-        if reach >= 0.0:
-            for j in range(j0, j1 + 1):
-                row = (half * CELLS + j) * CELLS
-                for cell in range(row + i0, row + i1 + 1):
-                    if farthest_in[cell] <= reach:
-                        q = int(first[cell])
-                        while q >= 0:
-                            p = points[q]
-                            to_a = difference(a, p)
-                            ahead = wp.dot(normal, to_a) * normal[2]
-                            if (half == 0 and ahead > _ZERO) or (half == 1 and ahead < _ZERO):
-                                to_b = difference(b, p)
-                                to_c = difference(c, p)
-                                passes = turns(to_a, to_b) + turns(to_b, to_c) + turns(to_c, to_a)
-                                if passes != 0:
-                                    wp.atomic_add(winding, q, wp.where(half == 0, passes, -passes))
-                            q = following[q]
+    begin = wp.tid() * each
+    for f in range(begin, wp.min(begin + each, faces.shape[0])):
+        corners = faces[f]
+        a = body[corners[0]]
+        b = body[corners[1]]
+        c = body[corners[2]]
+        box_low = lesser(lesser(a, b), c)
+        box_high = greater(greater(a, b), c)
+        if box_low[1] <= high[1] and box_high[1] >= low[1] and box_low[0] <= high[0] and box_high[0] >= low[0]:
+            front = box_high[2] - middle
+            back = middle - box_low[2]
+            i0 = cell_along(box_low[0], low[0], per_metre[0])
+            i1 = cell_along(box_high[0], low[0], per_metre[0])
+            j0 = cell_along(box_low[1], low[1], per_metre[1])
+            j1 = cell_along(box_high[1], low[1], per_metre[1])
+            for half in range(2):
+                reach = wp.where(half == 0, front, back)
+                if reach >= 0.0:
+                    for j in range(j0, j1 + 1):
+                        row = (half * CELLS + j) * CELLS
+                        for cell in range(row + i0, row + i1 + 1):
+                            if farthest_in[cell] <= reach:
+                                q = int(first[cell])
+                                while q >= 0:
+                                    p = points[q]
+                                    along = p[0] >= box_low[0] and p[0] <= box_high[0]
+                                    if along and p[1] >= box_low[1] and p[1] <= box_high[1]:
+                                        found = crossing(a, b, c, p, half)
+                                        if found != 0:
+                                            wp.atomic_add(winding, q, found)
+                                    q = following[q]

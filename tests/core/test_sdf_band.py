@@ -16,11 +16,10 @@ from torch import Tensor
 from refu_core.body import load_body
 from refu_core.errors import MeshError
 from refu_core.garments import PAPER_GARMENTS, load_garment
-from refu_core.mesh import Adjacency, Connectivity
+from refu_core.mesh import Adjacency, Connectivity, grouped
 from refu_core.metrics._self_contact import SelfContactDetector
 from refu_core.sdf import ExactSdf
 from refu_core.sdf._band import BAND, BandSdf, Links
-from refu_core.sdf._box_tree import grouped
 from refu_core.simulation import load_clips
 
 BALL = trimesh.creation.icosphere(subdivisions=3, radius=0.3)

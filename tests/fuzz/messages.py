@@ -93,6 +93,31 @@ def markers(_: Path) -> Reader:
     return near([good, good, *others]), read
 
 
+def surroundings(_: Path) -> Reader:
+    """What else the node reads of a graph, by the first byte: transforms, ids, cameras; and points of its own."""
+    numbers = adapters.Transform(5, "map", "cam", np.zeros(3), np.array([0.0, 0, 0, 1]))
+    transforms = adapters.encode_transforms([numbers, numbers])
+    points = adapters.PointCloudEncoder([4]).encode(
+        [np.eye(4, 3)],
+        stamp_ns=5,
+        normals=[np.eye(4, 3)],
+        values={name: [np.zeros(4)] for name in ("clearance", "sigma", "visible")},
+    )
+    readers: list[Callable[[bytes], object]] = [
+        lambda data: adapters.TransformBuffer().put(data, is_static=False),
+        adapters.decode_ids,
+        adapters.decode_camera_info,
+        adapters.decode_point_cloud,
+    ]
+    good = [bytes([kind]) + data for kind in range(len(readers)) for data in (transforms, points)]
+
+    def read(data: bytes) -> None:
+        if data:
+            readers[data[0] % len(readers)](data[1:])
+
+    return near(good), read
+
+
 # Objects ------------------------------------------------------------------------------------------
 
 

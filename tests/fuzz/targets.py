@@ -279,6 +279,7 @@ _ALL = (
     Target("definition", "the .msg text that a bag carries", ms.definition),
     Target("objects", "message objects with odd fields", ms.objects),
     Target("markers", "visualization_msgs/MarkerArray in CDR", ms.markers),
+    Target("surroundings", "transforms, tracked ids, cameras and points in CDR", ms.surroundings),
     Target("encoder", "odd meshes to a MarkerArray", ms.encoder),
     Target("parameters", "parameters of the node", ms.parameters),
     Target("arguments", "command lines", ms.arguments),

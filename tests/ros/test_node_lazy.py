@@ -88,7 +88,7 @@ class Stage:
 @pytest.fixture
 def stage(ros: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Stage]]:  # noqa: ARG001
     """Makes stages."""
-    monkeypatch.setattr("refu_ros._node._GRACE_S", 0.0)
+    monkeypatch.setattr("refu_ros._listener._GRACE_S", 0.0)
     made: list[Stage] = []
 
     def make(make_executor: Callable[[], Any] = make_executor, **parameters: Any) -> Stage:
@@ -138,7 +138,7 @@ def test_an_event_or_the_second_is_enough(
     stage: Callable[..., Stage], monkeypatch: pytest.MonkeyPatch, missing: str
 ) -> None:
     if missing == "event":
-        monkeypatch.setattr("refu_ros._node.PublisherEventCallbacks", lambda **_: PublisherEventCallbacks())
+        monkeypatch.setattr("refu_ros._bank.PublisherEventCallbacks", lambda **_: PublisherEventCallbacks())
     scene = stage()
     scene.rests()
     if missing == "timer":

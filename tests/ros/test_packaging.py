@@ -25,6 +25,8 @@ ROOT = Path(__file__).parents[2]
 INSTALLED_FOLDERS = ("launch", "config", "rviz", "foxglove", "resource")
 LAUNCH_FILES = sorted((ROOT / "launch").glob("*.launch.py"))
 TOPICS = {"/garments", "/body"}
+ON_REQUEST = {"/openings", "/points"}
+"""Not shown at first: what isn't shown isn't computed."""
 
 
 @pytest.fixture(scope="module")
@@ -128,19 +130,18 @@ def test_launch_files_have_their_entry_point(path: Path) -> None:
 
 def test_rviz_shows_the_topics() -> None:
     manager = yaml.safe_load((ROOT / "rviz" / "refu.rviz").read_text(encoding="utf-8"))["Visualization Manager"]
-    shown = {
-        display["Topic"]["Value"]: display["Topic"]
-        for display in manager["Displays"]
-        if display["Class"] == "rviz_default_plugins/MarkerArray"
-    }
-    assert set(shown) == TOPICS
-    assert {topic["Depth"] for topic in shown.values()} == {1}  # a deeper queue only holds old garments
+    displays = {display["Topic"]["Value"]: display for display in manager["Displays"] if "Topic" in display}
+    assert {topic for topic, display in displays.items() if display["Enabled"]} == TOPICS
+    assert set(displays) == TOPICS | ON_REQUEST
+    assert {display["Topic"]["Depth"] for display in displays.values()} == {1}  # a deeper queue only holds old garments
     assert manager["Global Options"]["Fixed Frame"] == defaults()["frame_id"]
 
 
 def test_foxglove_shows_the_topics() -> None:
     layout = json.loads((ROOT / "foxglove" / "refu.json").read_text(encoding="utf-8"))
-    assert set(layout["configById"]["3D!refu"]["topics"]) == TOPICS
+    topics = layout["configById"]["3D!refu"]["topics"]
+    assert {name for name, topic in topics.items() if topic["visible"]} == TOPICS
+    assert set(topics) == TOPICS | ON_REQUEST | {"/scene"}
     assert layout["configById"]["3D!refu"]["followTf"] == defaults()["frame_id"]
 
     def panels(node: Any) -> list[str]:

@@ -1,0 +1,103 @@
+"""Meshes for planners: shape_msgs/Mesh and moveit_msgs/CollisionObject in CDR."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from msg_adapters.cdr import CdrWriter
+from msg_adapters.errors import EncodeError
+from msg_adapters.rotations import quaternion_from_matrix
+from msg_adapters.transforms import Placement
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+MESH = "shape_msgs/msg/Mesh"
+COLLISION_OBJECT = "moveit_msgs/msg/CollisionObject"
+Operation = Literal["add", "remove", "append", "move"]
+_OPERATIONS: dict[Operation, int] = {"add": 0, "remove": 1, "append": 2, "move": 3}
+
+
+def encode_mesh(vertices: ArrayLike, faces: ArrayLike) -> bytes:
+    """A `shape_msgs/Mesh` of vertices [m], shape (V, 3), and triangles, shape (F, 3): it has no header.
+
+    Raises `EncodeError` for arrays of other shapes, and for vertices that aren't finite or that faces name in vain.
+    """
+    writer = CdrWriter()
+    _mesh(writer, vertices, faces)
+    return writer.to_bytes()
+
+
+def encode_collision_object(
+    name: str,
+    operation: Operation,
+    *,
+    stamp_ns: int,
+    frame_id: str = "map",
+    placement: Placement | None = None,
+    mesh: tuple[ArrayLike, ArrayLike] | None = None,
+    subframes: Mapping[str, Placement] | None = None,
+) -> bytes:
+    """A `moveit_msgs/CollisionObject`, as MoveIt's planning scene takes it.
+
+    Args:
+        name: the object's id.
+        operation: `add` puts it in, in the place of one of that name; `move` sets the pose of one that is there, and
+            has no mesh; `remove` takes it out.
+        stamp_ns: time of the measurement [ns].
+        frame_id: of the header.
+        placement: of the object in that frame.
+        mesh: vertices relative to the object [m], shape (V, 3), and triangles, shape (F, 3); for `add` and `append`.
+        subframes: of the object, relative to it, by name; MoveIt plans to `<object>/<name>`.
+
+    Raises:
+        EncodeError: no such operation, a mesh that is missing, one too many, or one that can't be.
+    """
+    if operation not in _OPERATIONS or (mesh is not None) != (operation in ("add", "append")):
+        what = "a mesh" if mesh is not None else "no mesh"
+        msg = f"wanted add or append with a mesh, or move or remove without one, got {operation!r} with {what}"
+        raise EncodeError(msg)
+    writer = CdrWriter()
+    writer.header(stamp_ns, frame_id)
+    _pose(writer, placement or Placement())
+    for text in (name, "", ""):  # id, type.key, type.db
+        writer.string(text)
+    writer.numbers("II", 0, 0)  # primitives, primitive_poses
+    writer.numbers("I", mesh is not None)
+    if mesh is not None:
+        _mesh(writer, *mesh)
+    writer.numbers("I", mesh is not None)
+    if mesh is not None:
+        _pose(writer, Placement())
+    writer.numbers("II", 0, 0)  # planes, plane_poses
+    writer.strings([*(subframes or {})])
+    writer.numbers("I", len(subframes or {}))
+    for frame in (subframes or {}).values():
+        _pose(writer, frame)
+    writer.numbers("B", _OPERATIONS[operation])
+    return writer.to_bytes()
+
+
+def _pose(writer: CdrWriter, placement: Placement) -> None:
+    writer.array("f8", placement.translation)
+    writer.array("f8", quaternion_from_matrix(placement.rotation))
+
+
+def _mesh(writer: CdrWriter, vertices: ArrayLike, faces: ArrayLike) -> None:
+    points, triangles = np.asarray(vertices), np.asarray(faces)
+    if points.ndim != 2 or points.shape[1:] != (3,) or not np.isfinite(points).all():
+        msg = f"wanted finite vertices of shape (V, 3), got {points.shape}"
+        raise EncodeError(msg)
+    if triangles.ndim != 2 or triangles.shape[1:] != (3,) or triangles.dtype.kind not in "iu" or not len(triangles):
+        msg = f"wanted triangles of shape (F, 3) of integers, F > 0, got {triangles.dtype} of shape {triangles.shape}"
+        raise EncodeError(msg)
+    if triangles.min() < 0 or triangles.max() >= len(points):
+        msg = f"wanted triangles of vertices 0 to {len(points) - 1}, got {triangles.min()} to {triangles.max()}"
+        raise EncodeError(msg)
+    writer.numbers("I", len(triangles))
+    writer.array("u4", triangles)
+    writer.numbers("I", len(points))
+    writer.array("f8", points)

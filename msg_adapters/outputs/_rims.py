@@ -1,0 +1,72 @@
+"""Openings of garments: geometry_msgs/PolygonStamped, visualization_msgs/MarkerArray and tf2_msgs/TFMessage in CDR."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from msg_adapters.cdr import CdrWriter
+from msg_adapters.errors import EncodeError
+from msg_adapters.markers import encode_strips
+from msg_adapters.rotations import quaternion_from_matrix
+from msg_adapters.transforms import Transform, encode_transforms
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+POLYGON = "geometry_msgs/msg/PolygonStamped"
+
+
+@dataclass(frozen=True, eq=False)
+class Rim:
+    """Where one opening of a garment is, in the axes of a header's frame."""
+
+    name: str
+    """Of the marker's namespace and of the frame: `[<person>/]<garment>/<opening>`."""
+    stamp_ns: int
+    centre: NDArray[np.float64]
+    """[m], shape (3,)."""
+    rotation: NDArray[np.float64]
+    """Columns are x, y and z of the opening, shape (3, 3): z points out of the garment."""
+    ring: NDArray[np.float64]
+    """Vertices of the rim in order [m], shape (K, 3)."""
+
+
+def encode_polygon(ring: ArrayLike, *, stamp_ns: int, frame_id: str = "map") -> bytes:
+    """A `geometry_msgs/PolygonStamped` of points [m], shape (K, 3).
+
+    Raises `EncodeError` for points that aren't finite or of another shape, and a stamp that doesn't fit a ROS time.
+    """
+    points = np.asarray(ring, np.float64)
+    if points.ndim != 2 or points.shape[1:] != (3,) or not np.isfinite(points).all():
+        msg = f"wanted finite points of shape (K, 3), got {points.shape}"
+        raise EncodeError(msg)
+    writer = CdrWriter()
+    writer.header(stamp_ns, frame_id)
+    writer.numbers("I", len(points))
+    writer.array("f4", points)
+    return writer.to_bytes()
+
+
+def encode_rims(rims: Sequence[Rim], *, frame_id: str = "map", lifetime_ns: int = 0) -> bytes:
+    """A MarkerArray with a LINE_STRIP a rim, closed; the marker's pose is the opening's frame, its points lie in that.
+
+    Raises `EncodeError` for what can't be drawn.
+    """
+    strips = []
+    for rim in rims:
+        with np.errstate(invalid="ignore"):  # what isn't finite is refused below
+            local = (rim.ring - rim.centre) @ rim.rotation
+        pose = np.concatenate([rim.centre, quaternion_from_matrix(rim.rotation)])
+        strips.append((rim.name, rim.stamp_ns, pose, np.concatenate([local, local[:1]])))
+    return encode_strips(strips, frame_id=frame_id, lifetime_ns=lifetime_ns)
+
+
+def encode_frames(rims: Sequence[Rim], *, frame_id: str = "map") -> bytes:
+    """A `tf2_msgs/TFMessage` with a frame a rim. Raises `EncodeError` for a stamp that doesn't fit a ROS time."""
+    return encode_transforms(
+        [Transform(rim.stamp_ns, frame_id, rim.name, rim.centre, quaternion_from_matrix(rim.rotation)) for rim in rims]
+    )

@@ -1,0 +1,190 @@
+"""tf2_msgs/TFMessage in CDR, and a buffer of transforms that is asked where a frame was at a time."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from msg_adapters.cdr import CdrReader, CdrWriter
+from msg_adapters.errors import TransformError
+from msg_adapters.rotations import matrix_from_quaternion, slerp
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+    from msg_adapters.cdr import Buffer
+
+TF_MESSAGE = "tf2_msgs/msg/TFMessage"
+HISTORY_NS = 10 * 10**9
+"""How far back transforms are kept, as tf2 does [ns]."""
+_MOST_FRAMES = 10_000
+_UNIT_TOLERANCE = 1e-2
+"""A quaternion's length is no farther from 1, as tf2 wants it."""
+_MIN_TRANSFORM_BYTES = 72
+
+
+@dataclass(frozen=True, eq=False)
+class Transform:
+    """Where a child frame is in its parent: geometry_msgs/TransformStamped."""
+
+    stamp_ns: int
+    parent: str
+    child: str
+    translation: ArrayLike
+    """[m], shape (3,)."""
+    quaternion: ArrayLike
+    """xyzw, shape (4,)."""
+
+
+def encode_transforms(transforms: Sequence[Transform]) -> bytes:
+    """A `tf2_msgs/TFMessage`. Raises `EncodeError` for a stamp that doesn't fit a ROS time."""
+    writer = CdrWriter()
+    writer.numbers("I", len(transforms))
+    for one in transforms:
+        writer.header(one.stamp_ns, one.parent)
+        writer.string(one.child)
+        writer.array("f8", one.translation)
+        writer.array("f8", one.quaternion)
+    return writer.to_bytes()
+
+
+def decode_transforms(data: Buffer) -> list[Transform]:
+    """The transforms of a `tf2_msgs/TFMessage`. Raises `DecodeError` for anything that isn't one."""
+    reader = CdrReader(data)
+    found = []
+    for _ in range(reader.length(item_bytes=_MIN_TRANSFORM_BYTES)):
+        stamp_ns, parent, child = reader.stamp_ns(), reader.string(), reader.string()
+        numbers = reader.array("f8", 7)
+        found.append(Transform(stamp_ns, parent, child, numbers[:3], numbers[3:]))
+    reader.finish()
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Points of one frame in another: p ↦ `rotation` p + `translation`."""
+
+    rotation: NDArray[np.float64] = field(default_factory=lambda: np.eye(3))
+    """Shape (3, 3)."""
+    translation: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    """[m], shape (3,)."""
+    is_late: bool = False
+    """Whether the newest transform there was is older than what was asked for."""
+
+    def after(self, inner: Placement) -> Placement:
+        """First `inner`, then this."""
+        translation = self.rotation @ inner.translation + self.translation
+        return Placement(self.rotation @ inner.rotation, translation, self.is_late or inner.is_late)
+
+    def inverse(self) -> Placement:
+        """The way back."""
+        return Placement(self.rotation.T, -(self.rotation.T @ self.translation), self.is_late)
+
+
+@dataclass(eq=False)
+class _Track:
+    """What is known of one child frame, the oldest first."""
+
+    parent: str
+    is_static: bool
+    stamps: list[int] = field(default_factory=list)
+    values: list[NDArray[np.float64]] = field(default_factory=list)
+    """Translation and quaternion, shape (7,) each."""
+
+    def put(self, stamp_ns: int, value: NDArray[np.float64]) -> None:
+        if self.is_static or (self.stamps and stamp_ns < self.stamps[-1] - HISTORY_NS):
+            self.stamps, self.values = [], []  # a static one is the newest; and a clock that was set back begins anew
+        at = bisect_right(self.stamps, stamp_ns)
+        self.stamps.insert(at, stamp_ns)
+        self.values.insert(at, value)
+        old = bisect_right(self.stamps, self.stamps[-1] - HISTORY_NS - 1)
+        del self.stamps[:old], self.values[:old]
+
+    def at(self, stamp_ns: int, tolerance_ns: int, child: str) -> Placement:
+        """Between the two transforms around that time. Raises `TransformError`."""
+        after, is_late = bisect_right(self.stamps, stamp_ns), False
+        if self.is_static or self.stamps[after - 1 if after else 0] == stamp_ns:
+            value = self.values[max(after - 1, 0)]
+        elif after == len(self.stamps):
+            lag = stamp_ns - self.stamps[-1]
+            if lag > tolerance_ns:
+                msg = f"the newest transform of {child} is {1e-9 * lag:.3f} s older than the input"
+                raise TransformError(msg)
+            value, is_late = self.values[-1], True
+        elif after == 0:
+            lag = self.stamps[0] - stamp_ns
+            msg = f"the oldest transform of {child} is {1e-9 * lag:.3f} s newer than the input"
+            raise TransformError(msg)
+        else:
+            value = _between(self.values[after - 1 : after + 1], self.stamps[after - 1 : after + 1], stamp_ns)
+        return Placement(matrix_from_quaternion(value[3:]), value[:3], is_late)
+
+
+def _between(values: Sequence[NDArray[np.float64]], stamps: Sequence[int], stamp_ns: int) -> NDArray[np.float64]:
+    (start, end), fraction = values, (stamp_ns - stamps[0]) / (stamps[1] - stamps[0])
+    return np.concatenate([start[:3] + fraction * (end[:3] - start[:3]), slerp(start[3:], end[3:], fraction)])
+
+
+class TransformBuffer:
+    """The transforms of `/tf` and `/tf_static` of the last ten seconds. Not thread-safe."""
+
+    def __init__(self) -> None:
+        self._tracks: dict[str, _Track] = {}
+
+    def __len__(self) -> int:
+        """How many frames have a parent."""
+        return len(self._tracks)
+
+    def put(self, data: Buffer, *, is_static: bool) -> int:
+        """Takes a `tf2_msgs/TFMessage`; returns how many of its transforms make no sense and were left out.
+
+        Raises `DecodeError` for anything that isn't such a message.
+        """
+        return sum(not self._take(one, is_static) for one in decode_transforms(data))
+
+    def _take(self, one: Transform, is_static: bool) -> bool:
+        parent, child = one.parent.lstrip("/"), one.child.lstrip("/")
+        value = np.concatenate([np.asarray(one.translation, np.float64), np.asarray(one.quaternion, np.float64)])
+        length = float(np.linalg.norm(value[3:]))
+        if not (parent and child and parent != child and np.isfinite(value).all()):
+            return False
+        if abs(length - 1.0) > _UNIT_TOLERANCE or (child not in self._tracks and len(self) >= _MOST_FRAMES):
+            return False
+        value[3:] /= length
+        track = self._tracks.get(child)
+        if track is None or track.parent != parent or track.is_static != is_static:
+            track = self._tracks[child] = _Track(parent, is_static)
+        track.put(one.stamp_ns, value)
+        return True
+
+    def lookup(self, target: str, source: str, stamp_ns: int, *, tolerance_ns: int = 0) -> Placement:
+        """Where points of `source` were in `target` at that time.
+
+        A transform that isn't there yet is replaced by the newest, as long as that is no older than the tolerance.
+
+        Raises:
+            TransformError: no way leads from one to the other, or not at that time.
+        """
+        up, down = self._way(source.lstrip("/")), self._way(target.lstrip("/"))
+        common = next((frame for frame in up if frame in down), None)
+        if common is None:
+            msg = f"no transform leads from {source or 'a frame without a name'} to {target}"
+            raise TransformError(msg)
+        ends = []
+        for way in (up, down):
+            placement = Placement()
+            for child in way[: way.index(common)]:
+                placement = self._tracks[child].at(stamp_ns, tolerance_ns, child).after(placement)
+            ends.append(placement)
+        return ends[1].inverse().after(ends[0])
+
+    def _way(self, frame: str) -> list[str]:
+        """The frame and what is above it, up to a root or, where they form a ring, once around."""
+        way = [frame]
+        while (track := self._tracks.get(way[-1])) is not None and track.parent not in way:
+            way.append(track.parent)
+        return way

@@ -1,0 +1,157 @@
+"""A pipeline whose garments follow what a depth camera sees of the person."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from refu_core.body import blend_transforms
+from refu_core.errors import FrameError
+from refu_core.observation._cloth import ObservedCloth, skin_mesh, thinned
+from refu_core.observation._settings import DEFAULT_OBSERVATION, ObservationSettings
+
+if TYPE_CHECKING:
+    from refu_core.frames import SmplFrame
+    from refu_core.realtime import Dressed, GarmentPipeline, PipelineOutput, RootTurn
+
+_LONGEST_GAP = 10.0
+"""A person who wasn't seen for this long is a new one [s]."""
+
+
+class Observer:
+    """Dresses one person, and brings the garments to measured points before collisions are handled.
+
+    Points change three things of a garment, each within bounds: its style, how it follows the shape, and a displacement
+    made of smooth fields. What they say is kept from frame to frame, fades, and can't drift (`Estimate`). The contact
+    stage runs after it as always, so a garment is as free of the body as without points, whatever is measured.
+
+    One observer for each person: it remembers. A pipeline may serve several.
+
+    Example:
+        >>> observer = Observer(pipeline)
+        >>> out = observer(frame, points, eye=camera_position)
+    """
+
+    def __init__(self, pipeline: GarmentPipeline, *, settings: ObservationSettings = DEFAULT_OBSERVATION) -> None:
+        """Prepares for the garments of a pipeline, in seconds the first time; then what was found is recalled."""
+        self._pipeline, self._settings = pipeline, settings
+        self._cloths = {name: ObservedCloth(garment, settings) for name, garment in pipeline.garments.items()}
+        body = pipeline.body
+        self._skin, self._skin_mesh = skin_mesh(body.v_template.detach().cpu(), body.faces.cpu())
+        self._stamp_ns: int | None = None
+        self.matched: dict[str, int] = {}
+        """How many points each garment was brought to in the last frame."""
+
+    def reset(self) -> None:
+        """Forgets what was measured."""
+        for cloth in self._cloths.values():
+            cloth.estimate.reset()
+        self._stamp_ns = None
+
+    def __call__(
+        self, frame: SmplFrame, points: ArrayLike | None = None, *, eye: ArrayLike | None = None
+    ) -> PipelineOutput:
+        """Dresses one frame.
+
+        Args:
+            frame: as the pipeline takes it; its stamps say how much time has passed, 1/30 s where they are zero.
+            points: of the person, whatever they are points of, in the frame's axes, translation and all [m], shape
+                (N, 3); None where nothing was measured: what was learnt serves, and fades.
+            eye: where the camera is in the same axes [m], shape (3,): cloth that looks away from it isn't matched.
+
+        Raises:
+            FrameError: points or eye of another shape, or not finite. What was learnt stays.
+            RefuError: as the pipeline does.
+        """
+        measured = np.empty((0, 3)) if points is None else _finite("points", points, 2)
+        camera = None if eye is None else _finite("eye", eye, 1)
+        self._wait(frame)
+
+        def adjust(dressed: Dressed) -> Dressed:
+            return self._adjusted(dressed, measured - frame.transl, None if camera is None else camera - frame.transl)
+
+        return self._pipeline.adjusted(frame, adjust)
+
+    def _wait(self, frame: SmplFrame) -> None:
+        seconds = self._settings.step
+        if frame.stamp_ns and self._stamp_ns:
+            seconds = 1e-9 * (frame.stamp_ns - self._stamp_ns)
+        self._stamp_ns = frame.stamp_ns
+        for cloth in self._cloths.values():
+            if 0 <= seconds < _LONGEST_GAP:
+                cloth.estimate.wait(seconds)
+            else:
+                cloth.estimate.reset()
+
+    def _adjusted(self, dressed: Dressed, points: NDArray[np.float64], eye: NDArray[np.float64] | None) -> Dressed:
+        turn = dressed.turns[0]
+        seen = thinned(_to_root(turn, points).astype(np.float32), self._settings.most_points * len(self._cloths))
+        camera = None if eye is None else _to_root(turn, eye[None])[0]
+        self._skin.copy_(dressed.skin[0])
+        if len(seen):
+            self._skin_mesh.refit()
+        drapes = dict(dressed.drapes)
+        for name, cloth in self._cloths.items():
+            garment = self._pipeline.garments[name]
+            blend = blend_transforms(garment.weights, dressed.transforms).rotation[0]
+            drape = drapes[name]
+            numbers = self._fit(cloth, drape.vertices[0].cpu(), blend.cpu().numpy(), seen, camera, name)
+            offset = torch.from_numpy(cloth.offset(numbers)).to(drape.vertices)
+            moved = (blend @ offset[:, :, None])[None, ..., 0]
+            drapes[name] = drape._replace(
+                vertices=drape.vertices + moved, unposed=drape.unposed + offset, on_mean=drape.on_mean + offset
+            )
+        return dressed._replace(drapes=drapes)
+
+    def _fit(
+        self,
+        cloth: ObservedCloth,
+        predicted: torch.Tensor,
+        blend: NDArray[np.float32],
+        points: NDArray[np.float32],
+        eye: NDArray[np.float64] | None,
+        name: str,
+    ) -> NDArray[np.float64]:
+        """The garment's numbers after the points (N, 3) as the root sees them."""
+        how, estimate = self._settings, cloth.estimate
+        self.matched[name] = 0
+        if not len(points):
+            return estimate.mean
+        before = estimate.precision()
+        numbers, after = estimate.mean, before
+        for _ in range(how.rounds):
+            moved = np.einsum("vij,vj->vi", blend, cloth.offset(numbers))
+            cloth.place(predicted + torch.from_numpy(moved))
+            found = cloth.match(points, self._skin_mesh, eye)
+            self.matched[name] = len(found.points)
+            slopes = cloth.slopes(found, blend)
+            trust = 1 / (1 + (found.height / how.robust) ** 2) / (how.overlap * how.noise**2)
+            weighed = (slopes * trust[:, None].astype(np.float32)).T
+            information = (weighed @ slopes).astype(np.float64)
+            pull = weighed @ found.height + information @ numbers
+            numbers, after = estimate.updated(before, information, pull.astype(np.float64))
+        estimate.take(numbers, after)
+        return numbers
+
+
+def _to_root(turn: RootTurn, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The inverse of a turn, of points (N, 3) [m]."""
+    rotation, shift = turn.rotation.cpu().double().numpy(), turn.shift.cpu().double().numpy()
+    seen: NDArray[np.float64] = (points - shift) @ rotation
+    return seen
+
+
+def _finite(name: str, value: ArrayLike, ndim: int) -> NDArray[np.float64]:
+    wanted = "(N, 3)" if ndim == 2 else "(3,)"
+    try:
+        array = np.asarray(value, np.float64)
+    except (TypeError, ValueError, RuntimeError) as error:
+        msg = f"{name} must be numbers of the shape {wanted}, got {type(value).__name__}"
+        raise FrameError(msg) from error
+    if array.ndim != ndim or array.shape[-1] != 3 or not np.isfinite(array).all():
+        msg = f"{name} must be finite numbers of the shape {wanted}, got {array.shape}; leave out what isn't measured"
+        raise FrameError(msg)
+    return array

@@ -1,0 +1,148 @@
+"""Where cloth is pressed between two parts of a body: an estimate from geometry, not a force."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+import warp as wp
+from numpy.typing import NDArray
+
+from refu_core._warp import as_warp
+from refu_core.body import DEFAULT_GAP, SEGMENTS, part_of_faces
+from refu_core.errors import MeshError
+from refu_core.outputs import _limbs_kernels as kernels
+from refu_core.outputs._check import as_points
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from refu_core.body import SmplBody
+    from refu_core.garments import GarmentTemplate
+    from refu_core.realtime import GarmentPipeline, PipelineOutput
+
+PRESSED = DEFAULT_GAP + 0.003
+"""Cloth is pressed where the skins on both sides of it are this near to each other [m]: the room that the collider
+leaves between two parts, and what the two ways to them are longer than the straight one."""
+_OPPOSED = -0.5
+"""Cosine of two skins' normals below which they face each other."""
+_PARTS = tuple(SEGMENTS)
+
+
+@dataclass(frozen=True, eq=False)
+class LimbContact:
+    """Cloth between two parts of the body that touch."""
+
+    parts: tuple[str, str]
+    """Their names, as `refu_core.body.SEGMENTS` has them."""
+    area: float
+    """Of the cloth between them, all garments together [m²]."""
+    depth: float
+    """How far the two would be in each other at most, had neither given way: what of them flesh and cloth have to take
+    up [m]; 0 where they touch without pressing."""
+    mean_depth: float
+    """The same on average over the area [m]."""
+    centre: NDArray[np.float64]
+    """Middle of that cloth, in the axes of the garments' `local` vertices [m], shape (3,)."""
+
+
+class LimbContacts:
+    """Finds the cloth that is pressed between parts of a body, by what the collider had to give way.
+
+    It is geometry alone: nothing in it knows how stiff cloth or flesh is, so no force can be had from it.
+    """
+
+    def __init__(self, body: SmplBody, garments: Mapping[str, GarmentTemplate], *, within: float = PRESSED) -> None:
+        """For garments on a body, on the CPU.
+
+        Raises:
+            MeshError: `within` [m] isn't positive.
+        """
+        if not 0 < within < 1:
+            msg = f"wanted a positive distance in metres, got {within}"
+            raise MeshError(msg)
+        self._within = within
+        self._faces = {name: garment.faces.cpu().numpy() for name, garment in garments.items()}
+        n = body.n_vertices
+        self._points, self._shift = torch.zeros(2, n, 3)
+        self._points.copy_(body.v_template.detach())
+        part = part_of_faces(body.weights.cpu(), body.faces.cpu(), list(SEGMENTS.values())).numpy()
+        faces = body.faces.cpu().numpy().astype(np.int32)
+        own = [np.ascontiguousarray(faces[part == k]) for k in range(len(_PARTS))]
+        points = as_warp(self._points, wp.vec3)
+        self._meshes = [wp.Mesh(points, wp.array(one.ravel(), dtype=wp.int32, device="cpu")) for one in own]
+        parts = kernels.Parts()
+        parts.mesh = wp.array([mesh.id for mesh in self._meshes], dtype=wp.uint64, device="cpu")
+        starts = np.cumsum([0, *map(len, own)]).astype(np.int32)
+        parts.face_start = wp.array(starts, dtype=wp.int32, device="cpu")
+        parts.face = wp.array(np.concatenate(own).ravel(), dtype=wp.int32, device="cpu")
+        parts.low, parts.high = (wp.zeros(len(_PARTS), dtype=wp.vec3, device="cpu") for _ in range(2))
+        parts.points, parts.shift = points, as_warp(self._shift, wp.vec3)
+        self._parts = parts
+
+    @classmethod
+    def of(cls, pipeline: GarmentPipeline, *, within: float = PRESSED) -> LimbContacts:
+        """For what a pipeline puts out. Raises `MeshError` as the class does."""
+        return cls(pipeline.body, pipeline.garments, within=within)
+
+    def __call__(self, output: PipelineOutput) -> tuple[LimbContact, ...]:
+        """The contacts in a pipeline's output, that of the largest area first.
+
+        Raises:
+            MeshError: it is of other garments, or of another body.
+        """
+        body = as_points("the body's vertices", output.body, len(self._points))
+        self._points.copy_(torch.from_numpy(body))
+        self._shift.copy_(torch.from_numpy(body - output.skin))
+        for mesh in self._meshes:
+            mesh.refit()
+        wp.launch(kernels.box_kernel, len(_PARTS), [self._parts], device="cpu")
+        found: list[tuple[NDArray[np.int32], NDArray[np.float64]]] = []
+        for name, garment in output.items():
+            if name not in self._faces:
+                msg = f"no garment {name!r} here: wanted one of {', '.join(self._faces)}"
+                raise MeshError(msg)
+            found.append(self._pressed(garment.local, self._faces[name]))
+        pairs = np.concatenate([pair for pair, _ in found])
+        rows = np.concatenate([row for _, row in found])
+        contacts = [_contact(int(pair), rows[pairs == pair]) for pair in np.unique(pairs)]
+        return tuple(sorted(contacts, key=lambda contact: -contact.area))
+
+    def _pressed(self, vertices: Any, faces: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+        """Of the vertices that are pressed: the pair, (M,), and area, depth and place, (M, 5)."""
+        points = as_points("the garment's vertices", vertices).astype(np.float32)
+        n = len(points)
+        pair, depth = np.empty(n, np.int32), np.empty(n, np.float32)
+        wp.launch(
+            kernels.pressed_kernel,
+            n,
+            [wp.array(points, dtype=wp.vec3, device="cpu", copy=False), self._parts, self._within, _OPPOSED],
+            [
+                wp.array(pair, dtype=wp.int32, device="cpu", copy=False),
+                wp.array(depth, dtype=wp.float32, device="cpu", copy=False),
+            ],
+            device="cpu",
+        )
+        rows = np.flatnonzero(pair >= 0)
+        if not len(rows):
+            return pair[rows], np.empty((0, 5))
+        around = np.flatnonzero((pair[faces] >= 0).any(axis=1))
+        a, b, c = points[faces[around]].astype(np.float64).transpose(1, 0, 2)
+        third = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
+        area = np.bincount(faces[around].ravel(), weights=np.repeat(third, 3), minlength=n)
+        return pair[rows], np.column_stack((area[rows], depth[rows], points[rows]))
+
+
+def _contact(pair: int, rows: NDArray[np.float64]) -> LimbContact:
+    area, depth, places = rows[:, 0], rows[:, 1], rows[:, 2:]
+    share = area / max(float(area.sum()), 1e-12)
+    first, second = divmod(pair, len(_PARTS))
+    return LimbContact(
+        (_PARTS[first], _PARTS[second]),
+        float(area.sum()),
+        float(depth.max()),
+        float(share @ depth),
+        share @ places,
+    )

@@ -1,0 +1,100 @@
+"""Which two parts of a body a vertex of cloth is pressed between."""
+
+import warp as wp
+
+
+@wp.struct
+class Parts:
+    """A posed body in parts, each a mesh of its own; P parts."""
+
+    mesh: wp.array[wp.uint64]
+    face_start: wp.array[wp.int32]
+    """Where each part's faces begin in `face`, shape (P + 1,)."""
+    face: wp.array[wp.int32]
+    """Three vertices of each face, of all parts one after another."""
+    low: wp.array[wp.vec3]
+    high: wp.array[wp.vec3]
+    """Corners of each part's box [m]."""
+    points: wp.array[wp.vec3]
+    """The body's vertices [m]."""
+    shift: wp.array[wp.vec3]
+    """How far each of them has left the skin [m]."""
+
+
+@wp.kernel(enable_backward=False)
+def box_kernel(parts: Parts) -> None:
+    """The boxes of parts, in the body's pose."""
+    k = wp.tid()
+    low, high = wp.vec3(1.0e9), wp.vec3(-1.0e9)
+    for i in range(3 * parts.face_start[k], 3 * parts.face_start[k + 1]):
+        p = parts.points[parts.face[i]]
+        low, high = wp.min(low, p), wp.max(high, p)
+    parts.low[k] = low
+    parts.high[k] = high
+
+
+@wp.struct
+class Beside:
+    """The part that is nearest to a point."""
+
+    part: wp.int32
+    """-1 for none."""
+    distance: wp.float32
+    normal: wp.vec3
+    gave: wp.float32
+    """How far its skin has given way there, inwards [m]."""
+
+
+@wp.func
+def beside(p: wp.vec3, parts: Parts, within: float, other: int, facing: wp.vec3, opposed: float) -> Beside:
+    """The nearest part but `other`, whose skin there faces the direction `facing`."""
+    found = Beside()
+    found.part = -1
+    found.distance = within
+    for k in range(parts.mesh.shape[0]):
+        out = wp.max(wp.max(parts.low[k] - p, p - parts.high[k]), wp.vec3())
+        if k != other and wp.length(out) < found.distance:
+            query = wp.mesh_query_point_no_sign(parts.mesh[k], p, found.distance)
+            if query.result:
+                f = 3 * (parts.face_start[k] + query.face)
+                a = parts.face[f]
+                b = parts.face[f + 1]
+                c = parts.face[f + 2]
+                u = query.u
+                v = query.v
+                w = 1.0 - u - v
+                normal = wp.normalize(wp.cross(parts.points[b] - parts.points[a], parts.points[c] - parts.points[a]))
+                place = u * parts.points[a] + v * parts.points[b] + w * parts.points[c]
+                distance = wp.length(p - place)
+                if distance < found.distance and (other < 0 or wp.dot(normal, facing) < opposed):
+                    shift = u * parts.shift[a] + v * parts.shift[b] + w * parts.shift[c]
+                    found.part = k
+                    found.distance = distance
+                    found.normal = normal
+                    found.gave = wp.max(-wp.dot(shift, normal), 0.0)
+    return found
+
+
+@wp.kernel(enable_backward=False)
+def pressed_kernel(
+    points: wp.array[wp.vec3],
+    parts: Parts,
+    within: float,
+    opposed: float,
+    # output
+    pair: wp.array[wp.int32],
+    depth: wp.array[float],
+) -> None:
+    """The pair of parts, lower times P plus higher, whose skins face each other on both sides of a vertex, together
+    `within` reach, -1 for none; and how far these two were in each other before they were pulled apart."""
+    i = wp.tid()
+    p = points[i]
+    pair[i] = -1
+    depth[i] = 0.0
+    first = beside(p, parts, within, -1, wp.vec3(), opposed)
+    if first.part < 0:
+        return
+    second = beside(p, parts, within - first.distance, first.part, first.normal, opposed)
+    if second.part >= 0:
+        pair[i] = wp.min(first.part, second.part) * parts.mesh.shape[0] + wp.max(first.part, second.part)
+        depth[i] = first.gave + second.gave

@@ -1,0 +1,214 @@
+"""How far a prediction may be off, vertex by vertex: from the network's errors on samples that it wasn't trained on."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from refu_core.errors import FrameError, MeshError, WeightsError
+from refu_core.frames import N_JOINTS
+from refu_core.outputs._input_sigma import input_variance
+from refu_core.weights import load_weights, save_weights, weights_folder
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from refu_core.frames import SmplFrame
+    from refu_core.garments import GarmentTemplate
+    from refu_core.realtime import GarmentPipeline, PipelineOutput
+
+UNKNOWN_SIGMA = 0.03
+"""Of every vertex of a garment whose network has no `sigma` file, or that has none and follows the skin [m]. By the
+skin alone, the T-shirt, the shirt, and the shorts are off by 24 to 27 mm a standard deviation, the skirt by 43."""
+RADIUS_90 = 2.5003
+"""A ball of so many σ around a vertex holds the true one in 90 % of cases: the quantile of χ with three degrees."""
+REGIONS = 3
+"""Pose regions: as many equal shares of the samples, from hardly bent to most bent."""
+_SWEEPS = 10
+"""The errors of neighbours are averaged along edges so often: some fifty samples say less of one vertex than that."""
+_FILE = "sigma"
+
+
+@dataclass(frozen=True, eq=False)
+class SigmaMap:
+    """What is known of one garment's errors."""
+
+    sigma: NDArray[np.float32]
+    """Standard deviation of each vertex in a coordinate, over all poses [m], shape (V,)."""
+    bend: NDArray[np.float32]
+    """How much the garment's joints are bent in the middle of each pose region [rad], ascending, shape (R,)."""
+    factor: NDArray[np.float32]
+    """By how much σ is larger there, shape (R,)."""
+    is_measured: bool = True
+    """False for `UNKNOWN_SIGMA`."""
+
+    def at(self, bend: float) -> NDArray[np.float32]:
+        """σ in a pose [m], shape (V,): between the regions' middles it is interpolated, so that nothing leaps."""
+        return self.sigma * np.float32(np.interp(bend, self.bend, self.factor))
+
+    @classmethod
+    def unknown(cls, n_vertices: int) -> SigmaMap:
+        """Of a garment that nothing is known of: a number that a filter can work with."""
+        one = np.ones(1, np.float32)
+        return cls(np.full(n_vertices, UNKNOWN_SIGMA, np.float32), 0 * one, one, is_measured=False)
+
+
+def bend_of(garment: GarmentTemplate, pose: NDArray[Any]) -> NDArray[np.float64]:
+    """How much the joints that a garment feels are bent [rad], root left out, of poses (…, 24, 3) [rad]; shape (…,)."""
+    joints = [joint for joint in garment.card.joints if joint != 0]
+    angle = np.linalg.norm(np.asarray(pose, np.float64)[..., joints, :], axis=-1)
+    found: NDArray[np.float64] = np.sqrt((np.minimum(angle, np.pi) ** 2).sum(-1))
+    return found
+
+
+def fit_sigma(garment: GarmentTemplate, errors: NDArray[Any], poses: NDArray[Any]) -> SigmaMap:
+    """σ of a garment from predictions whose truth is known, and which its network hasn't seen.
+
+    In each pose region σ is scaled so that nine in ten of the true vertices are within `RADIUS_90` of it.
+
+    Args:
+        garment: whose σ it is.
+        errors: distance of each predicted vertex to the true one [m], shape (N, V).
+        poses: of these samples [rad], shape (N, 24, 3).
+
+    Raises:
+        MeshError: arrays of other shapes, or fewer than 10 samples a region.
+    """
+    length = np.asarray(errors, np.float64)
+    where = np.asarray(poses, np.float64)
+    n = len(length)
+    if length.shape != (n, garment.n_vertices) or where.shape != (n, N_JOINTS, 3) or not np.isfinite(length).all():
+        wanted = f"finite errors (N, {garment.n_vertices}) and poses (N, {N_JOINTS}, 3)"
+        msg = f"wanted {wanted}, got {length.shape} and {where.shape}"
+        raise MeshError(msg)
+    if n < 10 * REGIONS:
+        msg = f"σ needs {10 * REGIONS} samples or more, got {n}"
+        raise MeshError(msg)
+    around = garment.mesh.adjacency_matrix()
+    degree = np.maximum(around.sum(axis=1), 1.0)
+    variance = (length**2).mean(0) / 3
+    for _ in range(_SWEEPS):
+        variance = 0.5 * variance + 0.5 * (around @ variance) / degree
+    sigma = np.sqrt(variance)
+    bend = bend_of(garment, where)
+    middle, factor = [], []
+    for rows in np.array_split(np.argsort(bend, kind="stable"), REGIONS):
+        middle.append(np.median(bend[rows]))
+        factor.append(np.quantile(length[rows] / sigma, 0.9) / RADIUS_90)
+    return SigmaMap(sigma.astype(np.float32), np.array(middle, np.float32), np.array(factor, np.float32))
+
+
+def save_sigma(
+    garment: GarmentTemplate, found: SigmaMap, card: Mapping[str, Any], *, folder: str | os.PathLike[str] | None = None
+) -> Path:
+    """Writes `sigma` beside a garment's weights, in its folder below `folder` or below those that ship.
+
+    Raises:
+        WeightsError: it can't be written.
+    """
+    tensors = {
+        "sigma": torch.from_numpy(found.sigma).half(),
+        "bend": torch.from_numpy(found.bend),
+        "factor": torch.from_numpy(found.factor),
+    }
+    about = {"garment": garment.name, "n_vertices": garment.n_vertices, **card}
+    return save_weights(weights_folder(garment.name, folder) / _FILE, tensors, about)
+
+
+def load_sigma(garment: GarmentTemplate, *, folder: str | os.PathLike[str] | None = None) -> SigmaMap:
+    """What `save_sigma` wrote; `SigmaMap.unknown` where there is no such file.
+
+    Raises:
+        WeightsError: it is damaged, or of another garment.
+    """
+    stem = weights_folder(garment.name, folder) / _FILE
+    if not stem.with_suffix(".json").exists():
+        return SigmaMap.unknown(garment.n_vertices)
+    stored = load_weights(stem, expect={"garment": garment.name, "n_vertices": garment.n_vertices})
+    try:
+        sigma, bend, factor = (stored.tensors[key].float().numpy() for key in ("sigma", "bend", "factor"))
+    except KeyError as error:
+        msg = f"{stored.path}: wanted the tensors sigma, bend and factor, there is no {error}"
+        raise WeightsError(msg) from error
+    is_right = sigma.shape == (garment.n_vertices,) and bend.ndim == 1 and bend.shape == factor.shape and len(bend)
+    if not is_right or not ((sigma > 0).all() and (factor > 0).all() and (np.diff(bend) >= 0).all()):
+        msg = f"{stored.path}: not the σ of {garment.name}: make it anew with scripts/fit_sigma.py"
+        raise WeightsError(msg)
+    return SigmaMap(sigma, bend, factor)
+
+
+class Sigma:
+    """Standard deviations of a pipeline's garments: of its networks, and of the input where its covariance is known."""
+
+    def __init__(self, pipeline: GarmentPipeline, *, folder: str | os.PathLike[str] | None = None) -> None:
+        """For a pipeline; `folder` is that of weights of one's own, if it was loaded with one.
+
+        Raises:
+            WeightsError: a file of σ is damaged.
+        """
+        self._body = pipeline.body
+        self._garments = pipeline.garments
+        self.maps: dict[str, SigmaMap] = {}
+        """By garment. One that no network drapes, or whose network nobody has measured, is `UNKNOWN_SIGMA`."""
+        for name, garment in self._garments.items():
+            known = name not in pipeline.untrained
+            self.maps[name] = load_sigma(garment, folder=folder) if known else SigmaMap.unknown(garment.n_vertices)
+
+    def __call__(
+        self,
+        frame: SmplFrame,
+        output: PipelineOutput,
+        *,
+        pose_covariance: NDArray[Any] | None = None,
+        transl_covariance: NDArray[Any] | None = None,
+    ) -> dict[str, NDArray[np.float32]]:
+        """σ of each garment's vertices in a coordinate [m], by name, shape (V,); never NaN.
+
+        A ball of `RADIUS_90` σ holds the true vertex in nine cases of ten, if the input is as it says.
+
+        Args:
+            frame: that was dressed.
+            output: what the pipeline made of it.
+            pose_covariance: of the rotation vectors [rad²], shape (72, 72), or (24, 3, 3) where joints are
+                independent; it is pushed through the kinematics.
+            transl_covariance: of the translation [m²], shape (3, 3).
+
+        Raises:
+            FrameError: a covariance of another shape, not finite, or with a negative variance.
+        """
+        pose = None if pose_covariance is None else _covariance("pose_covariance", pose_covariance)
+        transl = 0.0
+        if transl_covariance is not None:
+            transl = float(np.trace(_covariance("transl_covariance", transl_covariance, (3, 3)))) / 3
+        found = {}
+        for name, garment in self._garments.items():
+            sigma = self.maps[name].at(float(bend_of(garment, frame.pose)))
+            if pose is not None or transl > 0:
+                variance = sigma.astype(np.float64) ** 2 + transl
+                if pose is not None:
+                    variance += input_variance(self._body, garment, frame, output[name].local, pose)
+                sigma = np.sqrt(variance).astype(np.float32)
+            found[name] = sigma
+        return found
+
+
+def _covariance(name: str, value: Any, *shapes: tuple[int, ...]) -> NDArray[np.float64]:
+    wanted = shapes or ((3 * N_JOINTS, 3 * N_JOINTS), (N_JOINTS, 3, 3))
+    try:
+        array = np.asarray(value, np.float64)
+    except (TypeError, ValueError) as error:
+        msg = f"{name} must be numbers of the shape {' or '.join(map(str, wanted))}, got {type(value).__name__}"
+        raise FrameError(msg) from error
+    if array.shape not in wanted or not np.isfinite(array).all():
+        msg = f"{name} must be finite numbers of the shape {' or '.join(map(str, wanted))}, got {array.shape}"
+        raise FrameError(msg)
+    if (np.diagonal(array, axis1=-2, axis2=-1) < 0).any():
+        msg = f"{name} has a negative variance on its diagonal"
+        raise FrameError(msg)
+    return array

@@ -1,0 +1,177 @@
+"""Which vertices and triangles a coarse copy of a mesh keeps: half-edge collapses by quadric error, boundary kept.
+
+Garland and Heckbert 1997, with vertices that stay where they are: so a coarse vertex is one of the garment's.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from refu_core.mesh import Connectivity
+
+_EVEN = 0.1
+"""How far a triangle's plane may be missed for an edge of length 1: cloth folds elsewhere in each pose, so triangles
+are to be of one size, and only sharp shapes are worth small ones."""
+_RIM = 3.0
+"""How much more a boundary's line counts than a plane as far off."""
+_LEAST_COSINE = 0.3
+"""Of the angle by which a triangle may turn in one collapse."""
+_LONGEST = 8
+"""Neighbours of a kept vertex: above that, fans of slivers begin."""
+
+Vector = tuple[float, float, float]
+
+
+def simplify(
+    vertices: NDArray[np.float64], faces: NDArray[np.int32], most: int
+) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
+    """Collapses edges until the faces, twice, and a wall along the boundary are `most` triangles or fewer.
+
+    Args:
+        vertices: [m], shape (V, 3).
+        faces: shape (F, 3), of a surface with or without a boundary.
+        most: triangles of the sheet's two sides and its walls; where no edge can be collapsed any more there are more.
+
+    Returns:
+        The vertices that are kept, (K,), and faces into them, (G, 3).
+    """
+    return _Sheet(vertices, faces).collapsed(most)
+
+
+class _Sheet:
+    def __init__(self, vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> None:
+        mesh = Connectivity.of(faces, len(vertices))
+        self.places: list[Vector] = [tuple(row) for row in vertices.tolist()]
+        self.faces: dict[int, tuple[int, int, int]] = dict(enumerate(map(tuple, faces.tolist())))
+        self.fan: list[set[int]] = [set() for _ in self.places]
+        self.ring: list[set[int]] = [set() for _ in self.places]
+        for number, face in self.faces.items():
+            for corner in face:
+                self.fan[corner].add(number)
+        for a, b in mesh.edges.tolist():
+            self.ring[a].add(b)
+            self.ring[b].add(a)
+        self.rim: list[set[int]] = [set() for _ in self.places]
+        """Its neighbours along the boundary."""
+        for a, b in mesh.boundary.tolist():
+            self.rim[a].add(b)
+            self.rim[b].add(a)
+        self.n_rim = len(mesh.boundary)
+        self.quadrics, self.areas = _quadrics(vertices, mesh)
+
+    def collapsed(self, most: int) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
+        heap = [entry for u in range(len(self.places)) for entry in self._options(u, self.ring[u])]
+        heapq.heapify(heap)
+        age = [0] * len(self.places)
+        while heap and 2 * (len(self.faces) + self.n_rim) > most:
+            _, u, v, seen = heapq.heappop(heap)
+            if seen != age[u] + age[v] or v not in self.ring[u] or not self._may(u, v):
+                continue
+            self._collapse(u, v)
+            age[u] = -(1 << 40)
+            age[v] += 1
+            for a, b in ((v, other) for other in self.ring[v]):
+                for entry in (*self._options(a, (b,)), *self._options(b, (a,))):
+                    heapq.heappush(heap, (*entry[:3], age[a] + age[b]))
+        faces = np.array(list(self.faces.values()), np.int64)
+        kept, of_corner = np.unique(faces, return_inverse=True)
+        return kept.astype(np.intp), of_corner.reshape(-1, 3).astype(np.int32)
+
+    def _options(self, u: int, to: Iterable[int]) -> Iterator[tuple[float, int, int, int]]:
+        """What it costs to draw `u` to each of these neighbours, to which it may be drawn."""
+        x, y, z = self.places[u]
+        xx, xy, xz, xd, yy, yz, yd, zz, zd, dd = self.quadrics[u]
+        area, rim = self.areas[u], self.rim[u]
+        for v in to:
+            if rim and v not in rim:
+                continue
+            p, q, r = self.places[v]
+            plane = p * (xx * p + 2 * (xy * q + xz * r + xd)) + q * (yy * q + 2 * (yz * r + yd))
+            plane += r * (zz * r + 2 * zd) + dd
+            length = (p - x) ** 2 + (q - y) ** 2 + (r - z) ** 2
+            yield plane + _EVEN**2 * area * length, u, v, 0
+
+    def _may(self, u: int, v: int) -> bool:
+        """Whether the surface stays one, and no triangle is turned over."""
+        on_rim = v in self.rim[u]
+        if self.rim[u] and (not on_rim or len(self.rim[u]) != 2 or self.rim[u] == {v}):
+            return False
+        if len(self.ring[u] & self.ring[v]) != (1 if on_rim else 2):
+            return False
+        if on_rim and self.rim[u] & self.rim[v]:
+            return False  # a loop of three
+        if len(self.ring[u] | self.ring[v]) - 2 > _LONGEST + len(self.rim[v]):
+            return False
+        for number in self.fan[u]:
+            face = self.faces[number]
+            if v in face:
+                continue
+            before = _normal(*(self.places[c] for c in face))
+            after = _normal(*(self.places[v if c == u else c] for c in face))
+            dot = sum(a * b for a, b in zip(before, after, strict=True))
+            square = sum(a * a for a in before) * sum(a * a for a in after)
+            if dot <= 0 or dot * dot < _LEAST_COSINE**2 * square:
+                return False
+        return True
+
+    def _collapse(self, u: int, v: int) -> None:
+        for number in list(self.fan[u]):
+            face = self.faces[number]
+            if v in face:
+                del self.faces[number]
+                for corner in face:
+                    self.fan[corner].discard(number)
+            else:
+                self.faces[number] = tuple(v if c == u else c for c in face)  # type: ignore[assignment]
+                self.fan[v].add(number)
+        for other in self.ring[u]:
+            self.ring[other].discard(u)
+            if other != v:
+                self.ring[other].add(v)
+                self.ring[v].add(other)
+        if self.rim[u]:
+            (other,) = self.rim[u] - {v}
+            for end, gone, new in ((other, u, v), (v, u, other)):
+                self.rim[end].discard(gone)
+                self.rim[end].add(new)
+            self.n_rim -= 1
+        self.fan[u], self.ring[u], self.rim[u] = set(), set(), set()
+        self.quadrics[v] = tuple(a + b for a, b in zip(self.quadrics[u], self.quadrics[v], strict=True))
+        self.areas[v] += self.areas[u]
+
+
+def _normal(a: Vector, b: Vector, c: Vector) -> Vector:
+    ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    vx, vy, vz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+    return uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+
+
+def _quadrics(vertices: NDArray[np.float64], mesh: Connectivity) -> tuple[list[tuple[float, ...]], list[float]]:
+    """Of each vertex the sum of squared distances from the planes around it, by area, as a form; and that area [m²]."""
+    a, b, c = vertices[mesh.faces].transpose(1, 0, 2)
+    normal = np.cross(b - a, c - a)
+    double = np.linalg.norm(normal, axis=1)
+    normal /= np.maximum(double, 1e-18)[:, None]
+    forms = np.zeros((len(vertices), 4, 4))
+    plane = np.concatenate((normal, -(normal * a).sum(1, keepdims=True)), axis=1)
+    third = double / 6
+    for corner in range(3):
+        np.add.at(forms, mesh.faces[:, corner], third[:, None, None] * plane[:, :, None] * plane[:, None])
+    areas = np.bincount(mesh.faces.ravel(), weights=np.repeat(third, 3), minlength=len(vertices))
+    for corner in range(3):
+        rim = mesh.n_faces_of_edge[mesh.edge_of_corner[:, corner]] == 1
+        start, end = mesh.faces[rim, corner], mesh.faces[rim, (corner + 1) % 3]
+        along = vertices[end] - vertices[start]
+        out = np.cross(along, normal[rim])
+        length = np.linalg.norm(out, axis=1)
+        out /= np.maximum(length, 1e-18)[:, None]
+        wall = np.concatenate((out, -(out * vertices[start]).sum(1, keepdims=True)), axis=1)
+        form = (_RIM * length**2)[:, None, None] * wall[:, :, None] * wall[:, None]
+        np.add.at(forms, start, form)
+        np.add.at(forms, end, form)
+    upper = forms[:, [0, 0, 0, 0, 1, 1, 1, 2, 2, 3], [0, 1, 2, 3, 1, 2, 3, 2, 3, 3]]
+    return [tuple(row) for row in upper.tolist()], areas.tolist()

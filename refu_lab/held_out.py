@@ -1,0 +1,90 @@
+"""Predictions beside truth that their network hasn't seen: what σ is fitted to, and checked against."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+import msg_adapters as adapters
+from refu_core import GarmentPipeline, GarmentTemplate, SmplFrame
+from refu_core.errors import GarmentError
+from refu_core.outputs import RADIUS_90, SigmaMap, bend_of
+from refu_lab.truth import GroundTruth
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+
+class Moment(NamedTuple):
+    """One frame whose truth is known."""
+
+    frame: SmplFrame
+    truth: NDArray[np.float64]
+    """The garment without the translation [m], shape (V, 3)."""
+    pair: int
+    """Number of the frame's style-shape pair."""
+
+
+def moments_of(bag: Path, garment: GarmentTemplate) -> list[Moment]:
+    """The frames of a bag that have the garment's truth.
+
+    Raises:
+        RefuError: the bag can't be read, or there is none of this garment.
+    """
+    truth = GroundTruth.of_bag(bag, {garment.name: garment.faces.cpu().numpy()})
+    found = []
+    with adapters.open_smpl_bag(bag) as opened:
+        for record in opened:
+            true = None if record.frame is None else truth.of(garment.name, record.frame)
+            if record.frame is not None and true is not None:
+                found.append((record.frame, true))
+    if not found:
+        msg = f"{bag}: no ground truth of {garment.name} in it"
+        raise GarmentError(msg)
+    keys = [np.concatenate((one.betas, np.zeros(4) if one.style is None else one.style)) for one, _ in found]
+    _, pairs = np.unique(np.round(keys, 4), axis=0, return_inverse=True)
+    return [Moment(*one, int(pair)) for one, pair in zip(found, pairs.reshape(-1), strict=True)]
+
+
+class HeldOut(NamedTuple):
+    """N samples of one garment."""
+
+    garment: GarmentTemplate
+    errors: NDArray[np.float64]
+    """Distance of each predicted vertex to the true one [m], shape (N, V)."""
+    poses: NDArray[np.float32]
+    """[rad], shape (N, 24, 3)."""
+    pairs: NDArray[np.intp]
+    """Number of each sample's style-shape pair, shape (N,)."""
+
+
+def held_out(bag: Path, garment: str, *, half: int | None = None, weights: Path | None = None) -> HeldOut:
+    """Predicts the frames of a bag that have their truth.
+
+    Args:
+        bag: with ground truth.
+        garment: whose.
+        half: 0 for every other style-shape pair, which σ is fitted to; 1 for the rest; None for all.
+        weights: a folder of one's own; those that ship by default.
+
+    Raises:
+        RefuError: the bag can't be read or has no truth of this garment, or there is no such garment.
+    """
+    pipeline = GarmentPipeline.load([garment], weights=weights)
+    (template,) = pipeline.garments.values()
+    moments = [one for one in moments_of(bag, template) if half is None or one.pair % 2 == half]
+    errors = [np.linalg.norm(pipeline(one.frame)[template.name].local - one.truth, axis=1) for one in moments]
+    pairs = np.array([one.pair for one in moments])
+    return HeldOut(template, np.stack(errors), np.stack([one.frame.pose for one in moments]), pairs)
+
+
+def coverage(found: SigmaMap, samples: HeldOut) -> float:
+    """Share of the true vertices that are within the 90 % interval."""
+    held = [
+        np.mean(errors <= RADIUS_90 * found.at(float(bend)))
+        for errors, bend in zip(samples.errors, bend_of(samples.garment, samples.poses), strict=True)
+    ]
+    return float(np.mean(held))

@@ -1,0 +1,85 @@
+"""The node's publishers: those of all people live as long as the node, those of one come and go with them."""
+
+from __future__ import annotations
+
+import contextlib
+from typing import TYPE_CHECKING, Any
+
+from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.exceptions import InvalidHandle
+from rclpy.qos_overriding_options import QoSOverridingOptions
+
+import msg_adapters as adapters
+from refu_core import RefuError
+from refu_ros._interfaces import interface, ros_qos
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+QOS = adapters.QosProfile(reliability="reliable", depth=5)
+
+
+class Bank:
+    """Publishers of a lifecycle node. `hold` belongs to the executor's thread, what else there is to any.
+
+    `on_match` is called when somebody subscribes, or does so no longer.
+    """
+
+    def __init__(self, node: Any, on_match: Callable[[], object]) -> None:
+        self._node, self._on_match = node, on_match
+        self._publishers: dict[str, Any] = {}
+        self._refused: set[str] = set()
+
+    def hold(self, wanted: Mapping[str, str], *, lasting: bool = False) -> None:
+        """Has publishers of these topics, by message type, and no others but those that were `lasting`.
+
+        Only those have overrides of their QoS: they are parameters, which never go. A type whose package isn't there is
+        left out, and said once.
+        """
+        for topic, kind in wanted.items():
+            if topic in self._publishers or kind in self._refused:
+                continue
+            try:
+                message_class = interface(kind)
+            except RefuError as error:
+                self._refused.add(kind)
+                self._node.get_logger().info(f"no {topic}: {error}")
+                continue
+            self._publishers[topic] = self._make(message_class, topic, lasting=lasting)
+        for topic in [topic for topic, one in self._publishers.items() if topic not in wanted and not one.lasts]:
+            self._node.destroy_lifecycle_publisher(self._publishers.pop(topic))
+
+    def _make(self, message_class: Any, topic: str, *, lasting: bool) -> Any:
+        publisher = self._node.create_lifecycle_publisher(
+            message_class,
+            topic,
+            ros_qos(QOS),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies() if lasting else None,
+            event_callbacks=PublisherEventCallbacks(matched=lambda _: self._on_match()),
+        )
+        publisher.lasts = lasting
+        if self._node.is_active:
+            publisher.on_activate(None)
+        return publisher
+
+    def name(self, topic: str) -> str:
+        """A topic's full name, after remapping."""
+        return str(self._publishers[topic].topic_name)
+
+    def watchers(self, topic: str) -> int:
+        """How many subscribe to a topic."""
+        publisher = self._publishers.get(topic)
+        try:
+            return 0 if publisher is None else int(publisher.get_subscription_count())
+        except InvalidHandle:  # destroyed meanwhile
+            return 0
+
+    def is_watched(self) -> bool:
+        """Whether anybody subscribes to anything."""
+        return any(self.watchers(topic) for topic in [*self._publishers])
+
+    def send(self, topic: str, data: bytes) -> None:
+        """Publishes, where the topic still is."""
+        if (publisher := self._publishers.get(topic)) is not None:
+            with contextlib.suppress(InvalidHandle):
+                publisher.publish(data)

@@ -1,0 +1,266 @@
+"""What comes in: subscriptions while somebody wants what comes of them, and where each message's frame is."""
+
+from __future__ import annotations
+
+import re
+import time
+from typing import TYPE_CHECKING, Any
+
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos_overriding_options import QoSOverridingOptions
+
+import msg_adapters as adapters
+from refu_core import FrameError, RefuError
+from refu_core.errors import printable
+from refu_core.outputs import PinholeCamera
+from refu_ros._decoding import InputDecoder
+from refu_ros._interfaces import interface, ros_qos
+
+if TYPE_CHECKING:
+    from msg_adapters import Placement
+    from refu_ros._node import GarmentNode
+    from refu_ros._scene import Scene
+    from refu_ros._settings import NodeSettings
+
+INPUT_QOS = adapters.QosProfile(reliability="best_effort", depth=1)
+_HUMANS = re.compile(r"/humans/bodies/([A-Za-z0-9_]+)/joint_states")
+_TRACKED = "/humans/bodies/tracked"
+_LOG_PERIOD_S = 5.0
+_GRACE_S = 5.0
+"""How long the inputs stay subscribed to when nobody is left: many a viewer is only restarted [s]."""
+_OVERRIDABLE = QoSOverridingOptions.with_default_policies()
+_TF_DEPTH = 100
+_FIRST_TF_S = 1.0
+"""How long the first transform is waited for; then people are shown as if their frame were that of the messages [s]."""
+
+
+class Listener:
+    """All of it belongs to the executor's thread, but for what it counts."""
+
+    def __init__(self, node: GarmentNode) -> None:
+        self._node = node
+        self.decoder = InputDecoder(node.settings)
+        self.scene: Scene | None = None
+        """Where people go who have come; None while nobody is dressed."""
+        self.since: float | None = None
+        """When the inputs were subscribed to, on the steady clock [s]; None while they aren't."""
+        self.input_frame = ""
+        """The sender's, where it isn't that of the messages."""
+        self._wanted_at = 0.0
+        self._inputs: dict[str, Any] = {}
+        self._frames: dict[str, str] = {}
+        self._tracked: list[str] | None = None
+        self._tf = adapters.TransformBuffer()
+        self._tf_asked_at: float | None = None
+        self._is_warned = self._is_refused = False
+        self._camera: adapters.Camera | None = None
+
+    @property
+    def _settings(self) -> NodeSettings:
+        return self._node.settings
+
+    @property
+    def persons(self) -> list[str]:
+        """Everybody who may come, as far as that is known."""
+        named = [*self._bodies()] if self._settings.follow_humans else self._settings.persons
+        return [*dict.fromkeys([*named, *(self.scene.persons if self.scene is not None else ())])]
+
+    def attend(self, *, is_wanted: bool) -> None:
+        """Listens while somebody wants what comes of it, and some seconds longer.
+
+        Called whenever that may have changed, and once a second in case an event was missed.
+        """
+        now = time.monotonic()
+        if is_wanted or not self._settings.lazy:
+            self._wanted_at = now
+            if self.since is None:
+                self.subscribe()
+        elif self.since is not None and now > self._wanted_at + _GRACE_S:
+            self.unsubscribe()
+        if self.since is not None and self._settings.follow_humans:
+            self._follow_humans()
+
+    def subscribe(self) -> None:
+        """Listens from now on."""
+        self.since = self._wanted_at = time.monotonic()
+        if self._settings.follow_humans:
+            self._listen_to_tracked()
+            self._follow_humans()
+        else:
+            for person in self._settings.persons:
+                self._listen(person, f"{person}/smpl_params" if person else "smpl_params")
+        if topic := self._settings.camera_info:
+            given = interface(adapters.CAMERA_INFO), topic, self._on_camera, ros_qos(INPUT_QOS)
+            self._inputs["/camera"] = self._node.create_subscription(*given, raw=True)
+
+    def unsubscribe(self) -> None:
+        """Listens no longer."""
+        if self._inputs:
+            self._node.get_logger().info("listening to nobody")
+        for subscription in self._inputs.values():
+            self._node.destroy_subscription(subscription)
+        self._inputs.clear()
+        self._frames.clear()
+        self.since = self._tracked = self._tf_asked_at = self._camera = None
+
+    def _listen(self, person: str, topic: str) -> None:
+        full_name = self._node.resolve_topic_name(topic)
+        self._node.get_logger().info(f"listening to {full_name} ({self.decoder.message_type})")
+        self._inputs[person] = self._node.create_subscription(
+            interface(self.decoder.message_type),
+            topic,
+            lambda data: self._on_input(person, full_name, data),
+            ros_qos(INPUT_QOS),
+            # Overrides are parameters, which never go: only topics that don't come and go have them.
+            qos_overriding_options=None if self._settings.follow_humans else _OVERRIDABLE,
+            raw=True,
+        )
+
+    def _on_input(self, person: str, topic: str, data: bytes) -> None:
+        node = self._node
+        if self.scene is None:
+            return
+        node.statistics.receive()
+        node.recording.put(topic, self.decoder.message_type, data, INPUT_QOS)
+        if not node.is_watched():
+            node.statistics.skip("unwatched")
+            return
+        try:
+            frames, given = self.decoder.frames(person, data, node.now_ns())
+        except (adapters.AdapterError, FrameError) as error:
+            node.statistics.drop("invalid", str(error))
+            node.get_logger().warning(f"{topic}: {printable(error)}", throttle_duration_sec=_LOG_PERIOD_S)
+            return
+        given = printable(given.lstrip("/"))
+        if doubt := self.decoder.doubt(frames.values()):
+            node.get_logger().warning(f"{topic}: {doubt}")
+        self.input_frame = given if self._need_transforms(topic, given) else ""
+        for name, frame in frames.items():
+            self._frames[name] = given
+            if not self.decoder.is_steady:
+                self._put(name, frame)
+
+    def predict(self) -> None:
+        """Everybody whose keypoints are followed, by now."""
+        if self.scene is not None and self._node.is_watched():
+            for name, frame in self.decoder.predicted(self._node.now_ns()).items():
+                self._put(name, frame)
+
+    def _put(self, person: str, frame: Any) -> None:
+        assert self.scene is not None
+        try:
+            placement = self._placement(self._frames.get(person, ""), frame.stamp_ns)
+        except adapters.TransformError as error:
+            self._node.statistics.drop("transform", str(error))
+            return
+        self.scene.put(person, frame, placement, self._camera_at(person, frame.stamp_ns))
+
+    # Frames ---------------------------------------------------------------------------------------
+
+    def _placement(self, given: str, stamp_ns: int) -> Placement | None:
+        """From a frame to that of the messages; None where they are one, or nobody sends transforms.
+
+        Raises `TransformError` where there are transforms, but none of this frame at this time.
+        """
+        target = self._settings.frame_id
+        if given in ("", target) or self._tf_asked_at is None:
+            return None
+        if not len(self._tf):
+            if time.monotonic() < self._tf_asked_at + _FIRST_TF_S:
+                msg = f"no transform has come yet, and the input is in {given}"
+                raise adapters.TransformError(msg)
+            self._warn(f"the input is in {given}, the garments are in {target}, and nobody sends transforms")
+            return None
+        tolerance = round(1e9 * self._settings.transform_tolerance)
+        found = self._tf.lookup(target, given, stamp_ns, tolerance_ns=tolerance)
+        if found.is_late:
+            self._node.statistics.late_transform()
+        return found
+
+    def _camera_at(self, person: str, stamp_ns: int) -> PinholeCamera | None:
+        """The camera, where it was as this person was seen; None where there is none, or no transform of it."""
+        if (camera := self._camera) is None:
+            return None
+        try:
+            way = self._placement(camera.frame_id, stamp_ns)
+        except adapters.TransformError:
+            self._node.statistics.skip("camera_without_transform")
+            return None
+        if way is None and camera.frame_id not in (self._settings.frame_id, self._frames.get(person)):
+            return None
+        back = (way or adapters.Placement()).inverse()
+        return PinholeCamera(*camera.numbers, back.rotation, back.translation)
+
+    def _on_camera(self, data: bytes) -> None:
+        self._camera = adapters.decode_camera_info(data)
+        self._need_transforms("the camera", self._camera.frame_id)
+
+    @property
+    def is_transformed(self) -> bool:
+        """Whether anybody sends transforms."""
+        return self._tf_asked_at is not None and len(self._tf) > 0
+
+    def _warn(self, text: str) -> None:
+        if not self._is_warned:
+            self._is_warned = True
+            self._node.get_logger().warning(f"{text}: set frame_id to the sender's frame if they are the same place")
+
+    def _need_transforms(self, who: str, given: str) -> bool:
+        """Asks for transforms as soon as a frame isn't that of the messages; whether it isn't."""
+        target = self._settings.frame_id
+        differs = given not in ("", target)
+        if differs and self._tf_asked_at is None and not self._is_refused:
+            try:
+                self._listen_to_tf()
+            except RefuError as error:
+                self._is_refused = True
+                self._warn(f"{who} is in {given}, the garments are in {target}, nothing is transformed ({error})")
+        return differs
+
+    def _listen_to_tf(self) -> None:
+        kind = interface(adapters.TF_MESSAGE)
+        self._tf, self._tf_asked_at = adapters.TransformBuffer(), time.monotonic()
+        for topic, durability in (("/tf", DurabilityPolicy.VOLATILE), ("/tf_static", DurabilityPolicy.TRANSIENT_LOCAL)):
+            self._inputs[topic] = self._node.create_subscription(
+                kind,
+                topic,
+                lambda data, is_static=topic == "/tf_static": self._on_transforms(data, is_static),
+                QoSProfile(depth=_TF_DEPTH, durability=durability),
+                raw=True,
+            )
+
+    def _on_transforms(self, data: bytes, is_static: bool) -> None:
+        if n := self._tf.put(data, is_static=is_static):
+            msg = f"{n} transforms make no sense: no frame, no finite numbers, or no rotation"
+            raise RefuError(msg)
+
+    # Humans (REP-155) -----------------------------------------------------------------------------
+
+    def _bodies(self) -> dict[str, str]:
+        """The topic of each body that there is: those that somebody says are tracked, else all."""
+        topics = (topic for topic, _ in self._node.get_topic_names_and_types())
+        bodies = {match[1]: topic for topic in topics if (match := _HUMANS.fullmatch(topic))}
+        if self._tracked is not None:
+            bodies = {person: topic for person, topic in bodies.items() if person in self._tracked}
+        return bodies
+
+    def _listen_to_tracked(self) -> None:
+        def take(data: bytes) -> None:
+            self._tracked = adapters.decode_ids(data)
+            self._follow_humans()
+
+        try:
+            kind = interface(adapters.IDS_LIST)
+        except RefuError:  # then whoever has a topic is there
+            return
+        self._inputs[_TRACKED] = self._node.create_subscription(kind, _TRACKED, take, QoSProfile(depth=1), raw=True)
+
+    def _follow_humans(self) -> None:
+        """Listens to bodies that have come and no longer to those that have gone."""
+        bodies, count = self._bodies(), self._node.count_publishers
+        for person, topic in bodies.items():
+            if person not in self._inputs and count(topic):
+                self._listen(person, topic)
+        here = [person for person in self._inputs if not person.startswith("/")]
+        for person in [person for person in here if not count(bodies.get(person, "/none"))]:
+            self._node.destroy_subscription(self._inputs.pop(person))

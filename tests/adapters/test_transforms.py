@@ -1,0 +1,158 @@
+"""Where a frame was at a time: against numbers that scipy makes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from reference import deserialise, serialise
+from scipy.spatial.transform import Rotation, Slerp
+
+from msg_adapters import (
+    TF_MESSAGE,
+    DecodeError,
+    Placement,
+    Transform,
+    TransformBuffer,
+    TransformError,
+    decode_transforms,
+    encode_transforms,
+)
+from msg_adapters.transforms import HISTORY_NS
+
+S = 10**9
+
+
+def transform(parent: str, child: str, stamp_ns: int = 0, seed: int = 0, **other: Any) -> Transform:
+    rng = np.random.default_rng(seed)
+    values = {"translation": rng.normal(size=3), "quaternion": Rotation.random(rng=rng).as_quat(), **other}
+    return Transform(stamp_ns, parent, child, **values)
+
+
+def put(buffer: TransformBuffer, *transforms: Transform, is_static: bool = False) -> int:
+    return buffer.put(encode_transforms(transforms), is_static=is_static)
+
+
+def matrix(one: Transform | Placement) -> Any:
+    """4 by 4, by scipy."""
+    full = np.eye(4)
+    is_placed = isinstance(one, Placement)
+    full[:3, :3] = one.rotation if is_placed else Rotation.from_quat(one.quaternion).as_matrix()  # type: ignore[union-attr]
+    full[:3, 3] = one.translation
+    return full
+
+
+def test_messages_are_those_of_tf2() -> None:
+    ones = [transform("map", "odom", 5, 1), transform("odom", "base", 7 * S, 2)]
+    data = encode_transforms(ones)
+    message = deserialise(data, TF_MESSAGE)
+    assert serialise(message, TF_MESSAGE) == data
+    for theirs, sent, back in zip(message.transforms, ones, decode_transforms(data), strict=True):
+        assert (theirs.header.frame_id, theirs.child_frame_id) == (sent.parent, sent.child)
+        assert (back.stamp_ns, back.parent, back.child) == (sent.stamp_ns, sent.parent, sent.child)
+        t, q = theirs.transform.translation, theirs.transform.rotation
+        np.testing.assert_array_equal([t.x, t.y, t.z, q.x, q.y, q.z, q.w], [*sent.translation, *sent.quaternion])
+        np.testing.assert_array_equal([*back.translation, *back.quaternion], [*sent.translation, *sent.quaternion])
+    with pytest.raises(DecodeError):
+        decode_transforms(data[:-40])
+
+
+@given(st.integers(0, 1000), st.integers(1, 5), st.integers(0, 4))
+@settings(max_examples=30)
+def test_chains_multiply_as_matrices_do(seed: int, up: int, down: int) -> None:
+    """From a leaf to another, over the frame that both hang on; some static, some moving."""
+    buffer, left, right = TransformBuffer(), np.eye(4), np.eye(4)
+    for i in range(up):
+        one = transform(f"l{i}" if i else "root", f"l{i + 1}", S, seed + i)
+        put(buffer, one, is_static=bool(i % 2))
+        left = left @ matrix(one)
+    for i in range(down):
+        one = transform(f"r{i}" if i else "root", f"r{i + 1}", S, seed + 50 + i)
+        put(buffer, one, is_static=not i % 2)
+        right = right @ matrix(one)
+    target = f"r{down}" if down else "root"
+    found = buffer.lookup(target, f"l{up}", S)
+    np.testing.assert_allclose(matrix(found), np.linalg.inv(right) @ left, atol=1e-12)
+    back = buffer.lookup(f"l{up}", f"/{target}", S)
+    np.testing.assert_allclose(matrix(back) @ matrix(found), np.eye(4), atol=1e-12)
+    assert not found.is_late
+
+
+@given(st.floats(0, 1), st.integers(0, 100), st.permutations([0, 1, 2, 3]))
+def test_between_two_transforms_it_is_in_between(fraction: float, seed: int, order: list[int]) -> None:
+    """In whatever order they arrive."""
+    buffer = TransformBuffer()
+    ones = [transform("map", "cam", i * S, seed + i) for i in range(4)]
+    for i in order:
+        put(buffer, ones[i])
+    stamp = S + int(fraction * S)
+    found = buffer.lookup("map", "cam", stamp)
+    slerp = Slerp([1, 2], Rotation.from_quat([ones[1].quaternion, ones[2].quaternion]))
+    share = (stamp - S) / S
+    np.testing.assert_allclose(found.rotation, slerp(1 + share).as_matrix(), atol=1e-7)
+    wanted = (1 - share) * np.asarray(ones[1].translation) + share * np.asarray(ones[2].translation)
+    np.testing.assert_allclose(found.translation, wanted, atol=1e-12)
+
+
+def test_late_and_old_and_missing() -> None:
+    buffer = TransformBuffer()
+    put(buffer, transform("map", "base", 5 * S), transform("map", "base", 6 * S))
+    put(buffer, transform("base", "cam", 0, 3), is_static=True)
+    assert not buffer.lookup("map", "cam", 6 * S).is_late
+    assert buffer.lookup("map", "cam", 6 * S + 50, tolerance_ns=100).is_late
+    with pytest.raises(TransformError, match=r"base is 1\.000 s older"):
+        buffer.lookup("map", "cam", 7 * S, tolerance_ns=100)
+    with pytest.raises(TransformError, match=r"base is 1\.000 s newer"):
+        buffer.lookup("map", "cam", 4 * S)
+    for target, source in (("map", "lidar"), ("world", "cam"), ("map", "")):
+        with pytest.raises(TransformError, match="no transform leads"):
+            buffer.lookup(target, source, 6 * S)
+    np.testing.assert_array_equal(matrix(buffer.lookup("cam", "cam", 0)), np.eye(4))  # itself, at any time
+    assert not buffer.lookup("base", "cam", 10**18).is_late  # static: at any time
+
+
+def test_what_makes_no_sense_is_left_out_and_counted() -> None:
+    buffer = TransformBuffer()
+    bad = [
+        transform("map", "map"),
+        transform("", "cam"),
+        transform("map", ""),
+        transform("map", "cam", quaternion=np.zeros(4)),
+        transform("map", "cam", quaternion=np.array([0, 0, 0, 2.0])),
+        transform("map", "cam", translation=np.array([np.nan, 0, 0])),
+    ]
+    assert put(buffer, *bad) == len(bad)
+    assert len(buffer) == 0
+    put(buffer, transform("a", "b"), transform("b", "a"))  # a ring ends
+    with pytest.raises(TransformError):
+        buffer.lookup("map", "a", 0)
+    buffer.lookup("a", "b", 0)
+
+
+def test_history_is_bounded_and_a_clock_may_go_back() -> None:
+    buffer = TransformBuffer()
+    for i in range(3000):
+        put(buffer, transform("map", "cam", i * S // 100, i))
+    track = buffer._tracks["cam"]
+    assert track.stamps[-1] - track.stamps[0] == HISTORY_NS
+    assert len(track.stamps) == len(track.values) == 1001
+    put(buffer, transform("map", "cam", 5 * S))
+    assert track.stamps == [5 * S]
+    put(buffer, transform("odom", "cam", 4 * S))  # another parent: what was known of the one before is over
+    with pytest.raises(TransformError):
+        buffer.lookup("map", "cam", 5 * S)
+
+
+def test_a_camera_that_looks_ahead_sees_people_upright() -> None:
+    """Optical frames have z ahead and y down; the numbers are REP-103's, by hand."""
+    buffer = TransformBuffer()
+    optical = Rotation.from_euler("ZYX", [-90, 0, -90], degrees=True)
+    put(buffer, Transform(0, "map", "camera_link", [2.0, 0.0, 1.5], [0, 0, 0, 1]))
+    put(buffer, Transform(0, "camera_link", "optical", [0, 0, 0], optical.as_quat()), is_static=True)
+    found = buffer.lookup("map", "optical", 0)
+    ahead, down = np.array([0.0, 0.0, 3.0]), np.array([0.0, 1.0, 0.0])
+    np.testing.assert_allclose(found.rotation @ ahead + found.translation, [5.0, 0.0, 1.5], atol=1e-12)
+    np.testing.assert_allclose(found.rotation @ down, [0.0, 0.0, -1.0], atol=1e-12)

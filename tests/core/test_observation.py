@@ -1,0 +1,173 @@
+"""Garments that follow measured points: nearer to what is seen, within bounds, never into the body."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import igl
+import numpy as np
+import pytest
+import torch
+
+from refu_core import FrameError, GarmentPipeline, SmplFrame
+from refu_core.observation import DEFAULT_OBSERVATION, Observer
+from refu_core.observation._estimate import Estimate
+from refu_core.outputs import Clearance, PinholeCamera, depth_image, visible
+from refu_lab.held_out import Moment, moments_of
+
+BAG = Path(__file__).parents[2] / "bags" / "eval_skirt_female"
+NAME = "skirt-female"
+
+
+@pytest.fixture(scope="module")
+def pipeline() -> GarmentPipeline:
+    return GarmentPipeline.load([NAME])
+
+
+@pytest.fixture(scope="module")
+def observer(pipeline: GarmentPipeline, tmp_path_factory: pytest.TempPathFactory) -> Observer:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("REFU_CACHE", str(tmp_path_factory.mktemp("cache")))
+        return Observer(pipeline)
+
+
+@pytest.fixture(scope="module")
+def moments(pipeline: GarmentPipeline) -> list[Moment]:
+    """Of the pairs that nothing was tuned on."""
+    return [one for one in moments_of(BAG, pipeline.garments[NAME]) if one.pair % 2 == 1]
+
+
+def seen_by(camera: PinholeCamera, meshes: list, rng: np.random.Generator) -> np.ndarray:
+    """A depth camera's points, wrong by 3 mm."""
+    depth = depth_image(meshes, camera).depth
+    row, column = np.nonzero(np.isfinite(depth))
+    z = depth[row, column] + rng.normal(0, 0.003, len(row))
+    x = (column + 0.5 - camera.centre[0]) / camera.focal[0] * z
+    y = (row + 0.5 - camera.centre[1]) / camera.focal[1] * z
+    return (np.stack((x, y, z), 1) - camera.translation) @ camera.rotation
+
+
+def test_the_visible_error_is_a_third_less(
+    pipeline: GarmentPipeline, observer: Observer, moments: list[Moment]
+) -> None:
+    faces, skin_faces = pipeline.garments[NAME].faces.numpy(), pipeline.body.faces.numpy()
+    rng, before, after = np.random.default_rng(0), [], []
+    for moment in moments[::5]:
+        observer.reset()
+        plain = pipeline(moment.frame)
+        middle, way = moment.truth.mean(0), rng.uniform(-np.pi, np.pi)
+        eye = middle + np.array([2 * np.sin(way), 0.4, 2 * np.cos(way)])
+        camera = PinholeCamera.looking_at(middle, eye, width=240, height=180)
+        skin = (plain.skin, skin_faces)
+        points = seen_by(camera, [(moment.truth, faces), skin], rng) + moment.frame.transl
+        out = observer(moment.frame, points, eye=eye + moment.frame.transl)
+        assert observer.matched[NAME] > 200
+        assert out.stats.garments[NAME].n_unresolved == 0
+        target = moment.truth[visible(moment.truth, faces, camera, [skin])]
+        for found, errors in ((plain, before), (out, after)):
+            square = igl.point_mesh_squared_distance(target, found[NAME].local.astype(np.float64), faces)[0]
+            errors.append(np.sqrt(square).mean())
+    assert np.mean(after) < 0.7 * np.mean(before)
+
+
+def test_without_points_it_is_the_prediction(
+    pipeline: GarmentPipeline, observer: Observer, moments: list[Moment]
+) -> None:
+    observer.reset()
+    plain, out = pipeline(moments[0].frame), observer(moments[0].frame)
+    assert np.abs(out[NAME].local - plain[NAME].local).max() < 1e-5
+    assert (out.body == plain.body).all()
+
+
+def test_it_follows_whichever_way_the_person_faces(
+    pipeline: GarmentPipeline, observer: Observer, moments: list[Moment]
+) -> None:
+    """Points of the true vertices, turned and moved with the person: the same cloth, turned and moved."""
+    frame, truth = moments[1].frame, moments[1].truth
+    found = []
+    for root in ([0.0, 0, 0], [0.0, 2.0, 0.0]):
+        pose = frame.pose.copy()
+        pose[0] = root
+        turned = SmplFrame(pose=pose, betas=frame.betas, style=frame.style, transl=[1.0, 2.0, 3.0])
+        still = SmplFrame(pose=np.concatenate((np.zeros((1, 3)), pose[1:])), betas=frame.betas, style=frame.style)
+        goal = pipeline(still)[NAME].local + np.array([0, 0, 0.01])
+        angle = root[1]
+        spin = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+        origin = pipeline.body.shape(torch.tensor(frame.betas)[None]).joints[0, 0].numpy()
+        observer.reset()
+        out = observer(turned, (goal - origin) @ spin.T + origin + turned.transl)
+        found.append((out[NAME].local - origin) @ spin + origin)
+    assert len(truth) == len(found[0])
+    assert np.abs(found[0] - found[1]).max() < 5e-4
+
+
+def test_points_inside_the_body_do_not_bring_cloth_into_it(pipeline: GarmentPipeline, observer: Observer) -> None:
+    observer.reset()
+    frame = SmplFrame(pose=np.zeros(72))
+    plain = pipeline(frame)
+    inside = 0.7 * plain[NAME].local + 0.3 * plain[NAME].local.mean(0)
+    ask = Clearance.of(pipeline)
+    for _ in range(5):
+        out = observer(frame, inside)
+    assert observer.matched[NAME] > 100
+    assert ask(out)[NAME].min() > 0
+    assert out.stats.garments[NAME].n_unresolved == 0
+
+
+def test_it_fades_and_stays_within_bounds(pipeline: GarmentPipeline, observer: Observer) -> None:
+    """Points that say the same for long move it only so far; without points it goes back."""
+    observer.reset()
+    frame = SmplFrame(pose=np.zeros(72))
+    plain = pipeline(frame)[NAME].local
+    wrong = plain + np.array([0.0, 0.0, 0.03])
+    way = [np.abs(observer(frame, wrong)[NAME].local - plain).max() for _ in range(12)]
+    assert way[0] > 0.01
+    assert max(way) < 0.1
+    assert abs(way[-1] - way[-2]) < 1e-3  # it has come to rest
+    later = SmplFrame(pose=np.zeros(72), stamp_ns=3_000_000_000)
+    observer(SmplFrame(pose=np.zeros(72), stamp_ns=1))
+    assert np.abs(observer(later)[NAME].local - plain).mean() < 0.2 * np.abs(wrong - plain).max()
+    reset = SmplFrame(pose=np.zeros(72), stamp_ns=2_000_000_000)  # time runs back: another recording
+    assert np.abs(observer(reset)[NAME].local - plain).max() < 1e-5
+
+
+def test_an_estimate_is_the_least_squares_of_prior_and_measurements() -> None:
+    rng = np.random.default_rng(0)
+    std = rng.uniform(0.5, 2, 6)
+    estimate = Estimate(std, np.full(6, 0.5), 50.0)
+    slopes, heights = rng.normal(size=(40, 6)), rng.normal(size=40)
+    before = estimate.precision()
+    mean, after = estimate.updated(before, slopes.T @ slopes, slopes.T @ heights)
+    wide = np.concatenate((slopes, np.diag(1 / std)))
+    assert np.allclose(mean, np.linalg.lstsq(wide, np.concatenate((heights, np.zeros(6))), rcond=None)[0])
+    estimate.take(mean, after)
+    assert (np.diag(estimate.covariance) < std**2).all()
+    estimate.wait(100.0)
+    assert np.abs(estimate.mean).max() < 1e-9
+    assert np.allclose(estimate.covariance, np.diag(std**2))
+
+
+def test_nothing_drifts_in_an_hour_of_bad_measurements() -> None:
+    std = np.array([0.01, 1.0])
+    estimate = Estimate(std, np.array([0.5, 20.0]), DEFAULT_OBSERVATION.bound)
+    for _ in range(2000):
+        estimate.wait(1 / 30)
+        before = estimate.precision()
+        mean, after = estimate.updated(before, np.diag([1e6, 1e3]), np.array([1e6, 1e6]))
+        estimate.take(mean, after)
+    assert (np.abs(estimate.mean) <= DEFAULT_OBSERVATION.bound * std + 1e-12).all()
+    assert np.linalg.eigvalsh(estimate.covariance).min() > 0
+
+
+@pytest.mark.parametrize(
+    ("points", "eye", "said"),
+    [
+        (np.zeros((4, 2)), None, r"points must be finite numbers of the shape \(N, 3\), got \(4, 2\)"),
+        (np.full((4, 3), np.nan), None, "leave out what isn't measured"),
+        ("cloud", None, "points must be numbers"),
+        (None, [0.0, 1.0], r"eye must be finite numbers of the shape \(3,\)"),
+    ],
+)
+def test_bad_points_get_a_sentence(observer: Observer, points: object, eye: object, said: str) -> None:
+    with pytest.raises(FrameError, match=said):
+        observer(SmplFrame(pose=np.zeros(72)), points, eye=eye)

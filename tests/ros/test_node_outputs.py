@@ -1,0 +1,471 @@
+"""What robots read: points, openings, meshes, obstacles and transforms, over real rclpy."""
+
+from __future__ import annotations
+
+import gc
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="rclpy isn't installed (extra ros): the node isn't tested")
+
+from geometry_msgs.msg import PolygonStamped, PoseStamped
+from harness import GARMENTS, PATIENCE_S, ROOT, Peer, frame, ros_arguments
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import CameraInfo, JointState, PointCloud2
+from shape_msgs.msg import Mesh
+from std_msgs.msg import String
+from visualization_msgs.msg import MarkerArray
+
+from msg_adapters import (
+    COLLISION_OBJECT,
+    IDS_LIST,
+    SCENE_UPDATE,
+    Transform,
+    TransformBuffer,
+    decode_marker_array,
+    encode_transforms,
+    encoder_for,
+    matrix_from_quaternion,
+    message_definition,
+    points_of,
+)
+from msg_adapters.cdr import CdrWriter
+from msg_adapters.inputs._ros4hri import AXES
+from refu_core import GarmentPipeline, SmplFrame, load_garment
+from refu_core.outputs import Openings
+from refu_ros import garment_node
+from refu_ros._node import GarmentNode
+from refu_ros._program import make_executor
+
+pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")
+PLAIN = {"input_type": "joint_state", "garments": [*GARMENTS], "backbone": "skinned", "sdf": "none"}
+TSHIRT = GARMENTS[0]
+
+
+class Robot:
+    """A node in this process, and a peer that hears what is asked for; both move when the test waits."""
+
+    def __init__(self, *persons: str, **parameters: Any) -> None:
+        self.node = GarmentNode(cli_args=ros_arguments(PLAIN | parameters))
+        self.peer = Peer(*persons)
+        self.peer.unwatch()
+        self.heard: dict[str, list[Any]] = {}
+        self._executor = make_executor()
+        self._executor.add_node(self.node)
+        assert garment_node.started(self.node)
+
+    def hear(self, topic: str, kind: Any, *, raw: bool = False) -> Any:
+        """Subscribes; what comes is in `heard`."""
+        came: list[Any] = self.heard.setdefault(topic, [])
+        return self.peer.node.create_subscription(kind, topic, came.append, 10, raw=raw)
+
+    def until(self, condition: Callable[[], Any], what: str, **options: Any) -> None:
+        """Fails with `what` when it doesn't come true."""
+
+        def both() -> Any:
+            self._executor.spin_once(timeout_sec=0.02)
+            return condition()
+
+        self.peer.spin_until(both, what, **options)
+
+    def sends(self, sent: SmplFrame, *topics: str, person: str = "", data: bytes | None = None) -> None:
+        """Until each topic has brought something of it."""
+        for topic in topics:
+            self.heard[topic].clear()
+
+        def came() -> bool:
+            self.peer.send_raw(data or encoder_for("joint_state")(sent), person)
+            return all(self.heard[topic] and _is_of(self.heard[topic][-1], sent) for topic in topics)
+
+        self.until(came, f"{topics} come")
+
+    def close(self) -> None:
+        self._executor.remove_node(self.node)
+        self.node.close()
+        self.node.destroy_node()
+        self.peer.close()
+        del self.node, self._executor
+        gc.collect()
+
+
+def _is_of(message: Any, sent: SmplFrame) -> bool:
+    """Whether it may be of the frame: by its stamp, where it has one."""
+    stamp = message.header.stamp if hasattr(message, "header") else None
+    return stamp is None or stamp.sec * 10**9 + stamp.nanosec == sent.stamp_ns
+
+
+@pytest.fixture
+def robot(ros: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Robot]]:  # noqa: ARG001
+    """Makes robots."""
+    monkeypatch.setattr("refu_ros._listener._GRACE_S", 0.0)
+    made: list[Robot] = []
+
+    def make(*persons: str, **parameters: Any) -> Robot:
+        made.append(Robot(*persons, **parameters))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.close()
+
+
+@pytest.fixture
+def foreign(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
+    """Packages that pip doesn't have, by name alone: what goes over the wire is our bytes under another type's name."""
+
+    def make(*types: str) -> Any:
+        for name in types:
+            package, kind, type_name = name.split("/")
+            module = ModuleType(f"{package}.{kind}")
+            setattr(module, type_name, String)
+            monkeypatch.setitem(sys.modules, package, ModuleType(package))
+            monkeypatch.setitem(sys.modules, f"{package}.{kind}", module)
+        return String
+
+    return make
+
+
+def count(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Every part that is computed for an output, by name, from now on."""
+    made: list[str] = []
+
+    def counted(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*arguments: Any, **options: Any) -> Any:
+            made.append(name)
+            return function(*arguments, **options)
+
+        return call
+
+    for place in (
+        "outputs._normals.VertexNormals.__call__",
+        "outputs._openings.Openings.frames",
+        "outputs._planner.PlannerMesh.solid",
+        "outputs._clearance.Clearance.__call__",
+        "outputs._sigma.Sigma.__call__",
+        "outputs._limbs.LimbContacts.__call__",
+        "realtime._pipeline.GarmentPipeline.__call__",
+    ):
+        path, _, method = f"refu_core.{place}".rpartition(".")
+        module, _, owner = path.rpartition(".")
+        whole = getattr(sys.modules[module], owner)
+        monkeypatch.setattr(whole, method, counted(owner, getattr(whole, method)))
+    return made
+
+
+def test_points_openings_and_meshes_are_those_of_the_pipeline(
+    robot: Callable[..., Robot], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each computed for who subscribes, and nothing else."""
+    scene = robot()
+    made = count(monkeypatch)
+    wanted = GarmentPipeline.load(GARMENTS, backbone="skinned", sdf="none")
+    sleeve = "openings/tshirt_male/left_sleeve"
+    sent = frame(3, transl=(1.0, 2.0, 3.0))
+    mesh = wanted(sent)[TSHIRT]
+    made.clear()
+    vertices = mesh.vertices[:, [2, 0, 1]]
+    (opening,) = (one for one in Openings(wanted.garments[TSHIRT]).frames(vertices) if one.name == "left_sleeve")
+    made.clear()
+
+    scene.until(lambda: scene.peer.node.count_publishers(sleeve), "the topics are there")
+    for i in range(5):
+        scene.peer.send(frame(i))
+        scene.peer.spin(0.02)
+    assert made == []
+
+    cloud = scene.hear("points", PointCloud2)
+    scene.sends(sent, "points")
+    assert set(made) == {"GarmentPipeline", "VertexNormals", "Clearance", "Sigma"}
+    message = scene.heard["points"][-1]
+    assert (message.header.frame_id, message.header.stamp.sec) == ("map", sent.stamp_ns // 10**9)
+    points = points_of(message)
+    own = points[points["garment"] == [*wanted.garments].index(TSHIRT)]
+    np.testing.assert_array_equal(own["vertex"], np.arange(len(vertices)))
+    np.testing.assert_allclose(np.stack([own["x"], own["y"], own["z"]], 1), vertices, atol=1e-5)
+    lengths = np.linalg.norm(np.stack([own[f"normal_{axis}"] for axis in "xyz"], 1), axis=1)
+    np.testing.assert_allclose(lengths, 1, atol=1e-5)
+    assert np.isfinite(own["clearance"]).all()
+    assert (own["sigma"] > 0).all()
+    assert "visible" not in points.dtype.names  # there is no camera
+    (result,) = scene.node.set_parameters([Parameter("points_fields", value=["normal", "garment"])])
+    assert result.successful, result.reason
+    scene.sends(frame(4), "points")
+    made.clear()
+    scene.sends(frame(5), "points")
+    assert set(made) == {"GarmentPipeline", "VertexNormals"}
+    scene.peer.node.destroy_subscription(cloud)
+
+    scene.until(lambda: not scene.node.watchers("points"), "nobody listens to points")
+    scene.hear(sleeve, PolygonStamped)
+    scene.sends(frame(6), sleeve)
+    made.clear()
+    scene.sends(sent, sleeve)
+    assert set(made) == {"GarmentPipeline", "Openings"}
+    ring = [(p.x, p.y, p.z) for p in scene.heard[sleeve][-1].polygon.points]
+    np.testing.assert_allclose(ring, opening.ring, atol=1e-4)
+
+    scene.hear("openings", MarkerArray, raw=True)
+    scene.hear("mesh/short_pant_male", Mesh)
+    scene.sends(sent, "openings", "mesh/short_pant_male")
+    rims = {marker.ns: marker for marker in decode_marker_array(scene.heard["openings"][-1])}
+    assert {"tshirt-male/neck", "tshirt-male/hem", "short-pant-male/waist"} <= set(rims)
+    pose = rims["tshirt-male/left_sleeve"].pose
+    np.testing.assert_allclose(pose[:3], opening.centre, atol=1e-4)
+    np.testing.assert_allclose(matrix_from_quaternion(pose[3:]), opening.rotation, atol=1e-3)
+    solid = scene.heard["mesh/short_pant_male"][-1]
+    assert 1000 < len(solid.triangles) <= 2000
+    corners = np.array([(p.x, p.y, p.z) for p in solid.vertices])
+    shorts = wanted(sent)[GARMENTS[1]].vertices[:, [2, 0, 1]]
+    np.testing.assert_allclose(corners.min(0), shorts.min(0), atol=0.02)
+    np.testing.assert_allclose(corners.max(0), shorts.max(0), atol=0.02)
+
+
+def test_nobody_listens_and_nothing_is_computed(robot: Callable[..., Robot], monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = robot(lazy=False)
+    made = count(monkeypatch)
+    scene.until(lambda: scene.peer.listeners(), "the node listens")
+
+    def ignored() -> bool:
+        scene.peer.send(frame(1))
+        return scene.node.statistics.report().total["skip.unwatched"] > 5
+
+    scene.until(ignored, "frames come")
+    assert made == []
+
+
+def test_persons_have_topics_of_their_own(robot: Callable[..., Robot]) -> None:
+    scene = robot("ann", "bob", persons=["ann", "bob"], garments=[TSHIRT])
+    scene.hear("ann/points", PointCloud2)
+    scene.hear("bob/points", PointCloud2)
+    scene.hear("contacts", String)
+    scene.until(lambda: scene.node.watchers("ann/points") and scene.node.watchers("bob/points"), "they are connected")
+    scene.sends(frame(1), "ann/points", person="ann")
+    assert not scene.heard["bob/points"]
+    (result,) = scene.node.set_parameters([Parameter("garments", value=[GARMENTS[1]])])
+    assert result.successful
+    graph = scene.peer.node.count_publishers
+    scene.until(lambda: graph("ann/openings/short_pant_male/waist"), "what is worn now has topics")
+    scene.until(lambda: not graph("ann/openings/tshirt_male/neck"), "what was worn has none any more")
+    scene.sends(frame(2), "ann/points", person="ann")
+
+
+def test_obstacles_are_added_moved_and_removed(robot: Callable[..., Robot], foreign: Callable[..., Any]) -> None:
+    kind = foreign(COLLISION_OBJECT, SCENE_UPDATE)
+    scene = robot(garments=[GARMENTS[1]], planner_rate=0.0, person_timeout=1.0)
+    scene.hear("collision_object", kind, raw=True)
+    scene.hear("scene", kind, raw=True)
+    store = get_typestore(Stores.ROS2_JAZZY)
+    found = get_types_from_msg(message_definition(COLLISION_OBJECT).text, COLLISION_OBJECT)
+    store.register({name: fields for name, fields in found.items() if name not in store.fielddefs})
+
+    def heard() -> list[Any]:
+        return [store.deserialize_cdr(data, COLLISION_OBJECT) for data in scene.heard["collision_object"]]
+
+    scene.sends(frame(1, stamp_ns=10**9), "collision_object", "scene")
+    first = heard()[0]
+    assert (first.id, first.operation, first.header.frame_id) == (GARMENTS[1], first.ADD, "map")
+    assert 1000 < len(first.meshes[0].triangles) <= 2000
+    assert set(first.subframe_names) == {"waist", "left_leg", "right_leg"}
+    assert len(scene.heard["scene"][0]) > 100_000
+    stamps = iter(range(2 * 10**9, 10**12, 10**8))
+
+    def moved() -> bool:
+        scene.peer.send(frame(1, stamp_ns=next(stamps), transl=(0.1, 0.0, 0.0)))
+        return any(one.operation == one.MOVE and not one.meshes and one.pose.position.y > 0.05 for one in heard())
+
+    scene.until(moved, "who has only moved is moved")
+    another = scene.hear("collision_object", kind, raw=True)
+
+    def added_anew() -> bool:
+        scene.heard["collision_object"].clear()
+        scene.peer.send(frame(1, stamp_ns=next(stamps)))
+        scene.peer.spin(0.05)
+        return any(one.operation == one.ADD for one in heard())
+
+    scene.until(added_anew, "who subscribes later is told all")
+    scene.peer.node.destroy_subscription(another)
+    scene.until(lambda: any(one.operation == one.REMOVE for one in heard()), "who has left is removed")
+
+
+def world() -> tuple[bytes, TransformBuffer]:
+    """A camera on a mast, 2 m high, that looks along x, 20° down: /tf_static, and the same for the test."""
+    optical = Rotation.from_euler("ZYX", [-90, 0, -90], degrees=True)
+    ones = [
+        Transform(0, "map", "mast", [1.0, 2.0, 2.0], Rotation.from_euler("y", 20, degrees=True).as_quat()),
+        Transform(0, "mast", "optical", [0, 0, 0], optical.as_quat()),
+    ]
+    data, buffer = encode_transforms(ones), TransformBuffer()
+    buffer.put(data, is_static=True)
+    return data, buffer
+
+
+def test_an_input_in_a_cameras_frame_is_seen_in_the_robots(
+    robot: Callable[..., Robot], foreign: Callable[..., Any]
+) -> None:
+    kind = foreign("tf2_msgs/msg/TFMessage")
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    scene = robot(garments=[TSHIRT], input_axes="frame", camera_info="camera_info")
+    static = scene.peer.node.create_publisher(kind, "/tf_static", latched)
+    data, buffer = world()
+    static.publish(data)
+    info = scene.peer.node.create_publisher(CameraInfo, "camera_info", 1)
+    calibrated = CameraInfo(width=640, height=480, k=[500.0, 0, 320, 0, 500, 240, 0, 0, 1])
+    calibrated.header.frame_id = "optical"
+    scene.hear("points", PointCloud2)
+    pose = np.zeros((24, 3))
+    pose[0] = Rotation.from_euler("x", 180, degrees=True).as_rotvec()  # upright, where y points down; faces the camera
+    sent = SmplFrame(pose, transl=np.array([0.0, 0.2, 3.0]), stamp_ns=5 * 10**9)
+    message = encoder_for("joint_state")(sent, frame_id="optical")
+
+    def sees() -> bool:
+        info.publish(calibrated)
+        scene.peer.send_raw(message)
+        came = scene.heard["points"]
+        return bool(came) and "visible" in points_of(came[-1]).dtype.names
+
+    scene.until(sees, "points come, and the camera is known")
+    points = points_of(scene.heard["points"][-1])
+    got = np.stack([points["x"], points["y"], points["z"]], 1)
+    mesh = GarmentPipeline.load([TSHIRT], backbone="skinned", sdf="none")(sent)[TSHIRT]
+    place = buffer.lookup("map", "optical", 0)
+    np.testing.assert_allclose(got, mesh.vertices @ place.rotation.T + place.translation, atol=1e-5)
+    # By hand: 3 m along a view that goes 20° down from 2 m, and the shirt is upright but for these.
+    assert got[:, 0].mean() == pytest.approx(1.0 + 3.0 * np.cos(np.radians(20)), abs=0.25)
+    assert got[:, 2].max() - got[:, 2].min() > 0.5
+    seen = points["visible"].astype(bool)
+    assert 0.3 < seen.mean() < 0.65  # about half of a shirt faces the camera
+    normals = np.stack([points[f"normal_{axis}"] for axis in "xyz"], 1)
+    facing = ((got - [1.0, 2.0, 2.0]) * normals).sum(1) < 0
+    assert (facing[seen]).mean() > 0.85
+
+    late = encode_transforms([Transform(4 * 10**9, "map", "other", [0, 0, 0], [0, 0, 0, 1])])
+    moving = scene.peer.node.create_publisher(kind, "/tf", 10)
+
+    def dropped() -> bool:
+        moving.publish(late)
+        scene.peer.send_raw(encoder_for("joint_state")(sent, frame_id="other"))
+        report = scene.node.statistics.report()
+        return "1.000 s older" in report.reasons.get("transform", "")
+
+    scene.until(dropped, "an input without a transform at its time is counted, with the reason")
+    with_tolerance = [Parameter("transform_tolerance", value=2.0)]
+    assert scene.node.set_parameters(with_tolerance)[0].successful
+
+    def late_ones() -> bool:
+        scene.peer.send_raw(encoder_for("joint_state")(sent, frame_id="other"))
+        return scene.node.statistics.report().total["late_transform"] > 0
+
+    scene.until(late_ones, "late transforms are counted")
+
+
+def test_without_transforms_the_frame_is_warned_of(
+    robot: Callable[..., Robot], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where tf2_msgs isn't there nothing is lost: people are shown as they were sent."""
+    monkeypatch.setitem(sys.modules, "tf2_msgs", None)
+    scene = robot(garments=[TSHIRT])
+    scene.hear("points", PointCloud2)
+    scene.sends(frame(1), "points", data=encoder_for("joint_state")(frame(1), frame_id="camera"))
+    assert scene.heard["points"][-1].header.frame_id == "map"
+    scene.peer.diagnostics.clear()
+    scene.until(lambda: scene.peer.diagnostics, "the node says how it is")
+    assert scene.peer.status("input")[2]["frame"] == "camera, shown as map"
+
+
+def test_who_is_tracked_is_followed(robot: Callable[..., Robot], foreign: Callable[..., Any]) -> None:
+    """REP-155: where somebody says who is tracked, nobody else; each in the frame of their body."""
+    kind = foreign(IDS_LIST, "tf2_msgs/msg/TFMessage")
+    people = Peer("ann", "bob", topic="/humans/bodies/{}/joint_states")
+    people.unwatch()
+    scene = robot(follow_humans=True, garments=[TSHIRT], person_timeout=30.0)
+    scene.hear("garments", MarkerArray, raw=True)
+    scene.until(lambda: people.listeners("ann") and people.listeners("bob"), "nobody says who is tracked")
+    tracked = people.node.create_publisher(kind, "/humans/bodies/tracked", 1)
+
+    def says(*ids: str) -> None:
+        writer = CdrWriter()
+        writer.header(0, "")
+        writer.strings(ids)
+        tracked.publish(writer.to_bytes())
+
+    def only_ann() -> bool:
+        says("ann", "eve")
+        return bool(people.listeners("ann")) and not people.listeners("bob")
+
+    scene.until(only_ann, "ann alone is tracked")
+    scene.until(lambda: scene.peer.node.count_publishers("ann/points"), "she has topics")
+    names = [f"{joint}_ann" for joint in AXES]
+    message = JointState(name=names, position=[0.0] * len(names))
+    message.header.stamp.sec = 5
+    moving = people.node.create_publisher(kind, "/tf", 10)
+    place = encode_transforms([Transform(5 * 10**9, "map", "body_ann", [4.0, 5.0, 1.0], [0, 0, 0, 1])])
+    people.fall_silent("bob")
+    sender = people.node.create_publisher(JointState, "/humans/bodies/ann/joint_states", 1)
+
+    def stands_there() -> bool:
+        moving.publish(place)
+        sender.publish(message)
+        came = [marker for data in scene.heard["garments"] for marker in decode_marker_array(data)]
+        return any(abs(marker.points.mean(0) - [4.0, 5.0, 1.25]).max() < 0.15 for marker in came if len(marker.points))
+
+    scene.until(stands_there, "she is dressed where tf has her body")
+    says()
+    scene.until(lambda: not people.listeners("ann"), "nobody is tracked")
+    people.close()
+
+
+def test_the_example_in_python_hears_the_node(robot: Callable[..., Robot], tmp_path: Path) -> None:
+    scene = robot(garments=[TSHIRT])
+    scene.hear("gripper_target", PoseStamped)
+    log = tmp_path / "log.txt"
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{os.environ.get('PYTHONPATH', '')}"}
+    with log.open("wb") as file:
+        example = subprocess.Popen(
+            [sys.executable, str(ROOT / "examples" / "ros" / "sleeve_listener.py")],
+            env=environment,
+            stdout=file,
+            stderr=file,
+        )
+    try:
+
+        def came() -> bool:
+            assert example.poll() is None, log.read_text()
+            scene.peer.send(frame(1))
+            return bool(scene.heard["gripper_target"]) and "mm off the skin" in log.read_text()
+
+        scene.until(came, "the example says what it has heard")
+        example.send_signal(signal.SIGINT)
+        assert example.wait(timeout=PATIENCE_S) == 0, log.read_text()
+    finally:
+        example.kill()
+        example.wait()
+    target = scene.heard["gripper_target"][-1]
+    garment = load_garment(TSHIRT)
+    worn = GarmentPipeline.load([TSHIRT], backbone="skinned", sdf="none")(frame(1))[TSHIRT].vertices[:, [2, 0, 1]]
+    (sleeve,) = (one for one in Openings(garment).frames(worn) if one.name == "left_sleeve")
+    place = np.array([target.pose.position.x, target.pose.position.y, target.pose.position.z])
+    assert 0.1 < (place - sleeve.centre) @ sleeve.rotation[:, 2] < 0.2
+    q = target.pose.orientation
+    into = matrix_from_quaternion([q.x, q.y, q.z, q.w])[:, 2]
+    assert into @ sleeve.rotation[:, 2] < -0.9
+
+
+@pytest.mark.skipif(shutil.which("colcon") is None or shutil.which("ros2") is None, reason="there is no rclcpp here")
+def test_the_example_in_cpp_builds(tmp_path: Path) -> None:
+    source = ROOT / "examples" / "ros" / "refu_listener_cpp"
+    command = ["colcon", "build", "--paths", str(source)]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=PATIENCE_S)
+    assert done.returncode == 0, done.stdout + done.stderr
