@@ -87,11 +87,18 @@ def _convert(folder: Path, frames: list[SmplFrame], rounds: int) -> None:
         )
 
 
-def _long(folder: Path, frames: list[SmplFrame], count: int, garments: tuple[str, ...]) -> None:
+def _long(folder: Path, frames: list[SmplFrame], count: int, garments: tuple[str, ...], *, with_body: bool) -> None:
     """Converts a recording of so many frames; its log memory.txt gets a line each half minute."""
     encode, log = adapters.encoder_for("multiarray"), folder / "memory.txt"
     out = folder / "long-out.mcap"
-    options = ReplayOptions(input=folder / "long.mcap", output=out, garments=garments, evaluate=False, overwrite=True)
+    options = ReplayOptions(
+        input=folder / "long.mcap",
+        output=out,
+        garments=garments,
+        evaluate=False,
+        overwrite=True,
+        with_body=with_body,
+    )
     with adapters.BagWriter(options.input, overwrite=True) as writer:
         writer.add_topic("/smpl_params", adapters.INPUT_TYPES["multiarray"])
         for i in range(count):
@@ -128,6 +135,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--long", type=int, default=108_000)
     parser.add_argument("--garments", default="tshirt-male", help="of the long recording")
+    parser.add_argument("--no-body", action="store_true", help="the long recording's output has garments alone")
     parser.add_argument("--folder", type=Path, help="of the long recording, and its log memory.txt (a temporary one)")
     parser.add_argument("--only", choices=("workers", "convert", "long"))
     args = parser.parse_args()
@@ -139,7 +147,7 @@ def main() -> None:
         if args.only == "long":
             place = args.folder or folder
             place.mkdir(parents=True, exist_ok=True)
-            _long(place, frames, args.long, tuple(args.garments.split(",")))
+            _long(place, frames, args.long, tuple(args.garments.split(",")), with_body=not args.no_body)
             print((place / "memory.txt").read_text())
         if args.only in (None, "workers"):
             (folder / "bags").mkdir()
