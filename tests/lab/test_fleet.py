@@ -169,13 +169,16 @@ def test_what_is_finished_is_not_done_again(bags: Path, alone: Path, tmp_path: P
     assert "0 of them before" in capsys.readouterr().out
 
 
-def test_results_by_url_are_those_by_path(bags: Path, alone: Path, tmp_path: Path, capsys: Any) -> None:
+def test_results_by_url_are_those_by_path(bags: Path, tmp_path: Path, capsys: Any) -> None:
     arguments = [f"file://{bags}/a", "--output", f"file://{tmp_path}/out", "--no-evaluate"]
+    assert run(bags / "a", "--output", tmp_path / "by-path", "--no-evaluate") == 0
     assert run(*arguments) == 0
     assert run(*arguments) == 0
     assert "2 of 2 recordings replayed, 2 of them before" in capsys.readouterr().out
     for name in ("walk", "turn"):
-        assert (tmp_path / "out" / f"{name}.mcap").read_bytes() == (alone / "a" / f"{name}.mcap").read_bytes()
+        by_url, by_path = ((tmp_path / folder / f"{name}.mcap").read_bytes() for folder in ("out", "by-path"))
+        is_same = by_url == by_path  # pytest would look for all differences of a million bytes
+        assert is_same
     record = json.loads((tmp_path / "out" / "walk.json").read_text())
     assert (record["frames"], record["garments"], record["worst"]) == (2, {}, [])
 

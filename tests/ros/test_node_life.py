@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import time
+from contextlib import closing
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -78,13 +79,12 @@ def test_a_signal_ends_it_while_it_loads(ros: None, tmp_path: Path, number: sign
 
 
 def test_its_frame_is_compared_with_the_senders(ros: None, tmp_path: Path) -> None:  # noqa: ARG001
-    with NodeProcess(tmp_path / "log.txt", **CHEAP, frame_id="odom") as node:
-        peer = Peer()
+    with NodeProcess(tmp_path / "log.txt", **CHEAP, frame_id="odom") as node, closing(Peer()) as peer:
         peer.wait_for_node()
         marker = peer.dress(frame(1))
         assert marker.lifetime_ns == 2 * 10**9
         peer.spin_until(lambda: peer.status("input")[2].get("frame") == "map, shown as odom", "both frames are named")
-        assert node.log.count("is in the frame map") == 1
+        assert node.log.count("is in map, the garments are in odom") == 1
         for line in (
             "configured with tshirt-male",
             "listening to /smpl_params",
@@ -94,4 +94,3 @@ def test_its_frame_is_compared_with_the_senders(ros: None, tmp_path: Path) -> No
             assert line in node.log
         hardware = {status.hardware_id for array in peer.diagnostics for status in array.status}
         assert hardware - {""}
-        peer.close()
