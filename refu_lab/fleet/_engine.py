@@ -178,10 +178,11 @@ class DaskEngine:
 
     def _result(self, future: Future[Any]) -> Any:
         from distributed import CancelledError, KilledWorker
+        from distributed.comm import CommClosedError
 
         try:
             return future.result()  # where that was on a worker that has died since, the task is done again
-        except CancelledError as error:
+        except (CancelledError, CommClosedError) as error:
             msg = "the Dask scheduler is gone; what is finished is kept: give the same command again to go on"
             raise FleetError(msg) from error
         except KilledWorker:
