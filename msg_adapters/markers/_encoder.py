@@ -253,30 +253,12 @@ def encode_strips(
     Raises:
         EncodeError: points of another shape, not finite, none at all, or a stamp that doesn't fit a ROS time.
     """
-    writer, points_at = CdrWriter(), []
-    writer.numbers("I", len(strips))
-    for ns, stamp_ns, pose, points in strips:
+    for ns, _, pose, points in strips:
         if points.ndim != 2 or points.shape[1] != 3 or not len(points) or not np.isfinite(points.sum() + pose.sum()):
             msg = f"{ns}: wanted finite points of shape (K, 3), K > 0, in a finite pose, got {points.shape}"
             raise EncodeError(msg)
-        _, at, _ = _write_marker(
-            writer,
-            key=(ns, 0),
-            action=ADD,
-            frame_id=frame_id,
-            stamp_ns=stamp_ns,
-            color=color,
-            n_points=len(points),
-            kind=LINE_STRIP,
-            size=width,
-            lifetime_ns=lifetime_ns,
-            pose=pose.tolist(),
-        )
-        points_at.append(at)
-    message = bytearray(writer.to_bytes())
-    for at, (*_, points) in zip(points_at, strips, strict=True):
-        message[HEADER_BYTES + at : HEADER_BYTES + at + points.nbytes] = points.astype("<f8").tobytes()
-    return bytes(message)
+    lists = [(ns, stamp_ns, pose.tolist(), points) for ns, stamp_ns, pose, points in strips]
+    return _encode_lists(LINE_STRIP, lists, frame_id=frame_id, color=color, size=width, lifetime_ns=lifetime_ns)
 
 
 def encode_points(
@@ -305,22 +287,41 @@ def encode_points(
     if array.ndim != 2 or array.shape[1] != 3 or not len(array) or not np.isfinite(array).all():
         msg = f"{ns}: wanted finite points of shape (V, 3), V > 0, got {array.shape}"
         raise EncodeError(msg)
-    writer = CdrWriter()
-    writer.numbers("I", 1)
-    _, points_at, _ = _write_marker(
-        writer,
-        key=(ns, 0),
-        action=ADD,
-        frame_id=frame_id,
-        stamp_ns=stamp_ns,
-        color=color,
-        n_points=len(array),
-        kind=POINTS,
-        size=size,
-    )
+    lists = [(ns, stamp_ns, _IDENTITY_POSE, array)]
+    return _encode_lists(POINTS, lists, frame_id=frame_id, color=color, size=size)
+
+
+def _encode_lists(
+    kind: int,
+    lists: Sequence[tuple[str, int, Sequence[float], NDArray[np.float64]]],
+    *,
+    frame_id: str,
+    color: Rgba,
+    size: float,
+    lifetime_ns: int = 0,
+) -> bytes:
+    """A MarkerArray with a marker each of namespace, stamp, pose and finite points (K, 3)."""
+    writer, points_at = CdrWriter(), []
+    writer.numbers("I", len(lists))
+    for ns, stamp_ns, pose, points in lists:
+        _, at, _ = _write_marker(
+            writer,
+            key=(ns, 0),
+            action=ADD,
+            frame_id=frame_id,
+            stamp_ns=stamp_ns,
+            color=color,
+            n_points=len(points),
+            kind=kind,
+            size=size,
+            lifetime_ns=lifetime_ns,
+            pose=pose,
+        )
+        points_at.append(at)
     message = bytearray(writer.to_bytes())
-    start = HEADER_BYTES + points_at
-    message[start : start + array.nbytes] = array.astype("<f8").tobytes()
+    for at, (*_, points) in zip(points_at, lists, strict=True):
+        data = points.astype("<f8").tobytes()
+        message[HEADER_BYTES + at : HEADER_BYTES + at + len(data)] = data
     return bytes(message)
 
 

@@ -189,9 +189,7 @@ def make_outputs(*, tf: bool = False) -> list[Output]:
         Apart(POINT_CLOUD, lambda _: [("points", None)], _Points().encode),
         Apart(DIAGNOSTIC_ARRAY, lambda _: [("contacts", None)], _encode_contacts),
         Apart(POLYGON, _opening_places, _encode_polygon),
-        Apart(
-            MESH, lambda fittings: [(f"mesh/{_token(name)}", name) for name in fittings.names], _encode_mesh, slow=True
-        ),
+        Apart(MESH, _mesh_places, _encode_mesh, slow=True),
         Obstacles(),
     ]
     if tf:

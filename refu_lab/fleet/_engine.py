@@ -137,12 +137,6 @@ class DaskEngine:
         self.client = client
         """Whose workers run them."""
 
-    @property
-    def dashboard(self) -> str | None:
-        """Where the workers can be watched, if anywhere."""
-        link = self.client.dashboard_link
-        return link if link and find_spec("bokeh") is not None else None
-
     def run(
         self, make: Callable[[], Callable[[Task], Result]], tasks: Sequence[Task]
     ) -> Iterator[tuple[int, Result | Lost]]:
