@@ -210,7 +210,9 @@ def part(v: int, work: Work, segments: Segments, bones: Bones, rings: Rings, rou
         sunk = wp.dot(start - p, normal)
         for k in range(segments.trees.shape[0]):
             if (touched >> k) & 1 == 1:
-                far = wp.where((outside >> k) & 1 == 1, wp.min(segments.gap[v, k] + sunk, reach), reach)
+                # The surface is within the gap of where `touch` found it; only `deepen` looks farther inside.
+                is_at = (outside >> k) & 1 == 1 or work.is_front[v] == 0
+                far = wp.where(is_at, wp.min(segments.gap[v, k] + wp.length(p - start), reach), reach)
                 ratio = segments.ratio[own, k]
                 found, away = way_out(p, normal, sunk, k, ratio, segments.gap[v, k], far, segments, bones)
                 step += wp.length_sq(found) * found

@@ -69,6 +69,7 @@ class Layer:
         self._push = torch.zeros(len(candidates), 3, device=self.device)
         self._extent = torch.zeros(2, 3, device=self.device)
         self._fields = torch.zeros(2, len(rows) + 1, 3, device=self.device)
+        self._looks = torch.zeros(len(rows), dtype=torch.int32, device=self.device)
         self._count = torch.zeros(1, dtype=torch.int32, device=self.device)
         self._n_doubtful = torch.zeros(1, dtype=torch.int32, device=self.device)
         self._tree: Any = None
@@ -127,6 +128,7 @@ class Layer:
         torch.aminmax(self._below, dim=0, out=(self._extent[0], self._extent[1]))
         self._commands["normals"].launch()
         self._tree_is_late = True
+        self._looks.fill_(1)
 
     def _look(self, search: str) -> None:
         """What has to be pushed, and how many vertices that are; a device that isn't waited for asks about everyone."""
@@ -177,6 +179,7 @@ class Layer:
             wp.zeros(self._n_candidates, dtype=wp.int32, device=str(self.device)) for _ in range(3)
         )
         itself = _ints(np.arange(self._n_candidates + 1), self.device)
+        looks = as_warp(self._looks, wp.int32)
         search = [below, below_cut, above, rows]
         garments = [below, normals, below_cut, above, above_cut, rows]
         pushed = [closest, push, as_warp(self._count, wp.int32)]
@@ -184,16 +187,16 @@ class Layer:
         blend = [push, start, ring]
         reached = [wp.zeros(self._n_region, dtype=wp.int32, device=str(self.device)) for _ in range(2)]
         extent = as_warp(self._extent, wp.vec3)
-        again = [start, ring, found, extent, later, *pushed, *doubts]
+        again = [start, ring, looks, found, extent, later, *pushed, *doubts]
         for name, kernel, size, arguments in (
             ("normals", kernels.normals_kernel, len(self._below), [below, below_cut, normals]),
-            ("search", kernels.search_kernel, self._n_candidates, [*search, near_start, near, found]),
-            ("search again", kernels.search_kernel, self._n_candidates, [*search, itself, closest, found]),
+            ("search", kernels.search_kernel, self._n_candidates, [*search, near_start, near, looks, found]),
+            ("search again", kernels.search_kernel, self._n_candidates, [*search, itself, closest, looks, found]),
             (
                 "lift",
                 kernels.lift_kernel,
                 self._n_candidates,
-                [*garments, start, ring, found, extent, rules, *pushed, *doubts],
+                [*garments, start, ring, looks, found, extent, rules, *pushed, *doubts],
             ),
             ("lift again", kernels.lift_kernel, self._n_candidates, [*garments, *again]),
             (
@@ -210,8 +213,8 @@ class Layer:
             ),
             ("spread0", kernels.spread_kernel, self._n_region, [*blend, fields[0], fields[1]]),
             ("spread1", kernels.spread_kernel, self._n_region, [*blend, fields[1], fields[0]]),
-            ("move", kernels.move_kernel, self._n_region, [rows, fields[0], above]),
-            ("move all", kernels.move_all_kernel, 1, [*blend, rows, 0, *reached, *fields, above]),
+            ("move", kernels.move_kernel, self._n_region, [rows, fields[0], above, looks]),
+            ("move all", kernels.move_all_kernel, 1, [*blend, rows, 0, *reached, *fields, above, looks]),
         ):
             self._commands[name] = wp.launch(kernel, size, arguments, device=str(self.device), record_cmd=True)
 

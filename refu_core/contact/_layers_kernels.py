@@ -125,15 +125,18 @@ def search_kernel(
     candidates: wp.array[int],
     near_start: wp.array[int],
     near: wp.array[int],
+    looks: wp.array[int],
     # output, by candidate
     found: wp.array[int],
 ) -> None:
-    """Which vertex of the sheet below each candidate comes to, downhill.
+    """Which vertex of the sheet below each candidate that `looks` comes to, downhill.
 
     From the nearest of those to look from, which are `near[near_start[k]:near_start[k + 1]]`; or -1, if they are -1.
     `STRANGER` where there are none.
     """
     k = wp.tid()
+    if looks[k] == 0:
+        return
     if near_start[k] == near_start[k + 1]:
         found[k] = STRANGER
         return
@@ -207,6 +210,7 @@ def lift_kernel(
     candidates: wp.array[int],
     ring_start: wp.array[int],
     ring: wp.array[int],
+    looks: wp.array[int],
     found: wp.array[int],
     extent: wp.array[wp.vec3],
     rules: LayerRules,
@@ -217,7 +221,7 @@ def lift_kernel(
     doubtful: wp.array[int],
     n_doubtful: wp.array[int],
 ) -> None:
-    """What brings each candidate to the gap above the sheet, and how many they are that lack something.
+    """What brings each candidate that `looks` to the gap above the sheet, and how many they are that lack something.
 
     A fold that one candidate's search ended in is seldom in the way of its neighbours': what these `found` is looked
     at, too. Whoever is far below the sheet is `doubtful`, and only listed. `closest` is the vertex of the sheet that
@@ -227,6 +231,8 @@ def lift_kernel(
     i = candidates[k]
     p = above[i]
     push[k] = wp.vec3(0.0, 0.0, 0.0)
+    if looks[k] == 0:
+        return
     v = int(found[k])
     closest[k] = -1
     if v == STRANGER:
@@ -247,10 +253,13 @@ def lift_kernel(
                     v = found[j]
         if v != found[k]:
             v = nearest_vertex(p, v, below, below_cut)
-    # No point of a face is farther than its longest edge from its closest corner.
-    if wp.length(below[v] - p) > rules.reach + rules.longest:
+    away = wp.length(below[v] - p)
+    if away > rules.reach + rules.longest:
         return
     closest[k] = v
+    # No point of a face is farther from its closest corner than from the middle of three edges of its longest one.
+    if away > rules.reach + 0.578 * rules.longest:
+        return
     face, feature, w, offset = nearest_face(p, v, below, below_cut)
     normal = normal_on(face, w, below_normals, below_cut)
     if wp.dot(offset, normal) >= rules.gap:
@@ -340,12 +349,14 @@ def spread_kernel(
 def move_kernel(
     rows: wp.array[int],
     field: wp.array[wp.vec3],
-    # output
+    # outputs
     points: wp.array[wp.vec3],
+    looks: wp.array[int],
 ) -> None:
-    """Moves the vertices of the region."""
+    """Moves the vertices of the region; those that have moved look again."""
     k = wp.tid()
     points[rows[k]] += field[k]
+    looks[k] = wp.where(wp.length_sq(field[k]) > 0.0, 1, 0)
 
 
 @wp.kernel(enable_backward=False)
@@ -360,10 +371,16 @@ def move_all_kernel(
     reached: wp.array[int],
     field: wp.array[wp.vec3],
     smoother: wp.array[wp.vec3],
-    # output
+    # outputs
     points: wp.array[wp.vec3],
+    looks: wp.array[int],
 ) -> None:
-    """All rounds, and the move, by one thread: of the pushed, and of those that so many rounds reach from there."""
+    """All rounds, and the move, by one thread: of the pushed, and of those that so many rounds reach from there.
+
+    Those look again.
+    """
+    for k in range(looks.shape[0]):
+        looks[k] = 0
     n = int(0)
     for k in range(push.shape[0]):
         if wp.length_sq(push[k]) > 0.0:
@@ -391,6 +408,7 @@ def move_all_kernel(
     for i in range(n):
         k = reached[i]
         points[rows[k]] += field[k]
+        looks[k] = 1
         is_reached[k] = 0
         field[k] = wp.vec3()
         smoother[k] = wp.vec3()

@@ -68,7 +68,7 @@ class Resolver:
         self,
         points: Tensor,
         sdf: MeshSdf,
-        start: SdfSample,
+        start: SdfSample | None,
         *,
         margin: float = DEFAULT_MARGIN,
         scale: float | VertexScale = 1.0,
@@ -78,7 +78,9 @@ class Resolver:
         Args:
             points: Garment vertices [m], shape (N, 3).
             sdf: The body's signed distance.
-            start: What it says of the points; what is beyond `margin` + 2 mm may be clipped from above.
+            start: What it says of the points; what is beyond `margin` + `ASKED_FROM` may be clipped from above. None
+                goes on from what the last call ended with, if that was for the same body: only points that were moved
+                since, and may have come that near, are asked.
             margin: ε ≥ 0 [m].
             scale: α of the first push: one number, or a function of vertices and their distances.
 
@@ -86,17 +88,18 @@ class Resolver:
             MeshError: points of another number or type, or a distance that isn't one to faces.
         """
         require_tensor("points", points)
-        if points.shape != (self._n_vertices, 3) or start.distance.shape != (self._n_vertices,):
-            shapes = f"{tuple(points.shape)} and {tuple(start.distance.shape)}"
+        distances = self._floats["distance"] if start is None else start.distance
+        if points.shape != (self._n_vertices, 3) or distances.shape != (self._n_vertices,):
+            shapes = f"{tuple(points.shape)} and {tuple(distances.shape)}"
             msg = f"wanted {self._n_vertices} points and their distances, got the shapes {shapes}"
             raise MeshError(msg)
-        if start.face is None:
+        if start is not None and start.face is None:
             msg = "start must name the closest faces: ask an ExactSdf, BandSdf or ApproxSdf"
             raise MeshError(msg)
         with torch_stream(self.device):
             self._take(points, start)
             self._record(sdf, margin)
-            self._run("begin", self._n_strips)
+            self._run("go on" if start is None else "begin", self._n_strips)
             if not sdf.is_exact:
                 self._reconcile()
             self._run("list", self._n_strips)
@@ -113,16 +116,17 @@ class Resolver:
             torch.cat((counts, depth.clamp_min(0))),
         )
 
-    def _take(self, points: Tensor, start: SdfSample) -> None:
+    def _take(self, points: Tensor, start: SdfSample | None) -> None:
         """Takes over a frame."""
-        assert start.face is not None  # these distances are to faces
         self._counts.zero_()
         if not self._is_serial:
             self._bounds.zero_()
         self._vectors["origin"].copy_(points)
-        self._floats["first"].copy_(start.distance)
-        self._vectors["first_gradient"].copy_(start.gradient)
-        self._ints["first_face"].copy_(start.face)
+        if start is not None:
+            assert start.face is not None  # these distances are to faces
+            self._floats["first"].copy_(start.distance)
+            self._vectors["first_gradient"].copy_(start.gradient)
+            self._ints["first_face"].copy_(start.face)
 
     def _reconcile(self) -> None:
         """Where distances contradict each other along an edge, a closest face was missed."""
@@ -218,6 +222,7 @@ class Resolver:
         state, cloth, rules = self._state, self._cloth, self._rules(margin)
         each = self._n_vertices // self._n_strips if self._n_vertices else 0
         self._command("begin", _resolver_kernels.begin_kernel, [each, state])
+        self._command("go on", _resolver_kernels.go_on_kernel, [each, margin + ASKED_FROM, state, skin])
         self._command("compare", _resolver_kernels.compare_kernel, [each, state, cloth, rules])
         self._command("retry", _resolver_kernels.retry_kernel, [state, cloth, skin, rules])
         self._command("adopt", _resolver_kernels.adopt_kernel, [state, cloth])
@@ -265,6 +270,8 @@ class Resolver:
         return state
 
 
+ASKED_FROM = 2e-3
+"""Vertices are asked for their exact distance up to this far beyond the margin [m]."""
 _VECTORS = ("origin", "first_gradient", "place", "gradient", "field", "smoother")
 _FLOATS = ("first", "distance", "way", "goal", "alpha", "largest")
 _INTS = ("first_face", "face", "mark", "near", "reached", "moved")

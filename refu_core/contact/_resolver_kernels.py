@@ -69,6 +69,26 @@ def begin_kernel(each: int, state: State) -> None:
 
 
 @wp.kernel(enable_backward=False)
+def go_on_kernel(each: int, reach: float, state: State, skin: Skin) -> None:
+    """From where the last call ended: who was moved since, and may have come within `reach`, is asked."""
+    first = wp.tid() * each
+    for i in range(first, first + each):
+        here = state.origin[i]
+        way = wp.length(here - state.place[i])
+        state.place[i] = here
+        if way > 0.0:
+            # No vertex gets nearer by more than it moves.
+            if state.distance[i] - way >= reach:
+                state.distance[i] -= way
+            else:
+                distance, gradient, face = query_skin(skin, here, state.face[i])
+                keep(i, here, distance, gradient, face, state)
+        state.first[i] = state.distance[i]
+        state.first_gradient[i] = state.gradient[i]
+        state.first_face[i] = state.face[i]
+
+
+@wp.kernel(enable_backward=False)
 def compare_kernel(each: int, state: State, cloth: Cloth, rules: Rules) -> None:
     """Lists the ends of edges at the skin along which distances contradict each other."""
     first = wp.tid() * each

@@ -121,8 +121,10 @@ def crossings_kernel(
                                 q = int(first[cell])
                                 while q >= 0:
                                     p = points[q]
+                                    # Most points are seen by this to be beyond the face, and few for the rest.
+                                    sees = wp.where(half == 0, p[2] <= box_high[2], p[2] >= box_low[2])
                                     along = p[0] >= box_low[0] and p[0] <= box_high[0]
-                                    if along and p[1] >= box_low[1] and p[1] <= box_high[1]:
+                                    if sees and along and p[1] >= box_low[1] and p[1] <= box_high[1]:
                                         found = crossing(a, b, c, p, half)
                                         if found != 0:
                                             wp.atomic_add(winding, q, found)
