@@ -144,7 +144,7 @@ class Resolver:
         alpha = self._floats["alpha"][:n]
         if callable(scale):
             rows = self._ints["near"][:n].long()
-            alpha.copy_(scale(rows, self._floats["distance"][rows]))
+            alpha.copy_(scale(rows, self._floats["distance"].index_select(0, rows)))
         else:
             alpha.fill_(scale)
         self._run("scale", n)
