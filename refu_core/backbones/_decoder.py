@@ -9,7 +9,7 @@ import warp as wp
 from torch import Tensor, nn
 from torch.nn import functional
 
-from refu_core._warp import argument, is_plain
+from refu_core._warp import Repeated, is_plain
 from refu_core.backbones._decode_kernels import STREAMS, WIDTH, HalfStrip, Strip, decode_kernel
 from refu_core.errors import WeightsError
 from refu_core.garments import GarmentTemplate
@@ -102,21 +102,12 @@ class _Strips:
         self._n = components.shape[1]
         room = (0, -self._n % (WIDTH * STREAMS))
         strips = functional.pad(components.half(), room).view(len(components), -1, WIDTH).transpose(0, 1).contiguous()
-        # Warp's arrays keep the tensors that they are made of.
-        self._basis = wp.from_torch(strips, dtype=HalfStrip)
-        self._mean = wp.from_torch(functional.pad(mean, room).view(-1, WIDTH), dtype=Strip)
-        self._n_threads = len(self._mean) // STREAMS
+        self._basis, self._mean = strips, functional.pad(mean, room).view(-1, WIDTH)
 
     def __call__(self, code: Tensor) -> Tensor:
         """Displacements, shape (B, V, 3), of codes (B, R)."""
-        decoded = torch.empty(len(code), len(self._mean), WIDTH)
-        wp.launch(
-            decode_kernel,
-            self._n_threads,
-            [argument(code.contiguous(), wp.float32), self._basis, self._mean],
-            [argument(decoded, Strip)],
-            device="cpu",
-        )
+        decoded = torch.empty(len(code), *self._mean.shape)
+        _decode((len(self._mean) // STREAMS,), code.contiguous(), self._basis, self._mean, decoded)
         return decoded.flatten(1)[:, : self._n].view(len(code), -1, 3)
 
     def is_of(self, components: Tensor) -> bool:
@@ -124,6 +115,7 @@ class _Strips:
         return self._of is components and self._version == components._version
 
 
+_decode = Repeated(decode_kernel, (wp.float32, HalfStrip, Strip, Strip))
 Decoder = DenseDecoder | BasisDecoder
 
 

@@ -61,7 +61,7 @@ class Resolver:
         self._state = self._bind_state()
         self._commands: dict[str, Any] = {}
         self._dims: dict[str, int] = {}
-        self._recorded_for: tuple[Any, ...] = ()
+        self._recorded: dict[float, tuple[Any, dict[str, Any], dict[str, int]]] = {}
 
     @torch.no_grad()
     def __call__(
@@ -213,12 +213,15 @@ class Resolver:
         self._commands[name] = wp.launch(kernel, dim=1, inputs=inputs, device=str(self.device), record_cmd=True)
 
     def _record(self, sdf: MeshSdf, margin: float) -> None:
-        """Records the launches of a frame, unless they are the last frame's."""
+        """Records the launches of a frame, or takes those that were recorded for the same body and margin."""
         skin = sdf.skin()
-        key = (skin, margin)
-        if key == self._recorded_for:
+        if margin in self._recorded and self._recorded[margin][0] is skin:
+            _, self._commands, self._dims = self._recorded[margin]
             return
-        self._recorded_for = key
+        if len(self._recorded) >= _MOST_MARGINS:
+            self._recorded.clear()
+        self._commands, self._dims = {}, {}
+        self._recorded[margin] = skin, self._commands, self._dims
         state, cloth, rules = self._state, self._cloth, self._rules(margin)
         each = self._n_vertices // self._n_strips if self._n_vertices else 0
         self._command("begin", _resolver_kernels.begin_kernel, [each, state])
@@ -272,6 +275,8 @@ class Resolver:
 
 ASKED_FROM = 2e-3
 """Vertices are asked for their exact distance up to this far beyond the margin [m]."""
+_MOST_MARGINS = 8
+"""Margins whose launches are kept: of an outer garment there are two a frame."""
 _VECTORS = ("origin", "first_gradient", "place", "gradient", "field", "smoother")
 _FLOATS = ("first", "distance", "way", "goal", "alpha", "largest")
 _INTS = ("first_face", "face", "mark", "near", "reached", "moved")
