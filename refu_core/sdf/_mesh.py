@@ -78,12 +78,14 @@ class Recorded:
         if n:
             if last is not None:
                 self._command.set_param_at_index(self._n_inputs - 1, last)
-            self._command.set_dim(n)
+            if n != self._dim:
+                self._command.set_dim(n)
+                self._dim = n
             self._command.launch()
         return Found(*(field[:n] for field in self._found))
 
     def _make_room(self, n: int) -> None:
-        self._room = n
+        self._room = self._dim = n
         self._points = torch.zeros(n, 3)
         self._near = torch.zeros(n, dtype=torch.int32)
         self._found = Found.empty(n, self._points.device)

@@ -77,13 +77,16 @@ class RestFaces:
             self._make_room(n)
         self._places[:n] = places
         if n:
-            self._look_up.set_dim(n)
+            if n != self._dim:
+                self._look_up.set_dim(n)
+                self._dim = n
             with torch_stream(self._device):
                 self._look_up.launch()
         return self._near[:n].clone().view(unposed.shape[:-1])
 
     def _make_room(self, n: int) -> None:
         """For n places. The launch is recorded: making it in Python takes longer than the look-ups."""
+        self._dim = n
         self._places = torch.empty(n, 3, device=self._device)
         self._near = torch.empty(n, dtype=torch.int32, device=self._device)
         self._look_up = wp.launch(
