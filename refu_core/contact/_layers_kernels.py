@@ -352,11 +352,13 @@ def move_kernel(
     # outputs
     points: wp.array[wp.vec3],
     looks: wp.array[int],
+    moved: wp.array[int],
 ) -> None:
-    """Moves the vertices of the region; those that have moved look again."""
+    """Moves the vertices of the region; those that have `moved` look again."""
     k = wp.tid()
     points[rows[k]] += field[k]
     looks[k] = wp.where(wp.length_sq(field[k]) > 0.0, 1, 0)
+    moved[k] = wp.max(moved[k], looks[k])
 
 
 @wp.kernel(enable_backward=False)
@@ -374,10 +376,11 @@ def move_all_kernel(
     # outputs
     points: wp.array[wp.vec3],
     looks: wp.array[int],
+    moved: wp.array[int],
 ) -> None:
     """All rounds, and the move, by one thread: of the pushed, and of those that so many rounds reach from there.
 
-    Those look again.
+    Those have `moved`, and look again.
     """
     for k in range(looks.shape[0]):
         looks[k] = 0
@@ -409,6 +412,7 @@ def move_all_kernel(
         k = reached[i]
         points[rows[k]] += field[k]
         looks[k] = 1
+        moved[k] = 1
         is_reached[k] = 0
         field[k] = wp.vec3()
         smoother[k] = wp.vec3()

@@ -103,11 +103,16 @@ class ContactStage:
             return vertices
         return self._press[name](vertices, self._outfit.below[name](self._body[None])[0])
 
-    def lift(self, name: str, vertices: Tensor, worn: Mapping[str, Worn]) -> tuple[Tensor, Tensor]:
-        """Vertices (V, 3) [m] off the `worn` inner garments, and how many were too near one of those, shape (1,)."""
+    def lift(
+        self, name: str, vertices: Tensor, worn: Mapping[str, Worn], *, goes_on: bool = False
+    ) -> tuple[Tensor, Tensor]:
+        """Vertices (V, 3) [m] off the `worn` inner garments, and how many were too near one of those, shape (1,).
+
+        It `goes_on` from the last call for the same garments.
+        """
         n_layered = torch.zeros(1, dtype=torch.int32, device=vertices.device)
         for inner, garment in worn.items():
-            vertices, n_low = self._below[name][inner](vertices, garment.vertices)
+            vertices, n_low = self._below[name][inner](vertices, garment.vertices, goes_on=goes_on)
             n_layered = n_layered + n_low
         return vertices, n_layered
 
@@ -131,7 +136,7 @@ class ContactStage:
         done = resolver(vertices, self.sdf, start, margin=margin, scale=scale)
         vertices, numbers = done.vertices, done.numbers
         if worn:
-            vertices, _ = self.lift(name, vertices, worn)
+            vertices, _ = self.lift(name, vertices, worn, goes_on=True)
             again = resolver(vertices, self.sdf, None, margin=self._kept * margin)
             # Each step goes no farther than that; together they may.
             vertices = pressed + torch.renorm(again.vertices - pressed, 2, 0, self._farthest)
