@@ -1,8 +1,8 @@
 """What the steps of `resolve` read and write: a garment, a frame of it, and numbers.
 
 Lists of vertices are filled by kernels: `counts[NAME]` says how many they are. On a CPU they are in order, on a GPU in
-any; nothing depends on it. On a CPU one thread goes through a list. To know how long it is a GPU would have to be waited
-for: there a launch is as long as any list can be, and what is beyond its list's end does nothing.
+any; nothing depends on it. On a CPU one thread goes through a list. To know how long it is a GPU would have to be
+waited for: there a launch is as long as any list can be, and what is beyond its list's end does nothing.
 """
 
 import warp as wp
