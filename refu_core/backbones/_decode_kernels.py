@@ -1,6 +1,6 @@
 """The product of a few codes with a basis, which libraries for matrices are slow at: they are made for many rows."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
@@ -14,7 +14,7 @@ STREAMS = 4
 
 if TYPE_CHECKING:
     Strip = wp.Vector[float]
-    HalfStrip = wp.Vector[float]
+    HalfStrip = Any  # or it couldn't be converted
 else:
     Strip = wp.types.vector(length=WIDTH, dtype=wp.float32)
     HalfStrip = wp.types.vector(length=WIDTH, dtype=wp.float16)

@@ -59,6 +59,7 @@ class RestFaces:
         by_block = face[tuple(nearest)].reshape([n for count in blocks.tolist() for n in (count, _BLOCK)])
         rows = by_block.transpose(0, 2, 4, 1, 3, 5).reshape(-1, _BLOCK**3)
         self._grid = wp.array(rows, dtype=wp.int32, device=str(self._device))
+        self._dim = 0
         self._make_room(1024)
 
     def under(self, unposed: Tensor, betas: Tensor, shapedirs: Tensor) -> Tensor:
