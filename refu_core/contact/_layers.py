@@ -13,6 +13,7 @@ from torch import Tensor
 
 from refu_core._warp import as_warp, torch_stream
 from refu_core.contact import _layers_kernels as kernels
+from refu_core.contact import _layers_move_kernels as moving
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
 from refu_core.errors import MeshError
 from refu_core.mesh import Adjacency, Connectivity
@@ -219,10 +220,10 @@ class Layer:
                 self._n_candidates,
                 [self._tree.id, *garments, found, rules, *doubts, *pushed],
             ),
-            ("spread0", kernels.spread_kernel, self._n_region, [*blend, fields[0], fields[1]]),
-            ("spread1", kernels.spread_kernel, self._n_region, [*blend, fields[1], fields[0]]),
-            ("move", kernels.move_kernel, self._n_region, [rows, fields[0], above, looks, moved]),
-            ("move all", kernels.move_all_kernel, 1, [*blend, rows, 0, *reached, *fields, above, looks, moved]),
+            ("spread0", moving.spread_kernel, self._n_region, [*blend, fields[0], fields[1]]),
+            ("spread1", moving.spread_kernel, self._n_region, [*blend, fields[1], fields[0]]),
+            ("move", moving.move_kernel, self._n_region, [rows, fields[0], above, looks, moved]),
+            ("move all", moving.move_all_kernel, 1, [*blend, rows, 0, *reached, *fields, above, looks, moved]),
         ):
             self._commands[name] = wp.launch(kernel, size, arguments, device=str(self.device), record_cmd=True)
 
