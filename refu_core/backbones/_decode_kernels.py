@@ -1,51 +1,45 @@
 """The product of a few codes with a basis, which libraries for matrices are slow at: they are made for many rows."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import warp as wp
 
 from refu_core import _warp  # noqa: F401  (quiets Warp before it starts)
 
 WIDTH = 16
-"""Columns of a strip: with four strips as many sums as a processor with 16 registers of eight numbers keeps in them."""
-STREAMS = 4
-"""Strips that a thread reads side by side: of one stream memory brings less than half as much in the same time."""
+"""Columns of a strip: with four codes as many sums as a processor with 16 registers of eight numbers keeps in them."""
+ROWS = wp.constant(4)
+"""Codes that a strip is multiplied by at a time."""
 
 
 if TYPE_CHECKING:
     Strip = wp.Vector[float]
-    HalfStrip = Any  # or it couldn't be converted
 else:
     Strip = wp.types.vector(length=WIDTH, dtype=wp.float32)
-    HalfStrip = wp.types.vector(length=WIDTH, dtype=wp.float16)
 
 
 @wp.kernel(enable_backward=False)
 def decode_kernel(
     code: wp.array2d[float],
-    strips: wp.array2d[HalfStrip],
+    strips: wp.array2d[Strip],
     mean: wp.array[Strip],
     # output
     decoded: wp.array2d[Strip],
 ) -> None:
-    """Four strips of mean + code @ basis, of codes (B, R); `strips` (S, R) are those of the basis' rows."""
+    """One strip of mean + code @ basis, of codes (4 n, R); `strips` (S, R) are those of the basis' rows."""
     s = wp.tid()
-    apart = strips.shape[0] // wp.static(STREAMS)
-    n = code.shape[1]
-    for i in range(code.shape[0]):
+    for i in range(0, code.shape[0], ROWS):
         a = mean[s]
-        b = mean[s + apart]
-        c = mean[s + 2 * apart]
-        d = mean[s + 3 * apart]
-        r = int(0)
-        while r < n:  # half the instructions of Warp's range
-            x = code[i, r]
-            a += x * Strip(strips[s, r])
-            b += x * Strip(strips[s + apart, r])
-            c += x * Strip(strips[s + 2 * apart, r])
-            d += x * Strip(strips[s + 3 * apart, r])
-            r += 1
+        b = mean[s]
+        c = mean[s]
+        d = mean[s]
+        for r in range(code.shape[1]):
+            row = strips[s, r]
+            a += code[i, r] * row
+            b += code[i + 1, r] * row
+            c += code[i + 2, r] * row
+            d += code[i + 3, r] * row
         decoded[i, s] = a
-        decoded[i, s + apart] = b
-        decoded[i, s + 2 * apart] = c
-        decoded[i, s + 3 * apart] = d
+        decoded[i + 1, s] = b
+        decoded[i + 2, s] = c
+        decoded[i + 3, s] = d

@@ -9,8 +9,8 @@ import warp as wp
 from torch import Tensor, nn
 from torch.nn import functional
 
-from refu_core._warp import Repeated, is_plain
-from refu_core.backbones._decode_kernels import STREAMS, WIDTH, HalfStrip, Strip, decode_kernel
+from refu_core._warp import argument, is_plain
+from refu_core.backbones._decode_kernels import ROWS, WIDTH, Strip, decode_kernel
 from refu_core.errors import WeightsError
 from refu_core.garments import GarmentTemplate
 
@@ -66,7 +66,7 @@ class BasisDecoder(nn.Module):
 
     def forward(self, code: Tensor) -> Tensor:
         """Displacements [m], shape (B, V, 3), of codes (B, R)."""
-        if len(code) <= _A_FEW and code.device.type == "cpu" and is_plain(code, self.components):
+        if 1 < len(code) <= _A_FEW and code.device.type == "cpu" and is_plain(code, self.components):
             if self._strips is None or not self._strips.is_of(self.components):
                 self._strips = _Strips(self.mean, self.components)
             return self._strips(code)
@@ -92,30 +92,38 @@ class BasisDecoder(nn.Module):
 
 
 class _Strips:
-    """A basis in strips of some columns, each in one piece of memory, as it is stored: for a few persons, on a CPU.
+    """A basis in strips of some columns, each in one piece of memory: for the codes of a few persons, on a CPU.
 
-    The basis has come from far by the time of the next frame: in half precision in half the time, once for all persons.
+    The basis is then read once for all of them, and the product takes hardly longer than that of one.
     """
 
     def __init__(self, mean: Tensor, components: Tensor) -> None:
         self._of, self._version = components, components._version
         self._n = components.shape[1]
-        room = (0, -self._n % (WIDTH * STREAMS))
-        strips = functional.pad(components.half(), room).view(len(components), -1, WIDTH).transpose(0, 1).contiguous()
-        self._basis, self._mean = strips, functional.pad(mean, room).view(-1, WIDTH)
+        room = (0, -self._n % WIDTH)
+        strips = functional.pad(components, room).view(len(components), -1, WIDTH).transpose(0, 1).contiguous()
+        # Warp's arrays keep the tensors that they are made of.
+        self._basis = wp.from_torch(strips, dtype=Strip)
+        self._mean = wp.from_torch(functional.pad(mean, room).view(-1, WIDTH), dtype=Strip)
 
     def __call__(self, code: Tensor) -> Tensor:
         """Displacements, shape (B, V, 3), of codes (B, R)."""
-        decoded = torch.empty(len(code), *self._mean.shape)
-        _decode((len(self._mean) // STREAMS,), code.contiguous(), self._basis, self._mean, decoded)
-        return decoded.flatten(1)[:, : self._n].view(len(code), -1, 3)
+        padded = functional.pad(code, (0, 0, 0, -len(code) % int(ROWS))).contiguous()
+        decoded = torch.empty(len(padded), len(self._mean), WIDTH)
+        wp.launch(
+            decode_kernel,
+            len(self._mean),
+            [argument(padded, wp.float32), self._basis, self._mean],
+            [argument(decoded, Strip)],
+            device="cpu",
+        )
+        return decoded.flatten(1)[: len(code), : self._n].view(len(code), -1, 3)
 
     def is_of(self, components: Tensor) -> bool:
         """Whether these are the strips of `components`, as they are now."""
         return self._of is components and self._version == components._version
 
 
-_decode = Repeated(decode_kernel, (wp.float32, HalfStrip, Strip, Strip))
 Decoder = DenseDecoder | BasisDecoder
 
 
