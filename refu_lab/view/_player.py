@@ -13,6 +13,7 @@ from refu_core.errors import printable
 from refu_core.modes import SdfMode
 from refu_lab.view._dressed import DressedFilm
 from refu_lab.view._film import BODY, SKIN
+from refu_lab.view._live import LiveFilm
 from refu_lab.view._marks import CLEARANCE, Band, Marker, Marking
 from refu_lab.view._stage import Stage
 
@@ -51,6 +52,8 @@ class Player:
         self._stage.set(first, ground=min(lowest), front=film.front)
         self._build(first)
         self._show(0)
+        if isinstance(film, LiveFilm):
+            film.told = self._changed.set
 
     def run(self, *, until: Callable[[], bool] = lambda: False) -> None:
         """Plays until an interrupt, or until asked after each frame."""
@@ -105,7 +108,9 @@ class Player:
         self._stage.draw(bands, wireframe=self._wire.value)
         if len(self._times) > 1:
             self._frame.value = index
-        facts = [f"frame {index} of {len(self._times)}, {self._times[index]:.2f} s", *self._film.facts(index)]
+        facts = self._film.facts(index)
+        if not isinstance(self._film, LiveFilm):
+            facts = [f"frame {index} of {len(self._times)}, {self._times[index]:.2f} s", *facts]
         self._said.content = "  \n".join(facts)
 
     def _bands(self, shapes: Sequence[Shape]) -> list[tuple[Shape, Sequence[Band]]]:
