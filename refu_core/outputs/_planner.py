@@ -32,9 +32,9 @@ _VERSION = 2
 _LEAST_WEIGHT = 0.01
 """A vertex counts less than this for a coarse one: it is left out."""
 _OWN = 0.5
-"""How much of a coarse vertex is the garment's own, the rest being the fit. Where cloth folds in a pose, the fit, which
-is of the rest pose, overshoots: on recorded motion 95.9 % of a T-shirt's solid are within 5 mm with 0, 99.0 with a half,
-98.9 with 0.7. Of the garment 0.04 % are farther off than that with a half, 0.08 with 0.7."""
+"""How much of a coarse vertex is the garment's own, the rest being the fit. Where cloth folds in a pose, the fit,
+which is of the rest pose, overshoots: on recorded motion 95.9 % of a T-shirt's solid are within 5 mm with 0, 99.0 with
+a half, 98.9 with 0.7. Of the garment 0.04 % are farther off than that with a half, 0.08 with 0.7."""
 _FIRM = 1e-3
 """How much the fit of coarse vertices is held together where hardly any cloth tells of one."""
 
