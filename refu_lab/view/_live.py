@@ -23,6 +23,8 @@ TOPICS = ("garments", "body")
 _DELETE, _DELETE_ALL = 2, 3
 _LOOK_S = 0.2
 """How often who waits for the first garments looks whether it is to end [s]."""
+_TOGETHER_S = 2.0
+"""How long after the first topic the others are waited for [s]."""
 
 
 class LiveFilm:
@@ -44,6 +46,7 @@ class LiveFilm:
         self._markers = MarkerShapes()
         self._stamp_ns = self._n_frames = self._n_bad = 0
         self._since: float | None = None
+        self._heard = {*topics}
         self._topics = LiveTopics(dict.fromkeys(topics, adapters.MARKER_ARRAY), self._take)
 
     @property
@@ -52,11 +55,16 @@ class LiveFilm:
         return np.zeros(1)
 
     def wait(self, until: Callable[[], bool]) -> bool:
-        """For the first garments; whether they have come before it was to end."""
+        """For the first meshes, of all topics if they come soon; whether they have come before it was to end."""
         with self._changed:
-            while not self._shapes and not until():
+            while not self._is_here() and not until():
                 self._changed.wait(_LOOK_S)
             return bool(self._shapes)
+
+    def _is_here(self) -> bool:
+        """Whether there is something to see: the ground is put under the first of it, so feet are waited for."""
+        is_late = self._since is not None and time.monotonic() > self._since + _TOGETHER_S
+        return bool(self._shapes) and (is_late or {topic for topic, *_ in self._shapes} == self._heard)
 
     def shapes(self, index: int) -> Sequence[Shape]:  # noqa: ARG002
         """What was published last of each topic; nothing of who has left."""

@@ -162,14 +162,15 @@ class Player:
         gui.set_panel_label(f"refu view: {printable(film.title)}")
         names = list(dict.fromkeys(shape.name for shape in first if shape.is_garment))
         last = max(len(self._times) - 1, 1)
+        is_live = isinstance(film, LiveFilm)  # there is no going back, and a body may come later
         with gui.add_folder("Play"):
-            self._frame = gui.add_slider("frame", 0, last, 1, 0, disabled=len(self._times) < 2)
-            self._button = gui.add_button(self._verb(), icon=None)
-            self._speed = gui.add_dropdown("speed", tuple(_SPEEDS), initial_value="1 ×")
+            self._frame = gui.add_slider("frame", 0, last, 1, 0, disabled=len(self._times) < 2, visible=not is_live)
+            self._button = gui.add_button(self._verb(), icon=None, visible=not is_live)
+            self._speed = gui.add_dropdown("speed", tuple(_SPEEDS), initial_value="1 ×", visible=not is_live)
             self._follows = gui.add_checkbox("follow", initial_value=True, hint="the camera goes with the first person")
         with gui.add_folder("Show"):
             has_skin = any(shape.name == SKIN for shape in first)
-            has_body = any(shape.name == BODY for shape in first)
+            has_body = is_live or any(shape.name == BODY for shape in first)
             bodies = tuple(_BODIES) if has_skin else ("collider", _HIDDEN) if has_body else (_HIDDEN,)
             self._body = gui.add_dropdown("body", bodies, initial_value=bodies[0])
             markings = tuple(str(one) for one in Marking) if has_body else (str(Marking.CLOTH),)

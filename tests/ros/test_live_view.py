@@ -82,6 +82,7 @@ def test_a_film_shows_what_is_published_and_not_who_has_left(node: Node) -> None
     film = LiveFilm(["garments"])
     try:
         assert not film.wait(lambda: True)
+        assert not film.shapes(0)
         node.until(lambda: len(film.shapes(0)) == 1, lambda: node.send(0.0, 10**9))
         (first,) = film.shapes(0)
         assert (first.name, first.person, len(first.vertices)) == ("tshirt-male", "", len(node.rest))
