@@ -5,15 +5,15 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING
 
+from msg_adapters.bags import Recorder
 from refu_core import RefuError
 from refu_core.errors import printable
-from refu_ros._recorder import Recorder
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from msg_adapters import QosProfile
-    from refu_ros._recorder import RecorderState
+    from msg_adapters.bags import RecorderState
 
 
 class Recording:

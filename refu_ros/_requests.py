@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from rclpy.action import ActionServer, CancelResponse
 from rclpy.task import Future as RosFuture
 
+from msg_adapters.bags import free_path
 from refu_core import RefuError
 from refu_core.errors import printable
 from refu_ros._asked import asked_frame, asked_path, asked_settings
@@ -17,7 +18,6 @@ from refu_ros._bag_job import BagJob
 from refu_ros._dresser import Dresser
 from refu_ros._guard import answer_no
 from refu_ros._interfaces import interface
-from refu_ros._recorder import free_path
 
 if TYPE_CHECKING:
     import numpy as np

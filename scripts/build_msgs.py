@@ -1,4 +1,4 @@
-"""Builds refu_msgs for a pip-installed rclpy: python scripts/build_msgs.py FOLDER, then FOLDER goes on PYTHONPATH.
+"""Builds refu_msgs for a pip-installed rclpy: eval "$(python scripts/build_msgs.py FOLDER)" puts it on PYTHONPATH.
 
 A ROS workspace doesn't need this: colcon builds refu_msgs beside refu_ros. The wheels of rclpy bring rosidl's
 generators and headers along, but no ament_cmake, so the code that rosidl writes is compiled here, for Fast DDS alone.
@@ -145,6 +145,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="where the package goes")
     folder = parser.parse_args().folder
+    shutil.rmtree(folder / PACKAGE, ignore_errors=True)  # of definitions as they once were
     try:
         build(folder)
     except BuildError as error:

@@ -29,6 +29,7 @@ from msg_adapters import (
     decode_marker_array,
     decode_point_cloud,
 )
+from msg_adapters.bags import Recorder, RecorderState, free_path
 from msg_adapters.cdr import CdrWriter
 from refu_core import BodyError, FrameError, GarmentPipeline, MeshError, RefuError, SmplFrame, load_body
 from refu_core.keypoints import Proportions, Skeleton, keypoint_layout
@@ -39,7 +40,6 @@ from refu_ros._decoding import InputDecoder
 from refu_ros._diagnostics import statuses
 from refu_ros._dresser import Dresser
 from refu_ros._loader import PipelineLoader
-from refu_ros._recorder import Recorder, RecorderState, free_path
 from refu_ros._scene import Scene, check_plausible
 from refu_ros._settings import NodeSettings, SettingsError, defaults, specs
 from refu_ros._statistics import Statistics
