@@ -26,7 +26,7 @@ REFERENCE = Path("docs/results/quick.json")
 TOLERANCES: dict[str, float] = {"mpve_mm": 0.3, "vfcp_percent": 0.02, "cfmp_percent": 7.0, "max_depth_mm": 1.0}
 """How much worse a figure may be than its reference: what other processors and releases of torch make of the same
 weights, far less than what a worse method does. Those of a reference file are in the file."""
-_FRAMES = 30
+_FRAMES = 15
 """Frames of a bag, at most."""
 _MODES = (("skinned", "accurate"), ("tailornet", "hybrid"))
 """(backbone, sdf) of the pipelines that are measured; what isn't trained is left out."""
