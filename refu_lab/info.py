@@ -78,7 +78,8 @@ def collect() -> dict[str, Any]:
         "devices": ["cpu", *(f"cuda: {name}" for name in cuda)],
         "bodies": {body.name: f"{body.n_vertices} vertices, {body.fingerprint}" for body in bodies},
         "garments": {
-            g.name: f"{g.n_vertices} vertices, {len(g.faces)} faces, for {g.body}; {networks_of(g.name)}" for g in garments
+            g.name: f"{g.n_vertices} vertices, {len(g.faces)} faces, for {g.body}; {networks_of(g.name)}"
+            for g in garments
         },
         "backbones": list(BackboneName),
         "sdf modes": list(SdfMode),

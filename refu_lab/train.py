@@ -83,10 +83,9 @@ def train(options: TrainOptions, *, progress: bool) -> dict[str, Any]:
         )
     dataset = open_dataset(options.data)
     if options.like is not None:
-        settings = replace(CarrySettings(), loop=replace(CarrySettings().loop, seed=options.seed))
-        settings = settings if options.steps is None else replace(settings, steps=options.steps)
+        few = _carrying(options)
         return carry_over(
-            template, dataset, options.folder, like=options.like, settings=settings, body=body, quiet=not progress
+            template, dataset, options.folder, like=options.like, settings=few, body=body, quiet=not progress
         )
     common |= {"backbone": options.backbone, "preset": options.preset, "body": body}
     source: Path | None = options.folder
@@ -134,6 +133,12 @@ def _pretraining(options: TrainOptions) -> PretrainSettings:
     if options.steps is None:
         return settings
     return replace(settings, style_shape_steps=options.steps, low_steps=options.steps, steps=options.steps)
+
+
+def _carrying(options: TrainOptions) -> CarrySettings:
+    settings = CarrySettings()
+    settings = replace(settings, loop=replace(settings.loop, seed=options.seed))
+    return settings if options.steps is None else replace(settings, steps=options.steps)
 
 
 def _finetuning(options: TrainOptions) -> FinetuneSettings:

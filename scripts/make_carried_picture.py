@@ -28,7 +28,9 @@ def main() -> None:
     parser.add_argument("garment")
     parser.add_argument("data", type=Path)
     parser.add_argument("--weights", type=Path, help="folder of weights (those that ship)")
-    parser.add_argument("--count", type=int, default=4, help="samples (4), of one style-shape pair or clip each if there are")
+    parser.add_argument(
+        "--count", type=int, default=4, help="samples (4), of one style-shape pair or clip each if there are"
+    )
     parser.add_argument("--output", type=Path, required=True)
     arguments = parser.parse_args()
     name, template = arguments.garment, load_garment(arguments.garment)
@@ -49,7 +51,10 @@ def main() -> None:
         views = []
         for yaw in (20.0, 200.0):
             camera = Camera.framing(sample.vertices, size=SIZE, yaw=yaw, margin=1.3)
-            meshes = [[RenderMesh(worn[1].body, faces), RenderMesh(one, template.faces.numpy(), colour=CLOTH)] for one in shown]
+            meshes = [
+                [RenderMesh(worn[1].body, faces), RenderMesh(one, template.faces.numpy(), colour=CLOTH)]
+                for one in shown
+            ]
             views.append(
                 [render(m, camera=camera, size=SIZE, samples=4, backdrop=Backdrop(show_ground=False)) for m in meshes]
             )

@@ -110,9 +110,7 @@ class ExactSdf(MeshSdf):
         skin.tree = self._mesh.id
         return skin
 
-    def closest(
-        self, points: Tensor, *, max_distance: float = math.inf, near: Tensor | None = None
-    ) -> ClosestPoints:
+    def closest(self, points: Tensor, *, max_distance: float = math.inf, near: Tensor | None = None) -> ClosestPoints:
         """The closest point of the body to each of `points` [m], shape (N, 3), where one is within `max_distance` [m].
 
         `near`, int32 of shape (N,), may name a body face near each point, or -1: then less is looked at.

@@ -116,7 +116,8 @@ class SimulatedCloth:
         self._skin = _Skin(n)
         self._middles = _Skin(len(self.topology.mesh.edges))
         self._searched_at: F32 = np.full((n, 3), 1e6, np.float32)  # far away: nothing that was found holds
-        self._candidates = np.zeros((2, 0), np.int32)
+        none = np.zeros(0, np.int32)
+        self._candidates: tuple[I32, I32] = (none, none)
 
     def start(
         self,
@@ -240,7 +241,7 @@ class SimulatedCloth:
 
     def _edge_contacts(self, body: F32, motion: F32 | None) -> _Contacts:
         edges, skin = self.topology.mesh.edges, self._middles
-        near = (self._skin.distance < _NEAR)[edges].all(1)
+        near = self._skin.distance[edges].max(1) < _NEAR
         middle = self.positions[edges].mean(1)
         stale = stale_points(middle, skin.asked_at, skin.distance, np.float32(_NEAR), np.float32(_SLIDE), False)
         which, point, direction, moved = self._touch(skin, middle, stale[near[stale]], body, motion)

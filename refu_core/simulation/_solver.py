@@ -21,7 +21,7 @@ def substep(
     v: _Floats,  # velocities (N, 3), updated
     previous: _Floats,  # scratch (N, 3)
     inverse_mass: _Floats,  # (N,)
-    ends: _Ints,  # vertices of the distance constraints (E, 2)
+    ends: NDArray[np.uint32],  # vertices of the distance constraints (E, 2)
     shortest: _Floats,  # between these two lengths they give way freely (E,)
     longest: _Floats,
     softness: _Floats,  # their compliance over h² (E,)
@@ -284,9 +284,7 @@ def find_candidates(x: _Floats, faces: _Ints, rest: _Floats, rest_apart: float, 
 
 
 @numba.njit(cache=True, fastmath=True)
-def near_pairs(
-    x: _Floats, faces: _Ints, vertex: _Ints, face: _Ints, reach: float
-) -> tuple[_Ints, _Ints, _Floats]:
+def near_pairs(x: _Floats, faces: _Ints, vertex: _Ints, face: _Ints, reach: float) -> tuple[_Ints, _Ints, _Floats]:
     """Of candidates (C,) those whose vertex is within `reach` of the plane of its face.
 
     Returns the vertex (S,), the face's vertices (S, 3) and the side of it (S,), by vertex.
@@ -319,7 +317,7 @@ def farthest_move(x: _Floats, before: _Floats) -> float:
             d = x[i, k] - before[i, k]
             moved2 += d * d
         longest2 = max(longest2, moved2)
-    return np.sqrt(longest2)
+    return float(np.sqrt(longest2))
 
 
 @numba.njit(cache=True)

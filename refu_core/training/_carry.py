@@ -124,7 +124,7 @@ def _smooth(share: NDArray[np.float64]) -> NDArray[np.float64]:
 def _from_rim(
     garment: GarmentTemplate, vertices: NDArray[np.float64], points: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """How far `points` (P, 3) are from the nearest hem of a garment whose vertices are at `vertices` (V, 3) [m], (P,)."""
+    """How far `points` (P, 3) are from the nearest hem of a garment with its vertices at `vertices` (V, 3) [m]."""
     return np.asarray(cKDTree(vertices[np.unique(garment.mesh.boundary)]).query(points)[0])
 
 
@@ -191,9 +191,7 @@ def carry_over(
         "dataset": opened.card,
         "figures": {
             **backbone_figures(model, test, body, template, mean=samples.displacement.mean(0)),
-            "carried_mm": round(
-                float(posed_errors(carried(test.betas, test.pose), test, body, template).mean()), 3
-            ),
+            "carried_mm": round(float(posed_errors(carried(test.betas, test.pose), test, body, template).mean()), 3),
         },
     }
     base = f"tailornet-{BASE}"
@@ -207,7 +205,7 @@ def carry_over(
 
 
 def _bodies(samples: TrainingSamples, settings: CarrySettings) -> tuple[Tensor, Tensor]:
-    """β (P, 10) and θ (P, 24, 3) [rad] that a network is asked about: poses near the set's, and any that joints allow."""
+    """β (P, 10) and θ (P, 24, 3) [rad] to ask a network about: poses near the set's, and any that joints allow."""
     rng = np.random.default_rng(settings.loop.seed)
     known = samples.pose.numpy()[rng.integers(len(samples), size=settings.poses)]
     known = known + rng.normal(0, settings.jitter, known.shape)
