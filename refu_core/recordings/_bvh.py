@@ -15,11 +15,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from refu_core._files import read_file
-from refu_core.keypoints import KeypointTracker, Proportions, Skeleton, TrackerSettings, layout_of
+from refu_core.recordings._followed import follow
 from refu_core.recordings._layouts import WANTED
 from refu_core.recordings._rate import MAX_FRAMES, check_fps
-from refu_core.recordings._recording import Recording
-from refu_core.recordings._upright import Axes, to_smpl
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -28,6 +26,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from refu_core.errors import RefuError
+    from refu_core.recordings._recording import Recording
+    from refu_core.recordings._upright import Axes
 
     Array = NDArray[np.float64]
 
@@ -55,7 +55,6 @@ _LEG = 0.82
 """Hip to knee to ankle of the mean body [m]."""
 _LEGS = (0.45, 1.1)
 """Of people [m]; a unit with which it's outside isn't meant."""
-_FIT = 100  # frames that a person's shape is taken from
 
 
 @dataclass(eq=False)
@@ -164,24 +163,9 @@ def _fitted(joints: list[_Joint], places: Array, fps: float, axes: Axes) -> Reco
         raise ValueError(msg)
     notes: list[str] = []
     scale = _scale(points, places[0], notes)
-    skeleton = Skeleton(layout_of("bvh", tuple(points)), Proportions.builtin("neutral"))
     seen = scale * places[:, list(points.values())]
-    settings = TrackerSettings(noise=0.01, rest_after=1.0)
-    some = np.linspace(0, len(seen) - 1, min(_FIT, len(seen))).astype(int)
-    shapes = [KeypointTracker(skeleton, settings=settings).update(seen[i], 0) for i in some]
-    known = [frame.betas for frame in shapes if frame is not None]
-    if not known:
-        msg = "its joints are in no order that a person's are in"
-        raise ValueError(msg)
-    betas = np.median(known, axis=0)
-    track = KeypointTracker(skeleton, betas=betas, settings=settings)
-    frames = [track.update(place, round(1e9 * i / fps)) for i, place in enumerate(seen)]
-    poses = np.stack([np.full((24, 3), np.nan) if frame is None else frame.pose for frame in frames])
-    transl = np.stack([np.full(3, np.nan) if frame is None else frame.transl for frame in frames])
     notes.append(f"the skeleton of {len(joints)} joints is fitted by the positions of {len(points)}")
-    roots, transl = to_smpl(poses[:, 0].astype(np.float64), transl, axes, notes, usual="smpl")
-    poses[:, 0] = roots
-    return Recording(poses.astype(np.float32), transl, betas.astype(np.float32), fps, "neutral", tuple(notes))
+    return follow(tuple(points), seen, fps=fps, axes=axes, usual="smpl", notes=notes)
 
 
 def _points(joints: list[_Joint]) -> dict[str, int]:

@@ -64,10 +64,14 @@ SCALINGS = ("smpl_scaling",)
 """AIST++'s translations are of a body that is larger by so much."""
 MODELS = ("surface_model_type",)
 
+KEYPOINTS, KEYPOINTS_PLACE = "pred_keypoints_3d", "pred_cam_t"
+"""Of SAM 3D Body, about the body, and where that is before the camera [m]."""
+TRACK_IDS = ("track_id", "person_id", "tid", "id")
+
 POSE_KEYS = frozenset(name for layout in LAYOUTS for name in layout.pose)
 ALL_KEYS = frozenset(
     {name for layout in LAYOUTS for names in (layout.pose, layout.transl, layout.betas) for name in names}
-    | {*RATES, *GENDERS, *FRAME_NUMBERS, *SCALINGS, *MODELS}
+    | {*RATES, *GENDERS, *FRAME_NUMBERS, *SCALINGS, *MODELS, KEYPOINTS, KEYPOINTS_PLACE}
 )
 """Everything that is read; all else in a file, meshes and pictures, is left unread."""
 
@@ -78,7 +82,7 @@ UNREAD = {
 }
 """What is recognised and can't be read, by names that give it away."""
 UNREAD_ADVICE = {
-    "MHR (SAM 3D Body)": "convert it with MHR's own tool for SMPL, or give its 3D keypoints (docs/guide/inputs.md)",
+    "MHR (SAM 3D Body)": "save pred_keypoints_3d with them, which is read, or convert them with MHR's own tool",
     "HumanML3D features": "fit SMPL to its joints, or give them as keypoints (docs/guide/inputs.md)",
     "EasyMocap": "save poses with Rh as their first three columns, and smplx's transl",
 }

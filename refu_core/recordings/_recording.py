@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from refu_core.frames import N_BETAS, N_JOINTS
 from refu_core.recordings import _layouts as table
 from refu_core.recordings._containers import Content, open_content
+from refu_core.recordings._mhr import POINTS, Track, tracks_of_mhr
 from refu_core.recordings._rate import MAX_FRAMES, check_fps
 from refu_core.recordings._rotations import BODY, WHOLE, rotvecs_of
 from refu_core.recordings._tracks import tracks_of
@@ -104,6 +105,9 @@ def read_recording(
 
 def _recording(content: Content, *, fps: float | None, axes: Axes, person: str | None) -> Recording:
     notes: list[str] = []
+    people = tracks_of_mhr(content)
+    if people:
+        return _of_mhr(content, people, fps=fps, axes=axes, person=person, notes=notes)
     found, above = _find(content, person, notes)
     layout, node = found.layout, found.node
     arrays = {name: content.array(node[name]) for name in layout.pose}
@@ -144,6 +148,21 @@ def _recording(content: Content, *, fps: float | None, axes: Axes, person: str |
     gender = _gender(_word(content, _first(above, table.GENDERS), which), notes)
     with np.errstate(over="ignore", invalid="ignore"):  # becomes inf or NaN, which the frame refuses
         return Recording(poses.astype(np.float32), transl, betas, check_fps(rate), gender, tuple(notes))
+
+
+def _of_mhr(
+    content: Content, people: list[Track], *, fps: float | None, axes: Axes, person: str | None, notes: list[str]
+) -> Recording:
+    from refu_core.recordings._followed import follow
+
+    names, lengths = [one.name for one in people], [len(one.places) for one in people]
+    chosen = people[_chosen(names, person, lengths, notes) if len(people) > 1 else 0]
+    if chosen.stays:
+        notes.append(f"no translation ({table.KEYPOINTS_PLACE}): the person stays in one place")
+    root = content.root if isinstance(content.root, dict) else {}
+    rate = check_fps(fps if fps is not None else _fps(content, [root]))
+    notes.append("MHR, another body than SMPL's: followed by its keypoints")
+    return follow(POINTS, chosen.places, fps=rate, axes=axes, usual="y-down", notes=notes)
 
 
 # Where it is ----------------------------------------------------------------------------------------------------------

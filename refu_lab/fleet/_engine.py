@@ -72,7 +72,7 @@ def _client(jobs: int | None, scheduler: str | None) -> Iterator[Client]:
         "distributed.scheduler.allowed-failures": ALLOWED_FAILURES,
         "distributed.admin.log-format": "%(message)s",
     }
-    with dask.config.set(settings), _no_logs("distributed.client"), ExitStack() as stack:
+    with dask.config.set(settings), _no_logs("distributed", "distributed.client"), ExitStack() as stack:
         cluster: Any = scheduler
         if scheduler is None:
             cluster = stack.enter_context(_own_cluster(jobs))
@@ -85,15 +85,17 @@ def _client(jobs: int | None, scheduler: str | None) -> Iterator[Client]:
 
 
 @contextmanager
-def _no_logs(name: str) -> Iterator[None]:
+def _no_logs(*names: str) -> Iterator[None]:
     """What goes wrong is said in one line by who gave the command; a scheduler that is gone would be a traceback."""
-    logger = logging.getLogger(name)
-    before = logger.level
-    logger.setLevel(logging.CRITICAL)
+    loggers = [logging.getLogger(name) for name in names]
+    before = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL)
     try:
         yield
     finally:
-        logger.setLevel(before)
+        for logger, level in zip(loggers, before, strict=True):
+            logger.setLevel(level)
 
 
 @contextmanager

@@ -153,7 +153,7 @@ def test_any_rotation_comes_back(seed: int, size: int) -> None:
         ({"poses": POSES, "fps": None}, "no frame rate in the file: say it, as in --fps 30"),
         ({"poses": POSES, "betas": np.zeros((4, 10))}, "betas must be one row of .*, or a row for each of 30"),
         ({"verts": np.zeros((T, 9, 3))}, "no poses; wanted pose_world, .*; the file has"),
-        ({"mhr_model_params": np.zeros((T, 204))}, "MHR .* aren't read: convert it"),
+        ({"mhr_model_params": np.zeros((T, 204))}, "MHR .* aren't read: save pred_keypoints_3d"),
     ],
 )  # fmt: skip
 def test_what_is_refused_says_what_to_do(tmp_path: Path, arrays: dict[str, Any], said: str) -> None:
@@ -382,3 +382,77 @@ def test_bvh_that_is_refused(tmp_path: Path) -> None:
         path.write_text(content)
         with pytest.raises(MotionFileError, match=said):
             read_motion(path)
+
+
+# SAM 3D Body ------------------------------------------------------------------------------------------------------
+
+BODY = "nose left_eye right_eye left_ear right_ear left_shoulder right_shoulder left_elbow right_elbow left_hip "
+BODY += "right_hip left_knee right_knee left_ankle right_ankle"
+MHR_JOINTS = {BODY.split().index(name): name for name in BODY.split()[5:]}
+MHR_JOINTS |= {41: "right_wrist", 62: "left_wrist", 69: "neck"}
+"""Those of the 70 keypoints that are joints of SMPL, too."""
+
+
+def mhr() -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float64]]:
+    """Keypoints (T, 70, 3) about the body and places (T, 3) in a camera's axes, y down; the joints (T, 24, 3) there."""
+    joints = load_body("male")(POSES, transl=TRANSL).joints.numpy()
+    joints = CAMERA.apply(joints.reshape(-1, 3)).reshape(T, 24, 3) + np.array([0.0, 0.0, 3.0])
+    place = joints[:, 0]
+    points = np.full((T, 70, 3), np.nan)
+    for index, name in MHR_JOINTS.items():
+        points[:, index] = joints[:, JOINT_NAMES.index(name)] - place
+    return points.astype(np.float32), place.astype(np.float32), joints
+
+
+def limbs_of(motion: Any) -> NDArray[np.float64]:
+    """Joints of arms and legs of a motion that was left in its file's axes [m], shape (T, 24, 3)."""
+    joints = load_body("neutral")(motion.poses, motion.betas[None], motion.transl.astype(np.float32)).joints
+    return joints.numpy().astype(np.float64)
+
+
+@pytest.mark.parametrize("form", ["stacked", "frames", "images", "objects"])
+def test_sam_3d_body_is_followed_by_its_keypoints(tmp_path: Path, form: str) -> None:
+    points, place, joints = mhr()
+    one = [
+        {"pred_keypoints_3d": seen, "pred_cam_t": at, "mhr_model_params": np.zeros(204)}
+        for seen, at in zip(points, place, strict=True)
+    ]
+    away = [body | {"pred_cam_t": body["pred_cam_t"] + np.array([2.0, 0, 0])} for body in one]
+    path = tmp_path / "a.pkl"
+    if form == "stacked":
+        path = save(tmp_path / "a.npz", pred_keypoints_3d=points, pred_cam_t=place)
+    elif form == "frames":  # the second person comes late, and is first in every other list
+        both = [[a] if i < 2 else [a, b][:: 1 - 2 * (i % 2)] for i, (a, b) in enumerate(zip(one, away, strict=True))]
+        path.write_bytes(pickle.dumps({"frames": [[], *both], "fps": 30.0}))
+    elif form == "images":
+        path.write_bytes(pickle.dumps({f"{i:04}.jpg": [body] for i, body in enumerate(one)}))
+    else:
+        path = tmp_path / "a.npz"
+        np.savez(path, outputs=np.array([[body] for body in one], dtype=object))
+    motion = read_motion(path, fps=30, axes="frame")
+    assert len(motion.poses) == T
+    assert "followed by its keypoints" in "; ".join(motion.notes)
+    limbs = [i for i in range(24) if JOINT_NAMES[i] in MHR_JOINTS.values() and JOINT_NAMES[i] != "neck"]
+    assert np.linalg.norm(limbs_of(motion) - joints, axis=2)[:, limbs].max() < 0.03
+    upright = read_motion(path, fps=30)
+    assert "-y: taken as y down" in "; ".join(upright.notes)
+    if form == "frames":
+        assert read_motion(path).fps == 30
+        assert "2 persons: 0 (" in "; ".join(upright.notes)
+        second = read_motion(path, person="1", axes="frame")
+        assert len(second.poses) == T - 2
+        assert np.linalg.norm(limbs_of(second) - joints[2:] - [2.0, 0, 0], axis=2)[:, limbs].max() < 0.03
+
+
+def test_keypoints_of_others_are_not_taken_for_mhr(tmp_path: Path) -> None:
+    points, place, _ = mhr()
+    path = save(tmp_path / "a.npz", pred_keypoints_3d=points[:, :44], pred_cam_t=place)
+    with pytest.raises(MotionFileError, match="no poses; wanted"):
+        read_motion(path, fps=30)
+    with pytest.raises(MotionFileError, match=r"must be \(30, 3\) like the keypoints"):
+        read_motion(save(path, pred_keypoints_3d=points, pred_cam_t=place[:2]), fps=30)
+    path.with_suffix(".pkl").write_bytes(pickle.dumps({"pred_keypoints_3d": points}))
+    with pytest.raises(MotionFileError, match="no frame rate"):
+        read_motion(path.with_suffix(".pkl"))
+    with pytest.raises(MotionFileError, match="in no order"):
+        read_motion(save(path, pred_keypoints_3d=np.full((4, 70, 3), np.nan)), fps=30)
