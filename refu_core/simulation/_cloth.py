@@ -11,14 +11,8 @@ import torch
 from numpy.typing import NDArray
 
 from refu_core.sdf import ExactSdf
-from refu_core.simulation._solver import (
-    farthest_move,
-    find_candidates,
-    near_pairs,
-    refresh_points,
-    stale_points,
-    substep,
-)
+from refu_core.simulation._pairs import farthest_move, find_candidates, near_pairs
+from refu_core.simulation._solver import refresh_points, stale_points, substep
 
 if TYPE_CHECKING:
     from refu_core.simulation._mesh import ClothTopology
