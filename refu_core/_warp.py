@@ -80,8 +80,9 @@ class Repeated(threading.local):
             arrays = [argument(tensor, kind) for tensor, kind in zip(tensors, self._kinds, strict=True)]
             self._known[key] = wp.launch(self._kernel, dim, arrays, device=str(device), record_cmd=True), arrays
         command, arrays = self._known[key]
+        self._kept = tensors
         for array, tensor in zip(arrays, tensors, strict=True):
-            array.data, array._ref = tensor.data_ptr(), tensor
+            array.data = tensor.data_ptr()
         with torch_stream(device):
             command.launch()
 
@@ -108,16 +109,19 @@ def is_plain(*tensors: Tensor) -> bool:
     return all(t.dtype == torch.float32 and not (tracks and t.requires_grad) for t in tensors)
 
 
-@contextlib.contextmanager
-def torch_stream(device: torch.device) -> Iterator[None]:
+def torch_stream(device: torch.device) -> contextlib.AbstractContextManager[Any]:
     """Queues Warp's work on torch's current CUDA stream, so that the two keep their order; nothing to do on a CPU."""
-    if device.type == "cuda":
-        stream = _same_stream(torch.cuda.current_stream(device))
-        # While torch captures a graph, work on another stream can't be waited for.
-        with wp.ScopedStream(stream, sync_enter=not torch.cuda.is_current_stream_capturing()):
-            yield
-    else:
-        yield
+    if device.type != "cuda":
+        return _NO_STREAM
+    stream = _same_stream(torch.cuda.current_stream(device))
+    # While torch captures a graph, work on another stream can't be waited for.
+    scope: contextlib.AbstractContextManager[Any] = wp.ScopedStream(
+        stream, sync_enter=not torch.cuda.is_current_stream_capturing()
+    )
+    return scope
+
+
+_NO_STREAM = contextlib.nullcontext()
 
 
 @functools.cache

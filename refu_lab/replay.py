@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import itertools
+import math
 import sys
 import time
 from array import array
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 _MAX_REASONS = 20
 """Reasons of skips that are counted apart."""
 _LONGEST_PAUSE_S = 60.0
+_TOLD_S = 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -300,10 +302,17 @@ class _Replayer:
 
 
 @one_thread()
-def replay(options: ReplayOptions, *, pipeline: GarmentPipeline | None = None, progress: bool = False) -> ReplayResult:
+def replay(
+    options: ReplayOptions,
+    *,
+    pipeline: GarmentPipeline | None = None,
+    progress: bool = False,
+    told: Callable[[int, int], object] | None = None,
+) -> ReplayResult:
     """Runs every frame of the input through the pipeline, writes the output bag, measures.
 
-    `pipeline` is what `options.load_pipeline()` has given, if that was called already.
+    `pipeline` is what `options.load_pipeline()` has given, if that was called already. `progress` shows a bar. `told`
+    is called some times a second with how many frames are done, and of how many: 0 where that isn't known.
 
     An interrupt (Ctrl-C) ends the replay early: the bag is closed and the result so far is returned.
 
@@ -326,9 +335,9 @@ def replay(options: ReplayOptions, *, pipeline: GarmentPipeline | None = None, p
         records = itertools.islice(source.records, options.max_frames)
         total = source.count if options.max_frames is None else min(source.count or sys.maxsize, options.max_frames)
         try:
-            for record in tqdm(
-                _paced(records, options.speed), total=total, unit="frame", disable=None if progress else True
-            ):
+            bar = None if progress and told is None else True
+            shown = tqdm(_paced(records, options.speed), total=total, unit="frame", disable=bar)
+            for record in shown if told is None else _counted(shown, total or 0, told):
                 replayer.run(record, bag)
         except KeyboardInterrupt:
             result.interrupted = True
@@ -352,6 +361,18 @@ def _doubts(result: ReplayResult, source: Source) -> list[str]:
             along = f": they stand along {up} (--input-axes frame?)" if up else ""
             doubts.append(f"people are upright in {100 * upright:.0f} % of the frames only{along}")
     return doubts
+
+
+def _counted(records: Iterable[FrameRecord], total: int, told: Callable[[int, int], object]) -> Iterator[FrameRecord]:
+    """The records; `told` is called before the first, after the last, and in between at most every `_TOLD_S`."""
+    done, last = 0, -math.inf
+    for i, record in enumerate(records):
+        if (now := time.monotonic()) > last + _TOLD_S:
+            last = now
+            told(i, total)
+        yield record
+        done = i + 1
+    told(done, total)
 
 
 def _paced(records: Iterable[FrameRecord], speed: Literal["max", "real"]) -> Iterator[FrameRecord]:

@@ -14,7 +14,7 @@ from refu_core.modes import FOREIGN_BETAS
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from refu_ros._recorder import RecorderState
+    from msg_adapters.bags import RecorderState
     from refu_ros._settings import NodeSettings, PipelineKey
     from refu_ros._statistics import Report
 

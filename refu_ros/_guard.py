@@ -6,6 +6,7 @@ import functools
 import time
 from typing import TYPE_CHECKING, Any
 
+from rclpy.action import ActionServer
 from rclpy.exceptions import InvalidHandle
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.node import Node, SetParametersResult
@@ -77,6 +78,10 @@ class GuardedNode(Node):  # type: ignore[misc]
         An event may be queued when its publisher or subscription is destroyed: then there is nothing to take any more,
         which the C++ executor would raise.
         """
+        if isinstance(waitable, ActionServer):
+            waitable.take_data = self.guarded("action", waitable.take_data, lambda *_: {})
+            super().add_waitable(waitable)
+            return
         waitable.callback = self.guarded("event", waitable.callback)
         take = waitable.take_data
 
@@ -120,8 +125,10 @@ def _bounded(callback: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def answer_no(error: Exception, request: Any, response: Any) -> Any:
-    """The answer to a request that can't be met: as it is made, `success` is false; parameters get the reason, too."""
+    """The answer to a request that can't be met: as it is made, `success` is false; where it has room, the reason."""
     refused = SetParametersResult(successful=False, reason=printable(_reason(error)))
+    if hasattr(response, "message"):
+        response.message = printable(_reason(error))
     if hasattr(response, "results"):
         response.results = [*response.results, *[refused] * (len(request.parameters) - len(response.results))]
     elif isinstance(getattr(response, "result", None), SetParametersResult):

@@ -16,7 +16,7 @@ def interface(name: str) -> Any:
     package, kind, type_name = name.split("/")
     try:
         return getattr(import_module(f"{package}.{kind}"), type_name)
-    except ImportError as error:
+    except (ImportError, AttributeError) as error:  # the latter: a folder of definitions, which Python takes for it
         msg = f"{name} isn't importable: install or source {package} ({error})"
         raise RefuError(msg) from error
 

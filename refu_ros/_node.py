@@ -23,6 +23,7 @@ from refu_ros._listener import Listener
 from refu_ros._loader import PipelineLoader
 from refu_ros._parameters import declare_settings
 from refu_ros._recording import Recording
+from refu_ros._requests import Requests
 from refu_ros._scene import Scene
 from refu_ros._settings import specs
 from refu_ros._worker import Worker
@@ -66,6 +67,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         self._diagnostics = self.create_publisher(interface(adapters.DIAGNOSTIC_ARRAY), DIAGNOSTICS_TOPIC, 10)
         switch = self.guarded("record", self._on_record, answer_no)
         self.create_service(interface("std_srvs/srv/SetBool"), "~/record", switch)
+        self._requests = Requests(self)
         self.add_on_set_parameters_callback(self._on_parameters)
         # Steady time: a simulation that stands still must not stop the diagnostics.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -144,6 +146,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
 
     def close(self) -> None:
         """Ends threads and files in the order data flows. May be called more than once."""
+        self._requests.close()
         self._deactivate()
         self._cleanup()
 
@@ -262,11 +265,15 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         self.get_logger().error(text)
 
     def _on_record(self, request: Any, response: Any) -> Any:
-        refusal = "" if self._state == "active" else f"the node is {self._state}: activate it first"
-        done = self.recording.switch(self.settings.record, on=request.data, refusal=refusal)
-        response.success, response.message = done
-        self._attend()
+        response.success, response.message, _ = self.record(on=request.data)
         return response
+
+    def record(self, *, on: bool, path: str = "") -> tuple[bool, str, str]:
+        """Starts or stops a recording, by default to the parameter's path: whether, what or why not, and where."""
+        refusal = "" if self._state == "active" else f"the node is {self._state}: activate it first"
+        done = self.recording.switch(path or self.settings.record, on=on, refusal=refusal)
+        self._attend()
+        return done
 
     # Once a second --------------------------------------------------------------------------------
 

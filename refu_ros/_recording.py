@@ -5,15 +5,15 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING
 
+from msg_adapters.bags import Recorder
 from refu_core import RefuError
 from refu_core.errors import printable
-from refu_ros._recorder import Recorder
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from msg_adapters import QosProfile
-    from refu_ros._recorder import RecorderState
+    from msg_adapters.bags import RecorderState
 
 
 class Recording:
@@ -50,23 +50,24 @@ class Recording:
         except RefuError as error:
             self._error = printable(error)
 
-    def switch(self, path: str, *, on: bool, refusal: str) -> tuple[bool, str]:
-        """Answers the service: whether it has been done, and what has been done or stands in the way."""
+    def switch(self, path: str, *, on: bool, refusal: str) -> tuple[bool, str, str]:
+        """Answers a service: whether it has been done, what has been done or stands in the way, and the bag."""
         recorder = self._recorder
         if not on:
             self._stop()
-            return (False, "nothing is recorded") if recorder is None else _done(f"{recorder.path} is being closed")
+            return _no("nothing is recorded") if recorder is None else _done("{} is being closed", recorder)
         if refusal:
-            return False, refusal
+            return _no(refusal)
         if recorder is not None and recorder.running:
-            return False, printable(f"already recording to {recorder.path}")
+            return _no(f"already recording to {recorder.path}")
         if not path:
-            return False, "no directory: set the parameter record to one, which also starts the recording"
+            return _no("no directory: set the parameter record to one, which also starts the recording")
         try:
             self.start(path)
         except RefuError as error:
-            return False, printable(error)
-        return _done(f"recording to {'' if self._recorder is None else self._recorder.path}")
+            return _no(error)
+        assert self._recorder is not None
+        return _done("recording to {}", self._recorder)
 
     def put(self, topic: str, message_type: str, data: bytes, qos: QosProfile) -> None:
         """Queues a message that was sent or received now."""
@@ -102,5 +103,9 @@ class Recording:
             self._closing.append(recorder)
 
 
-def _done(text: str) -> tuple[bool, str]:
-    return True, printable(text)
+def _done(text: str, recorder: Recorder) -> tuple[bool, str, str]:
+    return True, printable(text.format(recorder.path)), str(recorder.path)
+
+
+def _no(reason: object) -> tuple[bool, str, str]:
+    return False, printable(reason), ""

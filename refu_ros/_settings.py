@@ -205,6 +205,9 @@ class NodeSettings:
         high=3600.0,
         live=False,
     )
+    bags: str = _parameter(
+        "", "Folder that requests may name bags in (refu_msgs); empty: they may name none.", live=False
+    )
     lazy: bool = _parameter(
         True,
         "Whether the inputs are subscribed to only while somebody wants the output, or it is recorded.",
@@ -232,7 +235,7 @@ class NodeSettings:
         if not _FRAME.fullmatch(self.frame_id):
             msg = f"frame_id: wanted a name as tf2 has them, without a leading slash or spaces, got {self.frame_id!r}"
             raise SettingsError(msg)
-        for name, path in (("record", self.record), ("weights", self.weights)):
+        for name, path in (("record", self.record), ("weights", self.weights), ("bags", self.bags)):
             if path and not _names_a_folder(path):
                 msg = f"{name}: wanted the path of a folder, got {path!r}"
                 raise SettingsError(msg)

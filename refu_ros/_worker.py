@@ -143,7 +143,7 @@ class Worker:
             for _ in arrivals:
                 self._statistics.skip("unwatched")
             return
-        frames = {person: _with_settings(arrival.frame, settings) for person, arrival in arrivals.items()}
+        frames = {person: with_settings(arrival.frame, settings) for person, arrival in arrivals.items()}
         found, unresolved = self._dress(frames)
         dressed = {person: frame for person, frame in frames.items() if person in self._dressed}
         if not dressed:
@@ -247,7 +247,7 @@ class Worker:
         return Moment(settings, self._outlet.watchers, self._outlet.now_ns())
 
 
-def _with_settings(frame: SmplFrame, settings: NodeSettings) -> SmplFrame:
+def with_settings(frame: SmplFrame, settings: NodeSettings) -> SmplFrame:
     """The frame with the shape and style that the parameters ask for."""
     if settings.betas_source == BetasSource.FIXED:
         frame = replace(frame, betas=np.array(settings.betas))

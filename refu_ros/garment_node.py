@@ -27,6 +27,7 @@ topics:
   /diagnostics  out: diagnostic_msgs/DiagnosticArray, once a second
 services:
   ~/record      std_srvs/SetBool: starts and stops a recording to the parameter record
+  ~/dress, ~/record_bag, ~/replay_bag (action)  of refu_msgs, where it is installed
   and those of every lifecycle node"""
 
 

@@ -71,7 +71,7 @@ class Recording:
     def begin(self, folder: Path) -> None:
         """Records until it is killed."""
         from msg_adapters import QosProfile
-        from refu_ros._recorder import Recorder
+        from msg_adapters.bags import Recorder
 
         with self._progress.open("r+b") as file, mmap.mmap(file.fileno(), 8) as progress:
             # Before there is a new bag: the last one's count would be taken for that of its empty file.

@@ -26,6 +26,7 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 
 from msg_adapters import BagError, BagReader, BagWriter, QosProfile
+from msg_adapters.bags import Recorder
 from msg_adapters.diagnostics import DiagnosticStatus
 from refu_core import GarmentPipeline, SmplFrame, WeightsError, load_body
 from refu_core._device import is_device_loss
@@ -34,7 +35,6 @@ from refu_core.training import load_checkpoint, save_checkpoint
 from refu_core.weights import save_weights
 from refu_lab.cli import main
 from refu_ros._diagnostics import statuses
-from refu_ros._recorder import Recorder
 from refu_ros._scene import Scene
 from refu_ros._settings import NodeSettings
 from refu_ros._statistics import Statistics

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import resource
+import tempfile
 import threading
 import time
 from dataclasses import replace
@@ -27,15 +29,17 @@ from msg_adapters import (
     decode_marker_array,
     decode_point_cloud,
 )
+from msg_adapters.bags import Recorder, RecorderState, free_path
 from msg_adapters.cdr import CdrWriter
-from refu_core import BodyError, FrameError, GarmentPipeline, MeshError, SmplFrame, load_body
+from refu_core import BodyError, FrameError, GarmentPipeline, MeshError, RefuError, SmplFrame, load_body
 from refu_core.keypoints import Proportions, Skeleton, keypoint_layout
 from refu_core.keypoints._pose import Pose
 from refu_core.modes import FOREIGN_BETAS
+from refu_ros._asked import asked_path
 from refu_ros._decoding import InputDecoder
 from refu_ros._diagnostics import statuses
+from refu_ros._dresser import Dresser
 from refu_ros._loader import PipelineLoader
-from refu_ros._recorder import Recorder, RecorderState, free_path
 from refu_ros._scene import Scene, check_plausible
 from refu_ros._settings import NodeSettings, SettingsError, defaults, specs
 from refu_ros._statistics import Statistics
@@ -725,3 +729,45 @@ def test_transforms_that_are_missing_are_reported() -> None:
     status = report_of(statistics)["input"]
     assert (status.level, status.message) == (1, "1 of 1 have no transform: no transform leads from camera to map")
     assert status.values["dropped: transform"] == "1"
+
+
+# ---- requests --------------------------------------------------------------------------------------------------------
+
+
+@given(
+    st.text(max_size=30) | st.lists(st.sampled_from(["a", "..", ".", "", "b.mcap", "-x", "~", "link"])).map("/".join)
+)
+def test_no_name_leads_out_of_the_folder(name: str) -> None:
+    with tempfile.TemporaryDirectory() as home:
+        folder = Path(home, "bags")
+        folder.mkdir()
+        (folder / "link").symlink_to(home)
+        path = folder.resolve()
+        with contextlib.suppress(RefuError):
+            path = asked_path(NodeSettings(bags=str(folder)), name)
+            assert path == folder.resolve() / name
+        assert ".." not in path.parts
+        assert not path.is_symlink()
+
+
+def test_without_a_folder_no_file_may_be_named() -> None:
+    with pytest.raises(RefuError, match="start the node with the parameter bags"):
+        asked_path(NodeSettings(), "walk.mcap")
+
+
+def test_who_asks_too_often_is_told_so() -> None:
+    dresser, go = Dresser(), threading.Event()
+    settings = NodeSettings(garments=("short-pant-male",), backbone="skinned")
+    frame = SmplFrame(np.zeros((24, 3)))
+    try:
+        waiting = [dresser.ask(frame, settings, lambda *_: go.wait(60)) for _ in range(8)]
+        with pytest.raises(RefuError, match="8 requests wait already"):
+            dresser.ask(frame, settings, lambda *_: None)
+        go.set()
+        assert all(one.result(60) for one in waiting)
+        seen = dresser.ask(frame, settings, lambda _, placed: placed["short-pant-male"]).result(60)
+    finally:
+        go.set()
+        dresser.close()
+    wanted = GarmentPipeline.load(["short-pant-male"], backbone="skinned")(frame)["short-pant-male"].local
+    np.testing.assert_array_equal(seen, wanted[:, [2, 0, 1]])

@@ -20,8 +20,8 @@ from mcap.records import Message
 from mcap.stream_reader import StreamReader
 
 from msg_adapters import BagError, BagReader, BagWriter, QosProfile, encoder_for, open_smpl_bag
+from msg_adapters.bags import Recorder
 from refu_core import SmplFrame
-from refu_ros._recorder import Recorder
 from tests.virtual_time import VirtualTime
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def put(recorder: Recorder, i: int, data: bytes = FRAME) -> None:
 def time(monkeypatch: pytest.MonkeyPatch) -> VirtualTime:
     """That of the recorder: its promises in seconds hold to the microsecond, and no machine is too busy for them."""
     time = VirtualTime()
-    time.rules("refu_ros._recorder", monkeypatch)
+    time.rules("msg_adapters.bags._recorder", monkeypatch)
     return time
 
 

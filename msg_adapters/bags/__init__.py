@@ -2,6 +2,7 @@
 
 from msg_adapters.bags._metadata import QosProfile
 from msg_adapters.bags._reader import BAG_SUFFIXES, BagMessage, BagReader, TopicInfo
+from msg_adapters.bags._recorder import Recorder, RecorderState, free_path
 from msg_adapters.bags._smpl import FrameRecord, SmplBag, iter_smpl_frames, open_smpl_bag
 from msg_adapters.bags._writer import BagWriter
 
@@ -12,8 +13,11 @@ __all__ = [
     "BagWriter",
     "FrameRecord",
     "QosProfile",
+    "Recorder",
+    "RecorderState",
     "SmplBag",
     "TopicInfo",
+    "free_path",
     "iter_smpl_frames",
     "open_smpl_bag",
 ]

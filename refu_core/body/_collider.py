@@ -90,9 +90,9 @@ class Collider:
             else:
                 run("part")
                 self._smooth(how.smooth_last)
-                for _ in range(how.edge_rounds):
-                    run("edge")
-                    run("follow")
+                for r in range(how.edge_rounds):
+                    run(f"edge {r}")
+                    run(f"follow {r}")
         return self._levelled(how.smooth_last)
 
     def _touch(self) -> None:
@@ -190,9 +190,11 @@ class Collider:
             "near": (launches.near_kernel, n_bundles, [work, segments, bundles, known.skins]),
             "touch": (launches.touch_kernel, n, [work, segments]),
             "part": (launches.part_kernel, n, [work, segments, bones, rings, how.part_rounds]),
-            "edge": (launches.edge_kernel, len(work.steps), [work, moved, rings, segments, bones, how.steep]),
-            "follow": (launches.follow_kernel, n, [work, moved, rings]),
         }
+        for r in range(how.edge_rounds):
+            edge = [r, work, moved, rings, segments, bones, how.steep]
+            steps[f"edge {r}"] = (launches.edge_kernel, len(work.steps), edge)
+            steps[f"follow {r}"] = (launches.follow_kernel, n, [r, work, moved, rings])
         for r in range(how.deepen_rounds):
             steps[f"deepen {r}"] = (launches.deepen_kernel, n, [work, segments, rings, r])
         return {name: self._recorded(*step) for name, step in steps.items()}

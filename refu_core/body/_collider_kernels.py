@@ -99,6 +99,7 @@ class Work:
     """Vertices of those edges."""
     is_moved: wp.array[int]
     is_end: wp.array[int]
+    """Whether a vertex is in `ends`; if it was moved with its edges, 2 and the last round in which it was."""
     is_front: wp.array[int]
     """The last round in whose front a vertex was, counted from 1."""
     touched: wp.array[int]

@@ -88,15 +88,21 @@ def part_kernel(work: Work, segments: Segments, bones: Bones, rings: Rings, roun
 
 @wp.kernel
 def edge_kernel(
-    work: Work, moved: wp.array[wp.vec3], rings: Rings, segments: Segments, bones: Bones, steep: float
+    rounds: int,
+    work: Work,
+    moved: wp.array[wp.vec3],
+    rings: Rings,
+    segments: Segments,
+    bones: Bones,
+    steep: float,
 ) -> None:
     i = wp.tid()
     if i < work.counts[HOT]:
-        raise_edge(work.hot[i], work, moved, rings, segments, bones, steep)
+        raise_edge(work.hot[i], rounds, work, moved, rings, segments, bones, steep)
 
 
 @wp.kernel
-def follow_kernel(work: Work, moved: wp.array[wp.vec3], rings: Rings) -> None:
+def follow_kernel(rounds: int, work: Work, moved: wp.array[wp.vec3], rings: Rings) -> None:
     i = wp.tid()
     if i < work.counts[ENDS]:
-        follow(work.ends[i], work, moved, rings)
+        follow(work.ends[i], rounds, work, moved, rings)

@@ -210,7 +210,9 @@ def part(v: int, work: Work, segments: Segments, bones: Bones, rings: Rings, rou
         sunk = wp.dot(start - p, normal)
         for k in range(segments.trees.shape[0]):
             if (touched >> k) & 1 == 1:
-                far = wp.where((outside >> k) & 1 == 1, wp.min(segments.gap[v, k] + sunk, reach), reach)
+                # The surface is within the gap of where `touch` found it; only `deepen` looks farther inside.
+                is_at = (outside >> k) & 1 == 1 or work.is_front[v] == 0
+                far = wp.where(is_at, wp.min(segments.gap[v, k] + wp.length(p - start), reach), reach)
                 ratio = segments.ratio[own, k]
                 found, away = way_out(p, normal, sunk, k, ratio, segments.gap[v, k], far, segments, bones)
                 step += wp.length_sq(found) * found
@@ -241,12 +243,22 @@ def part(v: int, work: Work, segments: Segments, bones: Bones, rings: Rings, rou
 
 @wp.func
 def raise_edge(
-    e: int, work: Work, moved: wp.array[wp.vec3], rings: Rings, segments: Segments, bones: Bones, steep: float
+    e: int,
+    rounds: int,
+    work: Work,
+    moved: wp.array[wp.vec3],
+    rings: Rings,
+    segments: Segments,
+    bones: Bones,
+    steep: float,
 ) -> None:
     """How the middle of a hot edge gives way, if its ends were moved by more than `steep` [m] apart from each other;
     in full from twice that on."""
     v = rings.ends[e][0]
     w = rings.ends[e][1]
+    # One that neither end of has moved in the last round gives way as before.
+    if rounds > 0 and work.is_end[v] <= rounds and work.is_end[w] <= rounds:
+        return
     step = wp.vec3()
     total = float(0.0)
     gone_v = work.points[v] - moved[v]
@@ -272,7 +284,7 @@ def raise_edge(
 
 
 @wp.func
-def follow(v: int, work: Work, moved: wp.array[wp.vec3], rings: Rings) -> None:
+def follow(v: int, rounds: int, work: Work, moved: wp.array[wp.vec3], rings: Rings) -> None:
     """A vertex goes with its edges, most of all with those that have far to go."""
     step = wp.vec3()
     total = float(0.0)
@@ -283,6 +295,7 @@ def follow(v: int, work: Work, moved: wp.array[wp.vec3], rings: Rings) -> None:
             total += wp.length_sq(found)
     if total > 0.0:
         moved[v] = within(moved[v] + step / total, work.skin[v], work.farthest[v])
+        work.is_end[v] = rounds + 2
 
 
 @wp.kernel

@@ -78,8 +78,11 @@ def skin_kernel(
     shape = wp.min(b, points.shape[0] - 1)
     for v in range(strip * each[0], wp.min((strip + 1) * each[0], posed.shape[1])):
         t = Transform()
-        for k in range(start[v], start[v + 1]):
+        k = int(start[v])
+        last = start[v + 1]
+        while k < last:  # half the instructions of Warp's range
             t += weight[k] * transforms[b, joint[k]]
+            k += 1
         p = points[shape, v]
         posed[b, v] = wp.vec3(
             t[0] * p[0] + t[1] * p[1] + t[2] * p[2] + t[9],

@@ -114,8 +114,8 @@ def part_kernel(
     for i in range(work.counts[TOUCHING]):
         part(work.touching[i], work, segments, bones, rings, rounds)
     smooth(work, rings, sweeps, full, step)
-    for _ in range(edge_rounds):
+    for rounds in range(edge_rounds):
         for i in range(work.counts[HOT]):
-            raise_edge(work.hot[i], work, moved, rings, segments, bones, steep)
+            raise_edge(work.hot[i], rounds, work, moved, rings, segments, bones, steep)
         for i in range(work.counts[ENDS]):
-            follow(work.ends[i], work, moved, rings)
+            follow(work.ends[i], rounds, work, moved, rings)

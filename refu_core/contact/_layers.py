@@ -13,6 +13,7 @@ from torch import Tensor
 
 from refu_core._warp import as_warp, torch_stream
 from refu_core.contact import _layers_kernels as kernels
+from refu_core.contact import _layers_move_kernels as moving
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
 from refu_core.errors import MeshError
 from refu_core.mesh import Adjacency, Connectivity
@@ -69,6 +70,8 @@ class Layer:
         self._push = torch.zeros(len(candidates), 3, device=self.device)
         self._extent = torch.zeros(2, 3, device=self.device)
         self._fields = torch.zeros(2, len(rows) + 1, 3, device=self.device)
+        self._rows = torch.from_numpy(rows).to(self.device)
+        self._looks, self._moved = torch.zeros(2, len(rows), dtype=torch.int32, device=self.device)
         self._count = torch.zeros(1, dtype=torch.int32, device=self.device)
         self._n_doubtful = torch.zeros(1, dtype=torch.int32, device=self.device)
         self._tree: Any = None
@@ -85,11 +88,14 @@ class Layer:
             self._record(rules, later, *cuts, *lists)
 
     @torch.no_grad()
-    def __call__(self, above: Tensor, below: Tensor) -> tuple[Tensor, Tensor]:
+    def __call__(self, above: Tensor, below: Tensor, *, goes_on: bool = False) -> tuple[Tensor, Tensor]:
         """The outer garment, (V, 3) [m], off the inner one, (U, 3), and how many of its vertices were below the gap.
 
         The number is an int32 of shape (1,), on the garments' device: a GPU isn't waited for, and makes the launches
         for those below the gap where there are none, too. Not differentiable.
+
+        A call that `goes_on` is for the same inner garment as the last one: whoever is where it was left, and needn't
+        be moved from there, isn't looked at.
 
         Raises `MeshError` for garments of other sizes than these were made for.
         """
@@ -97,7 +103,7 @@ class Layer:
         if not self._n_candidates:
             return above, torch.zeros_like(self._count)
         with torch_stream(self.device):
-            self._take(above, below)
+            self._take(above, below, goes_on=goes_on)
             self._look("search")
             n_low = self._count.clone()
             if not self._may_move():
@@ -120,13 +126,18 @@ class Layer:
             )
             raise MeshError(msg)
 
-    def _take(self, above: Tensor, below: Tensor) -> None:
+    def _take(self, above: Tensor, below: Tensor, *, goes_on: bool) -> None:
         """Takes over a frame."""
+        if goes_on:
+            self._looks.copy_((above != self._above).any(1)[self._rows] | (self._moved > 0))
+        else:
+            self._looks.fill_(1)
+            self._below.copy_(below)
+            torch.aminmax(self._below, dim=0, out=(self._extent[0], self._extent[1]))
+            self._commands["normals"].launch()
+            self._tree_is_late = True
+        self._moved.zero_()
         self._above.copy_(above)
-        self._below.copy_(below)
-        torch.aminmax(self._below, dim=0, out=(self._extent[0], self._extent[1]))
-        self._commands["normals"].launch()
-        self._tree_is_late = True
 
     def _look(self, search: str) -> None:
         """What has to be pushed, and how many vertices that are; a device that isn't waited for asks about everyone."""
@@ -177,6 +188,7 @@ class Layer:
             wp.zeros(self._n_candidates, dtype=wp.int32, device=str(self.device)) for _ in range(3)
         )
         itself = _ints(np.arange(self._n_candidates + 1), self.device)
+        looks, moved = as_warp(self._looks, wp.int32), as_warp(self._moved, wp.int32)
         search = [below, below_cut, above, rows]
         garments = [below, normals, below_cut, above, above_cut, rows]
         pushed = [closest, push, as_warp(self._count, wp.int32)]
@@ -184,16 +196,16 @@ class Layer:
         blend = [push, start, ring]
         reached = [wp.zeros(self._n_region, dtype=wp.int32, device=str(self.device)) for _ in range(2)]
         extent = as_warp(self._extent, wp.vec3)
-        again = [start, ring, found, extent, later, *pushed, *doubts]
+        again = [start, ring, looks, found, extent, later, *pushed, *doubts]
         for name, kernel, size, arguments in (
             ("normals", kernels.normals_kernel, len(self._below), [below, below_cut, normals]),
-            ("search", kernels.search_kernel, self._n_candidates, [*search, near_start, near, found]),
-            ("search again", kernels.search_kernel, self._n_candidates, [*search, itself, closest, found]),
+            ("search", kernels.search_kernel, self._n_candidates, [*search, near_start, near, looks, found]),
+            ("search again", kernels.search_kernel, self._n_candidates, [*search, itself, closest, looks, found]),
             (
                 "lift",
                 kernels.lift_kernel,
                 self._n_candidates,
-                [*garments, start, ring, found, extent, rules, *pushed, *doubts],
+                [*garments, start, ring, looks, found, extent, rules, *pushed, *doubts],
             ),
             ("lift again", kernels.lift_kernel, self._n_candidates, [*garments, *again]),
             (
@@ -208,10 +220,10 @@ class Layer:
                 self._n_candidates,
                 [self._tree.id, *garments, found, rules, *doubts, *pushed],
             ),
-            ("spread0", kernels.spread_kernel, self._n_region, [*blend, fields[0], fields[1]]),
-            ("spread1", kernels.spread_kernel, self._n_region, [*blend, fields[1], fields[0]]),
-            ("move", kernels.move_kernel, self._n_region, [rows, fields[0], above]),
-            ("move all", kernels.move_all_kernel, 1, [*blend, rows, 0, *reached, *fields, above]),
+            ("spread0", moving.spread_kernel, self._n_region, [*blend, fields[0], fields[1]]),
+            ("spread1", moving.spread_kernel, self._n_region, [*blend, fields[1], fields[0]]),
+            ("move", moving.move_kernel, self._n_region, [rows, fields[0], above, looks, moved]),
+            ("move all", moving.move_all_kernel, 1, [*blend, rows, 0, *reached, *fields, above, looks, moved]),
         ):
             self._commands[name] = wp.launch(kernel, size, arguments, device=str(self.device), record_cmd=True)
 

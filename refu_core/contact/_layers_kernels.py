@@ -125,15 +125,18 @@ def search_kernel(
     candidates: wp.array[int],
     near_start: wp.array[int],
     near: wp.array[int],
+    looks: wp.array[int],
     # output, by candidate
     found: wp.array[int],
 ) -> None:
-    """Which vertex of the sheet below each candidate comes to, downhill.
+    """Which vertex of the sheet below each candidate that `looks` comes to, downhill.
 
     From the nearest of those to look from, which are `near[near_start[k]:near_start[k + 1]]`; or -1, if they are -1.
     `STRANGER` where there are none.
     """
     k = wp.tid()
+    if looks[k] == 0:
+        return
     if near_start[k] == near_start[k + 1]:
         found[k] = STRANGER
         return
@@ -207,6 +210,7 @@ def lift_kernel(
     candidates: wp.array[int],
     ring_start: wp.array[int],
     ring: wp.array[int],
+    looks: wp.array[int],
     found: wp.array[int],
     extent: wp.array[wp.vec3],
     rules: LayerRules,
@@ -217,7 +221,7 @@ def lift_kernel(
     doubtful: wp.array[int],
     n_doubtful: wp.array[int],
 ) -> None:
-    """What brings each candidate to the gap above the sheet, and how many they are that lack something.
+    """What brings each candidate that `looks` to the gap above the sheet, and how many they are that lack something.
 
     A fold that one candidate's search ended in is seldom in the way of its neighbours': what these `found` is looked
     at, too. Whoever is far below the sheet is `doubtful`, and only listed. `closest` is the vertex of the sheet that
@@ -227,6 +231,8 @@ def lift_kernel(
     i = candidates[k]
     p = above[i]
     push[k] = wp.vec3(0.0, 0.0, 0.0)
+    if looks[k] == 0:
+        return
     v = int(found[k])
     closest[k] = -1
     if v == STRANGER:
@@ -247,10 +253,13 @@ def lift_kernel(
                     v = found[j]
         if v != found[k]:
             v = nearest_vertex(p, v, below, below_cut)
-    # No point of a face is farther than its longest edge from its closest corner.
-    if wp.length(below[v] - p) > rules.reach + rules.longest:
+    away = wp.length(below[v] - p)
+    if away > rules.reach + rules.longest:
         return
     closest[k] = v
+    # No point of a face is farther from its closest corner than from the middle of three edges of its longest one.
+    if away > rules.reach + 0.578 * rules.longest:
+        return
     face, feature, w, offset = nearest_face(p, v, below, below_cut)
     normal = normal_on(face, w, below_normals, below_cut)
     if wp.dot(offset, normal) >= rules.gap:
@@ -296,101 +305,3 @@ def tree_kernel(
     normal = normal_on(face, w, below_normals, below_cut)
     closest[k] = below_cut.faces[face, heaviest(w)]
     lift_off(k, i, face, feature, offset, normal, below_cut, above, above_cut, found[k] == STRANGER, rules, push, count)
-
-
-@wp.func
-def spread(
-    k: int,
-    push: wp.array[wp.vec3],
-    ring_start: wp.array[int],
-    ring: wp.array[int],
-    field: wp.array[wp.vec3],
-    # output
-    smoother: wp.array[wp.vec3],
-) -> None:
-    """One round of `Blend.spread`."""
-    start = ring_start[k]
-    end = ring_start[k + 1]
-    total = wp.vec3(0.0, 0.0, 0.0)
-    for r in range(start, end):
-        total += field[ring[r]]
-    mean = total / float(wp.max(end - start, 1))
-    if k < push.shape[0]:
-        length = wp.length(push[k])
-        if length > 0.0:
-            way = push[k] / length
-            mean += wp.max(0.0, length - wp.dot(mean, way)) * way
-    smoother[k] = mean
-
-
-@wp.kernel(enable_backward=False)
-def spread_kernel(
-    push: wp.array[wp.vec3],
-    ring_start: wp.array[int],
-    ring: wp.array[int],
-    field: wp.array[wp.vec3],
-    # output
-    smoother: wp.array[wp.vec3],
-) -> None:
-    """`spread` of one of the region a thread."""
-    spread(wp.tid(), push, ring_start, ring, field, smoother)
-
-
-@wp.kernel(enable_backward=False)
-def move_kernel(
-    rows: wp.array[int],
-    field: wp.array[wp.vec3],
-    # output
-    points: wp.array[wp.vec3],
-) -> None:
-    """Moves the vertices of the region."""
-    k = wp.tid()
-    points[rows[k]] += field[k]
-
-
-@wp.kernel(enable_backward=False)
-def move_all_kernel(
-    push: wp.array[wp.vec3],
-    ring_start: wp.array[int],
-    ring: wp.array[int],
-    rows: wp.array[int],
-    rounds: int,
-    # memory, zero between launches
-    is_reached: wp.array[int],
-    reached: wp.array[int],
-    field: wp.array[wp.vec3],
-    smoother: wp.array[wp.vec3],
-    # output
-    points: wp.array[wp.vec3],
-) -> None:
-    """All rounds, and the move, by one thread: of the pushed, and of those that so many rounds reach from there."""
-    n = int(0)
-    for k in range(push.shape[0]):
-        if wp.length_sq(push[k]) > 0.0:
-            field[k] = push[k]
-            is_reached[k] = 1
-            reached[n] = k
-            n += 1
-    first = int(0)
-    for _ in range(rounds):
-        last = int(n)
-        for i in range(first, last):
-            for r in range(ring_start[reached[i]], ring_start[reached[i] + 1]):
-                j = ring[r]
-                if j < rows.shape[0] and is_reached[j] == 0:
-                    is_reached[j] = 1
-                    reached[n] = j
-                    n += 1
-        first = last
-    for sweep in range(rounds):
-        for i in range(n):
-            if sweep % 2 == 0:
-                spread(reached[i], push, ring_start, ring, field, smoother)
-            else:
-                spread(reached[i], push, ring_start, ring, smoother, field)
-    for i in range(n):
-        k = reached[i]
-        points[rows[k]] += field[k]
-        is_reached[k] = 0
-        field[k] = wp.vec3()
-        smoother[k] = wp.vec3()

@@ -60,15 +60,14 @@ class Resolver:
         self._read_counts = self._counts.numpy() if self._is_serial else None
         self._state = self._bind_state()
         self._commands: dict[str, Any] = {}
-        self._dims: dict[str, int] = {}
-        self._recorded_for: tuple[Any, ...] = ()
+        self._recorded: dict[float, tuple[Any, dict[str, Any]]] = {}
 
     @torch.no_grad()
     def __call__(
         self,
         points: Tensor,
         sdf: MeshSdf,
-        start: SdfSample,
+        start: SdfSample | None,
         *,
         margin: float = DEFAULT_MARGIN,
         scale: float | VertexScale = 1.0,
@@ -78,7 +77,9 @@ class Resolver:
         Args:
             points: Garment vertices [m], shape (N, 3).
             sdf: The body's signed distance.
-            start: What it says of the points; what is beyond `margin` + 2 mm may be clipped from above.
+            start: What it says of the points; what is beyond `margin` + `ASKED_FROM` may be clipped from above. None
+                goes on from what the last call ended with, if that was for the same body: only points that were moved
+                since, and may have come that near, are asked.
             margin: ε ≥ 0 [m].
             scale: α of the first push: one number, or a function of vertices and their distances.
 
@@ -86,25 +87,26 @@ class Resolver:
             MeshError: points of another number or type, or a distance that isn't one to faces.
         """
         require_tensor("points", points)
-        if points.shape != (self._n_vertices, 3) or start.distance.shape != (self._n_vertices,):
-            shapes = f"{tuple(points.shape)} and {tuple(start.distance.shape)}"
+        distances = self._floats["distance"] if start is None else start.distance
+        if points.shape != (self._n_vertices, 3) or distances.shape != (self._n_vertices,):
+            shapes = f"{tuple(points.shape)} and {tuple(distances.shape)}"
             msg = f"wanted {self._n_vertices} points and their distances, got the shapes {shapes}"
             raise MeshError(msg)
-        if start.face is None:
+        if start is not None and start.face is None:
             msg = "start must name the closest faces: ask an ExactSdf, BandSdf or ApproxSdf"
             raise MeshError(msg)
         with torch_stream(self.device):
             self._take(points, start)
             self._record(sdf, margin)
-            self._run("begin", self._n_strips)
+            self._run("go on" if start is None else "begin")
             if not sdf.is_exact:
                 self._reconcile()
-            self._run("list", self._n_strips)
+            self._run("list")
             n = self._length(_state.NEAR)
             if n:
                 self._push(n, scale)
                 self._raise_edges()
-                self._run("tally", n)
+                self._run("tally")
         depth = -self._floats["first"].amin(0, keepdim=True)
         counts = self._counts[_state.INSIDE : _state.STUCK + 1].float()
         return Resolution(
@@ -113,25 +115,27 @@ class Resolver:
             torch.cat((counts, depth.clamp_min(0))),
         )
 
-    def _take(self, points: Tensor, start: SdfSample) -> None:
+    def _take(self, points: Tensor, start: SdfSample | None) -> None:
         """Takes over a frame."""
-        assert start.face is not None  # these distances are to faces
         self._counts.zero_()
         if not self._is_serial:
             self._bounds.zero_()
         self._vectors["origin"].copy_(points)
-        self._floats["first"].copy_(start.distance)
-        self._vectors["first_gradient"].copy_(start.gradient)
-        self._ints["first_face"].copy_(start.face)
+        if start is not None:
+            assert start.face is not None  # these distances are to faces
+            self._floats["first"].copy_(start.distance)
+            self._vectors["first_gradient"].copy_(start.gradient)
+            self._ints["first_face"].copy_(start.face)
 
     def _reconcile(self) -> None:
         """Where distances contradict each other along an edge, a closest face was missed."""
-        self._run("compare", self._n_strips)
+        self._run("compare")
         for _ in range(self._settings.looks):
             n = self._length(_state.SUSPECTS)
             self._counts[_state.CHANGED].zero_()
-            self._run("retry", n)
-            self._run("adopt", n)
+            if n:
+                self._run("retry")
+                self._run("adopt")
             if self._is_serial and not self._count(_state.CHANGED):
                 break
 
@@ -140,92 +144,89 @@ class Resolver:
         alpha = self._floats["alpha"][:n]
         if callable(scale):
             rows = self._ints["near"][:n].long()
-            alpha.copy_(scale(rows, self._floats["distance"][rows]))
+            alpha.copy_(scale(rows, self._floats["distance"].index_select(0, rows)))
         else:
             alpha.fill_(scale)
-        self._run("scale", n)
+        self._run("scale")
         self._blend()
-        self._run("settle", self._length(_state.REACHED))
+        self._length(_state.REACHED)
+        self._run("settle")
 
     def _blend(self) -> None:
         """Neighbours of pushed vertices give way with them."""
         if self._is_serial:
-            self._run("blend", 1)
+            self._run("blend")
             return
         for _ in range(self._settings.blend_reach):
-            self._run("reach", self._length(_state.REACHED))
-        n = self._length(_state.REACHED)
+            self._length(_state.REACHED)
+            self._run("reach")
+        self._length(_state.REACHED)
         for sweep in range(2 * self._settings.blend_pairs):
-            self._run(f"spread{sweep % 2}", n)
+            self._run(f"spread{sweep % 2}")
 
     def _raise_edges(self) -> None:
         """Raises both ends of the edges that run too low."""
-        n = self._n_edges
-        self._run("suspect", self._n_strips)
+        self._run("suspect")
         if self._is_serial:
-            self._run("raise edges", int(self._count(_state.CUTTING) > 0))
+            if self._count(_state.CUTTING):
+                self._run("raise edges")
             return
         self._close(_state.CUTTING)
         for round_ in range(self._settings.max_pushes):
-            self._run("measure" if round_ == 0 else f"again{round_ % 2}", n, (4, round_))
+            self._run("measure" if round_ == 0 else f"again{round_ % 2}", (4, round_))
             self._close(_state.CUTTING + 1 + round_)
             self._counts[_state.RAISED].zero_()
-            self._run(f"choose{round_ % 2}", n, (2, round_))
-            self._run("lift", self._length(_state.RAISED))
-
-    @property
-    def _n_strips(self) -> int:
-        """Threads that go through all vertices: one where a loop is faster than threads (`strips`)."""
-        return 1 if self._is_serial else self._n_vertices
+            self._run(f"choose{round_ % 2}", (2, round_))
+            self._length(_state.RAISED)
+            self._run("lift")
 
     def _length(self, which: int) -> int:
-        """How long a launch over a list of vertices is: as long as the list; on a GPU, as long as it may become."""
+        """How long a list of vertices is; on a GPU, which closes it, how long it may become."""
         if self._is_serial:
             return self._count(which)
         self._close(which)
         return self._n_vertices
 
     def _close(self, which: int) -> None:
-        self._run("close", 1, (1, which))
+        self._run("close", (1, which))
 
     def _count(self, which: int) -> int:
         assert self._read_counts is not None  # of a CPU
         return int(self._read_counts[which])
 
-    def _run(self, name: str, n: int, parameter: tuple[int, int] | None = None) -> None:
-        """Launches a step for `n` of its list, with one of its parameters, by position, set anew."""
-        if not n:
-            return
-        command = self._commands[name]
+    def _run(self, name: str, parameter: tuple[int, int] | None = None) -> None:
+        """Launches a step, with one of its parameters, by position, set anew."""
         if parameter is not None:
-            command.set_param_at_index(*parameter)
-        if self._dims.get(name) != n:
-            command.set_dim(n)
-            self._dims[name] = n
-        command.launch()
+            self._commands[name].set_param_at_index(*parameter)
+        self._commands[name].launch()
 
-    def _command(self, name: str, kernel: Any, inputs: list[Any]) -> None:
-        self._dims[name] = 1
-        self._commands[name] = wp.launch(kernel, dim=1, inputs=inputs, device=str(self.device), record_cmd=True)
+    def _command(self, name: str, kernel: Any, inputs: list[Any], n: int | None = None) -> None:
+        """Records a launch for `n` items, by default the vertices; on a CPU for one thread, which goes through all."""
+        dim = 1 if self._is_serial else self._n_vertices if n is None else n
+        self._commands[name] = wp.launch(kernel, dim, inputs, device=str(self.device), record_cmd=True)
 
     def _record(self, sdf: MeshSdf, margin: float) -> None:
-        """Records the launches of a frame, unless they are the last frame's."""
+        """Records the launches of a frame, or takes those that were recorded for the same body and margin."""
         skin = sdf.skin()
-        key = (skin, margin)
-        if key == self._recorded_for:
+        if margin in self._recorded and self._recorded[margin][0] is skin:
+            self._commands = self._recorded[margin][1]
             return
-        self._recorded_for = key
+        if len(self._recorded) >= _MOST_MARGINS:
+            self._recorded.clear()
+        self._commands = {}
+        self._recorded[margin] = skin, self._commands
         state, cloth, rules = self._state, self._cloth, self._rules(margin)
-        each = self._n_vertices // self._n_strips if self._n_vertices else 0
+        each = self._n_vertices if self._is_serial else 1
         self._command("begin", _resolver_kernels.begin_kernel, [each, state])
+        self._command("go on", _resolver_kernels.go_on_kernel, [each, margin + ASKED_FROM, state, skin])
         self._command("compare", _resolver_kernels.compare_kernel, [each, state, cloth, rules])
-        self._command("retry", _resolver_kernels.retry_kernel, [state, cloth, skin, rules])
-        self._command("adopt", _resolver_kernels.adopt_kernel, [state, cloth])
+        self._command("retry", _resolver_kernels.retry_kernel, [each, state, cloth, skin, rules])
+        self._command("adopt", _resolver_kernels.adopt_kernel, [each, state, cloth])
         self._command("list", _resolver_kernels.list_near_kernel, [each, state, rules])
-        self._command("scale", _resolver_kernels.scale_kernel, [state, rules])
-        self._command("settle", _resolver_kernels.settle_kernel, [state, skin, rules])
+        self._command("scale", _resolver_kernels.scale_kernel, [each, state, rules])
+        self._command("settle", _resolver_kernels.settle_kernel, [each, state, skin, rules])
         self._command("suspect", _edge_kernels.suspect_kernel, [each, state, cloth, rules])
-        self._command("tally", _resolver_kernels.tally_kernel, [state])
+        self._command("tally", _resolver_kernels.tally_kernel, [each, state])
         long_step, short_step = self._settings.blend_steps
         if self._is_serial:
             inputs = [state, cloth, self._settings.blend_reach, self._settings.blend_pairs, long_step, short_step]
@@ -233,7 +234,7 @@ class Resolver:
             self._command("raise edges", _edge_kernels.raise_edges_kernel, [state, cloth, skin, rules])
             return
         suspects, low, lower = (as_warp(row, wp.int32) for row in self._by_edge)
-        self._command("close", _round_kernels.close_kernel, [state, 0])
+        self._command("close", _round_kernels.close_kernel, [state, 0], 1)
         self._command("reach", _round_kernels.reach_kernel, [state, cloth])
         for name, step, fields in (
             ("spread0", long_step, (state.field, state.smoother)),
@@ -241,9 +242,10 @@ class Resolver:
         ):
             self._command(name, _round_kernels.spread_kernel, [state, cloth, step, *fields])
         for name, source, target in (("measure", suspects, low), ("again1", low, lower), ("again0", lower, low)):
-            self._command(name, _round_kernels.measure_kernel, [state, cloth, skin, rules, 0, source, target])
+            inputs = [state, cloth, skin, rules, 0, source, target]
+            self._command(name, _round_kernels.measure_kernel, inputs, self._n_edges)
         for name, source in (("choose0", low), ("choose1", lower)):
-            self._command(name, _round_kernels.choose_kernel, [state, cloth, 0, source])
+            self._command(name, _round_kernels.choose_kernel, [state, cloth, 0, source], self._n_edges)
         self._command("lift", _round_kernels.lift_kernel, [state, skin, rules])
 
     def _rules(self, margin: float) -> Any:
@@ -265,6 +267,10 @@ class Resolver:
         return state
 
 
+ASKED_FROM = 2e-3
+"""Vertices are asked for their exact distance up to this far beyond the margin [m]."""
+_MOST_MARGINS = 8
+"""Margins whose launches are kept: of an outer garment there are two a frame."""
 _VECTORS = ("origin", "first_gradient", "place", "gradient", "field", "smoother")
 _FLOATS = ("first", "distance", "way", "goal", "alpha", "largest")
 _INTS = ("first_face", "face", "mark", "near", "reached", "moved")

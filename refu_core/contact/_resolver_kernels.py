@@ -17,7 +17,7 @@ from refu_core.contact._state import (
     State,
     bounded,
     keep,
-    listed,
+    length,
 )
 from refu_core.sdf import Skin, query_skin
 
@@ -69,6 +69,26 @@ def begin_kernel(each: int, state: State) -> None:
 
 
 @wp.kernel(enable_backward=False)
+def go_on_kernel(each: int, reach: float, state: State, skin: Skin) -> None:
+    """From where the last call ended: who was moved since, and may have come within `reach`, is asked."""
+    first = wp.tid() * each
+    for i in range(first, first + each):
+        here = state.origin[i]
+        way = wp.length(here - state.place[i])
+        state.place[i] = here
+        if way > 0.0:
+            # No vertex gets nearer by more than it moves.
+            if state.distance[i] - way >= reach:
+                state.distance[i] -= way
+            else:
+                distance, gradient, face = query_skin(skin, here, state.face[i])
+                keep(i, here, distance, gradient, face, state)
+        state.first[i] = state.distance[i]
+        state.first_gradient[i] = state.gradient[i]
+        state.first_face[i] = state.face[i]
+
+
+@wp.kernel(enable_backward=False)
 def compare_kernel(each: int, state: State, cloth: Cloth, rules: Rules) -> None:
     """Lists the ends of edges at the skin along which distances contradict each other."""
     first = wp.tid() * each
@@ -81,12 +101,9 @@ def compare_kernel(each: int, state: State, cloth: Cloth, rules: Rules) -> None:
                     suspect(j, state)
 
 
-@wp.kernel(enable_backward=False)
-def retry_kernel(state: State, cloth: Cloth, skin: Skin, rules: Rules) -> None:
+@wp.func
+def retry(i: int, state: State, cloth: Cloth, skin: Skin, rules: Rules) -> None:
     """From the faces of neighbours that are nearer to theirs, a nearer one than the vertex's own may be found."""
-    i = listed(wp.tid(), SUSPECTS, state.reached, state)
-    if i < 0:
-        return
     nearest = wp.abs(state.distance[i])
     for k in range(cloth.ring_start[i], cloth.ring_start[i + 1]):
         j = cloth.ring[k]
@@ -100,17 +117,30 @@ def retry_kernel(state: State, cloth: Cloth, skin: Skin, rules: Rules) -> None:
 
 
 @wp.kernel(enable_backward=False)
-def adopt_kernel(state: State, cloth: Cloth) -> None:
+def retry_kernel(each: int, state: State, cloth: Cloth, skin: Skin, rules: Rules) -> None:
+    """`retry` for a list, `each` of it a thread."""
+    begin = wp.tid() * each
+    for k in range(begin, wp.min(begin + each, length(SUSPECTS, state))):
+        retry(state.reached[k], state, cloth, skin, rules)
+
+
+@wp.func
+def adopt(i: int, state: State, cloth: Cloth) -> None:
     """Takes over what was found, and suspects the neighbours of what changed."""
-    i = listed(wp.tid(), SUSPECTS, state.reached, state)
-    if i < 0:
-        return
     if state.first[i] == state.distance[i]:
         return
     wp.atomic_add(state.counts, CHANGED, 1)
     keep(i, state.origin[i], state.first[i], state.first_gradient[i], state.first_face[i], state)
     for k in range(cloth.ring_start[i], cloth.ring_start[i + 1]):
         suspect(cloth.ring[k], state)
+
+
+@wp.kernel(enable_backward=False)
+def adopt_kernel(each: int, state: State, cloth: Cloth) -> None:
+    """`adopt` for a list, `each` of it a thread."""
+    begin = wp.tid() * each
+    for k in range(begin, wp.min(begin + each, length(SUSPECTS, state))):
+        adopt(state.reached[k], state, cloth)
 
 
 @wp.kernel(enable_backward=False)
@@ -123,13 +153,10 @@ def list_near_kernel(each: int, state: State, rules: Rules) -> None:
             state.near[wp.atomic_add(state.counts, NEAR, 1)] = i
 
 
-@wp.kernel(enable_backward=False)
-def scale_kernel(state: State, rules: Rules) -> None:
+@wp.func
+def scale(k: int, state: State, rules: Rules) -> None:
     """How far each near vertex goes, for predicted scales: at least until it is outside."""
-    k = wp.tid()
-    i = listed(k, NEAR, state.near, state)
-    if i < 0:
-        return
+    i = state.near[k]
     distance = state.distance[i]
     deficit = rules.margin - distance
     # Where α is below 1, the distance was predicted to exaggerate; its sign is trusted all the same.
@@ -143,11 +170,16 @@ def scale_kernel(state: State, rules: Rules) -> None:
 
 
 @wp.kernel(enable_backward=False)
-def settle_kernel(state: State, skin: Skin, rules: Rules) -> None:
+def scale_kernel(each: int, state: State, rules: Rules) -> None:
+    """`scale` for a list, `each` of it a thread."""
+    begin = wp.tid() * each
+    for k in range(begin, wp.min(begin + each, length(NEAR, state))):
+        scale(k, state, rules)
+
+
+@wp.func
+def settle(i: int, state: State, skin: Skin, rules: Rules) -> None:
     """Takes vertices along, and pushes on those that aren't clear yet. Leaves fields and marks empty."""
-    i = listed(wp.tid(), REACHED, state.reached, state)
-    if i < 0:
-        return
     shift = state.field[i]
     mark = state.mark[i]
     state.field[i] = wp.vec3()
@@ -182,11 +214,16 @@ def settle_kernel(state: State, skin: Skin, rules: Rules) -> None:
 
 
 @wp.kernel(enable_backward=False)
-def tally_kernel(state: State) -> None:
+def settle_kernel(each: int, state: State, skin: Skin, rules: Rules) -> None:
+    """`settle` for a list, `each` of it a thread."""
+    begin = wp.tid() * each
+    for k in range(begin, wp.min(begin + each, length(REACHED, state))):
+        settle(state.reached[k], state, skin, rules)
+
+
+@wp.func
+def tally(i: int, state: State) -> None:
     """Counts who was inside, who was moved, and who is inside."""
-    i = listed(wp.tid(), NEAR, state.near, state)
-    if i < 0:
-        return
     way = state.place[i] - state.origin[i]
     if way[0] != 0.0 or way[1] != 0.0 or way[2] != 0.0:
         wp.atomic_add(state.counts, MOVED, 1)
@@ -194,3 +231,11 @@ def tally_kernel(state: State) -> None:
         wp.atomic_add(state.counts, INSIDE, 1)
     if state.distance[i] < 0.0:
         wp.atomic_add(state.counts, STUCK, 1)
+
+
+@wp.kernel(enable_backward=False)
+def tally_kernel(each: int, state: State) -> None:
+    """`tally` for a list, `each` of it a thread."""
+    begin = wp.tid() * each
+    for k in range(begin, wp.min(begin + each, length(NEAR, state))):
+        tally(state.near[k], state)

@@ -1,7 +1,7 @@
 """What the steps of `resolve` read and write: a garment, a frame of it, and numbers.
 
 Lists of vertices are filled by kernels: `counts[NAME]` says how many they are. On a CPU they are in order, on a GPU in
-any; nothing depends on it. On a CPU a launch is as long as its list. To know how long that is a GPU would have to be
+any; nothing depends on it. On a CPU one thread goes through a list. To know how long it is a GPU would have to be
 waited for: there a launch is as long as any list can be, and what is beyond its list's end does nothing.
 """
 
@@ -93,6 +93,12 @@ class State:
     """Edges that may run too low; how much those lack that do, and the way up."""
     largest: wp.array[wp.float32]
     """The largest of those at each vertex."""
+
+
+@wp.func
+def length(which: int, state: State) -> int:
+    """Of a list; on a GPU, as it was when it was closed."""
+    return wp.min(state.ends[which], state.counts[which])
 
 
 @wp.func

@@ -72,7 +72,8 @@ class ObservedCloth:
         """What the numbers (D,) add to the garment before it is posed [m], shape (V, 3)."""
         n = self._cut.shape[2]
         some = numbers.astype(np.float32)
-        found: F32 = self._cut @ some[:n] + (self._fields @ some[n:])[:, None] * self._out
+        cut = self._cut.reshape(-1, n) @ some[:n]  # one product: a stack of small ones takes ten times as long
+        found: F32 = cut.reshape(-1, 3) + (self._fields @ some[n:])[:, None] * self._out
         return found
 
     def place(self, vertices: Tensor) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.linalg.lapack import dpotri
 
 F64 = NDArray[np.float64]
 
@@ -38,7 +39,7 @@ class Estimate:
 
     def precision(self) -> F64:
         """The inverse of the covariance, shape (D, D)."""
-        return np.asarray(cho_solve(cho_factor(self.covariance), np.eye(len(self.mean))))
+        return _inverse(self.covariance)
 
     def updated(self, precision: F64, information: F64, pull: F64) -> tuple[F64, F64]:
         """Mean (D,) and precision (D, D) after measurements of `information` JᵀWJ and `pull` JᵀW(r + J c).
@@ -52,5 +53,15 @@ class Estimate:
     def take(self, mean: F64, precision: F64) -> None:
         """Believes this from now on."""
         self.mean = mean
-        covariance = cho_solve(cho_factor(precision), np.eye(len(mean)))
-        self.covariance = 0.5 * (covariance + covariance.T)
+        self.covariance = _inverse(precision)
+
+
+def _inverse(matrix: F64) -> F64:
+    """Of a symmetric positive definite matrix (D, D): half the work of solving for each unit vector, and symmetric."""
+    factor, lower = cho_factor(matrix, lower=True)
+    found, failed = dpotri(factor, lower=lower)
+    if failed:
+        msg = f"row {failed} of the factor is zero"
+        raise LinAlgError(msg)
+    half = np.tril(found)
+    return np.asarray(half + np.tril(half, -1).T)

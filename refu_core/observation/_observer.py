@@ -122,13 +122,14 @@ class Observer:
             return estimate.mean
         before = estimate.precision()
         numbers, after = estimate.mean, before
-        for _ in range(how.rounds):
+        for left in reversed(range(how.rounds)):
+            every = how.first_look if left else 1
             moved = np.einsum("vij,vj->vi", blend, cloth.offset(numbers))
             cloth.place(predicted + torch.from_numpy(moved))
-            found = cloth.match(points, self._skin_mesh, eye)
+            found = cloth.match(points[::every], self._skin_mesh, eye)
             self.matched[name] = len(found.points)
             slopes = cloth.slopes(found, blend)
-            trust = 1 / (1 + (found.height / how.robust) ** 2) / (how.overlap * how.noise**2)
+            trust = 1 / (1 + (found.height / how.robust) ** 2) * every / (how.overlap * how.noise**2)
             weighed = (slopes * trust[:, None].astype(np.float32)).T
             information = (weighed @ slopes).astype(np.float64)
             pull = weighed @ found.height + information @ numbers

@@ -38,6 +38,8 @@ class ObservationSettings:
     """Height off the cloth from which on a point counts less and less [m] (Cauchy)."""
     rounds: int = 2
     """How often points are matched in a frame."""
+    first_look: int = 3
+    """Each so-many-th point is matched but in the last round, which decides: the others say where to look."""
     most_points: int = 1500
     """More points than this are thinned out evenly."""
     remembered: float = 0.5

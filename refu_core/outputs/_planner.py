@@ -27,10 +27,14 @@ HALF_THICKNESS = 0.005
 the garment, which so lies within the solid nearly everywhere."""
 MAX_TRIANGLES = 2000
 _LEAST_TRIANGLES = 100
-_VERSION = 1
+_VERSION = 2
 """Of what is recalled: another one is computed anew."""
 _LEAST_WEIGHT = 0.01
 """A vertex counts less than this for a coarse one: it is left out."""
+_OWN = 0.5
+"""How much of a coarse vertex is the garment's own, the rest being the fit. Where cloth folds in a pose, the fit,
+which is of the rest pose, overshoots: on recorded motion 95.9 % of a T-shirt's solid are within 5 mm with 0, 99.0 with
+a half, 98.9 with 0.7. Of the garment 0.04 % are farther off than that with a half, 0.08 with 0.7."""
 _FIRM = 1e-3
 """How much the fit of coarse vertices is held together where hardly any cloth tells of one."""
 
@@ -38,9 +42,9 @@ _FIRM = 1e-3
 class PlannerMesh:
     """A coarse, closed copy of one garment, decimated once; a frame of it is one sparse product.
 
-    The cloth becomes a sheet of about half the triangles, whose vertices are means of the garment's around them: those
-    for which the sheet, as a whole, is nearest to the garment (least squares) in whatever pose it is. Its two sides
-    lie `half_thickness` off the sheet, with a wall along every rim.
+    The cloth becomes a sheet of about half the triangles. Its vertices are half-way between vertices of the garment and
+    those means of the garment's around them for which the sheet, as a whole, is nearest to it (least squares). Its two
+    sides lie `half_thickness` off the sheet, with a wall along every rim.
 
     A solid around the cloth reaches into the body that wears it: planners are to allow these two to touch.
     """
@@ -168,4 +172,4 @@ def _means(
     dense = cho_solve(factor, weighed + firm * own.toarray())
     dense[np.abs(dense) < _LEAST_WEIGHT] = 0
     dense /= dense.sum(1, keepdims=True)
-    return csr_array(dense)
+    return csr_array((1 - _OWN) * dense + _OWN * own.toarray())

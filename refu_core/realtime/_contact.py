@@ -8,15 +8,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from refu_core.contact import DEFAULT_CONTACT, ContactSettings, Layer, LimbMeshes, Press, Resolution, Resolver
+from refu_core.contact import ASKED_FROM, DEFAULT_CONTACT, ContactSettings, Layer, LimbMeshes, Press, Resolver
 from refu_core.garments import inner_first
 from refu_core.modes import SdfMode
 from refu_core.realtime._wearer import Outfit
 from refu_core.refu import VertexScale
 from refu_core.sdf import ApproxSdf, MeshSdf, Winding, exact_sdf
-
-_ASKED_FROM = 2e-3
-"""Vertices are asked exactly up to this far beyond the margin [m]."""
 
 
 class Worn(NamedTuple):
@@ -106,11 +103,16 @@ class ContactStage:
             return vertices
         return self._press[name](vertices, self._outfit.below[name](self._body[None])[0])
 
-    def lift(self, name: str, vertices: Tensor, worn: Mapping[str, Worn]) -> tuple[Tensor, Tensor]:
-        """Vertices (V, 3) [m] off the `worn` inner garments, and how many were too near one of those, shape (1,)."""
+    def lift(
+        self, name: str, vertices: Tensor, worn: Mapping[str, Worn], *, goes_on: bool = False
+    ) -> tuple[Tensor, Tensor]:
+        """Vertices (V, 3) [m] off the `worn` inner garments, and how many were too near one of those, shape (1,).
+
+        It `goes_on` from the last call for the same garments.
+        """
         n_layered = torch.zeros(1, dtype=torch.int32, device=vertices.device)
         for inner, garment in worn.items():
-            vertices, n_low = self._below[name][inner](vertices, garment.vertices)
+            vertices, n_low = self._below[name][inner](vertices, garment.vertices, goes_on=goes_on)
             n_layered = n_layered + n_low
         return vertices, n_layered
 
@@ -127,22 +129,18 @@ class ContactStage:
         n_layered: Tensor,
     ) -> Resolved:
         """Vertices (V, 3) [m] off the body, which has the last word, and within reach of where limbs `pressed` them."""
-        done, n_clipped = self._off_body(name, vertices, on_mean=on_mean, margin=margin, scale=scale)
+        start = self._asked[name](vertices, on_mean=on_mean, reach=margin + ASKED_FROM)
+        assert start.face is not None  # these distances are to faces
+        n_clipped = (start.face < 0).sum()
+        resolver = self.resolvers[name]
+        done = resolver(vertices, self.sdf, start, margin=margin, scale=scale)
         vertices, numbers = done.vertices, done.numbers
         if worn:
-            vertices, _ = self.lift(name, vertices, worn)
-            again, _ = self._off_body(name, vertices, on_mean=on_mean, margin=self._kept * margin, scale=1.0)
+            vertices, _ = self.lift(name, vertices, worn, goes_on=True)
+            again = resolver(vertices, self.sdf, None, margin=self._kept * margin)
             # Each step goes no farther than that; together they may.
             vertices = pressed + torch.renorm(again.vertices - pressed, 2, 0, self._farthest)
             numbers[_N_UNRESOLVED] = again.numbers[_N_UNRESOLVED]
         if self.winding is not None:
             numbers[_N_UNRESOLVED] = torch.count_nonzero(self.winding(vertices))
         return Resolved(vertices, torch.cat((numbers, n_layered)), n_clipped)
-
-    def _off_body(
-        self, name: str, vertices: Tensor, *, on_mean: Tensor, margin: float, scale: float | VertexScale
-    ) -> tuple[Resolution, Tensor]:
-        """Off the body, and how many weren't asked, since they are far off, shape ()."""
-        start = self._asked[name](vertices, on_mean=on_mean, reach=margin + _ASKED_FROM)
-        assert start.face is not None  # these distances are to faces
-        return self.resolvers[name](vertices, self.sdf, start, margin=margin, scale=scale), (start.face < 0).sum()

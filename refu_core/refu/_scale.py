@@ -163,7 +163,7 @@ class ScaleNet(nn.Module):
         weight = (first * inputs).T
 
         def scale(vertex: Tensor, distance: Tensor) -> Tensor:
-            hidden = torch.addmm(bias, k.embedding[vertex], weight[:-1])
+            hidden = torch.addmm(bias, k.embedding.index_select(0, vertex), weight[:-1])
             hidden = functional.relu(hidden + torch.outer(distance, weight[-1]))
             return self._in_range(torch.addmv(last_bias, hidden, last[0]))
 

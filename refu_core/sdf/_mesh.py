@@ -59,7 +59,7 @@ class Recorded:
     def __init__(self, kernel: Any, inputs: Callable[[Any, Any], list[Any]]) -> None:
         """`inputs` makes a list of the kernel's inputs from the points and their near faces; outputs are `Found`'s."""
         self._kernel, self._inputs = kernel, inputs
-        self._room = 0
+        self._room = self._dim = 0
         self._make_room(256)
 
     def ask(self, points: Tensor, near: Tensor | None = None, *, last: Any = None) -> Found:
@@ -78,12 +78,14 @@ class Recorded:
         if n:
             if last is not None:
                 self._command.set_param_at_index(self._n_inputs - 1, last)
-            self._command.set_dim(n)
+            if n != self._dim:
+                self._command.set_dim(n)
+                self._dim = n
             self._command.launch()
         return Found(*(field[:n] for field in self._found))
 
     def _make_room(self, n: int) -> None:
-        self._room = n
+        self._room, self._dim = n, n
         self._points = torch.zeros(n, 3)
         self._near = torch.zeros(n, dtype=torch.int32)
         self._found = Found.empty(n, self._points.device)

@@ -59,6 +59,7 @@ class RestFaces:
         by_block = face[tuple(nearest)].reshape([n for count in blocks.tolist() for n in (count, _BLOCK)])
         rows = by_block.transpose(0, 2, 4, 1, 3, 5).reshape(-1, _BLOCK**3)
         self._grid = wp.array(rows, dtype=wp.int32, device=str(self._device))
+        self._dim = 0
         self._make_room(1024)
 
     def under(self, unposed: Tensor, betas: Tensor, shapedirs: Tensor) -> Tensor:
@@ -77,13 +78,16 @@ class RestFaces:
             self._make_room(n)
         self._places[:n] = places
         if n:
-            self._look_up.set_dim(n)
+            if n != self._dim:
+                self._look_up.set_dim(n)
+                self._dim = n
             with torch_stream(self._device):
                 self._look_up.launch()
         return self._near[:n].clone().view(unposed.shape[:-1])
 
     def _make_room(self, n: int) -> None:
         """For n places. The launch is recorded: making it in Python takes longer than the look-ups."""
+        self._dim = n
         self._places = torch.empty(n, 3, device=self._device)
         self._near = torch.empty(n, dtype=torch.int32, device=self._device)
         self._look_up = wp.launch(

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from refu_core._warp import as_warp, torch_stream
 from refu_core.mesh import Connectivity
-from refu_core.sdf._winding_kernels import CELLS, bin_kernel, crossings_kernel
+from refu_core.sdf._winding_kernels import CELLS, bin_kernel, crossings_kernel, extent_kernel
 
 _N_CELLS = int(CELLS)
 
@@ -33,16 +33,17 @@ class Winding:
         self._faces = wp.array(mesh.faces, dtype=wp.vec3i, device=str(self._device))
         self._n_faces = len(mesh.faces)
         self._body = torch.zeros(mesh.n_vertices, 3, device=self._device)
-        self._grid = torch.zeros(4, 3, device=self._device)
-        self._first = torch.zeros(2 * _N_CELLS**2, dtype=torch.int32, device=self._device)
-        self._farthest_in = torch.zeros(2 * _N_CELLS**2, device=self._device)
+        # The first point of each cell, its least distance, and the box of all: as they are before any point is known.
+        n = 2 * _N_CELLS**2
+        box = torch.tensor([torch.inf] * 3 + [-torch.inf] * 3)
+        blank = (torch.full((n,), -1, dtype=torch.int32), torch.full((n,), torch.inf).view(torch.int32))
+        self._blank = torch.cat((*blank, box.view(torch.int32))).to(self._device)
+        self._memory = self._blank.clone()
+        first, rest = self._memory[:n], self._memory[n:].view(torch.float32)
         self._cells = [
-            as_warp(tensor, kind)
-            for tensor, kind in (
-                (self._grid, wp.vec3),
-                (self._first, wp.int32),
-                (self._farthest_in, wp.float32),
-            )
+            as_warp(rest[n:].view(2, 3), wp.vec3),
+            as_warp(first, wp.int32),
+            as_warp(rest[:n], wp.float32),
         ]
         self._body_wp = as_warp(self._body, wp.vec3)
         self._launches: dict[int, _Launches] = {}
@@ -64,14 +65,9 @@ class Winding:
         known.points.copy_(points)
         known.winding.zero_()
         if n:
-            torch.aminmax(known.points, dim=0, out=(self._grid[0], self._grid[1]))
-            extent = self._grid[1] - self._grid[0]
-            # A hair less, so that the last point is in the last cell.
-            torch.div(0.9999 * _N_CELLS, extent.clamp_min(1e-6), out=self._grid[2])
-            torch.lerp(self._grid[0], self._grid[1], 0.5, out=self._grid[3])
-            self._first.fill_(-1)
-            self._farthest_in.fill_(torch.inf)
+            self._memory.copy_(self._blank)
             with torch_stream(self._device):
+                known.bound.launch()
                 known.sort.launch()
                 known.cross.launch()
         return known.winding
@@ -91,6 +87,8 @@ class _Launches:
         def record(kernel: Any, dim: int, inputs: list[Any]) -> Any:
             return wp.launch(kernel, dim, inputs, device=str(device), record_cmd=True)
 
+        strips = 1 if of._device.type == "cpu" else n
+        self.bound = record(extent_kernel, strips, [n // max(strips, 1), points, grid])
         self.sort = record(bin_kernel, n, [points, grid, first, following, farthest_in])
         # A CPU's compiler keeps more in registers within a loop than from call to call.
         each = of._n_faces if of._device.type == "cpu" else 1

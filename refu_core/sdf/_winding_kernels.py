@@ -58,6 +58,34 @@ def crossing(a: wp.vec3, b: wp.vec3, c: wp.vec3, p: wp.vec3, half: int) -> int:
     return 0
 
 
+@wp.func
+def per_metre_of(grid: wp.array[wp.vec3]) -> wp.vec3:
+    """Cells a metre; a hair fewer than there are, so that the last point is in the last cell."""
+    extent = grid[1] - grid[0]
+    cells = wp.static(0.9999 * CELLS)
+    return wp.vec3(
+        cells / wp.max(extent[0], 1.0e-6), cells / wp.max(extent[1], 1.0e-6), cells / wp.max(extent[2], 1.0e-6)
+    )
+
+
+@wp.kernel
+def extent_kernel(
+    each: int,
+    points: wp.array[wp.vec3],
+    # output, and infinite before
+    grid: wp.array[wp.vec3],
+) -> None:
+    """The corners of the box around the points; `each` points a thread."""
+    begin = wp.tid() * each
+    low = points[begin]
+    high = low
+    for q in range(begin + 1, begin + each):
+        low = lesser(low, points[q])
+        high = greater(high, points[q])
+    wp.atomic_min(grid, 0, low)
+    wp.atomic_max(grid, 1, high)
+
+
 @wp.kernel
 def bin_kernel(
     points: wp.array[wp.vec3],
@@ -70,8 +98,9 @@ def bin_kernel(
     """Lists the points by cell; `farthest_in` is the least distance of a cell's points before the middle plane."""
     q = wp.tid()
     p = points[q]
-    ahead = p[2] - grid[3][2]
-    cell = cell_along(p[1], grid[0][1], grid[2][1]) * CELLS + cell_along(p[0], grid[0][0], grid[2][0])
+    per_metre = per_metre_of(grid)
+    ahead = p[2] - 0.5 * (grid[0][2] + grid[1][2])
+    cell = cell_along(p[1], grid[0][1], per_metre[1]) * CELLS + cell_along(p[0], grid[0][0], per_metre[0])
     if ahead < 0.0:
         cell += CELLS * CELLS
     following[q] = wp.atomic_exch(first, cell, q)
@@ -94,8 +123,8 @@ def crossings_kernel(
     """Each face adds itself to the winding numbers of the points that look through it; `each` faces a thread."""
     low = grid[0]
     high = grid[1]
-    per_metre = grid[2]
-    middle = grid[3][2]
+    per_metre = per_metre_of(grid)
+    middle = 0.5 * (low[2] + high[2])
     begin = wp.tid() * each
     for f in range(begin, wp.min(begin + each, faces.shape[0])):
         corners = faces[f]
@@ -121,8 +150,10 @@ def crossings_kernel(
                                 q = int(first[cell])
                                 while q >= 0:
                                     p = points[q]
+                                    # Most points are seen by this to be beyond the face, and few for the rest.
+                                    sees = wp.where(half == 0, p[2] <= box_high[2], p[2] >= box_low[2])
                                     along = p[0] >= box_low[0] and p[0] <= box_high[0]
-                                    if along and p[1] >= box_low[1] and p[1] <= box_high[1]:
+                                    if sees and along and p[1] >= box_low[1] and p[1] <= box_high[1]:
                                         found = crossing(a, b, c, p, half)
                                         if found != 0:
                                             wp.atomic_add(winding, q, found)

@@ -70,6 +70,12 @@ def add(commands: Any) -> None:
         action="store_false",
         help="leave the body out of the output, which is 40 %% smaller then",
     )
+    parser.add_argument(
+        "--progress",
+        choices=("bar", "lines"),
+        default="bar",
+        help="bar (default), or lines `progress DONE TOTAL` on the standard output, for programs; TOTAL 0: unknown",
+    )
     parser.add_argument("--overwrite", action="store_true", help="replace an output that is there already")
     parser.add_argument("--again", action="store_true", help="of several inputs: also those that are finished")
     add_cluster(parser)
@@ -101,7 +107,8 @@ def _replay_one(args: argparse.Namespace) -> int:
     check_writable(report)
     output = None if args.output is None else Path(args.output)
     options = ReplayOptions(**given(args, ReplayOptions) | {"input": Path(args.input[0]), "output": output})
-    result = replay(options, progress=not args.quiet)
+    told = _print_progress if args.progress == "lines" else None
+    result = replay(options, progress=not args.quiet, told=told)
     print(replay_table(result))
     write_json(args.json, result.as_dict())
     if report is not None and result.frames:
@@ -109,6 +116,10 @@ def _replay_one(args: argparse.Namespace) -> int:
 
         print(f"report: {write_report(result, report, progress=not args.quiet)}")
     return EXIT_INTERRUPTED if result.interrupted else 0
+
+
+def _print_progress(done: int, total: int) -> None:
+    print("progress", done, total, flush=True)
 
 
 def _replay_many(args: argparse.Namespace) -> int:

@@ -1,4 +1,4 @@
-"""`refu view`: recorded motion, dressed, in the browser."""
+"""`refu view`: recorded motion, dressed, or a node that runs, in the browser."""
 
 from __future__ import annotations
 
@@ -15,12 +15,20 @@ def add(commands: Any) -> None:
     """The command's parser."""
     parser = commands.add_parser(
         "view",
-        help="look at recorded motion in the browser, dressed",
+        help="look at recorded motion, dressed, or at a node that runs, in the browser",
         description="Serve a 3D view at http://localhost:8080. A bag with garments (of refu replay, or of the node) is "
-        "shown as it was recorded; motion is dressed while you look. Needs the extra view.",
+        "shown as it was recorded; motion is dressed while you look; a running node is shown live. Needs the extra "
+        "view.",
     )
     parser.add_argument(
-        "input", type=in_path, nargs="+", metavar="INPUT", help="a bag or motion file; of several, each is a person"
+        "input", type=in_path, nargs="*", metavar="INPUT", help="a bag or motion file; of several, each is a person"
+    )
+    parser.add_argument(
+        "--live",
+        type=word,
+        nargs="*",
+        metavar="TOPIC",
+        help="what a running node publishes on topics of markers (garments, body), in place of INPUT; needs rclpy",
     )
     parser.add_argument("--dress", action="store_true", help="dress the motion anew, though the bag has garments")
     parser.add_argument("--port", type=port, metavar="N", help="where to listen (the first one free from 8080 on)")
@@ -41,7 +49,10 @@ def run(args: argparse.Namespace) -> int:
 
     replay = ReplayOptions(**given(args, ReplayOptions) | {"input": Path(), "output": None})
     view(
-        ViewOptions(**given(args, ViewOptions) | {"inputs": tuple(args.input), "replay": replay}),
+        ViewOptions(
+            **given(args, ViewOptions)
+            | {"inputs": tuple(args.input), "live": None if args.live is None else tuple(args.live), "replay": replay}
+        ),
         progress=not args.quiet,
     )
     return 0

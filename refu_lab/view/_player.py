@@ -13,6 +13,7 @@ from refu_core.errors import printable
 from refu_core.modes import SdfMode
 from refu_lab.view._dressed import DressedFilm
 from refu_lab.view._film import BODY, SKIN
+from refu_lab.view._live import LiveFilm
 from refu_lab.view._marks import CLEARANCE, Band, Marker, Marking
 from refu_lab.view._stage import Stage
 
@@ -51,6 +52,8 @@ class Player:
         self._stage.set(first, ground=min(lowest), front=film.front)
         self._build(first)
         self._show(0)
+        if isinstance(film, LiveFilm):
+            film.told = self._changed.set
 
     def run(self, *, until: Callable[[], bool] = lambda: False) -> None:
         """Plays until an interrupt, or until asked after each frame."""
@@ -105,7 +108,9 @@ class Player:
         self._stage.draw(bands, wireframe=self._wire.value)
         if len(self._times) > 1:
             self._frame.value = index
-        facts = [f"frame {index} of {len(self._times)}, {self._times[index]:.2f} s", *self._film.facts(index)]
+        facts = self._film.facts(index)
+        if not isinstance(self._film, LiveFilm):
+            facts = [f"frame {index} of {len(self._times)}, {self._times[index]:.2f} s", *facts]
         self._said.content = "  \n".join(facts)
 
     def _bands(self, shapes: Sequence[Shape]) -> list[tuple[Shape, Sequence[Band]]]:
@@ -157,14 +162,15 @@ class Player:
         gui.set_panel_label(f"refu view: {printable(film.title)}")
         names = list(dict.fromkeys(shape.name for shape in first if shape.is_garment))
         last = max(len(self._times) - 1, 1)
+        is_live = isinstance(film, LiveFilm)  # there is no going back, and a body may come later
         with gui.add_folder("Play"):
-            self._frame = gui.add_slider("frame", 0, last, 1, 0, disabled=len(self._times) < 2)
-            self._button = gui.add_button(self._verb(), icon=None)
-            self._speed = gui.add_dropdown("speed", tuple(_SPEEDS), initial_value="1 ×")
+            self._frame = gui.add_slider("frame", 0, last, 1, 0, disabled=len(self._times) < 2, visible=not is_live)
+            self._button = gui.add_button(self._verb(), icon=None, visible=not is_live)
+            self._speed = gui.add_dropdown("speed", tuple(_SPEEDS), initial_value="1 ×", visible=not is_live)
             self._follows = gui.add_checkbox("follow", initial_value=True, hint="the camera goes with the first person")
         with gui.add_folder("Show"):
             has_skin = any(shape.name == SKIN for shape in first)
-            has_body = any(shape.name == BODY for shape in first)
+            has_body = is_live or any(shape.name == BODY for shape in first)
             bodies = tuple(_BODIES) if has_skin else ("collider", _HIDDEN) if has_body else (_HIDDEN,)
             self._body = gui.add_dropdown("body", bodies, initial_value=bodies[0])
             markings = tuple(str(one) for one in Marking) if has_body else (str(Marking.CLOTH),)

@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 import msg_adapters as adapters
-from msg_adapters.markers import TRIANGLE_LIST
 from refu_core import RefuError
 from refu_lab.view._film import Cache, Shape
+from refu_lab.view._markers import MarkerShapes, meshes_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -22,36 +22,14 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-_ADD = 0
-
-
-@dataclass(frozen=True, eq=False)
-class Topology:
-    """How the corners of a marker's triangles share vertices."""
-
-    first: NDArray[np.intp]
-    """A corner of each vertex, shape (V,)."""
-    faces: NDArray[np.int64]
-    """Shape (F, 3)."""
-
-    @classmethod
-    def of(cls, points: NDArray[np.float64]) -> Topology:
-        """Of corners [m], shape (3F, 3): those in one place are one vertex."""
-        rows = np.ascontiguousarray(points).view([("", points.dtype)] * 3).ravel()
-        _, first, inverse = np.unique(rows, return_index=True, return_inverse=True)
-        return cls(first, inverse.reshape(-1, 3).astype(np.int64))
-
-    def fits(self, points: NDArray[np.float64]) -> bool:
-        """Whether corners, shape (3F, 3), share their vertices in this way."""
-        return len(points) == self.faces.size and np.array_equal(points[self.first][self.faces.reshape(-1)], points)
-
 
 @dataclass(frozen=True)
 class _Stored:
     name: str
     person: str
     color: tuple[float, float, float]
-    topology: Topology
+    faces: NDArray[np.int64]
+    n_vertices: int
     offset: int
 
 
@@ -67,8 +45,7 @@ class RecordedFilm:
         """What there is to warn of, for people."""
         self._spool = tempfile.TemporaryFile()  # noqa: SIM115  (as long as the film)
         self._size = 0
-        self._origin: NDArray[np.float64] | None = None
-        self._topologies: dict[tuple[str, int], Topology] = {}
+        self._markers = MarkerShapes()
         frames: dict[int, list[_Stored]] = {}
         n_bad = 0
         with adapters.BagReader(path) as reader:
@@ -113,19 +90,9 @@ class RecordedFilm:
         self._spool.close()
 
     def _store(self, marker: adapters.Marker) -> _Stored:
-        key = (marker.ns, marker.id)
-        points = marker.points
-        topology = self._topologies.get(key)
-        if topology is None or not topology.fits(points):
-            topology = self._topologies[key] = Topology.of(points)
-        vertices = points[topology.first] * marker.scale
-        if marker.pose != (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0):
-            vertices = Rotation.from_quat(marker.pose[3:]).apply(vertices) + marker.pose[:3]
-        if self._origin is None:
-            self._origin = vertices[0].copy()
-        data = (vertices - self._origin).astype(np.float32).tobytes()
-        person, _, name = marker.ns.rpartition("/")
-        stored = _Stored(name, person, (marker.color[0], marker.color[1], marker.color[2]), topology, self._size)
+        shape = self._markers.shape(marker)
+        stored = _Stored(shape.name, shape.person, shape.color, shape.faces, len(shape.vertices), self._size)
+        data = shape.vertices.tobytes()
         self._spool.write(data)
         self._size += len(data)
         return stored
@@ -134,10 +101,9 @@ class RecordedFilm:
         self._spool.flush()
         found = []
         for one in self._frames[index]:
-            n_vertices = len(one.topology.first)
-            data = os.pread(self._spool.fileno(), 12 * n_vertices, one.offset)
-            vertices = np.frombuffer(data, np.float32).reshape(n_vertices, 3).copy()
-            found.append(Shape(one.name, one.person, vertices, one.topology.faces, one.color))
+            data = os.pread(self._spool.fileno(), 12 * one.n_vertices, one.offset)
+            vertices = np.frombuffer(data, np.float32).reshape(-1, 3).copy()
+            found.append(Shape(one.name, one.person, vertices, one.faces, one.color))
         return found
 
 
@@ -158,7 +124,7 @@ def _triangles(data: bytes) -> list[adapters.Marker] | None:
         markers = adapters.decode_marker_array(data)
     except adapters.DecodeError:
         return None
-    return [one for one in markers if one.type == TRIANGLE_LIST and one.action == _ADD and len(one.points)]
+    return meshes_of(markers)
 
 
 def _front(path: Path) -> float:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from refu_core import RefuError
 from refu_core._device import one_thread
 from refu_core.recordings import SUFFIXES
+from refu_lab.view._live import TOPICS, LiveFilm
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -34,7 +35,9 @@ _PORTS = 20
 class ViewOptions:
     """What is shown, and where; the fields are the options of `refu view`."""
 
-    inputs: tuple[Path, ...]
+    inputs: tuple[Path, ...] = ()
+    live: tuple[str, ...] | None = None
+    """Topics of markers to look at, in place of inputs: none for the node's own; None: no topics, the inputs."""
     replay: ReplayOptions
     """How motion is dressed; its input is left out of account."""
     dress: bool = False
@@ -63,27 +66,40 @@ def view(
     film = open_film(options, progress=progress)
     for note in film.notes:
         say(f"warning: {note}")
+    until = until or (lambda: False)
     server = _serve(options)
     try:
+        if isinstance(film, LiveFilm):
+            say(f"{film.title}: waiting for garments")
+            if not film.wait(until):
+                return
         player = Player(server, film)
         host = "localhost" if options.host in ("0.0.0.0", "::") else options.host
         url = f"http://{host}:{server.get_port()}"
-        say(f"{film.title}: {len(film.times)} frames at {url} (Ctrl-C ends it)")
+        what = "" if isinstance(film, LiveFilm) else f": {len(film.times)} frames"
+        say(f"{film.title}{what} at {url} (Ctrl-C ends it)")
         if options.browser and _has_display():
             webbrowser.open(url)
         elif "SSH_CONNECTION" in os.environ and options.host == "localhost":
             port = server.get_port()
             say(f"from your own machine: ssh -L {port}:localhost:{port} {socket.gethostname()}, then open {url} there")
-        player.run(until=until or (lambda: False))
+        player.run(until=until)
     except KeyboardInterrupt:
         say("viewer closed")
     finally:
+        if isinstance(film, LiveFilm):
+            film.close()
         with contextlib.redirect_stdout(io.StringIO()):
             server.stop()
 
 
-def open_film(options: ViewOptions, *, progress: bool = False) -> DressedFilm | RecordedFilm:
+def open_film(options: ViewOptions, *, progress: bool = False) -> DressedFilm | RecordedFilm | LiveFilm:
     """What the inputs are: a bag of garments is shown as it is, motion is dressed. Raises `RefuError`."""
+    if (options.live is None) == (not options.inputs):
+        msg = "wanted recordings to look at, or --live for a node that runs"
+        raise RefuError(msg)
+    if options.live is not None:
+        return LiveFilm(options.live or TOPICS)
     from refu_lab.view._dressed import DressedFilm
     from refu_lab.view._recorded import RecordedFilm, has_markers
 

@@ -163,6 +163,23 @@ def test_a_sleeve_that_comes_beside_is_a_stranger_and_brought_off(height: float,
     assert bool(friend(comes, below)[1] == 0) is faces_it
 
 
+@given(seed=st.integers(0, 1000), height=st.floats(-0.01, 0.004))
+@settings(max_examples=12)
+def test_going_on_is_as_looking_at_everyone_again(seed: int, height: float) -> None:
+    below, below_faces = sheet(11, step=0.013)
+    above, above_faces = sheet(13)
+    low = wavy(below, seed, amplitude=0.004)
+    high = wavy(above, seed + 1, amplitude=0.012) + torch.tensor([0.0, height, 0.0])
+    layer, anew = (Layer(above_faces, above, below_faces, below) for _ in range(2))
+    lifted, _ = layer(high, low)
+    moved = lifted.clone()
+    moved[:40, 1] -= 0.008
+    found, n_low = layer(moved, low, goes_on=True)
+    wanted, n_wanted = anew(moved, low)
+    assert torch.equal(n_low, n_wanted)
+    assert torch.equal(found, wanted)
+
+
 @pytest.mark.parametrize("height", [-0.004, 0.002, 0.5])
 def test_unasked_it_does_the_same(height: float) -> None:
     """As on a GPU, which isn't waited for to know whether anything is too low."""

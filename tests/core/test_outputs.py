@@ -196,7 +196,7 @@ def test_a_planners_mesh_is_closed_small_and_near(pipeline: GarmentPipeline) -> 
     full = trimesh.Trimesh(worn, SHORTS.faces.numpy(), process=False)
     for one, other in ((mesh, full), (full, mesh)):
         square = igl.point_mesh_squared_distance(one.triangles_center, other.vertices, other.faces)[0]
-        assert np.percentile(np.sqrt(square), 98) - coarse.half_thickness < 5e-3
+        assert np.percentile(np.sqrt(square), 99.5) - coarse.half_thickness < 5e-3
 
 
 def test_a_planners_mesh_is_recalled_and_moves_with_the_garment() -> None:

@@ -138,3 +138,19 @@ def test_what_is_far_from_the_body_stays() -> None:
     no_face = torch.full((len(away),), -1, dtype=torch.int32)
     clipped = SdfSample(sample.distance.clamp_max(0.008), sample.gradient, no_face)
     assert torch.equal(worn("tshirt-male")[2](away, sdf, clipped).vertices, away)
+
+
+@pytest.mark.parametrize("kind", ["exact", "band"])
+def test_going_on_is_as_asking_everyone_again(kind: str) -> None:
+    _, template, resolver = worn("tshirt-male")
+    body, _, points = dressed("tshirt-male", 0.4, 0.004)
+    sdf = distance("tshirt-male", kind)
+    sdf.update(body)
+    done = resolver(points, sdf, sdf.query(points))
+    moved = done.vertices + 0.01 * torch.sin(40.0 * points).clamp_min(0.9).sub(0.9)
+    assert 0 < (moved == done.vertices).all(1).sum() < len(points)
+    again = resolver(moved, sdf, None, margin=0.002)
+    anew = resolver_of(template)(moved, sdf, sdf.query(moved), margin=0.002)
+    assert (again.vertices - done.vertices).abs().max() > 1e-4
+    torch.testing.assert_close(again.vertices, anew.vertices, rtol=0, atol=1e-6)
+    torch.testing.assert_close(again.numbers, anew.numbers, rtol=0, atol=1e-6)

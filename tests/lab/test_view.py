@@ -27,9 +27,10 @@ from refu_lab.replay import ReplayOptions
 from refu_lab.view import ViewOptions, view
 from refu_lab.view._dressed import DressedFilm, Track
 from refu_lab.view._film import BODY, SKIN, Cache, Shape
+from refu_lab.view._markers import Topology
 from refu_lab.view._marks import CLEARANCE, Marker, Marking
 from refu_lab.view._player import Player
-from refu_lab.view._recorded import RecordedFilm, Topology
+from refu_lab.view._recorded import RecordedFilm
 from refu_lab.view._view import open_film
 
 ROOT = Path(__file__).parents[2]

@@ -43,16 +43,23 @@ class NodeProcess:
     """`garment_node` with parameters; killed at the end of the block if it still runs."""
 
     def __init__(
-        self, log: Path, prepare: Callable[[], None] | None = None, *, program: str = "", **parameters: Any
+        self,
+        log: Path,
+        prepare: Callable[[], None] | None = None,
+        *,
+        program: str = "",
+        packages: Path | None = None,
+        **parameters: Any,
     ) -> None:
         self._log = log
         start = ["-c", program] if program else ["-m", "refu_ros.garment_node"]
         command = [sys.executable, *start, *ros_arguments(parameters)]
+        path = [ROOT, *([] if packages is None else [packages]), os.environ.get("PYTHONPATH", "")]
         with log.open("wb") as file:
             self.process = subprocess.Popen(
                 command,
                 cwd=log.parent,  # relative paths that a test or a hostile peer names
-                env={**os.environ, "PYTHONPATH": f"{ROOT}:{os.environ.get('PYTHONPATH', '')}"},
+                env={**os.environ, "PYTHONPATH": ":".join(map(str, path))},
                 stdout=file,
                 stderr=file,
                 preexec_fn=prepare,

@@ -82,11 +82,25 @@ def test_package_xml(package_xml: ET.Element) -> None:
     assert package_xml.findtext("export/build_type") == "ament_python"
 
 
-def test_package_xml_is_valid() -> None:
+@pytest.mark.parametrize("folder", [".", "refu_msgs"])
+def test_package_xml_is_valid(folder: str) -> None:
     catkin = pytest.importorskip("catkin_pkg.package", reason="catkin_pkg isn't installed (extra test)")
     warnings: list[str] = []
-    catkin.parse_package(str(ROOT), warnings=warnings).validate(warnings=warnings)
+    package = catkin.parse_package(str(ROOT / folder), warnings=warnings)
+    package.validate(warnings=warnings)
     assert not warnings
+    assert package.version == __version__
+
+
+def test_the_interfaces_are_all_built() -> None:
+    """What CMake is told of is what there is, and no definition uses a package that isn't a dependency."""
+    folder = ROOT / "refu_msgs"
+    listed = set(re.findall(r'"(\w+/\w+\.\w+)"', (folder / "CMakeLists.txt").read_text(encoding="utf-8")))
+    files = [path for kind in ("msg", "srv", "action") for path in (folder / kind).iterdir()]
+    assert listed == {f"{path.parent.name}/{path.name}" for path in files}
+    used = {name for path in files for name in re.findall(r"^(\w+)/\w+", path.read_text(), flags=re.MULTILINE)}
+    xml = ET.parse(folder / "package.xml").getroot()
+    assert used - {"refu_msgs"} <= {element.text for element in xml.findall("depend")}
 
 
 def test_package_xml_depends_on_what_is_imported(package_xml: ET.Element) -> None:

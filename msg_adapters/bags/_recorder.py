@@ -12,7 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from msg_adapters import BagError, BagWriter, QosProfile
+from msg_adapters.bags._metadata import QosProfile
+from msg_adapters.bags._writer import BagWriter
+from msg_adapters.errors import BagError
 
 if TYPE_CHECKING:
     from collections.abc import Callable

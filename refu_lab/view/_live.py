@@ -1,0 +1,113 @@
+"""A film that isn't over: what a running node publishes, the newest of it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+import msg_adapters as adapters
+from refu_core import RefuError
+from refu_lab.view._markers import MarkerShapes, meshes_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
+
+    from refu_lab.view._film import Shape
+
+TOPICS = ("garments", "body")
+_DELETE, _DELETE_ALL = 2, 3
+_LOOK_S = 0.2
+"""How often who waits for the first garments looks whether it is to end [s]."""
+_TOGETHER_S = 2.0
+"""How long after the first topic the others are waited for [s]."""
+
+
+class LiveFilm:
+    """Garments and bodies of marker topics; `wait` before it is shown, `close` it afterwards.
+
+    Raises `RefuError` where rclpy isn't there, and for names that no topic has.
+    """
+
+    def __init__(self, topics: Sequence[str] = TOPICS) -> None:
+        from refu_ros.listening import LiveTopics
+
+        self.title = f"live: {', '.join(topics)}"
+        self.notes: list[str] = []
+        self.front = 0.0
+        self.told: Callable[[], object] = lambda: None
+        """Called, from another thread, when there is something new."""
+        self._changed = threading.Condition()
+        self._shapes: dict[tuple[str, str, int], Shape] = {}
+        self._markers = MarkerShapes()
+        self._stamp_ns = self._n_frames = self._n_bad = 0
+        self._since: float | None = None
+        self._heard = {*topics}
+        self._topics = LiveTopics(dict.fromkeys(topics, adapters.MARKER_ARRAY), self._take)
+
+    @property
+    def times(self) -> NDArray[np.float64]:
+        """There is no moment but this one."""
+        return np.zeros(1)
+
+    def wait(self, until: Callable[[], bool]) -> bool:
+        """For the first meshes, of all topics if they come soon; whether they have come before it was to end."""
+        with self._changed:
+            while not self._is_here() and not until():
+                self._changed.wait(_LOOK_S)
+            return bool(self._shapes)
+
+    def _is_here(self) -> bool:
+        """Whether there is something to see: the ground is put under the first of it, so feet are waited for."""
+        is_late = self._since is not None and time.monotonic() > self._since + _TOGETHER_S
+        return bool(self._shapes) and (is_late or {topic for topic, *_ in self._shapes} == self._heard)
+
+    def shapes(self, index: int) -> Sequence[Shape]:  # noqa: ARG002
+        """What was published last of each topic; nothing of who has left."""
+        with self._changed:
+            return [*self._shapes.values()]
+
+    def facts(self, index: int) -> list[str]:  # noqa: ARG002
+        """How it goes."""
+        with self._changed:
+            passed = time.monotonic() - (self._since or time.monotonic())
+            rate = f"{self._n_frames / passed:.0f} Hz" if passed > 1 else "…"
+            bad = [f"{self._n_bad} messages are no markers"] if self._n_bad else []
+            return [f"stamp {1e-9 * self._stamp_ns:.2f} s, {rate}", f"{len(self._shapes)} meshes, as published", *bad]
+
+    def close(self) -> None:
+        """Hears no more."""
+        self._topics.close()
+
+    def _take(self, topic: str, data: bytes) -> None:
+        with self._changed:
+            try:
+                self._show(topic, data)
+            except RefuError:
+                self._n_bad += 1
+            self._changed.notify_all()
+        self.told()
+
+    def _show(self, topic: str, data: bytes) -> None:
+        markers = adapters.decode_marker_array(data)
+        for marker in markers:
+            if marker.action in (_DELETE, _DELETE_ALL):
+                gone = [
+                    key
+                    for key in self._shapes
+                    if key[0] == topic and (marker.action == _DELETE_ALL or key[1:] == (marker.ns, marker.id))
+                ]
+                for key in gone:
+                    del self._shapes[key]
+        for marker in meshes_of(markers):
+            if not np.isfinite(marker.points).all():
+                continue
+            self._shapes[topic, marker.ns, marker.id] = self._markers.shape(marker)
+            if marker.stamp_ns != self._stamp_ns:
+                self._stamp_ns = marker.stamp_ns
+                self._n_frames += 1
+            self._since = self._since or time.monotonic()

@@ -1,0 +1,64 @@
+"""Messages of a running node for programs that are no nodes themselves: raw bytes, in a thread of their own."""
+
+from __future__ import annotations
+
+import threading
+from typing import TYPE_CHECKING, Any
+
+from refu_core import RefuError
+from refu_ros._transport import make_room
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from typing_extensions import Self
+
+
+class LiveTopics:
+    """Subscribes to topics, by message type; each message goes to `take(topic, data)`, from one thread.
+
+    Use it as a context manager, or `close` it. Raises `RefuError` where rclpy isn't there, and for names that no topic
+    has.
+    """
+
+    def __init__(self, topics: Mapping[str, str], take: Callable[[str, bytes], object]) -> None:
+        make_room()
+        try:
+            import rclpy
+            from rclpy.executors import SingleThreadedExecutor
+            from rclpy.signals import SignalHandlerOptions
+
+            from refu_ros._interfaces import interface
+        except ImportError as error:
+            msg = f'source a ROS 2 installation, or pip install "refu-ros[ros]" ({error})'
+            raise RefuError(msg) from error
+        self._take, self._context = take, rclpy.Context()
+        try:
+            rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+            node = rclpy.create_node("refu_view", context=self._context, enable_rosout=False)
+            self._node: Any = node
+            for topic, kind in topics.items():
+                node.create_subscription(
+                    interface(kind), topic, lambda data, of=topic: self._take(of, data), 1, raw=True
+                )
+        except Exception as error:
+            self._context.try_shutdown()
+            msg = f"no topics {', '.join(topics)}: {error}"
+            raise RefuError(msg) from error
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(node)
+        self._thread = threading.Thread(target=self._executor.spin, name="topics", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Hears no more."""
+        self._executor.shutdown()
+        self._thread.join()
+        self._node.destroy_node()
+        self._context.try_shutdown()

@@ -1,0 +1,262 @@
+"""Requests with types of our own, over Fast DDS: a frame, a recording, a bag, and peers who mean harm."""
+
+from __future__ import annotations
+
+import os
+import time
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="rclpy isn't installed (extra ros): the node isn't tested")
+
+from action_msgs.msg import GoalStatus
+from harness import GARMENTS, ROOT, NodeProcess, Peer, frame
+from rclpy.action import ActionClient
+from std_msgs.msg import Header
+
+from msg_adapters import BagReader, BagWriter
+from msg_adapters.axes import SMPL_COLUMNS
+from refu_core import GarmentPipeline, SmplFrame
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")
+WALK = ROOT / "bags" / "walk"
+N_WALK = 8
+"""Frames of the bag that is dressed here."""
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a short bag, and with what a peer mustn't reach by it."""
+    home: Path = tmp_path_factory.mktemp("node")
+    folder = home / "bags"
+    folder.mkdir()
+    with BagReader(WALK) as walk:
+        messages = [message for message in walk.messages() if message.topic == "/smpl_params"][:N_WALK]
+    for path in (folder / "walk.mcap", home / "secret.mcap"):
+        with BagWriter(path) as bag:
+            bag.add_topic("/smpl_params", messages[0].message_type)
+            for message in messages:
+                bag.write("/smpl_params", message.data, log_time_ns=message.log_time_ns)
+    (folder / "out.mcap").symlink_to(home / "secret.mcap")
+    (folder / "noise.mcap").write_bytes(os.urandom(1000))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def node(ros: None, messages: Path, bags: Path) -> Iterator[NodeProcess]:  # noqa: ARG001
+    log = bags.parent / "log.txt"
+    with NodeProcess(log, packages=messages, input_type="joint_state", backbone="skinned", bags=bags) as node:
+        yield node
+        assert node.process.poll() is None, node.log
+        assert "Traceback" not in node.log
+
+
+@pytest.fixture(scope="module")
+def peer(node: NodeProcess) -> Iterator[Peer]:  # noqa: ARG001
+    peer = Peer()
+    yield peer
+    peer.close()
+
+
+def ask(peer: Peer, **given: Any) -> Any:
+    """A frame's answer."""
+    from refu_msgs.srv import Dress
+
+    return peer.call(Dress, "garment_node/dress", Dress.Request(**given))
+
+
+class Replayer:
+    """An action client."""
+
+    def __init__(self, peer: Peer) -> None:
+        from refu_msgs.action import ReplayBag
+
+        self._peer, self._type = peer, ReplayBag
+        self._client = ActionClient(peer.node, ReplayBag, "garment_node/replay_bag")
+        peer.spin_until(self._client.server_is_ready, "the action is offered")
+        self.feedback: list[tuple[int, int]] = []
+
+    def begin(self, **goal: Any) -> Any:
+        """The goal's handle."""
+        told = lambda message: self.feedback.append(  # noqa: E731
+            (message.feedback.frames_done, message.feedback.frames_total)
+        )
+        return self._done(self._client.send_goal_async(self._type.Goal(**goal), feedback_callback=told))
+
+    def result(self, handle: Any) -> tuple[int, Any]:
+        """Status and result."""
+        answer = self._done(handle.get_result_async())
+        return answer.status, answer.result
+
+    def cancel(self, handle: Any) -> None:
+        """Asks for it."""
+        assert self._done(handle.cancel_goal_async()).goals_canceling
+
+    def _done(self, future: Any) -> Any:
+        self._peer.spin_until(future.done, "the action answers")
+        return future.result()
+
+
+def test_a_frame_is_dressed_as_by_the_library(peer: Peer) -> None:
+    given = frame(3, transl=(1.0, 2.0, 3.0))
+    betas = [0.5, -1.0]
+    header = Header(frame_id="camera")
+    header.stamp.sec = 7
+    pose = given.pose.ravel()
+    answer = ask(
+        peer, header=header, pose=pose, betas=betas, transl=given.transl, garments=GARMENTS[:1], sdf="accurate"
+    )
+    assert answer.success, answer.message
+    assert (answer.message, answer.header) == ("", header)
+    pipeline = GarmentPipeline.load(GARMENTS[:1], sdf="accurate", backbone="skinned")
+    wanted = pipeline(SmplFrame(pose=given.pose, betas=np.pad(betas, (0, 8)), transl=given.transl))
+    (garment,) = answer.garments
+    mesh = wanted[GARMENTS[0]]
+    assert garment.name == GARMENTS[0]
+    points = np.array([(point.x, point.y, point.z) for point in garment.mesh.vertices])
+    np.testing.assert_allclose(points, mesh.vertices[:, SMPL_COLUMNS["smpl"]], atol=1e-6)
+    np.testing.assert_array_equal([corner.vertex_indices for corner in garment.mesh.triangles], mesh.faces)
+    stats = wanted.stats.garments[GARMENTS[0]]
+    assert (garment.n_inside, garment.n_unresolved) == (stats.n_inside, stats.n_unresolved)
+    assert answer.largest_shift == pytest.approx(wanted.stats.shift.largest, abs=1e-6)
+    assert answer.within_promise
+
+
+def test_requests_leave_the_stream_as_it_is(peer: Peer) -> None:
+    peer.wait_for_node()
+    before = peer.dress(frame(1)).points
+    assert ask(peer, pose=frame(9).pose.ravel(), betas=[2.0] * 10).success
+    after = peer.dress(frame(1, stamp_ns=5 * 10**9)).points
+    np.testing.assert_array_equal(before, after)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"pose": [np.nan] * 72}, "NaN"),
+        ({"pose": [1e30] * 72}, "pose"),
+        ({"betas": [0.0] * 11}, "betas"),
+        ({"betas": [np.inf]}, "betas"),
+        ({"transl": [0.0, np.nan, 0.0]}, "transl"),
+        ({"style": [1.0]}, "style"),
+        ({"header": Header(stamp={})}, "stamp"),
+        ({"garments": ["cape"]}, "cape"),
+        ({"garments": ["/etc/passwd.npz"]}, "garments"),
+        ({"garments": ["../garment_tshirt-male.npz"]}, "garments"),
+        ({"garments": ["tshirt-male"] * 2}, "distinct"),
+        ({"garments": ["tshirt-male"] * 17}, "garments"),
+        ({"garments": ["tshirt-male", "skirt-female"]}, "one body"),
+        ({"sdf": "best"}, "sdf"),
+    ],
+    ids=lambda value: "" if isinstance(value, dict) else value,
+)
+def test_nonsense_gets_an_answer(peer: Peer, given: dict[str, Any], said: str) -> None:
+    if "header" in given:
+        given = {"header": Header()}
+        given["header"].stamp.sec = -1
+    answer = ask(peer, **given)
+    assert not answer.success
+    assert said in answer.message
+    assert "\n" not in answer.message
+    assert not answer.garments
+
+
+OUTSIDE = ("../secret", "/tmp/bag", "a/../../secret", ".hidden", "--help", "a//b", "a\x1b[2J", "x" * 200)
+
+
+@pytest.mark.parametrize("path", OUTSIDE)
+def test_a_recording_stays_in_its_folder(peer: Peer, bags: Path, path: str) -> None:
+    from refu_msgs.srv import Record
+
+    before = sorted(bags.parent.rglob("*"))
+    answer = peer.call(Record, "garment_node/record_bag", Record.Request(start=True, path=path))
+    assert (answer.success, answer.path) == (False, "")
+    assert "below the parameter bags" in answer.message
+    assert sorted(bags.parent.rglob("*")) == before
+
+
+def test_a_recording_says_where_it_is(peer: Peer, bags: Path) -> None:
+    from refu_msgs.srv import Record
+
+    def record(path: str = "", *, start: bool = True) -> Any:
+        return peer.call(Record, "garment_node/record_bag", Record.Request(start=start, path=path))
+
+    assert "set the parameter record" in record().message
+    for wanted in ("day", "day-1"):
+        begun = record("day")
+        assert begun.success, begun.message
+        assert begun.path == str(bags / wanted)
+        assert "already" in record("day").message
+        peer.dress(frame(1 if wanted == "day" else 2))
+        ended = record(start=False)
+        assert (ended.success, ended.path) == (True, begun.path)
+    assert not record(start=False).success
+
+
+def test_a_bag_is_dressed_beside_the_stream(peer: Peer, bags: Path) -> None:
+    replayer = Replayer(peer)
+    handle = replayer.begin(bag="walk.mcap", garments=GARMENTS[:1])
+    peer.dress(frame(4))  # meanwhile
+    status, result = replayer.result(handle)
+    assert (status, result.success) == (GoalStatus.STATUS_SUCCEEDED, True), result.message
+    assert result.output == str(bags / "walk-dressed.mcap")
+    assert (result.frames, list(result.garments)) == (N_WALK, [GARMENTS[0]])
+    assert 0 <= result.vfcp_percent[0] <= 100
+    assert 0 <= result.cfmp_percent[0] <= 100
+    assert replayer.feedback[0] == (0, N_WALK)
+    assert replayer.feedback[-1] == (N_WALK, N_WALK)
+    with BagReader(bags / "walk-dressed.mcap") as bag:
+        assert sum(message.topic == "/garments" for message in bag.messages()) == N_WALK
+
+
+def test_one_bag_at_a_time_and_it_can_be_cancelled(peer: Peer, bags: Path) -> None:
+    long = bags / "endless.mcap"
+    with BagReader(bags / "walk.mcap") as walk:
+        (message, *_) = walk.messages()
+    with BagWriter(long) as bag:
+        bag.add_topic("/smpl_params", message.message_type)
+        for i in range(20_000):
+            bag.write("/smpl_params", message.data, log_time_ns=i)
+    replayer = Replayer(peer)
+    first = replayer.begin(bag="endless.mcap", garments=GARMENTS[:1], sdf="none")
+    status, result = replayer.result(replayer.begin(bag="walk.mcap"))
+    assert status == GoalStatus.STATUS_ABORTED
+    assert "another bag" in result.message
+    peer.spin_until(lambda: any(done for done, _ in replayer.feedback), "it has begun")
+    begun = time.monotonic()
+    replayer.cancel(first)
+    status, result = replayer.result(first)
+    assert time.monotonic() < begun + 60
+    assert status == GoalStatus.STATUS_CANCELED
+    assert not result.success
+    assert "cancelled" in result.message
+    assert 0 < result.frames < 20_000
+    with BagReader(result.output) as bag:
+        assert not bag.truncated
+
+
+@pytest.mark.parametrize(
+    ("goal", "said"),
+    [
+        ({"bag": "none.mcap"}, "no bag"),
+        ({"bag": ""}, "below the parameter bags"),
+        ({"bag": "../secret.mcap"}, "below the parameter bags"),
+        ({"bag": "out.mcap"}, "below the parameter bags"),
+        ({"bag": "walk.mcap", "garments": ["x.npz"]}, "garments"),
+        ({"bag": "walk.mcap", "sdf": "--help"}, "sdf"),
+        ({"bag": "noise.mcap"}, "noise.mcap"),
+    ],
+    ids=lambda value: "" if isinstance(value, dict) else value,
+)
+def test_a_bad_goal_gets_an_answer(peer: Peer, goal: dict[str, Any], said: str) -> None:
+    replayer = Replayer(peer)
+    status, result = replayer.result(replayer.begin(**goal))
+    assert (status, result.success, result.output) == (GoalStatus.STATUS_ABORTED, False, "")
+    assert said in result.message
+    assert "\n" not in result.message
