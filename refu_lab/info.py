@@ -12,6 +12,7 @@ from refu_core.body import BUILTIN_BODIES, POOR_FIT, load_body, load_fit
 from refu_core.garments import garment_files, load_garment
 from refu_core.mesh import Connectivity
 from refu_core.modes import BackboneName, SdfMode
+from refu_core.weights import load_card, weights_folder
 from refu_lab.bodies import fit_facts
 
 
@@ -48,6 +49,17 @@ def describe_body(source: str) -> dict[str, Any]:
     return facts | fit_facts(fit)
 
 
+def networks_of(garment: str) -> str:
+    """What the shipped networks of a garment are made of; raises `WeightsError` where their card is damaged."""
+    stem = weights_folder(garment) / "tailornet-hybrid"
+    if not stem.with_suffix(".json").exists():
+        return "no networks: worn by skinning"
+    card = load_card(stem)
+    if "like" in card:
+        return f"networks of {card['like']} and {card['simulated']} samples"
+    return "networks"
+
+
 def collect() -> dict[str, Any]:
     """Versions, bodies, garments, modes and devices; plain values, ready for JSON."""
     import torch
@@ -65,7 +77,10 @@ def collect() -> dict[str, Any]:
         "rclpy": "importable" if find_spec("rclpy") else "not found (needed by the node only)",
         "devices": ["cpu", *(f"cuda: {name}" for name in cuda)],
         "bodies": {body.name: f"{body.n_vertices} vertices, {body.fingerprint}" for body in bodies},
-        "garments": {g.name: f"{g.n_vertices} vertices, {len(g.faces)} faces, for {g.body}" for g in garments},
+        "garments": {
+            g.name: f"{g.n_vertices} vertices, {len(g.faces)} faces, for {g.body}; {networks_of(g.name)}"
+            for g in garments
+        },
         "backbones": list(BackboneName),
         "sdf modes": list(SdfMode),
     }

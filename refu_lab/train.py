@@ -16,9 +16,11 @@ from refu_core.sdf import SDF_PRESETS
 from refu_core.simulation import GarmentDataset, open_dataset
 from refu_core.training import (
     FINETUNE_MODES,
+    CarrySettings,
     FinetuneSettings,
     PretrainSettings,
     SdfSettings,
+    carry_over,
     finetune,
     pretrain,
     train_sdf,
@@ -50,6 +52,8 @@ class TrainOptions:
     margin: float | None = None
     unblended: bool = False
     body: str | None = None
+    like: str | None = None
+    """A related garment whose networks are carried over: what a small set is enough for."""
     seed: int = 0
     steps: int | None = None
     device: str = "cpu"
@@ -78,6 +82,11 @@ def train(options: TrainOptions, *, progress: bool) -> dict[str, Any]:
             GarmentDataset(options.data), body, template, options.folder, settings=_sdf_training(options), **common
         )
     dataset = open_dataset(options.data)
+    if options.like is not None:
+        few = _carrying(options)
+        return carry_over(
+            template, dataset, options.folder, like=options.like, settings=few, body=body, quiet=not progress
+        )
     common |= {"backbone": options.backbone, "preset": options.preset, "body": body}
     source: Path | None = options.folder
     if options.mode == "none":
@@ -92,6 +101,13 @@ def train(options: TrainOptions, *, progress: bool) -> dict[str, Any]:
 
 def _check(options: TrainOptions) -> None:
     checked_device(options.device)
+    if options.like is not None and (options.network, options.backbone, options.preset) != (
+        "garment",
+        "tailornet",
+        "realtime",
+    ):
+        msg = "--like makes a tailornet of the preset realtime: leave --network, --backbone and --preset out"
+        raise RefuError(msg)
     if options.margin is not None and not 0 <= options.margin <= MAX_MARGIN:
         msg = f"the margin must be between 0 and {MAX_MARGIN} m, got {options.margin}"
         raise RefuError(msg)
@@ -119,6 +135,12 @@ def _pretraining(options: TrainOptions) -> PretrainSettings:
     return replace(settings, style_shape_steps=options.steps, low_steps=options.steps, steps=options.steps)
 
 
+def _carrying(options: TrainOptions) -> CarrySettings:
+    settings = CarrySettings()
+    settings = replace(settings, loop=replace(settings.loop, seed=options.seed))
+    return settings if options.steps is None else replace(settings, steps=options.steps)
+
+
 def _finetuning(options: TrainOptions) -> FinetuneSettings:
     settings = FinetuneSettings.of(options.backbone, options.preset)
     settings = replace(settings, loop=replace(settings.loop, seed=options.seed))
@@ -135,7 +157,7 @@ def _finetuning(options: TrainOptions) -> FinetuneSettings:
 
 def training_table(card: dict[str, Any], options: TrainOptions) -> str:
     """What `refu train` prints."""
-    rows = [(name, str(card[name])) for name in ("backbone", "mode", "preset", "samples") if name in card]
+    rows = [(name, str(card[name])) for name in ("backbone", "mode", "preset", "like", "samples") if name in card]
     rows += [
         (name.replace("_", " "), f"{value:.3f}")
         for name, value in card.get("figures", {}).items()

@@ -97,7 +97,7 @@ class Judge:
         """Of the cut, with the room that it has for raised arms and bent elbows, up to 15 %; shape (E,)."""
         key = shape.numpy().tobytes() + style.tobytes()
         if self._lengths is None or self._lengths[0] != key:
-            rest = self._garment.rest(shape, torch.from_numpy(style)[None])
+            rest = self._garment.rest(shape, self._garment.own(torch.from_numpy(style)[None]))
             poses = comfort_poses()
             eased = self._garment.pose(rest.expand(len(poses), -1, -1), self._body(poses, shape).transforms)
             both = torch.cat((rest, eased)).numpy().astype(np.float64)

@@ -3,7 +3,7 @@
 from refu_core.frames import N_STYLES
 from refu_core.garments._below import SkinBelow
 from refu_core.garments._card import GarmentCard, Tailoring, card_to_json
-from refu_core.garments._file import load_garment, save_garment
+from refu_core.garments._file import garment_name, load_garment, save_garment
 from refu_core.garments._registry import garment_files, garments_folder
 from refu_core.garments._template import GarmentTemplate, UvMap, inner_first
 from refu_core.garments._transfer import worn_on
@@ -21,6 +21,7 @@ __all__ = [
     "UvMap",
     "card_to_json",
     "garment_files",
+    "garment_name",
     "garments_folder",
     "inner_first",
     "load_garment",

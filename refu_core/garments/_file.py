@@ -55,6 +55,12 @@ def load_garment(
     return _read(path, device, dtype)
 
 
+def garment_name(garment: str | os.PathLike[str]) -> str:
+    """The name of a garment that was asked for by its name or by its file's path, which needs not be there."""
+    text = os.fspath(garment)
+    return Path(text).stem.removeprefix("garment_") if text.endswith(".npz") else text
+
+
 def _read(path: Path, device: str | torch.device, dtype: torch.dtype) -> GarmentTemplate:
     name = path.stem.removeprefix("garment_")
     if not _NAME.fullmatch(name):

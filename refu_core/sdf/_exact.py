@@ -110,8 +110,10 @@ class ExactSdf(MeshSdf):
         skin.tree = self._mesh.id
         return skin
 
-    def closest(self, points: Tensor, *, max_distance: float = math.inf) -> ClosestPoints:
+    def closest(self, points: Tensor, *, max_distance: float = math.inf, near: Tensor | None = None) -> ClosestPoints:
         """The closest point of the body to each of `points` [m], shape (N, 3), where one is within `max_distance` [m].
+
+        `near`, int32 of shape (N,), may name a body face near each point, or -1: then less is looked at.
 
         Not differentiable; raises as `query`.
         """
@@ -120,7 +122,7 @@ class ExactSdf(MeshSdf):
             raise MeshError(msg)
         self._require_update()
         where = self._checked(points)
-        found = self._launch(where, min(max_distance, _UNLIMITED))
+        found = self._launch(where, min(max_distance, _UNLIMITED), near)
         _, barycentrics, _ = self._features(where, found.face)
         sign = torch.where(found.distance < 0, -1.0, 1.0)
         return ClosestPoints(found.face, barycentrics, found.distance.abs(), sign)

@@ -11,7 +11,7 @@ from refu_core.simulation._dataset import (
 from refu_core.simulation._drape import Draper, DrapeSettings, SettledDrape, canonical_pose, colliders
 from refu_core.simulation._errors import SimulationError
 from refu_core.simulation._plan import SamplePlan
-from refu_core.simulation._poses import Clip, load_clips, split_clips
+from refu_core.simulation._poses import Clip, load_clips, random_pose, split_clips
 from refu_core.simulation._produce import Progress
 from refu_core.simulation._selection import CAUSES, SelectionSettings
 from refu_core.simulation._sequences import SequencePlan, SequenceSettings, simulate_sequences
@@ -44,6 +44,7 @@ __all__ = [
     "colliders",
     "load_clips",
     "open_dataset",
+    "random_pose",
     "simulate_dataset",
     "simulate_sequences",
     "split_clips",

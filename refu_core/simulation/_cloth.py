@@ -11,7 +11,8 @@ import torch
 from numpy.typing import NDArray
 
 from refu_core.sdf import ExactSdf
-from refu_core.simulation._solver import find_pairs, refresh_points, stale_points, substep
+from refu_core.simulation._pairs import farthest_move, find_candidates, near_pairs
+from refu_core.simulation._solver import refresh_points, stale_points, substep
 
 if TYPE_CHECKING:
     from refu_core.simulation._mesh import ClothTopology
@@ -58,7 +59,19 @@ _REACH = 0.04  # [m]: how far from the skin a vertex knows its distance
 _NEAR = 0.012  # [m]: closer vertices carry a contact
 _SLIDE = 0.003  # [m]: a contact's tangent plane holds for this far
 _PAIR_REACH = 0.007  # [m]: a vertex this close to another piece of the cloth is watched
+_PAIR_SLACK = 0.003  # [m]: pieces are looked for farther away by this, and then not until a vertex has moved half of it
 _MAX_SPEED = 6.0  # [m/s]
+
+
+class _Skin:
+    """Where on the skin each of N points was found closest when it was asked for last."""
+
+    def __init__(self, n: int) -> None:
+        self.face = np.full(n, -1, np.int32)
+        self.weights: F32 = np.zeros((n, 3), np.float32)
+        self.normal: F32 = np.zeros((n, 3), np.float32)
+        self.asked_at: F32 = np.full((n, 3), 1e6, np.float32)  # far away: everything is stale
+        self.distance: F32 = np.zeros(n, np.float32)
 
 
 class SimulatedCloth:
@@ -76,7 +89,8 @@ class SimulatedCloth:
         self._body_faces = sdf.faces.cpu().numpy().astype(np.int32)
         n = topology.n_vertices
         # Bends first: in each sweep the stiffer edges have the last word.
-        self._ends = np.concatenate((topology.bends[topology.bend_order], topology.mesh.edges[topology.stretch_order]))
+        ends = np.concatenate((topology.bends[topology.bend_order], topology.mesh.edges[topology.stretch_order]))
+        self._ends = ends.astype(np.uint32)  # without a sign no index has to be asked whether it counts from the end
         h2 = self.settings.substep**2
         self._softness = np.concatenate(
             (
@@ -93,11 +107,11 @@ class SimulatedCloth:
     def _dress(self, rest: F32) -> None:
         n = self.topology.n_vertices
         self._rest = rest
-        self._face = np.full(n, -1, np.int32)
-        self._weights: F32 = np.zeros((n, 3), np.float32)
-        self._normal: F32 = np.zeros((n, 3), np.float32)
-        self._asked_at: F32 = np.full((n, 3), 1e6, np.float32)  # far away: everything is stale
-        self._asked_distance: F32 = np.zeros(n, np.float32)
+        self._skin = _Skin(n)
+        self._middles = _Skin(len(self.topology.mesh.edges))
+        self._searched_at: F32 = np.full((n, 3), 1e6, np.float32)  # far away: nothing that was found holds
+        none = np.zeros(0, np.int32)
+        self._candidates: tuple[I32, I32] = (none, none)
 
     def start(
         self,
@@ -189,14 +203,7 @@ class SimulatedCloth:
             edges = (
                 self._edge_contacts(body, motion) if careful else (np.zeros((0, 2), np.int32), empty3, empty3, empty3)
             )
-            pairs = find_pairs(
-                self.positions,
-                self.topology.mesh.faces,
-                self._rest,
-                np.float32(2.2 * self._edge_length),
-                np.float32(_PAIR_REACH),
-                np.float32(_PAIR_REACH + 0.85 * self._edge_length),
-            )
+            pairs = self._pairs()
             for _ in range(min(refresh, s.substeps - first)):
                 substep(
                     self.positions, self.velocities, self._previous, self._inverse_mass,
@@ -210,36 +217,46 @@ class SimulatedCloth:
                 )  # fmt: skip
         return float(np.sqrt((self.velocities**2).sum(1).mean()))
 
+    def _pairs(self) -> tuple[I32, I32, F32]:
+        """Vertices near a face of the same cloth that isn't near it in the rest shape, the face, and the side of it."""
+        faces, reach = self.topology.mesh.faces, np.float32(_PAIR_REACH + 0.85 * self._edge_length)
+        if farthest_move(self.positions, self._searched_at) > _PAIR_SLACK / 2:
+            self._candidates = find_candidates(
+                self.positions, faces, self._rest, np.float32(2.2 * self._edge_length), reach + np.float32(_PAIR_SLACK)
+            )
+            self._searched_at[:] = self.positions
+        return near_pairs(self.positions, faces, *self._candidates, np.float32(_PAIR_REACH))
+
     def _contacts(self, body: F32, motion: F32 | None, *, everything: bool) -> _Contacts:
         stale = stale_points(
-            self.positions, self._asked_at, self._asked_distance, np.float32(_NEAR), np.float32(_SLIDE), everything
+            self.positions, self._skin.asked_at, self._skin.distance, np.float32(_NEAR), np.float32(_SLIDE), everything
         )
-        if len(stale):
-            asked = self.positions[stale]
-            self._sdf.update(torch.from_numpy(body))
-            found = self._sdf.closest(torch.from_numpy(asked), max_distance=_REACH)
-            self._face[stale] = found.face.numpy()
-            self._weights[stale] = found.barycentrics.numpy()
-            self._asked_at[stale] = asked
-            self._asked_distance[stale] = np.minimum(found.distance.numpy(), _REACH) * found.sign.numpy()
-        return refresh_points(
-            self.positions, self._face, self._weights, self._asked_distance, self._normal, stale,
-            self._body_faces, body, body if motion is None else motion, motion is not None, np.float32(_NEAR),
-        )  # fmt: skip
+        return self._touch(self._skin, self.positions, stale, body, motion)
 
     def _edge_contacts(self, body: F32, motion: F32 | None) -> _Contacts:
-        near = self._asked_distance < _NEAR
-        ends = self.topology.mesh.edges[near[self.topology.mesh.edges].all(1)]
-        middle = self.positions[ends].mean(1)
-        self._sdf.update(torch.from_numpy(body))
-        found = self._sdf.closest(torch.from_numpy(middle), max_distance=_REACH)
-        distance = np.minimum(found.distance.numpy(), _REACH) * found.sign.numpy()
-        which, point, direction, moved = refresh_points(
-            middle, found.face.numpy(), found.barycentrics.numpy(), distance, np.zeros_like(middle),
-            np.arange(len(middle), dtype=np.int32),
+        edges, skin = self.topology.mesh.edges, self._middles
+        near = self._skin.distance[edges].max(1) < _NEAR
+        middle = self.positions[edges].mean(1)
+        stale = stale_points(middle, skin.asked_at, skin.distance, np.float32(_NEAR), np.float32(_SLIDE), False)
+        which, point, direction, moved = self._touch(skin, middle, stale[near[stale]], body, motion)
+        kept = near[which]
+        return edges[which[kept]], point[kept], direction[kept], moved[kept]
+
+    def _touch(self, skin: _Skin, points: F32, stale: I32, body: F32, motion: F32 | None) -> _Contacts:
+        """Contacts of `points` (N, 3) with the body (V, 3), which is asked about the `stale` ones."""
+        if len(stale):
+            asked = points[stale]
+            self._sdf.update(torch.from_numpy(body))
+            near = torch.from_numpy(skin.face[stale])
+            found = self._sdf.closest(torch.from_numpy(asked), max_distance=_REACH, near=near)
+            skin.face[stale] = found.face.numpy()
+            skin.weights[stale] = found.barycentrics.numpy()
+            skin.asked_at[stale] = asked
+            skin.distance[stale] = np.minimum(found.distance.numpy(), _REACH) * found.sign.numpy()
+        return refresh_points(
+            points, skin.face, skin.weights, skin.distance, skin.normal, stale,
             self._body_faces, body, body if motion is None else motion, motion is not None, np.float32(_NEAR),
         )  # fmt: skip
-        return ends[which], point, direction, moved
 
     def stretch(self, positions: F32 | None = None) -> F32:
         """Length of each edge over its rest length, shape (E,); of vertices at `positions` if given, (N, 3) [m]."""

@@ -44,9 +44,9 @@ class DrapeSettings:
     """Frames in which the arms go down from the T-pose to the canonical one."""
     canonical_frames: int = 60
     """Most frames in which the canonical drape settles."""
-    speed: float = 0.02
+    speed: float = 0.035
     """Way of the fastest part of the body in a frame of the move, on average [m]."""
-    move_frames: tuple[int, int] = (20, 60)
+    move_frames: tuple[int, int] = (12, 40)
     """Fewest and most frames of the move."""
     settle_frames: tuple[int, int] = (14, 45)
     """Fewest and most frames of settling; it ends early when the cloth rests."""
@@ -88,13 +88,14 @@ def comfort_poses() -> NDArray[np.float32]:
     """Poses that a garment is cut to be comfortable in [rad], shape (P, 24, 3); the T-pose isn't among them.
 
     Cloth cut to the T-pose alone is too short over the shoulders when arms hang, at the elbows when they bend, at the
-    seat and the crotch when legs are raised or spread; a tailor leaves room there.
+    seat, the knees and the crotch when legs are raised or spread; a tailor leaves room there.
     """
     hang, bend, raised, spread = np.zeros((4, N_JOINTS, 3), np.float32)
     hang[16, 2], hang[17, 2] = -0.87, 0.87
     bend[16, 1], bend[17, 1] = -0.7, 0.7
     bend[18, 1], bend[19, 1] = -1.2, 1.2
     raised[1, 0] = raised[2, 0] = -0.8
+    raised[4, 0] = raised[5, 0] = 1.2
     spread[1, 2], spread[2, 2] = 0.4, -0.4
     return np.stack((hang, bend, raised, spread))
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from refu_core.frames import N_BETAS
-from refu_core.garments import N_STYLES
+from refu_core.garments import N_STYLES, garment_name
 from refu_core.simulation._errors import SimulationError
 from refu_core.simulation._poses import clip_pose, random_pose
 
@@ -105,7 +105,7 @@ class SamplePlan:
         return [runs[k] for k in order]
 
     def _key(self, *numbers: int) -> list[int]:
-        return [self.seed, zlib.crc32(self.garment.encode()), *numbers]
+        return [self.seed, zlib.crc32(garment_name(self.garment).encode()), *numbers]
 
     def style_shape(self, pair: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """β (10,) and γ (4,) of a pair, normal, cut off at ±2; the pivots are spread evenly over each coordinate."""

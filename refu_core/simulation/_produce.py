@@ -137,7 +137,7 @@ def _card_of(simulator: Simulator) -> dict[str, Any]:
         "garment_fingerprint": digest.hexdigest()[:16],
         "motions_fingerprint": motions.hexdigest()[:16],
         "quantum_m": QUANTUM,
-        "plan": asdict(simulator.plan),
+        "plan": asdict(simulator.plan) | {"garment": garment.name},  # however its file was named
         "settings": asdict(simulator.settings),
         "clips": {"train": [clip.name for clip in clips[0]], "test": [clip.name for clip in clips[1]]},
         "versions": {

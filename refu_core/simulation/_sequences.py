@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from refu_core._engine import Engine
 from refu_core.frames import N_BETAS
-from refu_core.garments import N_STYLES
+from refu_core.garments import N_STYLES, garment_name
 from refu_core.simulation._drape import GRAVITY, SettledDrape
 from refu_core.simulation._errors import SimulationError
 from refu_core.simulation._motion import FPS, STEPS, DrawnMotion, draw_motion
@@ -77,7 +77,7 @@ class SequencePlan:
         return [[int(slot)] for slot in order]
 
     def _key(self, *numbers: int) -> list[int]:
-        return [self.seed, zlib.crc32(f"{self.garment} sequences".encode()), *numbers]
+        return [self.seed, zlib.crc32(f"{garment_name(self.garment)} sequences".encode()), *numbers]
 
     def style_shape(self, slot: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """β (10,), normal, cut off at ±2, and γ (4,), zero."""

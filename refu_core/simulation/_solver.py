@@ -21,7 +21,7 @@ def substep(
     v: _Floats,  # velocities (N, 3), updated
     previous: _Floats,  # scratch (N, 3)
     inverse_mass: _Floats,  # (N,)
-    ends: _Ints,  # vertices of the distance constraints (E, 2)
+    ends: NDArray[np.uint32],  # vertices of the distance constraints (E, 2)
     shortest: _Floats,  # between these two lengths they give way freely (E,)
     longest: _Floats,
     softness: _Floats,  # their compliance over h² (E,)
@@ -203,91 +203,6 @@ def _separate_pairs(
         x[d, 0] -= sd * nx
         x[d, 1] -= sd * ny
         x[d, 2] -= sd * nz
-
-
-@numba.njit(cache=True, fastmath=True)
-def find_pairs(
-    x: _Floats, faces: _Ints, rest: _Floats, rest_apart: float, reach: float, cell: float
-) -> tuple[_Ints, _Ints, _Floats]:
-    """Vertices within `reach` of a face of the same cloth that isn't near it in the rest shape.
-
-    Faces are binned by their centres in a grid of the given cell size (at least `reach` plus the longest distance of a
-    corner from its centre). Returns the vertex (S,), the face's vertices (S, 3) and the side of it (S,), by vertex.
-    """
-    n = x.shape[0]
-    m = faces.shape[0]
-    third = np.float32(1.0 / 3.0)
-    low = np.empty(3, np.float32)
-    size = np.empty(3, np.int64)
-    for k in range(3):
-        a, b = x[0, k], x[0, k]
-        for i in range(n):
-            a, b = min(a, x[i, k]), max(b, x[i, k])
-        low[k] = a - cell * np.float32(1.5)  # a rim of empty cells: no neighbour lies outside the grid
-        size[k] = int((b - low[k]) / cell) + 2
-    key = np.empty(m, np.int32)
-    start = np.zeros(size[0] * size[1] * size[2] + 1, np.int32)
-    for f in range(m):
-        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        bucket = int(((x[a, 0] + x[b, 0] + x[c, 0]) * third - low[0]) / cell)
-        bucket = bucket * size[1] + int(((x[a, 1] + x[b, 1] + x[c, 1]) * third - low[1]) / cell)
-        bucket = bucket * size[2] + int(((x[a, 2] + x[b, 2] + x[c, 2]) * third - low[2]) / cell)
-        key[f] = bucket
-        start[bucket + 1] += 1
-    for c in range(len(start) - 1):
-        start[c + 1] += start[c]
-    fill = start[:-1].copy()
-    member = np.empty(m, np.int32)
-    centre = np.empty(
-        (m, 6), np.float32
-    )  # of the present and of the rest shape, side by side in the order of the cells
-    for f in range(m):
-        s = fill[key[f]]
-        fill[key[f]] += 1
-        member[s] = f
-        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        for k in range(3):
-            centre[s, k] = (x[a, k] + x[b, k] + x[c, k]) * third
-            centre[s, k + 3] = (rest[a, k] + rest[b, k] + rest[c, k]) * third
-
-    found_vertex = np.empty(1024, np.int32)
-    found_face = np.empty(1024, np.int32)
-    found_side = np.empty(1024, np.float32)
-    count = 0
-    cell2 = cell * cell
-    apart2 = rest_apart * rest_apart
-    for i in range(n):
-        ci = int((x[i, 0] - low[0]) / cell)
-        cj = int((x[i, 1] - low[1]) / cell)
-        ck = int((x[i, 2] - low[2]) / cell)
-        for di in range(ci - 1, ci + 2):
-            for dj in range(cj - 1, cj + 2):
-                row = (di * size[1] + dj) * size[2] + ck
-                for s in range(start[row - 1], start[row + 2]):  # three cells that follow each other
-                    px = x[i, 0] - centre[s, 0]
-                    py = x[i, 1] - centre[s, 1]
-                    pz = x[i, 2] - centre[s, 2]
-                    rx = rest[i, 0] - centre[s, 3]
-                    ry = rest[i, 1] - centre[s, 4]
-                    rz = rest[i, 2] - centre[s, 5]
-                    if px * px + py * py + pz * pz > cell2 or rx * rx + ry * ry + rz * rz < apart2:
-                        continue
-                    f = member[s]
-                    a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-                    ux, uy, uz = x[b, 0] - x[a, 0], x[b, 1] - x[a, 1], x[b, 2] - x[a, 2]
-                    vx, vy, vz = x[c, 0] - x[a, 0], x[c, 1] - x[a, 1], x[c, 2] - x[a, 2]
-                    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-                    height = (x[i, 0] - x[a, 0]) * nx + (x[i, 1] - x[a, 1]) * ny + (x[i, 2] - x[a, 2]) * nz
-                    if abs(height) < reach * np.sqrt(nx * nx + ny * ny + nz * nz):
-                        if count == len(found_vertex):
-                            found_vertex = np.concatenate((found_vertex, np.empty(count, np.int32)))
-                            found_face = np.concatenate((found_face, np.empty(count, np.int32)))
-                            found_side = np.concatenate((found_side, np.empty(count, np.float32)))
-                        found_vertex[count] = i
-                        found_face[count] = f
-                        found_side[count] = 1.0 if height >= 0 else -1.0
-                        count += 1
-    return found_vertex[:count], faces[found_face[:count]], found_side[:count]
 
 
 @numba.njit(cache=True)

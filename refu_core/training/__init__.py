@@ -1,5 +1,6 @@
 """Training of backbones, SDF networks and ReFU; needs the extra `train`."""
 
+from refu_core.training._carry import CarrySettings, carry_over
 from refu_core.training._checkpoint import load_checkpoint, save_checkpoint
 from refu_core.training._data import TrainingSamples, output_basis, read_samples, split_validation
 from refu_core.training._figures import backbone_figures, displacements, posed_errors
@@ -13,6 +14,7 @@ from refu_core.training._sdf import SdfSettings, train_sdf
 
 __all__ = [
     "FINETUNE_MODES",
+    "CarrySettings",
     "FinetuneSettings",
     "LoopSettings",
     "Losses",
@@ -22,6 +24,7 @@ __all__ = [
     "TrainingLog",
     "TrainingSamples",
     "backbone_figures",
+    "carry_over",
     "collision_loss",
     "displacements",
     "finetune",

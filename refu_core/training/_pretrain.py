@@ -211,7 +211,7 @@ def stages(
         return [TrainingStage("all", objective, settings.steps, *parts)]
     inputs = [(_features(model, s), s.style_shape) for s in (train, validation)]
     codes = [_encode(model, s) for s in (train, validation)]
-    loss = _CodeLoss(model)
+    loss = CodeLoss(model)
     both = [(x, s, code) for (x, s), code in zip(inputs, codes, strict=True)]
     if isinstance(model, Mlp):
         model.net.standardise(torch.cat(inputs[0], 1), model.features.groups)
@@ -245,7 +245,7 @@ def stages(
     return [*found, TrainingStage("high", Objective([model.high], model.high, loss), settings.steps, *fine)]
 
 
-class _CodeLoss:
+class CodeLoss:
     """Distance of garments [mm].
 
     Dense codes are vertices: L1, as the original. In an orthonormal basis, distances between codes are root mean square

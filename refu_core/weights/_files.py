@@ -105,6 +105,11 @@ def save_weights(
     return path
 
 
+def load_card(stem: str | Path) -> dict[str, Any]:
+    """The card of weights alone. Raises `WeightsError` where there is none, or it is no card of weights."""
+    return _read_card(_with_suffix(Path(stem), ".json"))
+
+
 def load_weights(stem: str | Path, *, expect: Mapping[str, Any] | None = None) -> Weights:
     """Reads `stem`.safetensors and its card, onto the CPU.
 

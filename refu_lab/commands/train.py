@@ -41,6 +41,11 @@ def add(commands: Any) -> None:
     parser.add_argument("--backbone", default="tailornet", metavar="NAME", help="tailornet (default), mlp or gcnn")
     parser.add_argument("--preset", default="realtime", metavar="NAME", help="realtime (default) or paper")
     parser.add_argument(
+        "--like",
+        metavar="GARMENT",
+        help="carry the shipped networks of this related garment over: for sets of a hundred samples; writes all modes",
+    )
+    parser.add_argument(
         "--output", type=out_folder, metavar="DIR", help="folder of the weights (default: weights/GARMENT)"
     )
     parser.add_argument(

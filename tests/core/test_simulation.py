@@ -617,6 +617,14 @@ def test_set_without_motions_has_drawn_poses(tmp_path: Path) -> None:
     assert plan.n_test == 1
 
 
+@pytest.mark.parametrize("typed", ["kilt.npz", "./here/kilt.npz", "/there/garment_kilt.npz"])
+def test_draws_depend_on_a_garments_name_and_not_on_the_way_to_its_file(typed: str) -> None:
+    plan, other = SamplePlan("kilt", 7), SamplePlan("gown", 7)
+    for slot in range(7):
+        assert (SamplePlan(typed, 7).pose(slot, 0, [])[0] == plan.pose(slot, 0, [])[0]).all()
+        assert (other.pose(slot, 0, [])[0] != plan.pose(slot, 0, [])[0]).any()
+
+
 def test_folder_without_motions_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SimulationError, match="found none"):
         simulate(tmp_path / "set", tmp_path)

@@ -83,6 +83,8 @@ def test_a_garment_of_another_body_is_refused(weights: Path, tmp_path: Path) -> 
         (["tshirt-male"], "wanted a set whose garment is tshirt-male"),
         ([GARMENT, "--mode", "best"], "no mode 'best' of training: wanted none, approx"),
         ([GARMENT, "--preset", "huge"], "no preset 'huge'"),
+        ([GARMENT, "--like", "tshirt-male", "--backbone", "mlp"], "--like makes a tailornet"),
+        ([GARMENT, "--like", "kilt", "--steps", "1"], "no garment 'kilt'"),
         ([GARMENT, "--scale", "huge"], "no scale 'huge'"),
         ([GARMENT, "--network", "gan"], "no network 'gan'"),
         ([GARMENT, "--backbone", "resnet"], "resnet"),

@@ -1,0 +1,262 @@
+"""Networks of few samples: those of a related garment, carried over, and what the samples add to them.
+
+A hundred simulated samples teach a network from scratch little. A T-shirt of another cut, on another body, falls much
+like the one whose networks learnt from a thousand: where it lies near that one, its displacement is that one's. What
+is left, the samples say, as a linear function of the pose.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from refu_core.backbones import (
+    BasisDecoder,
+    TailorNet,
+    TailorNetConfig,
+    build_backbone,
+    load_backbone,
+    save_backbone,
+    save_basis,
+)
+from refu_core.body import SmplBody, load_fit
+from refu_core.errors import RefuError
+from refu_core.frames import N_BETAS
+from refu_core.garments import N_STYLES, GarmentTemplate, load_garment, worn_on
+from refu_core.modes import SdfMode
+from refu_core.simulation import GarmentDataset, GarmentSequences, random_pose
+from refu_core.training._data import TrainingSamples, TrainingSet, in_chunks, mirrored, output_basis, read_samples
+from refu_core.training._figures import backbone_figures, posed_errors
+from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage
+from refu_core.training._mirror import Mirror
+from refu_core.training._pretrain import CodeLoss
+from refu_core.training._progress import TrainingLog
+from refu_core.weights import load_weights, save_weights
+
+BASE = SdfMode.HYBRID
+"""The mode whose file has the network; the other modes' files only name it."""
+
+
+@dataclass(frozen=True)
+class CarrySettings:
+    """How networks are carried over; the defaults are those of the shipped weights."""
+
+    loop: LoopSettings = field(default_factory=lambda: LoopSettings(weight_decay=0.01, check_every=500))
+    rank: int = 48
+    """Components of the output basis. 64 give a T-shirt .1 mm, and a third more bytes."""
+    hidden: tuple[int, ...] = (256, 256)
+    """Layers of the net that learns what was carried over."""
+    poses: int = 4000
+    """Bodies that it learns it of."""
+    steps: int = 3000
+    reach: float = 0.015
+    """Cloth that is nearer than this to the related garment, both in the T-pose, is moved as that is [m]."""
+    fade: float = 0.03
+    """Way farther in which that ends [m]. Trousers whose legs hear of shorts 60 mm away are 13.0 mm off, not 10.5."""
+    hem: float = 0.12
+    """The related garment's hem is felt less and less within this of it [m], where the other garment goes on."""
+    jitter: float = 0.15
+    """Standard deviation by which poses of the set are varied [rad]."""
+    ridge: float = 10.0
+    """Weight of the square of the linear part's coefficients. 3 and 30 are .3 mm worse at most."""
+
+    def __post_init__(self) -> None:
+        """Raises `RefuError` for sizes that make no network."""
+        if min(self.rank, self.poses, self.steps, *self.hidden) < 1 or not self.ridge > 0:
+            msg = f"rank, poses, steps, layers and ridge must be above zero, got {self}"
+            raise RefuError(msg)
+
+
+class Carried:
+    """What the networks of one garment predict, on another."""
+
+    def __init__(self, related: GarmentTemplate, garment: GarmentTemplate, settings: CarrySettings) -> None:
+        """For `garment`, near which `related` lies once it is worn on the same body.
+
+        Raises `WeightsError` when no networks of `related` ship.
+        """
+        self.network = load_backbone("tailornet", related)
+        fit = None if garment.body == related.body else load_fit(garment.body)
+        self._betas = None if fit is None else fit.difference(related.body).betas
+        worn = worn_on(related, fit)
+        faces, vertices = worn.faces.numpy(), worn.v_template.double().numpy()
+        mesh = trimesh.Trimesh(vertices, faces, process=False)
+        place, distance, face = trimesh.proximity.closest_point(mesh, garment.v_template.double().numpy())
+        share = _smooth((settings.reach + settings.fade - distance) / settings.fade)
+        # Trousers go on where shorts end: a hem that swings there would be a step in them.
+        own = _from_rim(garment, garment.v_template.double().numpy(), garment.v_template.double().numpy())
+        ends = _from_rim(worn, vertices, place)
+        goes_on = _smooth((own - ends) / settings.hem)
+        share *= 1 - goes_on * _smooth(1 - ends / settings.hem)
+        weights = trimesh.triangles.points_to_barycentric(vertices[faces[face]], place)
+        self._corners = torch.as_tensor(faces[face])
+        self._weights = torch.as_tensor(weights * share[:, None], dtype=torch.float32)
+
+    @torch.no_grad()
+    def __call__(self, betas: Tensor, pose: Tensor) -> Tensor:
+        """Displacements of the other garment [m], (B, V, 3), for its betas (B, 10) and poses (B, 24, 3) [rad]."""
+
+        def one(betas: Tensor, pose: Tensor) -> Tensor:
+            known = betas if self._betas is None else self._betas(betas).float()
+            there = self.network(known, pose, None).displacement
+            assert there is not None  # a network was asked for
+            corners = (self._weights[:, k, None] * there[:, self._corners[:, k]] for k in range(3))
+            return sum(corners, start=torch.zeros(()))
+
+        return in_chunks(one, betas, pose)
+
+
+def _smooth(share: NDArray[np.float64]) -> NDArray[np.float64]:
+    """From 0 to 1, level at both ends, for shares cut off there."""
+    cut: NDArray[np.float64] = np.clip(share, 0, 1)
+    return cut * cut * (3 - 2 * cut)
+
+
+def _from_rim(
+    garment: GarmentTemplate, vertices: NDArray[np.float64], points: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """How far `points` (P, 3) are from the nearest hem of a garment with its vertices at `vertices` (V, 3) [m]."""
+    return np.asarray(cKDTree(vertices[np.unique(garment.mesh.boundary)]).query(points)[0])
+
+
+def carry_over(
+    garment: str | GarmentTemplate,
+    dataset: str | Path | GarmentDataset | GarmentSequences,
+    output: str | Path,
+    *,
+    like: str,
+    settings: CarrySettings | None = None,
+    body: SmplBody | None = None,
+    quiet: bool = False,
+) -> dict[str, Any]:
+    """Makes a garment's networks of those of a related one and few samples; writes `output`/basis and all modes.
+
+    Args:
+        garment: name of a built-in garment, or a template; on its own body.
+        dataset: simulated set of it (`refu simulate`); fifty samples are worth it.
+        output: folder of the weights.
+        like: name of the related garment, one whose networks ship.
+        settings: how.
+        body: the body that the set was simulated on; the garment's built-in one if not given.
+        quiet: show no progress.
+
+    Returns:
+        The card: what was made of what, and its figures on the test split.
+
+    Raises:
+        RefuError: the set is of another garment or body, or too small.
+        GarmentError: there is no such related garment.
+        WeightsError: no networks of the related garment ship, or `output` can't be written.
+    """
+    settings = CarrySettings() if settings is None else settings
+    opened = TrainingSet.of(garment, dataset, body)
+    template, body = opened.garment, opened.body
+    test = read_samples(opened.rows, body, template, split="test")
+    carried = Carried(load_garment(like), template, settings)
+    samples = opened.samples.joined(mirrored(opened.samples, Mirror.of(template)))
+    output = Path(output)
+    drawn = _bodies(opened.samples, settings)
+    there = carried(*drawn)
+    # As many of either: the samples' own folds must have their components.
+    basis = output_basis(torch.cat((samples.displacement, there[: len(samples)])), rank=settings.rank)
+    described = {**opened.identity, "samples": len(samples), "simulated": len(opened.samples), "like": like}
+    save_basis(output, basis, {**described, "set": len(opened.rows)})
+
+    config = TailorNetConfig(template.card.joints, low=settings.hidden, high=(), style_shape=(), dropout=0.0)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(settings.loop.seed)
+        model = build_backbone(config, template, basis=basis, pivots=torch.zeros(1, N_BETAS + N_STYLES))
+    assert isinstance(model, TailorNet)
+    with torch.no_grad():  # one pivot: there is nothing to choose between
+        for parameter in (*model.style_shape.parameters(), *model.high.parameters()):
+            parameter.zero_()
+    _learn_carried(model, drawn, there, output, settings, described, quiet=quiet)
+    _add_linear(model, samples, settings.ridge)
+    model.eval()
+
+    card = {
+        **described,
+        "backbone": "tailornet",
+        "preset": "realtime",
+        "settings": asdict(settings),
+        "dataset": opened.card,
+        "figures": {
+            **backbone_figures(model, test, body, template, mean=samples.displacement.mean(0)),
+            "carried_mm": round(float(posed_errors(carried(test.betas, test.pose), test, body, template).mean()), 3),
+        },
+    }
+    base = f"tailornet-{BASE}"
+    save_backbone(output / base, model, {**card, "mode": str(BASE)})
+    stored = load_weights(output / base).card
+    for mode in SdfMode:
+        if mode is not BASE:
+            own = {key: stored[key] for key in ("config", "basis_sha256")}
+            save_weights(output / f"tailornet-{mode}", {}, {**card, **own, "mode": str(mode)}, base=base)
+    return {**card, "mode": str(BASE)}
+
+
+def _bodies(samples: TrainingSamples, settings: CarrySettings) -> tuple[Tensor, Tensor]:
+    """β (P, 10) and θ (P, 24, 3) [rad] to ask a network about: poses near the set's, and any that joints allow."""
+    rng = np.random.default_rng(settings.loop.seed)
+    known = samples.pose.numpy()[rng.integers(len(samples), size=settings.poses)]
+    known = known + rng.normal(0, settings.jitter, known.shape)
+    drawn = np.stack([random_pose(rng) for _ in range(settings.poses)])
+    pose = np.where((rng.random(settings.poses) < 0.5)[:, None, None], known, drawn)
+    betas = rng.normal(0, 1.2, (settings.poses, N_BETAS)).clip(-2, 2)
+    return torch.as_tensor(betas, dtype=torch.float32), torch.as_tensor(pose, dtype=torch.float32)
+
+
+def _learn_carried(
+    model: TailorNet,
+    drawn: tuple[Tensor, Tensor],
+    there: Tensor,
+    output: Path,
+    settings: CarrySettings,
+    identity: dict[str, Any],
+    *,
+    quiet: bool,
+) -> None:
+    """Teaches the low-frequency net what is carried over, `there` (P, V, 3) [m], at the bodies `drawn`."""
+    betas, pose = drawn
+    x, s = model.features(pose), torch.cat((betas, betas.new_zeros(len(betas), N_STYLES)), 1)
+    code = in_chunks(model.decoder.encode, there, size=256)
+    model.low.standardise(torch.cat((x, s), 1), model.features.groups)
+    model.low.scale[-N_STYLES:] = 0  # a garment of one style doesn't hear of any
+    held_out = len(x) // 12
+    parts = [(x[rows], s[rows], code[rows]) for rows in (slice(held_out, None), slice(held_out))]
+    loop = Loop(
+        model,
+        settings.loop,
+        checkpoint=output / "carried.checkpoint",
+        identity=json.dumps([identity, asdict(settings)], sort_keys=True, default=str),
+        log=TrainingLog(output, name="carried", quiet=quiet),
+        device=torch.device("cpu"),
+    )
+    objective = Objective([model.low], model.low_code, CodeLoss(model))
+    loop.run(TrainingStage("carried", objective, settings.steps, *parts))
+    (output / "carried.checkpoint").unlink(missing_ok=True)
+
+
+@torch.no_grad()
+def _add_linear(model: TailorNet, samples: TrainingSamples, ridge: float) -> None:
+    """Fits the high-frequency net, one layer, to what the low-frequency one leaves of the samples."""
+    model.eval()
+    assert isinstance(model.decoder, BasisDecoder)
+    x = model.features(samples.pose)
+    left = model.decoder.encode(samples.displacement) - model.low_code(x, samples.style_shape)
+    middle, mean = x.mean(0), left.mean(0)
+    centred = (x - middle).double()
+    normal = centred.T @ centred + ridge * torch.eye(x.shape[1], dtype=torch.float64)
+    slope = torch.linalg.solve(normal, centred.T @ (left - mean).double()).float()
+    (weight,), (bias,) = model.high.weights, model.high.biases
+    weight.copy_(slope[None])
+    bias.copy_((mean - middle @ slope)[None])
