@@ -80,9 +80,8 @@ class Repeated(threading.local):
             arrays = [argument(tensor, kind) for tensor, kind in zip(tensors, self._kinds, strict=True)]
             self._known[key] = wp.launch(self._kernel, dim, arrays, device=str(device), record_cmd=True), arrays
         command, arrays = self._known[key]
-        self._kept = tensors
         for array, tensor in zip(arrays, tensors, strict=True):
-            array.data = tensor.data_ptr()
+            array.data, array._ref = tensor.data_ptr(), tensor
         with torch_stream(device):
             command.launch()
 
