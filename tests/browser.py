@@ -70,7 +70,7 @@ class Browser:
 
     def resize(self, size: tuple[int, int], *, dark: bool = False) -> None:
         """The window [pixels], and what colours its owner likes."""
-        width, height = size
+        width, height = self._size = size
         self._call(
             "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 500
         )
@@ -84,8 +84,9 @@ class Browser:
         )
 
     def open(self, url: str) -> None:
-        """Goes there; returns when the page is loaded."""
+        """Goes there; returns when the page is loaded, in a window of the size that it had."""
         self._call("Page.navigate", url=url)
+        self.resize(self._size)  # another site may be another process, which doesn't know it
         end = time.monotonic() + _LONG_S
         while self.run("document.readyState") != "complete" and time.monotonic() < end:
             time.sleep(0.1)
