@@ -44,9 +44,7 @@ others have nothing left to do."""
 
 def pytest_configure(config: pytest.Config) -> None:
     """pytest-xdist begins with the files of most tests unless it is told otherwise."""
-    if (
-        signal.getsignal(signal.SIGINT) is signal.SIG_IGN
-    ):  # a shell's background; the programs that tests start inherit it
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # in a shell's background; programs would inherit it
         signal.signal(signal.SIGINT, signal.default_int_handler)
     if hasattr(config.option, "loadscopereorder"):
         config.option.loadscopereorder = False
