@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import torch
 import warp as wp
 from torch import Tensor, nn
 from torch.nn import functional
 
-from refu_core._warp import argument, is_plain
-from refu_core.backbones._decode_kernels import ROWS, WIDTH, Strip, decode_kernel
+from refu_core._warp import Repeated, is_plain
+from refu_core.backbones._decode_kernels import WIDTH, Steps, Strip, decode_kernel
 from refu_core.errors import WeightsError
 from refu_core.garments import GarmentTemplate
 
 _A_FEW = 16
 """From more codes on, a product of matrices is the faster way."""
+_WHOLE = 32
+"""Components in half precision. Bytes for the others move a garment by 0.06 mm on recorded motion, 0.5 mm at most; with
+16 it is 0.11 and 0.8 mm, with 64 0.03 and 0.3, and a garment's basis takes a third more."""
+_STEPS = 127
 
 
 class DenseDecoder(nn.Module):
@@ -43,8 +48,9 @@ class DenseDecoder(nn.Module):
 class BasisDecoder(nn.Module):
     """The code is in an orthonormal basis of displacements (preset `realtime`): a head of R columns, not of 3 V.
 
-    All networks of a garment share the basis, so it is stored once, in half precision, and the product with it, most
-    of what a frame costs, is made once for the sum of all networks. Distances between codes are distances between
+    All networks of a garment share the basis, so it is stored once, and the product with it, most of what a frame
+    costs, is made once for the sum of all networks. The first components, which say most, are stored in half
+    precision, the others as whole numbers of steps, -127 to 127. Distances between codes are distances between
     garments: |code - code'|² = Σ_v |D_v - D'_v|², up to rounding.
     """
 
@@ -59,14 +65,30 @@ class BasisDecoder(nn.Module):
         """Width R of a code."""
         # What is computed with is what is stored, or codes wouldn't mean the same before and after.
         self.register_buffer("mean", mean.half().float().flatten())
-        self.register_buffer("components", components.half().float().contiguous())
+        self.register_buffer("components", _Stored.of(components.float()).components())
         self.mean: Tensor
         self.components: Tensor
         self._strips: _Strips | None = None
 
+    @classmethod
+    def of_tensors(cls, tensors: Mapping[str, Tensor]) -> BasisDecoder:
+        """Of what a basis file holds: the inverse of `tensors`.
+
+        Raises:
+            WeightsError: something is missing, or parts don't fit each other.
+        """
+        missing = [name for name in ("mean", "components") if name not in tensors]
+        if missing:
+            msg = f"has no {' and no '.join(missing)}: not an output basis"
+            raise WeightsError(msg)
+        coarse = tensors["components"].float()
+        nothing = torch.zeros(0, *coarse.shape[1:], dtype=torch.int8)
+        stored = _Stored(coarse, tensors.get("fine", nothing), tensors.get("steps", coarse.new_zeros(0)).float())
+        return cls(tensors["mean"].float(), stored.components())
+
     def forward(self, code: Tensor) -> Tensor:
         """Displacements [m], shape (B, V, 3), of codes (B, R)."""
-        if 1 < len(code) <= _A_FEW and code.device.type == "cpu" and is_plain(code, self.components):
+        if len(code) <= _A_FEW and code.device.type == "cpu" and is_plain(code, self.components):
             if self._strips is None or not self._strips.is_of(self.components):
                 self._strips = _Strips(self.mean, self.components)
             return self._strips(code)
@@ -88,7 +110,39 @@ class BasisDecoder(nn.Module):
 
     def tensors(self) -> Mapping[str, Tensor]:
         """What a basis file holds."""
-        return {"mean": self.mean.view(-1, 3).half(), "components": self.components.half()}
+        stored = _Stored.of(self.components)
+        tensors = {"mean": self.mean.view(-1, 3).half(), "components": stored.coarse.half()}
+        return tensors | ({"fine": stored.fine, "steps": stored.steps.bfloat16()} if len(stored.fine) else {})
+
+
+class _Stored(NamedTuple):
+    """A basis as it is stored."""
+
+    coarse: Tensor
+    """The first components, rounded to half precision, shape (K, 3 V)."""
+    fine: Tensor
+    """The others in steps, int8, shape (R - K, 3 V)."""
+    steps: Tensor
+    """What a step of each of those is worth, rounded to bfloat16, shape (R - K,)."""
+
+    @classmethod
+    def of(cls, components: Tensor) -> _Stored:
+        """Of components (R, 3 V). Of those that were stored before it is what was stored, to the bit."""
+        rest = components[_WHOLE:]
+        largest = rest.abs().amax(1) if len(rest) else rest.new_zeros(0)
+        # 127 of them have few enough digits for float32, so the largest one says what the step was.
+        steps = (largest / _STEPS).bfloat16().float()
+        fine = (rest / steps.clamp_min(torch.finfo().tiny)[:, None]).round().clamp(-_STEPS, _STEPS)
+        return cls(components[:_WHOLE].half().float(), fine.to(torch.int8), steps)
+
+    def components(self) -> Tensor:
+        """As numbers, float32, shape (R, 3 V). Raises `WeightsError` for parts that don't fit each other."""
+        sizes = (self.coarse.shape[1:], self.fine.shape[:1], self.fine.dtype)
+        if self.coarse.ndim != 2 or sizes != (self.fine.shape[1:], self.steps.shape, torch.int8):
+            shapes = ", ".join(str(tuple(part.shape)) for part in self)
+            msg = f"wanted a basis of (K, 3 V), bytes (R - K, 3 V) and steps (R - K), got {shapes}: get them again"
+            raise WeightsError(msg)
+        return torch.cat((self.coarse, self.steps[:, None] * self.fine))
 
 
 class _Strips:
@@ -100,28 +154,28 @@ class _Strips:
     def __init__(self, mean: Tensor, components: Tensor) -> None:
         self._of, self._version = components, components._version
         self._n = components.shape[1]
-        room = (0, -self._n % WIDTH)
-        strips = functional.pad(components, room).view(len(components), -1, WIDTH).transpose(0, 1).contiguous()
-        # Warp's arrays keep the tensors that they are made of.
-        self._basis = wp.from_torch(strips, dtype=Strip)
-        self._mean = wp.from_torch(functional.pad(mean, room).view(-1, WIDTH), dtype=Strip)
+        stored = _Stored.of(components)
+        self._parts = _in_strips(stored.coarse), _in_strips(stored.fine), stored.steps, _in_strips(mean[None])[:, 0]
 
     def __call__(self, code: Tensor) -> Tensor:
         """Displacements, shape (B, V, 3), of codes (B, R)."""
-        padded = functional.pad(code, (0, 0, 0, -len(code) % int(ROWS))).contiguous()
-        decoded = torch.empty(len(padded), len(self._mean), WIDTH)
-        wp.launch(
-            decode_kernel,
-            len(self._mean),
-            [argument(padded, wp.float32), self._basis, self._mean],
-            [argument(decoded, Strip)],
-            device="cpu",
-        )
-        return decoded.flatten(1)[: len(code), : self._n].view(len(code), -1, 3)
+        n_strips = len(self._parts[0])
+        decoded = torch.empty(len(code), n_strips, WIDTH)
+        _decode((n_strips,), code.contiguous(), *self._parts, decoded)
+        return decoded.flatten(1)[:, : self._n].view(len(code), -1, 3)
 
     def is_of(self, components: Tensor) -> bool:
         """Whether these are the strips of `components`, as they are now."""
         return self._of is components and self._version == components._version
+
+
+_decode = Repeated(decode_kernel, (wp.float32, Strip, Steps, wp.float32, Strip, Strip))
+
+
+def _in_strips(rows: Tensor) -> Tensor:
+    """Rows (N, C) as strips (S, N, WIDTH), the last of which ends with zeros."""
+    padded = functional.pad(rows, (0, -rows.shape[1] % WIDTH))
+    return padded.view(len(rows), padded.shape[1] // WIDTH, WIDTH).transpose(0, 1).contiguous()
 
 
 Decoder = DenseDecoder | BasisDecoder

@@ -37,7 +37,11 @@ def load_basis(folder: Path, *, expect: Mapping[str, Any]) -> tuple[BasisDecoder
         WeightsError: missing, damaged, or not as expected (`refu_core.weights.load_weights`).
     """
     weights = load_weights(folder / "basis", expect=expect)
-    basis = BasisDecoder(_tensor(weights, "mean"), _tensor(weights, "components"))
+    try:
+        basis = BasisDecoder.of_tensors(weights.tensors)
+    except WeightsError as error:
+        msg = f"{weights.path}: {error}"
+        raise WeightsError(msg) from error
     return basis, str(weights.card["sha256"])
 
 
@@ -161,10 +165,3 @@ def backbone_weights(
     if body_fingerprint is not None:
         expect["body_fingerprint"] = body_fingerprint
     return load_weights(folder / f"{kind}-{mode}", expect=expect)
-
-
-def _tensor(weights: Weights, name: str) -> Tensor:
-    if name not in weights.tensors:
-        msg = f"{weights.path}: has no {name}: not an output basis"
-        raise WeightsError(msg)
-    return weights.tensors[name].float()

@@ -273,18 +273,72 @@ def test_codes_of_a_basis_measure_vertices(garment: GarmentTemplate, basis: Basi
         torch.testing.assert_close(norms, rest.square().sum((1, 2)), rtol=1e-2, atol=0)
 
 
-@pytest.mark.parametrize("n", [2, 3, 4, 7, 16, 17])
+@pytest.mark.parametrize("rank", [9, 40])  # of which the first 32 are stored in half precision
+@pytest.mark.parametrize("n", [1, 2, 4, 7, 16, 17])
 @pytest.mark.parametrize("n_vertices", [1, 16, 107])
-def test_a_few_codes_at_once_are_decoded_as_one_by_one(n: int, n_vertices: int) -> None:
-    decoder = BasisDecoder(torch.randn(n_vertices, 3), torch.randn(9, 3 * n_vertices))
-    code = torch.randn(n, 9, requires_grad=True)
+def test_codes_are_decoded_as_a_product_of_matrices(n: int, n_vertices: int, rank: int) -> None:
+    decoder = BasisDecoder(torch.randn(n_vertices, 3), torch.randn(rank, 3 * n_vertices))
+    code = torch.randn(n, rank, requires_grad=True)
     with torch.no_grad():
-        together = decoder(code)
-        one_by_one = torch.cat([decoder(row[None]) for row in code])
-        torch.testing.assert_close(together, one_by_one, rtol=0, atol=2e-5)
+        decoded = decoder(code)
+        product = torch.addmm(decoder.mean, code, decoder.components).view(n, -1, 3)
+        torch.testing.assert_close(decoded, product, rtol=0, atol=5e-5)
+        alone = torch.cat([decoder(row[None]) for row in code])
+        torch.testing.assert_close(decoded, alone, rtol=0, atol=0 if n <= 16 else 5e-5)  # more are a product indeed
         decoder.components *= 2
-        torch.testing.assert_close(decoder(code) - decoder.mean.view(-1, 3), 2 * (together - decoder.mean.view(-1, 3)))
+        torch.testing.assert_close(
+            decoder(code) - decoder.mean.view(-1, 3), 2 * (decoded - decoder.mean.view(-1, 3)), rtol=0, atol=1e-4
+        )
     assert decoder(code).requires_grad
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e-3, 1.0])
+def test_a_basis_is_what_is_stored_of_it(scale: float) -> None:
+    given = scale * torch.randn(40, 3 * 107)
+    given[35] = 0  # as of a set of fewer samples than it has components
+    decoder = BasisDecoder(torch.randn(107, 3), given)
+    again = BasisDecoder.of_tensors(decoder.tensors())
+    assert torch.equal(again.components, decoder.components)
+    assert torch.equal(again.mean, decoder.mean)
+    assert {name: str(tensor.dtype) for name, tensor in decoder.tensors().items()} == {
+        "mean": "torch.float16",
+        "components": "torch.float16",
+        "fine": "torch.int8",
+        "steps": "torch.bfloat16",
+    }
+    largest = given.abs().amax(1)
+    if scale > 1e-5:  # below, half precision has no digits left
+        assert (decoder.components - given).abs().amax(1)[:32].le(1e-3 * largest[:32]).all()
+        assert (decoder.components - given).abs().amax(1).le(0.006 * largest).all()  # 1/254 of it, and rounding
+    before = {"mean": decoder.mean.view(-1, 3), "components": decoder.components}  # a file of before there were bytes
+    assert torch.equal(BasisDecoder.of_tensors(before).components, decoder.components)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"mean": None}, "has no mean"),
+        ({"components": None}, "has no components"),
+        ({"fine": torch.zeros(3, 30, dtype=torch.int8)}, r"steps \(R - K\)"),
+        ({"fine": torch.zeros(2, 30)}, "wanted a basis"),
+        ({"fine": torch.zeros(2, 33, dtype=torch.int8)}, "wanted a basis"),
+        ({"steps": torch.zeros(2, 1)}, "wanted a basis"),
+        ({"components": torch.zeros(4)}, "wanted a basis"),
+        ({"components": torch.zeros(4, 30, 1)}, "wanted a basis"),
+        ({"mean": torch.zeros(11, 3)}, r"wanted a basis of \(R, 33\)"),
+    ],
+)
+def test_parts_of_a_basis_that_do_not_fit_are_refused(changes: dict[str, torch.Tensor | None], message: str) -> None:
+    tensors = {
+        "mean": torch.zeros(10, 3),
+        "components": torch.zeros(4, 30),
+        "fine": torch.zeros(2, 30, dtype=torch.int8),
+        "steps": torch.zeros(2),
+    }
+    changed = {name: tensor for name, tensor in {**tensors, **changes}.items() if tensor is not None}
+    assert BasisDecoder.of_tensors(tensors).size == 6
+    with pytest.raises(WeightsError, match=message):
+        BasisDecoder.of_tensors(changed)
 
 
 def test_a_basis_that_does_not_fit_is_refused() -> None:
