@@ -126,6 +126,7 @@ class DressedBag:
             }
         values |= {
             "skin moved by the collider, at most [mm]": f"{1e3 * output.stats.shift.largest:.1f}",
+            "skin that gives way no farther [vertices]": str(output.stats.shift.n_held),
             "within the promised poses and shapes": "yes" if output.stats.within_promise else "no",
             **self._settings,
         }

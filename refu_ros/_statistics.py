@@ -95,7 +95,7 @@ class Statistics:
             self._total["late_transform"] += 1
 
     def beyond_promise(self) -> None:
-        """A frame's joints or shape are outside of the range that "nothing inside" is promised for."""
+        """A frame is none of those that "nothing inside" is promised for (`FrameStats.within_promise`)."""
         with self._lock:
             self._total["beyond_promise"] += 1
 

@@ -202,6 +202,13 @@ class Collider:
     def _recorded(self, kernel: Any, dim: int, inputs: list[Any]) -> Any:
         return wp.launch(kernel, dim, inputs, device=str(self.device), record_cmd=True)
 
+    def is_held(self, way: Tensor) -> Tensor:
+        """Whether skin that went so far, (B, V) [m], has gone as far as it may: bool, shape (B, V).
+
+        Where it has, two parts may still be in each other: as deep as flesh doesn't give way to.
+        """
+        return way > _HELD * self.anatomy.farthest.to(way)
+
     @torch.no_grad()
     def touched(self, skin: Tensor) -> Tensor:
         """Which segments each vertex of `skin` (V, 3) [m] has to give way to, bool, shape (V, K)."""
@@ -237,3 +244,7 @@ class Collider:
         of_middle = torch.repeat_interleave(torch.arange(len(start) - 1, device=skin.device), start.long().diff())
         middles = skin.new_zeros(len(start) - 1, 3)
         return torch.cat((skin, middles.index_add(0, of_middle, skin[vertex.long()] * weight.to(skin)[:, None])))
+
+
+_HELD = 0.99
+"""Share of the farthest that counts as all of it: levelling and edges come after, and move skin by a little."""

@@ -12,7 +12,8 @@ from scipy.sparse.csgraph import connected_components
 from refu_core.body._parts import joints_of
 
 SOFTNESS: tuple[tuple[tuple[int, ...], float], ...] = (
-    (joints_of("trunk"), 1.0),
+    ((0, 3), 1.0),
+    ((6, 9, 13, 14), 1.0),
     (joints_of("head"), 0.5),
     (joints_of("left_upper_arm"), 1.0),
     (joints_of("right_upper_arm"), 1.0),
@@ -28,6 +29,7 @@ SOFTNESS: tuple[tuple[tuple[int, ...], float], ...] = (
     ((8, 11), 0.25),
 )
 """Joints of the segments that give way to each other, and how softly: of two, each gives way by its share of both.
+A trunk is two, as one that is bent to the side comes down upon its own hip.
 Flanks and thighs are flesh; forearms and shins have bone below the skin; hands, feet and heads hardly give way."""
 
 

@@ -6,14 +6,16 @@ from refu_core.realtime._frame import Adjust
 from refu_core.realtime._load import wearable_of
 from refu_core.realtime._outputs import SKIPS, FrameStats, GarmentMesh, GarmentStats, PipelineOutput, SkinShift
 from refu_core.realtime._pipeline import GarmentPipeline
-from refu_core.realtime._promise import PROMISED_POSES, PROMISED_SIZE, within_promise
+from refu_core.realtime._promise import PROMISED_BEND, PROMISED_POSES, PROMISED_SIZE, SPINE, spine_bend, within_promise
 from refu_core.realtime._turn import RootTurn
 from refu_core.realtime._wearer import Outfit, Wearable, Wearer
 
 __all__ = [
+    "PROMISED_BEND",
     "PROMISED_POSES",
     "PROMISED_SIZE",
     "SKIPS",
+    "SPINE",
     "Adjust",
     "ContactStage",
     "Drape",
@@ -29,6 +31,7 @@ __all__ = [
     "Wearable",
     "Wearer",
     "dress",
+    "spine_bend",
     "wearable_of",
     "within_promise",
 ]

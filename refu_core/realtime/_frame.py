@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from refu_core.body import Collider
 from refu_core.errors import MeshError
 from refu_core.realtime._contact import N_NUMBERS, ContactStage, Worn
 from refu_core.realtime._dress import Dressed, dress, scale_of
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
 Adjust = Callable[[Dressed], Dressed]
 """Changes what was predicted: garments, not bodies."""
-N_SHIFT = 3
+N_SHIFT = 4
 _MOVED = 1e-4
 """Skin that was moved by more than this counts as moved [m]."""
 
@@ -37,7 +38,7 @@ class Person(NamedTuple):
     skin: Tensor
     """The posed body before its overlaps were pulled apart [m], shape (V, 3)."""
     shift: Tensor
-    """`n_moved`, `largest` and `mean` of a `SkinShift`, shape (3,)."""
+    """`n_moved`, `largest`, `mean` and `n_held` of a `SkinShift`, shape (4,)."""
     garments: Mapping[str, Worn]
 
 
@@ -101,7 +102,7 @@ class FrameStep:
             shared.lap("adjust")
         margin_of = dict(zip(self._outfit.wearables, margins, strict=True))
         persons = []
-        shifts = _shift(dressed)
+        shifts = _shift(dressed, self._outfit.collider)
         for person, (body, skin, turn) in enumerate(zip(dressed.body, dressed.skin, dressed.turns, strict=True)):
             clock = clocks[person] if clocks else StageClock()
             clock.start(shared, share=1 / len(pose))
@@ -161,7 +162,10 @@ class FrameStep:
             yield [part if len(part) in (N_SHIFT, N_NUMBERS) else part.reshape(-1, 3) for part in parts]
 
 
-def _shift(dressed: Dressed) -> Tensor:
-    """The numbers of each person's `SkinShift`, shape (B, 3)."""
+def _shift(dressed: Dressed, collider: Collider | None) -> Tensor:
+    """The numbers of each person's `SkinShift`, shape (B, 4)."""
+    if collider is None:
+        return dressed.body.new_zeros(len(dressed.body), N_SHIFT)
     way = torch.linalg.vector_norm(dressed.body - dressed.skin, dim=-1)
-    return torch.stack(((way > _MOVED).sum(1).to(way), way.amax(1), way.mean(1)), 1)
+    n_moved, n_held = (which.sum(1).to(way) for which in (way > _MOVED, collider.is_held(way)))
+    return torch.stack((n_moved, way.amax(1), way.mean(1), n_held), 1)

@@ -28,12 +28,15 @@ class SkinShift:
     """The longest way of any vertex [m]."""
     mean: float = 0.0
     """The mean of all vertices' ways, those that stayed among them [m]."""
+    n_held: int = 0
+    """Vertices that went as far as skin may (`Collider.is_held`): there the body may run through itself still, deeper
+    than any body does, and cloth has no room."""
 
     @classmethod
     def of(cls, numbers: Sequence[float]) -> SkinShift:
-        """Of the three, in this order."""
-        n_moved, largest, mean = numbers
-        return cls(int(n_moved), float(largest), float(mean))
+        """Of the four, in this order."""
+        n_moved, largest, mean, n_held = numbers
+        return cls(int(n_moved), float(largest), float(mean), int(n_held))
 
 
 @dataclass(frozen=True)
@@ -72,7 +75,8 @@ class FrameStats:
     is_certified: bool = False
     """Whether `n_unresolved` counts every vertex inside, whatever the frame."""
     within_promise: bool = True
-    """Whether joints and β are within the range that "nothing inside" is promised for (docs/reliability.md)."""
+    """Whether "nothing inside" is promised for the frame (docs/reliability.md): joints and β are within a range, and no
+    two parts of the body are in each other deeper than skin gives way (`shift.n_held`)."""
     skipped: Mapping[str, int] = field(default_factory=dict)
     """How much of what `SKIPS` names was left out: vertices, networks, meshes and persons."""
     shift: SkinShift = field(default_factory=SkinShift)

@@ -327,8 +327,9 @@ class GarmentPipeline:
         skipped: Mapping[str, int],
         shift: Sequence[float],
     ) -> FrameStats:
-        promised = within_promise(frame)
-        return FrameStats(stage_ms, garments, self._is_certified, promised, skipped, SkinShift.of(shift))
+        moved = SkinShift.of(shift)
+        promised = within_promise(frame) and not moved.n_held
+        return FrameStats(stage_ms, garments, self._is_certified, promised, skipped, moved)
 
 
 def _key(frame: SmplFrame, *, of_pose: bool = True) -> bytes:

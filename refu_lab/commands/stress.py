@@ -47,7 +47,9 @@ def add(commands: Any) -> None:
         metavar="A,B",
         help="garments of any body (default: all four)",
     )
-    parser.add_argument("--backbone", metavar="NAME", help="one mode (default: skinned accurate and tailornet hybrid)")
+    parser.add_argument(
+        "--backbone", metavar="NAME", help="one mode (default: skinned accurate, tailornet accurate and hybrid)"
+    )
     parser.add_argument("--sdf", metavar="MODE", help="accurate, hybrid, approx or none, with --backbone")
     parser.add_argument(
         "--weights", type=in_path, metavar="DIR", help="folder with a folder a garment of weights of one's own"

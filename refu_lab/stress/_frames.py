@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from refu_core.body import JOINT_NAMES
 from refu_core.frames import N_BETAS, N_JOINTS, N_STYLES, SmplFrame
-from refu_core.realtime import PROMISED_POSES, PROMISED_SIZE
+from refu_core.realtime import PROMISED_BEND, PROMISED_POSES, PROMISED_SIZE, SPINE, spine_bend
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -136,6 +136,8 @@ def promised(rng: np.random.Generator) -> SmplFrame:
     angle = np.linalg.norm(pose, axis=1, keepdims=True)
     pose *= np.minimum(1.0, 3.0 / np.maximum(angle, 1e-9))  # beyond half a turn it were another vector
     pose *= rng.uniform(0.2, 1.0)
+    while spine_bend(pose) > PROMISED_BEND:
+        pose[SPINE] *= 0.9
     betas = PROMISED_SIZE * (rng.uniform(-1, 1, N_BETAS) if rng.random() < 0.5 else rng.choice((-1, 0, 1), N_BETAS))
     return frame_of(pose, betas=betas)
 

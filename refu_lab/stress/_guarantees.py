@@ -43,8 +43,14 @@ _BURIED = 0.02  # [m]
 
 
 def nothing_inside(subject: Subject, trial: Trial) -> Iterator[Measurement]:
-    """The depth of the deepest vertex, by winding number."""
+    """The depth of the deepest vertex, by winding number, where the frame promises it (`FrameStats.within_promise`).
+
+    Where it doesn't, since the body is deeper in itself than skin gives way, the frame has to say who is inside.
+    """
     (out,) = subject.pipeline(trial.frames)
+    if not out.stats.within_promise:
+        yield from _counted(subject, out)
+        return
     subject.checker.update(out.body)
     for mesh in out.values():
         depth = subject.checker.check(mesh.local, mesh.faces).max_depth
@@ -54,6 +60,10 @@ def nothing_inside(subject: Subject, trial: Trial) -> Iterator[Measurement]:
 def counted(subject: Subject, trial: Trial) -> Iterator[Measurement]:
     """The certificate (`n_unresolved`) against the winding numbers of every vertex that came out, by garment."""
     (out,) = subject.pipeline(trial.frames)
+    yield from _counted(subject, out)
+
+
+def _counted(subject: Subject, out: PipelineOutput) -> Iterator[Measurement]:
     subject.checker.update(out.body)
     for name, mesh in out.items():
         found = subject.checker.check(mesh.local, mesh.faces)

@@ -22,7 +22,7 @@ from refu_lab.stress._soak import SoakResult, soak
 from refu_lab.stress._subject import Subject, Wardrobe
 from refu_lab.stress._trial import Check, StressError, Tally, load_trial, save_trial
 
-MODES: tuple[tuple[str, str], ...] = (("skinned", "accurate"), ("tailornet", "hybrid"))
+MODES: tuple[tuple[str, str], ...] = (("skinned", "accurate"), ("tailornet", "accurate"), ("tailornet", "hybrid"))
 """Backbone and signed distance of the modes that are tried if none is named."""
 _SOAK_SHARE = 0.3
 """Of the time of a long run."""

@@ -178,6 +178,7 @@ def test_replayed_frames_are_those_of_the_pipeline(garments: list[str], sdf: str
             np.testing.assert_allclose(new.skin, old.skin, atol=1e-6)
             assert new.stats.shift.n_moved > 0
             assert abs(new.stats.shift.n_moved - old.stats.shift.n_moved) <= 5
+            assert abs(new.stats.shift.n_held - old.stats.shift.n_held) <= 5
             assert new.stats.shift.largest == pytest.approx(old.stats.shift.largest, abs=1e-6)
             assert new.stats.shift.mean == pytest.approx(old.stats.shift.mean, abs=1e-6)
             assert list(new) == list(old) == garments

@@ -20,7 +20,7 @@ from refu_core import (
     load_garment,
 )
 from refu_core.errors import MeshError
-from refu_core.realtime import SKIPS, SkinShift
+from refu_core.realtime import SKIPS, SkinShift, within_promise
 from refu_core.sdf import ExactSdf, Winding
 
 
@@ -109,6 +109,26 @@ def test_garments_are_brought_off_the_collider(sdf: str) -> None:
         found = inside(torch.as_tensor(apart["tshirt-male"].local)).count_nonzero()
         assert apart.stats.garments["tshirt-male"].n_unresolved == found, "certified by the collider"
         assert found == 0
+
+
+def test_a_body_deeper_in_itself_than_flesh_gives_way_is_no_promised_one() -> None:
+    """Arms that are lowered, and go on through the trunk: all joints are where people's are."""
+    pipeline = GarmentPipeline.load(["tshirt-male"], sdf="accurate")
+    n_held = []
+    for angle in np.linspace(0.0, 1.9, 8):
+        pose = np.zeros((24, 3))
+        pose[16, 2], pose[17, 2] = -angle, angle
+        frame = SmplFrame(pose=pose)
+        assert within_promise(frame)
+        out = pipeline(frame)
+        stats = out.stats
+        way = np.linalg.norm(out.body - out.skin, axis=1)
+        assert stats.shift.n_held <= (way > 1e-4).sum()
+        assert stats.within_promise is (stats.shift.n_held == 0)
+        assert not stats.within_promise or stats.garments["tshirt-male"].n_unresolved == 0
+        n_held.append(stats.shift.n_held)
+    assert n_held[:5] == [0] * 5, "to hanging arms there is room"
+    assert 0 < n_held[6] < n_held[7], "the deeper, the more"
 
 
 def test_without_signed_distance_the_raw_backbone_comes_out() -> None:
