@@ -11,6 +11,7 @@ import torch
 from refu_core.body import JOINT_NAMES, blend_transforms, unapply_transforms
 from refu_core.errors import GarmentError
 from refu_core.fitting._clean import MAX_VERTICES, clean, components, face_normals, split_long_edges, turned_over
+from refu_core.fitting._pieces import unsewn, without_bodies
 from refu_core.fitting._place import Place, Placing, find_places
 from refu_core.fitting._posed import PosedBody
 from refu_core.fitting._transfer import Transfer
@@ -126,13 +127,14 @@ def _put_on(
 
     Raises `GarmentError` where it can't be there.
     """
-    notes = list(place.notes)
+    posed = PosedBody(body, place.pose)
+    mesh, bodies = without_bodies(replace(mesh, vertices=place(mesh.vertices)), posed)
+    notes = [*place.notes, *bodies, *unsewn(mesh)]
     n = len(mesh.vertices)
-    mesh = split_long_edges(replace(mesh, vertices=place(mesh.vertices)), longest_edge)
+    mesh = split_long_edges(mesh, longest_edge)
     if len(mesh.vertices) > n:
         added = len(mesh.vertices) - n
         notes.append(f"edges longer than {1e3 * longest_edge:.0f} mm were split: {added} vertices were added to {n}")
-    posed = PosedBody(body, place.pose)
     mesh = _outward(mesh, posed)
     if place.pose.any():
         mesh = replace(mesh, vertices=_unposed(mesh, posed))

@@ -25,8 +25,9 @@ from refu_core.fitting import (
     standing_pose,
 )
 from refu_core.fitting._clean import clean, components, split_long_edges
+from refu_core.fitting._pieces import unsewn
 from refu_core.fitting._place import find_places
-from refu_core.garments import save_garment
+from refu_core.garments import UvMap, save_garment
 from refu_core.mesh import Connectivity
 
 
@@ -251,6 +252,44 @@ def test_a_pose_that_it_isnt_in_is_refused() -> None:
     v = v + np.array([0, float(body.v_template[:, 1].min()), 0])
     with pytest.raises(GarmentError, match="--pose"):
         fit_garment(SurfaceMesh(v, f), body, name="coat", placing=Placing(1.0, "y", standing_pose(0.0), is_placed=True))
+
+
+# -- pieces
+
+
+def test_a_character_s_body_is_left_out_of_its_clothes_and_is_no_garment() -> None:
+    """Of other proportions than the wearer's, in centimetres, with a texture."""
+    shirt, body, wearer = load_garment("tshirt-male"), load_body("male"), load_body("neutral")
+    betas = torch.zeros(1, 10)
+    betas[0, 1] = 1.0
+    parts = [
+        (shirt.rest(betas, torch.zeros(1, 4))[0].numpy(), shirt.faces.numpy()),
+        (body.rest_vertices(betas)[0].numpy(), body.faces.numpy()),
+    ]
+    v = 100 * np.concatenate([part for part, _ in parts]).astype(np.float64)
+    f = np.concatenate((parts[0][1], parts[1][1] + len(parts[0][0])))
+    both = SurfaceMesh(v, f, UvMap(np.zeros((len(v), 2), np.float32), f.copy()))
+    fitted = fit_garment(both, wearer, name="character", longest_edge=0.05)
+    assert [note for note in fitted.notes if "left out" in note] == [
+        "a piece with head, hands and feet was taken for the wearer's body and left out"
+    ]
+    assert fitted.template.n_vertices == shirt.n_vertices
+    assert fitted.template.uv is not None
+    assert len(fitted.template.uv.faces) == len(shirt.faces)
+    with pytest.raises(GarmentError, match="it is a body with head, hands and feet"):
+        fit_garment(SurfaceMesh(parts[1][0].astype(np.float64), parts[1][1], None), wearer, name="body", placing=AS_IS)
+
+
+@pytest.mark.parametrize(("gap", "is_said"), [(0.0, False), (0.002, True), (0.03, False)])
+def test_panels_that_nobody_sewed_are_said(gap: float, is_said: bool) -> None:
+    v, f = tube()
+    is_left = v[f].mean(1)[:, 0] < 0
+    panels = [np.unique(f[part], return_inverse=True) for part in (is_left, ~is_left)]
+    v = np.concatenate([v[used] + (side * gap / 2, 0, 0) for (used, _), side in zip(panels, (-1, 1), strict=True)])
+    f = np.concatenate([panels[0][1].reshape(-1, 3), panels[1][1].reshape(-1, 3) + len(panels[0][0])])
+    notes = unsewn(clean(SurfaceMesh(v, f, None))[0])
+    said = [note.partition(", and")[0] for note in notes]
+    assert said == (["2 pieces lie along each other, 2.0 mm apart"] if is_said else [])
 
 
 # -- the whole way
