@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when NumPy is imported; the programs say so themselves
+
 _MISSING = [name for name in ("torch", "warp", "hypothesis", "rosbags") if not importlib.util.find_spec(name)]
 
 if "hypothesis" not in _MISSING:
