@@ -115,6 +115,7 @@ class Peer:
         self.garments: list[list[Marker]] = []
         self.diagnostics: list[DiagnosticArray] = []
         self._subscription: Any = None
+        self._clients: dict[str, Any] = {}
         self._encode = encoder_for("joint_state")
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self.diagnostics.append, 10)
         self.watch()
@@ -207,14 +208,13 @@ class Peer:
 
     def call(self, service_type: Any, name: str, request: Any) -> Any:
         """A service's answer."""
-        client = self.node.create_client(service_type, name)
-        try:
-            assert client.wait_for_service(timeout_sec=PATIENCE_S), name
-            future = client.call_async(request)
-            self.spin_until(future.done, f"{name} answers")
-            return future.result()
-        finally:
-            self.node.destroy_client(client)
+        client = self._clients.get(name)
+        if client is None:  # one is kept: while the two find each other, a request or its answer may be lost
+            client = self._clients[name] = self.node.create_client(service_type, name)
+        assert client.wait_for_service(timeout_sec=PATIENCE_S), name
+        future = client.call_async(request)
+        self.spin_until(future.done, f"{name} answers")
+        return future.result()
 
     def set(self, **parameters: Any) -> list[Any]:
         """Sets parameters of the node; returns a result for each."""
