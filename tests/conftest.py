@@ -31,16 +31,29 @@ if importlib.util.find_spec("torch"):  # the adapters' tests run without it
 
 
 LONGEST = (
+    "lab/test_replay.py",
+    "ros/test_node_requests.py",
     "core/test_simulation.py",
-    "ros/test_node_recording.py",
-    "lab/test_evaluate.py",
-    "core/test_training_backbone.py",
-    "ros/test_node_lazy.py",
-    "core/test_stability.py",
-    "ros/test_node.py",
-    "ros/test_node_life.py",
-    "core/test_kernel_bounds.py",
     "test_faults.py",
+    "ros/test_node_recording.py",
+    "lab/test_fleet.py",
+    "test_style.py",
+    "lab/test_view.py",
+    "lab/test_garment.py",
+    "lab/test_evaluate.py",
+    "ros/test_node_lazy.py",
+    "ros/test_node.py",
+    "core/test_stability.py",
+    "lab/test_reproduction.py",
+    "ros/test_node_life.py",
+    "core/test_hostile_files.py",
+    "core/test_training_backbone.py",
+    "lab/test_stress.py",
+    "lab/test_train.py",
+    "lab/test_benchmark.py",
+    "fuzz/test_targets.py",
+    "core/test_kernel_bounds.py",
+    "ros/test_node_stays_up.py",
 )
 """Files of tests, the one that takes longest first: begun last, one of them would keep a single process busy while all
 others have nothing left to do."""
