@@ -38,9 +38,12 @@ PATIENCE_S = 300.0
 """How long anything that has to happen may take, on a machine that has a lot to do: nobody waits any longer for what
 has happened, so only what never does takes that long."""
 
+_LAST_WORDS_S = 20.0
+"""A node that is told to end is killed after this time."""
+
 
 class NodeProcess:
-    """`garment_node` with parameters; killed at the end of the block if it still runs."""
+    """`garment_node` with parameters; ended at the end of the block if it still runs."""
 
     def __init__(
         self,
@@ -69,9 +72,13 @@ class NodeProcess:
         return self
 
     def __exit__(self, *error: object) -> None:
-        if self.process.poll() is None:
+        # One that is killed is there for the others for twenty seconds more: the next test would talk to it.
+        self.process.terminate()
+        try:
+            self.process.wait(_LAST_WORDS_S)
+        except subprocess.TimeoutExpired:
             self.process.kill()
-        self.process.wait()
+            self.process.wait()
 
     @property
     def log(self) -> str:
