@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -171,7 +171,17 @@ def _grouped(owner: NDArray[Any], items: NDArray[Any], n: int) -> Adjacency:
 
 
 def grouped(places: NDArray[np.float32], width: int = 8) -> NDArray[np.int64]:
-    """An order of places (N, 3) in which each eight (or `width`), each 64, and so on are close together."""
+    """An order of places (N, 3) in which each eight (or `width`), each 64, and so on are close together.
+
+    The last few are remembered: every pipeline and every checker of a mesh asks for the same. So it is read-only.
+    """
+    return _order_of(np.ascontiguousarray(places).tobytes(), np.dtype(places.dtype).str, width)
+
+
+@lru_cache(maxsize=64)
+def _order_of(place_bytes: bytes, dtype: str, width: int) -> NDArray[np.int64]:
+    """Of places as bytes, by which they are known again."""
+    places = np.frombuffer(place_bytes, dtype).reshape(-1, 3)
     n = len(places)
     sizes_of_groups = width ** np.arange(20, dtype=np.int64)
     order, bounds = np.arange(n), np.array([0, n])
@@ -179,6 +189,7 @@ def grouped(places: NDArray[np.float32], width: int = 8) -> NDArray[np.int64]:
         starts, sizes = bounds[:-1], np.diff(bounds)
         is_open = sizes > 1
         if not is_open.any():
+            order.flags.writeable = False
             return order
         here = places[order]
         extent = np.maximum.reduceat(here, starts) - np.minimum.reduceat(here, starts)

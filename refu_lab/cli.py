@@ -8,6 +8,8 @@ import sys
 import traceback
 from typing import TYPE_CHECKING
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # NumPy reads it; its threads wait for busy cores
+
 from refu_core import RefuError, __version__
 from refu_core.errors import printable
 from refu_lab.commands import COMMANDS

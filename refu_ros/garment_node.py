@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
 import time
 from typing import TYPE_CHECKING, Any
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # NumPy reads it; its threads wait for busy cores
 
 from refu_ros._program import EXIT_BAD_INPUT, make_executor, on_signals, run, spin
 from refu_ros._transport import make_room

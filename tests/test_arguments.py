@@ -138,6 +138,20 @@ def test_an_extra_that_is_missing_is_named(package: str, extra: str, arguments: 
     assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("program", "before"),
+    [("refu_lab.cli", "os"), ("refu_ros.garment_node", "rclpy.qos"), ("refu_ros.smpl_publisher", "rclpy.qos")],
+)
+def test_numpy_starts_no_threads(program: str, before: str) -> None:
+    """With threads a small product waits for all cores: beside other work a hundred times as long."""
+    pytest.importorskip(before)  # rclpy has threads of its own
+    count = "len(os.listdir('/proc/self/task'))"
+    code = f"import os, {before}; n = {count}; import {program}, numpy, scipy.linalg; print({count} - n)"
+    environment = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout == "0\n"
+
+
 @pytest.mark.parametrize("device", ["meta", "mps", "cpu:x", "cuda:99", "xla", "", "cpu\0"])
 def test_devices_that_there_are_not(device: str) -> None:
     with pytest.raises(RefuError, match="no device"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -62,8 +63,23 @@ def find_creases(
 ) -> Creases:
     """The creases of a body: rest pose (V, 3) [m], edges (E, 2), skinning weights (V, 24).
 
-    Skin farther than `reach` [m] from a seam isn't held by it.
+    Skin farther than `reach` [m] from a seam isn't held by it. The last few bodies are remembered: every pipeline and
+    every checker of one body asks for the same.
     """
+    return _find(
+        np.ascontiguousarray(rest, np.float64).tobytes(),
+        np.ascontiguousarray(edges, np.int32).tobytes(),
+        np.ascontiguousarray(weights, np.float64).tobytes(),
+        reach,
+    )
+
+
+@lru_cache(maxsize=3)
+def _find(rest_bytes: bytes, edge_bytes: bytes, weight_bytes: bytes, reach: float) -> Creases:
+    """Of arrays as bytes, by which they are known again."""
+    rest = np.frombuffer(rest_bytes, np.float64).reshape(-1, 3)
+    edges = np.frombuffer(edge_bytes, np.int32).reshape(-1, 2)
+    weights = np.frombuffer(weight_bytes, np.float64).reshape(len(rest), -1)
     moved_by = _moved_by(weights)
     tree = cKDTree(rest)
     station_rows: list[tuple[NDArray[Any], NDArray[Any]]] = []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+from functools import cache
 from importlib import resources
 from os import PathLike
 from pathlib import Path
@@ -33,10 +35,7 @@ def load_body(
         BodyError: no such body or file, a file that can't be read, or one that isn't an SMPL-layout model.
     """
     if str(source) in BUILTIN_BODIES:
-        name = str(source)
-        with resources.as_file(resources.files("refu_core") / "assets" / f"body_{name}.npz") as path:
-            data = read_npz(path, keys=_KEYS, error=BodyError, wanted=_WANTED)
-        return SmplBody(BodyArrays.from_mapping(data, source=f"body {name}"), name=name, device=device, dtype=dtype)
+        return SmplBody(_builtin(str(source)), name=str(source), device=device, dtype=dtype)
     require_type(source, (str, PathLike), "a body's name or path", error=BodyError)
     path = Path(source)
     if not path.suffix:
@@ -48,3 +47,16 @@ def load_body(
     read = read_npz if path.suffix == ".npz" else read_smpl_pickle
     data = read(path, keys=_KEYS, error=BodyError, wanted=_WANTED)
     return SmplBody(BodyArrays.from_mapping(data, source=str(path)), name=path.stem, device=device, dtype=dtype)
+
+
+@cache
+def _builtin(name: str) -> BodyArrays:
+    """Read once: a pipeline asks for its garments' body several times."""
+    with resources.as_file(resources.files("refu_core") / "assets" / f"body_{name}.npz") as path:
+        data = read_npz(path, keys=_KEYS, error=BodyError, wanted=_WANTED)
+    arrays = BodyArrays.from_mapping(data, source=f"body {name}")
+    for entry in fields(arrays):
+        array = getattr(arrays, entry.name)
+        if array is not None:
+            array.flags.writeable = False
+    return arrays

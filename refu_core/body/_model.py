@@ -167,7 +167,7 @@ class SmplBody:
 
     @property
     def arrays(self) -> BodyArrays:
-        """The model's arrays as its file has them, in float64."""
+        """The model's arrays as its file has them, in float64; those of built-in bodies are shared and read-only."""
         return self._arrays
 
     @property

@@ -49,16 +49,18 @@ def crossing_pairs(mesh: trimesh.Trimesh) -> list[tuple[int, int]]:
     objects = [fcl.CollisionObject(model, fcl.Transform()) for _ in range(2)]
     result = fcl.CollisionResult()
     fcl.collide(*objects, fcl.CollisionRequest(num_max_contacts=10_000_000), result)
-    faces = [set(face) for face in mesh.faces.tolist()]
-    pairs = {(contact.b1, contact.b2) for contact in result.contacts}
+    pairs = np.unique([(contact.b1, contact.b2) for contact in result.contacts], axis=0)
     assert len(pairs) >= len(mesh.faces)  # every face touches itself: FCL has looked
-    return [(a, b) for a, b in pairs if a < b and not faces[a] & faces[b]]
+    first, second = np.asarray(mesh.faces)[pairs].transpose(1, 0, 2)
+    apart = ~(first[:, :, None] == second[:, None]).any((1, 2))
+    return [(a, b) for a, b in pairs[apart].tolist() if a < b]
 
 
 def boundary_loops(mesh: trimesh.Trimesh) -> list[np.ndarray]:
     """Closed boundaries as vertices in order."""
-    edges = {tuple(edge) for edge in mesh.edges.tolist()}
-    after = {a: b for a, b in edges if (b, a) not in edges}
+    edges = np.asarray(mesh.edges)
+    has_twin = np.isin(edges @ (1, len(mesh.vertices)), edges @ (len(mesh.vertices), 1))
+    after = dict(edges[~has_twin].tolist())
     assert len(set(after.values())) == len(after)  # no vertex where two boundaries touch
     loops = []
     while after:

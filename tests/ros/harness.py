@@ -38,9 +38,12 @@ PATIENCE_S = 300.0
 """How long anything that has to happen may take, on a machine that has a lot to do: nobody waits any longer for what
 has happened, so only what never does takes that long."""
 
+_LAST_WORDS_S = 20.0
+"""A node that is told to end is killed after this time."""
+
 
 class NodeProcess:
-    """`garment_node` with parameters; killed at the end of the block if it still runs."""
+    """`garment_node` with parameters; ended at the end of the block if it still runs."""
 
     def __init__(
         self,
@@ -69,9 +72,13 @@ class NodeProcess:
         return self
 
     def __exit__(self, *error: object) -> None:
-        if self.process.poll() is None:
+        # One that is killed is there for the others for twenty seconds more: the next test would talk to it.
+        self.process.terminate()
+        try:
+            self.process.wait(_LAST_WORDS_S)
+        except subprocess.TimeoutExpired:
             self.process.kill()
-        self.process.wait()
+            self.process.wait()
 
     @property
     def log(self) -> str:
@@ -115,6 +122,7 @@ class Peer:
         self.garments: list[list[Marker]] = []
         self.diagnostics: list[DiagnosticArray] = []
         self._subscription: Any = None
+        self._clients: dict[str, Any] = {}
         self._encode = encoder_for("joint_state")
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self.diagnostics.append, 10)
         self.watch()
@@ -207,14 +215,13 @@ class Peer:
 
     def call(self, service_type: Any, name: str, request: Any) -> Any:
         """A service's answer."""
-        client = self.node.create_client(service_type, name)
-        try:
-            assert client.wait_for_service(timeout_sec=PATIENCE_S), name
-            future = client.call_async(request)
-            self.spin_until(future.done, f"{name} answers")
-            return future.result()
-        finally:
-            self.node.destroy_client(client)
+        client = self._clients.get(name)
+        if client is None:  # one is kept: while the two find each other, a request or its answer may be lost
+            client = self._clients[name] = self.node.create_client(service_type, name)
+        assert client.wait_for_service(timeout_sec=PATIENCE_S), name
+        future = client.call_async(request)
+        self.spin_until(future.done, f"{name} answers")
+        return future.result()
 
     def set(self, **parameters: Any) -> list[Any]:
         """Sets parameters of the node; returns a result for each."""

@@ -103,6 +103,8 @@ def test_a_kill_leaves_all_but_the_last_chunk(peer: Peer, tmp_path: Path) -> Non
     assert truncated
     assert len(published - garments) <= 1  # a message of garments is a chunk of its own
     assert len(garments - inputs) == 0
+    # Until the others miss it they find its services, and ask it in the place of the next test's node.
+    peer.spin_until(lambda: "garment_node" not in peer.node.get_node_names(), "the killed node is gone")
 
 
 def test_the_service_starts_and_stops(peer: Peer, tmp_path: Path) -> None:
