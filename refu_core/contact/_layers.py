@@ -14,6 +14,7 @@ from torch import Tensor
 from refu_core._warp import as_warp, torch_stream
 from refu_core.contact import _layers_kernels as kernels
 from refu_core.contact import _layers_move_kernels as moving
+from refu_core.contact._parting import Parting, Sheet
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
 from refu_core.errors import MeshError
 from refu_core.mesh import Adjacency, Connectivity
@@ -115,6 +116,18 @@ class Layer:
                 self._move(self._settings.layer_later_rounds)
         return self._above.clone(), n_low
 
+    def find_cuts(self, above: Tensor) -> bool:
+        """Whether triangles of the outer garment, (V, 3) [m], still cut the inner one of the last call.
+
+        True on a GPU, which isn't waited for: `parting` has their number, and goes on from what was found.
+        """
+        if not self._n_candidates:
+            return False
+        with torch_stream(self.device):
+            self._fit_tree()
+            self.parting.find(above)
+        return not self._is_serial or int(self.parting.n_cut) > 0
+
     def _may_move(self) -> bool:
         return not self._is_serial or int(self._count) > 0
 
@@ -148,11 +161,14 @@ class Layer:
         self._commands[lift].launch()
         n = int(self._n_doubtful) if self._is_serial else self._n_candidates
         if n:
-            if self._tree_is_late:
-                self._tree.refit()
-                self._tree_is_late = False
+            self._fit_tree()
             self._commands[ask].set_dim(n)
             self._commands[ask].launch()
+
+    def _fit_tree(self) -> None:
+        if self._tree_is_late:
+            self._tree.refit()
+            self._tree_is_late = False
 
     def _move(self, blend_rounds: int) -> None:
         """Pushes those with their neighbourhood, in an even number of rounds."""
@@ -184,6 +200,9 @@ class Layer:
         )
         fields = [as_warp(field, wp.vec3) for field in self._fields]
         self._tree = wp.Mesh(below, below_cut.faces.flatten())
+        sheet = Sheet(self._tree.id, as_warp(self._extent, wp.vec3), normals, below_cut.faces)
+        self.parting = Parting(above_cut, self._above, sheet, settings=self._settings)
+        """What is done where triangles cut each other after all."""
         found, closest, doubtful = (
             wp.zeros(self._n_candidates, dtype=wp.int32, device=str(self.device)) for _ in range(3)
         )

@@ -1,0 +1,186 @@
+"""Triangles of garments that cut each other, and cloth deep inside the body: each step against a slow, obvious one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from test_layers import sheet, wavy
+from torch import Tensor
+
+from refu_core.body import load_body
+from refu_core.contact import DEFAULT_CONTACT, Layer, Moved, Sunken
+from refu_core.contact._parting_kernels import depth_below
+from refu_core.mesh import Connectivity
+from refu_core.metrics import SheetChecker
+from refu_core.sdf import ExactSdf
+
+Array = NDArray[np.float64]
+
+
+@wp.kernel
+def _depth_kernel(corners: wp.array[wp.vec3], n: wp.vec3, depth: wp.array[float], place: wp.array[wp.vec3]) -> None:
+    found, w = depth_below(n, corners[0], corners[1], corners[2], corners[3], corners[4], corners[5])
+    depth[0] = found
+    place[0] = w
+
+
+def grid(n: int) -> Array:
+    """Barycentrics all over a triangle, shape (K, 3)."""
+    return np.array([(i, j, n - i - j) for i in range(n + 1) for j in range(n + 1 - i)]) / n
+
+
+@given(seed=st.integers(0, 10_000))
+@settings(max_examples=60)
+def test_a_face_has_as_far_to_go_as_its_deepest_place(seed: int) -> None:
+    """Of many places on both triangles, the one where one lies deepest below the other."""
+    rng = np.random.default_rng(seed)
+    n = np.array([0.0, 1.0, 0.0])
+    corners = rng.uniform(-0.01, 0.01, (6, 3)) * [1, 0.4, 1]
+    found, place = wp.zeros(1, dtype=wp.float32, device="cpu"), wp.zeros(1, dtype=wp.vec3, device="cpu")
+    points = wp.array(corners.astype(np.float32), dtype=wp.vec3, device="cpu")
+    wp.launch(_depth_kernel, 1, [points, wp.vec3(*n), found, place], device="cpu")
+    own, other = corners[:3], corners[3:]
+    deepest = 0.0
+    for first, second, sign in ((own, other, 1), (other, own, -1)):
+        (ax, az), (bx, bz), (cx, cz) = second[:, [0, 2]]
+        to_weights = np.linalg.inv([[ax, bx, cx], [az, bz, cz], [1, 1, 1]])
+        for p in grid(60) @ first:
+            w = to_weights @ [p[0], p[2], 1]
+            if w.min() >= 0:
+                deepest = max(deepest, sign * float(w @ second[:, 1] - p[1]))
+    depth, w = float(found.numpy()[0]), place.numpy()[0].astype(float)
+    assert depth >= deepest - 1e-6
+    assert depth <= deepest + 1e-3, "and no farther: the places are as close together as this"
+    if depth > 0:
+        assert w.min() >= -1e-5
+        assert w.sum() == pytest.approx(1, abs=1e-5)
+
+
+def levelled(points: Array, ring: list[list[int]], weight: Array, rounds: int) -> Array:
+    for _ in range(rounds):
+        mean = np.stack([points[around].mean(axis=0) for around in ring])
+        points = points + weight[:, None] * (mean - points)
+    return points
+
+
+def ring_of(faces: Tensor, n: int) -> list[list[int]]:
+    start, items = Connectivity.of(faces, n).ring
+    return [items[start[i] : start[i + 1]].tolist() for i in range(n)]
+
+
+def over(seed: int, height: float, amplitude: float) -> tuple[Layer, Tensor, Tensor, Tensor, Tensor]:
+    """A layer, and its garments: the outer one so far above a wavy inner one, with waves of its own."""
+    below, below_faces = sheet(11, step=0.013)
+    above, above_faces = sheet(13)
+    layer = Layer(above_faces, above, below_faces, below)
+    low = wavy(below, seed, amplitude=amplitude)
+    high = wavy(above, seed + 1, amplitude=amplitude) + torch.tensor([0.0, height, 0.0])
+    return layer, high, above_faces, low, below_faces
+
+
+@given(seed=st.integers(0, 1000), height=st.floats(-0.004, 0.008))
+@settings(max_examples=12)
+def test_what_cuts_is_found_and_levelled(seed: int, height: float) -> None:
+    layer, high, faces, low, below_faces = over(seed, height, 0.006)
+    layer(high, low)
+    checker = SheetChecker(below_faces.numpy())
+    checker.update(low.numpy())
+    cut = np.unique(checker.with_other(high.numpy(), faces.numpy())[:, 0])
+    assert layer.find_cuts(high) is bool(len(cut))
+    ring, weight = ring_of(faces, len(high)), np.zeros(len(high))
+    weight[faces.numpy()[cut].ravel()] = 1
+    for _ in range(DEFAULT_CONTACT.parting_reach):
+        weight = np.array([max(weight[i], *weight[around]) for i, around in enumerate(ring)])
+    wanted = levelled(high.double().numpy(), ring, weight, DEFAULT_CONTACT.parting_rounds)
+    np.testing.assert_allclose(layer.parting.level(high).numpy(), wanted, atol=1e-5)
+
+
+@given(seed=st.integers(0, 1000), height=st.floats(0.001, 0.008))
+@settings(max_examples=12)
+def test_sheets_that_cut_are_parted_and_nothing_else_is_moved(seed: int, height: float) -> None:
+    layer, high, faces, low, below_faces = over(seed, height, 0.006)
+    layer(high, low)
+    is_cut = layer.find_cuts(high)
+    found = layer.parting.part(layer.parting.level(high))
+    if not is_cut:
+        assert torch.equal(found, high)
+        return
+    checker = SheetChecker(below_faces.numpy())
+    checker.update(low.numpy())
+    before = len(checker.with_other(high.numpy(), faces.numpy()))
+    after = len(checker.with_other(found.numpy(), faces.numpy()))
+    assert after <= 0.1 * before, "there is room for all"
+    farthest = DEFAULT_CONTACT.parting_sweeps * DEFAULT_CONTACT.parting_step
+    assert (found - layer.parting.level(high)).norm(dim=1).max() <= 3 * farthest
+
+
+def test_a_ridge_through_the_middle_of_a_face_is_cleared() -> None:
+    """No vertex of the outer garment is below the sheet."""
+    below, below_faces = sheet(13, step=0.005)
+    ridge = below.clone()
+    ridge[6 * 13 + 6, 1] += 0.006
+    above, above_faces = sheet(5, step=0.017)
+    above += below.mean(0) - above.mean(0) + torch.tensor([0.006, 0.004, 0.004])
+    layer = Layer(above_faces, above, below_faces, below)
+    lifted, n_low = layer(above, ridge)
+    checker = SheetChecker(below_faces.numpy())
+    checker.update(ridge.numpy())
+    assert n_low == 0
+    assert len(checker.with_other(lifted.numpy(), above_faces.numpy())) > 0
+    assert layer.find_cuts(lifted)
+    found = layer.parting.part(lifted)
+    assert len(checker.with_other(found.numpy(), above_faces.numpy())) == 0
+    moved = (found - above).norm(dim=1)
+    assert moved.max() < 0.006
+    assert not layer.find_cuts(found)
+
+
+@given(seed=st.integers(0, 1000))
+@settings(max_examples=10)
+def test_what_is_deep_hangs_between_what_is_not(seed: int) -> None:
+    points, faces = sheet(14)
+    points = wavy(points, seed, amplitude=0.01)
+    distance = points[:, 1] * 3
+    begin, end = DEFAULT_CONTACT.sunken
+    sunken = Sunken(faces, len(points))
+    found = sunken(points, distance)
+    weight = np.clip((-begin - distance.double().numpy()) / (end - begin), 0, 1)
+    if not weight.any():
+        assert found is points
+        return
+    wanted = levelled(points.double().numpy(), ring_of(faces, len(points)), weight, DEFAULT_CONTACT.sunken_rounds)
+    np.testing.assert_allclose(found.numpy(), wanted, atol=1e-5)
+    np.testing.assert_array_equal(found.numpy()[weight == 0], points.numpy()[weight == 0])
+    # No threshold: a hair deeper is a hair's difference.
+    nudged = sunken(points, distance - 1e-6)
+    assert (nudged - found).norm(dim=1).max() < 2e-4
+    sunken._is_serial = False  # as on a GPU, which isn't waited for
+    assert torch.equal(sunken(points, distance), found)
+    assert torch.equal(sunken(points, distance.abs()), points)
+
+
+def test_only_what_was_moved_is_asked_again() -> None:
+    body = load_body("male")
+    sdf = ExactSdf(body.faces)
+    sdf.update(body.v_template)
+    generator = torch.Generator().manual_seed(1)
+    before = body.v_template[::7] + 0.02 * torch.randn(len(body.v_template[::7]), 3, generator=generator)
+    points = before.clone()
+    points[::3] += 0.01 * torch.randn(len(points[::3]), 3, generator=generator)
+    sample, wanted = sdf.query(before), sdf.query(points)
+    found = Moved(len(points), points.device)(before, sample, points, sdf, reach=0.006)
+    is_asked = wanted.distance < 0.006
+    torch.testing.assert_close(found.distance[is_asked], wanted.distance[is_asked], atol=1e-6, rtol=0)
+    assert (found.distance[~is_asked] <= wanted.distance[~is_asked] + 1e-6).all()
+    assert (found.distance[~is_asked] >= 0.006 - 1e-6).all()
+    untouched = torch.ones(len(points), dtype=torch.bool)
+    untouched[::3] = False
+    for new, old in zip(found, sample, strict=True):
+        assert new is not None
+        assert old is not None
+        assert torch.equal(new[untouched], old[untouched])
