@@ -8,7 +8,7 @@ import warp as wp
 from torch import Tensor
 
 from refu_core._warp import as_warp, torch_stream
-from refu_core.contact._level_kernels import level_kernel
+from refu_core.contact._level_kernels import level_kernel, level_rows_kernel
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
 from refu_core.mesh import Connectivity
 
@@ -34,6 +34,7 @@ class Sunken:
         self._points = torch.zeros(n_vertices, 3, device=faces.device)
         self._other = torch.zeros_like(self._points)
         self._weight = torch.zeros(n_vertices, device=faces.device)
+        self._rows = torch.zeros(n_vertices, dtype=torch.int32, device=faces.device)
         points, other = as_warp(self._points, wp.vec3), as_warp(self._other, wp.vec3)
         weight = as_warp(self._weight, wp.float32)
         self._rounds = [
@@ -41,19 +42,34 @@ class Sunken:
             for source, end in ((points, other), (other, points))
         ]
 
+        rows = as_warp(self._rows, wp.int32)
+        inputs = [settings.sunken_rounds, 0, rows, points, weight, ring_start, ring, other]
+        self._serial = wp.launch(level_rows_kernel, 1, inputs, device=device, record_cmd=True)
+
     @torch.no_grad()
-    def __call__(self, points: Tensor, distance: Tensor) -> Tensor:
+    def __call__(self, points: Tensor, distance: Tensor) -> tuple[Tensor, Tensor | None]:
         """Vertices (N, 3) [m] levelled, whose signed `distance` to the body is (N,) [m]; not differentiable.
 
-        On a CPU they are the same tensor where none is deep.
+        And which were, (K,), where that is known: a GPU isn't waited for. Where none is, they are the same tensor.
         """
         begin, end = self._settings.sunken
         weight = ((-begin - distance) / (end - begin)).clamp(0, 1)
-        if self._is_serial and not bool(weight.any()):
-            return points
+        self._weight.copy_(weight)
+        self._points.copy_(points)
+        if self._is_serial:
+            rows = torch.nonzero(weight)[:, 0]
+            if not len(rows):
+                return points, rows
+            self._other.copy_(points)
+            self._rows[: len(rows)] = rows
+            self._serial.set_param_at_index(_N_ROWS, len(rows))
+            self._serial.launch()
+            return self._points.clone(), rows
         with torch_stream(self._device):
-            self._weight.copy_(weight)
-            self._points.copy_(points)
             for k in range(self._settings.sunken_rounds):
                 self._rounds[k % 2].launch()
-        return self._points.clone()
+        return self._points.clone(), None
+
+
+_N_ROWS = 1
+"""Which of the kernel's inputs says how many they are."""

@@ -135,9 +135,9 @@ class ContactStage:
         reach = margin + ASKED_FROM
         sample = self._asked[name](vertices, on_mean=on_mean, reach=reach)
         inside = _inside(sample)
-        drawn = self._sunken[name](vertices, sample.distance)
+        drawn, rows = self._sunken[name](vertices, sample.distance)
         if drawn is not vertices:
-            sample = self._asked[name](drawn, on_mean=on_mean, reach=reach)
+            sample = self._asked[name](drawn, on_mean=on_mean, reach=reach, last=sample, rows=rows)
         return Surfaced(drawn, sample, inside - _inside(sample))
 
     def lift(

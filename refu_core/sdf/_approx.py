@@ -125,8 +125,17 @@ class ApproxSdf(MeshSdf):
         """As `BodySdf.of_garment`: walks begin where the vertices were near before posing."""
         rest_faces = self._rest_faces
 
-        def ask(vertices: Tensor, *, on_mean: Tensor, reach: float = math.inf) -> SdfSample:  # noqa: ARG001
-            return self.query(vertices, near=rest_faces(on_mean))
+        def ask(
+            vertices: Tensor,
+            *,
+            on_mean: Tensor,
+            reach: float = math.inf,  # noqa: ARG001
+            last: SdfSample | None = None,
+            rows: Tensor | None = None,
+        ) -> SdfSample:
+            if last is None or rows is None:
+                return self.query(vertices, near=rest_faces(on_mean))
+            return last.renewed(rows, self.query(vertices[rows], near=rest_faces(on_mean[rows])))
 
         return ask
 

@@ -148,20 +148,24 @@ def test_what_is_deep_hangs_between_what_is_not(seed: int) -> None:
     distance = points[:, 1] * 3
     begin, end = DEFAULT_CONTACT.sunken
     sunken = Sunken(faces, len(points))
-    found = sunken(points, distance)
+    found, rows = sunken(points, distance)
+    assert rows is not None
     weight = np.clip((-begin - distance.double().numpy()) / (end - begin), 0, 1)
-    if not weight.any():
+    assert np.array_equal(rows.numpy(), np.flatnonzero(weight))
+    if not len(rows):
         assert found is points
         return
     wanted = levelled(points.double().numpy(), ring_of(faces, len(points)), weight, DEFAULT_CONTACT.sunken_rounds)
     np.testing.assert_allclose(found.numpy(), wanted, atol=1e-5)
     np.testing.assert_array_equal(found.numpy()[weight == 0], points.numpy()[weight == 0])
     # No threshold: a hair deeper is a hair's difference.
-    nudged = sunken(points, distance - 1e-6)
+    nudged, _ = sunken(points, distance - 1e-6)
     assert (nudged - found).norm(dim=1).max() < 2e-4
     sunken._is_serial = False  # as on a GPU, which isn't waited for
-    assert torch.equal(sunken(points, distance), found)
-    assert torch.equal(sunken(points, distance.abs()), points)
+    for at, wanted_there in ((distance, found), (distance.abs(), points)):
+        there, unknown = sunken(points, at)
+        assert torch.equal(there, wanted_there)
+        assert unknown is None
 
 
 def test_only_what_was_moved_is_asked_again() -> None:
