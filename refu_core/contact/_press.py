@@ -66,9 +66,10 @@ class Press:
 
     A hand that hangs beside a thigh goes through a wide skirt. Along the gradient half of the cloth in it would leave
     in front and half behind, with edges through the hand between them. So a vertex is looked at from the skin that it
-    lies on: where another limb comes in between, it has room on this side only, and its neighbours have little more.
-    How much is a minimum over the cloth around, which falls off along its edges. So a vertex that a limb comes before
-    is drawn back from where its neighbours are already.
+    lies on: where another limb comes in between, it is drawn back to this side of it, and neighbours with it.
+
+    All of it is continuous: a limb that comes up beside the way to a vertex draws it back the farther the nearer it is
+    to that way, and how far a vertex goes is a maximum over the cloth around, which falls off along its edges.
     """
 
     def __init__(
@@ -80,7 +81,7 @@ class Press:
         n, self.device = garment.n_vertices, garment.v_template.device
         self._is_serial = self.device.type == "cpu"
         self._skin, self._points = torch.zeros(2, n, 3, device=self.device)
-        self._room = torch.full((2, n), torch.inf, device=self.device)
+        self._cut = torch.zeros(2, n, device=self.device)
         self._counts = torch.zeros(kernels.N_COUNTS, dtype=torch.int32, device=self.device)
         self._commands: dict[str, Any] = {}
         own = weight_of_parts(garment.weights, _LIMBS) > settings.own_weight
@@ -89,7 +90,7 @@ class Press:
         ring = Connectivity.of(garment.faces.cpu(), n).ring
         self._fabric = fabric = kernels.Fabric()
         fabric.skin, fabric.points = as_warp(self._skin, wp.vec3), as_warp(self._points, wp.vec3)
-        fabric.room, fabric.spread = (as_warp(one, wp.float32) for one in self._room)
+        fabric.cut, fabric.spread = (as_warp(one, wp.float32) for one in self._cut)
         fabric.counts = as_warp(self._counts, wp.int32)
         lists = {
             "start": [*range(0, n, _PIECE), n],
@@ -98,7 +99,8 @@ class Press:
             "ring_start": ring.start,
             "ring": ring.items,
             "rows": np.arange(n),
-        } | dict.fromkeys(("boxed", "near", "is_row"), np.zeros(n))
+            "front": np.zeros(2 * n),
+        } | dict.fromkeys(("boxed", "near", "in_front"), np.zeros(n))
         for name, values in lists.items():
             setattr(fabric, name, wp.array(np.asarray(values, np.int32), dtype=wp.int32, device=str(self.device)))
 
@@ -122,7 +124,7 @@ class Press:
                 if not self._counts[kernels.PRESSED]:
                     return points
             else:
-                self._room.fill_(torch.inf)
+                self._cut.zero_()
                 self._run("press")
                 for sweep in range(self._settings.press_sweeps):
                     self._run(f"spread {sweep}")
@@ -139,24 +141,30 @@ class Press:
         how, fabric, n = self._settings, self._fabric, len(self._points)
         device = str(self.device)
         limbs = wp.array([mesh.id for mesh in self._limbs.meshes], dtype=wp.uint64, device=device)
-        room = [fabric.room, fabric.spread]
-        sweeps = how.press_sweeps
-        look = (kernels.look_kernel, len(fabric.start) - 1, [fabric, self._limbs.bundles, how.press_room])
+        cut = [fabric.cut, fabric.spread]
+        sweeps, feel = how.press_sweeps, self._feel()
+        look = (kernels.look_kernel, len(fabric.start) - 1, [fabric, self._limbs.bundles, feel])
         steps: dict[str, tuple[Any, int, list[Any]]] = {"look": look}
         if self._is_serial:
-            numbers = [how.press_room, how.press_slope, sweeps, how.press_reach]
+            numbers = [feel, how.press_slope, sweeps, how.press_reach]
             steps["press all"] = (kernels.press_all_kernel, 1, [fabric, limbs, *numbers])
         else:
-            steps["press"] = (kernels.press_kernel, n, [fabric, limbs, how.press_room])
+            steps["press"] = (kernels.press_kernel, n, [fabric, limbs, feel])
             for sweep in range(sweeps):
                 slope = 0.0 if sweep < how.press_reach else how.press_slope
-                fields = [room[sweep % 2], room[1 - sweep % 2]]
+                fields = [cut[sweep % 2], cut[1 - sweep % 2]]
                 steps[f"spread {sweep}"] = (kernels.spread_kernel, n, [fabric, slope, *fields])
-            steps["lower"] = (kernels.lower_kernel, n, [fabric, room[sweeps % 2]])
+            steps["lower"] = (kernels.lower_kernel, n, [fabric, 0.5 * how.press_room, cut[sweeps % 2]])
         return {
             name: wp.launch(kernel, dim, inputs, device=device, record_cmd=True)
             for name, (kernel, dim, inputs) in steps.items()
         }
+
+    def _feel(self) -> Any:
+        how, feel = self._settings, kernels.Feel()
+        feel.room, feel.beside, feel.flat = how.press_room, how.press_beside, how.press_flat
+        feel.lies, feel.looks, feel.step = wp.vec2(*how.press_lies), how.press_looks, how.press_step
+        return feel
 
 
 _PIECE = 32

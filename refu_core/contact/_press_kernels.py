@@ -8,8 +8,20 @@ wp.set_module_options({"enable_backward": False})
 
 WANTED = wp.constant(0)  # limbs that may be near any vertex, as bits
 NEAR = wp.constant(1)  # vertices that any of them may be near
-PRESSED = wp.constant(2)  # vertices with less room than height, and on a CPU those that sweeps reach from there
+PRESSED = wp.constant(2)  # vertices that limbs draw back, and on a CPU those that sweeps reach from there
 N_COUNTS = 3
+
+
+@wp.struct
+class Feel:
+    """What is read of `ContactSettings`."""
+
+    room: wp.float32
+    beside: wp.float32
+    flat: wp.float32
+    lies: wp.vec2
+    looks: wp.int32
+    step: wp.float32
 
 
 @wp.struct
@@ -31,30 +43,41 @@ class Fabric:
     """Limbs that may be near the piece of each of `near`, as bits."""
     near: wp.array[int]
     rows: wp.array[int]
-    """On a CPU the vertices that are pressed, and as far as sweeps reach; on a GPU all."""
-    is_row: wp.array[int]
-    room: wp.array[float]
+    """On a CPU the vertices that are drawn back; on a GPU all."""
+    cut: wp.array[float]
     spread: wp.array[float]
-    """How far from the skin each vertex may be [m], and the same a sweep later."""
+    """How far each vertex is drawn back [m], and the same a sweep later; on a CPU, and a sweep before."""
+    front: wp.array[int]
+    """On a CPU the vertices that were drawn back farther in this sweep, after those of the last one."""
+    in_front: wp.array[int]
+    """The last sweep after which a vertex was there, counted from 1."""
     counts: wp.array[int]
 
 
 @wp.func
-def find_near(i: int, fabric: Fabric, bundles: Bundles, clearance: float) -> None:
-    """Lists the vertices of piece i if a limb may be between it and the skin, by boxes."""
+def beside(height: float, feel: Feel) -> float:
+    """How far beside a limb cloth at such a height feels it [m]."""
+    return wp.min(feel.beside, height * height / feel.flat)
+
+
+@wp.func
+def find_near(i: int, fabric: Fabric, bundles: Bundles, feel: Feel) -> None:
+    """Lists the vertices of piece i that may feel a limb, by boxes."""
     first = fabric.start[i]
     last = fabric.start[i + 1]
     low = fabric.points[fabric.vertex[first]]
     high = low
     foreign = int(0)
+    highest = float(0.0)
     for c in range(first, last):
         v = fabric.vertex[c]
         low = lesser(low, lesser(fabric.points[v], fabric.skin[v]))
         high = greater(high, greater(fabric.points[v], fabric.skin[v]))
+        highest = wp.max(highest, wp.length(fabric.points[v] - fabric.skin[v]))
         foreign |= fabric.foreign[v]
     found = int(0)
     for k in range(bundles.group_low.shape[0]):
-        if (foreign >> k) & 1 == 1 and is_near(low, high, k, clearance, bundles):
+        if (foreign >> k) & 1 == 1 and is_near(low, high, k, beside(highest, feel), bundles):
             found |= 1 << k
     if found == 0:
         return
@@ -63,10 +86,12 @@ def find_near(i: int, fabric: Fabric, bundles: Bundles, clearance: float) -> Non
         v = fabric.vertex[c]
         low = lesser(fabric.points[v], fabric.skin[v])
         high = greater(fabric.points[v], fabric.skin[v])
+        height = wp.length(fabric.points[v] - fabric.skin[v])
         boxed = int(0)
-        for k in range(bundles.group_low.shape[0]):
-            if ((fabric.foreign[v] & found) >> k) & 1 == 1 and is_near(low, high, k, clearance, bundles):
-                boxed |= 1 << k
+        if height > feel.room and height < feel.lies[1]:
+            for k in range(bundles.group_low.shape[0]):
+                if ((fabric.foreign[v] & found) >> k) & 1 == 1 and is_near(low, high, k, beside(height, feel), bundles):
+                    boxed |= 1 << k
         if boxed != 0:
             wanted |= boxed
             fabric.boxed[v] = boxed
@@ -75,104 +100,122 @@ def find_near(i: int, fabric: Fabric, bundles: Bundles, clearance: float) -> Non
 
 
 @wp.func
-def press(v: int, fabric: Fabric, limbs: wp.array[wp.uint64], clearance: float) -> None:
-    """How far from the skin that it lies on a vertex may be: where a limb comes in between, on this side of it."""
+def press(v: int, fabric: Fabric, limbs: wp.array[wp.uint64], feel: Feel) -> None:
+    """How far a vertex is drawn back to the skin that it lies on: before a limb that comes in between.
+
+    Whatever is on the way within `beside` is in between the less the farther beside it is. The way is looked along as
+    a ray is marched along: by as much as nothing is near.
+    """
     way = fabric.points[v] - fabric.skin[v]
     height = wp.length(way)
-    if height < clearance:
-        return
-    up = way / height
-    least = float(height)
+    whole = height + feel.room
+    aside = beside(height, feel)
+    least = float(whole)
     for k in range(limbs.shape[0]):
         if (fabric.boxed[v] >> k) & 1 == 1:
-            hit = wp.mesh_query_ray(limbs[k], fabric.skin[v], up, height + clearance)
-            if hit.result and wp.dot(hit.normal, up) < 0.0:  # else nothing is there, or the skin itself is within it
-                least = wp.min(least, wp.max(hit.t - clearance, 0.5 * hit.t))
-    if least < height:
-        fabric.room[v] = least
-        fabric.is_row[v] = 1
-        fabric.rows[wp.atomic_add(fabric.counts, PRESSED, 1)] = v
+            at = float(0.0)
+            for _ in range(feel.looks):
+                here = fabric.skin[v] + (at / height) * way
+                off = aside * (least - at) / (whole - at)  # what is farther off than that says nothing new
+                hit = wp.mesh_query_point_no_sign(limbs[k], here, off)
+                if hit.result:
+                    off = wp.min(off, wp.length(wp.mesh_eval_position(limbs[k], hit.face, hit.u, hit.v) - here))
+                    least = wp.min(least, at + (whole - at) * off / aside)
+                at += wp.max(off, feel.step)
+                if at >= least:
+                    break
+    if least < whole:
+        # Cloth at the skin has nothing to give, and cloth far off doesn't lie on this skin.
+        lies = wp.clamp((feel.lies[1] - height) / (feel.lies[1] - feel.lies[0]), 0.0, 1.0)
+        lies *= wp.clamp(height / feel.room - 1.0, 0.0, 1.0)
+        cut = lies * (height - wp.max(least - feel.room, 0.5 * least))
+        if cut > 0.0:
+            fabric.cut[v] = cut
+            fabric.rows[wp.atomic_add(fabric.counts, PRESSED, 1)] = v
 
 
 @wp.func
-def spread(v: int, fabric: Fabric, slope: float, room: wp.array[float], wider: wp.array[float]) -> None:
-    """A vertex has no more room than a neighbour of it, and what `slope` gives for the way from there."""
-    least = room[v]
+def spread(v: int, fabric: Fabric, slope: float, cut: wp.array[float], wider: wp.array[float]) -> None:
+    """A vertex is drawn back as far as a neighbour of it, but for what `slope` gives for the way from there."""
+    most = cut[v]
     for k in range(fabric.ring_start[v], fabric.ring_start[v + 1]):
         w = fabric.ring[k]
-        least = wp.min(least, room[w] + slope * wp.length(fabric.points[v] - fabric.points[w]))
-    wider[v] = least
+        most = wp.max(most, cut[w] - slope * wp.length(fabric.points[v] - fabric.points[w]))
+    wider[v] = most
 
 
 @wp.func
-def lower(v: int, fabric: Fabric, room: wp.array[float]) -> None:
-    """Draws a vertex back to the room that it has, towards the skin."""
-    way = fabric.points[v] - fabric.skin[v]
-    height = wp.length(way)
-    if height > room[v]:
-        fabric.points[v] = fabric.skin[v] + (room[v] / height) * way
+def lower(v: int, fabric: Fabric, kept: float, cut: wp.array[float]) -> None:
+    """Draws a vertex back towards the skin, of which it keeps `kept` [m] off if it was."""
+    if cut[v] > 0.0:
+        way = fabric.points[v] - fabric.skin[v]
+        height = wp.length(way)
+        left = wp.max(height - cut[v], wp.min(height, kept))
+        fabric.points[v] = fabric.skin[v] + (left / wp.max(height, 1.0e-9)) * way
 
 
 @wp.kernel
-def look_kernel(fabric: Fabric, bundles: Bundles, clearance: float) -> None:
+def look_kernel(fabric: Fabric, bundles: Bundles, feel: Feel) -> None:
     """`find_near` of one piece a thread."""
-    find_near(wp.tid(), fabric, bundles, clearance)
+    find_near(wp.tid(), fabric, bundles, feel)
 
 
 @wp.kernel
-def press_kernel(fabric: Fabric, limbs: wp.array[wp.uint64], clearance: float) -> None:
+def press_kernel(fabric: Fabric, limbs: wp.array[wp.uint64], feel: Feel) -> None:
     """`press` of one vertex a thread."""
     i = wp.tid()
     if i < fabric.counts[NEAR]:
-        press(fabric.near[i], fabric, limbs, clearance)
+        press(fabric.near[i], fabric, limbs, feel)
 
 
 @wp.kernel
-def spread_kernel(fabric: Fabric, slope: float, room: wp.array[float], wider: wp.array[float]) -> None:
+def spread_kernel(fabric: Fabric, slope: float, cut: wp.array[float], wider: wp.array[float]) -> None:
     """`spread` of one vertex a thread."""
-    spread(wp.tid(), fabric, slope, room, wider)
+    spread(wp.tid(), fabric, slope, cut, wider)
 
 
 @wp.kernel
-def lower_kernel(fabric: Fabric, room: wp.array[float]) -> None:
+def lower_kernel(fabric: Fabric, kept: float, cut: wp.array[float]) -> None:
     """`lower` of one vertex a thread."""
-    lower(wp.tid(), fabric, room)
+    lower(wp.tid(), fabric, kept, cut)
 
 
 @wp.kernel
 def press_all_kernel(
-    fabric: Fabric, limbs: wp.array[wp.uint64], clearance: float, slope: float, sweeps: int, reach: int
+    fabric: Fabric, limbs: wp.array[wp.uint64], feel: Feel, slope: float, sweeps: int, reach: int
 ) -> None:
-    """All that follows, by one thread, of the vertices that it concerns."""
+    """All that follows, by one thread: sweeps go on from those that the last one has drawn back farther."""
     for i in range(fabric.counts[NEAR]):
-        press(fabric.near[i], fabric, limbs, clearance)
+        press(fabric.near[i], fabric, limbs, feel)
+    n_front = int(fabric.counts[PRESSED])
+    for i in range(n_front):
+        fabric.front[i] = fabric.rows[i]
     first = int(0)
-    for _ in range(sweeps):
-        last = int(fabric.counts[PRESSED])
-        for i in range(first, last):
-            v = fabric.rows[i]
-            for k in range(fabric.ring_start[v], fabric.ring_start[v + 1]):
-                w = fabric.ring[k]
-                if fabric.is_row[w] == 0:
-                    fabric.is_row[w] = 1
-                    fabric.rows[wp.atomic_add(fabric.counts, PRESSED, 1)] = w
-        first = last
-    n = int(fabric.counts[PRESSED])
     for sweep in range(sweeps):
         rise = wp.where(sweep < reach, 0.0, slope)
-        for i in range(n):
-            if sweep % 2 == 0:
-                spread(fabric.rows[i], fabric, rise, fabric.room, fabric.spread)
-            else:
-                spread(fabric.rows[i], fabric, rise, fabric.spread, fabric.room)
-    for i in range(n):
+        for i in range(n_front):
+            v = fabric.front[first + i]
+            fabric.spread[v] = fabric.cut[v]
+        after = fabric.cut.shape[0] - first  # where the other half begins
+        n_next = int(0)
+        for i in range(n_front):
+            v = fabric.front[first + i]
+            for k in range(fabric.ring_start[v], fabric.ring_start[v + 1]):
+                w = fabric.ring[k]
+                cut = fabric.spread[v] - rise * wp.length(fabric.points[w] - fabric.points[v])
+                if cut > fabric.cut[w]:
+                    if fabric.cut[w] == 0.0:
+                        fabric.rows[wp.atomic_add(fabric.counts, PRESSED, 1)] = w
+                    fabric.cut[w] = cut
+                    if fabric.in_front[w] != sweep + 1:
+                        fabric.in_front[w] = sweep + 1
+                        fabric.front[after + n_next] = w
+                        n_next += 1
+        first = after
+        n_front = n_next
+    for i in range(fabric.counts[PRESSED]):
+        lower(fabric.rows[i], fabric, 0.5 * feel.room, fabric.cut)
+    for i in range(fabric.counts[PRESSED]):
         v = fabric.rows[i]
-        if sweeps % 2 == 0:
-            lower(v, fabric, fabric.room)
-        else:
-            lower(v, fabric, fabric.spread)
-    for i in range(n):
-        v = fabric.rows[i]
-        fabric.is_row[v] = 0
-        fabric.room[v] = wp.inf
-        fabric.spread[v] = wp.inf
+        fabric.in_front[v] = 0
+        fabric.cut[v] = 0.0
