@@ -14,17 +14,15 @@ from refu_core.contact import (
     ContactSettings,
     Layer,
     LimbMeshes,
-    Moved,
     Press,
     Resolution,
     Resolver,
-    Sunken,
 )
 from refu_core.garments import inner_first
 from refu_core.modes import SdfMode
 from refu_core.realtime._wearer import Outfit
 from refu_core.refu import VertexScale
-from refu_core.sdf import ApproxSdf, MeshSdf, SdfSample, Winding, exact_sdf
+from refu_core.sdf import ApproxSdf, MeshSdf, Winding, exact_sdf
 
 
 class Worn(NamedTuple):
@@ -40,17 +38,6 @@ class Worn(NamedTuple):
     """As `Resolved.n_clipped`."""
 
 
-class Surfaced(NamedTuple):
-    """A garment of which no vertex is deep inside the body any more."""
-
-    vertices: Tensor
-    """[m], shape (V, 3)."""
-    sample: SdfSample
-    """Their distance to the body."""
-    drawn_out: Tensor
-    """How many of them were inside and aren't any more, and by how much less deep the deepest is [m], shape (2,)."""
-
-
 class Resolved(NamedTuple):
     """A garment off the body and off the garments below it, and the numbers of a `GarmentStats`."""
 
@@ -64,8 +51,6 @@ class Resolved(NamedTuple):
 
 N_NUMBERS = 5
 _N_UNRESOLVED = 2
-_INSIDE = slice(0, 4, 3)
-"""`n_inside` and `max_depth`."""
 
 
 class ContactStage:
@@ -93,14 +78,12 @@ class ContactStage:
         self.resolvers = {
             name: Resolver(one.faces, one.n_vertices, settings=settings) for name, one in garments.items()
         }
-        self._sunken = {name: Sunken(one.faces, one.n_vertices, settings=settings) for name, one in garments.items()}
-        self._moved = {name: Moved(one.n_vertices, one.faces.device) for name, one in garments.items()}
         self._limbs, self._press = None, {}
         if outfit.collider is not None:  # or there is no room
             self._limbs = limbs = LimbMeshes(body)
             self._press = {name: Press(one, limbs, settings=settings) for name, one in garments.items()}
         self._outfit, self._farthest, self._kept = outfit, settings.max_displacement, settings.layer_margin
-        self._partings = settings.partings
+        self._partings, self._part_most = settings.partings, settings.parting_most
         self._below = {
             name: {
                 inner: Layer(
@@ -130,16 +113,6 @@ class ContactStage:
             return vertices
         return self._press[name](vertices, self._outfit.below[name](self._body[None])[0])
 
-    def surface(self, name: str, vertices: Tensor, on_mean: Tensor, *, margin: float) -> Surfaced:
-        """Vertices (V, 3) [m] of which those deep inside the body are drawn out by the cloth around them."""
-        reach = margin + ASKED_FROM
-        sample = self._asked[name](vertices, on_mean=on_mean, reach=reach)
-        inside = _inside(sample)
-        drawn, rows = self._sunken[name](vertices, sample.distance)
-        if drawn is not vertices:
-            sample = self._asked[name](drawn, on_mean=on_mean, reach=reach, last=sample, rows=rows)
-        return Surfaced(drawn, sample, inside - _inside(sample))
-
     def lift(
         self, name: str, vertices: Tensor, worn: Mapping[str, Worn], *, goes_on: bool = False
     ) -> tuple[Tensor, Tensor]:
@@ -164,41 +137,28 @@ class ContactStage:
         margin: float,
         scale: float | VertexScale,
         n_layered: Tensor,
-        surfaced: Surfaced | None = None,
     ) -> Resolved:
-        """Vertices (V, 3) [m] off the body, which has the last word, and within reach of where limbs `pressed` them.
-
-        Where they have `surfaced`, the distance of those that were moved since is asked for alone.
-        """
-        reach = margin + ASKED_FROM
-        if surfaced is None:
-            start = self._asked[name](vertices, on_mean=on_mean, reach=reach)
-        elif vertices is surfaced.vertices:
-            start = surfaced.sample
-        else:
-            start = self._moved[name](*surfaced[:2], vertices, self.sdf, reach=reach)
+        """Vertices (V, 3) [m] off the body, which has the last word, and within reach of where limbs `pressed` them."""
+        start = self._asked[name](vertices, on_mean=on_mean, reach=margin + ASKED_FROM)
         assert start.face is not None  # these distances are to faces
         n_clipped = (start.face < 0).sum()
         resolver = self.resolvers[name]
         done = resolver(vertices, self.sdf, start, margin=margin, scale=scale)
         vertices, numbers = done.vertices, done.numbers
-        # Inside is inside, whether the body pushes it out or the cloth around it draws it out.
-        if surfaced is not None:
-            numbers[_INSIDE] += surfaced.drawn_out
         if worn:
             vertices, _ = self.lift(name, vertices, worn, goes_on=True)
             again = resolver(vertices, self.sdf, None, margin=self._kept * margin)
             again = self._part(name, again, worn, margin=self._kept * margin)
-            vertices = again.vertices
+            # Each step goes no farther than that; together they may.
+            vertices = pressed + torch.renorm(again.vertices - pressed, 2, 0, self._farthest)
             numbers[_N_UNRESOLVED] = again.numbers[_N_UNRESOLVED]
-        # Each step goes no farther than that; together they may.
-        vertices = pressed + torch.renorm(vertices - pressed, 2, 0, self._farthest)
         if self.winding is not None:
             numbers[_N_UNRESOLVED] = torch.count_nonzero(self.winding(vertices))
         return Resolved(vertices, torch.cat((numbers, n_layered)), n_clipped)
 
     def _part(self, name: str, done: Resolution, worn: Mapping[str, Worn], *, margin: float) -> Resolution:
         """A garment off the body, off the `worn` inner ones where triangles cut each other after all."""
+        before = done.vertices
         for round_ in range(self._partings):
             cut_by = [layer for layer in self._below[name].values() if layer.find_cuts(done.vertices)]
             if not cut_by:
@@ -210,6 +170,7 @@ class ContactStage:
                 vertices, _ = self.lift(name, vertices, worn, goes_on=True)
             for layer in cut_by:
                 vertices = layer.parting.part(vertices)
+            vertices = before + torch.renorm(vertices - before, 2, 0, self._part_most)
             parted = self.resolvers[name](vertices, self.sdf, None, margin=margin)
             # A GPU, which isn't waited for, comes here without a cut, too.
             is_cut = torch.stack([layer.parting.n_cut for layer in cut_by]).any()
@@ -219,8 +180,3 @@ class ContactStage:
                 torch.where(is_cut, parted.numbers, done.numbers),
             )
         return done
-
-
-def _inside(sample: SdfSample) -> Tensor:
-    """How many vertices are inside, and the depth of the deepest [m], shape (2,)."""
-    return torch.stack(((sample.distance < 0).sum().to(sample.distance), (-sample.distance.amin()).clamp_min(0)))

@@ -116,8 +116,7 @@ class FrameStep:
                 numbers, n_clipped = raw.new_zeros(N_NUMBERS), raw.new_zeros(())
                 if self.contact is not None:
                     pressed = self.contact.press(name, raw)
-                    surfaced = self.contact.surface(name, pressed, drape.on_mean[person], margin=margin_of[name])
-                    vertices, n_layered = self.contact.lift(name, surfaced.vertices, garments)
+                    vertices, n_layered = self.contact.lift(name, pressed, garments)
                     if len(self._order) > 1:
                         clock.lap("layers", name)
                     vertices, numbers, n_clipped = self.contact.resolve(
@@ -129,7 +128,6 @@ class FrameStep:
                         margin=margin_of[name],
                         scale=scale_of(self._outfit.wearables[name], drape, person),
                         n_layered=n_layered,
-                        surfaced=surfaced,
                     )
                 garments[name] = Worn(vertices, raw, numbers, n_clipped)
                 clock.lap("refu", name)

@@ -125,17 +125,8 @@ class ApproxSdf(MeshSdf):
         """As `BodySdf.of_garment`: walks begin where the vertices were near before posing."""
         rest_faces = self._rest_faces
 
-        def ask(
-            vertices: Tensor,
-            *,
-            on_mean: Tensor,
-            reach: float = math.inf,  # noqa: ARG001
-            last: SdfSample | None = None,
-            rows: Tensor | None = None,
-        ) -> SdfSample:
-            if last is None or rows is None:
-                return self.query(vertices, near=rest_faces(on_mean))
-            return last.renewed(rows, self.query(vertices[rows], near=rest_faces(on_mean[rows])))
+        def ask(vertices: Tensor, *, on_mean: Tensor, reach: float = math.inf) -> SdfSample:  # noqa: ARG001
+            return self.query(vertices, near=rest_faces(on_mean))
 
         return ask
 

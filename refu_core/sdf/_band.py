@@ -114,14 +114,7 @@ class BandSdf(MeshSdf):
         """As `BodySdf.of_garment`; distances beyond the band are computed only where `reach` asks for them."""
         links = Links(garment.mesh.ring)
 
-        def ask(
-            vertices: Tensor,
-            *,
-            on_mean: Tensor,  # noqa: ARG001
-            reach: float = math.inf,
-            last: SdfSample | None = None,  # noqa: ARG001  # how far off many are is known of their neighbours alone
-            rows: Tensor | None = None,  # noqa: ARG001
-        ) -> SdfSample:
+        def ask(vertices: Tensor, *, on_mean: Tensor, reach: float = math.inf) -> SdfSample:  # noqa: ARG001
             return self.clipped(vertices, links) if reach <= self.band else self.query(vertices)
 
         return ask

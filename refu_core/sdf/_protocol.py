@@ -27,16 +27,6 @@ class SdfSample(NamedTuple):
         face = None if self.face is None else self.face[index]
         return SdfSample(self.distance[index], self.gradient[index], face)
 
-    def renewed(self, index: Tensor, of_rows: SdfSample) -> SdfSample:
-        """The sample with that of some of the points, `rows(index)`, replaced."""
-        distance, gradient = self.distance.clone(), self.gradient.clone()
-        distance[index], gradient[index] = of_rows.distance, of_rows.gradient
-        if self.face is None or of_rows.face is None:
-            return SdfSample(distance, gradient)
-        face = self.face.clone()
-        face[index] = of_rows.face
-        return SdfSample(distance, gradient, face)
-
 
 @runtime_checkable
 class BodySdf(Protocol):
@@ -66,23 +56,13 @@ class BodySdf(Protocol):
 class GarmentSdf(Protocol):
     """The signed distance of a garment's vertices to one posed body."""
 
-    def __call__(
-        self,
-        vertices: Tensor,
-        *,
-        on_mean: Tensor,
-        reach: float = math.inf,
-        last: SdfSample | None = None,
-        rows: Tensor | None = None,
-    ) -> SdfSample:
+    def __call__(self, vertices: Tensor, *, on_mean: Tensor, reach: float = math.inf) -> SdfSample:
         """Distance and gradient of posed vertices [m], shape (N, 3). Not differentiable.
 
         Args:
             vertices: In the frame of the body's vertices [m], shape (N, 3).
             on_mean: Where they are on the unposed mean shape [m], shape (N, 3).
             reach: Distances beyond it [m] may be clipped from above; such a sample's face is -1.
-            last: A sample of the same vertices before those in `rows` were moved. Others needn't be asked.
-            rows: Indices of those, shape (K,); None for all.
         """
         ...
 
@@ -90,17 +70,8 @@ class GarmentSdf(Protocol):
 def plain_garment_sdf(sdf: BodySdf) -> GarmentSdf:
     """Of a distance for which one garment is like any other points."""
 
-    def ask(
-        vertices: Tensor,
-        *,
-        on_mean: Tensor,  # noqa: ARG001
-        reach: float = math.inf,  # noqa: ARG001
-        last: SdfSample | None = None,
-        rows: Tensor | None = None,
-    ) -> SdfSample:
-        if last is None or rows is None:
-            return sdf.query(vertices)
-        return last.renewed(rows, sdf.query(vertices[rows]))
+    def ask(vertices: Tensor, *, on_mean: Tensor, reach: float = math.inf) -> SdfSample:  # noqa: ARG001
+        return sdf.query(vertices)
 
     return ask
 

@@ -129,8 +129,6 @@ def as_on_a_gpu(pipeline: GarmentPipeline) -> FrameStep:
             contact.sdf._is_serial = False
         for press in contact._press.values():
             press._is_serial = False
-        for sunken in contact._sunken.values():
-            sunken._is_serial = False
         for resolver in contact.resolvers.values():
             resolver._is_serial = False
         for layers in contact._below.values():

@@ -12,12 +12,10 @@ from numpy.typing import NDArray
 from test_layers import sheet, wavy
 from torch import Tensor
 
-from refu_core.body import load_body
-from refu_core.contact import DEFAULT_CONTACT, Layer, Moved, Sunken
+from refu_core.contact import DEFAULT_CONTACT, Layer
 from refu_core.contact._parting_kernels import depth_below
 from refu_core.mesh import Connectivity
 from refu_core.metrics import SheetChecker
-from refu_core.sdf import ExactSdf
 
 Array = NDArray[np.float64]
 
@@ -138,53 +136,3 @@ def test_a_ridge_through_the_middle_of_a_face_is_cleared() -> None:
     moved = (found - above).norm(dim=1)
     assert moved.max() < 0.006
     assert not layer.find_cuts(found)
-
-
-@given(seed=st.integers(0, 1000))
-@settings(max_examples=10)
-def test_what_is_deep_hangs_between_what_is_not(seed: int) -> None:
-    points, faces = sheet(14)
-    points = wavy(points, seed, amplitude=0.01)
-    distance = points[:, 1] * 3
-    begin, end = DEFAULT_CONTACT.sunken
-    sunken = Sunken(faces, len(points))
-    found, rows = sunken(points, distance)
-    assert rows is not None
-    weight = np.clip((-begin - distance.double().numpy()) / (end - begin), 0, 1)
-    assert np.array_equal(rows.numpy(), np.flatnonzero(weight))
-    if not len(rows):
-        assert found is points
-        return
-    wanted = levelled(points.double().numpy(), ring_of(faces, len(points)), weight, DEFAULT_CONTACT.sunken_rounds)
-    np.testing.assert_allclose(found.numpy(), wanted, atol=1e-5)
-    np.testing.assert_array_equal(found.numpy()[weight == 0], points.numpy()[weight == 0])
-    # No threshold: a hair deeper is a hair's difference.
-    nudged, _ = sunken(points, distance - 1e-6)
-    assert (nudged - found).norm(dim=1).max() < 2e-4
-    sunken._is_serial = False  # as on a GPU, which isn't waited for
-    for at, wanted_there in ((distance, found), (distance.abs(), points)):
-        there, unknown = sunken(points, at)
-        assert torch.equal(there, wanted_there)
-        assert unknown is None
-
-
-def test_only_what_was_moved_is_asked_again() -> None:
-    body = load_body("male")
-    sdf = ExactSdf(body.faces)
-    sdf.update(body.v_template)
-    generator = torch.Generator().manual_seed(1)
-    before = body.v_template[::7] + 0.02 * torch.randn(len(body.v_template[::7]), 3, generator=generator)
-    points = before.clone()
-    points[::3] += 0.01 * torch.randn(len(points[::3]), 3, generator=generator)
-    sample, wanted = sdf.query(before), sdf.query(points)
-    found = Moved(len(points), points.device)(before, sample, points, sdf, reach=0.006)
-    is_asked = wanted.distance < 0.006
-    torch.testing.assert_close(found.distance[is_asked], wanted.distance[is_asked], atol=1e-6, rtol=0)
-    assert (found.distance[~is_asked] <= wanted.distance[~is_asked] + 1e-6).all()
-    assert (found.distance[~is_asked] >= 0.006 - 1e-6).all()
-    untouched = torch.ones(len(points), dtype=torch.bool)
-    untouched[::3] = False
-    for new, old in zip(found, sample, strict=True):
-        assert new is not None
-        assert old is not None
-        assert torch.equal(new[untouched], old[untouched])

@@ -15,7 +15,7 @@ from torch import Tensor
 from refu_core.body import SmplBody, load_body
 from refu_core.errors import MeshError
 from refu_core.garments import GarmentTemplate, load_garment
-from refu_core.sdf import ApproxSdf, BodySdf, ExactSdf, RestFaces, exact_sdf, query_batch
+from refu_core.sdf import ApproxSdf, BodySdf, ExactSdf, RestFaces, query_batch
 from refu_core.sdf._approx import EXACT_FROM
 
 POSES: dict[str, dict[int, tuple[float, float, float]]] = {
@@ -210,25 +210,6 @@ def test_rest_faces_are_near(body: SmplBody) -> None:
     assert off.quantile(0.99) < 0.06
     assert rest(places.view(2, -1, 3)).shape == (2, len(places) // 2)
     assert int(rest(torch.full((1, 3), 1e6))) in range(len(body.faces))
-
-
-@pytest.mark.parametrize("kind", ["approx", "exact", "band"])
-def test_of_a_garment_what_was_moved_is_asked_alone(body: SmplBody, kind: str) -> None:
-    garment = load_garment("tshirt-male")
-    sdf = {"approx": ApproxSdf(body), "exact": ExactSdf(body.faces), "band": exact_sdf(body)}[kind]
-    sdf.update(body.v_template.float())
-    ask = sdf.of_garment(garment)
-    on_mean = garment.v_template.float()
-    first = ask(on_mean, on_mean=on_mean, reach=0.01)
-    moved, rows = on_mean.clone(), torch.arange(3, len(on_mean), 7)
-    moved[rows] -= 0.015 * first.gradient[rows]
-    before = [field.clone() for field in first if field is not None]
-    again = ask(moved, on_mean=on_mean, reach=0.01, last=first, rows=rows)
-    for found, wanted in zip(again, ask(moved, on_mean=on_mean, reach=0.01), strict=True):
-        assert found is not None
-        assert wanted is not None
-        assert torch.equal(found, wanted)
-    assert all(torch.equal(field, old) for field, old in zip(first, before, strict=True) if field is not None)
 
 
 def test_gradcheck_of_distance_and_gradient(body: SmplBody, approx: ApproxSdf) -> None:
