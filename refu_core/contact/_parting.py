@@ -13,6 +13,7 @@ from refu_core.contact import _parting_kernels as kernels
 from refu_core.contact._level_kernels import level_kernel
 from refu_core.contact._settings import ContactSettings
 from refu_core.mesh import grouped
+from refu_core.sdf._crossing_kernels import BLOCK
 
 
 class Sheet(NamedTuple):
@@ -67,7 +68,7 @@ class Parting:
             (
                 "find",
                 kernels.find_kernel,
-                -(-n_faces // int(kernels.BLOCK)),
+                -(-n_faces // int(BLOCK)),
                 [sheet.tree, sheet.extent, *own, in_groups, marked, count],
             ),
             ("widen0", kernels.widen_kernel, n, [marked, cut, wider]),

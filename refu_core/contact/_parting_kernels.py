@@ -1,20 +1,11 @@
 """Parting garments whose triangles cut each other: one code for CPU and CUDA, each thread for one face or vertex."""
 
-from typing import TYPE_CHECKING
-
 import warp as wp
 
 from refu_core.contact._layers_kernels import Cut
-from refu_core.sdf._crossing_kernels import double, meeting_edges
+from refu_core.sdf._crossing_kernels import BLOCK, Corners, double, meeting_edges
 
 wp.set_module_options({"fuse_fp": False, "enable_backward": False})
-
-BLOCK = wp.constant(8)
-"""Faces that look for others together."""
-if TYPE_CHECKING:
-    _Corners = wp.Matrix[float]
-else:
-    _Corners = wp.types.matrix(shape=(8, 3), dtype=wp.float32)
 
 
 @wp.func
@@ -54,8 +45,8 @@ def find_kernel(
     end = wp.min(first + BLOCK, order.shape[0])
     lower = wp.vec3(wp.inf)
     upper = wp.vec3(-wp.inf)
-    lows = _Corners()
-    highs = _Corners()
+    lows = Corners()
+    highs = Corners()
     for n in range(first, end):
         face = order[n]
         a = corner(face, 0, points, faces)

@@ -15,7 +15,8 @@ from scipy.sparse.csgraph import connected_components
 from refu_core._warp import as_warp, torch_stream
 from refu_core.errors import MeshError
 from refu_core.mesh import Connectivity, grouped
-from refu_core.metrics._intersect_kernels import BLOCK, intersect_kernel
+from refu_core.metrics._intersect_kernels import intersect_kernel
+from refu_core.sdf._crossing_kernels import BLOCK
 
 _CORNERS = np.array([[0, 1], [1, 2], [2, 0]])  # the two ends of edge k of a face
 

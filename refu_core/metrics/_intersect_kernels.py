@@ -1,20 +1,11 @@
 """Triangle-triangle intersections in double precision, candidates from a BVH."""
 
-from typing import TYPE_CHECKING
-
 import warp as wp
 
-from refu_core.sdf._crossing_kernels import double, meeting_edges
+from refu_core.sdf._crossing_kernels import BLOCK, Corners, double, meeting_edges
 
 # Contracted multiply-adds would round a x b and b x a differently, and open cracks between neighbouring triangles.
 wp.set_module_options({"fuse_fp": False, "enable_backward": False})
-
-BLOCK = wp.constant(8)
-"""Faces that look for others together."""
-if TYPE_CHECKING:
-    _Corners = wp.Matrix[float]
-else:
-    _Corners = wp.types.matrix(shape=(8, 3), dtype=wp.float32)
 
 
 @wp.kernel
@@ -38,8 +29,8 @@ def intersect_kernel(
     end = wp.min(first + BLOCK, faces.shape[0])
     lower = vertices[faces[first][0]]
     upper = lower
-    lows = _Corners()
-    highs = _Corners()
+    lows = Corners()
+    highs = Corners()
     for k in range(first, end):
         a = vertices[faces[k][0]]
         b = vertices[faces[k][1]]

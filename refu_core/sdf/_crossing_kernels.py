@@ -1,11 +1,20 @@
 """Whether two triangles cut each other, in double precision: one code for CPU and CUDA."""
 
+from typing import TYPE_CHECKING
+
 import warp as wp
 
 from refu_core import _warp  # noqa: F401  (quiets Warp before it starts)
 
 # Contracted multiply-adds would round a x b and b x a differently, and open cracks between neighbouring triangles.
 wp.set_module_options({"fuse_fp": False, "enable_backward": False})
+
+BLOCK = wp.constant(8)
+"""Faces that look for others together."""
+if TYPE_CHECKING:
+    Corners = wp.Matrix[float]
+else:
+    Corners = wp.types.matrix(shape=(8, 3), dtype=wp.float32)
 
 FLOAT0 = wp.constant(wp.float64(0.0))
 APART = wp.constant(wp.float64(1e-9))
