@@ -1,5 +1,6 @@
 """Networks that predict a garment's displacement in the unposed space; `skinned` is the one without a network."""
 
+from refu_core.backbones._controls import Controls
 from refu_core.backbones._decoder import BasisDecoder, Decoder, DenseDecoder
 from refu_core.backbones._features import (
     ENCODINGS,
@@ -41,6 +42,7 @@ __all__ = [
     "Backbone",
     "BackboneConfig",
     "BasisDecoder",
+    "Controls",
     "Decoder",
     "DenseDecoder",
     "Gcnn",

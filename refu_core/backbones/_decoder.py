@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from refu_core._warp import Repeated, is_plain
+from refu_core.backbones._controls import Controls
 from refu_core.backbones._decode_kernels import WIDTH, Steps, Strip, decode_kernel
 from refu_core.errors import WeightsError
 from refu_core.garments import GarmentTemplate
@@ -52,14 +53,30 @@ class BasisDecoder(nn.Module):
     costs, is made once for the sum of all networks. The first components, which say most, are stored in half
     precision, the others as whole numbers of steps, -127 to 127. Distances between codes are distances between
     garments: |code - code'|² = Σ_v |D_v - D'_v|², up to rounding.
+
+    A basis of few samples is smooth. It is stored at `controls`, a hundredth of the bytes or less, and is that of all
+    vertices from when it is loaded on.
     """
 
-    def __init__(self, mean: Tensor, components: Tensor) -> None:
-        """`mean` [m], shape (V, 3), and orthonormal rows `components`, shape (R, 3 V)."""
+    def __init__(self, mean: Tensor, components: Tensor, *, controls: Controls | None = None) -> None:
+        """`mean` [m], shape (V, 3), and orthonormal rows `components`, shape (R, 3 V).
+
+        With `controls` both are given there, (C, 3) and (R, 3 C), and orthonormal is what they say of all vertices.
+        """
         super().__init__()
         if components.ndim != 2 or components.shape[1] != mean.numel():
             msg = f"wanted a basis of (R, {mean.numel()}), got {tuple(components.shape)}: get them again"
             raise WeightsError(msg)
+        self.controls = controls
+        self._at_controls = None
+        if controls is not None:
+            if len(mean) != len(controls.vertices):
+                msg = f"wanted a basis at {len(controls.vertices)} controls, got one at {len(mean)}: get them again"
+                raise WeightsError(msg)
+            self._at_controls = {"mean": mean.half(), "components": components.half()}
+            both = torch.cat((mean.flatten()[None], components)).half().float()
+            mean, components = controls(both.view(len(both), -1, 3)).flatten(1).tensor_split((1,))
+            mean = mean.view(-1, 3)
         self.n_vertices = len(mean)
         self.size = len(components)
         """Width R of a code."""
@@ -71,17 +88,22 @@ class BasisDecoder(nn.Module):
         self._strips: _Strips | None = None
 
     @classmethod
-    def of_tensors(cls, tensors: Mapping[str, Tensor]) -> BasisDecoder:
-        """Of what a basis file holds: the inverse of `tensors`.
+    def of_tensors(cls, tensors: Mapping[str, Tensor], garment: GarmentTemplate | None = None) -> BasisDecoder:
+        """Of what a basis file holds: the inverse of `tensors`. One at controls is that of a `garment`.
 
         Raises:
-            WeightsError: something is missing, or parts don't fit each other.
+            WeightsError: something is missing, or parts don't fit each other or the garment.
         """
         missing = [name for name in ("mean", "components") if name not in tensors]
         if missing:
             msg = f"has no {' and no '.join(missing)}: not an output basis"
             raise WeightsError(msg)
         coarse = tensors["components"].float()
+        if "controls" in tensors:
+            if garment is None:
+                msg = "is known at controls alone: say whose basis it is"
+                raise WeightsError(msg)
+            return cls(tensors["mean"].float(), coarse, controls=Controls.of(garment, tensors["controls"]))
         nothing = torch.zeros(0, *coarse.shape[1:], dtype=torch.int8)
         stored = _Stored(coarse, tensors.get("fine", nothing), tensors.get("steps", coarse.new_zeros(0)).float())
         return cls(tensors["mean"].float(), stored.components())
@@ -108,8 +130,17 @@ class BasisDecoder(nn.Module):
         outside = torch.linalg.qr((whole - inside @ self.components).T).R.T
         return torch.cat((inside, outside), 1)
 
+    def is_stored_as(self, tensors: Mapping[str, Tensor]) -> bool:
+        """Whether this is the basis of a file that holds `tensors`. Raises `WeightsError` as `of_tensors`."""
+        if "controls" not in tensors:
+            return torch.equal(BasisDecoder.of_tensors(tensors).components, self.components.cpu())
+        own = self.tensors()
+        return own.keys() == tensors.keys() and all(torch.equal(own[name], tensors[name]) for name in own)
+
     def tensors(self) -> Mapping[str, Tensor]:
         """What a basis file holds."""
+        if self.controls is not None and self._at_controls is not None:
+            return self._at_controls | {"controls": self.controls.vertices}
         stored = _Stored.of(self.components)
         tensors = {"mean": self.mean.view(-1, 3).half(), "components": stored.coarse.half()}
         return tensors | ({"fine": stored.fine, "steps": stored.steps.bfloat16()} if len(stored.fine) else {})

@@ -30,7 +30,7 @@ def save_basis(folder: Path, basis: BasisDecoder, card: Mapping[str, Any]) -> Pa
     return save_weights(folder / "basis", basis.tensors(), {**card, "rank": basis.size})
 
 
-def load_basis(folder: Path, *, expect: Mapping[str, Any]) -> tuple[BasisDecoder, str]:
+def load_basis(folder: Path, garment: GarmentTemplate, *, expect: Mapping[str, Any]) -> tuple[BasisDecoder, str]:
     """The output basis of a garment and its hash.
 
     Raises:
@@ -38,7 +38,7 @@ def load_basis(folder: Path, *, expect: Mapping[str, Any]) -> tuple[BasisDecoder
     """
     weights = load_weights(folder / "basis", expect=expect)
     try:
-        basis = BasisDecoder.of_tensors(weights.tensors)
+        basis = BasisDecoder.of_tensors(weights.tensors, garment)
     except WeightsError as error:
         msg = f"{weights.path}: {error}"
         raise WeightsError(msg) from error
@@ -73,8 +73,9 @@ def save_backbone(
     described: dict[str, Any] = {"backbone": backbone_name(backbone), "config": config_to_card(config)}  # type: ignore[arg-type]
     decoder = getattr(backbone, "decoder", None)
     if isinstance(decoder, BasisDecoder):
-        stored, described["basis_sha256"] = load_basis(stem.parent, expect={"garment": card["garment"]})
-        if not torch.equal(stored.components, decoder.components.cpu()):
+        stored = load_weights(stem.parent / "basis", expect={"garment": card["garment"]})
+        described["basis_sha256"] = str(stored.card["sha256"])
+        if not decoder.is_stored_as(stored.tensors):
             msg = f"{stem}: the basis in this folder isn't the one that the backbone was trained with; use a new folder"
             raise WeightsError(msg)
     return save_weights(stem, {**tensors, **(others or {})}, {**described, **card})
@@ -91,7 +92,7 @@ def backbone_from_weights(weights: Weights, garment: GarmentTemplate, *, device:
     basis = None
     if "basis_sha256" in card:
         identity = {key: card[key] for key in ("garment", "body_fingerprint") if key in card}
-        basis, digest = load_basis(weights.path.parent, expect=identity)
+        basis, digest = load_basis(weights.path.parent, garment.to(device="cpu"), expect=identity)
         if digest != card["basis_sha256"]:
             msg = f"{weights.path}: made for another basis than the one beside it; get both files again"
             raise WeightsError(msg)

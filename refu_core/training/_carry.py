@@ -1,40 +1,46 @@
 """Networks of few samples: those of a related garment, carried over, and what the samples add to them.
 
 A hundred simulated samples teach a network from scratch little. A T-shirt of another cut, on another body, falls much
-like the one whose networks learnt from a thousand: where it lies near that one, its displacement is that one's. What
-is left, the samples say, as a linear function of the pose.
+like the one whose networks learnt from a thousand: where it lies near that one, it moves as that one does, as far as
+the samples bear that out. What is left, the samples say, as a linear function of the pose.
 """
 
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-import trimesh
-from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from refu_core.backbones import (
     BasisDecoder,
+    Controls,
     TailorNet,
     TailorNetConfig,
     build_backbone,
-    load_backbone,
     save_backbone,
     save_basis,
 )
-from refu_core.body import SmplBody, load_fit
+from refu_core.body import Collider, SmplBody
 from refu_core.errors import RefuError
 from refu_core.frames import N_BETAS
-from refu_core.garments import N_STYLES, GarmentTemplate, load_garment, worn_on
+from refu_core.garments import N_STYLES, GarmentTemplate, SkinBelow, load_garment
 from refu_core.modes import SdfMode
+from refu_core.realtime import RootTurn
 from refu_core.simulation import GarmentDataset, GarmentSequences, random_pose
-from refu_core.training._data import TrainingSamples, TrainingSet, in_chunks, mirrored, output_basis, read_samples
+from refu_core.training._carried import Carried
+from refu_core.training._data import (
+    TrainingSamples,
+    TrainingSet,
+    in_chunks,
+    mirrored,
+    principal_components,
+    read_samples,
+)
 from refu_core.training._figures import backbone_figures, posed_errors
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage
 from refu_core.training._mirror import Mirror
@@ -42,6 +48,8 @@ from refu_core.training._pretrain import CodeLoss
 from refu_core.training._progress import TrainingLog
 from refu_core.weights import load_weights, save_weights
 
+_DOUBT = 0.1
+"""Where less than this share of the mean is carried over, nothing is said for it."""
 BASE = SdfMode.HYBRID
 """The mode whose file has the network; the other modes' files only name it."""
 
@@ -53,14 +61,16 @@ class CarrySettings:
     loop: LoopSettings = field(default_factory=lambda: LoopSettings(weight_decay=0.01, check_every=500))
     rank: int = 48
     """Components of the output basis. 64 give a T-shirt .1 mm, and a third more bytes."""
-    hidden: tuple[int, ...] = (256, 256)
+    controls: int = 200
+    """Vertices at which the basis is stored."""
+    hidden: tuple[int, ...] = (128, 128)
     """Layers of the net that learns what was carried over."""
     poses: int = 4000
     """Bodies that it learns it of."""
     steps: int = 3000
-    reach: float = 0.015
+    reach: float = 0.05
     """Cloth that is nearer than this to the related garment, both in the T-pose, is moved as that is [m]."""
-    fade: float = 0.03
+    fade: float = 0.05
     """Way farther in which that ends [m]. Trousers whose legs hear of shorts 60 mm away are 13.0 mm off, not 10.5."""
     hem: float = 0.12
     """The related garment's hem is felt less and less within this of it [m], where the other garment goes on."""
@@ -74,58 +84,6 @@ class CarrySettings:
         if min(self.rank, self.poses, self.steps, *self.hidden) < 1 or not self.ridge > 0:
             msg = f"rank, poses, steps, layers and ridge must be above zero, got {self}"
             raise RefuError(msg)
-
-
-class Carried:
-    """What the networks of one garment predict, on another."""
-
-    def __init__(self, related: GarmentTemplate, garment: GarmentTemplate, settings: CarrySettings) -> None:
-        """For `garment`, near which `related` lies once it is worn on the same body.
-
-        Raises `WeightsError` when no networks of `related` ship.
-        """
-        self.network = load_backbone("tailornet", related)
-        fit = None if garment.body == related.body else load_fit(garment.body)
-        self._betas = None if fit is None else fit.difference(related.body).betas
-        worn = worn_on(related, fit)
-        faces, vertices = worn.faces.numpy(), worn.v_template.double().numpy()
-        mesh = trimesh.Trimesh(vertices, faces, process=False)
-        place, distance, face = trimesh.proximity.closest_point(mesh, garment.v_template.double().numpy())
-        share = _smooth((settings.reach + settings.fade - distance) / settings.fade)
-        # Trousers go on where shorts end: a hem that swings there would be a step in them.
-        own = _from_rim(garment, garment.v_template.double().numpy(), garment.v_template.double().numpy())
-        ends = _from_rim(worn, vertices, place)
-        goes_on = _smooth((own - ends) / settings.hem)
-        share *= 1 - goes_on * _smooth(1 - ends / settings.hem)
-        weights = trimesh.triangles.points_to_barycentric(vertices[faces[face]], place)
-        self._corners = torch.as_tensor(faces[face])
-        self._weights = torch.as_tensor(weights * share[:, None], dtype=torch.float32)
-
-    @torch.no_grad()
-    def __call__(self, betas: Tensor, pose: Tensor) -> Tensor:
-        """Displacements of the other garment [m], (B, V, 3), for its betas (B, 10) and poses (B, 24, 3) [rad]."""
-
-        def one(betas: Tensor, pose: Tensor) -> Tensor:
-            known = betas if self._betas is None else self._betas(betas).float()
-            there = self.network(known, pose, None).displacement
-            assert there is not None  # a network was asked for
-            corners = (self._weights[:, k, None] * there[:, self._corners[:, k]] for k in range(3))
-            return sum(corners, start=torch.zeros(()))
-
-        return in_chunks(one, betas, pose)
-
-
-def _smooth(share: NDArray[np.float64]) -> NDArray[np.float64]:
-    """From 0 to 1, level at both ends, for shares cut off there."""
-    cut: NDArray[np.float64] = np.clip(share, 0, 1)
-    return cut * cut * (3 - 2 * cut)
-
-
-def _from_rim(
-    garment: GarmentTemplate, vertices: NDArray[np.float64], points: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """How far `points` (P, 3) are from the nearest hem of a garment with its vertices at `vertices` (V, 3) [m]."""
-    return np.asarray(cKDTree(vertices[np.unique(garment.mesh.boundary)]).query(points)[0])
 
 
 def carry_over(
@@ -160,14 +118,17 @@ def carry_over(
     settings = CarrySettings() if settings is None else settings
     opened = TrainingSet.of(garment, dataset, body)
     template, body = opened.garment, opened.body
-    test = read_samples(opened.rows, body, template, split="test")
-    carried = Carried(load_garment(like), template, settings)
-    samples = opened.samples.joined(mirrored(opened.samples, Mirror.of(template)))
+    test = _off_collider(read_samples(opened.rows, body, template, split="test"), body, template)
+    simulated = _off_collider(opened.samples, body, template)
+    carried = Carried(load_garment(like), template, body, settings)
+    samples = simulated.joined(mirrored(simulated, Mirror.of(template)))
     output = Path(output)
+    controls = Controls.spread(template, settings.controls)
+    share = _borne_out(carried(samples.betas, samples.pose), samples.displacement, controls)
     drawn = _bodies(opened.samples, settings)
-    there = carried(*drawn)
+    there = share[:, None] * carried(*drawn)
     # As many of either: the samples' own folds must have their components.
-    basis = output_basis(torch.cat((samples.displacement, there[: len(samples)])), rank=settings.rank)
+    basis = _smooth_basis(torch.cat((samples.displacement, there[: len(samples)])), controls, settings.rank)
     described = {**opened.identity, "samples": len(samples), "simulated": len(opened.samples), "like": like}
     save_basis(output, basis, {**described, "set": len(opened.rows)})
 
@@ -192,6 +153,7 @@ def carry_over(
         "figures": {
             **backbone_figures(model, test, body, template, mean=samples.displacement.mean(0)),
             "carried_mm": round(float(posed_errors(carried(test.betas, test.pose), test, body, template).mean()), 3),
+            "borne_out": round(float(share.mean()), 3),
         },
     }
     base = f"tailornet-{BASE}"
@@ -202,6 +164,47 @@ def carry_over(
             own = {key: stored[key] for key in ("config", "basis_sha256")}
             save_weights(output / f"tailornet-{mode}", {}, {**card, **own, "mode": str(mode)}, base=base)
     return {**card, "mode": str(BASE)}
+
+
+@torch.no_grad()
+def _off_collider(samples: TrainingSamples, body: SmplBody, garment: GarmentTemplate) -> TrainingSamples:
+    """The samples less how far a collider takes cloth along: the pipeline adds that to what a network says."""
+    collider, below = Collider(body), SkinBelow.of(garment, body)
+
+    def one(displacement: Tensor, betas: Tensor, pose: Tensor) -> Tensor:
+        shape = body.shape(betas)
+        _, at_root = RootTurn.taken_off(pose, shape.joints)
+        posed, rest = body.posed(at_root, shape), garment.rest(betas)
+        vertices = garment.pose(rest + displacement, posed.transforms)
+        vertices = vertices - below(collider(posed.vertices, posed.transforms) - posed.vertices)
+        return garment.unpose(vertices, posed.transforms) - rest
+
+    return replace(samples, displacement=in_chunks(one, samples.displacement, samples.betas, samples.pose, size=32))
+
+
+def _borne_out(carried: Tensor, truth: Tensor, controls: Controls) -> Tensor:
+    """How much of what is carried over (N, V, 3) varies as the truth does, from 0 to 1, smoothly over the cloth, (V,).
+
+    A sleeve moves as the related garment's, a hem that is cut wider may not: least squares in each neighbourhood.
+    """
+    carried, truth = carried - carried.mean(0), truth - truth.mean(0)
+    common, own = (carried * truth).sum((0, 2)), (carried * carried).sum((0, 2))
+    field = controls.matrix()
+    near = field.clamp_min(0).T / field.clamp_min(0).sum(0)[:, None]
+    least = _DOUBT * own.mean() + torch.finfo().tiny
+    share: Tensor = (field @ ((near @ common) / (near @ own + least))).clamp(0, 1)
+    return share
+
+
+def _smooth_basis(displacement: Tensor, controls: Controls, rank: int) -> BasisDecoder:
+    """The output basis of displacements (N, V, 3) [m], of what of them is known at `controls`."""
+    field = controls.matrix()
+    smooth, triangle = torch.linalg.qr(field)
+    at = torch.einsum("vc,nvk->nck", smooth, displacement)
+    mean, components = principal_components(at, rank=rank)  # smooth's columns are orthonormal: as over all vertices
+    both = torch.cat((mean.flatten()[None], components)).view(-1, *mean.shape)
+    mean, components = torch.linalg.solve_triangular(triangle, both, upper=True).flatten(1).tensor_split((1,))
+    return BasisDecoder(mean.view(-1, 3), components, controls=controls)
 
 
 def _bodies(samples: TrainingSamples, settings: CarrySettings) -> tuple[Tensor, Tensor]:

@@ -157,23 +157,27 @@ def split_validation(samples: TrainingSamples, *, share: float, seed: int) -> tu
 
 
 def output_basis(displacement: Tensor, *, rank: int) -> BasisDecoder:
-    """The `rank` principal components of displacements (N, V, 3) [m]; of N of them there are N - 1 at most.
+    """The basis of the `rank` principal components of displacements (N, V, 3) [m]. Raises `RefuError` as they do."""
+    return BasisDecoder(*principal_components(displacement, rank=rank))
+
+
+def principal_components(values: Tensor, *, rank: int) -> tuple[Tensor, Tensor]:
+    """The mean (V, 3) and the `rank` principal components (R, 3 V) of `values` (N, V, 3); of N of them there are N - 1.
 
     Raises:
         RefuError: there are fewer than two samples.
     """
-    n = len(displacement)
+    n = len(values)
     if n < _FEWEST:
         msg = f"an output basis needs {_FEWEST} samples at least, got {n}: simulate more"
         raise RefuError(msg)
     rank = min(rank, n - 1)
-    mean = displacement.mean(0)
-    centred = (displacement - mean).flatten(1)
+    mean = values.mean(0)
+    centred = (values - mean).flatten(1)
     # The samples' products instead of the vertices': N is smaller than 3 V.
-    values, vectors = torch.linalg.eigh((centred @ centred.T).double())
-    values, vectors = values[-rank:].flip(0), vectors[:, -rank:].flip(1)
-    components = (vectors / values.clamp_min(1e-12).sqrt()).float().T @ centred
-    return BasisDecoder(mean, components)
+    found, vectors = torch.linalg.eigh((centred @ centred.T).double())
+    found, vectors = found[-rank:].flip(0), vectors[:, -rank:].flip(1)
+    return mean, (vectors / found.clamp_min(1e-12).sqrt()).float().T @ centred
 
 
 def check_dataset(dataset: GarmentDataset | GarmentSequences, body: SmplBody, garment: GarmentTemplate) -> None:

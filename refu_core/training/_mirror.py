@@ -13,7 +13,7 @@ from refu_core.body import MIRRORED_JOINTS
 from refu_core.errors import GarmentError
 from refu_core.garments import GarmentTemplate
 
-MAX_ASYMMETRY = 3e-3
+MAX_ASYMMETRY = 5e-3
 """A template that is farther from its own mirror image anywhere has none [m]."""
 
 

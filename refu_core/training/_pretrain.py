@@ -176,7 +176,7 @@ def pretrain(
 def basis_of(folder: Path, opened: TrainingSet, mirror: Mirror | None, rank: int, *, is_writer: bool) -> BasisDecoder:
     """The folder's basis, made if it isn't there."""
     if (folder / "basis.json").exists():
-        return load_basis(folder, expect=opened.identity)[0]
+        return load_basis(folder, opened.garment, expect=opened.identity)[0]
     displacement = opened.samples.displacement
     if mirror is not None:
         displacement = torch.cat((displacement, mirrored(opened.samples, mirror).displacement))

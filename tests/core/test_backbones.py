@@ -19,6 +19,7 @@ from refu_core import WeightsError, load_body, load_garment
 from refu_core.backbones import (
     TRAINABLE,
     BasisDecoder,
+    Controls,
     DenseDecoder,
     Gcnn,
     GcnnConfig,
@@ -341,6 +342,31 @@ def test_parts_of_a_basis_that_do_not_fit_are_refused(changes: dict[str, torch.T
         BasisDecoder.of_tensors(changed)
 
 
+def test_a_basis_at_controls_is_that_of_all_vertices(garment: GarmentTemplate) -> None:
+    """A field that bends no more than a garment's controls can say, stored in a hundredth of its bytes."""
+    controls = Controls.spread(garment, 40)
+    assert len(set(controls.vertices.tolist())) == 40
+    at = garment.v_template[controls.vertices.long()]
+    whole = controls(torch.stack((at, at.roll(1, 1))))
+    torch.testing.assert_close(whole[0], garment.v_template, atol=0.03, rtol=0)  # as smooth as that, not as creased
+    torch.testing.assert_close(whole[:, controls.vertices.long()], torch.stack((at, at.roll(1, 1))), atol=5e-3, rtol=0)
+    torch.testing.assert_close(controls(torch.ones(1, 40, 2)), torch.ones(1, garment.n_vertices, 2))
+    decoder = BasisDecoder(at, at.flatten()[None], controls=controls)
+    torch.testing.assert_close(decoder(torch.zeros(1, 1))[0], whole[0], atol=1e-3, rtol=0)
+    stored = decoder.tensors()
+    again = BasisDecoder.of_tensors(stored, garment)
+    assert torch.equal(again.components, decoder.components)
+    assert again.is_stored_as(stored)
+    assert not again.is_stored_as({**stored, "mean": stored["mean"] + 1})
+    with pytest.raises(WeightsError, match="say whose basis"):
+        BasisDecoder.of_tensors(stored)
+    for wrong in (stored["controls"] + garment.n_vertices, stored["controls"].float(), stored["controls"] * 0):
+        with pytest.raises(WeightsError, match="wanted controls among"):
+            BasisDecoder.of_tensors({**stored, "controls": wrong}, garment)
+    with pytest.raises(WeightsError, match="wanted a basis at 39 controls"):
+        BasisDecoder.of_tensors({**stored, "controls": stored["controls"][1:]}, garment)
+
+
 def test_a_basis_that_does_not_fit_is_refused() -> None:
     with pytest.raises(WeightsError, match=r"wanted a basis of \(R, 30\)"):
         BasisDecoder(torch.zeros(10, 3), torch.zeros(4, 33))
@@ -485,7 +511,7 @@ def test_modes_share_the_basis_and_no_other(
 ) -> None:
     write(tmp_path, nets["tailornet"], basis)
     write(tmp_path, nets["tailornet"], basis, mode="approx")
-    stored, digest = load_basis(tmp_path, expect=IDENTITY)
+    stored, digest = load_basis(tmp_path, garment, expect=IDENTITY)
     assert torch.equal(stored.components, basis.components)
     assert json.loads((tmp_path / "tailornet-approx.json").read_text())["basis_sha256"] == digest
     other = BasisDecoder(torch.zeros(garment.n_vertices, 3), basis.components.roll(1, 0))

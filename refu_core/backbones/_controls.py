@@ -1,0 +1,95 @@
+"""A smooth field over a garment, known at some of its vertices: what few samples can tell needs no more numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.csgraph import dijkstra
+from scipy.sparse.linalg import splu
+from torch import Tensor
+
+from refu_core.errors import WeightsError
+from refu_core.garments import GarmentTemplate
+from refu_core.mesh import Connectivity
+
+_HOLD = 100.0
+"""How much more a control's own value weighs than the smoothness at a vertex."""
+_NEVER_SINGULAR = 1e-9
+"""A piece of cloth without a control doesn't move."""
+
+
+@dataclass(frozen=True, eq=False)
+class Controls:
+    """Vertices of a garment whose values say those of all others: smooth, as a least-squares mesh is.
+
+    Sorkine and Cohen-Or (2004): each vertex is the mean of its neighbours, as far as the controls' values allow.
+    """
+
+    mesh: Connectivity
+    """The garment's."""
+    vertices: Tensor
+    """Which of its vertices are controls, int32, shape (C,)."""
+
+    @classmethod
+    def of(cls, garment: GarmentTemplate, vertices: Tensor) -> Controls:
+        """Of these vertices (C,). Raises `WeightsError` where they aren't vertices of the garment, each once."""
+        numbers = vertices.tolist() if vertices.ndim == 1 and not vertices.is_floating_point() else []
+        inside = bool(numbers) and 0 <= min(numbers) <= max(numbers) < garment.n_vertices
+        if not inside or len(set(numbers)) < len(numbers):
+            msg = f"wanted controls among the {garment.n_vertices} vertices of {garment.name}, each once, got "
+            msg += f"{vertices.dtype} {tuple(vertices.shape)}: get the weights again"
+            raise WeightsError(msg)
+        return cls(garment.mesh, vertices.to(torch.int32))
+
+    @classmethod
+    def spread(cls, garment: GarmentTemplate, count: int) -> Controls:
+        """`count` of them, each new one where the way along the cloth to all before it is longest."""
+        points, edges = garment.v_template.cpu().double().numpy(), garment.mesh.edges
+        graph = _matrix(edges, np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1), len(points))
+        chosen, way = [0], _ways(graph, 0)
+        while len(chosen) < min(count, len(points)):
+            chosen.append(int(way.argmax()))
+            way = np.minimum(way, _ways(graph, chosen[-1]))
+        return cls(garment.mesh, torch.tensor(chosen, dtype=torch.int32))
+
+    def __call__(self, values: Tensor) -> Tensor:
+        """The field at all vertices, float32, shape (N, V, K), of its values at the controls (N, C, K)."""
+        n_fields, n_controls, width = values.shape
+        n, at = self.mesh.n_vertices, self.vertices.numpy()
+        around = _matrix(self.mesh.edges, np.ones(len(self.mesh.edges)), n)
+        per_vertex = sparse.diags(1 / np.maximum(np.asarray(around.sum(1)).ravel(), 1))
+        bend = sparse.eye(n) - per_vertex @ around
+        hold = np.full(n, _NEVER_SINGULAR)
+        hold[at] += _HOLD
+        known = np.zeros((n, n_fields * width))
+        known[at] = _HOLD * values.detach().cpu().double().numpy().transpose(1, 0, 2).reshape(n_controls, -1)
+        # Symmetric, and positive: that is told, or the factors are several times as large.
+        solver = splu(
+            (bend.T @ bend + sparse.diags(hold)).tocsc(),
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        )
+        field = torch.from_numpy(solver.solve(known)).float()
+        return field.view(n, n_fields, width).transpose(0, 1).contiguous()
+
+    def matrix(self) -> Tensor:
+        """What each control is worth at each vertex, shape (V, C)."""
+        return self(torch.eye(len(self.vertices))[None])[0]
+
+
+def _matrix(edges: NDArray[np.int32], values: NDArray[np.float64], n: int) -> sparse.csr_matrix:
+    """Symmetric, with a value an edge, shape (n, n)."""
+    first, second = edges.T
+    rows, columns = np.concatenate((first, second)), np.concatenate((second, first))
+    return sparse.csr_matrix((np.concatenate((values, values)), (rows, columns)), (n, n))
+
+
+def _ways(graph: sparse.csr_matrix, start: int) -> NDArray[np.float64]:
+    """How far all vertices are from one along the cloth [m]; those of other pieces farther than any."""
+    way: NDArray[np.float64] = np.nan_to_num(dijkstra(graph, indices=[start])[0], posinf=1e9)
+    return way
