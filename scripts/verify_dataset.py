@@ -37,7 +37,8 @@ from refu_core.simulation import colliders
 from refu_core.simulation._drape import comfort_poses
 
 F64 = NDArray[np.float64]
-MOST_STRETCH = 1.15
+MOST_EASE = 1.15
+"""How much longer an edge may be cut where raised arms need it."""
 Place = tuple[Path, int, int]
 """Shard, row, and frame of a sequence (-1 in a set of samples)."""
 
@@ -58,17 +59,24 @@ class Verdict:
     """Pairs of the garment's triangles, without a common vertex, that intersect."""
     stretch: float
     """99.9th percentile over the edges."""
+    most_stretch: float
+    """What the set's card allows."""
 
     @property
     def is_good(self) -> bool:
         """Nothing against it."""
-        return not (self.body_pairs or self.inside or self.self_pairs) and self.stretch <= MOST_STRETCH
+        return not (self.body_pairs or self.inside or self.self_pairs) and not self.is_stretched
+
+    @property
+    def is_stretched(self) -> bool:
+        """More than the set allows."""
+        return self.stretch > self.most_stretch
 
 
 class Judge:
     """Judges garments of one kind on one body."""
 
-    def __init__(self, garment: str, body: str, gap: float) -> None:
+    def __init__(self, garment: str, body: str, gap: float, most_stretch: float) -> None:
         self._garment = load_garment(garment)
         self._body = load_body(body)
         self._collider = Collider(self._body, gap=gap)
@@ -76,6 +84,7 @@ class Judge:
         self._body_faces = self._body.faces.numpy().astype(np.int64)
         self._edges = self._garment.mesh.edges
         self._lengths: tuple[bytes, F64] | None = None
+        self._most_stretch = most_stretch
 
     def judge(self, place: str, slot: int, vertices: F64, pose: Any, betas: Any, style: Any) -> Verdict:
         """One garment (N, 3) [m] on the collider of this pose (24, 3), shape (10,) and style (4,)."""
@@ -91,6 +100,7 @@ class Judge:
             clearance_mm=float(1e3 * distance[0].min()),
             self_pairs=self_intersections(vertices, self._faces),
             stretch=float(np.percentile(length / self._rest_lengths(shape, np.array(style)), 99.9)),
+            most_stretch=self._most_stretch,
         )
 
     def _rest_lengths(self, shape: torch.Tensor, style: NDArray[np.float32]) -> F64:
@@ -102,7 +112,7 @@ class Judge:
             eased = self._garment.pose(rest.expand(len(poses), -1, -1), self._body(poses, shape).transforms)
             both = torch.cat((rest, eased)).numpy().astype(np.float64)
             length = np.linalg.norm(both[:, self._edges[:, 0]] - both[:, self._edges[:, 1]], axis=-1)
-            self._lengths = key, np.clip(length.max(0), length[0], MOST_STRETCH * length[0])
+            self._lengths = key, np.clip(length.max(0), length[0], MOST_EASE * length[0])
         return self._lengths[1]
 
 
@@ -174,9 +184,9 @@ def places(directory: Path, card: dict[str, Any]) -> list[Place]:
 
 
 @cache
-def _judge(garment: str, body: str, gap: float) -> Judge:
+def _judge(garment: str, body: str, gap: float, most_stretch: float) -> Judge:
     torch.set_num_threads(1)
-    return Judge(garment, body, gap)
+    return Judge(garment, body, gap, most_stretch)
 
 
 @cache
@@ -186,7 +196,7 @@ def _columns(shard: Path) -> dict[str, Any]:
     }
 
 
-def _verdict(task: tuple[Place, tuple[str, str, float], float]) -> Verdict:
+def _verdict(task: tuple[Place, tuple[str, str, float, float], float]) -> Verdict:
     (shard, row, frame), judged_by, quantum = task
     column = _columns(shard)
     at = (row,) if frame < 0 else (row, frame)
@@ -204,7 +214,8 @@ def verdicts(directory: Path, *, body: str | None = None, processes: int = 1, ev
     body = body or load_garment(card["garment"]).body
     if load_body(body).fingerprint != card["body_fingerprint"]:
         sys.exit(f"{directory}: made for another body than {body!r}: name its file as --body")
-    judged_by = (card["garment"], body, float(card["settings"]["drape"]["gap"]))
+    settings = card["settings"]
+    judged_by = (card["garment"], body, float(settings["drape"]["gap"]), float(settings["selection"]["stretch"]))
     tasks = [(place, judged_by, float(card["quantum_m"])) for place in places(directory, card)[::every]]
     bar = tqdm(total=len(tasks), unit="garment", disable=None)
     if processes == 1:
@@ -225,7 +236,7 @@ def summary(found: list[Verdict]) -> dict[str, Any]:
         "with_body_pairs": sum(v.body_pairs > 0 for v in found),
         "with_vertices_inside": sum(v.inside > 0 for v in found),
         "with_self_intersections": sum(v.self_pairs > 0 for v in found),
-        "stretched": sum(v.stretch > MOST_STRETCH for v in found),
+        "stretched": sum(v.is_stretched for v in found),
         "smallest_clearance_mm": min((v.clearance_mm for v in found), default=None),
         "stretch_p999_median": float(np.median([v.stretch for v in found])) if found else None,
         "stretch_p999_largest": max((v.stretch for v in found), default=None),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,6 +25,8 @@ def simulate_dataset(
     seed: int = 0,
     engine: Engine | None = None,
     test_share: float = 1 / 6,
+    recorded_share: float = SamplePlan.recorded_share,
+    pivots: int = SamplePlan.pivots,
     settings: SimulationSettings | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> dict[str, Any]:
@@ -43,6 +44,8 @@ def simulate_dataset(
         seed: of everything that is drawn.
         engine: what shares the work among processes (`refu_lab.fleet.open_engine`); None for this one alone.
         test_share: share of the samples that is kept for the test.
+        recorded_share: share of the poses that are frames of the motions; the others are drawn.
+        pivots: style-shape pairs that half of the training samples share.
         settings: of simulation and selection.
         progress: called in this process after each slot.
 
@@ -58,10 +61,9 @@ def simulate_dataset(
     """
     output = Path(output)
     clips: tuple[list[Clip], list[Clip]] = ([], [])
-    plan = SamplePlan(garment, count, seed=seed, test_share=test_share)
-    if motions is None:
-        plan = replace(plan, recorded_share=0.0)
-    else:
+    recorded_share = 0.0 if motions is None else recorded_share
+    plan = SamplePlan(garment, count, seed=seed, test_share=test_share, recorded_share=recorded_share, pivots=pivots)
+    if motions is not None:
         clips = split_clips(as_clips(motions))
     make = partial(SlotSimulator, plan, clips, settings or SimulationSettings(), body)
     produce(make, output, engine=engine, progress=progress)
