@@ -62,7 +62,7 @@ class CarrySettings:
     rank: int = 48
     """Components of the output basis. 64 give a T-shirt .1 mm, and a third more bytes."""
     controls: int = 200
-    """Vertices at which the basis is stored."""
+    """Vertices at which the basis is stored. 150 and 600 are .1 mm worse and better."""
     hidden: tuple[int, ...] = (128, 128)
     """Layers of the net that learns what was carried over."""
     poses: int = 4000
@@ -71,13 +71,13 @@ class CarrySettings:
     reach: float = 0.05
     """Cloth that is nearer than this to the related garment, both in the T-pose, is moved as that is [m]."""
     fade: float = 0.05
-    """Way farther in which that ends [m]. Trousers whose legs hear of shorts 60 mm away are 13.0 mm off, not 10.5."""
+    """Way farther in which that ends [m]. A dress that hears of a skirt up to 45 mm away is 24 mm off, not 18."""
     hem: float = 0.12
     """The related garment's hem is felt less and less within this of it [m], where the other garment goes on."""
     jitter: float = 0.15
     """Standard deviation by which poses of the set are varied [rad]."""
     ridge: float = 10.0
-    """Weight of the square of the linear part's coefficients. 3 and 30 are .3 mm worse at most."""
+    """Weight of the square of the linear part's coefficients. With 3 and 30 it is .6 mm worse at most, or better."""
 
     def __post_init__(self) -> None:
         """Raises `RefuError` for sizes that make no network."""
