@@ -11,6 +11,7 @@ from refu_core.training._mirror import Mirror, mirror_pose
 from refu_core.training._pretrain import PretrainSettings, pretrain
 from refu_core.training._progress import TrainingLog
 from refu_core.training._sdf import SdfSettings, train_sdf
+from refu_core.training._sharpen import in_new_codes, next_gains, orthonormal, sharpened
 
 __all__ = [
     "FINETUNE_MODES",
@@ -28,8 +29,11 @@ __all__ = [
     "collision_loss",
     "displacements",
     "finetune",
+    "in_new_codes",
     "load_checkpoint",
     "mirror_pose",
+    "next_gains",
+    "orthonormal",
     "output_basis",
     "posed_errors",
     "pretrain",
@@ -37,6 +41,7 @@ __all__ = [
     "reconstruction_loss",
     "refu_loss",
     "save_checkpoint",
+    "sharpened",
     "split_validation",
     "train_sdf",
 ]
