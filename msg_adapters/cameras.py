@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from msg_adapters.cdr import CdrReader
+from msg_adapters.cdr import Buffer, CdrReader
 from msg_adapters.errors import DecodeError
-
-if TYPE_CHECKING:
-    from msg_adapters.cdr import Buffer
 
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 

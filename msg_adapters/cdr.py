@@ -7,16 +7,13 @@ to its size, counted from the start of the payload.
 from __future__ import annotations
 
 import struct
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from msg_adapters.errors import DecodeError, EncodeError
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
 
 Buffer = bytes | bytearray | memoryview
 

@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from msg_adapters.cdr import CdrReader
-
-if TYPE_CHECKING:
-    from msg_adapters.cdr import Buffer
+from msg_adapters.cdr import Buffer, CdrReader
 
 IDS_LIST = "hri_msgs/msg/IdsList"
 _MIN_STRING_BYTES = 4

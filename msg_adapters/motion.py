@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 
@@ -11,13 +12,7 @@ from msg_adapters.cdr import NS_PER_S
 from msg_adapters.errors import MotionFileError
 from msg_adapters.rotations import quaternion_from_rotvec, rotvec_from_quaternion, slerp
 from refu_core.frames import N_JOINTS, SmplFrame
-from refu_core.recordings import MAX_FRAMES, Recording, n_resampled, read_recording
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from refu_core.recordings import Axes
+from refu_core.recordings import MAX_FRAMES, Axes, Recording, n_resampled, read_recording
 
 _BLOCK = 10_000  # frames that are resampled at once: a clip of hours would take gigabytes
 

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from numpy.typing import ArrayLike
 
+from msg_adapters.cdr import Buffer
 from msg_adapters.errors import DecodeError
 from msg_adapters.inputs import KEYPOINT_TYPES, decode_keypoints
-from refu_core.keypoints import LAYOUTS, People, Skeleton, TrackerSettings, keypoint_layout
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from msg_adapters.cdr import Buffer
-    from refu_core.frames import SmplFrame
-    from refu_core.keypoints import Proportions
+from refu_core.frames import SmplFrame
+from refu_core.keypoints import LAYOUTS, People, Proportions, Skeleton, TrackerSettings, keypoint_layout
 
 
 class KeypointStream:

@@ -5,18 +5,13 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from msg_adapters.cdr import CdrReader, CdrWriter
+from msg_adapters.cdr import Buffer, CdrReader, CdrWriter
 from msg_adapters.errors import TransformError
 from msg_adapters.rotations import matrix_from_quaternion, slerp
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
-
-    from msg_adapters.cdr import Buffer
 
 TF_MESSAGE = "tf2_msgs/msg/TFMessage"
 HISTORY_NS = 10 * 10**9

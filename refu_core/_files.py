@@ -11,10 +11,9 @@ import math
 import os
 import stat
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from refu_core.errors import RefuError
+from refu_core.errors import RefuError
 
 MAX_JSON_BYTES = 4 << 20
 """What a card or a table takes at most; parsed, it may take a hundred times as much."""

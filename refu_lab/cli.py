@@ -6,19 +6,16 @@ import os
 import signal
 import sys
 import traceback
-from typing import TYPE_CHECKING
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # NumPy reads it; its threads wait for busy cores
+
+from collections.abc import Sequence
+from types import FrameType
 
 from refu_core import RefuError, __version__
 from refu_core.errors import printable
 from refu_lab.commands import COMMANDS
 from refu_lab.commands._common import EXIT_BAD_INPUT, EXIT_BUG, EXIT_CHECK_FAILED, EXIT_INTERRUPTED, Parser
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from types import FrameType
-
 
 _OF_LAB = ("matplotlib", "PIL", "tqdm")
 """Packages of the extra `lab`; others that may be missing are of `train`."""

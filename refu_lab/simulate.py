@@ -5,20 +5,17 @@ from __future__ import annotations
 import sys
 from collections import Counter
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 from tqdm import tqdm
 
 from refu_core._engine import Engine
+from refu_core.recordings import Axes
 from refu_core.simulation import GarmentDataset, Progress, load_clips, simulate_dataset, simulate_sequences
 from refu_lab.contact_sheet import contact_sheet
 from refu_lab.render import save_png
 from refu_lab.tables import format_table
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from refu_core.recordings import Axes
 
 SHEET = "samples.png"
 """Random samples of a finished set, to look at before anything is trained on it."""

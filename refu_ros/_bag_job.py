@@ -10,18 +10,15 @@ import subprocess
 import sys
 import tempfile
 import threading
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from refu_core import RefuError
 from refu_core.errors import printable
 from refu_core.modes import BetasSource
 from refu_ros._dresser import NICE
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from refu_ros._settings import NodeSettings
+from refu_ros._settings import NodeSettings
 
 _PATIENCE_S = 10.0
 """Time for a bag to be closed when its replay is ended [s]."""

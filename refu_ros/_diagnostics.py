@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import math
 import socket
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from msg_adapters import DiagnosticStatus
+from msg_adapters.bags import RecorderState
 from msg_adapters.diagnostics import ERROR, OK, WARN
 from refu_core.modes import FOREIGN_BETAS
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from msg_adapters.bags import RecorderState
-    from refu_ros._settings import NodeSettings, PipelineKey
-    from refu_ros._statistics import Report
+from refu_ros._settings import NodeSettings, PipelineKey
+from refu_ros._statistics import Report
 
 _OVER_BUDGET = 0.1
 """Share of the frames that may be superseded before they are worked on."""

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import threading
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from refu_core import GarmentPipeline
-    from refu_ros._settings import PipelineKey
+from refu_core import GarmentPipeline
+from refu_ros._settings import PipelineKey
 
 
 class PipelineLoader:

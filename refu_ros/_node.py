@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
@@ -12,7 +12,7 @@ from rclpy.node import SetParametersResult
 
 import msg_adapters as adapters
 from msg_adapters.outputs import GARMENTS, make_outputs
-from refu_core import RefuError
+from refu_core import GarmentPipeline, RefuError
 from refu_core.errors import printable
 from refu_core.outputs import Fittings
 from refu_ros._bank import QOS, Bank
@@ -25,12 +25,8 @@ from refu_ros._parameters import declare_settings
 from refu_ros._recording import Recording
 from refu_ros._requests import Requests
 from refu_ros._scene import Scene
-from refu_ros._settings import specs
+from refu_ros._settings import PipelineKey, specs
 from refu_ros._worker import Worker
-
-if TYPE_CHECKING:
-    from refu_core import GarmentPipeline
-    from refu_ros._settings import PipelineKey
 
 NODE_NAME = "garment_node"
 DIAGNOSTICS_TOPIC = "/diagnostics"

@@ -4,25 +4,21 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
 
 from msg_adapters import INPUT_TYPES, KEYPOINT_TYPES, POINT_FIELDS, InputAxes, InputType
-from refu_core import GarmentPipeline, RefuError, SmplFrame, load_garment
+from refu_core import GarmentPipeline, GarmentTemplate, RefuError, SmplFrame, load_garment
 from refu_core._device import checked_device
 from refu_core.frames import N_JOINTS
 from refu_core.keypoints import LAYOUTS
 from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN, MAX_MARGIN, BackboneName, BetasSource, SdfMode
 from refu_core.weights import weights_folder
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from refu_core import GarmentTemplate
 
 _PERSON = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,99}")
 _FRAME = re.compile(r"[^/\s\x00-\x1f\x7f][^\s\x00-\x1f\x7f]{0,254}")

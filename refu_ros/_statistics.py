@@ -5,15 +5,12 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter, deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from refu_core.errors import printable
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 _WINDOW = 1000
 """Latencies that percentiles are taken of."""

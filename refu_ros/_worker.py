@@ -4,29 +4,24 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 import torch
 
 from msg_adapters import Placement
 from msg_adapters.axes import SMPL_COLUMNS
-from msg_adapters.outputs import Moment, make_outputs
-from refu_core import RefuError
+from msg_adapters.outputs import Moment, Output, make_outputs
+from refu_core import GarmentPipeline, RefuError, SmplFrame
 from refu_core._device import is_device_loss
 from refu_core.modes import BetasSource
 from refu_core.outputs import Dressed, Fittings
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-
-    from msg_adapters.outputs import Output
-    from refu_core import GarmentPipeline, SmplFrame
-    from refu_core.realtime import PipelineOutput
-    from refu_ros._scene import Arrival, Scene
-    from refu_ros._settings import NodeSettings
-    from refu_ros._statistics import Statistics
+from refu_core.realtime import PipelineOutput
+from refu_ros._scene import Arrival, Scene
+from refu_ros._settings import NodeSettings
+from refu_ros._statistics import Statistics
 
 _IDLE_S = 0.1
 """How often the thread looks for persons who have left when nobody sends [s]."""

@@ -6,15 +6,14 @@ import os
 import sys
 import threading
 import time
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # NumPy reads it; its threads wait for busy cores
 
+from collections.abc import Callable, Sequence
+
 from refu_ros._program import EXIT_BAD_INPUT, make_executor, on_signals, run, spin
 from refu_ros._transport import make_room
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
 
 EXIT_DEVICE_LOST = 3
 _LAST_WORDS_S = 0.3

@@ -7,27 +7,24 @@ import sys
 import threading
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # NumPy reads it; its threads wait for busy cores
+
+from collections.abc import Sequence
 
 import numpy as np
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from msg_adapters import INPUT_TYPES, BagError, Motion, encoder_for, iter_smpl_frames, read_motion
+from msg_adapters import INPUT_TYPES, BagError, Encoder, InputType, Motion, encoder_for, iter_smpl_frames, read_motion
 from msg_adapters.march import MARCH_FPS, march
 from refu_core import FrameError, RefuError, SmplFrame
 from refu_core.recordings import SUFFIXES, Axes
 from refu_ros._guard import GuardedNode
 from refu_ros._interfaces import interface
 from refu_ros._program import make_executor, on_signals, run, spin
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from msg_adapters import Encoder, InputType
 
 TOPIC = "smpl_params"
 

@@ -6,25 +6,19 @@ other joints (a jaw, fingers) are ignored; `velocity` and `effort` aren't read.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from msg_adapters.cdr import CdrReader, CdrWriter
+from msg_adapters.cdr import Buffer, CdrReader, CdrWriter
 from msg_adapters.errors import DecodeError
 from msg_adapters.inputs import _ros4hri
 from msg_adapters.inputs._frame import decoding, reading_fields, smpl_frame, stamp_ns_of
 from msg_adapters.joints import SMPL_JOINTS
-from refu_core.frames import N_BETAS
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    from msg_adapters.cdr import Buffer
-    from refu_core.frames import SmplFrame
+from refu_core.frames import N_BETAS, SmplFrame
 
 MESSAGE_TYPE = "sensor_msgs/msg/JointState"
 _POSE_NAMES = tuple(f"{joint}_{axis}" for joint in SMPL_JOINTS for axis in "xyz")

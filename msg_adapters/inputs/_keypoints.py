@@ -9,23 +9,17 @@ is NaN, or exactly zero in all of x, y, z.
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from msg_adapters.cdr import CdrReader
+from msg_adapters.cdr import Buffer, CdrReader
 from msg_adapters.errors import DecodeError
 from msg_adapters.inputs._frame import decoding
-from msg_adapters.markers import MARKER_ARRAY, decode_marker_array
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from msg_adapters.cdr import Buffer
-    from msg_adapters.markers import Marker
+from msg_adapters.markers import MARKER_ARRAY, Marker, decode_marker_array
 
 KeypointType = Literal["keypoint_poses", "keypoint_markers"]
 

@@ -7,21 +7,16 @@ numbers after the one before it (0 stands for its size), the first one at `layou
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from msg_adapters.cdr import CdrReader, CdrWriter
+from msg_adapters.cdr import Buffer, CdrReader, CdrWriter
 from msg_adapters.errors import DecodeError
 from msg_adapters.inputs._frame import decoding, reading_fields, smpl_frame
 from refu_core.frames import N_BETAS, N_JOINTS, N_STYLES, SmplFrame
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from msg_adapters.cdr import Buffer
 
 MESSAGE_TYPE = "std_msgs/msg/Float32MultiArray"
 _SIZES = {"pose": N_JOINTS * 3, "betas": N_BETAS, "transl": 3, "style": N_STYLES}

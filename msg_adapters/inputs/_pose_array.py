@@ -5,22 +5,17 @@ The other positions aren't read (bone lengths come from the betas, which this ty
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from msg_adapters.cdr import CdrReader, CdrWriter
+from msg_adapters.cdr import Buffer, CdrReader, CdrWriter
 from msg_adapters.errors import DecodeError
 from msg_adapters.inputs._frame import decoding, reading_fields, smpl_frame, stamp_ns_of
 from msg_adapters.joints import SMPL_JOINTS
 from msg_adapters.rotations import quaternion_from_rotvec, rotvec_from_quaternion
-from refu_core.frames import N_JOINTS
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from msg_adapters.cdr import Buffer
-    from refu_core.frames import SmplFrame
+from refu_core.frames import N_JOINTS, SmplFrame
 
 MESSAGE_TYPE = "geometry_msgs/msg/PoseArray"
 _POSE_NUMBERS = 7  # position xyz, orientation xyzw

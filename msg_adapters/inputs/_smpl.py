@@ -7,23 +7,17 @@ precision of the arrays; only the names and sizes are relied on.
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from msg_adapters.cdr import CdrReader, CdrWriter
+from msg_adapters.cdr import Buffer, CdrReader, CdrWriter
 from msg_adapters.definitions import message_definition
 from msg_adapters.errors import DecodeError
 from msg_adapters.inputs._frame import decoding, reading_fields, smpl_frame, stamp_ns_of
-from refu_core.frames import N_BETAS, N_JOINTS
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from numpy.typing import NDArray
-
-    from msg_adapters.cdr import Buffer
-    from refu_core.frames import SmplFrame
+from refu_core.frames import N_BETAS, N_JOINTS, SmplFrame
 
 MESSAGE_TYPE = "smpl_msgs/msg/Smpl"
 _SIZES = {"global_orient": 3, "body_pose": (N_JOINTS - 1) * 3, "betas": N_BETAS, "transl": 3}

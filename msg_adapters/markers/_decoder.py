@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from msg_adapters.cdr import CdrReader
+from msg_adapters.cdr import Buffer, CdrReader
 from msg_adapters.errors import DecodeError
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from msg_adapters.cdr import Buffer
 
 _MIN_MARKER_BYTES = 180
 

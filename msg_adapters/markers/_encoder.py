@@ -7,23 +7,17 @@ of all triangle corners straight into the message's bytes takes a fraction of on
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from msg_adapters.axes import SMPL_COLUMNS
+from msg_adapters.axes import SMPL_COLUMNS, InputAxes
 from msg_adapters.cdr import HEADER_BYTES, CdrWriter, split_stamp
 from msg_adapters.errors import EncodeError
-from msg_adapters.markers._mesh import CLOTH, Rgba, numbers
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import ArrayLike, NDArray
-
-    from msg_adapters.axes import InputAxes
-    from msg_adapters.markers._mesh import MarkerMesh
+from msg_adapters.markers._mesh import CLOTH, MarkerMesh, Rgba, numbers
 
 MARKER_ARRAY = "visualization_msgs/msg/MarkerArray"
 

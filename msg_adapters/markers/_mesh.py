@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from msg_adapters.errors import EncodeError
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 Rgba = tuple[float, float, float, float]
 CLOTH: Rgba = (0.55, 0.63, 0.75, 1.0)

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from msg_adapters.cdr import CdrWriter
 from msg_adapters.errors import EncodeError
 from msg_adapters.rotations import quaternion_from_matrix
 from msg_adapters.transforms import Placement
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
 
 MESH = "shape_msgs/msg/Mesh"
 COLLISION_OBJECT = "moveit_msgs/msg/CollisionObject"

@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from msg_adapters.cdr import HEADER_BYTES, CdrReader, CdrWriter, split_stamp
+from msg_adapters.cdr import HEADER_BYTES, Buffer, CdrReader, CdrWriter, split_stamp
 from msg_adapters.errors import DecodeError, EncodeError
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
-
-    from msg_adapters.cdr import Buffer
 
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 PointField = Literal["normal", "clearance", "sigma", "vertex", "garment", "visible"]

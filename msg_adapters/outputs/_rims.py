@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from msg_adapters.cdr import CdrWriter
 from msg_adapters.errors import EncodeError
 from msg_adapters.markers import encode_strips
 from msg_adapters.rotations import quaternion_from_matrix
 from msg_adapters.transforms import Transform, encode_transforms
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
 
 POLYGON = "geometry_msgs/msg/PolygonStamped"
 

@@ -4,17 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from msg_adapters.cdr import CdrWriter
 from msg_adapters.errors import EncodeError
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from msg_adapters.markers import MarkerMesh
+from msg_adapters.markers import MarkerMesh
 
 SCENE_UPDATE = "foxglove_msgs/msg/SceneUpdate"
 _MATCHING_ID = 0

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
-from refu_core.body import JOINT_NAMES, blend_transforms, unapply_transforms
+from refu_core.body import JOINT_NAMES, SmplBody, blend_transforms, unapply_transforms
 from refu_core.errors import GarmentError
 from refu_core.fitting._clean import MAX_VERTICES, clean, components, face_normals, split_long_edges, turned_over
+from refu_core.fitting._mesh_file import SurfaceMesh
 from refu_core.fitting._pieces import unsewn, without_bodies
 from refu_core.fitting._place import Place, Placing, find_places
 from refu_core.fitting._posed import PosedBody
@@ -19,14 +20,8 @@ from refu_core.frames import N_BETAS, N_JOINTS
 from refu_core.garments import GarmentCard, GarmentTemplate
 from refu_core.mesh import Connectivity
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from refu_core.body import SmplBody
-    from refu_core.fitting._mesh_file import SurfaceMesh
-
-    F64 = NDArray[np.float64]
-    Ints = NDArray[np.int64]
+F64 = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 HOLDS: tuple[str, ...] = ("waist", "shoulders")
 LONGEST_EDGE = 0.02

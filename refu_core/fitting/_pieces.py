@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from refu_core.body import JOINT_NAMES
 from refu_core.errors import GarmentError
 from refu_core.fitting._clean import components, rim_of
 from refu_core.fitting._mesh_file import SurfaceMesh
+from refu_core.fitting._posed import PosedBody
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from refu_core.fitting._posed import PosedBody
-
-    F64 = NDArray[np.float64]
+F64 = NDArray[np.float64]
 
 _ENDS = tuple(JOINT_NAMES.index(name) for name in ("head", "left_hand", "right_hand", "left_foot", "right_foot"))
 _ON_SKIN = 0.02

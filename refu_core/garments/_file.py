@@ -5,10 +5,11 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from refu_core._npz import read_npz
 from refu_core.body import BUILTIN_BODIES
@@ -18,9 +19,6 @@ from refu_core.garments._card import GarmentCard, card_to_json, json_to_card
 from refu_core.garments._registry import garment_files
 from refu_core.garments._template import GarmentTemplate, UvMap
 from refu_core.mesh import check_faces
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 _ARRAYS = ("v_template", "f", "weights", "shapedirs")
 _UV = ("uv", "uv_f")

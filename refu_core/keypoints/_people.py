@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from numpy.typing import ArrayLike
 
+from refu_core.frames import SmplFrame
+from refu_core.keypoints._pose import Skeleton
 from refu_core.keypoints._settings import DEFAULTS, TrackerSettings
 from refu_core.keypoints._tracker import KeypointTracker
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from refu_core.frames import SmplFrame
-    from refu_core.keypoints._pose import Skeleton
 
 _MOST = 64
 """People who are followed at once; whose keypoints haven't come for longest is forgotten."""

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
 from refu_core.frames import N_BETAS, N_JOINTS
 from refu_core.keypoints._anatomy import resting
 from refu_core.keypoints._pose import Pose, Skeleton, log_so3, skew
+from refu_core.keypoints._settings import TrackerSettings
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from refu_core.keypoints._settings import TrackerSettings
-
-    Array = NDArray[np.float64]
+Array = NDArray[np.float64]
 
 N_PARTS = 3 + 3 * N_JOINTS + N_BETAS
 TURNS, BETAS = slice(3, 3 + 3 * N_JOINTS), slice(3 + 3 * N_JOINTS, N_PARTS)

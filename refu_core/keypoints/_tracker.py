@@ -8,9 +8,10 @@ seen goes on for a while and then comes to rest, and how much a keypoint moves t
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from refu_core.errors import FrameError
 from refu_core.frames import N_BETAS, N_JOINTS, SmplFrame
@@ -19,10 +20,7 @@ from refu_core.keypoints._pose import Pose, Skeleton, exp_so3, log_so3
 from refu_core.keypoints._settings import DEFAULTS, TrackerSettings
 from refu_core.keypoints._solver import BETAS, MEAN, N_PARTS, SPREAD, Solution, solve
 
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
-
-    Array = NDArray[np.float64]
+Array = NDArray[np.float64]
 
 
 class _Seen(NamedTuple):

@@ -8,17 +8,15 @@ import math
 import os
 import re
 import stat
+from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 from refu_core import RefuError
 from refu_core.errors import printable
 from refu_core.keypoints import LAYOUTS
 from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN, BackboneName
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 Number = TypeVar("Number", int, float)
 

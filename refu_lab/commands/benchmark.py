@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from refu_lab.commands._common import (
     EXIT_INTERRUPTED,
@@ -18,9 +19,6 @@ from refu_lab.commands._common import (
     positive,
     write_json,
 )
-
-if TYPE_CHECKING:
-    import argparse
 
 
 def add(commands: Any) -> None:

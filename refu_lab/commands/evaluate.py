@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import argparse
+from typing import Any
 
 from refu_lab.commands._cluster import add_cluster, place
 from refu_lab.commands._common import (
@@ -18,9 +19,6 @@ from refu_lab.commands._common import (
     write_json,
 )
 from refu_lab.tables import RESULT_TABLES
-
-if TYPE_CHECKING:
-    import argparse
 
 
 def add(commands: Any) -> None:

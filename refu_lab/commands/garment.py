@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import argparse
+from typing import Any
 
 from refu_lab.commands._common import (
     add_common,
@@ -15,9 +16,6 @@ from refu_lab.commands._common import (
     word,
     write_json,
 )
-
-if TYPE_CHECKING:
-    import argparse
 
 
 def add(commands: Any) -> None:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import argparse
+from typing import Any
 
 from refu_lab.commands._common import add_common, write_json
-
-if TYPE_CHECKING:
-    import argparse
 
 
 def add(commands: Any) -> None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from refu_core import RefuError
 from refu_lab.commands._cluster import add_cluster, place, place_for
@@ -21,9 +22,6 @@ from refu_lab.commands._common import (
     word,
     write_json,
 )
-
-if TYPE_CHECKING:
-    import argparse
 
 
 def add(commands: Any) -> None:

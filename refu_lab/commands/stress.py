@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from refu_core.modes import PAPER_GARMENTS
 from refu_lab.commands._common import (
@@ -20,9 +21,6 @@ from refu_lab.commands._common import (
     seed,
     write_json,
 )
-
-if TYPE_CHECKING:
-    import argparse
 
 
 def add(commands: Any) -> None:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from refu_lab.commands._common import add_pipeline, add_recording, given, in_path, port, word
-
-if TYPE_CHECKING:
-    import argparse
 
 
 def add(commands: Any) -> None:
