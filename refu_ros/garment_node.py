@@ -6,11 +6,10 @@ import os
 import sys
 import threading
 import time
+from collections.abc import Callable, Sequence
 from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # NumPy reads it; its threads wait for busy cores
-
-from collections.abc import Callable, Sequence
 
 from refu_ros._program import EXIT_BAD_INPUT, make_executor, on_signals, run, spin
 from refu_ros._transport import make_room

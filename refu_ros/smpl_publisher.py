@@ -5,13 +5,12 @@ from __future__ import annotations
 import os
 import sys
 import threading
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # NumPy reads it; its threads wait for busy cores
-
-from collections.abc import Sequence
 
 import numpy as np
 from rcl_interfaces.msg import ParameterDescriptor
