@@ -136,7 +136,7 @@ class Worker:
             return
         if not self._outlet.is_watched():
             for _ in arrivals:
-                self._statistics.skip("unwatched")
+                self._statistics.count("skip.unwatched")
             return
         frames = {person: with_settings(arrival.frame, settings) for person, arrival in arrivals.items()}
         found, unresolved = self._dress(frames)
@@ -153,7 +153,7 @@ class Worker:
         for person, arrival in arrivals.items():
             place = arrival.placement.rotation @ arrival.frame.transl + arrival.placement.translation
             if settings.max_distance and np.linalg.norm(place) > settings.max_distance:
-                self._statistics.skip("distance")
+                self._statistics.count("skip.distance")
                 self._remove([person])
             else:
                 near[person] = arrival
@@ -165,7 +165,7 @@ class Worker:
         for person, frame in frames.items():
             known = self._dressed.get(person)
             if known is not None and known.inputs == _inputs(frame):
-                self._statistics.skip("unchanged")
+                self._statistics.count("skip.unchanged")
             else:
                 todo[person] = frame
                 self._dressed.pop(person, None)
@@ -179,7 +179,7 @@ class Worker:
             unresolved += sum(stats.n_unresolved for stats in output.stats.garments.values())
             self._statistics.shift(output.stats.shift.largest)
             if not output.stats.within_promise:
-                self._statistics.beyond_promise()
+                self._statistics.count("beyond_promise")
         return found, unresolved
 
     def _infer(self, frames: Mapping[str, SmplFrame]) -> dict[str, PipelineOutput]:

@@ -11,6 +11,7 @@ from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # NumPy reads it; its threads wait for busy cores
 
+from refu_ros._parameters import listing
 from refu_ros._program import EXIT_BAD_INPUT, make_executor, on_signals, run, spin
 from refu_ros._transport import make_room
 
@@ -39,10 +40,9 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _listing() -> str:
-    from refu_ros._settings import defaults, specs
+    from refu_ros._settings import NodeSettings
 
-    lines = [f"  {name:<16}{spec.description} Default: {defaults()[name]!r}" for name, spec in specs().items()]
-    return "\n".join(["parameters:", *lines, _TOPICS])
+    return f"{listing(NodeSettings)}\n{_TOPICS}"
 
 
 def _live() -> int:

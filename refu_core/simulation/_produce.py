@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -17,9 +17,7 @@ from refu_core._engine import Engine, InProcess, Lost
 from refu_core.simulation._errors import SimulationError
 from refu_core.simulation._selection import CAUSES
 from refu_core.simulation._store import QUANTUM, TO_DO, locked, read_card, write_card
-
-if TYPE_CHECKING:
-    from refu_core.simulation._worker import Simulator
+from refu_core.simulation._worker import Simulator
 
 
 @dataclass(frozen=True)
