@@ -11,8 +11,7 @@ _MIN_STRING_BYTES = 4
 def decode_ids(data: Buffer) -> list[str]:
     """The ids of a `hri_msgs/IdsList` in CDR. Raises `DecodeError` for anything that isn't one."""
     reader = CdrReader(data)
-    reader.stamp_ns()
-    reader.string()
+    reader.fields("Ts")
     ids = [reader.string() for _ in range(reader.length(item_bytes=_MIN_STRING_BYTES))]
     reader.finish()
     return ids

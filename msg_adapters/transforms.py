@@ -38,10 +38,9 @@ class Transform:
 def encode_transforms(transforms: Sequence[Transform]) -> bytes:
     """A `tf2_msgs/TFMessage`. Raises `EncodeError` for a stamp that doesn't fit a ROS time."""
     writer = CdrWriter()
-    writer.numbers("I", len(transforms))
+    writer.fields("I", len(transforms))
     for one in transforms:
-        writer.header(one.stamp_ns, one.parent)
-        writer.string(one.child)
+        writer.fields("Tss", one.stamp_ns, one.parent, one.child)
         writer.array("f8", one.translation)
         writer.array("f8", one.quaternion)
     return writer.to_bytes()
@@ -52,7 +51,7 @@ def decode_transforms(data: Buffer) -> list[Transform]:
     reader = CdrReader(data)
     found = []
     for _ in range(reader.length(item_bytes=_MIN_TRANSFORM_BYTES)):
-        stamp_ns, parent, child = reader.stamp_ns(), reader.string(), reader.string()
+        stamp_ns, parent, child = reader.fields("Tss")
         numbers = reader.array("f8", 7)
         found.append(Transform(stamp_ns, parent, child, numbers[:3], numbers[3:]))
     reader.finish()

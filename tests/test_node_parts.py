@@ -624,8 +624,8 @@ def test_keypoints_are_followed_from_message_to_frames() -> None:
     def message(stamp_ns: int, x: float) -> bytes:
         points = bones.posed(Pose(np.array([x, 1.0, 0.0]), turns, np.zeros(10))).points
         cdr = CdrWriter()
-        cdr.header(stamp_ns, "camera")
-        cdr.numbers("I", len(points))
+        cdr.fields("Ts", stamp_ns, "camera")
+        cdr.fields("I", len(points))
         cdr.array("f8", np.pad(points, ((0, 0), (0, 4))))
         return cdr.to_bytes()
 
@@ -645,8 +645,8 @@ def test_keypoints_are_followed_from_message_to_frames() -> None:
 
 def _of_ones(n: int) -> bytes:
     cdr = CdrWriter()
-    cdr.header(1, "camera")
-    cdr.numbers("I", n)
+    cdr.fields("Ts", 1, "camera")
+    cdr.fields("I", n)
     cdr.array("f8", np.ones((n, 7)))
     return cdr.to_bytes()
 

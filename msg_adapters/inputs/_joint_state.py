@@ -121,8 +121,7 @@ def from_bytes(data: Buffer) -> SmplFrame:
     global _last  # one assignment: another thread's at the same time does no harm
     with decoding(MESSAGE_TYPE):
         reader, layout, names = CdrReader(data), None, []
-        stamp_ns = reader.stamp_ns()
-        reader.string()
+        stamp_ns, _ = reader.fields("Ts")
         reader.align(4)
         if _last is not None and reader.repeats(_last[0]):
             layout = _last[1]
@@ -145,8 +144,7 @@ def from_bytes(data: Buffer) -> SmplFrame:
 def body_of(data: Buffer) -> str | None:
     """The id of the ROS4HRI body in a message that could be decoded, None for SMPL's joints."""
     reader, names = CdrReader(data), []
-    reader.stamp_ns()
-    reader.string()
+    reader.fields("Ts")
     for _ in range(reader.length(item_bytes=_MIN_NAME_BYTES)):
         names.append(reader.string())
         if names[-1] in _SLOTS:  # the first one is, where they are SMPL's
@@ -168,9 +166,8 @@ def from_message(message: Any) -> SmplFrame:
 def to_bytes(frame: SmplFrame, *, frame_id: str = "map") -> bytes:
     """The message in CDR, with betas and translation."""
     writer = CdrWriter()
-    writer.header(frame.stamp_ns, frame_id)
+    writer.fields("Ts", frame.stamp_ns, frame_id)
     writer.strings(_NAMES)
     writer.sequence("f8", np.concatenate([frame.pose.ravel(), frame.betas, frame.transl]))
-    for _ in ("velocity", "effort"):
-        writer.numbers("I", 0)
+    writer.fields("II", 0, 0)  # velocity, effort
     return writer.to_bytes()

@@ -74,7 +74,7 @@ def decode_keypoints(input_type: str, data: Buffer, n: int) -> dict[str, Keypoin
 
 def _of_poses(data: Buffer, n: int) -> dict[str, Keypoints]:
     reader = CdrReader(data)
-    stamp_ns, frame_id = reader.stamp_ns(), reader.string()
+    stamp_ns, frame_id = reader.fields("Ts")
     count = reader.length(item_bytes=_POSE_NUMBERS * 8)
     poses = reader.array("f8", count * _POSE_NUMBERS).reshape(count, _POSE_NUMBERS)
     reader.finish()

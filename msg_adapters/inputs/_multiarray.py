@@ -74,8 +74,8 @@ def from_bytes(data: Buffer) -> SmplFrame:
         if count > _MAX_DIMENSIONS:
             msg = f"{count} dimensions in layout.dim; {_LABELLING}"
             raise DecodeError(msg)
-        dimensions = [_Dimension(reader.string(), *reader.numbers("II")) for _ in range(count)]
-        (offset,) = reader.numbers("I")
+        dimensions = [_Dimension(*reader.fields("sII")) for _ in range(count)]
+        (offset,) = reader.fields("I")
         values = reader.array("f4", reader.length(item_bytes=4))
         reader.finish()
         return _frame(dimensions, offset, values)
@@ -98,10 +98,9 @@ def to_bytes(frame: SmplFrame, *, frame_id: str = "map") -> bytes:  # noqa: ARG0
     if frame.style is not None:
         blocks["style"] = frame.style
     writer = CdrWriter()
-    writer.numbers("I", len(blocks))
+    writer.fields("I", len(blocks))
     for label, block in blocks.items():
-        writer.string(label)
-        writer.numbers("II", block.size, block.size)
-    writer.numbers("I", 0)
+        writer.fields("sII", label, block.size, block.size)
+    writer.fields("I", 0)
     writer.sequence("f4", np.concatenate(list(blocks.values())))
     return writer.to_bytes()

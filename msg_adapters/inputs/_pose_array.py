@@ -45,8 +45,7 @@ def from_bytes(data: Buffer) -> SmplFrame:
     """The frame of a message in CDR; quaternions are normalised."""
     with decoding(MESSAGE_TYPE):
         reader = CdrReader(data)
-        stamp_ns = reader.stamp_ns()
-        reader.string()
+        stamp_ns, _ = reader.fields("Ts")
         _check_count(reader.length(item_bytes=_POSE_NUMBERS * 8))
         poses = reader.array("f8", N_JOINTS * _POSE_NUMBERS).reshape(N_JOINTS, _POSE_NUMBERS)
         reader.finish()
@@ -70,7 +69,6 @@ def to_bytes(frame: SmplFrame, *, frame_id: str = "map") -> bytes:
     poses[0, :3] = frame.transl
     poses[:, 3:] = quaternion_from_rotvec(frame.pose)
     writer = CdrWriter()
-    writer.header(frame.stamp_ns, frame_id)
-    writer.numbers("I", N_JOINTS)
-    writer.array("f8", poses)
+    writer.fields("Ts", frame.stamp_ns, frame_id)
+    writer.sequence("f8", poses)
     return writer.to_bytes()

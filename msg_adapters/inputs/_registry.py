@@ -94,6 +94,4 @@ def frame_id_of(data: Buffer, input_type: InputType) -> str:
         return ""
     if input_type == "joint_state" and (body := _joint_state.body_of(data)):
         return f"body_{body}"
-    reader = CdrReader(data)
-    reader.stamp_ns()
-    return reader.string()
+    return str(CdrReader(data).fields("Ts")[1])

@@ -69,8 +69,7 @@ def bytes_decoder(definition: str | None = None) -> Callable[[Buffer], SmplFrame
         """The frame of a message in CDR."""
         with decoding(MESSAGE_TYPE):
             reader = CdrReader(data)
-            stamp_ns = reader.stamp_ns()
-            reader.string()
+            stamp_ns, _ = reader.fields("Ts")
             values = {name: reader.array(kind, size) for name, kind, size in layout}
             reader.finish()
             return _frame(values, stamp_ns)
@@ -96,7 +95,7 @@ def to_bytes(frame: SmplFrame, *, frame_id: str = "map") -> bytes:
     pose = frame.pose.ravel()
     values = {"global_orient": pose[:3], "body_pose": pose[3:], "betas": frame.betas, "transl": frame.transl}
     writer = CdrWriter()
-    writer.header(frame.stamp_ns, frame_id)
+    writer.fields("Ts", frame.stamp_ns, frame_id)
     for name, kind, size in parse_layout(message_definition(MESSAGE_TYPE).text):
         writer.array(kind, values.get(name, np.zeros(size)))
     return writer.to_bytes()

@@ -45,27 +45,15 @@ def _write_marker(
     pose: Sequence[float] = _IDENTITY_POSE,
 ) -> tuple[int, int, int]:
     """Append one visualization_msgs/Marker; returns the payload offsets of its stamp, points and colours."""
-    ns, marker_id = key
-    stamp_at = writer.header(stamp_ns, frame_id)
-    writer.string(ns)
-    writer.numbers("iii", marker_id, kind, action)
-    writer.numbers("ddddddd", *pose)
-    writer.numbers("ddd", size, size, size)
-    writer.numbers("ffff", *color)
-    writer.stamp(lifetime_ns)
-    writer.numbers("B", 0)  # frame_locked
-    writer.numbers("I", n_points)
+    stamp_at = writer.fields("Tssiii", stamp_ns, frame_id, *key, kind, action)
+    writer.fields("ddddddddddffff", *pose, size, size, size, *color)
+    writer.fields("T?", lifetime_ns, False)  # frame_locked
+    writer.fields("I", n_points)
     points_at = writer.array("f8", np.zeros(n_points * 3))
-    writer.numbers("I", n_colors)
+    writer.fields("I", n_colors)
     colors_at = writer.array("f4", np.zeros(n_colors * 4))
-    writer.string("")  # texture_resource
-    writer.header(0, "")  # texture.header
-    writer.string("")  # texture.format
-    writer.numbers("II", 0, 0)  # texture.data, uv_coordinates
-    for _ in ("text", "mesh_resource", "mesh_file.filename"):
-        writer.string("")
-    writer.numbers("I", 0)  # mesh_file.data
-    writer.numbers("B", 0)  # mesh_use_embedded_materials
+    writer.fields("sTssI", "", 0, "", "", 0)  # texture_resource, texture
+    writer.fields("IsssI?", 0, "", "", "", 0, False)  # uv_coordinates, text, mesh_resource, mesh_file and its materials
     return stamp_at, points_at, colors_at
 
 
@@ -110,7 +98,7 @@ class MarkerArrayEncoder:
             raise EncodeError(msg)
         self._columns = SMPL_COLUMNS[axes]
         writer = CdrWriter()
-        writer.numbers("I", len(meshes))
+        writer.fields("I", len(meshes))
         places = [
             _write_marker(
                 writer,
@@ -296,7 +284,7 @@ def _encode_lists(
 ) -> bytes:
     """A MarkerArray with a marker each of namespace, stamp, pose and finite points (K, 3)."""
     writer, points_at = CdrWriter(), []
-    writer.numbers("I", len(lists))
+    writer.fields("I", len(lists))
     for ns, stamp_ns, pose, points in lists:
         _, at, _ = _write_marker(
             writer,
@@ -325,7 +313,7 @@ def encode_delete(keys: Sequence[tuple[str, int]], *, stamp_ns: int, frame_id: s
     Raises `EncodeError` when an id or the stamp doesn't fit the message.
     """
     writer = CdrWriter()
-    writer.numbers("I", len(keys))
+    writer.fields("I", len(keys))
     for key in keys:
         _write_marker(writer, key=key, action=DELETE, frame_id=frame_id, stamp_ns=stamp_ns)
     return writer.to_bytes()
@@ -337,6 +325,6 @@ def encode_delete_all(*, stamp_ns: int, frame_id: str = "map", ns: str = "") -> 
     Raises `EncodeError` when the stamp doesn't fit the message.
     """
     writer = CdrWriter()
-    writer.numbers("I", 1)
+    writer.fields("I", 1)
     _write_marker(writer, key=(ns, 0), action=DELETE_ALL, frame_id=frame_id, stamp_ns=stamp_ns)
     return writer.to_bytes()

@@ -59,23 +59,23 @@ def encode_collision_object(
         msg = f"wanted add or append with a mesh, or move or remove without one, got {operation!r} with {what}"
         raise EncodeError(msg)
     writer = CdrWriter()
-    writer.header(stamp_ns, frame_id)
+    frames = subframes or {}
+    writer.fields("Ts", stamp_ns, frame_id)
     _pose(writer, placement or Placement())
-    for text in (name, "", ""):  # id, type.key, type.db
-        writer.string(text)
-    writer.numbers("II", 0, 0)  # primitives, primitive_poses
-    writer.numbers("I", mesh is not None)
-    if mesh is not None:
+    writer.fields("sssII", name, "", "", 0, 0)  # id, type, primitives, primitive_poses
+    if mesh is None:
+        writer.fields("II", 0, 0)  # meshes, mesh_poses
+    else:
+        writer.fields("I", 1)
         _mesh(writer, *mesh)
-    writer.numbers("I", mesh is not None)
-    if mesh is not None:
+        writer.fields("I", 1)
         _pose(writer, Placement())
-    writer.numbers("II", 0, 0)  # planes, plane_poses
-    writer.strings([*(subframes or {})])
-    writer.numbers("I", len(subframes or {}))
-    for frame in (subframes or {}).values():
+    writer.fields("II", 0, 0)  # planes, plane_poses
+    writer.strings([*frames])
+    writer.fields("I", len(frames))
+    for frame in frames.values():
         _pose(writer, frame)
-    writer.numbers("B", _OPERATIONS[operation])
+    writer.fields("B", _OPERATIONS[operation])
     return writer.to_bytes()
 
 
@@ -95,7 +95,5 @@ def _mesh(writer: CdrWriter, vertices: ArrayLike, faces: ArrayLike) -> None:
     if triangles.min() < 0 or triangles.max() >= len(points):
         msg = f"wanted triangles of vertices 0 to {len(points) - 1}, got {triangles.min()} to {triangles.max()}"
         raise EncodeError(msg)
-    writer.numbers("I", len(triangles))
-    writer.array("u4", triangles)
-    writer.numbers("I", len(points))
-    writer.array("f8", points)
+    writer.sequence("u4", triangles)
+    writer.sequence("f8", points)

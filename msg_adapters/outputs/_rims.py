@@ -42,9 +42,8 @@ def encode_polygon(ring: ArrayLike, *, stamp_ns: int, frame_id: str = "map") -> 
         msg = f"wanted finite points of shape (K, 3), got {points.shape}"
         raise EncodeError(msg)
     writer = CdrWriter()
-    writer.header(stamp_ns, frame_id)
-    writer.numbers("I", len(points))
-    writer.array("f4", points)
+    writer.fields("Ts", stamp_ns, frame_id)
+    writer.sequence("f4", points)
     return writer.to_bytes()
 
 

@@ -43,12 +43,10 @@ def encode_scene(
     Raises `EncodeError` for vertices that aren't finite or too few, and a stamp that doesn't fit a ROS time.
     """
     writer = CdrWriter()
-    writer.numbers("I", len(deleted))
+    writer.fields("I", len(deleted))
     for name in deleted:
-        writer.stamp(stamp_ns)
-        writer.numbers("B", _MATCHING_ID)
-        writer.string(name)
-    writer.numbers("I", len(entities))
+        writer.fields("TBs", stamp_ns, _MATCHING_ID, name)
+    writer.fields("I", len(entities))
     for one in entities:
         _write(writer, one, frame_id, lifetime_ns)
     return writer.to_bytes()
@@ -59,17 +57,12 @@ def _write(writer: CdrWriter, one: Entity, frame_id: str, lifetime_ns: int) -> N
     if vertices.shape != (mesh.n_vertices, 3) or not np.isfinite(vertices).all():
         msg = f"{mesh.ns}: wanted finite vertices of shape ({mesh.n_vertices}, 3), got {vertices.shape}"
         raise EncodeError(msg)
-    writer.stamp(one.stamp_ns)
-    writer.string(frame_id)
-    writer.string(mesh.ns)
-    writer.stamp(lifetime_ns)
-    writer.numbers("B", 0)  # frame_locked
-    writer.numbers("IIIIII", *[0] * 6)  # metadata, arrows, cubes, spheres, cylinders, lines
-    writer.numbers("I", 1)
+    writer.fields("TssT?", one.stamp_ns, frame_id, mesh.ns, lifetime_ns, False)  # frame_locked
+    writer.fields("IIIIII", *[0] * 6)  # metadata, arrows, cubes, spheres, cylinders, lines
+    writer.fields("I", 1)
     writer.array("f8", [*one.position, *_IDENTITY])
-    writer.numbers("I", len(vertices))
-    writer.array("f8", vertices)
+    writer.sequence("f8", vertices)
     writer.array("f8", mesh.color)
-    writer.numbers("I", 0)  # colors
-    writer.sequence("u4", mesh.faces)
-    writer.numbers("II", 0, 0)  # texts, models
+    writer.fields("I", 0)  # colors
+    writer.sequence("u4", mesh.faces.ravel())
+    writer.fields("II", 0, 0)  # texts, models
