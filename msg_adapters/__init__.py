@@ -30,8 +30,6 @@ from msg_adapters.errors import DecodeError as DecodeError
 from msg_adapters.errors import EncodeError as EncodeError
 from msg_adapters.errors import MotionFileError as MotionFileError
 from msg_adapters.errors import TransformError as TransformError
-from msg_adapters.humans import IDS_LIST as IDS_LIST
-from msg_adapters.humans import decode_ids as decode_ids
 from msg_adapters.inputs import INPUT_TYPES as INPUT_TYPES
 from msg_adapters.inputs import KEYPOINT_TYPES as KEYPOINT_TYPES
 from msg_adapters.inputs import Decoder as Decoder
@@ -75,7 +73,9 @@ from msg_adapters.outputs import encode_polygon as encode_polygon
 from msg_adapters.outputs import encode_rims as encode_rims
 from msg_adapters.outputs import encode_scene as encode_scene
 from msg_adapters.outputs import points_of as points_of
+from msg_adapters.people import IDS_LIST as IDS_LIST
 from msg_adapters.people import KeypointStream as KeypointStream
+from msg_adapters.people import decode_ids as decode_ids
 from msg_adapters.rotations import matrix_from_quaternion as matrix_from_quaternion
 from msg_adapters.rotations import quaternion_from_matrix as quaternion_from_matrix
 from msg_adapters.rotations import quaternion_from_rotvec as quaternion_from_rotvec

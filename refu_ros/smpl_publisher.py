@@ -18,7 +18,7 @@ from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from msg_adapters import INPUT_TYPES, BagError, Encoder, InputType, Motion, encoder_for, iter_smpl_frames, read_motion
-from msg_adapters.march import MARCH_FPS, march
+from msg_adapters.motion import MARCH_FPS, march
 from refu_core import FrameError, SmplFrame
 from refu_core.recordings import SUFFIXES, Axes
 from refu_ros._guard import GuardedNode

@@ -5,12 +5,12 @@ from msg_adapters.markers._decoder import decode_marker_array as decode_marker_a
 from msg_adapters.markers._decoder import vertices_from_points as vertices_from_points
 from msg_adapters.markers._encoder import MARKER_ARRAY as MARKER_ARRAY
 from msg_adapters.markers._encoder import POINTS as POINTS
+from msg_adapters.markers._encoder import SKIN as SKIN
 from msg_adapters.markers._encoder import TRIANGLE_LIST as TRIANGLE_LIST
 from msg_adapters.markers._encoder import MarkerArrayEncoder as MarkerArrayEncoder
+from msg_adapters.markers._encoder import MarkerMesh as MarkerMesh
 from msg_adapters.markers._encoder import encode_delete as encode_delete
 from msg_adapters.markers._encoder import encode_delete_all as encode_delete_all
 from msg_adapters.markers._encoder import encode_points as encode_points
 from msg_adapters.markers._encoder import encode_strips as encode_strips
-from msg_adapters.markers._mesh import SKIN as SKIN
-from msg_adapters.markers._mesh import MarkerMesh as MarkerMesh
-from msg_adapters.markers._mesh import garment_namespace as garment_namespace
+from msg_adapters.markers._encoder import garment_namespace as garment_namespace

@@ -15,10 +15,10 @@ from refu_core.errors import RefuError
 from refu_core.frames import N_BETAS, N_JOINTS
 from refu_core.recordings import _layouts as table
 from refu_core.recordings._containers import Content, Key, open_content
+from refu_core.recordings._layouts import tracks_of
 from refu_core.recordings._mhr import POINTS, Track, tracks_of_mhr
 from refu_core.recordings._rate import MAX_FRAMES, check_fps
 from refu_core.recordings._rotations import BODY, WHOLE, rotvecs_of
-from refu_core.recordings._tracks import tracks_of
 from refu_core.recordings._upright import Axes, to_smpl
 
 SUFFIXES = (".npz", ".npy", ".pkl", ".pickle", ".pk", ".p", ".joblib", ".pt", ".pth", ".bvh")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from refu_core.simulation._errors import SimulationError
+from refu_core.errors import SimulationError
 from refu_core.simulation._poses import Clip, mirrored, without_heading
 
 FPS = 30

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
+from refu_core.errors import SimulationError
 from refu_core.frames import N_BETAS
 from refu_core.garments import N_STYLES, garment_name
-from refu_core.simulation._errors import SimulationError
 from refu_core.simulation._poses import Clip, clip_pose, random_pose
 
 TRAIN, TEST = 0, 1

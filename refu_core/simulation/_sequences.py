@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from refu_core._engine import Engine
+from refu_core.errors import SimulationError
 from refu_core.frames import N_BETAS
 from refu_core.garments import N_STYLES, garment_name
 from refu_core.simulation._cloth import F32
 from refu_core.simulation._drape import GRAVITY, SettledDrape
-from refu_core.simulation._errors import SimulationError
 from refu_core.simulation._motion import FPS, STEPS, DrawnMotion, draw_motion
 from refu_core.simulation._plan import TEST, TRAIN, truncated_normal
 from refu_core.simulation._poses import Clip, as_clips, split_clips

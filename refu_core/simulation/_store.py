@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from refu_core._files import open_file, read_json
 from refu_core._npz import DAMAGE, check_npy
-from refu_core.simulation._errors import SimulationError
+from refu_core.errors import SimulationError
 from refu_core.simulation._selection import CAUSES
 
 FORMAT = "refu-garments-2"
