@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from refu_core._files import replacing
 from refu_core._npz import read_npz
 from refu_core.errors import RefuError
 
@@ -45,11 +46,5 @@ def keep(name: str, arrays: Mapping[str, NDArray[Any]]) -> None:
     with contextlib.suppress(OSError):
         folder = cache_folder()
         folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=folder, suffix=".part", delete=False) as part:
-            try:
-                np.savez(part, allow_pickle=False, **arrays)
-                part.close()
-                Path(part.name).replace(folder / f"{name}.npz")
-            except OSError:
-                Path(part.name).unlink(missing_ok=True)
-                raise
+        with replacing(folder / f"{name}.npz") as file:
+            np.savez(file, allow_pickle=False, **arrays)

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from refu_core._files import replacing
 from refu_core._npz import read_npz
 from refu_core.body import BUILTIN_BODIES
 from refu_core.errors import GarmentError, MeshError
@@ -142,17 +143,13 @@ def save_garment(template: GarmentTemplate, path: str | os.PathLike[str]) -> Pat
         arrays["styledirs"] = _rounded(template.styledirs, 20).reshape(n, 3, N_STYLES)
     if template.uv is not None:
         arrays |= {"uv": template.uv.coordinates, "uv_f": template.uv.faces.astype(np.uint32)}
-    part = target.with_name(f".{target.name}.{os.getpid()}")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        with part.open("wb") as file:
+        with replacing(target) as file:
             np.savez_compressed(file, **arrays)
-        part.replace(target)
     except OSError as error:
         msg = f"{target}: can't be written: {error.strerror}"
         raise GarmentError(msg) from error
-    finally:
-        part.unlink(missing_ok=True)
     return target
 
 

@@ -373,7 +373,7 @@ def test_objects_of_another_type(input_type: str, message: Any) -> None:
 
 def test_strings_must_be_utf8_and_end() -> None:
     good = CdrWriter()
-    good.string("é")
+    good.fields("s", "é")
     assert CdrReader(good.to_bytes()).string() == "é"
     for raw, message in ((b"\xff\0", "UTF-8"), (b"ab", "ends in NUL")):
         with pytest.raises(DecodeError, match=message):
