@@ -81,7 +81,6 @@ LINE_STRIP, POINTS, TRIANGLE_LIST = 4, 8, 11
 ADD, DELETE, DELETE_ALL = 0, 2, 3
 _IDENTITY_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 _LEAD_BYTES = 4  # before the header, so that the payload, and with it every float64, lies on a multiple of 8
-LINE: Rgba = (0.95, 0.55, 0.1, 1.0)
 _NO_COLOR: Rgba = (0.0, 0.0, 0.0, 0.0)
 
 
@@ -270,35 +269,6 @@ class MarkerArrayEncoder:
         np.take(rgba, slot.corners, axis=0, out=slot.colors, mode="clip")
 
 
-def encode_strips(
-    strips: Sequence[tuple[str, int, NDArray[np.float64], NDArray[np.float64]]],
-    *,
-    frame_id: str = "map",
-    lifetime_ns: int = 0,
-    color: Rgba = LINE,
-    width: float = 0.004,
-) -> bytes:
-    """A MarkerArray with a LINE_STRIP each.
-
-    Args:
-        strips: namespace (the id is 0), stamp [ns], pose (7,) as position [m] and quaternion xyzw, and the points of
-            the line in that pose [m], shape (K, 3).
-        frame_id: of the headers.
-        lifetime_ns: viewers forget a line that isn't renewed for so long; 0: never.
-        color: red, green, blue, alpha.
-        width: of the lines [m].
-
-    Raises:
-        EncodeError: points of another shape, not finite, none at all, or a stamp that doesn't fit a ROS time.
-    """
-    for ns, _, pose, points in strips:
-        if points.ndim != 2 or points.shape[1] != 3 or not len(points) or not np.isfinite(points.sum() + pose.sum()):
-            msg = f"{ns}: wanted finite points of shape (K, 3), K > 0, in a finite pose, got {points.shape}"
-            raise EncodeError(msg)
-    lists = [(ns, stamp_ns, pose.tolist(), points) for ns, stamp_ns, pose, points in strips]
-    return _encode_lists(LINE_STRIP, lists, frame_id=frame_id, color=color, size=width, lifetime_ns=lifetime_ns)
-
-
 def encode_points(
     points: ArrayLike,
     *,
@@ -321,15 +291,11 @@ def encode_points(
     Raises:
         EncodeError: points of another shape, not finite, none at all, or a stamp that doesn't fit a ROS time.
     """
-    array = numbers(ns, points).astype(np.float64)
-    if array.ndim != 2 or array.shape[1] != 3 or not len(array) or not np.isfinite(array).all():
-        msg = f"{ns}: wanted finite points of shape (V, 3), V > 0, got {array.shape}"
-        raise EncodeError(msg)
-    lists = [(ns, stamp_ns, _IDENTITY_POSE, array)]
-    return _encode_lists(POINTS, lists, frame_id=frame_id, color=color, size=size)
+    lists = [(ns, stamp_ns, _IDENTITY_POSE, numbers(ns, points).astype(np.float64))]
+    return encode_lists(POINTS, lists, frame_id=frame_id, color=color, size=size)
 
 
-def _encode_lists(
+def encode_lists(
     kind: int,
     lists: Sequence[tuple[str, int, Sequence[float], NDArray[np.float64]]],
     *,
@@ -338,10 +304,27 @@ def _encode_lists(
     size: float,
     lifetime_ns: int = 0,
 ) -> bytes:
-    """A MarkerArray with a marker each of namespace, stamp, pose and finite points (K, 3)."""
+    """A MarkerArray with a marker each, of the type `kind`.
+
+    Args:
+        kind: `LINE_STRIP` or `POINTS`.
+        lists: namespace (the id is 0), stamp [ns], pose as position [m] and quaternion xyzw, and the points in that
+            pose [m], shape (K, 3).
+        frame_id: of the headers.
+        color: red, green, blue, alpha.
+        size: width of the lines or points [m].
+        lifetime_ns: viewers forget a marker that isn't renewed for so long; 0: never.
+
+    Raises:
+        EncodeError: points of another shape, not finite, none at all, or a stamp that doesn't fit a ROS time.
+    """
     writer, points_at = CdrWriter(), []
     writer.fields("I", len(lists))
     for ns, stamp_ns, pose, points in lists:
+        is_finite = np.isfinite(points).all() and np.isfinite(pose).all()
+        if points.ndim != 2 or points.shape[1] != 3 or not len(points) or not is_finite:
+            msg = f"{ns}: wanted finite points of shape (K, 3), K > 0, in a finite pose, got {points.shape}"
+            raise EncodeError(msg)
         _, at, _ = _write_marker(
             writer,
             key=(ns, 0),

@@ -14,10 +14,11 @@ from scipy.spatial.transform import Rotation, Slerp
 from refu_core.errors import RefuError
 from refu_core.frames import N_BETAS, N_JOINTS
 from refu_core.recordings import _layouts as table
-from refu_core.recordings._containers import Content, Key, entries, open_content
+from refu_core.recordings._containers import Content, Key, open_content
 from refu_core.recordings._mhr import POINTS, Track, tracks_of_mhr
 from refu_core.recordings._rate import MAX_FRAMES, check_fps
 from refu_core.recordings._rotations import BODY, WHOLE, rotvecs_of
+from refu_core.recordings._tracks import tracks_of
 from refu_core.recordings._upright import Axes, to_smpl
 
 SUFFIXES = (".npz", ".npy", ".pkl", ".pickle", ".pk", ".p", ".joblib", ".pt", ".pth", ".bvh")
@@ -364,38 +365,3 @@ def _filled(
     joints = [Slerp(at, Rotation.from_rotvec(poses[:, j]))(wanted).as_rotvec() for j in range(N_JOINTS)]
     notes.append(f"{len(wanted) - len(at)} of {len(wanted)} frames are missing: interpolated")
     return np.stack(joints, 1), np.stack([np.interp(wanted, at, transl[:, k]) for k in range(3)], 1)
-
-
-_ARRAYS = ("global_orient", "body_pose", "betas")
-
-
-def tracks_of(content: Content) -> Mapping[Any, Any] | None:
-    """The persons of a file of PHALP's (4DHumans): a dictionary each, where the file has one a frame; None of others.
-
-    Raises `ValueError` for frames whose lists don't fit each other.
-    """
-    frames = [inside for inside in map(entries, (entries(content.root) or {}).values()) if inside is not None]
-    if not frames or not all("smpl" in frame and "tid" in frame for frame in frames):
-        return None
-    persons: dict[int, dict[str, list[Any]]] = {}
-    for number, frame in enumerate(frames):
-        bodies = list((entries(frame["smpl"]) or {}).values())
-        for person, body in zip(_ids(content, frame["tid"]), bodies, strict=False):
-            values = entries(body) or {}
-            if not all(name in values for name in _ARRAYS):
-                msg = f"frame {number}: a person without {', '.join(_ARRAYS)}"
-                raise ValueError(msg)
-            track = persons.setdefault(person, {name: [] for name in (*_ARRAYS, "frame_ids")})
-            if track["frame_ids"][-1:] == [number]:
-                continue
-            track["frame_ids"].append(number)
-            for name in _ARRAYS:
-                track[name].append(content.array(values[name]))
-    return {
-        person: {name: np.stack(rows) if name != "frame_ids" else np.array(rows) for name, rows in track.items()}
-        for person, track in persons.items()
-    }
-
-
-def _ids(content: Content, value: Any) -> list[int]:
-    return [int(number) for number in content.array(value).reshape(-1)] if len(value or ()) else []
