@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 from refu_core import RefuError, load_garment
 from refu_core._device import checked_device
@@ -12,6 +12,7 @@ from refu_core.backbones import PRESETS
 from refu_core.body import load_fit
 from refu_core.garments import worn_on
 from refu_core.modes import MAX_MARGIN
+from refu_core.refu import ScaleKind
 from refu_core.sdf import SDF_PRESETS
 from refu_core.simulation import GarmentDataset, open_dataset
 from refu_core.training import (
@@ -26,9 +27,6 @@ from refu_core.training import (
     train_sdf,
 )
 from refu_lab.tables import format_table
-
-if TYPE_CHECKING:
-    from refu_core.refu import ScaleKind
 
 TRAIN_MODES: tuple[str, ...] = ("none", *FINETUNE_MODES)
 NETWORKS: tuple[str, ...] = ("garment", "sdf")
