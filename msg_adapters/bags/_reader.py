@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from msg_adapters.bags import _mcap
 from msg_adapters.bags._metadata import MAX_TIME_NS, METADATA_FILE, read_file_paths
@@ -14,13 +15,6 @@ from msg_adapters.bags._sqlite import MAGIC as SQLITE_MAGIC
 from msg_adapters.bags._sqlite import SqliteFile
 from msg_adapters.errors import BagError
 from refu_core.errors import printable
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
-    from types import TracebackType
-
-    from typing_extensions import Self
-
 
 BAG_SUFFIXES = (".mcap", ".db3")
 _MAX_WARNINGS = 20
@@ -141,12 +135,10 @@ class BagReader:
         self._files = self._find_files()
         self._topics: tuple[TopicInfo, ...] | None = None
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> BagReader:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Nothing is open between calls."""
 
     @property

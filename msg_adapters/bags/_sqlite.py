@@ -7,17 +7,15 @@ are plain columns of plain tables; anything else in their place is refused.
 from __future__ import annotations
 
 import sqlite3
+from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import quote
 
 from msg_adapters.bags._mcap import MAX_CHUNK_BYTES, Budget, DamageError
 from msg_adapters.definitions import full_type_name
 from msg_adapters.errors import BagError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 MAGIC = b"SQLite format 3\x00"
 _NEEDED = {"topics": {"id", "name", "type", "serialization_format"}, "messages": {"topic_id", "timestamp", "data"}}

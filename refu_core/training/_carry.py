@@ -8,7 +8,7 @@ the samples bear that out. What is left, the samples say, as a linear function o
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +25,11 @@ from refu_core.backbones import (
     save_backbone,
     save_basis,
 )
-from refu_core.body import Collider, SmplBody
+from refu_core.body import SmplBody
 from refu_core.errors import RefuError
 from refu_core.frames import N_BETAS
-from refu_core.garments import N_STYLES, GarmentTemplate, SkinBelow, load_garment
+from refu_core.garments import N_STYLES, GarmentTemplate, load_garment
 from refu_core.modes import SdfMode
-from refu_core.realtime import RootTurn
 from refu_core.simulation import GarmentDataset, GarmentSequences, random_pose
 from refu_core.training._carried import Carried
 from refu_core.training._data import (
@@ -118,10 +117,9 @@ def carry_over(
     settings = CarrySettings() if settings is None else settings
     opened = TrainingSet.of(garment, dataset, body)
     template, body = opened.garment, opened.body
-    test = _off_collider(read_samples(opened.rows, body, template, split="test"), body, template)
-    simulated = _off_collider(opened.samples, body, template)
+    test = read_samples(opened.rows, body, template, split="test")
     carried = Carried(load_garment(like), template, body, settings)
-    samples = simulated.joined(mirrored(simulated, Mirror.of(template)))
+    samples = opened.samples.joined(mirrored(opened.samples, Mirror.of(template)))
     output = Path(output)
     controls = Controls.spread(template, settings.controls)
     share = _borne_out(carried(samples.betas, samples.pose), samples.displacement, controls)
@@ -164,22 +162,6 @@ def carry_over(
             own = {key: stored[key] for key in ("config", "basis_sha256")}
             save_weights(output / f"tailornet-{mode}", {}, {**card, **own, "mode": str(mode)}, base=base)
     return {**card, "mode": str(BASE)}
-
-
-@torch.no_grad()
-def _off_collider(samples: TrainingSamples, body: SmplBody, garment: GarmentTemplate) -> TrainingSamples:
-    """The samples less how far a collider takes cloth along: the pipeline adds that to what a network says."""
-    collider, below = Collider(body), SkinBelow.of(garment, body)
-
-    def one(displacement: Tensor, betas: Tensor, pose: Tensor) -> Tensor:
-        shape = body.shape(betas)
-        _, at_root = RootTurn.taken_off(pose, shape.joints)
-        posed, rest = body.posed(at_root, shape), garment.rest(betas)
-        vertices = garment.pose(rest + displacement, posed.transforms)
-        vertices = vertices - below(collider(posed.vertices, posed.transforms) - posed.vertices)
-        return garment.unpose(vertices, posed.transforms) - rest
-
-    return replace(samples, displacement=in_chunks(one, samples.displacement, samples.betas, samples.pose, size=32))
 
 
 def _borne_out(carried: Tensor, truth: Tensor, controls: Controls) -> Tensor:

@@ -6,16 +6,14 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from refu_core._npz import read_npz
 from refu_core.errors import RefuError
 from refu_core.frames import N_STYLES, SmplFrame
-
-if TYPE_CHECKING:
-    from refu_lab.stress._subject import Subject, Wardrobe
+from refu_lab.stress._subject import Subject, Wardrobe
 
 _KEYS = ("check", "garments", "backbone", "sdf", "pose", "betas", "transl", "style", "has_style", "seed")
 

@@ -12,14 +12,14 @@ from small_set import write_set
 from torch import Tensor
 
 from refu_core import GarmentPipeline, RefuError, SmplFrame, load_body, load_garment
-from refu_core.backbones import Controls, Prediction, WithoutWearerCode, load_backbone
+from refu_core.backbones import Controls, load_backbone
 from refu_core.errors import WeightsError
 from refu_core.garments import BUILTIN_GARMENTS, save_garment
 from refu_core.modes import SdfMode
 from refu_core.simulation import open_dataset
 from refu_core.training import CarrySettings, carry_over, displacements, posed_errors, read_samples
 from refu_core.training._carried import Carried
-from refu_core.training._carry import _borne_out, _off_collider
+from refu_core.training._carry import _borne_out
 from refu_core.weights import load_card, weights_folder
 
 GARMENT, LIKE = "tshirt-neutral", "tshirt-male"
@@ -34,16 +34,6 @@ def swelling(pose: Tensor) -> Tensor:
     """A displacement that is a linear function of the pose's matrices near the T-pose, (N, V, 3) [m]."""
     up = load_garment(GARMENT).v_template[:, 1:2] / 10
     return torch.sin(pose[:, 16, 2])[:, None, None] * up * torch.tensor((0.0, 1.0, 1.0))
-
-
-class Always(WithoutWearerCode):
-    """A backbone that always says the same."""
-
-    def __init__(self, displacement: Tensor) -> None:
-        self.displacement = displacement
-
-    def __call__(self, *_: object, **__: object) -> Prediction:
-        return Prediction(self.displacement, None)
 
 
 @pytest.fixture(scope="module")
@@ -116,23 +106,6 @@ def test_only_what_the_samples_bear_out_is_carried_over() -> None:
     assert float(share[garment.v_template[:, 0] < -0.15].max()) < 0.05
 
 
-def test_what_the_collider_moves_is_not_learnt(data: Path) -> None:
-    """Where limbs touch, the pipeline takes cloth along with the skin: learnt as well, it would go twice as far."""
-    garment, body = load_garment(GARMENT), load_body("neutral")
-    samples = read_samples(open_dataset(data), body, garment, split="test").take(torch.arange(1))
-    samples.pose[:] = 0
-    samples.pose[0, 16, 2], samples.pose[0, 17, 2] = -1.5, 1.5  # upper arms in the flanks
-    learnt = _off_collider(samples, body, garment).displacement
-    plugged = GarmentPipeline.load([GARMENT], backbone="skinned", sdf="none")
-    wearable = plugged.outfit.wearables[GARMENT]
-    plugged.outfit.wearables[GARMENT] = replace(wearable, backbone=Always(learnt))  # type: ignore[index]
-    worn = plugged(SmplFrame(pose=samples.pose[0].numpy(), betas=samples.betas[0].numpy()))[GARMENT].local
-    transforms = body(samples.pose, samples.betas).transforms
-    truth = garment.pose(garment.rest(samples.betas) + samples.displacement, transforms)[0].numpy()
-    assert np.abs(worn - truth).max() < 1e-4
-    assert float((learnt - samples.displacement).norm(dim=-1).max()) > 5e-3
-
-
 def test_what_the_samples_say_is_learnt(data: Path, made: Path) -> None:
     """The least squares of its own code, on poses that it wasn't shown: nearer to them than what was carried over."""
     garment, body = load_garment(GARMENT), load_body("neutral")
@@ -170,7 +143,7 @@ def test_what_ships_is_nearer_to_the_simulation_than_skinning_and_says_what_it_i
     pose = torch.as_tensor(ARMS_DOWN[None], dtype=torch.float32)
     moved = load_backbone("auto", name, mode="hybrid")(torch.zeros(1, 10), pose, None).displacement
     assert moved is not None
-    assert 2e-3 < float(moved.norm(dim=-1).mean()) < 0.03
+    assert 2e-3 < float(moved.norm(dim=-1).mean()) < 1.2e-3 * card["figures"]["skinned_mm"]
 
 
 def test_every_garment_that_ships_has_networks() -> None:
