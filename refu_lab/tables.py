@@ -123,9 +123,11 @@ def replay_table(result: ReplayResult) -> str:
 
 REPLAY_HEADER = (
     *("garment", "frames", "p50 ms", "p95 ms", "p99 ms", "VFCP %", "CFMP %", "depth mm", "MPVE mm"),
-    "CFMP % on the skin",
+    *("folds", "CFMP % on the skin"),
 )
 _FIGURES = (("vfcp_percent", 3), ("cfmp_percent", 1), ("max_depth_mm", 1), ("mpve_mm", 2))
+
+_FOLDS = ("folds_1", "folds_4", "folds_16", "folds_64")
 
 
 def replay_rows(garments: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, ...]]:
@@ -134,7 +136,9 @@ def replay_rows(garments: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, ..
     for name, after in garments.items():
         latency = [f"{after['latency_ms'][p]:.2f}" for p in ("p50", "p95", "p99")]
         on_skin = after["skin_cfmp_percent"]
-        figures = (*_changes(after["before"], after), "-" if on_skin is None else f"{on_skin:.1f}")
+        folds = [after[key] for key in _FOLDS]
+        against_truth = "-" if None in folds else " ".join(f"{one:.2f}" for one in folds)
+        figures = (*_changes(after["before"], after), against_truth, "-" if on_skin is None else f"{on_skin:.1f}")
         rows.append((name, str(after["n_frames"]), *latency, *figures))
     return rows
 

@@ -2,6 +2,7 @@
 
 from refu_core.metrics._collisions import CollisionChecker as CollisionChecker
 from refu_core.metrics._collisions import Collisions as Collisions
+from refu_core.metrics._folds import FoldBands as FoldBands
 from refu_core.metrics._garment import Figures as Figures
 from refu_core.metrics._garment import FrameMetrics as FrameMetrics
 from refu_core.metrics._garment import GarmentMetrics as GarmentMetrics
