@@ -181,9 +181,8 @@ A whole frame, bytes to bytes: p50 {frame["p50"]:.1f}, p95 {frame["p95"]:.1f}, p
 <h2>Figures</h2><div class='wide'>{html_table(REPLAY_HEADER, replay_rows(data["garments"]))}</div>
 <p class="note">VFCP: vertices inside the body. CFMP: frames without any collision, vertices and triangles.
 Both by exact checks of every frame and every vertex, against the collider: the posed body with its overlaps (an arm in
-the flank, thighs in a squat) pulled apart. Folds: their energy over that of the true garment's, from the finest to the
-widest; below 1 the garment is smoother than cloth. The last column is against the skin, which runs through itself
-there.</p>
+the flank, thighs in a squat) pulled apart. The last column is against the skin, which runs through itself there. Folds:
+their energy over that of the true garment's, from the finest to the widest; below 1 it is smoother than cloth.</p>
 <h2>Worst, median and best frame</h2>{turned}
 <p class="note">Drag to turn; click, then the wheel to come nearer; a double click goes back. Red: colliding triangles
 and vertices inside the body.</p>

@@ -33,6 +33,12 @@ def add(commands: Any) -> None:
         help="carry the shipped networks of this related garment over: for sets of a hundred samples; writes all modes",
     )
     parser.add_argument(
+        "--start",
+        type=cli.in_path,
+        metavar="DIR",
+        help="go on from a garment's weights in this folder, those that ship (refu_core/weights/GARMENT) or your own",
+    )
+    parser.add_argument(
         "--output", type=cli.out_folder, metavar="DIR", help="folder of the weights (default: weights/GARMENT)"
     )
     parser.add_argument(
