@@ -25,6 +25,7 @@ from refu_core.training._losses import COLLISION_WEIGHT, RECONSTRUCTION_WEIGHT, 
 from refu_core.training._mirror import Mirror
 from refu_core.training._pretrain import PretrainSettings, basis_of, pivots_of, stages
 from refu_core.training._progress import TrainingLog
+from refu_core.training._taken_along import TakenAlong
 from refu_core.weights import load_weights
 
 _CHUNK = 64
@@ -219,13 +220,16 @@ def finetune(
 def _tensors(samples: TrainingSamples, body: SmplBody, garment: GarmentTemplate) -> tuple[Tensor, ...]:
     """What the loop draws from: β, θ, γ and the posed true garments [m], shape (N, V, 3)."""
     posed = torch.empty_like(samples.displacement)
-    style = garment.own(samples.style)
+    style, along = garment.own(samples.style), TakenAlong(body, garment)
     with torch.no_grad():
         for start in range(0, len(samples), _CHUNK):
             chunk = slice(start, start + _CHUNK)
             rest = garment.rest(samples.betas[chunk], None if style is None else style[chunk])
             transforms = body(samples.pose[chunk], samples.betas[chunk]).transforms
-            posed[chunk] = garment.pose(rest + samples.displacement[chunk], transforms)
+            whole = along.with_it(
+                samples.displacement[chunk], samples.betas[chunk], samples.pose[chunk], samples.style[chunk]
+            )
+            posed[chunk] = garment.pose(rest + whole, transforms)
     return samples.betas, samples.pose, samples.style, posed
 
 
