@@ -104,7 +104,7 @@ def planner() -> None:
     for garment in GARMENTS:
         pipeline = GarmentPipeline.load([garment])
         template = pipeline.garments[garment]
-        coarse, faces = PlannerMesh(template), template.faces.numpy()
+        coarse, faces = PlannerMesh.of(pipeline, garment), template.faces.numpy()
         there, back, closed = [], [], True
         for moment in moments_of(bag_of(garment), template)[::4]:
             worn = pipeline(moment.frame)[garment].local.astype(np.float64)
@@ -206,7 +206,7 @@ def times() -> None:
     camera = PinholeCamera.looking_at([0, 0, 0], [0.3, 0.4, 2.2], width=320, height=240)
     depth = depth_image([*meshes, body], camera).depth
     points = measured(depth, camera, np.random.default_rng(0))
-    rims, solid, every = Openings(shirt), PlannerMesh(shirt), Sigma(pipeline)
+    rims, solid, every = Openings(shirt), PlannerMesh.of(pipeline, shirt.name), Sigma(pipeline)
     clear, limbs, observer = Clearance.of(pipeline), LimbContacts.of(pipeline), Observer(pipeline)
     spread = np.tile(1e-4 * np.eye(3), (24, 1, 1))
     turned = [SmplFrame(pose=pose + 1e-4 * i) for i in range(40)]

@@ -41,7 +41,7 @@ def main() -> None:
         front = true[:, 2] > true[:, 2].mean() + 0.05
         before, after = (1e3 * np.abs((one[name].vertices - true)[front, 2]).mean() for one in (plain, out))
         inside = out.stats.garments[name].n_unresolved
-        print(f"frame {k}: {observer.matched[name]} points, {before:.1f} mm → {after:.1f} mm, {inside} inside the body")
+        print(f"frame {k}: {observer.matched[name]} places, {before:.1f} mm → {after:.1f} mm, {inside} inside the body")
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ def main() -> None:
     """Prints what there is to say of one frame."""
     pipeline = GarmentPipeline.load(["short-pant-male"])
     (garment,) = pipeline.garments.values()
-    openings, planner = Openings(garment), PlannerMesh(garment)  # once for each garment
+    openings, planner = Openings(garment), PlannerMesh.of(pipeline, garment.name)  # once for each garment
     clearance, contacts, sigma = Clearance.of(pipeline), LimbContacts.of(pipeline), Sigma(pipeline)  # once
 
     pose = np.zeros((24, 3))

@@ -106,7 +106,7 @@ def test_robot_outputs(run) -> None:
 
 
 def test_follow_camera(run) -> None:
-    said = re.findall(r"(\d+) points, (\S+) mm → (\S+) mm, (\d+) inside", run("follow_camera"))
+    said = re.findall(r"(\d+) places, (\S+) mm → (\S+) mm, (\d+) inside", run("follow_camera"))
     frames = [[float(number) for number in row] for row in said]
     assert len(frames) == 4
     for points, before, after, inside in frames:

@@ -1,10 +1,10 @@
 """rosbag2 bags: MCAP written as ROS 2 Jazzy writes it, MCAP and SQLite read as a stream, all without ROS."""
 
 from msg_adapters.bags._metadata import QosProfile as QosProfile
+from msg_adapters.bags._metadata import TopicInfo as TopicInfo
 from msg_adapters.bags._reader import BAG_SUFFIXES as BAG_SUFFIXES
 from msg_adapters.bags._reader import BagMessage as BagMessage
 from msg_adapters.bags._reader import BagReader as BagReader
-from msg_adapters.bags._reader import TopicInfo as TopicInfo
 from msg_adapters.bags._recorder import Recorder as Recorder
 from msg_adapters.bags._recorder import RecorderState as RecorderState
 from msg_adapters.bags._recorder import free_path as free_path

@@ -58,6 +58,25 @@ class QosProfile:
 
 
 @dataclass(frozen=True)
+class TopicInfo:
+    """A topic of a bag."""
+
+    name: str
+    message_type: str
+    """`package/msg/Type`; empty where the bag carries no schema for the topic."""
+    encoding: str
+    """Message encoding; `cdr` is what ROS 2 writes."""
+    message_count: int
+    definition: str
+    """Text of the message type (`ros2msg`); empty where it is in another language."""
+    type_hash: str
+    qos: str
+    """Offered profiles in YAML, as recorded."""
+    betas_of: str = ""
+    """Whose shape space β in the messages are of: `builtin`, or (empty) the bag doesn't say."""
+
+
+@dataclass(frozen=True)
 class TopicSummary:
     """A topic's entry in the metadata."""
 

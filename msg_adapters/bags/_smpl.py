@@ -6,7 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from msg_adapters.bags._reader import BagReader, TopicInfo
+from msg_adapters.bags._metadata import TopicInfo
+from msg_adapters.bags._reader import BagReader
 from msg_adapters.cdr import split_stamp
 from msg_adapters.errors import BagError, DecodeError, EncodeError
 from msg_adapters.inputs import INPUT_TYPES, Decoder, decoder_for

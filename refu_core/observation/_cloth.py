@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
 import warp as wp
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 from torch import Tensor
 
 from refu_core._warp import as_warp
@@ -21,13 +23,24 @@ if TYPE_CHECKING:
     from refu_core.observation._settings import ObservationSettings
 
 F32 = NDArray[np.float32]
+_OFF_CENTRE = 0.37
+"""Where cells begin, in cells: not at the body's plane of symmetry, where the last bit would say which cell it is."""
+
+
+class Measured(NamedTuple):
+    """N points as the person's root sees them."""
+
+    points: F32
+    """[m], shape (N, 3)."""
+    say: F32
+    """How much each says, at most one, shape (N,)."""
 
 
 class Matches(NamedTuple):
     """M points and their places on the cloth."""
 
-    points: NDArray[np.intp]
-    """Which of the points, shape (M,)."""
+    say: F32
+    """How much each says, shape (M,)."""
     face: NDArray[np.int32]
     weight: F32
     """Of the face's corners, shape (M, 3)."""
@@ -43,22 +56,24 @@ class ObservedCloth:
         self._settings = settings
         self._faces = garment.mesh.faces
         n = garment.n_vertices
-        modes = smooth_modes(garment, min(settings.modes, n // 8))
+        modes = smooth_modes(garment, min(settings.modes, n // 8)).up_to(settings.finest)
         rest = garment.v_template.detach().cpu().double().numpy()
         self._out = vertex_normals(rest, self._faces).astype(np.float32)
-        self._fields = modes.fields
-        directions = [garment.shapedirs] if garment.styledirs is None else [garment.styledirs, garment.shapedirs]
-        self._cut = np.concatenate([d.detach().cpu().numpy().reshape(n, 3, -1) for d in directions], 2)
-        self._cut = self._cut.astype(np.float32)
-        """Of style and shape: how vertices move with each number, shape (V, 3, C)."""
         falls = 1 / (1 + (modes.wave / settings.wave) ** 2)
         std = settings.amplitude * falls / np.sqrt((falls**2).sum())
+        self._fields = modes.fields * std.astype(np.float32)
+        """How far vertices move along the normal with each number [m], shape (V, K)."""
+        directions = [garment.shapedirs] if garment.styledirs is None else [garment.styledirs, garment.shapedirs]
+        self._cut = np.concatenate([d.detach().cpu().numpy().reshape(n, 3, -1) for d in directions], 2)
         n_style = 0 if garment.styledirs is None else garment.styledirs.shape[1]
-        n_shape = garment.shapedirs.shape[1]
-        every = np.concatenate((np.full(n_style, settings.style), np.full(n_shape, settings.shape), std))
-        times = np.full(len(every), settings.remembered)
-        times[: n_style + n_shape] = settings.style_remembered
-        self.estimate = Estimate(every, times, settings.bound)
+        n_cut = self._cut.shape[2]
+        self._cut *= np.where(np.arange(n_cut) < n_style, settings.style, settings.shape)
+        self._cut = self._cut.astype(np.float32).reshape(3 * n, n_cut)
+        """Of style and shape: how coordinates change with each number [m], shape (3 V, C)."""
+        times = np.full(n_cut + len(std), settings.remembered)
+        times[:n_cut] = settings.style_remembered
+        self.estimate = Estimate(times, settings.bound)
+        self.reset()
         on_rim = garment.mesh.n_faces_of_edge[garment.mesh.edge_of_corner] == 1
         # Bit k says that the edge across from weight k is on the boundary, in the kernel's order of weights.
         bits = (on_rim[:, [1, 2, 0]] * np.array([2, 4, 1])).sum(1).astype(np.int32)
@@ -68,25 +83,42 @@ class ObservedCloth:
             as_warp(self._points, wp.vec3), wp.array(self._faces.ravel(), dtype=wp.int32, device="cpu")
         )
 
-    def offset(self, numbers: NDArray[np.float64]) -> F32:
-        """What the numbers (D,) add to the garment before it is posed [m], shape (V, 3)."""
-        n = self._cut.shape[2]
+    def reset(self) -> None:
+        """Forgets what was measured."""
+        self.estimate.reset()
+        self._recut, self._lift = np.zeros(3 * len(self._out), np.float32), np.zeros(len(self._out), np.float32)
+
+    def wait(self, seconds: float) -> None:
+        """Lets time pass. What is drawn fades as the numbers do."""
+        self.estimate.wait(seconds)
+        self._recut *= math.exp(-seconds / self._settings.style_remembered)
+        self._lift *= math.exp(-seconds / self._settings.remembered)
+
+    def draw(self, numbers: NDArray[np.float64]) -> None:
+        """Takes over what the numbers (D,) say, in standard deviations."""
+        n = self._cut.shape[1]
         some = numbers.astype(np.float32)
-        cut = self._cut.reshape(-1, n) @ some[:n]  # one product: a stack of small ones takes ten times as long
-        found: F32 = cut.reshape(-1, 3) + (self._fields @ some[n:])[:, None] * self._out
+        self._recut, self._lift = self._cut @ some[:n], self._fields @ some[n:]
+
+    @property
+    def offset(self) -> F32:
+        """What is drawn adds to the garment before it is posed [m], shape (V, 3)."""
+        found: F32 = self._recut.reshape(-1, 3) + self._lift[:, None] * self._out
         return found
 
-    def place(self, vertices: Tensor) -> None:
+    def place(self, vertices: F32) -> None:
         """Takes over where it is [m], shape (V, 3)."""
-        self._points.copy_(vertices)
+        self._points.copy_(torch.from_numpy(vertices))
         self._mesh.refit()
 
-    def match(self, points: F32, skin: wp.Mesh, eye: NDArray[np.float64] | None) -> Matches:
-        """Which of the points (N, 3) [m] are the cloth's, and where."""
-        n = len(points)
+    def match(self, measured: Measured, skin: wp.Mesh, eye: NDArray[np.float64] | None) -> Matches:
+        """Which of the points are the cloth's, and where."""
+        how = self._settings
+        own = self._points.numpy()
+        rows = np.flatnonzero(within(measured.points, own.min(0) - how.reach, own.max(0) + how.reach))
+        n, points = len(rows), measured.points[rows]
         face, height = np.empty(n, np.int32), np.empty(n, np.float32)
         weight, normal = np.empty((2, n, 3), np.float32)
-        how = self._settings
         seen = wp.vec3() if eye is None else wp.vec3(*eye.tolist())
         wp.launch(
             match_kernel,
@@ -103,29 +135,44 @@ class ObservedCloth:
             ],
             device="cpu",
         )
-        rows = np.flatnonzero(face >= 0)
-        return Matches(rows, face[rows], weight[rows], normal[rows], height[rows])
+        on = np.flatnonzero(face >= 0)
+        return Matches(measured.say[rows[on]], face[on], weight[on], normal[on], height[on])
 
     def slopes(self, found: Matches, blend: F32) -> F32:
         """How the cloth rises along each match's normal with each number, shape (M, D).
 
         `blend` (V, 3, 3) is what poses a displacement.
         """
-        corner = self._faces[found.face]
-        along = np.einsum("mi,mkij->mkj", found.normal, blend[corner], optimize=True) * found.weight[:, :, None]
-        cut = np.einsum("mkj,mkjc->mc", along, self._cut[corner], optimize=True)
+        m = len(found.face)
+        corner = self._faces[found.face].astype(np.int32)
+        along = np.matmul(found.normal[:, None, None], blend[corner])[:, :, 0] * found.weight[:, :, None]
+        # Sparse products: what they gather is as large as a processor's cache, and isn't copied first.
+        places, ends = corner[:, :, None] * 3 + np.arange(3, dtype=np.int32), np.arange(m + 1, dtype=np.int32)
+        cut = csr_array((along.ravel(), places.ravel(), 9 * ends), shape=(m, 3 * len(blend)))
         lift = (along * self._out[corner]).sum(2)
-        fields = np.zeros((len(corner), self._fields.shape[1]), np.float32)
-        for k in range(3):  # all three at once would be larger than a processor's cache
-            fields += lift[:, k, None] * self._fields[corner[:, k]]
-        return np.concatenate((cut, fields), axis=1)
+        fields = csr_array((lift.ravel(), corner.ravel(), 3 * ends), shape=(m, len(blend)))
+        return np.concatenate((cut @ self._cut, fields @ self._fields), axis=1)
 
 
-def thinned(points: F32, most: int) -> F32:
-    """Every so-many-th of the points (N, 3), `most` at most: a picture's are in rows, so that is even."""
-    if len(points) <= most:
-        return points
-    return points[np.linspace(0, len(points) - 1, most).astype(np.intp)]
+def within(points: F32, low: F32, high: F32) -> NDArray[np.bool_]:
+    """Which of the points (N, 3) are in a box."""
+    inside = np.ones(len(points), np.bool_)
+    for values, least, most in zip(points.T, low, high, strict=True):
+        inside &= (values > least) & (values < most)
+    return inside
+
+
+def averaged(points: F32, settings: ObservationSettings) -> Measured:
+    """The points (N, 3) [m] by cells of space: a mean says what many do, with less noise, and is matched once."""
+    if len(points) > settings.most_points:  # a picture's are in rows, so that is even
+        points = points[np.linspace(0, len(points) - 1, settings.most_points).astype(np.intp)]
+    cell = np.floor(points / settings.cell + _OFF_CENTRE).astype(np.int64)
+    cell -= cell.min(0)
+    _, high, deep = cell.max(0) + 1
+    key = (cell[:, 0] * high + cell[:, 1]) * deep + cell[:, 2]
+    _, of_point, count = np.unique(key, return_inverse=True, return_counts=True)
+    means = np.stack([np.bincount(of_point, values) for values in points.T], 1) / count[:, None]
+    return Measured(means.astype(np.float32), (count / (count + settings.enough)).astype(np.float32))
 
 
 def skin_mesh(vertices: Tensor, faces: Tensor) -> tuple[Tensor, wp.Mesh]:

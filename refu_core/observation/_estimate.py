@@ -8,60 +8,65 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.linalg.lapack import dpotri
 
 F64 = NDArray[np.float64]
+_AT_ONCE = 1e-9
+"""Variance that comes back in a time from which on time counts [of the prior's]."""
 
 
 class Estimate:
-    """A mean and a covariance of D numbers that return to zero by themselves (an Ornstein–Uhlenbeck process).
+    """A mean and a precision of D numbers that return to zero by themselves (an Ornstein–Uhlenbeck process).
 
-    Between frames each number fades towards zero, and what is unknown of it grows towards its prior. So information is
-    forgotten, yet nothing can drift: without measurements the prediction is left as it was, and with them every number
-    stays within its bound.
+    Numbers are in standard deviations of the prior, whose precision so is the identity. Between frames each number
+    fades towards zero, and what is unknown of it grows towards its prior. So information is forgotten, yet nothing can
+    drift: without measurements the prediction is left as it was, and with them every number stays within its bound.
     """
 
-    def __init__(self, std: F64, times: F64, bound: float) -> None:
-        """Of the prior's standard deviations (D,), the times in which numbers fade to a third [s], (D,), and bounds in
-        standard deviations."""
-        self._std, self._times, self._limit = std, times, bound * std
+    def __init__(self, times: F64, bound: float) -> None:
+        """Of the times in which numbers fade to a third [s], (D,), and the bound of each."""
+        self._times, self._limit = times, bound
         self.reset()
 
     def reset(self) -> None:
         """Forgets all."""
-        self.mean = np.zeros_like(self._std)
-        self.covariance = np.diag(self._std**2)
+        self.mean = np.zeros_like(self._times)
+        self.precision = np.eye(len(self._times))
+        """The inverse of the covariance, shape (D, D)."""
+        self.is_informed = False
+        """Whether anything was measured since."""
 
     def wait(self, seconds: float) -> None:
         """Lets time pass."""
         keeps = np.exp(-seconds / self._times)
+        comes = 1 - keeps**2
+        if not self.is_informed or comes.min() < _AT_ONCE:
+            return
         self.mean = keeps * self.mean
-        self.covariance = keeps[:, None] * self.covariance * keeps
+        # The covariance becomes K C K + Q. Its inverse is Q⁻¹ - Q⁻¹ K (C⁻¹ + K Q⁻¹ K)⁻¹ K Q⁻¹ (Woodbury).
         rows = np.arange(len(keeps))
-        self.covariance[rows, rows] += (1 - keeps**2) * self._std**2
+        between = self.precision
+        between[rows, rows] += keeps**2 / comes
+        ratio = keeps / comes
+        self.precision = _inverse(between) * -ratio[:, None] * ratio
+        self.precision[rows, rows] += 1 / comes
 
-    def precision(self) -> F64:
-        """The inverse of the covariance, shape (D, D)."""
-        return _inverse(self.covariance)
-
-    def updated(self, precision: F64, information: F64, pull: F64) -> tuple[F64, F64]:
-        """Mean (D,) and precision (D, D) after measurements of `information` JᵀWJ and `pull` JᵀW(r + J c).
-
-        `precision` is that before.
-        """
-        total = precision + information
-        mean = cho_solve(cho_factor(total), precision @ self.mean + pull)
+    def updated(self, information: F64, pull: F64) -> tuple[F64, F64]:
+        """Mean (D,) and precision (D, D) after measurements of `information` JᵀWJ and `pull` JᵀW(r + J c)."""
+        total = self.precision + information
+        mean = cho_solve(cho_factor(total, check_finite=False), self.precision @ self.mean + pull, check_finite=False)
         return np.clip(mean, -self._limit, self._limit), total
 
     def take(self, mean: F64, precision: F64) -> None:
         """Believes this from now on."""
-        self.mean = mean
-        self.covariance = _inverse(precision)
+        self.mean, self.precision, self.is_informed = mean, precision, True
 
 
 def _inverse(matrix: F64) -> F64:
-    """Of a symmetric positive definite matrix (D, D): half the work of solving for each unit vector, and symmetric."""
-    factor, lower = cho_factor(matrix, lower=True)
-    found, failed = dpotri(factor, lower=lower)
+    """Of a symmetric positive definite matrix (D, D), which is written over: half the work of solving for each unit
+    vector, and symmetric."""
+    factor, _ = cho_factor(matrix.T, lower=True, overwrite_a=True, check_finite=False)
+    found, failed = dpotri(factor, lower=True, overwrite_c=True)
     if failed:
         msg = f"row {failed} of the factor is zero"
         raise LinAlgError(msg)
     half = np.tril(found)
-    return np.asarray(half + np.tril(half, -1).T)
+    half += np.tril(half, -1).T
+    return np.asarray(half)

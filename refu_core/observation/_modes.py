@@ -34,6 +34,11 @@ class Modes:
     wave: NDArray[np.float64]
     """Wave number of each [rad/m], shape (K,)."""
 
+    def up_to(self, wave: float) -> Modes:
+        """Those of longer waves than this [rad/m]."""
+        kept = self.wave <= wave
+        return Modes(np.ascontiguousarray(self.fields[:, kept]), self.wave[kept])
+
 
 def smooth_modes(garment: GarmentTemplate, count: int) -> Modes:
     """The lowest fields of a garment's Laplacian, or nearly those: computed in seconds once, and then recalled."""

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from refu_core.body import blend_transforms
 from refu_core.errors import FrameError
-from refu_core.observation._cloth import ObservedCloth, skin_mesh, thinned
+from refu_core.observation._cloth import Measured, ObservedCloth, averaged, skin_mesh, within
 from refu_core.observation._settings import DEFAULT_OBSERVATION, ObservationSettings
 
 if TYPE_CHECKING:
@@ -43,12 +43,12 @@ class Observer:
         self._skin, self._skin_mesh = skin_mesh(body.v_template.detach().cpu(), body.faces.cpu())
         self._stamp_ns: int | None = None
         self.matched: dict[str, int] = {}
-        """How many points each garment was brought to in the last frame."""
+        """How many places each garment was brought to in the last frame: cells of space with points of it in them."""
 
     def reset(self) -> None:
         """Forgets what was measured."""
         for cloth in self._cloths.values():
-            cloth.estimate.reset()
+            cloth.reset()
         self._stamp_ns = None
 
     def __call__(
@@ -82,60 +82,74 @@ class Observer:
         self._stamp_ns = frame.stamp_ns
         for cloth in self._cloths.values():
             if 0 <= seconds < _LONGEST_GAP:
-                cloth.estimate.wait(seconds)
+                cloth.wait(seconds)
             else:
-                cloth.estimate.reset()
+                cloth.reset()
 
     def _adjusted(self, dressed: Dressed, points: NDArray[np.float64], eye: NDArray[np.float64] | None) -> Dressed:
         turn = dressed.turns[0]
-        seen = thinned(_to_root(turn, points).astype(np.float32), self._settings.most_points * len(self._cloths))
+        near = _to_root(turn, points).astype(np.float32)
+        if len(near) > 4 * self._settings.most_points:  # a picture of more than the person
+            near = self._near(dressed, near)
+        seen = averaged(near, self._settings) if len(near) else None
         camera = None if eye is None else _to_root(turn, eye[None])[0]
-        self._skin.copy_(dressed.skin[0])
-        if len(seen):
+        if seen is not None:
+            self._skin.copy_(dressed.skin[0])
             self._skin_mesh.refit()
         drapes = dict(dressed.drapes)
         for name, cloth in self._cloths.items():
-            garment = self._pipeline.garments[name]
-            blend = blend_transforms(garment.weights, dressed.transforms).rotation[0]
+            self.matched[name] = 0
+            if seen is None and not cloth.estimate.is_informed:
+                continue
             drape = drapes[name]
-            numbers = self._fit(cloth, drape.vertices[0].cpu(), blend.cpu().numpy(), seen, camera, name)
-            offset = torch.from_numpy(cloth.offset(numbers)).to(drape.vertices)
-            moved = (blend @ offset[:, :, None])[None, ..., 0]
+            weights = self._pipeline.garments[name].weights
+            blend = blend_transforms(weights, dressed.transforms).rotation[0].cpu().numpy()
+            if seen is not None:
+                self._fit(cloth, drape.vertices[0].cpu().numpy(), blend, seen, camera, name)
+            offset = cloth.offset
+            moved, unposed = (torch.from_numpy(a).to(drape.vertices) for a in (_posed(blend, offset), offset))
             drapes[name] = drape._replace(
-                vertices=drape.vertices + moved, unposed=drape.unposed + offset, on_mean=drape.on_mean + offset
+                vertices=drape.vertices + moved, unposed=drape.unposed + unposed, on_mean=drape.on_mean + unposed
             )
         return dressed._replace(drapes=drapes)
+
+    def _near(self, dressed: Dressed, points: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Those of the points (N, 3) that may be of a garment."""
+        every = [drape.vertices[0].cpu().numpy() for drape in dressed.drapes.values()]
+        reach = self._settings.reach + self._settings.bound * self._settings.amplitude
+        low, high = np.min([v.min(0) for v in every], 0) - reach, np.max([v.max(0) for v in every], 0) + reach
+        return points[within(points, low, high)]
 
     def _fit(
         self,
         cloth: ObservedCloth,
-        predicted: torch.Tensor,
+        predicted: NDArray[np.float32],
         blend: NDArray[np.float32],
-        points: NDArray[np.float32],
+        seen: Measured,
         eye: NDArray[np.float64] | None,
         name: str,
-    ) -> NDArray[np.float64]:
-        """The garment's numbers after the points (N, 3) as the root sees them."""
+    ) -> None:
+        """Brings the garment's numbers to what is seen."""
         how, estimate = self._settings, cloth.estimate
-        self.matched[name] = 0
-        if not len(points):
-            return estimate.mean
-        before = estimate.precision()
-        numbers, after = estimate.mean, before
-        for left in reversed(range(how.rounds)):
-            every = how.first_look if left else 1
-            moved = np.einsum("vij,vj->vi", blend, cloth.offset(numbers))
-            cloth.place(predicted + torch.from_numpy(moved))
-            found = cloth.match(points[::every], self._skin_mesh, eye)
-            self.matched[name] = len(found.points)
+        numbers, after = estimate.mean, estimate.precision
+        for _ in range(1 if estimate.is_informed else how.first_rounds):
+            cloth.place(predicted + _posed(blend, cloth.offset))
+            found = cloth.match(seen, self._skin_mesh, eye)
+            self.matched[name] = len(found.say)
             slopes = cloth.slopes(found, blend)
-            trust = 1 / (1 + (found.height / how.robust) ** 2) * every / (how.overlap * how.noise**2)
-            weighed = (slopes * trust[:, None].astype(np.float32)).T
+            trust = found.say / (1 + (found.height / how.robust) ** 2) / how.noise**2
+            weighed = (slopes * trust[:, None]).T
             information = (weighed @ slopes).astype(np.float64)
             pull = weighed @ found.height + information @ numbers
-            numbers, after = estimate.updated(before, information, pull.astype(np.float64))
+            numbers, after = estimate.updated(information, pull.astype(np.float64))
+            cloth.draw(numbers)
         estimate.take(numbers, after)
-        return numbers
+
+
+def _posed(blend: NDArray[np.float32], offset: NDArray[np.float32]) -> NDArray[np.float32]:
+    """What displacements (V, 3) [m] are once they are posed by the joints' blend (V, 3, 3)."""
+    moved: NDArray[np.float32] = np.einsum("vij,vj->vi", blend, offset)
+    return moved
 
 
 def _to_root(turn: RootTurn, points: NDArray[np.float64]) -> NDArray[np.float64]:

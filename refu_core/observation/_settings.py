@@ -13,7 +13,9 @@ class ObservationSettings:
     """
 
     modes: int = 192
-    """Smooth fields of the displacement along the normal."""
+    """Smooth fields of the displacement along the normal, at most."""
+    finest: float = 55.0
+    """Their largest wave number [rad/m]: waves of 11 cm. A small garment has fewer fields."""
     style: float = 0.15
     """How far the style γ may be from what it is said to be [standard deviations, each]. More than
     this lets a displacement that isn't understood pass for a wider cut, which throws off what nobody sees."""
@@ -26,21 +28,22 @@ class ObservationSettings:
     its square."""
     bound: float = 3.0
     """Each number stays within so many of its standard deviations, whatever is measured."""
-    noise: float = 0.004
-    """Standard deviation of a measured point along the normal, and of what the fields can't follow [m]."""
-    overlap: float = 4.0
-    """Points of which there are so many say as much as one: what the fields can't follow is alike in neighbours."""
-    reach: float = 0.06
+    noise: float = 0.003
+    """Standard deviation of a cell's point along the normal, and of what the fields can't follow [m]."""
+    enough: float = 2.0
+    """A cell of space with so many points says half as much as one with very many: what the fields can't follow is
+    alike in neighbours, and isn't less for many."""
+    cell: float = 0.04
+    """Edge of a cell, whose points are taken for one, their mean [m]."""
+    reach: float = 0.04
     """Points farther from the cloth than this are none of its [m]."""
     slack: float = 0.01
     """A point may be so much nearer to the skin than to the cloth and still be the cloth's [m]."""
     robust: float = 0.015
     """Height off the cloth from which on a point counts less and less [m] (Cauchy)."""
-    rounds: int = 2
-    """How often points are matched in a frame."""
-    first_look: int = 3
-    """Each so-many-th point is matched but in the last round, which decides: the others say where to look."""
-    most_points: int = 1500
+    first_rounds: int = 2
+    """How often the first points are matched. Later ones are once: the cloth is where the last ones have brought it."""
+    most_points: int = 6000
     """More points than this are thinned out evenly."""
     remembered: float = 0.5
     """Time after which a displacement has faded to a third [s]: folds change with the pose."""

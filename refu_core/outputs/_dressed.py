@@ -55,8 +55,8 @@ class Fittings:
         return found
 
     def planner(self, name: str) -> PlannerMesh:
-        """A garment's; takes a second or two when it is made for the first time ever."""
-        found: PlannerMesh = self._once(PlannerMesh, name, self.garments[name])
+        """A garment's; takes ten seconds or so when it is made for the first time ever."""
+        found: PlannerMesh = self._once(PlannerMesh.of, name, self._pipeline, name)
         return found
 
     def has_planner(self, name: str) -> bool:
@@ -64,7 +64,7 @@ class Fittings:
         if name not in self._preparing:
             self._preparing[name] = threading.Thread(target=self.planner, args=(name,), daemon=True)
             self._preparing[name].start()
-        return (PlannerMesh, name) in self._known or not self._preparing[name].is_alive()
+        return (PlannerMesh.of, name) in self._known or not self._preparing[name].is_alive()
 
     def normals(self, name: str) -> VertexNormals:
         """Of a garment."""

@@ -9,42 +9,37 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csr_array
 
 from refu_core._cache import keep, recall
-from refu_core.body import Surface
 from refu_core.errors import MeshError
-from refu_core.mesh import Connectivity
 from refu_core.outputs._check import as_points
+from refu_core.outputs._planner_fit import fitted_means
+from refu_core.outputs._practice import practised
 from refu_core.outputs._simplify import simplify
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from refu_core.garments import GarmentTemplate
+    from refu_core.realtime import GarmentPipeline
 
 HALF_THICKNESS = 0.005
 """How far either side of the solid is from the middle of the cloth [m]: about as far as the coarse cloth may be from
 the garment, which so lies within the solid nearly everywhere."""
 MAX_TRIANGLES = 2000
 _LEAST_TRIANGLES = 100
-_VERSION = 2
+_VERSION = 3
 """Of what is recalled: another one is computed anew."""
-_LEAST_WEIGHT = 0.01
-"""A vertex counts less than this for a coarse one: it is left out."""
-_OWN = 0.5
-"""How much of a coarse vertex is the garment's own, the rest being the fit. Where cloth folds in a pose, the fit,
-which is of the rest pose, overshoots: on recorded motion 95.9 % of a T-shirt's solid are within 5 mm with 0, 99.0 with
-a half, 98.9 with 0.7. Of the garment 0.04 % are farther off than that with a half, 0.08 with 0.7."""
-_FIRM = 1e-3
-"""How much the fit of coarse vertices is held together where hardly any cloth tells of one."""
+Worn = NDArray[np.float64]
 
 
 class PlannerMesh:
     """A coarse, closed copy of one garment, decimated once; a frame of it is one sparse product.
 
-    The cloth becomes a sheet of about half the triangles. Its vertices are half-way between vertices of the garment and
-    those means of the garment's around them for which the sheet, as a whole, is nearest to it (least squares). Its two
-    sides lie `half_thickness` off the sheet, with a wall along every rim.
+    The cloth becomes a sheet of about half the triangles. Which ones, and of which vertices of the garment its vertices
+    are means, is found on a number of poses, so that it is near the cloth in all of them. Its two sides lie
+    `half_thickness` off the sheet, with a wall along every rim.
 
     A solid around the cloth reaches into the body that wears it: planners are to allow these two to touch.
     """
@@ -55,13 +50,16 @@ class PlannerMesh:
         max_triangles: int = MAX_TRIANGLES,
         *,
         half_thickness: float = HALF_THICKNESS,
+        worn: Callable[[], Worn] | None = None,
     ) -> None:
-        """Prepares for a garment, in one or two seconds the first time; then what was found is recalled (`REFU_CACHE`).
+        """Prepares for a garment, in some seconds the first time; then what was found is recalled (`REFU_CACHE`).
 
         Args:
-            garment: what is decimated, in its rest pose.
+            garment: what is decimated.
             max_triangles: the most that the solid has, 100 at least.
             half_thickness: from the middle of the cloth to either side [m].
+            worn: gives the garment as it is worn in several poses [m], shape (P, V, 3); asked only where nothing is
+                recalled. Without, the rest pose has to do. `of` makes them.
 
         Raises:
             MeshError: fewer triangles or no thickness are asked for, or the garment can't be drawn so coarse.
@@ -76,7 +74,7 @@ class PlannerMesh:
         """[m]"""
         rest = garment.v_template.detach().cpu().double().numpy()
         self._n_vertices = len(rest)
-        kept, self._sheet, self._take = _prepared(garment, rest, max_triangles)
+        kept, self._sheet, self._take = _prepared(garment, rest, max_triangles, worn)
         self.faces: NDArray[np.int32] = _solid(self._sheet, len(kept))
         """Counter-clockwise from outside, shape (T, 3); the same in every frame."""
         if len(self.faces) > max_triangles:
@@ -86,6 +84,26 @@ class PlannerMesh:
         self._around = csr_array(
             (np.ones(3 * len(self._sheet)), (self._sheet.ravel(), corners)), shape=(len(kept), len(self._sheet))
         )
+
+    @classmethod
+    def of(
+        cls,
+        pipeline: GarmentPipeline,
+        garment: str,
+        max_triangles: int = MAX_TRIANGLES,
+        *,
+        half_thickness: float = HALF_THICKNESS,
+    ) -> PlannerMesh:
+        """For a pipeline's garment of this name, which it dresses in ten poses the first time.
+
+        Raises:
+            MeshError: as the constructor does, or the pipeline has no such garment.
+        """
+        template = pipeline.garments.get(garment)
+        if template is None:
+            msg = f"the pipeline has no garment {garment!r}: wanted one of {', '.join(pipeline.garments)}"
+            raise MeshError(msg)
+        return cls(template, max_triangles, half_thickness=half_thickness, worn=lambda: practised(pipeline, garment))
 
     @property
     def sheet(self) -> NDArray[np.int32]:
@@ -127,16 +145,17 @@ class PlannerMesh:
 
 
 def _prepared(
-    garment: GarmentTemplate, rest: NDArray[np.float64], max_triangles: int
+    garment: GarmentTemplate, rest: NDArray[np.float64], max_triangles: int, worn: Callable[[], Worn] | None
 ) -> tuple[NDArray[np.intp], NDArray[np.int32], csr_array]:
     """The vertices that are kept, the sheet's faces and its weights; computed once for a garment, and then recalled."""
     digest = hashlib.sha256(rest.astype(np.float32).tobytes() + garment.mesh.faces.tobytes()).hexdigest()[:16]
-    name = f"planner-{_VERSION}-{digest}-{max_triangles}"
+    name = f"planner-{_VERSION}-{digest}-{max_triangles}{'-worn' if worn else ''}"
     keys = ("kept", "sheet", "weight", "column", "start")
     known = recall(name, keys=keys)
     if known is None:
-        kept, sheet = simplify(rest, garment.mesh.faces, max_triangles)
-        take = _means(rest, garment.mesh, kept, sheet)
+        shapes = rest[None] if worn is None else np.concatenate((rest[None], worn()))
+        kept, sheet = simplify(shapes, garment.mesh.faces, max_triangles)
+        take = fitted_means(shapes, garment.mesh, kept, sheet)
         known = dict(zip(keys, (kept, sheet, take.data, take.indices, take.indptr), strict=True))
         keep(name, known)
     shape = (len(known["kept"]), len(rest))
@@ -150,26 +169,3 @@ def _solid(sheet: NDArray[np.int32], n: int) -> NDArray[np.int32]:
     a, b = start[rim], end[rim]
     walls = np.concatenate((np.stack((b, a, a + n), 1), np.stack((b, a + n, b + n), 1)))
     return np.concatenate((sheet, sheet[:, ::-1] + n, walls)).astype(np.int32)
-
-
-def _means(
-    rest: NDArray[np.float64], mesh: Connectivity, kept: NDArray[np.intp], sheet: NDArray[np.int32]
-) -> csr_array:
-    """The weights (K, V) that take a garment to the sheet that is nearest to it, rows of which sum to one."""
-    if len(kept) == len(rest):
-        return csr_array((np.ones(len(kept)), (np.arange(len(kept)), kept)), shape=(len(kept), len(rest)))
-    found = Surface(rest[kept], sheet).closest(rest)
-    rows = np.repeat(np.arange(len(rest)), 3)
-    place = csr_array((found.weight.ravel(), (rows, sheet[found.face].ravel())), shape=(len(rest), len(kept)))
-    a, b, c = rest[mesh.faces].transpose(1, 0, 2)
-    double = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    area = np.bincount(mesh.faces.ravel(), weights=np.repeat(double / 6, 3), minlength=len(rest))
-    weighed = (place.T * area).toarray()
-    normal = np.asarray(weighed @ place)
-    own = csr_array((np.ones(len(kept)), (np.arange(len(kept)), kept)), shape=(len(kept), len(rest)))
-    firm = _FIRM * float(np.trace(normal)) / len(kept)
-    factor = cho_factor(normal + firm * np.eye(len(kept)))
-    dense = cho_solve(factor, weighed + firm * own.toarray())
-    dense[np.abs(dense) < _LEAST_WEIGHT] = 0
-    dense /= dense.sum(1, keepdims=True)
-    return csr_array((1 - _OWN) * dense + _OWN * own.toarray())

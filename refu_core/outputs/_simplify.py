@@ -1,21 +1,22 @@
 """Which vertices and triangles a coarse copy of a mesh keeps: half-edge collapses by quadric error, boundary kept.
 
-Garland and Heckbert 1997, with vertices that stay where they are: so a coarse vertex is one of the garment's.
+Garland and Heckbert 1997, with vertices that stay where they are: so a coarse vertex is one of the garment's. Errors
+are those of several shapes of one mesh, summed: a garment folds where its wearer bends.
 """
 
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from refu_core.mesh import Connectivity
 
-_EVEN = 0.1
+_EVEN = 0.03
 """How far a triangle's plane may be missed for an edge of length 1: cloth folds elsewhere in each pose, so triangles
-are to be of one size, and only sharp shapes are worth small ones."""
+are to be of about one size, and only sharp shapes are worth small ones."""
 _RIM = 3.0
 """How much more a boundary's line counts than a plane as far off."""
 _LEAST_COSINE = 0.3
@@ -27,25 +28,31 @@ Vector = tuple[float, float, float]
 
 
 def simplify(
-    vertices: NDArray[np.float64], faces: NDArray[np.int32], most: int
+    shapes: NDArray[np.float64], faces: NDArray[np.int32], most: int
 ) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
     """Collapses edges until the faces, twice, and a wall along the boundary are `most` triangles or fewer.
 
     Args:
-        vertices: [m], shape (V, 3).
+        shapes: of one mesh [m], shape (P, V, 3); in the first, no triangle is turned over.
         faces: shape (F, 3), of a surface with or without a boundary.
         most: triangles of the sheet's two sides and its walls; where no edge can be collapsed any more there are more.
 
     Returns:
         The vertices that are kept, (K,), and faces into them, (G, 3).
     """
-    return _Sheet(vertices, faces).collapsed(most)
+    return _Sheet(shapes, faces).collapsed(most)
 
 
 class _Sheet:
-    def __init__(self, vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> None:
-        mesh = Connectivity.of(faces, len(vertices))
-        self.places: list[Vector] = [tuple(row) for row in vertices.tolist()]
+    def __init__(self, shapes: NDArray[np.float64], faces: NDArray[np.int32]) -> None:
+        mesh = Connectivity.of(faces, shapes.shape[1])
+        self.places: list[Vector] = [tuple(row) for row in shapes[0].tolist()]
+        self.shapes = np.ascontiguousarray(shapes.transpose(1, 0, 2))
+        x, y, z = np.moveaxis(self.shapes, -1, 0)
+        one = np.ones_like(x)
+        terms = (x * x, 2 * x * y, 2 * x * z, 2 * x, y * y, 2 * y * z, 2 * y, z * z, 2 * z, one)
+        self.terms = np.stack(terms, -1).reshape(len(self.shapes), -1)
+        """What a quadric is multiplied with for its value at each vertex, shape (V, 10 P)."""
         self.faces: dict[int, tuple[int, int, int]] = dict(enumerate(map(tuple, faces.tolist())))
         self.fan: list[set[int]] = [set() for _ in self.places]
         self.ring: list[set[int]] = [set() for _ in self.places]
@@ -61,10 +68,14 @@ class _Sheet:
             self.rim[a].add(b)
             self.rim[b].add(a)
         self.n_rim = len(mesh.boundary)
-        self.quadrics, self.areas = _quadrics(vertices, mesh)
+        every, areas = zip(*(_quadrics(shape, mesh) for shape in shapes), strict=True)
+        self.quadrics = np.stack(every, 1).reshape(len(self.shapes), -1) / len(shapes)
+        """Of each vertex the mean over shapes, shape (V, 10 P)."""
+        self.areas = np.mean(areas, axis=0)
 
     def collapsed(self, most: int) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
-        heap = [entry for u in range(len(self.places)) for entry in self._options(u, self.ring[u])]
+        edges = [(u, v) for u, ring in enumerate(self.ring) for v in ring]
+        heap = [(price, u, v, 0) for price, u, v in self._options(edges)]
         heapq.heapify(heap)
         age = [0] * len(self.places)
         while heap and 2 * (len(self.faces) + self.n_rim) > most:
@@ -74,26 +85,22 @@ class _Sheet:
             self._collapse(u, v)
             age[u] = -(1 << 40)
             age[v] += 1
-            for a, b in ((v, other) for other in self.ring[v]):
-                for entry in (*self._options(a, (b,)), *self._options(b, (a,))):
-                    heapq.heappush(heap, (*entry[:3], age[a] + age[b]))
+            for price, a, b in self._options([pair for w in self.ring[v] for pair in ((v, w), (w, v))]):
+                heapq.heappush(heap, (price, a, b, age[a] + age[b]))
         faces = np.array(list(self.faces.values()), np.int64)
         kept, of_corner = np.unique(faces, return_inverse=True)
         return kept.astype(np.intp), of_corner.reshape(-1, 3).astype(np.int32)
 
-    def _options(self, u: int, to: Iterable[int]) -> Iterator[tuple[float, int, int, int]]:
-        """What it costs to draw `u` to each of these neighbours, to which it may be drawn."""
-        x, y, z = self.places[u]
-        xx, xy, xz, xd, yy, yz, yd, zz, zd, dd = self.quadrics[u]
-        area, rim = self.areas[u], self.rim[u]
-        for v in to:
-            if rim and v not in rim:
-                continue
-            p, q, r = self.places[v]
-            plane = p * (xx * p + 2 * (xy * q + xz * r + xd)) + q * (yy * q + 2 * (yz * r + yd))
-            plane += r * (zz * r + 2 * zd) + dd
-            length = (p - x) ** 2 + (q - y) ** 2 + (r - z) ** 2
-            yield plane + _EVEN**2 * area * length, u, v, 0
+    def _options(self, edges: Sequence[tuple[int, int]]) -> Iterator[tuple[float, int, int]]:
+        """Those of the edges whose first vertex may be drawn to the second, after what it costs."""
+        may = [(u, v) for u, v in edges if not self.rim[u] or v in self.rim[u]]
+        if not may:
+            return
+        start, end = np.array(may).T
+        cost = np.einsum("kq,kq->k", self.terms[end], self.quadrics[start])
+        way = self.shapes[end] - self.shapes[start]
+        cost += _EVEN**2 * self.areas[start] * np.einsum("kpi,kpi->k", way, way) / way.shape[1]
+        yield from ((price, *edge) for price, edge in zip(cost.tolist(), may, strict=True))
 
     def _may(self, u: int, v: int) -> bool:
         """Whether the surface stays one, and no triangle is turned over."""
@@ -140,7 +147,7 @@ class _Sheet:
                 self.rim[end].add(new)
             self.n_rim -= 1
         self.fan[u], self.ring[u], self.rim[u] = set(), set(), set()
-        self.quadrics[v] = tuple(a + b for a, b in zip(self.quadrics[u], self.quadrics[v], strict=True))
+        self.quadrics[v] += self.quadrics[u]
         self.areas[v] += self.areas[u]
 
 
@@ -150,8 +157,9 @@ def _normal(a: Vector, b: Vector, c: Vector) -> Vector:
     return uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
 
 
-def _quadrics(vertices: NDArray[np.float64], mesh: Connectivity) -> tuple[list[tuple[float, ...]], list[float]]:
-    """Of each vertex the sum of squared distances from the planes around it, by area, as a form; and that area [m²]."""
+def _quadrics(vertices: NDArray[np.float64], mesh: Connectivity) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Of each vertex the sum of squared distances from the planes around it, by area, as a form (V, 10); and that area
+    [m²], (V,)."""
     a, b, c = vertices[mesh.faces].transpose(1, 0, 2)
     normal = np.cross(b - a, c - a)
     double = np.linalg.norm(normal, axis=1)
@@ -174,4 +182,4 @@ def _quadrics(vertices: NDArray[np.float64], mesh: Connectivity) -> tuple[list[t
         np.add.at(forms, start, form)
         np.add.at(forms, end, form)
     upper = forms[:, [0, 0, 0, 0, 1, 1, 1, 2, 2, 3], [0, 1, 2, 3, 1, 2, 3, 2, 3, 3]]
-    return [tuple(row) for row in upper.tolist()], areas.tolist()
+    return upper, areas.astype(np.float64)

@@ -10,7 +10,7 @@ where they belong, in the displacement that a backbone predicts.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -266,8 +266,6 @@ def build_styles(
 
 def with_styles(garment: GarmentTemplate, v_template: F32, styledirs: F32) -> GarmentTemplate:
     """The garment with another mean cut (N, 3) and these style directions (N, 3, 4), everything else as it was."""
-    from dataclasses import replace
-
     return replace(
         garment,
         v_template=torch.from_numpy(np.ascontiguousarray(v_template)),

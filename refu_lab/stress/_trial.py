@@ -187,8 +187,6 @@ def load_trial(path: Path) -> tuple[str, Wardrobe, Trial]:
     Raises:
         StressError: the file is missing, damaged or something else.
     """
-    from refu_lab.stress._subject import Wardrobe
-
     data = read_npz(path, keys=_KEYS, error=StressError, wanted="a trial that refu stress has written")
     missing = [key for key in _KEYS if key not in data]
     if missing:
