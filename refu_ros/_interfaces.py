@@ -15,8 +15,10 @@ from refu_core import RefuError
 
 
 def interface(name: str) -> Any:
-    """The class of a type such as `std_msgs/msg/Header`. Raises `RefuError` where its package isn't there, or is broken:
-    built for another Python, or without a library that it needs."""
+    """The class of a type such as `std_msgs/msg/Header`.
+
+    Raises `RefuError` where its package isn't there, or is broken: made for another Python, or a library is missing.
+    """
     package, kind, type_name = name.split("/")
     try:
         found = getattr(import_module(f"{package}.{kind}"), type_name)

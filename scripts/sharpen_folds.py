@@ -36,11 +36,10 @@ class Judge:
         self.samples = [dataset.sample(i) for i in range(len(dataset))][:count]
         self.true = sum(self.bands.energies(sample.vertices) for sample in self.samples)
 
-    def __call__(
-        self, mean: Tensor | None = None, components: Tensor | None = None
-    ) -> tuple[NDArray[np.float64], float]:
-        """The energy of each band over the true one's, finest first, and the mean error [mm]."""
-        if mean is not None and components is not None:
+    def __call__(self, basis: tuple[Tensor, Tensor] | None = None) -> tuple[NDArray[np.float64], float]:
+        """The energy of each band over the true one's, finest first, and the mean error [mm], also of another basis."""
+        if basis is not None:
+            mean, components = basis
             decoder = self.pipeline.outfit.wearables[self.name].backbone.decoder
             decoder.mean.copy_(mean.flatten())
             decoder.components.copy_(components)
@@ -60,13 +59,14 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True, help="simulated samples")
     parser.add_argument("--count", type=int, help="as many of them (all)")
     parser.add_argument("--target", type=float, default=1.0, help="energy of each band over the true one's (1)")
+    parser.add_argument("--gains", type=float, nargs=4, help="to begin with (1 1 1 1)")
     parser.add_argument("--rounds", type=int, default=10, help="tries until the gains are taken (10)")
     parser.add_argument("--dry-run", action="store_true", help="write nothing")
     arguments = parser.parse_args()
     folder = arguments.folder
     judge = Judge(folder, arguments.data, arguments.count)
-    basis, _ = load_basis(folder, expect={"garment": folder.name})
-    gains = np.ones(4)
+    basis, _ = load_basis(folder, judge.pipeline.garments[folder.name], expect={"garment": folder.name})
+    gains = np.array(arguments.gains or (1.0, 1.0, 1.0, 1.0))
     print(f"{folder.name}, {len(judge.samples)} samples; bands finest first")
     for _ in range(arguments.rounds):
         ratios, error = judge(sharpened(basis, judge.bands, gains))

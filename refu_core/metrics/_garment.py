@@ -18,8 +18,6 @@ from refu_core.metrics._intersect import as_vertices
 ON_SKIN = 1e-6
 """Vertices no deeper than this [m] lie on the skin and not inside: positions of a metre are stored to a tenth of it."""
 
-FoldEnergies = tuple[float, float, float, float]
-
 
 @dataclass(frozen=True)
 class FrameMetrics:
@@ -47,8 +45,8 @@ class FrameMetrics:
     laplacian_mm: float | None
     """Mean length of the difference between Laplacian and true Laplacian [mm], over the vertices in question; None
     without a truth or without such a vertex. See `GarmentMetrics.add`."""
-    folds: tuple[FoldEnergies, FoldEnergies] | None
-    """Energy of the garment's folds and of the true one's, by `FoldBands` [m^2]; None without a truth."""
+    folds: list[list[float]] | None
+    """Energy of the garment's folds and of the true one's, four bands each (`FoldBands`) [m^2]; None without one."""
 
 
 @dataclass(frozen=True)
@@ -178,7 +176,7 @@ class GarmentMetrics:
             collision_error_mm=1e3 * float(depth.sum()),
             mpve_mm=None if errors is None else 1e3 * float(errors.mean()),
             laplacian_mm=None if laplacians is None or not region.any() else 1e3 * float(laplacians[region].mean()),
-            folds=None if target is None else (self._folds_of(garment), self._folds_of(target)),
+            folds=None if target is None else [self._folds_of(garment), self._folds_of(target)],
         )
         self._frames.append(frame)
         return frame
@@ -187,11 +185,11 @@ class GarmentMetrics:
         """The figures over the frames added so far."""
         return Figures.over(self._frames)
 
-    def _folds_of(self, vertices: NDArray[np.float32]) -> FoldEnergies:
+    def _folds_of(self, vertices: NDArray[np.float32]) -> list[float]:
         if self._bands is None:
             self._bands = FoldBands(Connectivity.of(self.faces, len(vertices)))
-        finest, fine, wide, widest = self._bands.energies(vertices).tolist()
-        return finest, fine, wide, widest
+        energies: list[float] = self._bands.energies(vertices).tolist()
+        return energies
 
     def _laplacian_of(self, vertices: NDArray[np.float32]) -> NDArray[np.float64]:
         """Each vertex minus the mean of its neighbours along edges (the uniform Laplacian) [m], shape (N, 3)."""
