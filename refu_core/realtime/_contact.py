@@ -88,6 +88,7 @@ class ContactStage:
             self._off_skin = {
                 name: Parting(one.faces, one.v_template, skin, settings=settings) for name, one in garments.items()
             }
+        self._is_serial = body.device.type == "cpu"
         self._outfit, self._farthest, self._kept = outfit, settings.max_displacement, settings.layer_margin
         self._partings, self._part_most = settings.partings, settings.parting_most
         self._below = {
@@ -111,7 +112,7 @@ class ContactStage:
         """
         self._body = body
         # Where skin has given way as far as it may, there may be less room than cloth needs. A GPU isn't asked.
-        self._is_tight = bool(self._off_skin) and (body.device.type != "cpu" or bool(n_held > 0))
+        self._is_tight = bool(self._off_skin) and (not self._is_serial or bool(n_held > 0))
         if self._is_tight:
             self._skin.take(body)
         self.sdf.update(body)

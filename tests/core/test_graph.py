@@ -127,8 +127,9 @@ def as_on_a_gpu(pipeline: GarmentPipeline) -> FrameStep:
             contact.sdf._rebuild_distance = math.inf
         if isinstance(contact.sdf, ApproxSdf):
             contact.sdf._is_serial = False
-        for press in contact._press.values():
-            press._is_serial = False
+        contact._is_serial = False
+        for one in (*contact._press.values(), *contact._off_skin.values()):
+            one._is_serial = False
         for resolver in contact.resolvers.values():
             resolver._is_serial = False
         for layers in contact._below.values():
