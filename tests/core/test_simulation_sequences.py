@@ -39,6 +39,7 @@ from refu_core.simulation._plan import TEST
 from refu_core.simulation._selection import Selector
 from refu_core.simulation._store import TO_DO, SequenceShard
 from refu_core.training import read_samples
+from refu_core.training._taken_along import TakenAlong
 from refu_lab.cli import main
 
 GARMENT = "short-pant-male"
@@ -126,7 +127,8 @@ def test_training_reads_the_good_frames(simulated: Path, tmp_path: Path) -> None
     np.testing.assert_array_equal(samples.pose, sequence.pose[good])
     assert (samples.betas == torch.tensor(sequence.betas)).all()
     assert (samples.pair == sequence.number).all()
-    unposed = garment.rest(samples.betas, samples.style) + samples.displacement
+    whole = TakenAlong(body, garment).with_it(samples.displacement, samples.betas, samples.pose, samples.style)
+    unposed = garment.rest(samples.betas, samples.style) + whole
     posed = garment.pose(unposed, body(samples.pose, samples.betas).transforms)
     np.testing.assert_allclose(posed, sequence.vertices(good), atol=1e-5)
 
