@@ -9,11 +9,9 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 
 from msg_adapters.axes import SMPL_COLUMNS
 from refu_core import RefuError
-from refu_ros._worker import with_settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -64,6 +62,8 @@ class Dresser:
 
     def _dress(self, frame: SmplFrame, settings: NodeSettings, then: Then) -> object:
         pipeline = self._pipeline(settings)
+        from refu_ros._worker import with_settings  # loads torch
+
         frame = with_settings(frame, settings)
         output = pipeline(frame)
         rotation = np.eye(3)[list(SMPL_COLUMNS[settings.axes])]
@@ -84,5 +84,7 @@ class Dresser:
 
 
 def _give_way() -> None:
+    import torch
+
     torch.set_num_threads(1)
     os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)  # to Linux a thread is a process

@@ -5,26 +5,27 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-from rclpy.exceptions import NoTypeSupportImportedException
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.type_support import check_for_type_support
-from rosidl_generator_py.import_type_support_impl import UnsupportedTypeSupport
 
 from msg_adapters import QosProfile
 from refu_core import RefuError
 
 
 def interface(name: str) -> Any:
-    """The class of a type such as `std_msgs/msg/Header`. Raises `RefuError` where its package isn't there, or is broken:
-    built for another Python, or without a library that it needs."""
+    """The class of a type such as `std_msgs/msg/Header`.
+
+    Raises `RefuError` where its package isn't there, or is broken: built for another Python, or without a library.
+    """
     package, kind, type_name = name.split("/")
     try:
         found = getattr(import_module(f"{package}.{kind}"), type_name)
-        check_for_type_support(found)
     except (ImportError, AttributeError) as error:  # the latter: a folder of definitions, which Python takes for it
         msg = f"{name} isn't importable: install or source {package} ({error})"
         raise RefuError(msg) from error
-    except (NoTypeSupportImportedException, UnsupportedTypeSupport) as error:
+    try:
+        check_for_type_support(found)
+    except Exception as error:  # one of rosidl's own, which has no public name
         msg = f"{name} is of no use: install or build {package} anew, for this ROS and Python ({error})"
         raise RefuError(msg) from error
     return found

@@ -19,7 +19,7 @@ def declare_settings(node: Node) -> NodeSettings:
         default = defaults()[name]
         value = list(default) if isinstance(default, tuple) else default
         values[name] = node.declare_parameter(name, value, _descriptor(default, spec)).value
-    return NodeSettings().changed(values)
+    return NodeSettings.of(values)
 
 
 def _descriptor(default: Any, spec: ParameterSpec) -> ParameterDescriptor:
