@@ -3,179 +3,87 @@
 Nothing here imports rclpy or torch.
 """
 
-from msg_adapters.axes import InputAxes, vertices_ros_from_smpl, vertices_smpl_from_ros
-from msg_adapters.bags import (
-    BAG_SUFFIXES,
-    BagMessage,
-    BagReader,
-    BagWriter,
-    FrameRecord,
-    QosProfile,
-    SmplBag,
-    TopicInfo,
-    iter_smpl_frames,
-    open_smpl_bag,
-)
-from msg_adapters.cameras import CAMERA_INFO, Camera, decode_camera_info
-from msg_adapters.definitions import MessageDefinition, message_definition
-from msg_adapters.diagnostics import DIAGNOSTIC_ARRAY, DiagnosticStatus, encode_diagnostics
-from msg_adapters.errors import (
-    AdapterError,
-    BagError,
-    DecodeError,
-    EncodeError,
-    MotionFileError,
-    TransformError,
-)
-from msg_adapters.humans import IDS_LIST, decode_ids
-from msg_adapters.inputs import (
-    INPUT_TYPES,
-    KEYPOINT_TYPES,
-    Decoder,
-    Encoder,
-    InputType,
-    Keypoints,
-    KeypointType,
-    decode_keypoints,
-    decoder_for,
-    encoder_for,
-    frame_id_of,
-)
-from msg_adapters.joints import SMPL_JOINTS
-from msg_adapters.markers import (
-    MARKER_ARRAY,
-    POINTS,
-    Marker,
-    MarkerArrayEncoder,
-    MarkerMesh,
-    decode_marker_array,
-    encode_delete,
-    encode_delete_all,
-    encode_points,
-    garment_namespace,
-    vertices_from_points,
-)
-from msg_adapters.motion import Motion, read_motion
-from msg_adapters.outputs import (
-    COLLISION_OBJECT,
-    MESH,
-    POINT_CLOUD,
-    POINT_FIELDS,
-    POLYGON,
-    SCENE_UPDATE,
-    Entity,
-    PointCloudEncoder,
-    PointField,
-    Rim,
-    decode_point_cloud,
-    encode_collision_object,
-    encode_frames,
-    encode_mesh,
-    encode_polygon,
-    encode_rims,
-    encode_scene,
-    points_of,
-)
-from msg_adapters.people import KeypointStream
-from msg_adapters.rotations import (
-    matrix_from_quaternion,
-    quaternion_from_matrix,
-    quaternion_from_rotvec,
-    rotvec_from_quaternion,
-    slerp,
-)
-from msg_adapters.transforms import (
-    TF_MESSAGE,
-    Placement,
-    Transform,
-    TransformBuffer,
-    decode_transforms,
-    encode_transforms,
-)
-
-__all__ = [
-    "BAG_SUFFIXES",
-    "CAMERA_INFO",
-    "COLLISION_OBJECT",
-    "DIAGNOSTIC_ARRAY",
-    "IDS_LIST",
-    "INPUT_TYPES",
-    "KEYPOINT_TYPES",
-    "MARKER_ARRAY",
-    "MESH",
-    "POINTS",
-    "POINT_CLOUD",
-    "POINT_FIELDS",
-    "POLYGON",
-    "SCENE_UPDATE",
-    "SMPL_JOINTS",
-    "TF_MESSAGE",
-    "AdapterError",
-    "BagError",
-    "BagMessage",
-    "BagReader",
-    "BagWriter",
-    "Camera",
-    "DecodeError",
-    "Decoder",
-    "DiagnosticStatus",
-    "EncodeError",
-    "Encoder",
-    "Entity",
-    "FrameRecord",
-    "InputAxes",
-    "InputType",
-    "KeypointStream",
-    "KeypointType",
-    "Keypoints",
-    "Marker",
-    "MarkerArrayEncoder",
-    "MarkerMesh",
-    "MessageDefinition",
-    "Motion",
-    "MotionFileError",
-    "Placement",
-    "PointCloudEncoder",
-    "PointField",
-    "QosProfile",
-    "Rim",
-    "SmplBag",
-    "TopicInfo",
-    "Transform",
-    "TransformBuffer",
-    "TransformError",
-    "decode_camera_info",
-    "decode_ids",
-    "decode_keypoints",
-    "decode_marker_array",
-    "decode_point_cloud",
-    "decode_transforms",
-    "decoder_for",
-    "encode_collision_object",
-    "encode_delete",
-    "encode_delete_all",
-    "encode_diagnostics",
-    "encode_frames",
-    "encode_mesh",
-    "encode_points",
-    "encode_polygon",
-    "encode_rims",
-    "encode_scene",
-    "encode_transforms",
-    "encoder_for",
-    "frame_id_of",
-    "garment_namespace",
-    "iter_smpl_frames",
-    "matrix_from_quaternion",
-    "message_definition",
-    "open_smpl_bag",
-    "points_of",
-    "quaternion_from_matrix",
-    "quaternion_from_rotvec",
-    "read_motion",
-    "rotvec_from_quaternion",
-    "slerp",
-    "vertices_from_points",
-    "vertices_ros_from_smpl",
-    "vertices_smpl_from_ros",
-]
+from msg_adapters.axes import InputAxes as InputAxes
+from msg_adapters.axes import vertices_ros_from_smpl as vertices_ros_from_smpl
+from msg_adapters.axes import vertices_smpl_from_ros as vertices_smpl_from_ros
+from msg_adapters.bags import BAG_SUFFIXES as BAG_SUFFIXES
+from msg_adapters.bags import BagMessage as BagMessage
+from msg_adapters.bags import BagReader as BagReader
+from msg_adapters.bags import BagWriter as BagWriter
+from msg_adapters.bags import FrameRecord as FrameRecord
+from msg_adapters.bags import QosProfile as QosProfile
+from msg_adapters.bags import SmplBag as SmplBag
+from msg_adapters.bags import TopicInfo as TopicInfo
+from msg_adapters.bags import iter_smpl_frames as iter_smpl_frames
+from msg_adapters.bags import open_smpl_bag as open_smpl_bag
+from msg_adapters.cameras import CAMERA_INFO as CAMERA_INFO
+from msg_adapters.cameras import Camera as Camera
+from msg_adapters.cameras import decode_camera_info as decode_camera_info
+from msg_adapters.definitions import MessageDefinition as MessageDefinition
+from msg_adapters.definitions import message_definition as message_definition
+from msg_adapters.diagnostics import DIAGNOSTIC_ARRAY as DIAGNOSTIC_ARRAY
+from msg_adapters.diagnostics import DiagnosticStatus as DiagnosticStatus
+from msg_adapters.diagnostics import encode_diagnostics as encode_diagnostics
+from msg_adapters.errors import AdapterError as AdapterError
+from msg_adapters.errors import BagError as BagError
+from msg_adapters.errors import DecodeError as DecodeError
+from msg_adapters.errors import EncodeError as EncodeError
+from msg_adapters.errors import MotionFileError as MotionFileError
+from msg_adapters.errors import TransformError as TransformError
+from msg_adapters.inputs import INPUT_TYPES as INPUT_TYPES
+from msg_adapters.inputs import KEYPOINT_TYPES as KEYPOINT_TYPES
+from msg_adapters.inputs import Decoder as Decoder
+from msg_adapters.inputs import Encoder as Encoder
+from msg_adapters.inputs import InputType as InputType
+from msg_adapters.inputs import Keypoints as Keypoints
+from msg_adapters.inputs import KeypointType as KeypointType
+from msg_adapters.inputs import decode_keypoints as decode_keypoints
+from msg_adapters.inputs import decoder_for as decoder_for
+from msg_adapters.inputs import encoder_for as encoder_for
+from msg_adapters.inputs import frame_id_of as frame_id_of
+from msg_adapters.joints import SMPL_JOINTS as SMPL_JOINTS
+from msg_adapters.markers import MARKER_ARRAY as MARKER_ARRAY
+from msg_adapters.markers import POINTS as POINTS
+from msg_adapters.markers import Marker as Marker
+from msg_adapters.markers import MarkerArrayEncoder as MarkerArrayEncoder
+from msg_adapters.markers import MarkerMesh as MarkerMesh
+from msg_adapters.markers import decode_marker_array as decode_marker_array
+from msg_adapters.markers import encode_delete as encode_delete
+from msg_adapters.markers import encode_delete_all as encode_delete_all
+from msg_adapters.markers import encode_points as encode_points
+from msg_adapters.markers import garment_namespace as garment_namespace
+from msg_adapters.markers import vertices_from_points as vertices_from_points
+from msg_adapters.motion import Motion as Motion
+from msg_adapters.motion import read_motion as read_motion
+from msg_adapters.outputs import COLLISION_OBJECT as COLLISION_OBJECT
+from msg_adapters.outputs import MESH as MESH
+from msg_adapters.outputs import POINT_CLOUD as POINT_CLOUD
+from msg_adapters.outputs import POINT_FIELDS as POINT_FIELDS
+from msg_adapters.outputs import POLYGON as POLYGON
+from msg_adapters.outputs import SCENE_UPDATE as SCENE_UPDATE
+from msg_adapters.outputs import Entity as Entity
+from msg_adapters.outputs import PointCloudEncoder as PointCloudEncoder
+from msg_adapters.outputs import PointField as PointField
+from msg_adapters.outputs import Rim as Rim
+from msg_adapters.outputs import decode_point_cloud as decode_point_cloud
+from msg_adapters.outputs import encode_collision_object as encode_collision_object
+from msg_adapters.outputs import encode_frames as encode_frames
+from msg_adapters.outputs import encode_mesh as encode_mesh
+from msg_adapters.outputs import encode_polygon as encode_polygon
+from msg_adapters.outputs import encode_rims as encode_rims
+from msg_adapters.outputs import encode_scene as encode_scene
+from msg_adapters.outputs import points_of as points_of
+from msg_adapters.people import IDS_LIST as IDS_LIST
+from msg_adapters.people import KeypointStream as KeypointStream
+from msg_adapters.people import decode_ids as decode_ids
+from msg_adapters.rotations import matrix_from_quaternion as matrix_from_quaternion
+from msg_adapters.rotations import quaternion_from_matrix as quaternion_from_matrix
+from msg_adapters.rotations import quaternion_from_rotvec as quaternion_from_rotvec
+from msg_adapters.rotations import rotvec_from_quaternion as rotvec_from_quaternion
+from msg_adapters.rotations import slerp as slerp
+from msg_adapters.transforms import TF_MESSAGE as TF_MESSAGE
+from msg_adapters.transforms import Placement as Placement
+from msg_adapters.transforms import Transform as Transform
+from msg_adapters.transforms import TransformBuffer as TransformBuffer
+from msg_adapters.transforms import decode_transforms as decode_transforms
+from msg_adapters.transforms import encode_transforms as encode_transforms

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    FloatT = TypeVar("FloatT", bound=np.floating[Any])
+FloatT = TypeVar("FloatT", bound=np.floating[Any])
 
 InputAxes = Literal["smpl", "frame"]
 """What a sender's root orientation and translation are expressed in.

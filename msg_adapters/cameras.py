@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from msg_adapters.cdr import CdrReader
+from msg_adapters.cdr import Buffer, CdrReader
 from msg_adapters.errors import DecodeError
-
-if TYPE_CHECKING:
-    from msg_adapters.cdr import Buffer
 
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 
@@ -39,16 +35,13 @@ class Camera:
 def decode_camera_info(data: Buffer) -> Camera:
     """The camera of a `sensor_msgs/CameraInfo` in CDR. Raises `DecodeError` for one that isn't calibrated."""
     reader = CdrReader(data)
-    reader.stamp_ns()
-    frame_id = reader.string().lstrip("/")
-    height, width = reader.numbers("II")
-    reader.string()
+    _, frame_id, height, width, _ = reader.fields("TsIIs")
     reader.array("f8", reader.length(item_bytes=8))
     k = reader.array("f8", 9 + 9 + 12)  # k, r, p
-    reader.numbers("IIIIIIB")  # binning, region of interest
+    reader.fields("IIIIII?")  # binning, region of interest
     reader.finish()
     focal, centre = (float(k[0]), float(k[4])), (float(k[2]), float(k[5]))
     if not (np.isfinite(k[:9]).all() and min(focal) > 0 and width and height):
         msg = f"the camera in {frame_id!r} isn't calibrated: {width} x {height} pixels, focal lengths {focal}"
         raise DecodeError(msg)
-    return Camera(frame_id, width, height, focal, centre)
+    return Camera(frame_id.lstrip("/"), width, height, focal, centre)

@@ -7,16 +7,13 @@ to its size, counted from the start of the payload.
 from __future__ import annotations
 
 import struct
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from msg_adapters.errors import DecodeError, EncodeError
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
 
 Buffer = bytes | bytearray | memoryview
 
@@ -24,6 +21,7 @@ HEADER_BYTES = 4
 LITTLE_ENDIAN_HEADER = b"\x00\x01\x00\x00"
 NS_PER_S = 1_000_000_000
 _BYTE_ORDERS = {0: ">", 1: "<"}
+_PRIMITIVES = {order + code: struct.Struct(order + code) for order in "<>" for code in "?BbiIfd"}
 # RTPS pads payloads to a multiple of 4; rclpy's serialize_message leaves up to 12 unused bytes after empty sequences.
 _MAX_TRAILING = 15
 
@@ -80,18 +78,23 @@ class CdrReader:
         self._at += n_bytes
         return view
 
-    def numbers(self, codes: str) -> tuple[Any, ...]:
-        """Consecutive primitives by their `struct` codes, each aligned to its own size."""
-        values = []
+    def fields(self, codes: str) -> tuple[Any, ...]:
+        """Consecutive fields: a `struct` code is a primitive, aligned to its size; s a string, T a time [ns]."""
+        values: list[Any] = []
         for code in codes:
-            size = struct.calcsize(f"={code}")
-            self.align(size)
-            values.append(struct.unpack(f"{self._order}{code}", self.skip(size))[0])
+            if code == "s":
+                values.append(self.string())
+            elif code == "T":
+                values.append(self.stamp_ns())
+            else:
+                primitive = _PRIMITIVES[self._order + code]
+                self.align(primitive.size)
+                values.append(primitive.unpack(self.skip(primitive.size))[0])
         return tuple(values)
 
     def length(self, *, item_bytes: int) -> int:
         """Length of a sequence whose items take at least `item_bytes` each."""
-        (count,) = self.numbers("I")
+        (count,) = self.fields("I")
         if count * item_bytes > self.remaining:
             msg = (
                 f"a sequence claims {count} items of at least {item_bytes} bytes, the message has {self.remaining} left"
@@ -122,7 +125,7 @@ class CdrReader:
 
     def stamp_ns(self) -> int:
         """builtin_interfaces/Time (or Duration) in nanoseconds."""
-        seconds, nanoseconds = self.numbers("iI")
+        seconds, nanoseconds = self.fields("iI")
         return int(seconds) * NS_PER_S + int(nanoseconds)
 
     def finish(self) -> None:
@@ -146,34 +149,40 @@ class CdrWriter:
         """Pad to a multiple of `size` bytes."""
         self._payload += bytes(-len(self._payload) % size)
 
-    def numbers(self, codes: str, *values: float) -> int:
-        """Append primitives by their `struct` codes; returns the payload offset of the first one."""
+    def fields(self, codes: str, *values: Any) -> int:
+        """Append fields by their codes, as `CdrReader.fields` has them; returns the payload offset of the first one."""
         start = -1
         for code, value in zip(codes, values, strict=True):
-            self.align(struct.calcsize(f"={code}"))
-            start = len(self._payload) if start < 0 else start
-            try:
-                self._payload += struct.pack(f"<{code}", value)
-            except (struct.error, OverflowError) as error:
-                msg = f"{value!r} doesn't fit the message's field: {error}"
-                raise EncodeError(msg) from None
+            if code == "s":
+                at = self._string(value)
+            elif code == "T":
+                at = self.fields("iI", *split_stamp(value))
+            else:
+                primitive = _PRIMITIVES["<" + code]
+                self.align(primitive.size)
+                at = len(self._payload)
+                try:
+                    self._payload += primitive.pack(value)
+                except (struct.error, OverflowError) as error:
+                    msg = f"{value!r} doesn't fit the message's field: {error}"
+                    raise EncodeError(msg) from None
+            start = at if start < 0 else start
         return start
 
-    def string(self, text: str) -> None:
-        """Append a string in UTF-8 with its length and final NUL."""
+    def _string(self, text: str) -> int:
+        """UTF-8 with its length and final NUL."""
         try:
             raw = text.encode() + b"\0"
         except UnicodeEncodeError as error:
             msg = f"{text!r} can't be written in UTF-8: {error.reason}"
             raise EncodeError(msg) from None
-        self.numbers("I", len(raw))
+        at = self.fields("I", len(raw))
         self._payload += raw
+        return at
 
     def strings(self, texts: Sequence[str]) -> None:
         """Append a sequence of strings."""
-        self.numbers("I", len(texts))
-        for text in texts:
-            self.string(text)
+        self.fields("I" + "s" * len(texts), len(texts), *texts)
 
     def array(self, kind: str, values: Any) -> int:
         """Append an array's numbers as a numpy kind ("f4", "f8"), without a length; returns their payload offset."""
@@ -186,19 +195,9 @@ class CdrWriter:
         return start
 
     def sequence(self, kind: str, values: Any) -> None:
-        """Append an unbounded sequence of numbers: its length, then the numbers."""
-        self.numbers("I", int(np.size(values)))
+        """Append an unbounded sequence of numbers, or of rows of them: its length, then the numbers."""
+        self.fields("I", len(values))
         self.array(kind, values)
-
-    def stamp(self, stamp_ns: int) -> int:
-        """Append builtin_interfaces/Time (or Duration); returns its payload offset."""
-        return self.numbers("iI", *split_stamp(stamp_ns))
-
-    def header(self, stamp_ns: int, frame_id: str) -> int:
-        """Append std_msgs/Header; returns the payload offset of its stamp."""
-        at = self.stamp(stamp_ns)
-        self.string(frame_id)
-        return at
 
     def to_bytes(self) -> bytes:
         """The whole message with its encapsulation header."""

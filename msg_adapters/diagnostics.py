@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 from msg_adapters.cdr import CdrWriter
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
 
 DIAGNOSTIC_ARRAY = "diagnostic_msgs/msg/DiagnosticArray"
 OK, WARN, ERROR, STALE = range(4)
@@ -32,15 +29,9 @@ def encode_diagnostics(statuses: Sequence[DiagnosticStatus], *, stamp_ns: int, f
     Raises `EncodeError` when a value doesn't fit the message.
     """
     writer = CdrWriter()
-    writer.header(stamp_ns, frame_id)
-    writer.numbers("I", len(statuses))
-    for status in statuses:
-        writer.numbers("B", status.level)
-        writer.string(status.name)
-        writer.string(status.message)
-        writer.string(status.hardware_id)
-        writer.numbers("I", len(status.values))
-        for key, value in status.values.items():
-            writer.string(key)
-            writer.string(value)
+    writer.fields("TsI", stamp_ns, frame_id, len(statuses))
+    for one in statuses:
+        writer.fields("BsssI", one.level, one.name, one.message, one.hardware_id, len(one.values))
+        for pair in one.values.items():
+            writer.fields("ss", *pair)
     return writer.to_bytes()

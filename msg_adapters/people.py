@@ -1,19 +1,14 @@
-"""Messages of keypoints to frames: everybody in them is followed."""
+"""Messages of people: keypoints to frames, everybody in them followed; who is tracked, as REP-155 has it."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from numpy.typing import ArrayLike
 
+from msg_adapters.cdr import Buffer, CdrReader
 from msg_adapters.errors import DecodeError
 from msg_adapters.inputs import KEYPOINT_TYPES, decode_keypoints
-from refu_core.keypoints import LAYOUTS, People, Skeleton, TrackerSettings, keypoint_layout
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from msg_adapters.cdr import Buffer
-    from refu_core.frames import SmplFrame
-    from refu_core.keypoints import Proportions
+from refu_core.frames import SmplFrame
+from refu_core.keypoints import LAYOUTS, People, Proportions, Skeleton, TrackerSettings, keypoint_layout
 
 
 class KeypointStream:
@@ -64,3 +59,16 @@ class KeypointStream:
     def predicted(self, now_ns: int) -> dict[str, SmplFrame]:
         """Everybody who is followed, by now."""
         return self._people.at(now_ns)
+
+
+IDS_LIST = "hri_msgs/msg/IdsList"
+_MIN_STRING_BYTES = 4
+
+
+def decode_ids(data: Buffer) -> list[str]:
+    """The ids of a `hri_msgs/IdsList` in CDR. Raises `DecodeError` for anything that isn't one."""
+    reader = CdrReader(data)
+    reader.fields("Ts")
+    ids = [reader.string() for _ in range(reader.length(item_bytes=_MIN_STRING_BYTES))]
+    reader.finish()
+    return ids

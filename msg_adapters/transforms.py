@@ -5,18 +5,13 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from msg_adapters.cdr import CdrReader, CdrWriter
+from msg_adapters.cdr import Buffer, CdrReader, CdrWriter
 from msg_adapters.errors import TransformError
 from msg_adapters.rotations import matrix_from_quaternion, slerp
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
-
-    from msg_adapters.cdr import Buffer
 
 TF_MESSAGE = "tf2_msgs/msg/TFMessage"
 HISTORY_NS = 10 * 10**9
@@ -43,10 +38,9 @@ class Transform:
 def encode_transforms(transforms: Sequence[Transform]) -> bytes:
     """A `tf2_msgs/TFMessage`. Raises `EncodeError` for a stamp that doesn't fit a ROS time."""
     writer = CdrWriter()
-    writer.numbers("I", len(transforms))
+    writer.fields("I", len(transforms))
     for one in transforms:
-        writer.header(one.stamp_ns, one.parent)
-        writer.string(one.child)
+        writer.fields("Tss", one.stamp_ns, one.parent, one.child)
         writer.array("f8", one.translation)
         writer.array("f8", one.quaternion)
     return writer.to_bytes()
@@ -57,7 +51,7 @@ def decode_transforms(data: Buffer) -> list[Transform]:
     reader = CdrReader(data)
     found = []
     for _ in range(reader.length(item_bytes=_MIN_TRANSFORM_BYTES)):
-        stamp_ns, parent, child = reader.stamp_ns(), reader.string(), reader.string()
+        stamp_ns, parent, child = reader.fields("Tss")
         numbers = reader.array("f8", 7)
         found.append(Transform(stamp_ns, parent, child, numbers[:3], numbers[3:]))
     reader.finish()

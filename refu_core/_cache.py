@@ -5,18 +5,16 @@ from __future__ import annotations
 import contextlib
 import os
 import tempfile
+from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from refu_core._files import replacing
 from refu_core._npz import read_npz
 from refu_core.errors import RefuError
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping
-
-    from numpy.typing import NDArray
 
 
 def cache_folder() -> Path:
@@ -48,11 +46,5 @@ def keep(name: str, arrays: Mapping[str, NDArray[Any]]) -> None:
     with contextlib.suppress(OSError):
         folder = cache_folder()
         folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=folder, suffix=".part", delete=False) as part:
-            try:
-                np.savez(part, allow_pickle=False, **arrays)
-                part.close()
-                Path(part.name).replace(folder / f"{name}.npz")
-            except OSError:
-                Path(part.name).unlink(missing_ok=True)
-                raise
+        with replacing(folder / f"{name}.npz") as file:
+            np.savez(file, allow_pickle=False, **arrays)

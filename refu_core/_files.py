@@ -1,20 +1,23 @@
 """The one place where input files are opened: regular ones alone, and no more of them than was asked for.
 
-A FIFO would keep its reader waiting for ever, a device has no end, and to open one may already do something.
+A FIFO would keep its reader waiting for ever, a device has no end, and to open one may already do something. And where
+files are put in another's place, all of them or nothing.
 """
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import math
 import os
 import stat
+import threading
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, BinaryIO
 
-if TYPE_CHECKING:
-    from refu_core.errors import RefuError
+from refu_core.errors import RefuError
 
 MAX_JSON_BYTES = 4 << 20
 """What a card or a table takes at most; parsed, it may take a hundred times as much."""
@@ -96,6 +99,25 @@ def read_json(path: str | os.PathLike[str], *, error: type[RefuError], wanted: s
 def parse_json(text: bytes) -> Any:
     """Raises `ValueError` for anything but JSON of finite numbers, `RecursionError` where it is nested too deeply."""
     return json.loads(text, parse_float=_finite, parse_constant=_finite)
+
+
+@contextlib.contextmanager
+def replacing(path: Path, *, sync: bool = False) -> Iterator[BinaryIO]:
+    """A file to write, which takes the place of `path` in one step when all of it is there; with `sync`, on the disk.
+
+    After an error, the system's own (`OSError`) for instance, `path` is what it was before.
+    """
+    part = path.with_name(f".{path.name}.{os.getpid()}.{threading.get_ident()}")
+    try:
+        with part.open("wb") as file:
+            yield file
+            if sync:
+                file.flush()
+                os.fsync(file.fileno())
+        part.replace(path)
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink()
 
 
 def _finite(text: str) -> float:

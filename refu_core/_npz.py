@@ -7,21 +7,17 @@ import math
 import struct
 import zipfile
 import zlib
+from collections.abc import Collection
+from pathlib import Path
 from tokenize import TokenError
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.lib import format as npy
+from numpy.typing import NDArray
 
 from refu_core._files import open_file
-
-if TYPE_CHECKING:
-    from collections.abc import Collection
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from refu_core.errors import RefuError
+from refu_core.errors import RefuError
 
 MAX_BYTES = 256 << 20
 """All arrays that are taken from a file together, as float64: a body of 100,000 vertices, an hour of motion at 120 Hz

@@ -5,21 +5,17 @@ from __future__ import annotations
 import operator
 import re
 import struct
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Collection
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from refu_core._files import open_file
 from refu_core._npz import ArrayBudget
 from refu_core._pickle_machine import MAX_PICKLE_BYTES, Machine, Record, exactly, kind_of_name
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from refu_core.errors import RefuError
+from refu_core.errors import RefuError
 
 DAMAGE = (ValueError, TypeError, LookupError, struct.error, OverflowError, MemoryError, OSError)
 """What the machine, and arrays, raise where a file is damaged."""

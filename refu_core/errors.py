@@ -56,3 +56,7 @@ class MeshError(RefuError, ValueError):
 
 class WeightsError(RefuError, ValueError):
     """Weights that are missing, damaged, or trained for another garment or body."""
+
+
+class SimulationError(RefuError, ValueError):
+    """Motions, plans or data sets that don't fit together or can't be read."""

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from refu_core.errors import FrameError
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 N_JOINTS = 24
 N_BETAS = 10

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from refu_core.body import BUILTIN_BODIES
+from refu_core import GarmentPipeline
+from refu_core.body import BUILTIN_BODIES, BodyFit
 from refu_core.modes import FOREIGN_BETAS, BetasSource
-
-if TYPE_CHECKING:
-    from refu_core import GarmentPipeline
-    from refu_core.body import BodyFit
 
 
 def body_facts(pipeline: GarmentPipeline) -> dict[str, Any]:

@@ -6,19 +6,23 @@ import os
 import signal
 import sys
 import traceback
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from pathlib import Path
+from types import FrameType
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # NumPy reads it; its threads wait for busy cores
 
 from refu_core import RefuError, __version__
 from refu_core.errors import printable
 from refu_lab.commands import COMMANDS
-from refu_lab.commands._common import EXIT_BAD_INPUT, EXIT_BUG, EXIT_CHECK_FAILED, EXIT_INTERRUPTED, Parser
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from types import FrameType
-
+from refu_lab.commands._common import (
+    EXIT_BAD_INPUT,
+    EXIT_BUG,
+    EXIT_CHECK_FAILED,
+    EXIT_INTERRUPTED,
+    Parser,
+    check_writable,
+)
 
 _OF_LAB = ("matplotlib", "PIL", "tqdm")
 """Packages of the extra `lab`; others that may be missing are of `train`."""
@@ -42,6 +46,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, _interrupt)  # a terminated replay closes its bag like an interrupted one
     try:
         args = _parser().parse_args(arguments)
+        for path in (getattr(args, name, None) for name in ("json", "output", "cache", "picture")):
+            check_writable(path if isinstance(path, Path) else None)
         code: int = args.run(args)
     except RefuError as error:
         return _failed(f"error: {error}", EXIT_BAD_INPUT)

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from refu_core.body import Collider, load_body
 from refu_core.garments import load_garment
-from refu_core.simulation import SimulationError, colliders
+from refu_core.simulation import GarmentDataset, SimulationError, colliders
 from refu_lab.render import Backdrop, Camera, RenderMesh, render
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from refu_core.simulation import GarmentDataset
 
 _CLOTH = ((0.36, 0.52, 0.66), (0.72, 0.42, 0.36), (0.42, 0.56, 0.42), (0.62, 0.54, 0.36))
 _TILE = (128, 160)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import msg_adapters as adapters
 from msg_adapters.diagnostics import ERROR, OK, WARN
@@ -10,9 +10,6 @@ from msg_adapters.markers import SKIN
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-    from types import TracebackType
-
-    from typing_extensions import Self
 
     from msg_adapters import FrameRecord
     from refu_core import GarmentPipeline, SmplFrame
@@ -65,14 +62,12 @@ class DressedBag:
             mesh = adapters.MarkerMesh("body", faces, len(pipeline.body.v_template), color=SKIN)
             self._body = adapters.MarkerArrayEncoder([mesh], frame_id=options.frame_id, axes=options.axes)
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> DressedBag:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: Any) -> None:
         """Finishes the bag, also after an exception."""
-        self._writer.__exit__(kind, error, trace)
+        self._writer.__exit__(*error)
 
     def add_input(self, record: FrameRecord) -> None:
         """A message as it came."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from refu_core import GarmentError, GarmentPipeline, SmplFrame, load_body, load_garment
 from refu_core.fitting import (
@@ -27,11 +29,6 @@ from refu_core.recordings import SUFFIXES, read_recording
 from refu_core.weights import weights_folder
 from refu_lab.render import Camera, RenderMesh, render, save_png
 from refu_lab.tables import format_table
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
 
 _TILE = (260, 400)
 """Width and height of one picture [pixels]."""

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 import msg_adapters as adapters
 from refu_core import GarmentPipeline, GarmentTemplate, SmplFrame
 from refu_core.errors import GarmentError
 from refu_core.outputs import RADIUS_90, SigmaMap, bend_of
 from refu_lab.truth import GroundTruth
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 
 class Moment(NamedTuple):

@@ -12,26 +12,23 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from tqdm import tqdm
 
 import msg_adapters as adapters
+from msg_adapters import FrameRecord
 from refu_core import GarmentPipeline, SmplFrame
 from refu_core._device import one_thread
 from refu_core.metrics import CollisionChecker, Figures, GarmentMetrics
 from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN, BackboneName, BetasSource
-from refu_core.recordings import axis_of, upright_share
+from refu_core.realtime import PipelineOutput, SkinShift
+from refu_core.recordings import Axes, axis_of, upright_share
 from refu_lab.bodies import betas_warnings, body_facts, body_warnings
 from refu_lab.dressed_bag import DressedBag, garment_encoder
 from refu_lab.sources import Source, open_source
 from refu_lab.truth import GroundTruth
-
-if TYPE_CHECKING:
-    from msg_adapters import FrameRecord
-    from refu_core.realtime import PipelineOutput, SkinShift
-    from refu_core.recordings import Axes
 
 _MAX_REASONS = 20
 """Reasons of skips that are counted apart."""

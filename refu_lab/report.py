@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import html
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -17,7 +16,7 @@ from refu_core.recordings import upright_turn
 from refu_lab.plots import new_axes, save_svg
 from refu_lab.render import SKIN, Camera, RenderMesh, colliding_vertices, collision_mesh, render, save_png
 from refu_lab.replay import FrameResult, ReplayResult
-from refu_lab.tables import REPLAY_HEADER, replay_rows
+from refu_lab.tables import REPLAY_HEADER, html_page, html_table, replay_rows
 from refu_lab.turntable import STYLE as TURNTABLE_STYLE
 from refu_lab.turntable import Frame, Mesh, Pose, turntable
 
@@ -48,22 +47,6 @@ figure { margin: 0; } .warn { border-left: 4px solid #d33; padding-left: .8rem; 
 """
 
 
-@dataclass(frozen=True)
-class _Pictured:
-    """A frame that is shown."""
-
-    name: str
-    """Worst, median or best."""
-    title: str
-    captions: tuple[str, str]
-    """What collided before and after."""
-
-    @property
-    def files(self) -> tuple[str, str]:
-        """Its pictures, before and after."""
-        return f"{self.name}_before.png", f"{self.name}_after.png"
-
-
 def write_report(result: ReplayResult, folder: Path, *, progress: bool = False) -> Path:
     """Writes `index.html` and its plots and pictures into `folder`, which is made if it isn't there.
 
@@ -77,9 +60,9 @@ def write_report(result: ReplayResult, folder: Path, *, progress: bool = False) 
         folder.mkdir(parents=True, exist_ok=True)
         pipeline = result.options.load_pipeline()
         _plot(result, pipeline, folder)
-        pictures, turned = _draw_frames(result, pipeline, folder, progress=progress)
+        frames, turned = _draw_frames(result, pipeline, folder, progress=progress)
         page = folder / "index.html"
-        page.write_text(_page(result, pictures, turned), encoding="utf-8")
+        page.write_text(_page(result, frames, turned), encoding="utf-8")
     except OSError as error:
         msg = f"{folder}: the report can't be written: {error.strerror or error}"
         raise RefuError(msg) from error
@@ -131,7 +114,7 @@ def _legend(axes: Axes, *, columns: int) -> None:
 
 def _draw_frames(
     result: ReplayResult, pipeline: GarmentPipeline, folder: Path, *, progress: bool
-) -> tuple[list[_Pictured], str]:
+) -> tuple[list[Frame], str]:
     """Renders the worst, a median and the best frame, before and after, from their parameters; and all as HTML."""
     order = sorted(range(len(result.frames)), key=lambda i: result.frames[i].badness)
     chosen = {"worst": order[-1], "median": order[len(order) // 2], "best": order[0]}
@@ -139,7 +122,7 @@ def _draw_frames(
     checker = CollisionChecker(body_faces)
     meshes = [Mesh("body", body_faces, SKIN)]
     meshes += [Mesh(name, one.faces.cpu().numpy(), one.card.color) for name, one in pipeline.garments.items()]
-    pictures, frames = [], []
+    frames = []
     start = result.frames[0].frame.stamp_ns
     # A frame has axes of its own (a camera's, or z up); the pictures have y up.
     roots = np.array([one.frame.pose[0] for one in result.frames], np.float64)
@@ -152,9 +135,8 @@ def _draw_frames(
             body, yaw = output.body @ turn.T, _front(frame, turn)
             camera = Camera.framing(body, size=_PICTURE, yaw=yaw)
             title = f"{name.capitalize()} frame, number {index}, {1e-9 * (frame.frame.stamp_ns - start):.2f} s"
-            picture = _Pictured(name, title, (_caption(frame, "before"), _caption(frame, "after")))
             poses = []
-            for when, file in zip(("before", "after"), picture.files, strict=True):
+            for when in ("before", "after"):
                 drawn, posed = [RenderMesh(body, body_faces)], [Pose(body)]
                 for garment, mesh in output.items():
                     vertices = mesh.raw if when == "before" else mesh.local
@@ -162,12 +144,12 @@ def _draw_frames(
                     colour = pipeline.garments[garment].card.color
                     drawn.append(collision_mesh(vertices @ turn.T, mesh.faces, found, colour=colour))
                     posed.append(Pose(vertices @ turn.T, colliding_vertices(mesh.faces, found)))
-                save_png(render(drawn, camera=camera, size=_PICTURE), folder / file)
+                save_png(render(drawn, camera=camera, size=_PICTURE), folder / f"{name}_{when}.png")
                 poses.append(posed)
                 bar.update()
-            pictures.append(picture)
-            frames.append(Frame(name, title, poses[0], poses[1], *picture.captions, yaw))
-    return pictures, turntable(meshes, frames)
+            captions = _caption(frame, "before"), _caption(frame, "after")
+            frames.append(Frame(name, title, poses[0], poses[1], *captions, yaw))
+    return frames, turntable(meshes, frames)
 
 
 def _front(frame: FrameResult, turn: NDArray[np.float32]) -> float:
@@ -184,26 +166,23 @@ def _caption(frame: FrameResult, when: str) -> str:
     return "; ".join(parts)
 
 
-def _page(result: ReplayResult, pictures: Sequence[_Pictured], turned: str) -> str:
+def _page(result: ReplayResult, frames: Sequence[Frame], turned: str) -> str:
     data = result.as_dict()
     notes = [f"{count} messages skipped: {reason}" for reason, count in result.skips.most_common()]
     notes += result.warnings + (["The replay was interrupted."] if result.interrupted else [])
     warning = "".join(f'<p class="warn">{html.escape(note)}</p>' for note in notes)
-    figures = "".join(map(_figure, pictures))
+    figures = "".join(map(_figure, frames))
     frame, shift = data["latency_ms"], data["skin_shift_mm"]
-    return f"""<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>Replay of {html.escape(result.options.input.name)}</title><style>{STYLE}{TURNTABLE_STYLE}</style></head><body>
-<h1>Replay of {html.escape(result.options.input.name)}</h1>
-<p class="note">{html.escape(result.source)}; backbone {html.escape(data["backbone"])}, signed distance
+    body = f"""<p class="note">{html.escape(result.source)}; backbone {html.escape(data["backbone"])}, signed distance
 {html.escape(data["sdf"])}, margin {1e3 * data["margin_m"]:g} mm, {html.escape(data["device"])}.
 {data["frames"]} frames; skin moved to be free of itself: {shift["mean"]:.2f} mm on average,
 {shift["largest"]:.1f} mm at most.
 A whole frame, bytes to bytes: p50 {frame["p50"]:.1f}, p95 {frame["p95"]:.1f}, p99 {frame["p99"]:.1f} ms.</p>{warning}
-<h2>Figures</h2>{_table(data)}
+<h2>Figures</h2><div class='wide'>{html_table(REPLAY_HEADER, replay_rows(data["garments"]))}</div>
 <p class="note">VFCP: vertices inside the body. CFMP: frames without any collision, vertices and triangles.
 Both by exact checks of every frame and every vertex, against the collider: the posed body with its overlaps (an arm in
-the flank, thighs in a squat) pulled apart. The last column is against the skin, which runs through itself there.</p>
+the flank, thighs in a squat) pulled apart. The last column is against the skin, which runs through itself there. Folds:
+their energy over that of the true garment's, from the finest to the widest; below 1 it is smoother than cloth.</p>
 <h2>Worst, median and best frame</h2>{turned}
 <p class="note">Drag to turn; click, then the wheel to come nearer; a double click goes back. Red: colliding triangles
 and vertices inside the body.</p>
@@ -211,24 +190,16 @@ and vertices inside the body.</p>
 <div class="wide"><img class="plot" src="penetration.svg" alt="penetration over time"></div>
 <h2>Latency</h2>
 <div class="wide"><img class="plot" src="latency.svg" alt="latency over time"></div>
-<h2>Pictures</h2><div class="pictures">{figures}</div>
-</body></html>
-"""
+<h2>Pictures</h2><div class="pictures">{figures}</div>"""
+    return html_page(f"Replay of {result.options.input.name}", body, style=STYLE + TURNTABLE_STYLE)
 
 
-def _figure(picture: _Pictured) -> str:
+def _figure(frame: Frame) -> str:
     """A frame before and after, side by side, under one caption."""
+    before, after = map(html.escape, (frame.before_caption, frame.after_caption))
     images = "".join(
-        f'<span title="{when}"><img src="{file}" alt="{html.escape(f"{when}: {caption}")}"></span>'
-        for when, file, caption in zip(("before", "after"), picture.files, picture.captions, strict=True)
+        f'<span title="{when}"><img src="{frame.name}_{when}.png" alt="{when}: {caption}"></span>'
+        for when, caption in (("before", before), ("after", after))
     )
-    before, after = map(html.escape, picture.captions)
-    return f"""<figure><div class="pair">{images}</div><figcaption><b>{html.escape(picture.title)}</b><br>
+    return f"""<figure><div class="pair">{images}</div><figcaption><b>{html.escape(frame.title)}</b><br>
 Before: {before}.<br>After: {after}.</figcaption></figure>"""
-
-
-def _table(data: dict[str, Any]) -> str:
-    lines = ["<tr>" + "".join(f"<th>{name}</th>" for name in REPLAY_HEADER) + "</tr>"]
-    for row in replay_rows(data["garments"]):
-        lines += ["<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>"]
-    return f"<div class='wide'><table>{''.join(lines)}</table></div>"

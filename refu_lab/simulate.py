@@ -4,67 +4,69 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
-from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 from tqdm import tqdm
 
 from refu_core._engine import Engine
+from refu_core.recordings import Axes
 from refu_core.simulation import GarmentDataset, Progress, load_clips, simulate_dataset, simulate_sequences
 from refu_lab.contact_sheet import contact_sheet
 from refu_lab.render import save_png
 from refu_lab.tables import format_table
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from refu_core.recordings import Axes
-
 SHEET = "samples.png"
 """Random samples of a finished set, to look at before anything is trained on it."""
 
 
-def simulate(
-    garment: str,
-    count: int,
-    output: Path,
-    *,
-    motions: Path | None,
-    axes: Axes = "auto",
-    fps: float | None = None,
-    body: str | None,
-    seed: int,
-    engine: Engine | None = None,
-    sequences: bool,
-    shapes: int,
-    seconds: float,
-    progress: bool,
-) -> dict[str, Any]:
+@dataclass(frozen=True, kw_only=True)
+class SimulateOptions:
+    """What is simulated; the fields are the options of `refu simulate`."""
+
+    garment: str
+    count: int
+    output: Path
+    motions: Path | None = None
+    input_axes: Axes = "auto"
+    fps: float | None = None
+    body: str | None = None
+    seed: int = 0
+    sequences: bool = False
+    shapes: int = 5
+    seconds: float = 10.0
+
+
+def simulate(options: SimulateOptions, *, engine: Engine | None = None, progress: bool) -> dict[str, Any]:
     """Simulates with a progress bar that shows what was dropped; returns the set's card.
 
     A finished set of samples gets its picture, `samples.png`.
 
     Raises `RefuError`.
     """
-    clips = None if motions is None else load_clips(motions, axes=axes, fps=fps)
+    clips = None
+    if options.motions is not None:
+        clips = load_clips(options.motions, axes=options.input_axes, fps=options.fps)
     for note, count in Counter(note for clip in clips or () for note in clip.notes).most_common():
         print(f"motions: {note} ({count} of {len(clips or ())} files)", file=sys.stderr)
-    with ExitStack() as stack:
-        unit = "sequence" if sequences else "sample"
-        bar = stack.enter_context(tqdm(total=None, unit=unit, disable=None if progress else True))
+    what = options.garment, options.count, options.output
+    unit = "sequence" if options.sequences else "sample"
+    with tqdm(total=None, unit=unit, disable=None if progress else True) as bar:
 
         def show(state: Progress) -> None:
             bar.total = state.total
             bar.set_postfix(state.dropped, refresh=False)
             bar.update(state.done - bar.n)
 
-        options: dict[str, Any] = {"motions": clips, "body": body, "seed": seed, "progress": show}
-        options["engine"] = engine
-        if sequences:
-            return simulate_sequences(garment, count, output, shapes=shapes, seconds=seconds, **options)
-        card = simulate_dataset(garment, count, output, **options)
+        how: dict[str, Any] = {"motions": clips, "body": options.body, "seed": options.seed, "progress": show}
+        how["engine"] = engine
+        if options.sequences:
+            return simulate_sequences(*what, shapes=options.shapes, seconds=options.seconds, **how)
+        card = simulate_dataset(*what, **how)
     if not card["counts"]["to_do"]:
-        save_png(contact_sheet(GarmentDataset(output), body=body, garment=garment), output / SHEET)
+        sheet = contact_sheet(GarmentDataset(options.output), body=options.body, garment=options.garment)
+        save_png(sheet, options.output / SHEET)
     return card
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from refu_core.errors import RefuError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
     from refu_lab.replay import ReplayResult
@@ -50,6 +51,26 @@ def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
         cells = [row[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True))]
         lines.append("  ".join(cells).rstrip())
     return "\n".join(lines)
+
+
+def html_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table of cells that are HTML already."""
+    lines = [("th", header), *(("td", row) for row in rows)]
+    body = "".join(f"<tr>{''.join(f'<{tag}>{cell}</{tag}>' for cell in cells)}</tr>" for tag, cells in lines)
+    return f"<table>{body}</table>"
+
+
+def html_page(title: str, body: str, *, style: str) -> str:
+    """A page that refers to nothing outside its folder; `title` is text, the rest HTML and CSS."""
+    head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
+    name = html.escape(title)
+    return f"""<!doctype html>
+<html lang="en"><head>{head}
+<title>{name}</title><style>{style}</style></head><body>
+<h1>{name}</h1>
+{body}
+</body></html>
+"""
 
 
 def picture_markdown(file: str, caption: str) -> str:
@@ -102,9 +123,11 @@ def replay_table(result: ReplayResult) -> str:
 
 REPLAY_HEADER = (
     *("garment", "frames", "p50 ms", "p95 ms", "p99 ms", "VFCP %", "CFMP %", "depth mm", "MPVE mm"),
-    "CFMP % on the skin",
+    *("folds", "CFMP % on the skin"),
 )
 _FIGURES = (("vfcp_percent", 3), ("cfmp_percent", 1), ("max_depth_mm", 1), ("mpve_mm", 2))
+
+_FOLDS = ("folds_1", "folds_4", "folds_16", "folds_64")
 
 
 def replay_rows(garments: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, ...]]:
@@ -113,7 +136,9 @@ def replay_rows(garments: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, ..
     for name, after in garments.items():
         latency = [f"{after['latency_ms'][p]:.2f}" for p in ("p50", "p95", "p99")]
         on_skin = after["skin_cfmp_percent"]
-        figures = (*_changes(after["before"], after), "-" if on_skin is None else f"{on_skin:.1f}")
+        folds = [after[key] for key in _FOLDS]
+        against_truth = "-" if None in folds else " ".join(f"{one:.2f}" for one in folds)
+        figures = (*_changes(after["before"], after), against_truth, "-" if on_skin is None else f"{on_skin:.1f}")
         rows.append((name, str(after["n_frames"]), *latency, *figures))
     return rows
 

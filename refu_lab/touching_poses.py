@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from refu_core import GarmentPipeline, SmplFrame
 from refu_core.body import JOINT_NAMES, joints_of
 from refu_core.errors import FrameError
 from refu_core.modes import DEFAULT_GARMENTS
 from refu_lab.render import SKIN, Camera, RenderMesh, render
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 Angles = Mapping[str, tuple[float, float, float]]
 _MOVED = (0.80, 0.24, 0.20)

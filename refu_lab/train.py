@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 from refu_core import RefuError, load_garment
 from refu_core._device import checked_device
@@ -12,6 +12,7 @@ from refu_core.backbones import PRESETS
 from refu_core.body import load_fit
 from refu_core.garments import worn_on
 from refu_core.modes import MAX_MARGIN
+from refu_core.refu import ScaleKind
 from refu_core.sdf import SDF_PRESETS
 from refu_core.simulation import GarmentDataset, open_dataset
 from refu_core.training import (
@@ -26,9 +27,6 @@ from refu_core.training import (
     train_sdf,
 )
 from refu_lab.tables import format_table
-
-if TYPE_CHECKING:
-    from refu_core.refu import ScaleKind
 
 TRAIN_MODES: tuple[str, ...] = ("none", *FINETUNE_MODES)
 NETWORKS: tuple[str, ...] = ("garment", "sdf")
@@ -54,6 +52,8 @@ class TrainOptions:
     body: str | None = None
     like: str | None = None
     """A related garment whose networks are carried over: what a small set is enough for."""
+    start: Path | None = None
+    """Folder of a garment's weights that training goes on from, with their ReFU."""
     seed: int = 0
     steps: int | None = None
     device: str = "cpu"
@@ -89,6 +89,18 @@ def train(options: TrainOptions, *, progress: bool) -> dict[str, Any]:
         )
     common |= {"backbone": options.backbone, "preset": options.preset, "body": body}
     source: Path | None = options.folder
+    if options.start is not None:
+        settings = _finetuning(options)
+        return finetune(
+            template,
+            dataset,
+            options.start,
+            options.folder,
+            mode=options.mode,
+            settings=settings,
+            goes_on=True,
+            **common,
+        )
     if options.mode == "none":
         return pretrain(template, dataset, options.folder, settings=_pretraining(options), **common)
     if options.backbone == "gcnn":
@@ -107,6 +119,9 @@ def _check(options: TrainOptions) -> None:
         "realtime",
     ):
         msg = "--like makes a tailornet of the preset realtime: leave --network, --backbone and --preset out"
+        raise RefuError(msg)
+    if options.start is not None and (options.mode == "none" or options.like is not None):
+        msg = "--start goes on with a mode that has ReFU: leave --like and --mode none out"
         raise RefuError(msg)
     if options.margin is not None and not 0 <= options.margin <= MAX_MARGIN:
         msg = f"the margin must be between 0 and {MAX_MARGIN} m, got {options.margin}"

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 import msg_adapters as adapters
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from refu_core import SmplFrame
+from refu_core import SmplFrame
 
 TOPIC = "/ground_truth"
 """A MarkerArray a frame, stamped as its body parameters are; a marker's `ns` is the garment's name.

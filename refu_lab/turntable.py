@@ -11,19 +11,16 @@ import base64
 import html
 import json
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from refu_core import RefuError
 from refu_lab.render import sky_light
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
 
 STYLE = """
 #turntable canvas { width: 100%; height: min(78vh, 620px, 125vw); touch-action: pan-y; cursor: grab;

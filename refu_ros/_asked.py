@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -13,9 +13,7 @@ from refu_core import RefuError, SmplFrame
 from refu_core.frames import N_BETAS
 from refu_core.modes import BUILTIN_GARMENTS
 from refu_ros._scene import check_plausible
-
-if TYPE_CHECKING:
-    from refu_ros._settings import NodeSettings
+from refu_ros._settings import NodeSettings
 
 _PART = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 """A folder or file: nothing hidden, no `..`, no option of a command."""

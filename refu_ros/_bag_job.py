@@ -10,18 +10,16 @@ import subprocess
 import sys
 import tempfile
 import threading
+from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from refu_core import RefuError
 from refu_core.errors import printable
 from refu_core.modes import BetasSource
 from refu_ros._dresser import NICE
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from refu_ros._settings import NodeSettings
+from refu_ros._settings import NodeSettings, PipelineKey
 
 _PATIENCE_S = 10.0
 """Time for a bag to be closed when its replay is ended [s]."""
@@ -80,18 +78,10 @@ class BagJob:
 
 def _options(settings: NodeSettings) -> list[str]:
     """The node's settings as the command has them."""
-    given: dict[str, Any] = {
-        "garments": ",".join(settings.garments),
-        "sdf": settings.sdf,
-        "backbone": settings.backbone,
-        "weights": settings.weights,
-        "margin": settings.margin,
-        "device": settings.device,
-        "body": settings.body,
-        "betas-from": settings.betas_from,
-        "frame-id": settings.frame_id,
-        "style": ",".join(map(str, settings.style)) if any(settings.style) else "",
-    }
+    names = [item.name for item in fields(PipelineKey) if item.name not in ("garments", "collider")]
+    given: dict[str, Any] = {name.replace("_", "-"): getattr(settings, name) for name in (*names, "margin", "frame_id")}
+    given["garments"] = ",".join(settings.garments)
+    given["style"] = ",".join(map(str, settings.style)) if any(settings.style) else ""
     if settings.betas_source == BetasSource.FIXED:
         given["betas"] = ",".join(map(str, settings.betas))
     else:

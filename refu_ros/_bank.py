@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping
+from typing import Any
 
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.exceptions import InvalidHandle
@@ -12,9 +13,6 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 import msg_adapters as adapters
 from refu_core import RefuError
 from refu_ros._interfaces import interface, ros_qos
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
 
 QOS = adapters.QosProfile(reliability="reliable", depth=5)
 

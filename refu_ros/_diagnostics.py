@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import math
 import socket
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 from msg_adapters import DiagnosticStatus
+from msg_adapters.bags import RecorderState
 from msg_adapters.diagnostics import ERROR, OK, WARN
 from refu_core.modes import FOREIGN_BETAS
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from msg_adapters.bags import RecorderState
-    from refu_ros._settings import NodeSettings, PipelineKey
-    from refu_ros._statistics import Report
+from refu_ros._settings import NodeSettings, PipelineKey
+from refu_ros._statistics import Report
 
 _OVER_BUDGET = 0.1
 """Share of the frames that may be superseded before they are worked on."""
@@ -25,60 +21,41 @@ _FIRST_INPUT_S = 2.0
 """How long after the node has begun to listen nobody is missed yet [s]."""
 
 
-def statuses(
-    report: Report,
-    settings: NodeSettings,
-    *,
-    node: str,
-    state: str,
-    persons: Sequence[str],
-    recording: RecorderState | None,
-    recording_error: str,
-    listening_for: float | None = math.inf,
-    in_use: PipelineKey | None = None,
-    input_frame: str = "",
-    is_transformed: bool = False,
-    has_foreign_betas: bool = False,
-    n_namesakes: int = 0,
-) -> list[DiagnosticStatus]:
-    """Node, input, output and recording; `state` is the lifecycle's, `persons` are those in the scene.
+@dataclass(frozen=True, kw_only=True)
+class Situation:
+    """What a report says nothing of."""
 
-    `node` is the name with its namespace; `listening_for` is the time since the inputs were subscribed to [s], None
-    where they aren't; `in_use` is what is computed with; `input_frame` is the sender's, where it isn't the markers',
-    and `is_transformed` whether there are transforms of it;
-    `has_foreign_betas`: nobody knows what the betas mean that came; `n_namesakes` are other nodes of this name.
-    """
-    active = state == "active"
-    found = [
-        _node(report, f"{node}: node", state=state),
-        _input(
-            report,
-            settings,
-            f"{node}: input",
-            persons=persons,
-            active=active,
-            listening_for=listening_for,
-            input_frame=input_frame,
-            is_transformed=is_transformed,
-            has_foreign_betas=has_foreign_betas,
-        ),
-        _output(
-            report,
-            settings,
-            f"{node}: garments",
-            state=state,
-            resting=listening_for is None,
-            in_use=in_use,
-            n_namesakes=n_namesakes,
-        ),
-        _recording(recording, settings, f"{node}: recording", error=recording_error),
-    ]
+    node: str
+    """Its name with the namespace."""
+    state: str
+    """The lifecycle's."""
+    persons: Sequence[str]
+    """Those in the scene."""
+    recording: RecorderState | None
+    recording_error: str
+    listening_for: float | None = math.inf
+    """Time since the inputs were subscribed to [s]; None where they aren't."""
+    in_use: PipelineKey | None = None
+    """What is computed with."""
+    input_frame: str = ""
+    """The sender's, where it isn't the markers'."""
+    is_transformed: bool = False
+    """Whether there are transforms of it."""
+    has_foreign_betas: bool = False
+    """Whether nobody knows what the betas mean that came."""
+    n_namesakes: int = 0
+    """Other nodes of this name."""
+
+
+def statuses(report: Report, settings: NodeSettings, now: Situation) -> list[DiagnosticStatus]:
+    """Node, input, output and recording."""
     host = socket.gethostname()  # two robots' nodes of one name are told apart by it
-    return [replace(status, hardware_id=host) for status in found]
+    return [replace(make(report, settings, now), hardware_id=host) for make in (_node, _input, _output, _recording)]
 
 
-def _node(report: Report, name: str, *, state: str) -> DiagnosticStatus:
+def _node(report: Report, _: NodeSettings, now: Situation) -> DiagnosticStatus:
     """What went wrong though nobody's frame was the reason: requests without sense, clocks, callbacks."""
+    name, state = f"{now.node}: node", now.state
     faults = {key: n for key, n in report.recent.items() if key.startswith("fault.")}
     values = {"state": state, "last fault": report.reasons.get("fault", "")}
     values |= {f"faults: {where}": str(n) for where, n in sorted(report.group("fault").items())}
@@ -88,22 +65,12 @@ def _node(report: Report, name: str, *, state: str) -> DiagnosticStatus:
     return DiagnosticStatus(WARN, name, message, values=values)
 
 
-def _input(
-    report: Report,
-    settings: NodeSettings,
-    name: str,
-    *,
-    persons: Sequence[str],
-    active: bool,
-    listening_for: float | None,
-    input_frame: str,
-    is_transformed: bool,
-    has_foreign_betas: bool,
-) -> DiagnosticStatus:
+def _input(report: Report, settings: NodeSettings, now: Situation) -> DiagnosticStatus:
+    persons, listening_for, input_frame = now.persons, now.listening_for, now.input_frame
     invalid, received = report.recent["drop.invalid"], report.recent["received"]
     missing = [] if settings.follow_humans else [person for person in settings.persons if person not in persons]
     level, message = OK, f"{report.rate('received'):.1f} Hz"
-    if not active:
+    if now.state != "active":
         message = "not active"
     elif listening_for is None:
         message = "not subscribed to: nobody listens to anything, and nothing is recorded"
@@ -124,9 +91,9 @@ def _input(
         who = ", ".join(filter(None, missing))
         level = WARN
         message = f"no input from {who}" if who else f"no input for {min(report.silent_for, listening_for):.1f} s"
-    elif has_foreign_betas:
+    elif now.has_foreign_betas:
         level, message = WARN, FOREIGN_BETAS
-    way = "transformed to" if is_transformed else "shown as"
+    way = "transformed to" if now.is_transformed else "shown as"
     values = {
         "subscribed": "no" if listening_for is None else "yes",
         "rate [Hz]": f"{report.rate('received'):.1f}",
@@ -138,19 +105,11 @@ def _input(
         "stamps that went back": str(report.total["back_in_time"]),
     }
     values |= {f"dropped: {cause}": str(n) for cause, n in sorted(report.group("drop").items())}
-    return DiagnosticStatus(level, name, message, values=values)
+    return DiagnosticStatus(level, f"{now.node}: input", message, values=values)
 
 
-def _output(
-    report: Report,
-    settings: NodeSettings,
-    name: str,
-    *,
-    state: str,
-    resting: bool,
-    in_use: PipelineKey | None,
-    n_namesakes: int,
-) -> DiagnosticStatus:
+def _output(report: Report, settings: NodeSettings, now: Situation) -> DiagnosticStatus:
+    state, in_use, n_namesakes = now.state, now.in_use, now.n_namesakes
     stale, received = report.recent["drop.stale"], report.recent["received"]
     causes = ("device", "failed", "not_finite")
     failed = sum(report.recent[f"drop.{cause}"] for cause in causes)
@@ -168,7 +127,7 @@ def _output(
     elif stale > _OVER_BUDGET * received:
         level = WARN
         message = f"over budget: {stale} of {received} frames were superseded; latency p95 {p95:.1f} ms"
-    elif resting:
+    elif now.listening_for is None:
         message = "nobody listens"
     found, unresolved = report.total["penetration.found"], report.total["penetration.unresolved"]
     values = {
@@ -197,10 +156,11 @@ def _output(
         if in_use != settings.pipeline:
             values["asked for"] = str(settings.pipeline)
     values |= {f"skipped: {kind}": str(n) for kind, n in sorted(report.group("skip").items())}
-    return DiagnosticStatus(level, name, message, values=values)
+    return DiagnosticStatus(level, f"{now.node}: garments", message, values=values)
 
 
-def _recording(state: RecorderState | None, settings: NodeSettings, name: str, *, error: str) -> DiagnosticStatus:
+def _recording(_: Report, settings: NodeSettings, now: Situation) -> DiagnosticStatus:
+    state, error, name = now.recording, now.recording_error, f"{now.node}: recording"
     level, message = (ERROR, f"not recording: {error}") if error else (OK, "not recording")
     if state is None:
         return DiagnosticStatus(level, name, message)

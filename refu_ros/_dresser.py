@@ -5,24 +5,22 @@ from __future__ import annotations
 import os
 import threading
 from collections import OrderedDict
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from msg_adapters.axes import SMPL_COLUMNS
-from refu_core import RefuError
+from refu_core import RefuError, SmplFrame
+from refu_ros._settings import NodeSettings, PipelineKey
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from numpy.typing import NDArray
-
-    from refu_core import GarmentPipeline, SmplFrame
+    from refu_core import GarmentPipeline
     from refu_core.realtime import PipelineOutput
-    from refu_ros._settings import NodeSettings, PipelineKey
 
-    Then = Callable[[PipelineOutput, dict[str, NDArray[np.float64]]], object]
+Then = Callable[["PipelineOutput", dict[str, NDArray[np.float64]]], object]
 
 _MOST_WAITING = 8
 """Requests that may wait: who asks more often than frames can be dressed is told so."""

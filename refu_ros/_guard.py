@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import functools
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 from rclpy.action import ActionServer
 from rclpy.exceptions import InvalidHandle
@@ -15,9 +16,6 @@ from refu_core import RefuError
 from refu_core.errors import printable
 from refu_ros._scene import check_stamp
 from refu_ros._statistics import Statistics
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 _CLOCK = "/clock"
 _MOST_ITEMS = 1000

@@ -123,7 +123,7 @@ class Listener:
         node.statistics.receive()
         node.recording.put(topic, self.decoder.message_type, data, INPUT_QOS)
         if not node.is_watched():
-            node.statistics.skip("unwatched")
+            node.statistics.count("skip.unwatched")
             return
         try:
             frames, given = self.decoder.frames(person, data, node.now_ns())
@@ -174,7 +174,7 @@ class Listener:
         tolerance = round(1e9 * self._settings.transform_tolerance)
         found = self._tf.lookup(target, given, stamp_ns, tolerance_ns=tolerance)
         if found.is_late:
-            self._node.statistics.late_transform()
+            self._node.statistics.count("late_transform")
         return found
 
     def _camera_at(self, person: str, stamp_ns: int) -> PinholeCamera | None:
@@ -184,7 +184,7 @@ class Listener:
         try:
             way = self._placement(camera.frame_id, stamp_ns)
         except adapters.TransformError:
-            self._node.statistics.skip("camera_without_transform")
+            self._node.statistics.count("skip.camera_without_transform")
             return None
         if way is None and camera.frame_id not in (self._settings.frame_id, self._frames.get(person)):
             return None

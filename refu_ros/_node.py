@@ -15,21 +15,20 @@ from msg_adapters.outputs import GARMENTS, make_outputs
 from refu_core import RefuError
 from refu_core.errors import printable
 from refu_ros._bank import QOS, Bank
-from refu_ros._diagnostics import statuses
+from refu_ros._diagnostics import Situation, statuses
 from refu_ros._guard import GuardedNode, answer_no, transition
 from refu_ros._interfaces import interface
 from refu_ros._listener import Listener
 from refu_ros._loader import PipelineLoader
-from refu_ros._parameters import declare_settings
+from refu_ros._parameters import declare
 from refu_ros._recording import Recording
 from refu_ros._requests import Requests
 from refu_ros._scene import Scene
-from refu_ros._settings import specs
+from refu_ros._settings import NodeSettings, PipelineKey, specs
 
 if TYPE_CHECKING:
     from refu_core import GarmentPipeline
     from refu_core.outputs import Fittings
-    from refu_ros._settings import PipelineKey
     from refu_ros._worker import Worker
 
 NODE_NAME = "garment_node"
@@ -48,7 +47,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         self.finalized = False
         self.failed = False
         """Whether it ended because its device did."""
-        self.settings = declare_settings(self)
+        self.settings = declare(self, NodeSettings)
         self.recording = Recording(self.get_logger().info, sync_period=self.settings.record_sync_period)
         self._state = "unconfigured"
         self._worker: Worker | None = None
@@ -293,24 +292,20 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
             self.get_logger().error(f"not recording: {error}", throttle_duration_sec=60.0)
         if report.recent["drop.failed"]:
             self.get_logger().error(report.reasons["failed"], throttle_duration_sec=_LOG_PERIOD_S)
-        data = adapters.encode_diagnostics(
-            statuses(
-                report,
-                self.settings,
-                node=self.get_fully_qualified_name().lstrip("/"),
-                state=self._state,
-                in_use=self._in_use,
-                input_frame=self._listener.input_frame,
-                is_transformed=self._listener.is_transformed,
-                has_foreign_betas=self._listener.decoder.has_foreign_betas,
-                persons=() if scene is None else scene.persons,
-                recording=recording,
-                recording_error=error,
-                listening_for=None if since is None else time.monotonic() - since,
-                n_namesakes=self._count_namesakes(),
-            ),
-            stamp_ns=self.now_ns(),
+        now = Situation(
+            node=self.get_fully_qualified_name().lstrip("/"),
+            state=self._state,
+            in_use=self._in_use,
+            input_frame=self._listener.input_frame,
+            is_transformed=self._listener.is_transformed,
+            has_foreign_betas=self._listener.decoder.has_foreign_betas,
+            persons=() if scene is None else scene.persons,
+            recording=recording,
+            recording_error=error,
+            listening_for=None if since is None else time.monotonic() - since,
+            n_namesakes=self._count_namesakes(),
         )
+        data = adapters.encode_diagnostics(statuses(report, self.settings, now), stamp_ns=self.now_ns())
         self._diagnostics.publish(data)
         self.recording.put(DIAGNOSTICS_TOPIC, adapters.DIAGNOSTIC_ARRAY, data, QOS)
 

@@ -6,10 +6,8 @@ import argparse
 import signal
 import sys
 import time
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 EXIT_BAD_INPUT = 2
 _LOOK_UP_S = 0.25

@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
-from msg_adapters.bags import Recorder
+from msg_adapters import QosProfile
+from msg_adapters.bags import Recorder, RecorderState
 from refu_core import RefuError
 from refu_core.errors import printable
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from msg_adapters import QosProfile
-    from msg_adapters.bags import RecorderState
 
 
 class Recording:

@@ -85,11 +85,11 @@ class Scene:
         with self._changed:
             if person in self._pending:
                 if self._held:
-                    self._statistics.skip("max_rate")
+                    self._statistics.count("skip.max_rate")
                 else:
                     self._statistics.drop("stale")
             if frame.stamp_ns < self._stamps.get(person, 0):
-                self._statistics.back_in_time()
+                self._statistics.count("back_in_time")
             self._stamps[person] = frame.stamp_ns
             self._pending[person] = Arrival(frame, now, placement or Placement(), camera)
             self._seen[person] = now

@@ -5,9 +5,9 @@ What loads torch is imported where it is needed: a mistyped parameter is to be a
 
 from __future__ import annotations
 
-import math
 import re
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -19,35 +19,14 @@ from refu_core import RefuError, SmplFrame
 from refu_core.frames import N_JOINTS
 from refu_core.keypoints import LAYOUTS
 from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN, MAX_MARGIN, BackboneName, BetasSource, SdfMode
+from refu_ros._parameters import ParameterSpec, SettingsError, check, coerced, defaults_of, parameter, specs_of
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from refu_core import GarmentPipeline, GarmentTemplate
 
 _PERSON = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,99}")
 _FRAME = re.compile(r"[^/\s\x00-\x1f\x7f][^\s\x00-\x1f\x7f]{0,254}")
 _SLOWEST_HZ = 0.01
-
-
-class SettingsError(RefuError, ValueError):
-    """A parameter of the node that has no meaning."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ParameterSpec:
-    """What ROS is told about a parameter."""
-
-    description: str
-    low: float | None = None
-    high: float | None = None
-    choices: tuple[str, ...] = ()
-    live: bool = True
-    """Whether it may change while the node runs."""
-
-
-def _parameter(default: Any, description: str, **limits: Any) -> Any:
-    return field(default=default, metadata={"spec": ParameterSpec(description=description, **limits)})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,123 +86,122 @@ class NodeSettings:
     Raises `SettingsError` for a value out of range and for values that can't go together.
     """
 
-    garments: tuple[str, ...] = _parameter(DEFAULT_GARMENTS, "Garments that every person wears.")
-    body: str = _parameter("", "Who wears them: an SMPL file, or a built-in name; empty for the garments' own.")
-    betas_from: str = _parameter("", "An SMPL file whose betas arrive: the built-in mesh follows them; empty for none.")
-    backbone: str = _parameter(
+    garments: tuple[str, ...] = parameter(DEFAULT_GARMENTS, "Garments that every person wears.")
+    body: str = parameter("", "Who wears them: an SMPL file, or a built-in name; empty for the garments' own.")
+    betas_from: str = parameter("", "An SMPL file whose betas arrive: the built-in mesh follows them; empty for none.")
+    backbone: str = parameter(
         "auto", "What predicts the garment before collisions are handled.", choices=tuple(BackboneName)
     )
-    weights: str = _parameter(
+    weights: str = parameter(
         "", "Folder with a folder a garment of weights of one's own (refu train); empty for those that ship."
     )
-    sdf: str = _parameter("hybrid", "How collisions are found.", choices=tuple(SdfMode))
-    margin: float = _parameter(DEFAULT_MARGIN, "Clearance that is kept from the skin [m].", low=0.0, high=MAX_MARGIN)
-    collider: bool = _parameter(
+    sdf: str = parameter("hybrid", "How collisions are found.", choices=tuple(SdfMode))
+    margin: float = parameter(DEFAULT_MARGIN, "Clearance that is kept from the skin [m].", low=0.0, high=MAX_MARGIN)
+    collider: bool = parameter(
         True, "Bring garments off a body whose overlaps are pulled apart, which topic body shows; else off the raw one."
     )
-    device: str = _parameter("cpu", "Torch device: cpu or cuda.")
-    on_device_loss: str = _parameter(
+    device: str = parameter("cpu", "Torch device: cpu or cuda.")
+    on_device_loss: str = parameter(
         "cpu", "When the device fails: go on on the cpu, with an ERROR, or stop the node.", choices=("cpu", "stop")
     )
-    style: tuple[float, ...] = _parameter(
+    style: tuple[float, ...] = parameter(
         (0.0,) * 4, "Garment style γ in standard deviations; zeros are the mean style.", low=-10.0, high=10.0
     )
-    betas: tuple[float, ...] = _parameter(
+    betas: tuple[float, ...] = parameter(
         (0.0,) * 10, "Body shape in standard deviations, where betas_source is fixed.", low=-20.0, high=20.0
     )
-    betas_source: str = _parameter(
+    betas_source: str = parameter(
         "message",
         "message: betas that arrive are of body or betas_from; builtin: of the built-in body; fixed: parameter betas.",
         choices=tuple(BetasSource),
     )
-    input_type: str = _parameter(
+    input_type: str = parameter(
         "multiarray",
         "Message type and layout of smpl_params.",
         choices=(*INPUT_TYPES, *KEYPOINT_TYPES),
         live=False,
     )
-    keypoints: str = _parameter(
+    keypoints: str = parameter(
         "zed38", "Which points of the body the tracker sends, where input_type is of keypoints.", choices=LAYOUTS
     )
-    keypoint_rate: float = _parameter(
+    keypoint_rate: float = parameter(
         0.0,
         "Poses of keypoints, predicted, so many a second; 0 for one a message [Hz].",
         low=0.0,
         high=240.0,
         live=False,
     )
-    keypoint_smoothing: float = _parameter(
+    keypoint_smoothing: float = parameter(
         1.0,
         "How much smoother than people usually move poses of keypoints are: 2 is calmer and later.",
         low=0.1,
         high=10.0,
     )
-    input_axes: str = _parameter(
+    input_axes: str = parameter(
         "smpl",
         "Axes of root orientation and translation: smpl (y up; turned into ROS axes) or frame (those of frame_id).",
         choices=("smpl", "frame"),
     )
-    frame_id: str = _parameter("map", "Frame of all that comes out; inputs of other frames are transformed (tf2).")
-    transform_tolerance: float = _parameter(
+    frame_id: str = parameter("map", "Frame of all that comes out; inputs of other frames are transformed (tf2).")
+    transform_tolerance: float = parameter(
         0.1,
         "A transform may be so much older than the input [s]; without one the input is dropped.",
         low=0.0,
         high=10.0,
     )
-    points_fields: tuple[str, ...] = _parameter(
+    points_fields: tuple[str, ...] = parameter(
         POINT_FIELDS, f"What the points have besides x, y and z: of {', '.join(POINT_FIELDS)}."
     )
-    camera_info: str = _parameter(
+    camera_info: str = parameter(
         "",
         "A camera's CameraInfo topic: points then say whether it sees them; empty for none.",
         live=False,
     )
-    planner_rate: float = _parameter(
+    planner_rate: float = parameter(
         5.0, "Meshes for planners: at most so many a second of each garment; 0 for no limit [Hz].", low=0.0, high=1000.0
     )
-    publish_tf: bool = _parameter(
+    publish_tf: bool = parameter(
         False, "Whether openings are frames on /tf, too; whoever listens there is then a reason to compute.", live=False
     )
-    persons: tuple[str, ...] = _parameter(
+    persons: tuple[str, ...] = parameter(
         ("",), "Persons, each with a topic <person>/smpl_params; one without a name listens to smpl_params.", live=False
     )
-    follow_humans: bool = _parameter(
+    follow_humans: bool = parameter(
         False, "Dress everybody with a topic /humans/bodies/<id>/joint_states (REP-155); needs joint_state.", live=False
     )
-    person_timeout: float = _parameter(
+    person_timeout: float = parameter(
         1.0, "A person who hasn't sent for so long leaves the scene [s].", low=0.05, high=3600.0
     )
-    max_rate: float = _parameter(0.0, "At most so many frames a second; 0 for no limit [Hz].", low=0.0, high=1000.0)
-    marker_lifetime: float = _parameter(
+    max_rate: float = parameter(0.0, "At most so many frames a second; 0 for no limit [Hz].", low=0.0, high=1000.0)
+    marker_lifetime: float = parameter(
         2.0,
         "How long viewers show a garment that isn't renewed, should the node end without a word; 0 for ever [s].",
         low=0.0,
         high=1e6,
     )
-    max_distance: float = _parameter(
+    max_distance: float = parameter(
         0.0, "A person farther from the origin of frame_id isn't dressed; 0 for no limit [m].", low=0.0, high=1e6
     )
-    record: str = _parameter("", "Directory that inputs and outputs are recorded to as a bag; empty for none.")
-    record_sync_period: float = _parameter(
+    record: str = parameter("", "Directory that inputs and outputs are recorded to as a bag; empty for none.")
+    record_sync_period: float = parameter(
         1.0,
         "A power cut takes no more than so much of a recording [s]; at 0 the disk is waited for at its end alone.",
         low=0.0,
         high=3600.0,
         live=False,
     )
-    bags: str = _parameter(
+    bags: str = parameter(
         "", "Folder that requests may name bags in (refu_msgs); empty: they may name none.", live=False
     )
-    lazy: bool = _parameter(
+    lazy: bool = parameter(
         True,
         "Whether the inputs are subscribed to only while somebody wants the output, or it is recorded.",
         live=False,
     )
-    autostart: bool = _parameter(True, "Whether the node configures and activates itself.", live=False)
+    autostart: bool = parameter(True, "Whether the node configures and activates itself.", live=False)
 
     def __post_init__(self) -> None:
-        for name, spec in specs().items():
-            _check(name, getattr(self, name), spec)
+        check(self)
         if not all(_PERSON.fullmatch(name) for name in self.persons if name) or len(set(self.persons)) < len(
             self.persons
         ):
@@ -268,14 +246,9 @@ class NodeSettings:
             msg = f"style: {', '.join(plain)} has no styles; set it to zeros"
             raise SettingsError(msg)
 
-    @classmethod
-    def of(cls, values: Mapping[str, Any]) -> NodeSettings:
-        """Settings of values as ROS has them, defaults where there is none. Raises `SettingsError`."""
-        return cls(**_coerced(values))
-
     def changed(self, values: Mapping[str, Any]) -> NodeSettings:
         """These settings with some values as ROS has them (lists, numbers of any kind). Raises `SettingsError`."""
-        return replace(self, **_coerced(values))
+        return replace(self, **coerced(NodeSettings, values))
 
     @property
     def pipeline(self) -> PipelineKey:
@@ -313,16 +286,14 @@ class NodeSettings:
         return cast("InputType", self.input_type)
 
 
-@cache
 def specs() -> dict[str, ParameterSpec]:
     """Each parameter's specification by name."""
-    return {item.name: item.metadata["spec"] for item in fields(NodeSettings)}
+    return specs_of(NodeSettings)
 
 
-@cache
 def defaults() -> dict[str, Any]:
     """Each parameter's default by name."""
-    return {item.name: item.default for item in fields(NodeSettings)}
+    return defaults_of(NodeSettings)
 
 
 @cache
@@ -332,55 +303,8 @@ def _template(name: str) -> GarmentTemplate:
     return load_garment(name)
 
 
-def _coerced(values: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: _coerce(name, value) for name, value in values.items() if name in specs()}
-
-
-def _coerce(name: str, value: Any) -> Any:
-    """A value of ROS as the settings have it: tuples for lists, floats for whole numbers."""
-    default = defaults()[name]
-    if isinstance(default, bool):
-        right, wanted = isinstance(value, bool), "true or false"
-    elif isinstance(default, float):
-        right, wanted = _is_number(value), "a number"
-    elif isinstance(default, str):
-        right, wanted = isinstance(value, str), "a string"
-    else:
-        items = list(value) if hasattr(value, "__iter__") and not isinstance(value, (str, bytes)) else None
-        if isinstance(default[0], str):
-            right, wanted = items is not None and all(isinstance(item, str) for item in items), "a list of strings"
-        else:
-            right = items is not None and len(items) == len(default) and all(map(_is_number, items))
-            wanted = f"a list of {len(default)} numbers"
-        value = items
-    if not right:
-        hint = "" if value is not None else ": no value, or whole numbers and decimals mixed; write all as decimals"
-        msg = f"{name}: wanted {wanted}, got {value!r}{hint}"
-        raise SettingsError(msg)
-    if isinstance(default, tuple):
-        return tuple(map(type(default[0]), value))
-    return type(default)(value)
-
-
 def _names_a_folder(path: str) -> bool:
     try:
         return "\0" not in path and Path(path).expanduser().absolute().name != ""
     except RuntimeError:  # the home of a user that there isn't
         return False
-
-
-def _is_number(value: Any) -> bool:
-    # ROS's whole numbers have 64 bits; longer ones don't even fit a float.
-    return isinstance(value, float) or (isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**64)
-
-
-def _check(name: str, value: Any, spec: ParameterSpec) -> None:
-    if spec.choices and value not in spec.choices:
-        msg = f"{name}: wanted {' or '.join(spec.choices)}, got {value!r}"
-        raise SettingsError(msg)
-    numbers = value if isinstance(value, tuple) else (value,)
-    if spec.low is not None and spec.high is not None:
-        bad = [n for n in numbers if not (math.isfinite(n) and spec.low <= n <= spec.high)]
-        if bad:
-            msg = f"{name}: wanted {spec.low:g} to {spec.high:g}, got {bad[0]:g}"
-            raise SettingsError(msg)

@@ -5,15 +5,12 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter, deque
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from refu_core.errors import printable
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 _WINDOW = 1000
 """Latencies that percentiles are taken of."""
@@ -49,8 +46,9 @@ class Report:
 class Statistics:
     """Counters that any thread may raise.
 
-    Keys: received, ticks, frames, drop.<cause>, skip.<kind>, fault.<where>, penetration.<found|unresolved>,
-    back_in_time, beyond_promise, late_transform.
+    Keys: received, ticks, frames, drop.<cause>, skip.<kind> (work that nobody needed), fault.<where>,
+    penetration.<found|unresolved>, back_in_time (a frame older than its person's frame before), late_transform (a frame
+    placed by a transform older than itself), beyond_promise (a frame that "nothing inside" isn't promised for).
     """
 
     def __init__(self, *, clock: Callable[[], float] = time.monotonic) -> None:
@@ -73,36 +71,17 @@ class Statistics:
 
     def drop(self, cause: str, reason: str = "") -> None:
         """A frame was lost to something that isn't wanted."""
-        with self._lock:
-            self._total[f"drop.{cause}"] += 1
-            if reason:
-                self._reasons[cause] = printable(reason)
+        self.count(f"drop.{cause}", {cause: reason})
 
     def fault(self, where: str, reason: str) -> None:
         """A callback failed, or a request made no sense."""
-        with self._lock:
-            self._total[f"fault.{where}"] += 1
-            self._reasons["fault"] = printable(reason)
+        self.count(f"fault.{where}", {"fault": reason})
 
-    def back_in_time(self) -> None:
-        """A frame is older by its stamp than its person's frame before."""
+    def count(self, key: str, reasons: Mapping[str, str] | None = None) -> None:
+        """One more of what one of the keys stands for, and why."""
         with self._lock:
-            self._total["back_in_time"] += 1
-
-    def late_transform(self) -> None:
-        """A frame was placed by a transform older than itself."""
-        with self._lock:
-            self._total["late_transform"] += 1
-
-    def beyond_promise(self) -> None:
-        """A frame is none of those that "nothing inside" is promised for (`FrameStats.within_promise`)."""
-        with self._lock:
-            self._total["beyond_promise"] += 1
-
-    def skip(self, kind: str) -> None:
-        """Work was left out that nobody needed."""
-        with self._lock:
-            self._total[f"skip.{kind}"] += 1
+            self._total[key] += 1
+            self._reasons |= {cause: printable(reason) for cause, reason in (reasons or {}).items() if reason}
 
     def shift(self, largest: float) -> None:
         """In a frame the collider left the skin by so much [m]."""

@@ -4,29 +4,24 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 import torch
 
 from msg_adapters import Placement
 from msg_adapters.axes import SMPL_COLUMNS
-from msg_adapters.outputs import Moment, make_outputs
-from refu_core import RefuError
+from msg_adapters.outputs import Moment, Output, make_outputs
+from refu_core import GarmentPipeline, RefuError, SmplFrame
 from refu_core._device import is_device_loss
 from refu_core.modes import BetasSource
 from refu_core.outputs import Dressed, Fittings
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-
-    from msg_adapters.outputs import Output
-    from refu_core import GarmentPipeline, SmplFrame
-    from refu_core.realtime import PipelineOutput
-    from refu_ros._scene import Arrival, Scene
-    from refu_ros._settings import NodeSettings
-    from refu_ros._statistics import Statistics
+from refu_core.realtime import PipelineOutput
+from refu_ros._scene import Arrival, Scene
+from refu_ros._settings import NodeSettings
+from refu_ros._statistics import Statistics
 
 _IDLE_S = 0.1
 """How often the thread looks for persons who have left when nobody sends [s]."""
@@ -141,7 +136,7 @@ class Worker:
             return
         if not self._outlet.is_watched():
             for _ in arrivals:
-                self._statistics.skip("unwatched")
+                self._statistics.count("skip.unwatched")
             return
         frames = {person: with_settings(arrival.frame, settings) for person, arrival in arrivals.items()}
         found, unresolved = self._dress(frames)
@@ -158,7 +153,7 @@ class Worker:
         for person, arrival in arrivals.items():
             place = arrival.placement.rotation @ arrival.frame.transl + arrival.placement.translation
             if settings.max_distance and np.linalg.norm(place) > settings.max_distance:
-                self._statistics.skip("distance")
+                self._statistics.count("skip.distance")
                 self._remove([person])
             else:
                 near[person] = arrival
@@ -170,7 +165,7 @@ class Worker:
         for person, frame in frames.items():
             known = self._dressed.get(person)
             if known is not None and known.inputs == _inputs(frame):
-                self._statistics.skip("unchanged")
+                self._statistics.count("skip.unchanged")
             else:
                 todo[person] = frame
                 self._dressed.pop(person, None)
@@ -184,7 +179,7 @@ class Worker:
             unresolved += sum(stats.n_unresolved for stats in output.stats.garments.values())
             self._statistics.shift(output.stats.shift.largest)
             if not output.stats.within_promise:
-                self._statistics.beyond_promise()
+                self._statistics.count("beyond_promise")
         return found, unresolved
 
     def _infer(self, frames: Mapping[str, SmplFrame]) -> dict[str, PipelineOutput]:

@@ -6,15 +6,14 @@ import os
 import sys
 import threading
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # NumPy reads it; its threads wait for busy cores
 
+from refu_ros._parameters import listing
 from refu_ros._program import EXIT_BAD_INPUT, make_executor, on_signals, run, spin
 from refu_ros._transport import make_room
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
 
 EXIT_DEVICE_LOST = 3
 _LAST_WORDS_S = 0.3
@@ -41,10 +40,9 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _listing() -> str:
-    from refu_ros._settings import defaults, specs
+    from refu_ros._settings import NodeSettings
 
-    lines = [f"  {name:<16}{spec.description} Default: {defaults()[name]!r}" for name, spec in specs().items()]
-    return "\n".join(["parameters:", *lines, _TOPICS])
+    return f"{listing(NodeSettings)}\n{_TOPICS}"
 
 
 def _live() -> int:

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import threading
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping
+from typing import Any
 
 from refu_core import RefuError
 from refu_ros._transport import make_room
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from typing_extensions import Self
 
 
 class LiveTopics:
@@ -50,7 +46,7 @@ class LiveTopics:
         self._thread = threading.Thread(target=self._executor.spin, name="topics", daemon=True)
         self._thread.start()
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> LiveTopics:
         return self
 
     def __exit__(self, *_: object) -> None:

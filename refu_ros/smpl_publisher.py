@@ -5,62 +5,66 @@ from __future__ import annotations
 import os
 import sys
 import threading
-from dataclasses import dataclass, fields, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, cast
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # NumPy reads it; its threads wait for busy cores
 
 import numpy as np
-from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from msg_adapters import INPUT_TYPES, BagError, Motion, encoder_for, iter_smpl_frames, read_motion
-from msg_adapters.march import MARCH_FPS, march
-from refu_core import FrameError, RefuError, SmplFrame
+from msg_adapters import INPUT_TYPES, BagError, Encoder, InputType, Motion, encoder_for, iter_smpl_frames, read_motion
+from msg_adapters.motion import MARCH_FPS, march
+from refu_core import FrameError, SmplFrame
 from refu_core.recordings import SUFFIXES, Axes
 from refu_ros._guard import GuardedNode
 from refu_ros._interfaces import interface
+from refu_ros._parameters import SettingsError, check, declare, listing, parameter
 from refu_ros._program import make_executor, on_signals, run, spin
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from msg_adapters import Encoder, InputType
 
 TOPIC = "smpl_params"
 
 
+_fixed = partial(parameter, live=False)
+
+
 @dataclass(frozen=True, kw_only=True)
 class PublisherOptions:
-    """The node's parameters: what is played, and how."""
+    """The node's parameters: what is played, and how. Raises `SettingsError` for values that have no meaning."""
 
-    motion: str = ""
-    input_type: InputType = "multiarray"
-    input_axes: Literal["smpl", "frame"] = "smpl"
-    frame_id: str = "map"
-    fps: float = 0.0
-    rate: float = 30.0
-    loop: bool = True
-    in_place: bool = False
-    persons: tuple[str, ...] = ()
-    spacing: float = 1.0
+    motion: str = _fixed(
+        "", "File of motion (docs/guide/inputs.md), .mcap, or rosbag2 directory to play; empty: a march on the spot."
+    )
+    input_type: str = _fixed("multiarray", f"Message to send: {', '.join(INPUT_TYPES)}.")
+    input_axes: str = _fixed(
+        "smpl",
+        "Axes that are sent: smpl (y up; files are turned), or frame (as files have them).",
+        choices=("smpl", "frame"),
+    )
+    frame_id: str = _fixed("map", "Frame of messages that have a header.")
+    fps: float = _fixed(0.0, "Frame rate of a file of motion, in place of its own; 0 for that [Hz].", low=0.0, high=1e4)
+    rate: float = _fixed(
+        30.0,
+        "Messages a second, the motion resampled to it; 0 for the rate it was recorded at [Hz].",
+        low=0.0,
+        high=1e4,
+    )
+    loop: bool = _fixed(True, "Start again after the last frame, instead of stopping the node.")
+    in_place: bool = _fixed(False, "Hold the horizontal position of the first frame.")
+    persons: tuple[str, ...] = _fixed(
+        ("",), "Names of several persons: each plays the motion from another time, on <name>/smpl_params."
+    )
+    spacing: float = _fixed(1.0, "Distance between persons, to the left [m].", low=-1e6, high=1e6)
 
-
-DESCRIPTIONS = {
-    "motion": "file of motion (docs/guide/inputs.md), .mcap, or rosbag2 directory to play; empty: a march on the spot",
-    "input_type": f"message to send: {', '.join(INPUT_TYPES)}",
-    "input_axes": "axes that are sent: smpl (y up; files are turned), or frame (as a file has them: z up)",
-    "frame_id": "frame_id of messages that have a header",
-    "fps": "frame rate of a file of motion, in place of its own; 0 for that [Hz]",
-    "rate": "messages a second, the motion resampled to it [Hz]; 0 for the rate it was recorded at",
-    "loop": "start again after the last frame, instead of stopping the node",
-    "in_place": "hold the horizontal position of the first frame",
-    "persons": "names of several persons: each plays the motion from another time, on <name>/smpl_params",
-    "spacing": "distance between persons, to the left [m]",
-}
-"""What each parameter is for."""
+    def __post_init__(self) -> None:
+        check(self)
+        if not all(name.isidentifier() for name in self.persons if name):
+            msg = f"persons: wanted names of letters, digits and underscores, got {list(self.persons)}"
+            raise SettingsError(msg)
 
 
 def load_motion(path: str, *, axes: Axes = "auto", fps: float = 0.0) -> Motion:
@@ -95,7 +99,7 @@ class SmplPublisher(GuardedNode):
     def __init__(self, **options: Any) -> None:
         """Declare the parameters and load the motion. Raises `RefuError`, and `ParameterException` for a wrong type."""
         super().__init__("smpl_publisher", **options)
-        self.options = self._declare()
+        self.options = declare(self, PublisherOptions)
         self.encode: Encoder = encoder_for(self.options.input_type)
         axes: Axes = "frame" if self.options.input_axes == "frame" else "auto"
         motion = load_motion(self.options.motion, axes=axes, fps=self.options.fps)
@@ -104,8 +108,9 @@ class SmplPublisher(GuardedNode):
         self.motion = self._prepare(motion)
         self.finished = False
         self._index = 0
-        message_class = interface(INPUT_TYPES[self.options.input_type])
-        names = self.options.persons
+        message_type = INPUT_TYPES[cast("InputType", self.options.input_type)]
+        message_class = interface(message_type)
+        names = [name for name in self.options.persons if name]
         self._outputs = [
             self.create_publisher(
                 message_class,
@@ -118,36 +123,8 @@ class SmplPublisher(GuardedNode):
         self.create_timer(1 / self.motion.fps, self.guarded("tick", self._tick))
         self.get_logger().info(
             f"{self.options.motion or 'march on the spot'}: {len(self.motion)} frames at {self.motion.fps:g} Hz as "
-            f"{INPUT_TYPES[self.options.input_type]} on {', '.join(output.topic_name for output in self._outputs)}"
+            f"{message_type} on {', '.join(output.topic_name for output in self._outputs)}"
         )
-
-    def _declare(self) -> PublisherOptions:
-        values: dict[str, Any] = {}
-        for field in fields(PublisherOptions):
-            # An empty list has no type of its own in rclpy: one empty name stands for no name.
-            default = [""] if field.name == "persons" else field.default
-            number = isinstance(default, float)
-            descriptor = ParameterDescriptor(
-                description=DESCRIPTIONS[field.name],
-                read_only=True,
-                dynamic_typing=number,  # whole numbers are fine for floats (`rate:=30`); ROS alone would refuse them
-            )
-            value = self.declare_parameter(field.name, default, descriptor).value
-            values[field.name] = float(value) if number and type(value) is int else value
-        values["persons"] = tuple(name for name in values["persons"] if name)
-        options = PublisherOptions(**values)
-        numbers = (options.rate, options.fps, options.spacing)
-        if not all(isinstance(n, float) and np.isfinite(n) for n in numbers) or min(numbers[:2]) < 0:
-            rate, fps, spacing = numbers
-            msg = f"wanted finite numbers, rate >= 0, got rate {rate!r}, fps {fps!r}, spacing {spacing!r}"
-            raise RefuError(msg)
-        if not all(name.isidentifier() for name in options.persons):
-            msg = f"persons: wanted names of letters, digits and underscores, got {list(options.persons)}"
-            raise RefuError(msg)
-        if options.input_axes not in ("smpl", "frame"):
-            msg = f"wanted input_axes smpl or frame, got {options.input_axes!r}"
-            raise RefuError(msg)
-        return options
 
     def _prepare(self, motion: Motion) -> Motion:
         if self.options.in_place:
@@ -179,13 +156,6 @@ class SmplPublisher(GuardedNode):
         self._index += 1
 
 
-def _listing() -> str:
-    defaults = {field.name: field.default for field in fields(PublisherOptions)}
-    return "\n".join(
-        ["parameters:", *(f"  {name:<12}{text} ({defaults[name]!r})" for name, text in DESCRIPTIONS.items())]
-    )
-
-
 def _live() -> int:
     node = SmplPublisher()
     told = threading.Event()
@@ -200,7 +170,7 @@ def _live() -> int:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the node until SIGINT, SIGTERM or the end of the motion; returns the exit code."""
-    return run("smpl_publisher", arguments, description=__doc__, listing=_listing, live=_live)
+    return run("smpl_publisher", arguments, description=__doc__, listing=lambda: listing(PublisherOptions), live=_live)
 
 
 if __name__ == "__main__":

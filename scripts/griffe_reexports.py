@@ -1,8 +1,10 @@
-"""For the API reference: what a package imports from its own private modules is public, with or without `__all__`."""
+"""For the API reference: what a package's `__init__` imports from this project is public, with or without `__all__`."""
 
 from __future__ import annotations
 
 import griffe
+
+PACKAGES = ("refu_core", "msg_adapters")
 
 
 class Reexports(griffe.Extension):
@@ -11,6 +13,6 @@ class Reexports(griffe.Extension):
     def on_package(self, *, pkg: griffe.Module, **_: object) -> None:
         """Marks such names, in all packages below `pkg`."""
         for module in [pkg, *(one for one in pkg.modules.values() if not one.is_alias)]:
-            for member in module.members.values():
-                if isinstance(member, griffe.Alias) and member.target_path.startswith(f"{module.path}._"):
+            for member in module.members.values() if module.is_init_module else ():
+                if isinstance(member, griffe.Alias) and member.target_path.startswith(PACKAGES):
                     member.public = True

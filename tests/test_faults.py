@@ -34,7 +34,7 @@ from refu_core.backbones import TailorNetConfig
 from refu_core.training import load_checkpoint, save_checkpoint
 from refu_core.weights import save_weights
 from refu_lab.cli import main
-from refu_ros._diagnostics import statuses
+from refu_ros._diagnostics import Situation, statuses
 from refu_ros._scene import Scene
 from refu_ros._settings import NodeSettings
 from refu_ros._statistics import Statistics
@@ -305,14 +305,15 @@ def test_a_lost_device_is_reported_once_and_another_pipeline_takes_over() -> Non
     assert (outlet.sent, outlet.losses) == (2, [LOST])
     report = statistics.report()
     assert report.total["drop.device"] == 3
-    parts = {"node": "n", "state": "active", "persons": ("",), "recording": None, "recording_error": ""}
-    output = status_of("garments", statuses(report, settings, **parts))  # type: ignore[arg-type]
+    parts: dict[str, Any] = {"node": "n", "state": "active", "persons": ("",)}
+    parts |= {"recording": None, "recording_error": ""}
+    output = status_of("garments", statuses(report, settings, Situation(**parts)))
     assert (output.level, "the device has failed" in output.message) == (2, True)
     worker.use(pipeline)
     tick(6)
     assert outlet.sent == 3
     in_use = replace(settings.pipeline, device="cpu")
-    found = statuses(statistics.report(), settings, **parts, in_use=in_use)  # type: ignore[arg-type]
+    found = statuses(statistics.report(), settings, Situation(**parts, in_use=in_use))
     assert status_of("garments", found).values["device"] == "cpu"
 
 
@@ -339,8 +340,8 @@ def test_a_clock_set_back_loses_nothing_and_is_reported(tmp_path: Path) -> None:
         scene.put("ann", SmplFrame(np.zeros((24, 3), np.float32), stamp_ns=stamp))
         assert scene.take(timeout=0.0)["ann"].frame.stamp_ns == stamp
     statistics.receive()
-    parts = {"node": "n", "state": "active", "recording": None, "recording_error": ""}
-    found = statuses(statistics.report(), NodeSettings(), persons=("",), **parts)  # type: ignore[arg-type]
+    now = Situation(node="n", state="active", persons=("",), recording=None, recording_error="")
+    found = statuses(statistics.report(), NodeSettings(), now)
     first = status_of("input", found)
     assert (first.level, first.values["stamps that went back"]) == (1, "1")
     assert "was a clock set back" in first.message
@@ -357,8 +358,8 @@ def test_a_clock_set_back_loses_nothing_and_is_reported(tmp_path: Path) -> None:
 
 
 def test_nodes_of_one_name_are_reported() -> None:
-    parts: dict[str, Any] = {"state": "active", "persons": ("",), "recording": None, "recording_error": ""}
-    found = statuses(Statistics().report(), NodeSettings(), node="n", n_namesakes=1, **parts)
+    now = Situation(node="n", state="active", persons=("",), recording=None, recording_error="", n_namesakes=1)
+    found = statuses(Statistics().report(), NodeSettings(), now)
     status = status_of("garments", found)
     assert (status.level, status.message) == (1, "2 nodes have this name: start others with -r __node:=another_name")
 

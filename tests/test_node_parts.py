@@ -37,7 +37,7 @@ from refu_core.keypoints._pose import Pose
 from refu_core.modes import FOREIGN_BETAS
 from refu_ros._asked import asked_path
 from refu_ros._decoding import InputDecoder
-from refu_ros._diagnostics import statuses
+from refu_ros._diagnostics import Situation, statuses
 from refu_ros._dresser import Dresser
 from refu_ros._loader import PipelineLoader
 from refu_ros._scene import Scene, check_plausible
@@ -460,9 +460,7 @@ def test_what_cannot_be_loaded_is_reported() -> None:
 def report_of(
     statistics: Statistics, recording: RecorderState | None = None, *, has_foreign_betas: bool = False, **settings: Any
 ) -> dict[str, Any]:
-    found = statuses(
-        statistics.report(),
-        NodeSettings().changed(settings),
+    now = Situation(
         node="n",
         state="active",
         persons=("",),
@@ -470,6 +468,7 @@ def report_of(
         recording_error=recording.error if recording else "",
         has_foreign_betas=has_foreign_betas,
     )
+    found = statuses(statistics.report(), NodeSettings().changed(settings), now)
     return {status.name.removeprefix("n: "): status for status in found}
 
 
@@ -625,8 +624,8 @@ def test_keypoints_are_followed_from_message_to_frames() -> None:
     def message(stamp_ns: int, x: float) -> bytes:
         points = bones.posed(Pose(np.array([x, 1.0, 0.0]), turns, np.zeros(10))).points
         cdr = CdrWriter()
-        cdr.header(stamp_ns, "camera")
-        cdr.numbers("I", len(points))
+        cdr.fields("Ts", stamp_ns, "camera")
+        cdr.fields("I", len(points))
         cdr.array("f8", np.pad(points, ((0, 0), (0, 4))))
         return cdr.to_bytes()
 
@@ -646,8 +645,8 @@ def test_keypoints_are_followed_from_message_to_frames() -> None:
 
 def _of_ones(n: int) -> bytes:
     cdr = CdrWriter()
-    cdr.header(1, "camera")
-    cdr.numbers("I", n)
+    cdr.fields("Ts", 1, "camera")
+    cdr.fields("I", n)
     cdr.array("f8", np.ones((n, 7)))
     return cdr.to_bytes()
 
@@ -722,7 +721,7 @@ def test_points_have_fields_that_there_are(fields: list[str]) -> None:
 def test_transforms_that_are_missing_are_reported() -> None:
     statistics = Statistics()
     statistics.receive()
-    statistics.late_transform()
+    statistics.count("late_transform")
     assert report_of(statistics)["input"].values["late transforms"] == "1"
     statistics.receive()
     statistics.drop("transform", "no transform leads from camera to map")

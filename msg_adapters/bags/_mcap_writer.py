@@ -8,16 +8,14 @@ from __future__ import annotations
 
 import struct
 import zlib
+from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, BinaryIO, Literal
+from typing import BinaryIO, Literal
 
 import zstandard
 
 from msg_adapters.bags._mcap import CHANNEL, CHUNK, DATA_END, FOOTER, MAGIC, MESSAGE, SCHEMA, STATISTICS
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 Compression = Literal["zstd", "none"]
 

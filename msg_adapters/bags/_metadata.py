@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from pathlib import Path
+from typing import Any, Literal
 
 import yaml
 
 from msg_adapters.errors import BagError
 from refu_core._files import read_file
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
 
 METADATA_FILE = "metadata.yaml"
 VERSION = 9
@@ -57,6 +55,25 @@ class QosProfile:
     def to_yaml(self) -> str:
         """The profile as it stands in an MCAP channel's metadata: a list of one."""
         return _dump([self.to_metadata()])
+
+
+@dataclass(frozen=True)
+class TopicInfo:
+    """A topic of a bag."""
+
+    name: str
+    message_type: str
+    """`package/msg/Type`; empty where the bag carries no schema for the topic."""
+    encoding: str
+    """Message encoding; `cdr` is what ROS 2 writes."""
+    message_count: int
+    definition: str
+    """Text of the message type (`ros2msg`); empty where it is in another language."""
+    type_hash: str
+    qos: str
+    """Offered profiles in YAML, as recorded."""
+    betas_of: str = ""
+    """Whose shape space β in the messages are of: `builtin`, or (empty) the bag doesn't say."""
 
 
 @dataclass(frozen=True)

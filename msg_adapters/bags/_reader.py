@@ -4,46 +4,25 @@ from __future__ import annotations
 
 import os
 import re
+from collections import Counter
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from msg_adapters.bags import _mcap
-from msg_adapters.bags._metadata import MAX_TIME_NS, METADATA_FILE, read_file_paths
+from msg_adapters.bags._metadata import MAX_TIME_NS, METADATA_FILE, TopicInfo, read_file_paths
 from msg_adapters.bags._sqlite import MAGIC as SQLITE_MAGIC
 from msg_adapters.bags._sqlite import SqliteFile
+from msg_adapters.cdr import Buffer
 from msg_adapters.errors import BagError
 from refu_core.errors import printable
 
-if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
-    from types import TracebackType
-
-    from typing_extensions import Self
-
-
 BAG_SUFFIXES = (".mcap", ".db3")
 _MAX_WARNINGS = 20
+_Found = tuple[TopicInfo | None, int, int, int, Buffer]
+"""A message's topic (None: undeclared), the topic's number, log time and publish time [ns], and the message."""
 _IMPOSSIBLE_TIME = "a message on {} at a time that ROS can't hold"
-
-
-@dataclass(frozen=True)
-class TopicInfo:
-    """A topic of a bag."""
-
-    name: str
-    message_type: str
-    """`package/msg/Type`; empty where the bag carries no schema for the topic."""
-    encoding: str
-    """Message encoding; `cdr` is what ROS 2 writes."""
-    message_count: int
-    definition: str
-    """Text of the message type (`ros2msg`); empty where it is in another language."""
-    type_hash: str
-    qos: str
-    """Offered profiles in YAML, as recorded."""
-    betas_of: str = ""
-    """Whose shape space β in the messages are of: `builtin`, or (empty) the bag doesn't say."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +50,7 @@ class _Catalogue:
         self.channels: dict[int, _mcap.Channel] = {}
         self._budget = budget
         self._known: dict[tuple[int, bytes], bytes] = {}
+        self._topics: dict[int, TopicInfo] = {}
 
     def add(self, opcode: int, content: memoryview) -> None:
         """Take in a schema or channel record; raises `DamageError`."""
@@ -88,32 +68,23 @@ class _Catalogue:
             channel = _mcap.parse_channel(content, self._budget)
             self.channels[channel.id] = channel
         self._known[key] = raw
+        self._topics.clear()
 
-    def message_type(self, channel: _mcap.Channel) -> str:
-        schema = self.schemas.get(channel.schema_id)
-        return schema.type_name if schema else ""
-
-    def topics(self, counts: dict[int, int]) -> dict[str, TopicInfo]:
-        """The topics by name; two channels of one topic (two publishers) are one."""
-        topics: dict[str, TopicInfo] = {}
-        for channel in self.channels.values():
-            count = counts.get(channel.id, 0)
-            known = topics.get(channel.topic)
-            if known:
-                topics[channel.topic] = replace(known, message_count=known.message_count + count)
-                continue
+    def topic(self, number: int) -> TopicInfo | None:
+        """The topic of a channel; None for one that wasn't declared."""
+        if number not in self._topics and (channel := self.channels.get(number)):
             schema = self.schemas.get(channel.schema_id)
-            topics[channel.topic] = TopicInfo(
+            self._topics[number] = TopicInfo(
                 name=channel.topic,
-                message_type=self.message_type(channel),
+                message_type=schema.type_name if schema else "",
                 encoding=channel.encoding,
-                message_count=count,
+                message_count=0,
                 definition=schema.definition if schema else "",
                 type_hash=channel.metadata.get("topic_type_hash", ""),
                 qos=channel.metadata.get("offered_qos_profiles", ""),
                 betas_of=channel.metadata.get(_mcap.BETAS_OF, ""),
             )
-        return topics
+        return self._topics.get(number)
 
 
 class BagReader:
@@ -141,12 +112,10 @@ class BagReader:
         self._files = self._find_files()
         self._topics: tuple[TopicInfo, ...] | None = None
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> BagReader:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Nothing is open between calls."""
 
     @property
@@ -214,13 +183,13 @@ class BagReader:
         return self._topics
 
     def _merge_topics(self, *, claimed: bool) -> tuple[TopicInfo, ...]:
+        """Two channels of one topic (two publishers, or two files) are one."""
         budget = self._begin()
         merged: dict[str, TopicInfo] = {}
         for path in self._files:
-            for name, topic in self._file_topics(path, budget, claimed=claimed).items():
-                known = merged.get(name)
-                count = topic.message_count + (known.message_count if known else 0)
-                merged[name] = replace(known, message_count=count) if known else topic
+            for topic, count in self._file_topics(path, budget, claimed=claimed):
+                known = merged.get(topic.name, topic)
+                merged[topic.name] = replace(known, message_count=known.message_count + count)
         return tuple(merged[name] for name in sorted(merged))
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[BagMessage]:
@@ -230,64 +199,32 @@ class BagReader:
         """
         budget = self._begin()
         for path in self._files:
-            if path in self._databases:
-                yield from self._database_messages(path, budget, topics)
-                continue
-            catalogue, _ = self._summary(path, budget)
-            for message in self._file_messages(path, catalogue, budget):
-                channel = catalogue.channels.get(message.channel_id)
-                if channel is None:
-                    self._damage(path, _mcap.DamageError("a message of the undeclared channel {}", message.channel_id))
-                elif max(message.log_time_ns, message.publish_time_ns) > MAX_TIME_NS:
-                    self._damage(path, _mcap.DamageError(_IMPOSSIBLE_TIME, channel.topic))
-                elif topics is None or channel.topic in topics:
-                    yield BagMessage(
-                        topic=channel.topic,
-                        message_type=catalogue.message_type(channel),
-                        log_time_ns=message.log_time_ns,
-                        publish_time_ns=message.publish_time_ns,
-                        data=bytes(message.data),
-                    )
+            of_file = self._database_messages if path in self._databases else self._mcap_messages
+            for topic, number, log_ns, publish_ns, data in of_file(path, budget):
+                if topic is None:
+                    what = "topic" if path in self._databases else "channel"
+                    self._damage(path, _mcap.DamageError(f"a message of the undeclared {what} {{}}", number))
+                elif min(log_ns, publish_ns) < 0 or max(log_ns, publish_ns) > MAX_TIME_NS:
+                    self._damage(path, _mcap.DamageError(_IMPOSSIBLE_TIME, topic.name))
+                elif topics is None or topic.name in topics:
+                    yield BagMessage(topic.name, topic.message_type, log_ns, publish_ns, bytes(data))
 
-    def _database_topics(self, path: Path, budget: _mcap.Budget) -> dict[str, TopicInfo]:
-        topics: dict[str, TopicInfo] = {}
-        try:
-            counts = self._databases[path].counts()
-            for number, found in self._databases[path].topics(budget).items():
-                known = topics.get(found["name"])
-                topics[found["name"]] = TopicInfo(
-                    name=found["name"],
-                    message_type=found["type"],
-                    encoding=found["serialization_format"],
-                    message_count=counts.get(number, 0) + (known.message_count if known else 0),
-                    definition=found["definition"],
-                    type_hash=found.get("type_description_hash", ""),
-                    qos=found.get("offered_qos_profiles", ""),
-                )
-        except _mcap.DamageError as damage:
-            self._damage(path, damage)
-        return topics
-
-    def _database_messages(
-        self, path: Path, budget: _mcap.Budget, wanted: Collection[str] | None
-    ) -> Iterator[BagMessage]:
+    def _database_messages(self, path: Path, budget: _mcap.Budget) -> Iterator[_Found]:
         try:
             topics = self._databases[path].topics(budget)
             for message in self._databases[path].messages(budget):
                 if isinstance(message, _mcap.DamageError):
                     self._damage(path, message)
-                    continue
-                number, stamp_ns, data = message
-                if number not in topics:
-                    self._damage(path, _mcap.DamageError("a message of the undeclared topic {}", number))
-                    continue
-                name, kind = topics[number]["name"], topics[number]["type"]
-                if not 0 <= stamp_ns <= MAX_TIME_NS:
-                    self._damage(path, _mcap.DamageError(_IMPOSSIBLE_TIME, name))
-                elif wanted is None or name in wanted:
-                    yield BagMessage(name, kind, stamp_ns, stamp_ns, data)
+                else:
+                    number, stamp_ns, data = message
+                    yield topics.get(number), number, stamp_ns, stamp_ns, data
         except _mcap.DamageError as damage:
             self._damage(path, damage)
+
+    def _mcap_messages(self, path: Path, budget: _mcap.Budget) -> Iterator[_Found]:
+        catalogue, _ = self._summary(path, budget)
+        for one in self._file_messages(path, catalogue, budget):
+            yield catalogue.topic(one.channel_id), one.channel_id, one.log_time_ns, one.publish_time_ns, one.data
 
     def _summary(self, path: Path, budget: _mcap.Budget) -> tuple[_Catalogue, dict[int, int] | None]:
         """What the file's end says of its channels, and how many messages each has (None: it doesn't)."""
@@ -305,17 +242,22 @@ class BagReader:
             raise _unreadable(path, error) from error
         return catalogue, counts
 
-    def _file_topics(self, path: Path, budget: _mcap.Budget, *, claimed: bool) -> dict[str, TopicInfo]:
+    def _file_topics(self, path: Path, budget: _mcap.Budget, *, claimed: bool) -> list[tuple[TopicInfo, int]]:
+        """With how many messages each has."""
         if path in self._databases:
-            return self._database_topics(path, budget)
-        catalogue, counts = self._summary(path, budget)
-        if claimed and counts is not None and catalogue.channels.keys() >= counts.keys():
+            try:
+                counts = self._databases[path].counts()
+                return [(topic, counts.get(n, 0)) for n, topic in self._databases[path].topics(budget).items()]
+            except _mcap.DamageError as damage:
+                self._damage(path, damage)
+                return []
+        catalogue, summed = self._summary(path, budget)
+        if claimed and summed is not None and catalogue.channels.keys() >= summed.keys():
             self._claimed = True
         else:
-            counts = {}
-            for message in self._file_messages(path, catalogue, budget):
-                counts[message.channel_id] = counts.get(message.channel_id, 0) + 1
-        return catalogue.topics(counts)
+            summed = Counter(message.channel_id for message in self._file_messages(path, catalogue, budget))
+        found = ((catalogue.topic(number), summed.get(number, 0)) for number in catalogue.channels)
+        return [(topic, count) for topic, count in found if topic is not None]
 
     def _file_messages(self, path: Path, catalogue: _Catalogue, budget: _mcap.Budget) -> Iterator[_mcap.Message]:
         with _mcap.open_mcap(path) as file:

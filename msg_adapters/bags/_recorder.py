@@ -8,16 +8,13 @@ import shutil
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from msg_adapters.bags._metadata import QosProfile
 from msg_adapters.bags._writer import BagWriter
 from msg_adapters.errors import BagError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 MAX_QUEUED_BYTES = 64 << 20
 SYNC_PERIOD_S = 1.0

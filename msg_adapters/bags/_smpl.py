@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
-from msg_adapters.bags._reader import BagReader, TopicInfo
+from msg_adapters.bags._metadata import TopicInfo
+from msg_adapters.bags._reader import BagReader
 from msg_adapters.cdr import split_stamp
 from msg_adapters.errors import BagError, DecodeError, EncodeError
-from msg_adapters.inputs import INPUT_TYPES, decoder_for
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-    from types import TracebackType
-
-    from typing_extensions import Self
-
-    from msg_adapters.inputs import Decoder
-    from refu_core.frames import SmplFrame
+from msg_adapters.inputs import INPUT_TYPES, Decoder, decoder_for
+from refu_core.frames import SmplFrame
 
 _USUAL_NAME = "smpl_params"
 
@@ -58,12 +51,10 @@ class SmplBag:
                 frame=None, error=None, stamp_ns=log, log_time_ns=log, topic=message.topic, raw=message.data
             )
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> SmplBag:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Nothing is open between iterations."""
 
     def __iter__(self) -> Iterator[FrameRecord]:

@@ -7,17 +7,16 @@ are plain columns of plain tables; anything else in their place is refused.
 from __future__ import annotations
 
 import sqlite3
+from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import quote
 
 from msg_adapters.bags._mcap import MAX_CHUNK_BYTES, Budget, DamageError
+from msg_adapters.bags._metadata import TopicInfo
 from msg_adapters.definitions import full_type_name
 from msg_adapters.errors import BagError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 MAGIC = b"SQLite format 3\x00"
 _NEEDED = {"topics": {"id", "name", "type", "serialization_format"}, "messages": {"topic_id", "timestamp", "data"}}
@@ -52,21 +51,30 @@ class SqliteFile:
             database.execute("PRAGMA cell_size_check = ON")
             yield database
 
-    def topics(self, budget: Budget) -> dict[int, dict[str, str]]:
-        """Name, type, encoding, QoS, hash and definition of each topic, by its number. Raises `DamageError`."""
+    def topics(self, budget: Budget) -> dict[int, TopicInfo]:
+        """The topics by their numbers, without their messages' count. Raises `DamageError`."""
         has = self._columns["topics"]
-        optional = [name for name in ("offered_qos_profiles", "type_description_hash") if name in has]
-        wanted = ["id", "name", "type", "serialization_format", *optional]
-        topics: dict[int, dict[str, str]] = {}
+        wanted = ["name", "type", "serialization_format"]
+        wanted += [name for name in ("offered_qos_profiles", "type_description_hash") if name in has]
+        topics: dict[int, TopicInfo] = {}
         try:
             with self._open() as database:
                 definitions = self._texts(database, budget)
-                for number, *values in database.execute(f"SELECT {', '.join(wanted)} FROM topics LIMIT {_MAX_TOPICS}"):
+                rows = database.execute(f"SELECT id, {', '.join(wanted)} FROM topics LIMIT {_MAX_TOPICS}")
+                for number, *values in rows:
                     texts = [value if isinstance(value, str) else "" for value in values]
                     budget.spend("bytes of declarations", sum(map(len, texts)))
-                    topic = dict(zip(wanted[1:], texts, strict=True))
-                    topic["type"] = full_type_name(topic["type"])
-                    topics[int(number)] = topic | {"definition": definitions.get(topic["type"], "")}
+                    got = dict(zip(wanted, texts, strict=True))
+                    kind = full_type_name(got["type"])
+                    topics[int(number)] = TopicInfo(
+                        name=got["name"],
+                        message_type=kind,
+                        encoding=got["serialization_format"],
+                        message_count=0,
+                        definition=definitions.get(kind, ""),
+                        type_hash=got.get("type_description_hash", ""),
+                        qos=got.get("offered_qos_profiles", ""),
+                    )
         except (sqlite3.Error, ValueError, TypeError, OverflowError) as error:
             raise DamageError(_UNREADABLE, error) from error
         return topics

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import errno
 import os
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import BinaryIO
 
 from msg_adapters.bags import _mcap
-from msg_adapters.bags._mcap_writer import McapWriter
+from msg_adapters.bags._mcap_writer import Compression, McapWriter
 from msg_adapters.bags._metadata import (
     MAX_TIME_NS,
     METADATA_FILE,
@@ -21,14 +22,6 @@ from msg_adapters.bags._metadata import (
 )
 from msg_adapters.definitions import full_type_name, message_definition
 from msg_adapters.errors import BagError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from types import TracebackType
-
-    from typing_extensions import Self
-
-    from msg_adapters.bags._mcap_writer import Compression
 
 _DEFAULT_QOS = QosProfile()
 
@@ -88,12 +81,10 @@ class BagWriter:
                     path.rmdir() if path.is_dir() else path.unlink()
             raise
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> BagWriter:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         if error is None:
             self.finish()
             return

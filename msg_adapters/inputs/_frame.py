@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from msg_adapters.cdr import NS_PER_S
 from msg_adapters.errors import DecodeError
 from refu_core.errors import FrameError
 from refu_core.frames import SmplFrame
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from numpy.typing import NDArray
 
 
 @contextmanager

@@ -6,25 +6,19 @@ other joints (a jaw, fingers) are ignored; `velocity` and `effort` aren't read.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from msg_adapters.cdr import CdrReader, CdrWriter
+from msg_adapters.cdr import Buffer, CdrReader, CdrWriter
 from msg_adapters.errors import DecodeError
 from msg_adapters.inputs import _ros4hri
 from msg_adapters.inputs._frame import decoding, reading_fields, smpl_frame, stamp_ns_of
 from msg_adapters.joints import SMPL_JOINTS
-from refu_core.frames import N_BETAS
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    from msg_adapters.cdr import Buffer
-    from refu_core.frames import SmplFrame
+from refu_core.frames import N_BETAS, SmplFrame
 
 MESSAGE_TYPE = "sensor_msgs/msg/JointState"
 _POSE_NAMES = tuple(f"{joint}_{axis}" for joint in SMPL_JOINTS for axis in "xyz")
@@ -127,8 +121,7 @@ def from_bytes(data: Buffer) -> SmplFrame:
     global _last  # one assignment: another thread's at the same time does no harm
     with decoding(MESSAGE_TYPE):
         reader, layout, names = CdrReader(data), None, []
-        stamp_ns = reader.stamp_ns()
-        reader.string()
+        stamp_ns, _ = reader.fields("Ts")
         reader.align(4)
         if _last is not None and reader.repeats(_last[0]):
             layout = _last[1]
@@ -151,8 +144,7 @@ def from_bytes(data: Buffer) -> SmplFrame:
 def body_of(data: Buffer) -> str | None:
     """The id of the ROS4HRI body in a message that could be decoded, None for SMPL's joints."""
     reader, names = CdrReader(data), []
-    reader.stamp_ns()
-    reader.string()
+    reader.fields("Ts")
     for _ in range(reader.length(item_bytes=_MIN_NAME_BYTES)):
         names.append(reader.string())
         if names[-1] in _SLOTS:  # the first one is, where they are SMPL's
@@ -174,9 +166,8 @@ def from_message(message: Any) -> SmplFrame:
 def to_bytes(frame: SmplFrame, *, frame_id: str = "map") -> bytes:
     """The message in CDR, with betas and translation."""
     writer = CdrWriter()
-    writer.header(frame.stamp_ns, frame_id)
+    writer.fields("Ts", frame.stamp_ns, frame_id)
     writer.strings(_NAMES)
     writer.sequence("f8", np.concatenate([frame.pose.ravel(), frame.betas, frame.transl]))
-    for _ in ("velocity", "effort"):
-        writer.numbers("I", 0)
+    writer.fields("II", 0, 0)  # velocity, effort
     return writer.to_bytes()

@@ -9,23 +9,17 @@ is NaN, or exactly zero in all of x, y, z.
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from msg_adapters.cdr import CdrReader
+from msg_adapters.cdr import Buffer, CdrReader
 from msg_adapters.errors import DecodeError
 from msg_adapters.inputs._frame import decoding
-from msg_adapters.markers import MARKER_ARRAY, decode_marker_array
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from msg_adapters.cdr import Buffer
-    from msg_adapters.markers import Marker
+from msg_adapters.markers import MARKER_ARRAY, Marker, decode_marker_array
 
 KeypointType = Literal["keypoint_poses", "keypoint_markers"]
 
@@ -80,7 +74,7 @@ def decode_keypoints(input_type: str, data: Buffer, n: int) -> dict[str, Keypoin
 
 def _of_poses(data: Buffer, n: int) -> dict[str, Keypoints]:
     reader = CdrReader(data)
-    stamp_ns, frame_id = reader.stamp_ns(), reader.string()
+    stamp_ns, frame_id = reader.fields("Ts")
     count = reader.length(item_bytes=_POSE_NUMBERS * 8)
     poses = reader.array("f8", count * _POSE_NUMBERS).reshape(count, _POSE_NUMBERS)
     reader.finish()

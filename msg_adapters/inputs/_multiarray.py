@@ -7,21 +7,16 @@ numbers after the one before it (0 stands for its size), the first one at `layou
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from msg_adapters.cdr import CdrReader, CdrWriter
+from msg_adapters.cdr import Buffer, CdrReader, CdrWriter
 from msg_adapters.errors import DecodeError
 from msg_adapters.inputs._frame import decoding, reading_fields, smpl_frame
 from refu_core.frames import N_BETAS, N_JOINTS, N_STYLES, SmplFrame
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from msg_adapters.cdr import Buffer
 
 MESSAGE_TYPE = "std_msgs/msg/Float32MultiArray"
 _SIZES = {"pose": N_JOINTS * 3, "betas": N_BETAS, "transl": 3, "style": N_STYLES}
@@ -79,8 +74,8 @@ def from_bytes(data: Buffer) -> SmplFrame:
         if count > _MAX_DIMENSIONS:
             msg = f"{count} dimensions in layout.dim; {_LABELLING}"
             raise DecodeError(msg)
-        dimensions = [_Dimension(reader.string(), *reader.numbers("II")) for _ in range(count)]
-        (offset,) = reader.numbers("I")
+        dimensions = [_Dimension(*reader.fields("sII")) for _ in range(count)]
+        (offset,) = reader.fields("I")
         values = reader.array("f4", reader.length(item_bytes=4))
         reader.finish()
         return _frame(dimensions, offset, values)
@@ -103,10 +98,9 @@ def to_bytes(frame: SmplFrame, *, frame_id: str = "map") -> bytes:  # noqa: ARG0
     if frame.style is not None:
         blocks["style"] = frame.style
     writer = CdrWriter()
-    writer.numbers("I", len(blocks))
+    writer.fields("I", len(blocks))
     for label, block in blocks.items():
-        writer.string(label)
-        writer.numbers("II", block.size, block.size)
-    writer.numbers("I", 0)
+        writer.fields("sII", label, block.size, block.size)
+    writer.fields("I", 0)
     writer.sequence("f4", np.concatenate(list(blocks.values())))
     return writer.to_bytes()

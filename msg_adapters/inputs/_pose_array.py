@@ -5,22 +5,17 @@ The other positions aren't read (bone lengths come from the betas, which this ty
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from msg_adapters.cdr import CdrReader, CdrWriter
+from msg_adapters.cdr import Buffer, CdrReader, CdrWriter
 from msg_adapters.errors import DecodeError
 from msg_adapters.inputs._frame import decoding, reading_fields, smpl_frame, stamp_ns_of
 from msg_adapters.joints import SMPL_JOINTS
 from msg_adapters.rotations import quaternion_from_rotvec, rotvec_from_quaternion
-from refu_core.frames import N_JOINTS
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from msg_adapters.cdr import Buffer
-    from refu_core.frames import SmplFrame
+from refu_core.frames import N_JOINTS, SmplFrame
 
 MESSAGE_TYPE = "geometry_msgs/msg/PoseArray"
 _POSE_NUMBERS = 7  # position xyz, orientation xyzw
@@ -50,8 +45,7 @@ def from_bytes(data: Buffer) -> SmplFrame:
     """The frame of a message in CDR; quaternions are normalised."""
     with decoding(MESSAGE_TYPE):
         reader = CdrReader(data)
-        stamp_ns = reader.stamp_ns()
-        reader.string()
+        stamp_ns, _ = reader.fields("Ts")
         _check_count(reader.length(item_bytes=_POSE_NUMBERS * 8))
         poses = reader.array("f8", N_JOINTS * _POSE_NUMBERS).reshape(N_JOINTS, _POSE_NUMBERS)
         reader.finish()
@@ -75,7 +69,6 @@ def to_bytes(frame: SmplFrame, *, frame_id: str = "map") -> bytes:
     poses[0, :3] = frame.transl
     poses[:, 3:] = quaternion_from_rotvec(frame.pose)
     writer = CdrWriter()
-    writer.header(frame.stamp_ns, frame_id)
-    writer.numbers("I", N_JOINTS)
-    writer.array("f8", poses)
+    writer.fields("Ts", frame.stamp_ns, frame_id)
+    writer.sequence("f8", poses)
     return writer.to_bytes()

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import Any, Literal, Protocol
 
-from msg_adapters.cdr import CdrReader
+from msg_adapters.cdr import Buffer, CdrReader
 from msg_adapters.definitions import full_type_name
 from msg_adapters.errors import DecodeError
 from msg_adapters.inputs import _joint_state, _multiarray, _pose_array, _smpl
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from msg_adapters.cdr import Buffer
-    from refu_core.frames import SmplFrame
+from refu_core.frames import SmplFrame
 
 InputType = Literal["multiarray", "joint_state", "pose_array", "smpl_msgs"]
 
@@ -98,6 +94,4 @@ def frame_id_of(data: Buffer, input_type: InputType) -> str:
         return ""
     if input_type == "joint_state" and (body := _joint_state.body_of(data)):
         return f"body_{body}"
-    reader = CdrReader(data)
-    reader.stamp_ns()
-    return reader.string()
+    return str(CdrReader(data).fields("Ts")[1])

@@ -7,21 +7,17 @@ person stands upright where the frame `body_<id>` is, with the pelvis in its ori
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import reduce
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from msg_adapters.axes import vertices_smpl_from_ros
 from msg_adapters.errors import DecodeError
 from msg_adapters.joints import SMPL_JOINTS
 from msg_adapters.rotations import quaternion_from_rotvec, quaternion_product, rotvec_from_quaternion
 from refu_core.frames import MAX_ANGLE
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
 
 AXES = {
     "waist": (0, 1, 0), "r_head": (1, 0, 0), "y_head": (0, 0, 1), "p_head": (0, -1, 0),

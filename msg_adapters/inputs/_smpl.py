@@ -7,23 +7,17 @@ precision of the arrays; only the names and sizes are relied on.
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from msg_adapters.cdr import CdrReader, CdrWriter
+from msg_adapters.cdr import Buffer, CdrReader, CdrWriter
 from msg_adapters.definitions import message_definition
 from msg_adapters.errors import DecodeError
 from msg_adapters.inputs._frame import decoding, reading_fields, smpl_frame, stamp_ns_of
-from refu_core.frames import N_BETAS, N_JOINTS
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from numpy.typing import NDArray
-
-    from msg_adapters.cdr import Buffer
-    from refu_core.frames import SmplFrame
+from refu_core.frames import N_BETAS, N_JOINTS, SmplFrame
 
 MESSAGE_TYPE = "smpl_msgs/msg/Smpl"
 _SIZES = {"global_orient": 3, "body_pose": (N_JOINTS - 1) * 3, "betas": N_BETAS, "transl": 3}
@@ -75,8 +69,7 @@ def bytes_decoder(definition: str | None = None) -> Callable[[Buffer], SmplFrame
         """The frame of a message in CDR."""
         with decoding(MESSAGE_TYPE):
             reader = CdrReader(data)
-            stamp_ns = reader.stamp_ns()
-            reader.string()
+            stamp_ns, _ = reader.fields("Ts")
             values = {name: reader.array(kind, size) for name, kind, size in layout}
             reader.finish()
             return _frame(values, stamp_ns)
@@ -102,7 +95,7 @@ def to_bytes(frame: SmplFrame, *, frame_id: str = "map") -> bytes:
     pose = frame.pose.ravel()
     values = {"global_orient": pose[:3], "body_pose": pose[3:], "betas": frame.betas, "transl": frame.transl}
     writer = CdrWriter()
-    writer.header(frame.stamp_ns, frame_id)
+    writer.fields("Ts", frame.stamp_ns, frame_id)
     for name, kind, size in parse_layout(message_definition(MESSAGE_TYPE).text):
         writer.array(kind, values.get(name, np.zeros(size)))
     return writer.to_bytes()

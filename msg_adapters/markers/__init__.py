@@ -1,31 +1,17 @@
 """visualization_msgs/MarkerArray with one TRIANGLE_LIST or POINTS a garment, between arrays and CDR bytes."""
 
-from msg_adapters.markers._decoder import Marker, decode_marker_array, vertices_from_points
-from msg_adapters.markers._encoder import (
-    MARKER_ARRAY,
-    POINTS,
-    TRIANGLE_LIST,
-    MarkerArrayEncoder,
-    encode_delete,
-    encode_delete_all,
-    encode_points,
-    encode_strips,
-)
-from msg_adapters.markers._mesh import SKIN, MarkerMesh, garment_namespace
-
-__all__ = [
-    "MARKER_ARRAY",
-    "POINTS",
-    "SKIN",
-    "TRIANGLE_LIST",
-    "Marker",
-    "MarkerArrayEncoder",
-    "MarkerMesh",
-    "decode_marker_array",
-    "encode_delete",
-    "encode_delete_all",
-    "encode_points",
-    "encode_strips",
-    "garment_namespace",
-    "vertices_from_points",
-]
+from msg_adapters.markers._decoder import Marker as Marker
+from msg_adapters.markers._decoder import decode_marker_array as decode_marker_array
+from msg_adapters.markers._decoder import vertices_from_points as vertices_from_points
+from msg_adapters.markers._encoder import LINE_STRIP as LINE_STRIP
+from msg_adapters.markers._encoder import MARKER_ARRAY as MARKER_ARRAY
+from msg_adapters.markers._encoder import POINTS as POINTS
+from msg_adapters.markers._encoder import SKIN as SKIN
+from msg_adapters.markers._encoder import TRIANGLE_LIST as TRIANGLE_LIST
+from msg_adapters.markers._encoder import MarkerArrayEncoder as MarkerArrayEncoder
+from msg_adapters.markers._encoder import MarkerMesh as MarkerMesh
+from msg_adapters.markers._encoder import encode_delete as encode_delete
+from msg_adapters.markers._encoder import encode_delete_all as encode_delete_all
+from msg_adapters.markers._encoder import encode_lists as encode_lists
+from msg_adapters.markers._encoder import encode_points as encode_points
+from msg_adapters.markers._encoder import garment_namespace as garment_namespace

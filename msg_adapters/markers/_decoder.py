@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from msg_adapters.cdr import CdrReader
+from msg_adapters.cdr import Buffer, CdrReader
 from msg_adapters.errors import DecodeError
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from msg_adapters.cdr import Buffer
 
 _MIN_MARKER_BYTES = 180
 
@@ -43,38 +39,18 @@ class Marker:
 
 
 def _marker(reader: CdrReader) -> Marker:
-    stamp_ns, frame_id, ns = reader.stamp_ns(), reader.string(), reader.string()
-    marker_id, kind, action = reader.numbers("iii")
-    pose, scale, color = reader.numbers("ddddddd"), reader.numbers("ddd"), reader.numbers("ffff")
-    lifetime_ns = reader.stamp_ns()
-    (frame_locked,) = reader.numbers("B")
+    named = reader.fields("Tssiii")
+    pose, scale, color = reader.fields("ddddddd"), reader.fields("ddd"), reader.fields("ffff")
+    kept = reader.fields("T?")  # lifetime, frame_locked
     points = reader.array("f8", 3 * reader.length(item_bytes=24)).reshape(-1, 3)
     colors = reader.array("f4", 4 * reader.length(item_bytes=16)).reshape(-1, 4)
-    reader.string()  # texture_resource
-    reader.stamp_ns()  # texture.header
-    reader.string()
-    reader.string()  # texture.format
-    reader.skip(reader.length(item_bytes=1))  # texture.data
+    reader.fields("sTss")  # texture_resource, texture
+    reader.skip(reader.length(item_bytes=1))
     reader.array("f4", 2 * reader.length(item_bytes=8))  # uv_coordinates
-    for _ in ("text", "mesh_resource", "mesh_file.filename"):
-        reader.string()
-    reader.skip(reader.length(item_bytes=1))  # mesh_file.data
-    reader.numbers("B")  # mesh_use_embedded_materials
-    return Marker(
-        stamp_ns=stamp_ns,
-        frame_id=frame_id,
-        ns=ns,
-        id=marker_id,
-        type=kind,
-        action=action,
-        pose=pose,
-        scale=scale,
-        color=color,
-        lifetime_ns=lifetime_ns,
-        frame_locked=bool(frame_locked),
-        points=points,
-        colors=colors,
-    )
+    reader.fields("sss")  # text, mesh_resource, mesh_file
+    reader.skip(reader.length(item_bytes=1))
+    reader.fields("?")  # mesh_use_embedded_materials
+    return Marker(*named, pose, scale, color, *kept, points, colors)  # type: ignore[call-arg]
 
 
 def decode_marker_array(data: Buffer) -> list[Marker]:

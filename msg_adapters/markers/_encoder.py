@@ -7,23 +7,73 @@ of all triangle corners straight into the message's bytes takes a fraction of on
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from msg_adapters.axes import SMPL_COLUMNS
+from msg_adapters.axes import SMPL_COLUMNS, InputAxes
 from msg_adapters.cdr import HEADER_BYTES, CdrWriter, split_stamp
 from msg_adapters.errors import EncodeError
-from msg_adapters.markers._mesh import CLOTH, Rgba, numbers
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
+Rgba = tuple[float, float, float, float]
+CLOTH: Rgba = (0.55, 0.63, 0.75, 1.0)
+SKIN: Rgba = (0.80, 0.67, 0.58, 1.0)
 
-    from numpy.typing import ArrayLike, NDArray
 
-    from msg_adapters.axes import InputAxes
-    from msg_adapters.markers._mesh import MarkerMesh
+def numbers(what: str, values: Any) -> NDArray[Any]:
+    """Real numbers as an array; raises `EncodeError` for anything else."""
+    try:
+        array = np.asarray(values)
+    except (ValueError, TypeError, OverflowError) as error:
+        msg = f"{what}: wanted an array of numbers, got {type(values).__name__}: {error}"
+        raise EncodeError(msg) from None
+    if array.dtype.kind not in "iuf":
+        msg = f"{what}: wanted an array of numbers, got {array.dtype} of shape {array.shape}"
+        raise EncodeError(msg)
+    return array
+
+
+def garment_namespace(garment: str, person: str = "") -> str:
+    """Namespace of a garment's marker: `<person>/<garment>`, or the garment's name where there is one person."""
+    return f"{person}/{garment}" if person else garment
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerMesh:
+    """Topology, name and colour of one marker.
+
+    Raises `EncodeError` when faces or colour can't be drawn: viewers drop such a marker without a word.
+    """
+
+    ns: str
+    """Namespace; with `id` it names the marker."""
+    faces: NDArray[np.integer[Any]]
+    """Vertex indices of the triangles, shape (F, 3), F > 0."""
+    n_vertices: int
+    """Number of vertices each frame will bring."""
+    color: Rgba = CLOTH
+    """Red, green, blue, alpha in [0, 1]."""
+    id: int = 0
+    vertex_colors: bool = False
+    """Whether frames bring a colour for each vertex (RViz draws those without shading)."""
+
+    def __post_init__(self) -> None:
+        faces = numbers(f"{self.ns}: faces", self.faces)
+        if faces.ndim != 2 or faces.shape[1] != 3 or not len(faces) or not np.issubdtype(faces.dtype, np.integer):
+            msg = f"{self.ns}: wanted faces of shape (F, 3) of integers, F > 0, got {faces.shape} of {faces.dtype}"
+            raise EncodeError(msg)
+        if faces.min() < 0 or faces.max() >= self.n_vertices:
+            msg = f"{self.ns}: wanted face indices in [0, {self.n_vertices}), got {faces.min()} ... {faces.max()}"
+            raise EncodeError(msg)
+        color = numbers(f"{self.ns}: colour", self.color).astype(np.float64)
+        if color.shape != (4,) or not ((color >= 0) & (color <= 1)).all():
+            msg = f"{self.ns}: wanted a colour of 4 numbers in [0, 1] (red, green, blue, alpha), got {self.color}"
+            raise EncodeError(msg)
+        object.__setattr__(self, "faces", faces)
+
 
 MARKER_ARRAY = "visualization_msgs/msg/MarkerArray"
 
@@ -31,7 +81,6 @@ LINE_STRIP, POINTS, TRIANGLE_LIST = 4, 8, 11
 ADD, DELETE, DELETE_ALL = 0, 2, 3
 _IDENTITY_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 _LEAD_BYTES = 4  # before the header, so that the payload, and with it every float64, lies on a multiple of 8
-LINE: Rgba = (0.95, 0.55, 0.1, 1.0)
 _NO_COLOR: Rgba = (0.0, 0.0, 0.0, 0.0)
 
 
@@ -51,27 +100,15 @@ def _write_marker(
     pose: Sequence[float] = _IDENTITY_POSE,
 ) -> tuple[int, int, int]:
     """Append one visualization_msgs/Marker; returns the payload offsets of its stamp, points and colours."""
-    ns, marker_id = key
-    stamp_at = writer.header(stamp_ns, frame_id)
-    writer.string(ns)
-    writer.numbers("iii", marker_id, kind, action)
-    writer.numbers("ddddddd", *pose)
-    writer.numbers("ddd", size, size, size)
-    writer.numbers("ffff", *color)
-    writer.stamp(lifetime_ns)
-    writer.numbers("B", 0)  # frame_locked
-    writer.numbers("I", n_points)
+    stamp_at = writer.fields("Tssiii", stamp_ns, frame_id, *key, kind, action)
+    writer.fields("ddddddddddffff", *pose, size, size, size, *color)
+    writer.fields("T?", lifetime_ns, False)  # frame_locked
+    writer.fields("I", n_points)
     points_at = writer.array("f8", np.zeros(n_points * 3))
-    writer.numbers("I", n_colors)
+    writer.fields("I", n_colors)
     colors_at = writer.array("f4", np.zeros(n_colors * 4))
-    writer.string("")  # texture_resource
-    writer.header(0, "")  # texture.header
-    writer.string("")  # texture.format
-    writer.numbers("II", 0, 0)  # texture.data, uv_coordinates
-    for _ in ("text", "mesh_resource", "mesh_file.filename"):
-        writer.string("")
-    writer.numbers("I", 0)  # mesh_file.data
-    writer.numbers("B", 0)  # mesh_use_embedded_materials
+    writer.fields("sTssI", "", 0, "", "", 0)  # texture_resource, texture
+    writer.fields("IsssI?", 0, "", "", "", 0, False)  # uv_coordinates, text, mesh_resource, mesh_file and its materials
     return stamp_at, points_at, colors_at
 
 
@@ -116,7 +153,7 @@ class MarkerArrayEncoder:
             raise EncodeError(msg)
         self._columns = SMPL_COLUMNS[axes]
         writer = CdrWriter()
-        writer.numbers("I", len(meshes))
+        writer.fields("I", len(meshes))
         places = [
             _write_marker(
                 writer,
@@ -232,35 +269,6 @@ class MarkerArrayEncoder:
         np.take(rgba, slot.corners, axis=0, out=slot.colors, mode="clip")
 
 
-def encode_strips(
-    strips: Sequence[tuple[str, int, NDArray[np.float64], NDArray[np.float64]]],
-    *,
-    frame_id: str = "map",
-    lifetime_ns: int = 0,
-    color: Rgba = LINE,
-    width: float = 0.004,
-) -> bytes:
-    """A MarkerArray with a LINE_STRIP each.
-
-    Args:
-        strips: namespace (the id is 0), stamp [ns], pose (7,) as position [m] and quaternion xyzw, and the points of
-            the line in that pose [m], shape (K, 3).
-        frame_id: of the headers.
-        lifetime_ns: viewers forget a line that isn't renewed for so long; 0: never.
-        color: red, green, blue, alpha.
-        width: of the lines [m].
-
-    Raises:
-        EncodeError: points of another shape, not finite, none at all, or a stamp that doesn't fit a ROS time.
-    """
-    for ns, _, pose, points in strips:
-        if points.ndim != 2 or points.shape[1] != 3 or not len(points) or not np.isfinite(points.sum() + pose.sum()):
-            msg = f"{ns}: wanted finite points of shape (K, 3), K > 0, in a finite pose, got {points.shape}"
-            raise EncodeError(msg)
-    lists = [(ns, stamp_ns, pose.tolist(), points) for ns, stamp_ns, pose, points in strips]
-    return _encode_lists(LINE_STRIP, lists, frame_id=frame_id, color=color, size=width, lifetime_ns=lifetime_ns)
-
-
 def encode_points(
     points: ArrayLike,
     *,
@@ -283,15 +291,11 @@ def encode_points(
     Raises:
         EncodeError: points of another shape, not finite, none at all, or a stamp that doesn't fit a ROS time.
     """
-    array = numbers(ns, points).astype(np.float64)
-    if array.ndim != 2 or array.shape[1] != 3 or not len(array) or not np.isfinite(array).all():
-        msg = f"{ns}: wanted finite points of shape (V, 3), V > 0, got {array.shape}"
-        raise EncodeError(msg)
-    lists = [(ns, stamp_ns, _IDENTITY_POSE, array)]
-    return _encode_lists(POINTS, lists, frame_id=frame_id, color=color, size=size)
+    lists = [(ns, stamp_ns, _IDENTITY_POSE, numbers(ns, points).astype(np.float64))]
+    return encode_lists(POINTS, lists, frame_id=frame_id, color=color, size=size)
 
 
-def _encode_lists(
+def encode_lists(
     kind: int,
     lists: Sequence[tuple[str, int, Sequence[float], NDArray[np.float64]]],
     *,
@@ -300,10 +304,27 @@ def _encode_lists(
     size: float,
     lifetime_ns: int = 0,
 ) -> bytes:
-    """A MarkerArray with a marker each of namespace, stamp, pose and finite points (K, 3)."""
+    """A MarkerArray with a marker each, of the type `kind`.
+
+    Args:
+        kind: `LINE_STRIP` or `POINTS`.
+        lists: namespace (the id is 0), stamp [ns], pose as position [m] and quaternion xyzw, and the points in that
+            pose [m], shape (K, 3).
+        frame_id: of the headers.
+        color: red, green, blue, alpha.
+        size: width of the lines or points [m].
+        lifetime_ns: viewers forget a marker that isn't renewed for so long; 0: never.
+
+    Raises:
+        EncodeError: points of another shape, not finite, none at all, or a stamp that doesn't fit a ROS time.
+    """
     writer, points_at = CdrWriter(), []
-    writer.numbers("I", len(lists))
+    writer.fields("I", len(lists))
     for ns, stamp_ns, pose, points in lists:
+        is_finite = np.isfinite(points).all() and np.isfinite(pose).all()
+        if points.ndim != 2 or points.shape[1] != 3 or not len(points) or not is_finite:
+            msg = f"{ns}: wanted finite points of shape (K, 3), K > 0, in a finite pose, got {points.shape}"
+            raise EncodeError(msg)
         _, at, _ = _write_marker(
             writer,
             key=(ns, 0),
@@ -331,7 +352,7 @@ def encode_delete(keys: Sequence[tuple[str, int]], *, stamp_ns: int, frame_id: s
     Raises `EncodeError` when an id or the stamp doesn't fit the message.
     """
     writer = CdrWriter()
-    writer.numbers("I", len(keys))
+    writer.fields("I", len(keys))
     for key in keys:
         _write_marker(writer, key=key, action=DELETE, frame_id=frame_id, stamp_ns=stamp_ns)
     return writer.to_bytes()
@@ -343,6 +364,6 @@ def encode_delete_all(*, stamp_ns: int, frame_id: str = "map", ns: str = "") -> 
     Raises `EncodeError` when the stamp doesn't fit the message.
     """
     writer = CdrWriter()
-    writer.numbers("I", 1)
+    writer.fields("I", 1)
     _write_marker(writer, key=(ns, 0), action=DELETE_ALL, frame_id=frame_id, stamp_ns=stamp_ns)
     return writer.to_bytes()

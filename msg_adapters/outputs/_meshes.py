@@ -1,19 +1,23 @@
-"""Meshes for planners: shape_msgs/Mesh and moveit_msgs/CollisionObject in CDR."""
+"""Meshes with their triangles as indices, in CDR.
+
+For planners: shape_msgs/Mesh and moveit_msgs/CollisionObject. For Foxglove: foxglove_msgs/SceneUpdate, a third of what
+a MarkerArray takes.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Literal
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from msg_adapters.cdr import CdrWriter
 from msg_adapters.errors import EncodeError
+from msg_adapters.markers import MarkerMesh
 from msg_adapters.rotations import quaternion_from_matrix
 from msg_adapters.transforms import Placement
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
 
 MESH = "shape_msgs/msg/Mesh"
 COLLISION_OBJECT = "moveit_msgs/msg/CollisionObject"
@@ -61,23 +65,23 @@ def encode_collision_object(
         msg = f"wanted add or append with a mesh, or move or remove without one, got {operation!r} with {what}"
         raise EncodeError(msg)
     writer = CdrWriter()
-    writer.header(stamp_ns, frame_id)
+    frames = subframes or {}
+    writer.fields("Ts", stamp_ns, frame_id)
     _pose(writer, placement or Placement())
-    for text in (name, "", ""):  # id, type.key, type.db
-        writer.string(text)
-    writer.numbers("II", 0, 0)  # primitives, primitive_poses
-    writer.numbers("I", mesh is not None)
-    if mesh is not None:
+    writer.fields("sssII", name, "", "", 0, 0)  # id, type, primitives, primitive_poses
+    if mesh is None:
+        writer.fields("II", 0, 0)  # meshes, mesh_poses
+    else:
+        writer.fields("I", 1)
         _mesh(writer, *mesh)
-    writer.numbers("I", mesh is not None)
-    if mesh is not None:
+        writer.fields("I", 1)
         _pose(writer, Placement())
-    writer.numbers("II", 0, 0)  # planes, plane_poses
-    writer.strings([*(subframes or {})])
-    writer.numbers("I", len(subframes or {}))
-    for frame in (subframes or {}).values():
+    writer.fields("II", 0, 0)  # planes, plane_poses
+    writer.strings([*frames])
+    writer.fields("I", len(frames))
+    for frame in frames.values():
         _pose(writer, frame)
-    writer.numbers("B", _OPERATIONS[operation])
+    writer.fields("B", _OPERATIONS[operation])
     return writer.to_bytes()
 
 
@@ -97,7 +101,61 @@ def _mesh(writer: CdrWriter, vertices: ArrayLike, faces: ArrayLike) -> None:
     if triangles.min() < 0 or triangles.max() >= len(points):
         msg = f"wanted triangles of vertices 0 to {len(points) - 1}, got {triangles.min()} to {triangles.max()}"
         raise EncodeError(msg)
-    writer.numbers("I", len(triangles))
-    writer.array("u4", triangles)
-    writer.numbers("I", len(points))
-    writer.array("f8", points)
+    writer.sequence("u4", triangles)
+    writer.sequence("f8", points)
+
+
+SCENE_UPDATE = "foxglove_msgs/msg/SceneUpdate"
+_MATCHING_ID = 0
+_IDENTITY = (0.0, 0.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Entity:
+    """One mesh of a scene; its id is the mesh's `ns`."""
+
+    mesh: MarkerMesh
+    vertices: NDArray[np.floating]
+    """[m] relative to `position`, in the axes of the frame, shape (V, 3)."""
+    position: NDArray[np.float64]
+    """[m] in the frame, shape (3,)."""
+    stamp_ns: int
+
+
+def encode_scene(
+    entities: Sequence[Entity],
+    *,
+    deleted: Sequence[str] = (),
+    stamp_ns: int = 0,
+    frame_id: str = "map",
+    lifetime_ns: int = 0,
+) -> bytes:
+    """A `foxglove_msgs/SceneUpdate`: the entities are shown, and those named in `deleted` are no longer.
+
+    `stamp_ns` is the time of the deletions [ns]; viewers forget what isn't renewed for `lifetime_ns`, 0: never.
+    Raises `EncodeError` for vertices that aren't finite or too few, and a stamp that doesn't fit a ROS time.
+    """
+    writer = CdrWriter()
+    writer.fields("I", len(deleted))
+    for name in deleted:
+        writer.fields("TBs", stamp_ns, _MATCHING_ID, name)
+    writer.fields("I", len(entities))
+    for one in entities:
+        _write(writer, one, frame_id, lifetime_ns)
+    return writer.to_bytes()
+
+
+def _write(writer: CdrWriter, one: Entity, frame_id: str, lifetime_ns: int) -> None:
+    mesh, vertices = one.mesh, one.vertices
+    if vertices.shape != (mesh.n_vertices, 3) or not np.isfinite(vertices).all():
+        msg = f"{mesh.ns}: wanted finite vertices of shape ({mesh.n_vertices}, 3), got {vertices.shape}"
+        raise EncodeError(msg)
+    writer.fields("TssT?", one.stamp_ns, frame_id, mesh.ns, lifetime_ns, False)  # frame_locked
+    writer.fields("IIIIII", *[0] * 6)  # metadata, arrows, cubes, spheres, cylinders, lines
+    writer.fields("I", 1)
+    writer.array("f8", [*one.position, *_IDENTITY])
+    writer.sequence("f8", vertices)
+    writer.array("f8", mesh.color)
+    writer.fields("I", 0)  # colors
+    writer.sequence("u4", mesh.faces.ravel())
+    writer.fields("II", 0, 0)  # texts, models

@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from msg_adapters.cdr import HEADER_BYTES, CdrReader, CdrWriter, split_stamp
+from msg_adapters.cdr import HEADER_BYTES, Buffer, CdrReader, CdrWriter, split_stamp
 from msg_adapters.errors import DecodeError, EncodeError
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
-
-    from msg_adapters.cdr import Buffer
 
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 PointField = Literal["normal", "clearance", "sigma", "vertex", "garment", "visible"]
@@ -50,18 +46,14 @@ class PointCloudEncoder:
             raise EncodeError(msg)
         dtype = _layout(fields, most_vertices=max(counts))
         writer = CdrWriter()
-        self._stamp_at = writer.header(0, frame_id)
-        total = sum(counts)
-        writer.numbers("II", 1, total)
-        writer.numbers("I", len(dtype.names or ()))
+        total, n_bytes = sum(counts), sum(counts) * dtype.itemsize
+        self._stamp_at = writer.fields("TsIII", 0, frame_id, 1, total, len(dtype.names or ()))
         for name in dtype.names or ():
             kind, offset = dtype.fields[name][:2]  # type: ignore[index]
-            writer.string(name)
-            writer.numbers("IBI", offset, _CODES[kind.str[1:]], 1)
-        writer.numbers("BII", 0, dtype.itemsize, dtype.itemsize * total)
-        writer.numbers("I", dtype.itemsize * total)
+            writer.fields("sIBI", name, offset, _CODES[kind.str[1:]], 1)
+        writer.fields("?III", False, dtype.itemsize, n_bytes, n_bytes)
         start = len(writer)
-        self._message = np.zeros(HEADER_BYTES + start + dtype.itemsize * total + 1, np.uint8)
+        self._message = np.zeros(HEADER_BYTES + start + n_bytes + 1, np.uint8)
         head = np.frombuffer(writer.to_bytes(), np.uint8)
         self._message[: len(head)] = head
         self._message[-1] = 1  # is_dense
@@ -172,17 +164,13 @@ def decode_point_cloud(data: Buffer) -> tuple[NDArray[Any], int, str]:
     Points are a structured array, a read-only view of `data`, with the message's fields by name. Raises `DecodeError`.
     """
     reader = CdrReader(data)
-    stamp_ns, frame_id = reader.stamp_ns(), reader.string()
-    height, width = reader.numbers("II")
-    fields = []
-    for _ in range(reader.length(item_bytes=_MIN_FIELD_BYTES)):
-        name = reader.string()
-        fields.append((name, *reader.numbers("IBI")))
-    is_big, step, _ = reader.numbers("BII")
+    stamp_ns, frame_id, height, width = reader.fields("TsII")
+    fields: Any = [reader.fields("sIBI") for _ in range(reader.length(item_bytes=_MIN_FIELD_BYTES))]
+    is_big, step, _ = reader.fields("?II")
     raw = reader.skip(reader.length(item_bytes=1))
-    reader.numbers("B")
+    reader.fields("?")
     reader.finish()
-    return _points(raw, fields, step, height * width, is_big=bool(is_big)), stamp_ns, frame_id
+    return _points(raw, fields, step, height * width, is_big=is_big), stamp_ns, frame_id
 
 
 def points_of(message: Any) -> NDArray[Any]:

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from msg_adapters.cdr import CdrWriter
 from msg_adapters.errors import EncodeError
-from msg_adapters.markers import encode_strips
+from msg_adapters.markers import LINE_STRIP, encode_lists
 from msg_adapters.rotations import quaternion_from_matrix
 from msg_adapters.transforms import Transform, encode_transforms
 
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
-
 POLYGON = "geometry_msgs/msg/PolygonStamped"
+_COLOR, _WIDTH_M = (0.95, 0.55, 0.1, 1.0), 0.004
+"""Of the lines."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,9 +44,8 @@ def encode_polygon(ring: ArrayLike, *, stamp_ns: int, frame_id: str = "map") -> 
         msg = f"wanted finite points of shape (K, 3), got {points.shape}"
         raise EncodeError(msg)
     writer = CdrWriter()
-    writer.header(stamp_ns, frame_id)
-    writer.numbers("I", len(points))
-    writer.array("f4", points)
+    writer.fields("Ts", stamp_ns, frame_id)
+    writer.sequence("f4", points)
     return writer.to_bytes()
 
 
@@ -60,9 +58,9 @@ def encode_rims(rims: Sequence[Rim], *, frame_id: str = "map", lifetime_ns: int 
     for rim in rims:
         with np.errstate(invalid="ignore"):  # what isn't finite is refused below
             local = (rim.ring - rim.centre) @ rim.rotation
-        pose = np.concatenate([rim.centre, quaternion_from_matrix(rim.rotation)])
+        pose = [*rim.centre.tolist(), *quaternion_from_matrix(rim.rotation).tolist()]
         strips.append((rim.name, rim.stamp_ns, pose, np.concatenate([local, local[:1]])))
-    return encode_strips(strips, frame_id=frame_id, lifetime_ns=lifetime_ns)
+    return encode_lists(LINE_STRIP, strips, frame_id=frame_id, color=_COLOR, size=_WIDTH_M, lifetime_ns=lifetime_ns)
 
 
 def encode_frames(rims: Sequence[Rim], *, frame_id: str = "map") -> bytes:

@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 from msg_adapters.diagnostics import DIAGNOSTIC_ARRAY, OK, DiagnosticStatus, encode_diagnostics
 from msg_adapters.markers import MARKER_ARRAY, SKIN, MarkerArrayEncoder, MarkerMesh, encode_delete, garment_namespace
-from msg_adapters.outputs._meshes import MESH, encode_mesh
+from msg_adapters.outputs._meshes import MESH, SCENE_UPDATE, Entity, encode_mesh, encode_scene
 from msg_adapters.outputs._obstacles import Obstacles
 from msg_adapters.outputs._points import POINT_CLOUD, POINT_FIELDS, PointCloudEncoder
 from msg_adapters.outputs._rims import POLYGON, Rim, encode_frames, encode_polygon, encode_rims
-from msg_adapters.outputs._scene import SCENE_UPDATE, Entity, encode_scene
 from msg_adapters.outputs._topics import Apart, Layouts, Moment, Output, Together, Wishes
 from msg_adapters.transforms import TF_MESSAGE
 

@@ -1,71 +1,37 @@
 """Networks that predict a garment's displacement in the unposed space; `skinned` is the one without a network."""
 
-from refu_core.backbones._decoder import BasisDecoder, Decoder, DenseDecoder
-from refu_core.backbones._features import (
-    ENCODINGS,
-    N_STYLE_SHAPE,
-    PoseFeatures,
-    style_shape,
-    tilt_rotvec,
-    up_in_root,
-)
-from refu_core.backbones._files import (
-    backbone_from_weights,
-    backbone_weights,
-    load_backbone,
-    load_basis,
-    save_backbone,
-    save_basis,
-)
-from refu_core.backbones._frequency import LaplacianSmoothing
-from refu_core.backbones._gcnn import Gcnn, GcnnConfig
-from refu_core.backbones._mlp import Mlp, MlpConfig
-from refu_core.backbones._presets import (
-    PRESETS,
-    TRAINABLE,
-    BackboneConfig,
-    Network,
-    backbone_config,
-    build_backbone,
-    uses_basis,
-)
-from refu_core.backbones._protocol import MAX_OFFSET, Backbone, Prediction, Skinned, WithoutWearerCode
-from refu_core.backbones._tailornet import TailorNet, TailorNetConfig, kernel_weights
-
-__all__ = [
-    "ENCODINGS",
-    "MAX_OFFSET",
-    "N_STYLE_SHAPE",
-    "PRESETS",
-    "TRAINABLE",
-    "Backbone",
-    "BackboneConfig",
-    "BasisDecoder",
-    "Decoder",
-    "DenseDecoder",
-    "Gcnn",
-    "GcnnConfig",
-    "LaplacianSmoothing",
-    "Mlp",
-    "MlpConfig",
-    "Network",
-    "PoseFeatures",
-    "Prediction",
-    "Skinned",
-    "TailorNet",
-    "TailorNetConfig",
-    "WithoutWearerCode",
-    "backbone_config",
-    "backbone_from_weights",
-    "backbone_weights",
-    "build_backbone",
-    "kernel_weights",
-    "load_backbone",
-    "load_basis",
-    "save_backbone",
-    "save_basis",
-    "style_shape",
-    "tilt_rotvec",
-    "up_in_root",
-    "uses_basis",
-]
+from refu_core.backbones._decoder import BasisDecoder as BasisDecoder
+from refu_core.backbones._decoder import Decoder as Decoder
+from refu_core.backbones._decoder import DenseDecoder as DenseDecoder
+from refu_core.backbones._features import ENCODINGS as ENCODINGS
+from refu_core.backbones._features import N_STYLE_SHAPE as N_STYLE_SHAPE
+from refu_core.backbones._features import PoseFeatures as PoseFeatures
+from refu_core.backbones._features import style_shape as style_shape
+from refu_core.backbones._features import tilt_rotvec as tilt_rotvec
+from refu_core.backbones._features import up_in_root as up_in_root
+from refu_core.backbones._files import backbone_from_weights as backbone_from_weights
+from refu_core.backbones._files import backbone_weights as backbone_weights
+from refu_core.backbones._files import load_backbone as load_backbone
+from refu_core.backbones._files import load_basis as load_basis
+from refu_core.backbones._files import save_backbone as save_backbone
+from refu_core.backbones._files import save_basis as save_basis
+from refu_core.backbones._frequency import LaplacianSmoothing as LaplacianSmoothing
+from refu_core.backbones._gcnn import Gcnn as Gcnn
+from refu_core.backbones._gcnn import GcnnConfig as GcnnConfig
+from refu_core.backbones._mlp import Mlp as Mlp
+from refu_core.backbones._mlp import MlpConfig as MlpConfig
+from refu_core.backbones._presets import PRESETS as PRESETS
+from refu_core.backbones._presets import TRAINABLE as TRAINABLE
+from refu_core.backbones._presets import BackboneConfig as BackboneConfig
+from refu_core.backbones._presets import Network as Network
+from refu_core.backbones._presets import backbone_config as backbone_config
+from refu_core.backbones._presets import build_backbone as build_backbone
+from refu_core.backbones._presets import uses_basis as uses_basis
+from refu_core.backbones._protocol import MAX_OFFSET as MAX_OFFSET
+from refu_core.backbones._protocol import Backbone as Backbone
+from refu_core.backbones._protocol import Prediction as Prediction
+from refu_core.backbones._protocol import Skinned as Skinned
+from refu_core.backbones._protocol import WithoutWearerCode as WithoutWearerCode
+from refu_core.backbones._tailornet import TailorNet as TailorNet
+from refu_core.backbones._tailornet import TailorNetConfig as TailorNetConfig
+from refu_core.backbones._tailornet import kernel_weights as kernel_weights

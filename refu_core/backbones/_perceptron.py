@@ -12,7 +12,29 @@ from torch.nn import functional
 ACTIVATIONS = {"relu": functional.relu, "silu": functional.silu}
 
 
-class Perceptron(nn.Module):
+class _Standardised(nn.Module):
+    """What brings its inputs to one size."""
+
+    shift: Tensor
+    scale: Tensor
+
+    def register_standard(self, inputs: int) -> None:
+        """Inputs are left as they are until `standardise`."""
+        self.register_buffer("shift", torch.zeros(inputs))
+        self.register_buffer("scale", torch.ones(inputs))
+
+    def standardise(self, inputs: Tensor, groups: Tensor | None = None) -> None:
+        """Takes shift and scale from the inputs of the training set, shape (N, I); one scale a group (I,) of inputs."""
+        groups = torch.arange(inputs.shape[1]) if groups is None else groups
+        with torch.no_grad():
+            self.shift.copy_(inputs.mean(0))
+            # Within a group the sizes stay as they are: what of a joint's rotation hardly varies says little, and isn't
+            # blown up to the size of the rest. The same for groups that don't vary at all.
+            variance = inputs.new_zeros(int(groups.max()) + 1).index_add(0, groups, inputs.var(0))
+            self.scale.copy_(1 / ((variance / torch.bincount(groups)).sqrt() + 1e-3)[groups])
+
+
+class Perceptron(_Standardised):
     """Linear layers with an activation and dropout between them, on standardised input."""
 
     def __init__(
@@ -23,14 +45,7 @@ class Perceptron(nn.Module):
         self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(sizes))
         self.activation = ACTIVATIONS[activation]
         self.dropout = dropout
-        self.register_buffer("shift", torch.zeros(inputs))
-        self.register_buffer("scale", torch.ones(inputs))
-        self.shift: Tensor
-        self.scale: Tensor
-
-    def standardise(self, inputs: Tensor, groups: Tensor | None = None) -> None:
-        """Takes shift and scale from the inputs of the training set, shape (N, I); one scale a group (I,) of inputs."""
-        _standardise(self.shift, self.scale, inputs, groups)
+        self.register_standard(inputs)
 
     def forward(self, x: Tensor) -> Tensor:
         """Shape (B, I) -> (B, O)."""
@@ -43,7 +58,7 @@ class Perceptron(nn.Module):
         return out
 
 
-class StackedPerceptrons(nn.Module):
+class StackedPerceptrons(_Standardised):
     """K perceptrons of one shape on one input, and their weighted sum."""
 
     def __init__(
@@ -66,14 +81,7 @@ class StackedPerceptrons(nn.Module):
             bound = a**-0.5  # as nn.Linear
             self.weights.append(nn.Parameter(torch.empty(count, a, b).uniform_(-bound, bound)))
             self.biases.append(nn.Parameter(torch.empty(count, b).uniform_(-bound, bound)))
-        self.register_buffer("shift", torch.zeros(inputs))
-        self.register_buffer("scale", torch.ones(inputs))
-        self.shift: Tensor
-        self.scale: Tensor
-
-    def standardise(self, inputs: Tensor, groups: Tensor | None = None) -> None:
-        """Takes shift and scale from the inputs of the training set, shape (N, I); one scale a group (I,) of inputs."""
-        _standardise(self.shift, self.scale, inputs, groups)
+        self.register_standard(inputs)
 
     def forward(self, x: Tensor, mixture: Tensor) -> Tensor:
         """Σ_k mixture[:, k] · perceptron_k(x), shape (B, O), of x (B, I) and mixture (B, K)."""
@@ -86,13 +94,3 @@ class StackedPerceptrons(nn.Module):
         # Mixing before the last layer makes one product of it, and no (K, B, O) array, large with dense heads.
         mixed = (h * mixture.T[..., None]).transpose(0, 1).flatten(1)  # (B, K * H)
         return torch.addmm(mixture @ bias, mixed, weight.flatten(0, 1))
-
-
-def _standardise(shift: Tensor, scale: Tensor, inputs: Tensor, groups: Tensor | None) -> None:
-    groups = torch.arange(inputs.shape[1]) if groups is None else groups
-    with torch.no_grad():
-        shift.copy_(inputs.mean(0))
-        # Within a group the sizes stay as they are: what of a joint's rotation hardly varies says little, and isn't
-        # blown up to the size of the rest. The same for groups that don't vary at all.
-        variance = inputs.new_zeros(int(groups.max()) + 1).index_add(0, groups, inputs.var(0))
-        scale.copy_(1 / ((variance / torch.bincount(groups)).sqrt() + 1e-3)[groups])

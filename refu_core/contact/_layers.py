@@ -14,8 +14,9 @@ from torch import Tensor
 from refu_core._warp import as_warp, torch_stream
 from refu_core.contact import _layers_kernels as kernels
 from refu_core.contact import _layers_move_kernels as moving
-from refu_core.contact._parting import Parting, Sheet
+from refu_core.contact._parting import Parting
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
+from refu_core.contact._sheet import Sheet, ints
 from refu_core.errors import MeshError
 from refu_core.mesh import Adjacency, Connectivity
 
@@ -59,34 +60,31 @@ class Layer:
         self._settings = settings
         self.device = above.device
         self._is_serial = self.device.type == "cpu"
-        self._above, self._below = _own(above), _own(below)
+        self._above = above.detach().to(torch.float32, copy=True).contiguous()
         above_mesh = Connectivity.of(above_faces.cpu(), len(above))
-        below_mesh = Connectivity.of(below_faces.cpu(), len(below))
-        rest, rest_below = self._above.cpu().numpy(), self._below.cpu().numpy()
+        self._below = Sheet(below_faces, below)
+        rest, rest_below = self._above.cpu().numpy(), self._below.vertices.cpu().numpy()
         is_near = cKDTree(rest_below).query(rest)[0] < settings.layer_meets
         meets, candidates = np.flatnonzero(is_near), np.argsort(~is_near, kind="stable")  # those that meet first
         rows, ring_start, ring = _region(above_mesh.ring, candidates, settings.layer_rounds)
         self._n_candidates, self._n_region = len(candidates), len(rows)
-        self._normals = torch.empty_like(self._below)
         self._push = torch.zeros(len(candidates), 3, device=self.device)
-        self._extent = torch.zeros(2, 3, device=self.device)
         self._fields = torch.zeros(2, len(rows) + 1, 3, device=self.device)
         self._rows = torch.from_numpy(rows).to(self.device)
         self._looks, self._moved = torch.zeros(2, len(rows), dtype=torch.int32, device=self.device)
         self._count = torch.zeros(1, dtype=torch.int32, device=self.device)
         self._n_doubtful = torch.zeros(1, dtype=torch.int32, device=self.device)
-        self._tree: Any = None
-        self._tree_is_late = True
         self._commands: dict[str, Any] = {}
         if len(candidates):
-            cuts = [_cut(mesh, self.device) for mesh in (above_mesh, below_mesh)]
             start, places = _starts(rest[meets], rest_below, settings)
             start = np.append(start, np.full(len(rest) - len(meets), start[-1]))  # strangers know of no place
-            lists = [_ints(values, self.device) for values in (start, places, rows, ring_start, ring)]
-            rules, later = (
-                _rules(settings, reach, self._below, below_mesh) for reach in (farthest, settings.layer_later_reach)
-            )
-            self._record(rules, later, *cuts, *lists)
+            lists = [ints(values, self.device) for values in (start, places, rows, ring_start, ring)]
+            edges = rest_below[self._below.mesh.edges]
+            longest = settings.layer_stretch * float(np.linalg.norm(edges[:, 0] - edges[:, 1], axis=1).max())
+            rules, later = (_rules(settings, reach, longest) for reach in (farthest, settings.layer_later_reach))
+            self.parting = Parting(above_faces, self._above, self._below, settings=settings)
+            """What is done where triangles cut each other after all."""
+            self._record(rules, later, *lists)
 
     @torch.no_grad()
     def __call__(self, above: Tensor, below: Tensor, *, goes_on: bool = False) -> tuple[Tensor, Tensor]:
@@ -124,7 +122,6 @@ class Layer:
         if not self._n_candidates:
             return False
         with torch_stream(self.device):
-            self._fit_tree()
             self.parting.find(above)
         return not self._is_serial or int(self.parting.n_cut) > 0
 
@@ -132,9 +129,9 @@ class Layer:
         return not self._is_serial or int(self._count) > 0
 
     def _check(self, above: Tensor, below: Tensor) -> None:
-        if above.shape != self._above.shape or below.shape != self._below.shape:
+        if above.shape != self._above.shape or below.shape != self._below.vertices.shape:
             msg = (
-                f"wanted garments of {len(self._above)} and {len(self._below)} vertices, "
+                f"wanted garments of {len(self._above)} and {len(self._below.vertices)} vertices, "
                 f"got the shapes {tuple(above.shape)} and {tuple(below.shape)}"
             )
             raise MeshError(msg)
@@ -145,10 +142,7 @@ class Layer:
             self._looks.copy_((above != self._above).any(1)[self._rows] | (self._moved > 0))
         else:
             self._looks.fill_(1)
-            self._below.copy_(below)
-            torch.aminmax(self._below, dim=0, out=(self._extent[0], self._extent[1]))
-            self._commands["normals"].launch()
-            self._tree_is_late = True
+            self._below.take(below)
         self._moved.zero_()
         self._above.copy_(above)
 
@@ -161,14 +155,9 @@ class Layer:
         self._commands[lift].launch()
         n = int(self._n_doubtful) if self._is_serial else self._n_candidates
         if n:
-            self._fit_tree()
+            self._below.fit()
             self._commands[ask].set_dim(n)
             self._commands[ask].launch()
-
-    def _fit_tree(self) -> None:
-        if self._tree_is_late:
-            self._tree.refit()
-            self._tree_is_late = False
 
     def _move(self, blend_rounds: int) -> None:
         """Pushes those with their neighbourhood, in an even number of rounds."""
@@ -186,8 +175,6 @@ class Layer:
         self,
         rules: Any,
         later: Any,
-        above_cut: Any,
-        below_cut: Any,
         near_start: Any,
         near: Any,
         rows: Any,
@@ -195,49 +182,42 @@ class Layer:
         ring: Any,
     ) -> None:
         """Records the launches of a frame: each of them is shorter than what Python makes of its arguments."""
-        above, below, normals, push = (
-            as_warp(tensor, wp.vec3) for tensor in (self._above, self._below, self._normals, self._push)
-        )
+        above, push = (as_warp(tensor, wp.vec3) for tensor in (self._above, self._push))
+        sheet = self._below
         fields = [as_warp(field, wp.vec3) for field in self._fields]
-        self._tree = wp.Mesh(below, below_cut.faces.flatten())
-        sheet = Sheet(self._tree.id, as_warp(self._extent, wp.vec3), normals, below_cut.faces)
-        self.parting = Parting(above_cut, self._above, sheet, settings=self._settings)
-        """What is done where triangles cut each other after all."""
         found, closest, doubtful = (
             wp.zeros(self._n_candidates, dtype=wp.int32, device=str(self.device)) for _ in range(3)
         )
-        itself = _ints(np.arange(self._n_candidates + 1), self.device)
+        itself = ints(np.arange(self._n_candidates + 1), self.device)
         looks, moved = as_warp(self._looks, wp.int32), as_warp(self._moved, wp.int32)
-        search = [below, below_cut, above, rows]
-        garments = [below, normals, below_cut, above, above_cut, rows]
+        search = [sheet.places, sheet.cut, above, rows]
+        garments = [sheet.places, sheet.normals, sheet.cut, above, self.parting.cut, rows]
         pushed = [closest, push, as_warp(self._count, wp.int32)]
         doubts = [doubtful, as_warp(self._n_doubtful, wp.int32)]
         blend = [push, start, ring]
         reached = [wp.zeros(self._n_region, dtype=wp.int32, device=str(self.device)) for _ in range(2)]
-        extent = as_warp(self._extent, wp.vec3)
-        again = [start, ring, looks, found, extent, later, *pushed, *doubts]
+        again = [start, ring, looks, found, sheet.extent, later, *pushed, *doubts]
         for name, kernel, size, arguments in (
-            ("normals", kernels.normals_kernel, len(self._below), [below, below_cut, normals]),
             ("search", kernels.search_kernel, self._n_candidates, [*search, near_start, near, looks, found]),
             ("search again", kernels.search_kernel, self._n_candidates, [*search, itself, closest, looks, found]),
             (
                 "lift",
                 kernels.lift_kernel,
                 self._n_candidates,
-                [*garments, start, ring, looks, found, extent, rules, *pushed, *doubts],
+                [*garments, start, ring, looks, found, sheet.extent, rules, *pushed, *doubts],
             ),
             ("lift again", kernels.lift_kernel, self._n_candidates, [*garments, *again]),
             (
                 "ask again",
                 kernels.tree_kernel,
                 self._n_candidates,
-                [self._tree.id, *garments, found, later, *doubts, *pushed],
+                [sheet.tree, *garments, found, later, *doubts, *pushed],
             ),
             (
                 "ask",
                 kernels.tree_kernel,
                 self._n_candidates,
-                [self._tree.id, *garments, found, rules, *doubts, *pushed],
+                [sheet.tree, *garments, found, rules, *doubts, *pushed],
             ),
             ("spread0", moving.spread_kernel, self._n_region, [*blend, fields[0], fields[1]]),
             ("spread1", moving.spread_kernel, self._n_region, [*blend, fields[1], fields[0]]),
@@ -247,31 +227,11 @@ class Layer:
             self._commands[name] = wp.launch(kernel, size, arguments, device=str(self.device), record_cmd=True)
 
 
-def _own(vertices: Tensor) -> Tensor:
-    return vertices.detach().to(torch.float32, copy=True).contiguous()
-
-
-def _ints(values: NDArray[Any], device: torch.device) -> Any:
-    return wp.array(values.astype(np.int32), dtype=wp.int32, device=str(device))
-
-
-def _rules(settings: ContactSettings, reach: float, below: Tensor, mesh: Connectivity) -> Any:
-    start, end = mesh.edges.T
-    rest = below.cpu().numpy()
+def _rules(settings: ContactSettings, reach: float, longest: float) -> Any:
     rules = kernels.LayerRules()
     rules.gap, rules.reach, rules.fade = settings.layer_gap, reach, settings.layer_fade
-    rules.agreement, rules.doubt = settings.layer_agreement, settings.layer_doubt
-    rules.longest = settings.layer_stretch * float(np.linalg.norm(rest[start] - rest[end], axis=1).max())
+    rules.agreement, rules.doubt, rules.longest = settings.layer_agreement, settings.layer_doubt, longest
     return rules
-
-
-def _cut(mesh: Connectivity, device: torch.device) -> Any:
-    """A garment's mesh as the kernels read it."""
-    cut = kernels.Cut()
-    cut.faces, cut.rim = _ints(mesh.faces, device), _ints(_rim(mesh), device)
-    cut.fan_start, cut.fan_face = (_ints(array, device) for array in mesh.fan)
-    cut.ring_start, cut.ring = (_ints(array, device) for array in mesh.ring)
-    return cut
 
 
 def _starts(
@@ -288,14 +248,6 @@ def _starts(
     each = [np.append(first, np.array(places)[others]) for first, others in zip(closest, around, strict=True)]
     found = np.concatenate((*each, np.zeros(0, np.int64))).astype(np.int64)
     return np.append(0, np.cumsum([len(one) for one in each])).astype(np.int64), found
-
-
-def _rim(mesh: Connectivity) -> NDArray[np.int64]:
-    """A bit for each feature (as `closest_on_triangle` numbers them) of each face, (F, 3), that is on an open rim."""
-    open_edge = (mesh.n_faces_of_edge == 1)[mesh.edge_of_corner]
-    open_vertex = np.isin(mesh.faces, mesh.boundary)
-    rim: NDArray[np.int64] = np.concatenate((open_vertex, open_edge), axis=1) @ (1 << np.arange(1, 7))
-    return rim
 
 
 def _region(

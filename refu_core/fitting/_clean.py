@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 from scipy.spatial import cKDTree
@@ -14,10 +14,7 @@ from refu_core.errors import GarmentError
 from refu_core.fitting._mesh_file import SurfaceMesh
 from refu_core.garments import UvMap
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Ints = NDArray[np.int64]
+Ints = NDArray[np.int64]
 
 _SAME_PLACE = 1e-5
 """Vertices nearer than this are one, as a share of the mesh's extent: 10 µm of a dress."""

@@ -3,25 +3,21 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from refu_core.body import SmplBody
 from refu_core.errors import GarmentError
+from refu_core.fitting._mesh_file import SurfaceMesh
 from refu_core.fitting._posed import LEFT_HIP, RIGHT_SHOULDER, PosedBody, standing_pose
 from refu_core.fitting._surround import Fit, Samples, fit_of, sample
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from numpy.typing import NDArray
-
-    from refu_core.body import SmplBody
-    from refu_core.fitting._mesh_file import SurfaceMesh
-
-    F64 = NDArray[np.float64]
+F64 = NDArray[np.float64]
 
 UNITS: dict[str, float] = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 """Metres of a unit."""

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
-from refu_core.body import JOINT_NAMES, RigidTransforms
+from refu_core.body import JOINT_NAMES, RigidTransforms, SmplBody
 from refu_core.frames import N_JOINTS
 from refu_core.sdf import ExactSdf
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from refu_core.body import SmplBody
-
-    F64 = NDArray[np.float64]
+F64 = NDArray[np.float64]
 
 LEFT_SHOULDER, RIGHT_SHOULDER = (JOINT_NAMES.index(f"{side}_shoulder") for side in ("left", "right"))
 LEFT_HIP, RIGHT_HIP = (JOINT_NAMES.index(f"{side}_hip") for side in ("left", "right"))

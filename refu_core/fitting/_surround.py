@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from refu_core.fitting._clean import components, face_normals, rim_of
+from refu_core.fitting._mesh_file import SurfaceMesh
+from refu_core.fitting._posed import PosedBody
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from refu_core.fitting._mesh_file import SurfaceMesh
-    from refu_core.fitting._posed import PosedBody
-
-    F64 = NDArray[np.float64]
+F64 = NDArray[np.float64]
 
 _ACROSS = 0.5
 """Cosine of an angle to the way off the skin from which on cloth lies across it."""

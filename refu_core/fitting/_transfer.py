@@ -14,22 +14,19 @@ has no negative weights: what lies between 0 and 1 stays there, and sums of 1 st
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import coo_array, csc_array, diags_array
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
 from refu_core.fitting._clean import components, face_normals, rim_of
+from refu_core.fitting._posed import PosedBody
 from refu_core.mesh import vertex_normals
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from refu_core.fitting._posed import PosedBody
-
-    F64 = NDArray[np.float64]
+F64 = NDArray[np.float64]
 
 _FARTHEST = 0.15
 """Skin farther off says nothing [m]."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 import warp as wp
@@ -12,11 +11,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from refu_core._warp import Repeated, is_plain, strips
+from refu_core.body import SmplBody
 from refu_core.garments._below_kernels import N_BELOW, Vertices, Weights, follow_kernel
-
-if TYPE_CHECKING:
-    from refu_core.body import SmplBody
-    from refu_core.garments._template import GarmentTemplate
+from refu_core.garments._template import GarmentTemplate
 
 _WIDTH = 0.01
 """How much farther than the nearest one these may be to count for much [m]: the length of a body's shorter edges."""

@@ -1,26 +1,48 @@
-"""A garment's file: its mesh and all that is known of it, one `.npz`."""
+"""A garment's file: its mesh and all that is known of it, one `.npz`; and where such files live."""
 
 from __future__ import annotations
 
 import os
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
+from refu_core._files import replacing
 from refu_core._npz import read_npz
 from refu_core.body import BUILTIN_BODIES
 from refu_core.errors import GarmentError, MeshError
 from refu_core.frames import N_BETAS, N_JOINTS, N_STYLES
 from refu_core.garments._card import GarmentCard, card_to_json, json_to_card
-from refu_core.garments._registry import garment_files
 from refu_core.garments._template import GarmentTemplate, UvMap
 from refu_core.mesh import check_faces
+from refu_core.modes import BUILTIN_GARMENTS, GARMENT_FILE
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+_BUILTIN = Path(__file__).parents[1] / "assets"
+
+
+def garments_folder() -> Path:
+    """The user's garments: $REFU_GARMENTS, or refu/garments in $XDG_DATA_HOME (~/.local/share); it needs not exist."""
+    if os.environ.get("REFU_GARMENTS"):
+        return Path(os.environ["REFU_GARMENTS"]).expanduser()
+    shared = os.environ.get("XDG_DATA_HOME")
+    return (Path(shared) if shared else Path("~/.local/share").expanduser()) / "refu" / "garments"
+
+
+def garment_files() -> dict[str, Path]:
+    """The file of each garment that has a name: those that ship, then the user's. Of one name, the one that ships."""
+    found = {name: _BUILTIN / GARMENT_FILE.format(name) for name in BUILTIN_GARMENTS}
+    try:
+        own = sorted(garments_folder().glob("*.npz"))
+    except (OSError, RuntimeError):  # no home, no permission: nobody's garments
+        own = []
+    for path in own:
+        found.setdefault(path.stem.removeprefix("garment_"), path)
+    return found
+
 
 _ARRAYS = ("v_template", "f", "weights", "shapedirs")
 _UV = ("uv", "uv_f")
@@ -121,17 +143,13 @@ def save_garment(template: GarmentTemplate, path: str | os.PathLike[str]) -> Pat
         arrays["styledirs"] = _rounded(template.styledirs, 20).reshape(n, 3, N_STYLES)
     if template.uv is not None:
         arrays |= {"uv": template.uv.coordinates, "uv_f": template.uv.faces.astype(np.uint32)}
-    part = target.with_name(f".{target.name}.{os.getpid()}")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        with part.open("wb") as file:
+        with replacing(target) as file:
             np.savez_compressed(file, **arrays)
-        part.replace(target)
     except OSError as error:
         msg = f"{target}: can't be written: {error.strerror}"
         raise GarmentError(msg) from error
-    finally:
-        part.unlink(missing_ok=True)
     return target
 
 

@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
 from refu_core.body import BodyFit, Surface, load_body
 from refu_core.frames import N_BETAS
+from refu_core.garments._template import GarmentTemplate
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from refu_core.garments._template import GarmentTemplate
-
-    Array = NDArray[np.float64]
+Array = NDArray[np.float64]
 
 _NEIGHBOURS = 16
 """Vertices of the skin that a garment's vertex is carried by."""

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from numpy.typing import NDArray
 
 from refu_core.keypoints._pose import Pose, Skeleton, exp_so3
 from refu_core.skeleton import PARENTS
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+Array = NDArray[np.float64]
 
 _TRUNK = (0, 1, 2, 3, 6, 9, 12, 13, 14, 15, 16, 17)
 """Joints that turn with the pelvis, more or less."""

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from refu_core.skeleton import JOINT_NAMES as SMPL_JOINTS
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 _POINTS: dict[str, tuple[str, tuple[float, float, float]]] = {
     "pelvis": ("pelvis", (0, 0, 0)),

@@ -4,22 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from importlib import resources
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from refu_core._npz import read_npz
 from refu_core.errors import BodyError
 from refu_core.frames import N_BETAS, N_JOINTS
+from refu_core.keypoints._layouts import KeypointLayout
 from refu_core.skeleton import PARENTS
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from refu_core.keypoints._layouts import KeypointLayout
-
-    Array = NDArray[np.float64]
+Array = NDArray[np.float64]
 
 _ABOVE = np.array(PARENTS)
 _DEPTH = np.zeros(N_JOINTS, int)

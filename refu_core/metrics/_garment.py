@@ -6,16 +6,19 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 
 from refu_core.errors import MeshError
 from refu_core.mesh import Connectivity, check_faces
 from refu_core.metrics._collisions import Collisions
+from refu_core.metrics._folds import SWEEPS, FoldBands
 from refu_core.metrics._intersect import as_vertices
 
 ON_SKIN = 1e-6
 """Vertices no deeper than this [m] lie on the skin and not inside: positions of a metre are stored to a tenth of it."""
+
+FoldEnergies = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
@@ -44,6 +47,8 @@ class FrameMetrics:
     laplacian_mm: float | None
     """Mean length of the difference between Laplacian and true Laplacian [mm], over the vertices in question; None
     without a truth or without such a vertex. See `GarmentMetrics.add`."""
+    folds: tuple[FoldEnergies, FoldEnergies] | None
+    """Energy of the garment's folds and of the true one's, by `FoldBands` [m^2]; None without a truth."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +75,15 @@ class Figures:
     """Mean collision error [mm] (see `FrameMetrics.collision_error_mm`)."""
     laplacian_mm: float | None
     """Local Laplacian error [mm], mean over the frames that have one."""
+    folds_1: float | None
+    """Energy of the garments' folds over that of the true ones', all frames together: of the finest folds, those that
+    the first levelling sweep takes away (`FoldBands`). Below 1 garments are smoother than cloth."""
+    folds_4: float | None
+    """The same of what four more sweeps take away."""
+    folds_16: float | None
+    """And sixteen more."""
+    folds_64: float | None
+    """And 64 more: the widest folds."""
 
     @staticmethod
     def over(frames: list[FrameMetrics]) -> Figures:
@@ -78,6 +92,8 @@ class Figures:
         def mean(values: list[float]) -> float | None:
             return float(np.mean(values)) if values else None
 
+        folds = np.sum([frame.folds for frame in frames if frame.folds is not None], axis=0)
+        ratios = dict(zip(SWEEPS, (folds[0] / folds[1]).tolist(), strict=True)) if np.ndim(folds) else {}
         return Figures(
             n_frames=len(frames),
             mpve_mm=mean([frame.mpve_mm for frame in frames if frame.mpve_mm is not None]),
@@ -89,6 +105,10 @@ class Figures:
             mean_energy=mean([frame.energy for frame in frames]),
             mean_collision_error_mm=mean([frame.collision_error_mm for frame in frames]),
             laplacian_mm=mean([frame.laplacian_mm for frame in frames if frame.laplacian_mm is not None]),
+            folds_1=ratios.get(1),
+            folds_4=ratios.get(4),
+            folds_16=ratios.get(16),
+            folds_64=ratios.get(64),
         )
 
     def as_dict(self) -> dict[str, Any]:
@@ -106,6 +126,7 @@ class GarmentMetrics:
     faces: NDArray[np.int32]
     _frames: list[FrameMetrics] = field(default_factory=list, init=False, repr=False)
     _laplacian: csr_array | None = field(default=None, init=False, repr=False)
+    _bands: FoldBands | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
         self.faces = check_faces(self.faces)
@@ -157,6 +178,7 @@ class GarmentMetrics:
             collision_error_mm=1e3 * float(depth.sum()),
             mpve_mm=None if errors is None else 1e3 * float(errors.mean()),
             laplacian_mm=None if laplacians is None or not region.any() else 1e3 * float(laplacians[region].mean()),
+            folds=None if target is None else (self._folds_of(garment), self._folds_of(target)),
         )
         self._frames.append(frame)
         return frame
@@ -165,9 +187,32 @@ class GarmentMetrics:
         """The figures over the frames added so far."""
         return Figures.over(self._frames)
 
+    def _folds_of(self, vertices: NDArray[np.float32]) -> FoldEnergies:
+        if self._bands is None:
+            self._bands = FoldBands(Connectivity.of(self.faces, len(vertices)))
+        finest, fine, wide, widest = self._bands.energies(vertices).tolist()
+        return finest, fine, wide, widest
+
     def _laplacian_of(self, vertices: NDArray[np.float32]) -> NDArray[np.float64]:
         """Each vertex minus the mean of its neighbours along edges (the uniform Laplacian) [m], shape (N, 3)."""
         if self._laplacian is None or self._laplacian.shape[0] != len(vertices):
             self._laplacian = Connectivity.of(self.faces, len(vertices)).uniform_laplacian()
         product: NDArray[np.float64] = self._laplacian @ vertices.astype(np.float64)
         return product
+
+
+def temporal_jitter(before: ArrayLike, now: ArrayLike, after: ArrayLike) -> float:
+    """Mean over the vertices of |x(t+1) - 2 x(t) + x(t-1)|, in millimetres a frame squared.
+
+    Three consecutive frames of a garment [m], each of shape (N, 3). A moving body accelerates too, so the figure means
+    something beside that of a garment skinned to the same motion at the same frame rate, and not on its own.
+
+    Raises:
+        MeshError: arrays of other or differing shapes.
+    """
+    frames = [np.asarray(frame, np.float64) for frame in (before, now, after)]
+    if frames[0].ndim != 2 or frames[0].shape[1] != 3 or len({frame.shape for frame in frames}) > 1:
+        msg = f"wanted three frames of one shape (N, 3), got {', '.join(str(frame.shape) for frame in frames)}"
+        raise MeshError(msg)
+    acceleration = frames[2] - 2 * frames[1] + frames[0]
+    return 1e3 * float(np.linalg.norm(acceleration, axis=1).mean()) if len(acceleration) else 0.0

@@ -14,9 +14,11 @@ from refu_core.contact import (
     ContactSettings,
     Layer,
     LimbMeshes,
+    Parting,
     Press,
     Resolution,
     Resolver,
+    Sheet,
 )
 from refu_core.garments import inner_first
 from refu_core.modes import SdfMode
@@ -78,10 +80,14 @@ class ContactStage:
         self.resolvers = {
             name: Resolver(one.faces, one.n_vertices, settings=settings) for name, one in garments.items()
         }
-        self._limbs, self._press = None, {}
+        self._limbs, self._press, self._off_skin = None, {}, {}
         if outfit.collider is not None:  # or there is no room
             self._limbs = limbs = LimbMeshes(body)
             self._press = {name: Press(one, limbs, settings=settings) for name, one in garments.items()}
+            self._skin = skin = Sheet(body.faces, body.v_template)
+            self._off_skin = {
+                name: Parting(one.faces, one.v_template, skin, settings=settings) for name, one in garments.items()
+            }
         self._outfit, self._farthest, self._kept = outfit, settings.max_displacement, settings.layer_margin
         self._partings, self._part_most = settings.partings, settings.parting_most
         self._below = {
@@ -98,9 +104,16 @@ class ContactStage:
             for i, name in enumerate(self.order)
         }
 
-    def update(self, body: Tensor) -> None:
-        """Takes over the body's new pose, shape (V, 3) [m]. Raises `MeshError` for one that isn't finite."""
+    def update(self, body: Tensor, n_held: Tensor | int = 0) -> None:
+        """Takes over the body's new pose, shape (V, 3) [m], and how much of its skin has gone as far as it may.
+
+        Raises `MeshError` for a body that isn't finite.
+        """
         self._body = body
+        # Where skin has given way as far as it may, there may be less room than cloth needs. A GPU isn't asked.
+        self._is_tight = bool(self._off_skin) and (body.device.type != "cpu" or bool(n_held > 0))
+        if self._is_tight:
+            self._skin.take(body)
         self.sdf.update(body)
         if self.winding is not None:
             self.winding.update(body)
@@ -152,6 +165,8 @@ class ContactStage:
             # Each step goes no farther than that; together they may.
             vertices = pressed + torch.renorm(again.vertices - pressed, 2, 0, self._farthest)
             numbers[_N_UNRESOLVED] = again.numbers[_N_UNRESOLVED]
+        if self._is_tight:
+            vertices = self._off_skin[name].parted(vertices)
         if self.winding is not None:
             numbers[_N_UNRESOLVED] = torch.count_nonzero(self.winding(vertices))
         return Resolved(vertices, torch.cat((numbers, n_layered)), n_clipped)

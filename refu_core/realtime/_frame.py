@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 Adjust = Callable[[Dressed], Dressed]
 """Changes what was predicted: garments, not bodies."""
 N_SHIFT = 4
+_N_HELD = 3
 _MOVED = 1e-4
 """Skin that was moved by more than this counts as moved [m]."""
 
@@ -107,7 +108,7 @@ class FrameStep:
             clock = clocks[person] if clocks else StageClock()
             clock.start(shared, share=1 / len(pose))
             if self.contact is not None:
-                self.contact.update(body)
+                self.contact.update(body, shifts[person, _N_HELD])
             clock.lap("sdf")
             garments: dict[str, Worn] = {}
             for name in self._order:

@@ -1,19 +1,13 @@
 """Recorded motion: one reader for what archives, pose estimators and motion capture write."""
 
-from refu_core.recordings._rate import FPS_RANGE, MAX_FRAMES, n_resampled
-from refu_core.recordings._recording import SUFFIXES, Recording, read_recording
-from refu_core.recordings._upright import AXES, Axes, axis_of, upright_share, upright_turn
-
-__all__ = [
-    "AXES",
-    "FPS_RANGE",
-    "MAX_FRAMES",
-    "SUFFIXES",
-    "Axes",
-    "Recording",
-    "axis_of",
-    "n_resampled",
-    "read_recording",
-    "upright_share",
-    "upright_turn",
-]
+from refu_core.recordings._rate import FPS_RANGE as FPS_RANGE
+from refu_core.recordings._rate import MAX_FRAMES as MAX_FRAMES
+from refu_core.recordings._rate import n_resampled as n_resampled
+from refu_core.recordings._recording import SUFFIXES as SUFFIXES
+from refu_core.recordings._recording import Recording as Recording
+from refu_core.recordings._recording import read_recording as read_recording
+from refu_core.recordings._upright import AXES as AXES
+from refu_core.recordings._upright import Axes as Axes
+from refu_core.recordings._upright import axis_of as axis_of
+from refu_core.recordings._upright import upright_share as upright_share
+from refu_core.recordings._upright import upright_turn as upright_turn

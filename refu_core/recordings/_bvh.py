@@ -7,29 +7,24 @@ its joints are posed, known by their names, and followed as keypoints are.
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from refu_core._files import read_file
+from refu_core.errors import RefuError
 from refu_core.recordings._followed import follow
 from refu_core.recordings._layouts import WANTED
 from refu_core.recordings._rate import MAX_FRAMES, check_fps
+from refu_core.recordings._recording import Recording
+from refu_core.recordings._upright import Axes
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from refu_core.errors import RefuError
-    from refu_core.recordings._recording import Recording
-    from refu_core.recordings._upright import Axes
-
-    Array = NDArray[np.float64]
+Array = NDArray[np.float64]
 
 _MAX_BYTES = 256 << 20
 _MAX_JOINTS = 1000

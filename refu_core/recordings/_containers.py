@@ -5,25 +5,21 @@ from __future__ import annotations
 import io
 import zipfile
 import zlib
-from typing import TYPE_CHECKING, Any, BinaryIO
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.lib import format as npy
+from numpy.typing import NDArray
 
 from refu_core._files import open_file
 from refu_core._npz import DAMAGE as ARCHIVE_DAMAGE
 from refu_core._npz import ArrayBudget, check_npy, npz_names, read_npz
 from refu_core._pickle import DAMAGE, PickledArrays
 from refu_core._pickle_machine import MAX_PICKLE_BYTES, Machine, Record
+from refu_core.errors import RefuError
 from refu_core.recordings._layouts import ALL_KEYS, POSE_KEYS, UNREAD, WANTED
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from refu_core.errors import RefuError
 
 Key = str | int
 _ZIP, _NPY, _GZIP = b"PK\x03\x04", b"\x93NUMPY", b"\x1f\x8b"

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from refu_core.keypoints import KeypointTracker, Proportions, Skeleton, TrackerSettings, layout_of
 from refu_core.recordings._recording import Recording
 from refu_core.recordings._upright import Axes, to_smpl
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
 
 _SETTINGS = TrackerSettings(noise=0.01, rest_after=1.0)
 _FIT = 100  # frames that a person's shape is taken from

@@ -6,23 +6,18 @@ People save lists of those lists, dictionaries by image, or the arrays of one pe
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from refu_core._pickle_machine import Record
-from refu_core.recordings._containers import entries
+from refu_core.recordings._containers import Content, Key, entries
 from refu_core.recordings._layouts import KEYPOINTS, KEYPOINTS_PLACE, TRACK_IDS
 from refu_core.recordings._rate import MAX_FRAMES
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    from refu_core.recordings._containers import Content, Key
-
-    Array = NDArray[np.float64]
+Array = NDArray[np.float64]
 
 _N_KEYPOINTS = 70
 _BODY = "nose l_eye r_eye l_ear r_ear l_shoulder r_shoulder l_elbow r_elbow l_hip r_hip l_knee r_knee l_ankle r_ankle "

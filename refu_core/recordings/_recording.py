@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from refu_core.errors import RefuError
 from refu_core.frames import N_BETAS, N_JOINTS
 from refu_core.recordings import _layouts as table
-from refu_core.recordings._containers import Content, open_content
+from refu_core.recordings._containers import Content, Key, open_content
 from refu_core.recordings._mhr import POINTS, Track, tracks_of_mhr
 from refu_core.recordings._rate import MAX_FRAMES, check_fps
 from refu_core.recordings._rotations import BODY, WHOLE, rotvecs_of
 from refu_core.recordings._tracks import tracks_of
 from refu_core.recordings._upright import Axes, to_smpl
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    from refu_core.errors import RefuError
-    from refu_core.recordings._containers import Key
 
 SUFFIXES = (".npz", ".npy", ".pkl", ".pickle", ".pk", ".p", ".joblib", ".pt", ".pth", ".bvh")
 """Of files that hold motion."""

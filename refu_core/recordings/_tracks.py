@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
 from refu_core.recordings._containers import Content, entries
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 _ARRAYS = ("global_orient", "body_pose", "betas")
 

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from refu_core.frames import MAX_ANGLE
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+Array = NDArray[np.float64]
 
 Axes = Literal["auto", "smpl", "z-up", "y-down", "frame"]
 """What root orientations and translations are expressed in: `smpl` (y up), `z-up` (AMASS, ROS), `y-down` (a camera's

@@ -55,10 +55,12 @@ def trained_from_weights(weights: Weights, garment: GarmentTemplate, *, device: 
         WeightsError: of another version or garment, or the basis beside them is missing, damaged or another one.
     """
     backbone: Backbone = backbone_from_weights(weights, garment, device=device).requires_grad_(False)
-    return Trained(backbone, _refu(weights, device))
+    refu = refu_from_weights(weights, device=device)
+    return Trained(backbone, None if refu is None else refu.eval().requires_grad_(False))
 
 
-def _refu(weights: Weights, device: str | torch.device) -> Refu | None:
+def refu_from_weights(weights: Weights, *, device: str | torch.device = "cpu") -> Refu | None:
+    """The layer in `weights`, None where there is none. Raises `WeightsError` for one that doesn't fit its card."""
     config = weights.card.get("refu")
     if config is None:
         return None
@@ -72,4 +74,4 @@ def _refu(weights: Weights, device: str | torch.device) -> Refu | None:
     except WeightsError as error:
         msg = f"{weights.path}: its ReFU layer doesn't fit its card: {error}"
         raise WeightsError(msg) from error
-    return refu.to(device).eval().requires_grad_(False)
+    return refu.to(device)

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from refu_core.sdf import ExactSdf
+from refu_core.simulation._mesh import ClothTopology
 from refu_core.simulation._pairs import farthest_move, find_candidates, near_pairs
 from refu_core.simulation._solver import refresh_points, stale_points, substep
-
-if TYPE_CHECKING:
-    from refu_core.simulation._mesh import ClothTopology
 
 F32 = NDArray[np.float32]
 I32 = NDArray[np.int32]

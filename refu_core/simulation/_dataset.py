@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from refu_core._files import read_json
-from refu_core.simulation._errors import SimulationError
+from refu_core.errors import SimulationError
 from refu_core.simulation._motion import FPS
 from refu_core.simulation._plan import TEST
 from refu_core.simulation._selection import CAUSES

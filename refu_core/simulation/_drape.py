@@ -9,25 +9,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from refu_core.body import DEFAULT_GAP, Collider
+from refu_core.body import DEFAULT_GAP, Collider, SmplBody
 from refu_core.frames import N_BETAS, N_JOINTS
-from refu_core.garments import N_STYLES
+from refu_core.garments import N_STYLES, GarmentTemplate
 from refu_core.realtime._turn import RootTurn
 from refu_core.sdf import ExactSdf
-from refu_core.simulation._cloth import ClothSettings, SimulatedCloth
+from refu_core.simulation._cloth import F32, ClothSettings, SimulatedCloth
 from refu_core.simulation._mesh import ClothTopology
-
-if TYPE_CHECKING:
-    from refu_core.body import SmplBody
-    from refu_core.garments import GarmentTemplate
-    from refu_core.simulation._cloth import F32
 
 GRAVITY = 9.81
 """[m/s²], along -y of the world."""

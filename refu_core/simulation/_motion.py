@@ -4,18 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from refu_core.simulation._errors import SimulationError
-from refu_core.simulation._poses import mirrored, without_heading
-
-if TYPE_CHECKING:
-    from refu_core.simulation._poses import Clip
+from refu_core.errors import SimulationError
+from refu_core.simulation._poses import Clip, mirrored, without_heading
 
 FPS = 30
 """Frames of a sequence [1/s]."""

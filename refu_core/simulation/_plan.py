@@ -9,19 +9,15 @@ from __future__ import annotations
 import zlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
+from refu_core.errors import SimulationError
 from refu_core.frames import N_BETAS
 from refu_core.garments import N_STYLES, garment_name
-from refu_core.simulation._errors import SimulationError
-from refu_core.simulation._poses import clip_pose, random_pose
-
-if TYPE_CHECKING:
-    from refu_core.simulation._poses import Clip
+from refu_core.simulation._poses import Clip, clip_pose, random_pose
 
 TRAIN, TEST = 0, 1
 MAX_PIVOTS_SHARE = 0.5

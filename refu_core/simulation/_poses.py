@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from refu_core.body import MIRRORED_JOINTS
+from refu_core.errors import SimulationError
 from refu_core.frames import N_JOINTS
 from refu_core.recordings import SUFFIXES, Axes, n_resampled, read_recording
-from refu_core.simulation._errors import SimulationError
 
 # Range of each joint's rotation vector [degrees] about x, y, z, for the left side where there are two; the right side
 # is its mirror image. x points to the subject's left, y up, z forward, so a thigh is raised by a negative turn about x,

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from refu_core.metrics import CollisionChecker, SheetChecker
-
-if TYPE_CHECKING:
-    from refu_core.simulation._cloth import F32
-    from refu_core.simulation._drape import SettledDrape
+from refu_core.simulation._cloth import F32
+from refu_core.simulation._drape import SettledDrape
 
 CAUSES = ("body_collision", "self_intersection", "stretch", "unsettled")
 """Why a sample isn't taken, in the order of the checks."""

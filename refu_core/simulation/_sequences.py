@@ -9,16 +9,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from refu_core._engine import Engine
+from refu_core.errors import SimulationError
 from refu_core.frames import N_BETAS
 from refu_core.garments import N_STYLES, garment_name
+from refu_core.simulation._cloth import F32
 from refu_core.simulation._drape import GRAVITY, SettledDrape
-from refu_core.simulation._errors import SimulationError
 from refu_core.simulation._motion import FPS, STEPS, DrawnMotion, draw_motion
 from refu_core.simulation._plan import TEST, TRAIN, truncated_normal
 from refu_core.simulation._poses import Clip, as_clips, split_clips
@@ -27,9 +28,6 @@ from refu_core.simulation._selection import CAUSES
 from refu_core.simulation._store import DONE, SEQUENCES, SequenceShard, dequantise, quantise
 from refu_core.simulation._summary import summarise_sequences
 from refu_core.simulation._worker import SimulationSettings, Simulator
-
-if TYPE_CHECKING:
-    from refu_core.simulation._cloth import F32
 
 
 @dataclass(frozen=True)

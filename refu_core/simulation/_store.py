@@ -31,9 +31,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from refu_core._files import open_file, read_json
+from refu_core._files import open_file, read_json, replacing
 from refu_core._npz import DAMAGE, check_npy
-from refu_core.simulation._errors import SimulationError
+from refu_core.errors import SimulationError
 from refu_core.simulation._selection import CAUSES
 
 FORMAT = "refu-garments-2"
@@ -286,17 +286,14 @@ def read_card(directory: Path, kind: str = FORMAT) -> dict[str, Any]:
 
 def write_card(directory: Path, card: dict[str, Any]) -> None:
     """Writes the card in one step: a reader sees the old one or the new one."""
-    partial = directory / f"card.json.{os.getpid()}"
-    partial.write_text(json.dumps(card, indent=1) + "\n")
-    partial.replace(directory / "card.json")
+    with replacing(directory / "card.json") as file:
+        file.write((json.dumps(card, indent=1) + "\n").encode())
 
 
 def write_by_slot(directory: Path, name: str, values: NDArray[np.float32]) -> None:
     """Writes `name`.npy of a set, one row a slot, in one step."""
-    partial = directory / f"{name}.npy.{os.getpid()}"
-    with partial.open("wb") as file:
+    with replacing(directory / f"{name}.npy") as file:
         np.save(file, values)
-    partial.replace(directory / f"{name}.npy")
 
 
 def read_by_slot(directory: Path, name: str, shape: tuple[int, ...]) -> NDArray[np.float32]:

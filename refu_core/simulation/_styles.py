@@ -10,24 +10,21 @@ where they belong, in the displacement that a backbone predicts.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from refu_core.body import SmplBody
 from refu_core.errors import GarmentError
 from refu_core.frames import N_BETAS
-from refu_core.garments import N_STYLES
+from refu_core.garments import N_STYLES, GarmentTemplate, Tailoring
 from refu_core.sdf import ExactSdf
+from refu_core.simulation._cloth import F32
 from refu_core.simulation._drape import Draper
 from refu_core.simulation._mesh import ClothTopology
-
-if TYPE_CHECKING:
-    from refu_core.body import SmplBody
-    from refu_core.garments import GarmentTemplate, Tailoring
-    from refu_core.simulation._cloth import F32
 
 F64 = NDArray[np.float64]
 _CLEARANCE = 0.005
@@ -269,8 +266,6 @@ def build_styles(
 
 def with_styles(garment: GarmentTemplate, v_template: F32, styledirs: F32) -> GarmentTemplate:
     """The garment with another mean cut (N, 3) and these style directions (N, 3, 4), everything else as it was."""
-    from dataclasses import replace
-
     return replace(
         garment,
         v_template=torch.from_numpy(np.ascontiguousarray(v_template)),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 import os
 import zipfile
@@ -12,7 +11,7 @@ from typing import Any
 
 import torch
 
-from refu_core._files import open_file
+from refu_core._files import open_file, replacing
 from refu_core.errors import RefuError, WeightsError
 
 _MAX_BYTES = 16 << 30
@@ -25,23 +24,16 @@ def save_checkpoint(path: Path, state: Mapping[str, Any]) -> None:
     Raises:
         WeightsError: the disk can't be written.
     """
-    part = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         # Through memory: on a full disk torch's own writer raises errors of its own, and no system's.
         buffer = io.BytesIO()
         torch.save(dict(state), buffer)
-        with part.open("wb") as file:
+        with replacing(path, sync=True) as file:
             file.write(buffer.getbuffer())
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
     except OSError as error:
         msg = f"{path}: the checkpoint can't be written: {error}"
         raise WeightsError(msg) from error
-    finally:
-        with contextlib.suppress(OSError):
-            part.unlink()
 
 
 def load_checkpoint(path: Path, identity: str | None = None) -> dict[str, Any] | None:

@@ -18,6 +18,7 @@ from refu_core.errors import RefuError
 from refu_core.garments import GarmentTemplate, load_garment
 from refu_core.simulation import GarmentDataset, GarmentSequences, open_dataset
 from refu_core.training._mirror import Mirror, mirror_pose
+from refu_core.training._taken_along import TakenAlong
 
 _FEWEST = 2
 """Samples that anything can be learnt from; hundreds are needed to learn it well."""
@@ -34,7 +35,7 @@ class TrainingSamples:
     style: Tensor
     """γ, shape (N, 4)."""
     displacement: Tensor
-    """D = unpose(x) - t(β, γ) of the simulated garment x [m], shape (N, V, 3)."""
+    """D = unpose(x) - t(β, γ) of the simulated garment x, less what `TakenAlong` adds to it [m], shape (N, V, 3)."""
     pair: Tensor
     """Number of the style-shape pair, or of the sequence, shape (N,), int64."""
 
@@ -113,9 +114,12 @@ def read_samples(
     vertices = stored.pop("vertices")
     column = {name: torch.as_tensor(values) for name, values in stored.items()}
 
+    along = TakenAlong(body, garment)
+
     def displacement(units: NDArray[np.int16], pose: Tensor, betas: Tensor, style: Tensor) -> Tensor:
         posed = torch.as_tensor(units.astype(np.float32) * float(dataset.card["quantum_m"]))
-        return garment.unpose(posed, body(pose, betas).transforms) - garment.rest(betas, garment.own(style))
+        whole = garment.unpose(posed, body(pose, betas).transforms) - garment.rest(betas, garment.own(style))
+        return along.without(whole, betas, pose, style)
 
     with torch.no_grad():
         found = in_chunks(displacement, vertices, column["pose"], column["betas"], column["style"])

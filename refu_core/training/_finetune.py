@@ -16,7 +16,7 @@ from refu_core.body import SmplBody
 from refu_core.errors import RefuError
 from refu_core.garments import GarmentTemplate
 from refu_core.modes import DEFAULT_MARGIN
-from refu_core.refu import SCALE_PRESETS, Refu, ScaleKind, refu_tensors
+from refu_core.refu import SCALE_PRESETS, Refu, ScaleKind, refu_from_weights, refu_tensors
 from refu_core.simulation import GarmentDataset, GarmentSequences
 from refu_core.training._data import TrainingSamples, TrainingSet, mirrored, split_validation
 from refu_core.training._dresser import Dresser, Sdf
@@ -25,6 +25,7 @@ from refu_core.training._losses import COLLISION_WEIGHT, RECONSTRUCTION_WEIGHT, 
 from refu_core.training._mirror import Mirror
 from refu_core.training._pretrain import PretrainSettings, basis_of, pivots_of, stages
 from refu_core.training._progress import TrainingLog
+from refu_core.training._taken_along import TakenAlong
 from refu_core.weights import load_weights
 
 _CHUNK = 64
@@ -99,6 +100,7 @@ def finetune(
     backbone: str = "tailornet",
     preset: str = "realtime",
     settings: FinetuneSettings | None = None,
+    goes_on: bool = False,
     body: SmplBody | None = None,
     device: str = "cpu",
     quiet: bool = False,
@@ -117,6 +119,7 @@ def finetune(
         backbone: `tailornet`, `mlp` or `gcnn`.
         preset: `realtime` or `paper`, of ReFU and of a backbone from scratch.
         settings: the backbone's own in the preset if not given.
+        goes_on: start from <backbone>-<mode> in `weights` with its ReFU, in place of <backbone>-none.
         body: the body that the set was simulated on; the garment's built-in one if not given.
         device: `cpu` or `cuda`.
         quiet: show no progress.
@@ -142,6 +145,7 @@ def finetune(
     if settings.is_mirrored:
         train = train.joined(mirrored(train, Mirror.of(template)))
     network: nn.Module
+    stored = None
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.loop.seed)
         if weights is None:
@@ -153,9 +157,12 @@ def finetune(
             # For the scale of inputs and outputs, which it sets; the stages themselves aren't run.
             stages(fresh, train, validation, template, PretrainSettings())
         else:
-            network = backbone_from_weights(load_weights(Path(weights) / f"{backbone}-none", expect=identity), template)
+            stored = load_weights(Path(weights) / f"{backbone}-{mode if goes_on else 'none'}", expect=identity)
+            network = backbone_from_weights(stored, template)
             _bring_basis(Path(weights), output, is_writer=is_writer)
         refu = _layer(mode, settings, template.n_vertices)
+        if stored is not None and goes_on:
+            refu = refu_from_weights(stored)
     described = {
         **identity,
         "backbone": backbone,
@@ -164,6 +171,7 @@ def finetune(
         "settings": asdict(settings),
         "samples": len(train),
         "from_scratch": weights is None,
+        **({"goes_on_from": stored.card["sha256"]} if stored is not None and goes_on else {}),
     }
     found = _MODES[mode]
     dresser = Dresser(
@@ -212,13 +220,16 @@ def finetune(
 def _tensors(samples: TrainingSamples, body: SmplBody, garment: GarmentTemplate) -> tuple[Tensor, ...]:
     """What the loop draws from: β, θ, γ and the posed true garments [m], shape (N, V, 3)."""
     posed = torch.empty_like(samples.displacement)
-    style = garment.own(samples.style)
+    style, along = garment.own(samples.style), TakenAlong(body, garment)
     with torch.no_grad():
         for start in range(0, len(samples), _CHUNK):
             chunk = slice(start, start + _CHUNK)
             rest = garment.rest(samples.betas[chunk], None if style is None else style[chunk])
             transforms = body(samples.pose[chunk], samples.betas[chunk]).transforms
-            posed[chunk] = garment.pose(rest + samples.displacement[chunk], transforms)
+            whole = along.with_it(
+                samples.displacement[chunk], samples.betas[chunk], samples.pose[chunk], samples.style[chunk]
+            )
+            posed[chunk] = garment.pose(rest + whole, transforms)
     return samples.betas, samples.pose, samples.style, posed
 
 

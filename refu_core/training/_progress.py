@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
-from refu_core._files import MAX_JSON_BYTES, read_file
+from refu_core._files import MAX_JSON_BYTES, read_file, replacing
 from refu_core.errors import RefuError
 
 
@@ -47,9 +46,8 @@ class TrainingLog:
         """Losses at a step, by name [mm]."""
         self._entries.append({"stage": stage, "step": step, **{k: round(v, 5) for k, v in values.items()}})
         # Under another name first: a training that is killed leaves the curves of the check before, and no half line.
-        part = self._lines.with_name(f".{self._lines.name}.{os.getpid()}")
-        part.write_text("".join(json.dumps(entry) + "\n" for entry in self._entries))
-        part.replace(self._lines)
+        with replacing(self._lines) as file:
+            file.write("".join(json.dumps(entry) + "\n" for entry in self._entries).encode())
         if self._bar is not None:
             self._bar.set_postfix({k: f"{v:.2f}" for k, v in values.items()})
 

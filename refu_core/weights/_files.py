@@ -23,7 +23,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
-from refu_core._files import InputFile, open_file, parse_json
+from refu_core._files import InputFile, open_file, parse_json, replacing
 from refu_core._npz import DAMAGE
 from refu_core.errors import WeightsError
 
@@ -97,8 +97,10 @@ def save_weights(
     path = _with_suffix(stem, ".safetensors")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        _replace(path, data)
-        _replace(_with_suffix(stem, ".json"), (json.dumps(full, indent=1) + "\n").encode())
+        with replacing(path, sync=True) as file:
+            file.write(data)
+        with replacing(_with_suffix(stem, ".json"), sync=True) as file:
+            file.write((json.dumps(full, indent=1) + "\n").encode())
     except OSError as error:
         msg = f"{stem}: weights can't be written: {error}"
         raise WeightsError(msg) from error
@@ -249,15 +251,3 @@ def _open(path: Path, most: int) -> InputFile:
 
 def _with_suffix(stem: Path, suffix: str) -> Path:
     return stem.with_name(stem.name + suffix)
-
-
-def _replace(path: Path, data: bytes) -> None:
-    part = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        with part.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)

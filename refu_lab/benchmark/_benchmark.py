@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+import itertools
+import os
+import platform
+from collections.abc import Callable, Mapping
 from functools import partial
-from typing import NoReturn
+from pathlib import Path
+from typing import Any, NoReturn, TypeVar
 
+import torch
 from tqdm import tqdm
 
+import msg_adapters as adapters
+from refu_core import GarmentPipeline
+from refu_core.metrics import CollisionChecker, GarmentMetrics
 from refu_lab.benchmark import _sections as sections
-from refu_lab.benchmark._accuracy import accuracies
 from refu_lab.benchmark._frames import load_pipelines
 from refu_lab.benchmark._inputs import moments, read_stretches
-from refu_lab.benchmark._machine import load_average, machine_facts
 from refu_lab.benchmark._measure import one_core
 from refu_lab.benchmark._options import BenchmarkOptions
 from refu_lab.benchmark._rows import BenchmarkResult
 from refu_lab.benchmark._starts import start_row
+from refu_lab.truth import GroundTruth
 
 
 def benchmark(options: BenchmarkOptions, *, progress: bool = False) -> BenchmarkResult:
@@ -71,3 +79,74 @@ def _measure(options: BenchmarkOptions, result: BenchmarkResult, bar: tqdm[NoRet
         row = start_row(options, mode=mode, backbone=backbone, unit_ms=unit_ms, first_ever=first_ever)
         result.rows.append(row)
         bar.update()
+
+
+def load_average() -> float | None:
+    """Processes that wanted a core in the last minute; None where the system doesn't say."""
+    return os.getloadavg()[0] if hasattr(os, "getloadavg") else None
+
+
+def machine_facts(device: str) -> dict[str, Any]:
+    """Processor, cores, device and versions: plain values, ready for JSON."""
+    facts: dict[str, Any] = {
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+    }
+    if torch.device(device).type == "cuda":
+        facts["gpu"] = torch.cuda.get_device_name(device)
+    return facts
+
+
+def _processor() -> str:
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        for line in cpuinfo.read_text(encoding="utf-8", errors="replace").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+FIGURES = ("mpve_mm", "vfcp_percent", "cfmp_percent", "max_depth_mm")
+Key = TypeVar("Key")
+
+
+def accuracies(
+    pipelines: Mapping[Key, GarmentPipeline],
+    garment: str,
+    bags: Path,
+    *,
+    frames: int | None,
+    progress: Callable[[], object],
+) -> dict[Key, dict[str, float]]:
+    """MPVE [mm], VFCP and CFMP [%] and the greatest depth [mm] of each pipeline in up to `frames` frames.
+
+    They are those of the bag of unseen bodies with the true garment, `eval_<garment>`; empty where there is none.
+
+    Raises:
+        RefuError: the bag can't be read.
+    """
+    bag = bags / f"eval_{garment.replace('-', '_')}"
+    if not bag.is_dir():
+        return {}
+    one = next(iter(pipelines.values()))
+    faces = one.garments[garment].faces.cpu().numpy()
+    checker = CollisionChecker(one.body.faces.cpu().numpy())
+    truth = GroundTruth.of_bag(bag, {garment: faces})
+    metrics = {key: GarmentMetrics(faces) for key in pipelines}
+    with adapters.open_smpl_bag(bag) as source:
+        for record in itertools.islice(source, frames):
+            if record.frame is None:
+                continue
+            for i, (key, pipeline) in enumerate(pipelines.items()):
+                output = pipeline(record.frame)
+                if i == 0:  # they all dress the same body
+                    checker.update(output.body)
+                vertices = output[garment].local
+                found = checker.check(vertices, faces)
+                metrics[key].add(vertices, found, truth=truth.of(garment, record.frame))
+                progress()
+    summaries = {key: one.summary().as_dict() for key, one in metrics.items()}
+    return {key: {name: float(s[name]) for name in FIGURES if s[name] is not None} for key, s in summaries.items()}

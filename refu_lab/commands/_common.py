@@ -8,17 +8,15 @@ import math
 import os
 import re
 import stat
+from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 from refu_core import RefuError
 from refu_core.errors import printable
 from refu_core.keypoints import LAYOUTS
-from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN, BackboneName
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
+from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN
 
 Number = TypeVar("Number", int, float)
 
@@ -173,7 +171,6 @@ def add_axes(parser: argparse.ArgumentParser, what: str, frame: str) -> None:
     parser.add_argument(
         "--input-axes",
         choices=("auto", "smpl", "z-up", "y-down", "frame"),
-        default="auto",
         help=f"axes of the {what} root: seen from the people, and said (auto, default); y up (smpl); z-up (AMASS); "
         f"y-down (a camera); or {frame} (frame)",
     )
@@ -187,32 +184,22 @@ def add_pipeline(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--garments",
         type=names,
-        default=DEFAULT_GARMENTS,
         metavar="A,B",
         help=f"garments of one body, by name or .npz (default: {','.join(DEFAULT_GARMENTS)})",
     )
     parser.add_argument(
         "--backbone",
-        default=BackboneName.AUTO,
         metavar="NAME",
         help="tailornet, mlp, gcnn, or skinned: no network; auto (default): tailornet where its weights ship",
     )
-    parser.add_argument(
-        "--sdf", default="hybrid", metavar="MODE", help="hybrid (default), approx, accurate, or none for no ReFU"
-    )
+    parser.add_argument("--sdf", metavar="MODE", help="hybrid (default), approx, accurate, or none for no ReFU")
     parser.add_argument(
         "--weights", type=in_path, metavar="DIR", help="folder with a folder a garment of weights of one's own"
     )
-    parser.add_argument(
-        "--margin",
-        type=float,
-        default=DEFAULT_MARGIN,
-        metavar="M",
-        help=f"clearance from the skin [m] ({DEFAULT_MARGIN:g})",
-    )
+    parser.add_argument("--margin", type=float, metavar="M", help=f"clearance from the skin [m] ({DEFAULT_MARGIN:g})")
     parser.add_argument("--betas", type=numbers(10), metavar="B0,…", help="shape to use instead of the recorded one")
     parser.add_argument("--style", type=numbers(4), metavar="G0,…", help="garment style γ")
-    parser.add_argument("--device", default="cpu", metavar="DEVICE", help="cpu (default) or cuda")
+    parser.add_argument("--device", metavar="DEVICE", help="cpu (default) or cuda")
     add_body(parser)
     parser.add_argument(
         "--betas-from",
@@ -223,7 +210,6 @@ def add_pipeline(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--betas-source",
         choices=("message", "builtin"),
-        default="message",
         help="message (default): the recorded betas are those of --body or --betas-from, and without either of unknown "
         "meaning, which is warned of; builtin: the built-in body's own",
     )
@@ -241,9 +227,7 @@ def add_recording(parser: argparse.ArgumentParser) -> None:
         metavar="TYPE",
         help="multiarray, joint_state, pose_array, smpl_msgs, keypoint_poses or keypoint_markers",
     )
-    parser.add_argument(
-        "--keypoints", default="zed38", choices=LAYOUTS, help="which points of the body, with keypoints as input"
-    )
+    parser.add_argument("--keypoints", choices=LAYOUTS, help="which points of the body, with keypoints as input")
     parser.add_argument("--person", type=word, metavar="NAME", help="whose motion, where the input has several people")
     add_axes(parser, "recorded", "those of the frame itself, left as they are")
 
@@ -259,10 +243,31 @@ def add_body(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def place(text: str) -> str:
+    """A path, folder, glob or URL, as it was typed."""
+    return text if "://" in text else str(in_path(text))
+
+
+def place_for(kind: Callable[[str], Path]) -> Callable[[str], str]:
+    """A path that is written to, as `kind` takes it, or a URL."""
+    return lambda text: word(text) if "://" in text else str(kind(text))
+
+
+def add_cluster(parser: argparse.ArgumentParser) -> None:
+    """What every command has that shares its work."""
+    parser.add_argument(
+        "--jobs", type=positive, metavar="N", help="processes of this machine, a thread each (1; others: extra cluster)"
+    )
+    parser.add_argument(
+        "--scheduler", type=word, metavar="ADDRESS", help="a Dask scheduler whose workers do it (docs/guide/fleets.md)"
+    )
+
+
 def given(args: argparse.Namespace, options: type) -> dict[str, Any]:
-    """The arguments that are fields of a dataclass of options, by name."""
-    names_of_fields = {field.name for field in fields(options)}
-    return {name: value for name, value in vars(args).items() if name in names_of_fields}
+    """The arguments that are fields of a dataclass of options, by name; what wasn't given is left to its defaults."""
+    known = {field.name for field in fields(options)}
+    named = {name: value for name, value in vars(args).items() if name in known and value is not None}
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in named.items()}
 
 
 def check_writable(path: Path | None) -> None:
@@ -282,3 +287,10 @@ def write_json(path: Path | None, content: dict[str, Any]) -> None:
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def tell(args: argparse.Namespace, text: str, content: dict[str, Any], *, code: int = 0) -> int:
+    """Prints the result, writes it as JSON where that was asked for, and gives the exit code back."""
+    print(text)
+    write_json(args.json, content)
+    return code

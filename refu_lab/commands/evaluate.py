@@ -2,25 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import argparse
+from typing import Any
 
-from refu_lab.commands._cluster import add_cluster, place
-from refu_lab.commands._common import (
-    EXIT_CHECK_FAILED,
-    add_body,
-    add_collider,
-    add_common,
-    check_writable,
-    in_path,
-    out_file,
-    out_folder,
-    positive,
-    write_json,
-)
+from refu_lab.commands import _common as cli
 from refu_lab.tables import RESULT_TABLES
-
-if TYPE_CHECKING:
-    import argparse
 
 
 def add(commands: Any) -> None:
@@ -33,30 +19,29 @@ def add(commands: Any) -> None:
     )
     parser.add_argument(
         "--data",
-        type=place,
+        type=cli.place,
         nargs="+",
         default=[],
         metavar="DIR",
         help="data sets of refu simulate, one a garment, or folders and globs of them; with --quick: bags",
     )
-    parser.add_argument("--table", choices=(*RESULT_TABLES, "all"), default="all", help="one table (default: all)")
+    parser.add_argument("--table", choices=(*RESULT_TABLES, "all"), help="one table (default: all)")
     parser.add_argument(
         "--weights",
-        type=in_path,
+        type=cli.in_path,
         nargs="+",
-        default=[],
         metavar="DIR",
         help="folders with GARMENT/NAME.safetensors that are looked at before the weights that ship",
     )
-    parser.add_argument("--motions", type=in_path, metavar="DIR", help="folder of AMASS-style .npz files, for motion")
-    parser.add_argument("--output", type=out_folder, metavar="DIR", help="where the pages go (docs/results)")
-    parser.add_argument("--cache", type=out_folder, metavar="DIR", help="keep what was measured, and use it again")
-    parser.add_argument("--every", type=positive, default=1, metavar="N", help="every N-th test sample (1)")
     parser.add_argument(
-        "--motion-every", type=positive, default=1, metavar="N", help="every N-th frame of a motion (1)"
+        "--motions", type=cli.in_path, metavar="DIR", help="folder of AMASS-style .npz files, for motion"
     )
-    add_body(parser)
-    add_collider(parser)
+    parser.add_argument("--output", type=cli.out_folder, metavar="DIR", help="where the pages go (docs/results)")
+    parser.add_argument("--cache", type=cli.out_folder, metavar="DIR", help="keep what was measured, and use it again")
+    parser.add_argument("--every", type=cli.positive, metavar="N", help="every N-th test sample (1)")
+    parser.add_argument("--motion-every", type=cli.positive, metavar="N", help="every N-th frame of a motion (1)")
+    cli.add_body(parser)
+    cli.add_collider(parser)
     parser.add_argument(
         "--quick",
         action="store_true",
@@ -64,20 +49,18 @@ def add(commands: Any) -> None:
     )
     parser.add_argument(
         "--reference",
-        type=out_file,
+        type=cli.out_file,
         metavar="FILE",
         help="figures that --quick holds its own against (docs/results/quick.json)",
     )
     parser.add_argument("--set-reference", action="store_true", help="write that file instead of comparing with it")
-    add_cluster(parser)
-    add_common(parser)
+    cli.add_cluster(parser)
+    cli.add_common(parser)
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Does what was asked; returns the exit code."""
-    for path in (args.json, args.output, args.cache):
-        check_writable(path)
     from refu_lab.fleet import find_data_sets, open_engine
 
     if args.quick:
@@ -85,32 +68,14 @@ def run(args: argparse.Namespace) -> int:
 
         with open_engine(args.jobs, args.scheduler) as engine:
             result = quick_check(
-                args.data,
-                reference=args.reference,
-                renew=args.set_reference,
-                progress=not args.quiet,
-                engine=engine,
+                args.data, reference=args.reference, renew=args.set_reference, progress=not args.quiet, engine=engine
             )
-        print(quick_table(result))
-        write_json(args.json, result.as_dict())
-        return 0 if result.is_passed else EXIT_CHECK_FAILED
-    from refu_lab.evaluate import OUTPUT, EvaluateOptions, evaluate, results_dict, results_text
+        return cli.tell(
+            args, quick_table(result), result.as_dict(), code=0 if result.is_passed else cli.EXIT_CHECK_FAILED
+        )
+    from refu_lab.evaluate import EvaluateOptions, evaluate, results_dict, results_text
 
-    output = args.output or OUTPUT
-    options = EvaluateOptions(
-        data=tuple(find_data_sets(args.data)),
-        table=args.table,
-        weights=tuple(args.weights),
-        motions=args.motions,
-        output=output,
-        cache=args.cache,
-        every=args.every,
-        motion_every=args.motion_every,
-        collider=args.collider,
-        body=args.body,
-    )
+    options = EvaluateOptions(**cli.given(args, EvaluateOptions) | {"data": tuple(find_data_sets(args.data))})
     with open_engine(args.jobs, args.scheduler) as engine:
         tables = evaluate(options, progress=not args.quiet, engine=engine)
-    print(results_text(tables, output))
-    write_json(args.json, results_dict(tables))
-    return 0
+    return cli.tell(args, results_text(tables, options.output), results_dict(tables))

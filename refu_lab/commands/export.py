@@ -2,23 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import argparse
+from typing import Any
 
-from refu_lab.commands._common import (
-    add_common,
-    add_pipeline,
-    add_recording,
-    check_writable,
-    given,
-    in_path,
-    out_file,
-    positive,
-    seed,
-    write_json,
-)
-
-if TYPE_CHECKING:
-    import argparse
+from refu_lab.commands import _common as cli
 
 
 def add(commands: Any) -> None:
@@ -29,16 +16,18 @@ def add(commands: Any) -> None:
         description="Dress frames of a bag or motion file and write them as meshes, garments with their UVs: a USD "
         "stage that moves, or a GLB or OBJ file a frame.",
     )
-    parser.add_argument("input", type=in_path, metavar="INPUT", help="a bag or motion file, as refu replay takes it")
     parser.add_argument(
-        "--output", type=out_file, required=True, metavar="FILE", help="FILE.glb, .obj, .usda or .usdc (extra usd)"
+        "input", type=cli.in_path, metavar="INPUT", help="a bag or motion file, as refu replay takes it"
     )
-    parser.add_argument("--first", type=seed, default=0, metavar="N", help="number of the first frame (0)")
-    parser.add_argument("--count", type=positive, default=1, metavar="N", help="how many frames (1)")
+    parser.add_argument(
+        "--output", type=cli.out_file, required=True, metavar="FILE", help="FILE.glb, .obj, .usda or .usdc (extra usd)"
+    )
+    parser.add_argument("--first", type=cli.seed, default=0, metavar="N", help="number of the first frame (0)")
+    parser.add_argument("--count", type=cli.positive, default=1, metavar="N", help="how many frames (1)")
     parser.add_argument("--no-body", dest="with_body", action="store_false", help="the garments alone")
-    add_pipeline(parser)
-    add_recording(parser)
-    add_common(parser)
+    cli.add_pipeline(parser)
+    cli.add_recording(parser)
+    cli.add_common(parser)
     parser.set_defaults(run=run)
 
 
@@ -47,13 +36,8 @@ def run(args: argparse.Namespace) -> int:
     from refu_lab.export import export
     from refu_lab.replay import ReplayOptions
 
-    for path in (args.json, args.output):
-        check_writable(path)
-    options = ReplayOptions(**{**given(args, ReplayOptions), "output": None})
+    options = ReplayOptions(**{**cli.given(args, ReplayOptions), "output": None})
     written, warnings = export(options, args.output, first=args.first, count=args.count, with_body=args.with_body)
-    for path in written:
-        print(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB)")
-    for warning in warnings:
-        print(f"warning: {warning}")
-    write_json(args.json, {"files": [str(path) for path in written], "warnings": warnings})
-    return 0
+    lines = [f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB)" for path in written]
+    lines += [f"warning: {warning}" for warning in warnings]
+    return cli.tell(args, "\n".join(lines), {"files": [str(path) for path in written], "warnings": warnings})

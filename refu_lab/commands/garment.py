@@ -2,22 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import argparse
+from typing import Any
 
-from refu_lab.commands._common import (
-    add_common,
-    between,
-    check_writable,
-    given,
-    in_path,
-    numbers,
-    out_file,
-    word,
-    write_json,
-)
-
-if TYPE_CHECKING:
-    import argparse
+from refu_lab.commands import _common as cli
 
 
 def add(commands: Any) -> None:
@@ -30,7 +18,7 @@ def add(commands: Any) -> None:
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     _add_add(actions)
     listing = actions.add_parser("list", help="the garments that have a name", description="The garments by name.")
-    add_common(listing)
+    cli.add_common(listing)
     listing.set_defaults(run=run_list)
 
 
@@ -41,32 +29,30 @@ def _add_add(actions: Any) -> None:
         description="Make a garment of a mesh (OBJ, PLY, STL, OFF, GLB) that was modelled round a body: its unit, "
         "axes, place and pose are found out, unless they are given. It can be worn at once, simulated and trained.",
     )
-    parser.add_argument("mesh", type=in_path, metavar="MESH", help="the mesh's file")
-    parser.add_argument("--body", default="neutral", metavar="BODY", help="male, female or neutral (default)")
-    parser.add_argument("--name", type=word, metavar="NAME", help="what it is called (default: as the mesh's file)")
+    parser.add_argument("mesh", type=cli.in_path, metavar="MESH", help="the mesh's file")
+    parser.add_argument("--body", metavar="BODY", help="male, female or neutral (default)")
+    parser.add_argument("--name", type=cli.word, metavar="NAME", help="what it is called (default: as the mesh's file)")
     parser.add_argument(
-        "--output", type=out_file, metavar="FILE", help="where it goes (default: NAME.npz in the user's folder)"
+        "--output", type=cli.out_file, metavar="FILE", help="where it goes (default: NAME.npz in the user's folder)"
     )
-    parser.add_argument("--layer", type=int, default=1, metavar="N", help="0 under 1 under 2 … (1)")
-    parser.add_argument("--color", type=numbers(3), metavar="R,G,B", help="sRGB, each from 0 to 1")
+    parser.add_argument("--layer", type=int, metavar="N", help="0 under 1 under 2 … (1)")
+    parser.add_argument("--color", type=cli.numbers(3), metavar="R,G,B", help="sRGB, each from 0 to 1")
     parser.add_argument("--held-at", choices=("waist", "shoulders"), help="what holds it (default: as its place says)")
-    parser.add_argument("--unit", type=word, metavar="U", help="of lengths: m, dm, cm, mm, in, or metres of one")
+    parser.add_argument("--unit", type=cli.word, metavar="U", help="of lengths: m, dm, cm, mm, in, or metres of one")
     parser.add_argument("--up", choices=("y", "z"), help="the axis that is up")
     parser.add_argument(
-        "--pose", type=word, metavar="POSE", help="it was modelled in: t, degrees of hanging arms, or a motion .npz"
+        "--pose", type=cli.word, metavar="POSE", help="it was modelled in: t, degrees of hanging arms, or a motion .npz"
     )
     parser.add_argument(
         "--as-placed", action="store_true", help="its origin is the body's own: don't look for another place"
     )
     parser.add_argument(
-        "--longest-edge", type=between(0.005, 0.2), default=0.02, metavar="M", help="longer edges are split [m] (0.02)"
+        "--longest-edge", type=cli.between(0.005, 0.2), metavar="M", help="longer edges are split [m] (0.02)"
     )
-    parser.add_argument(
-        "--source", type=word, default="a mesh of the user's", metavar="TEXT", help="author and licence"
-    )
-    parser.add_argument("--picture", type=out_file, metavar="FILE", help="write a picture (.png) of it, worn")
+    parser.add_argument("--source", type=cli.word, metavar="TEXT", help="author and licence")
+    parser.add_argument("--picture", type=cli.out_file, metavar="FILE", help="write a picture (.png) of it, worn")
     parser.add_argument("--overwrite", action="store_true", help="replace a garment that is there already")
-    add_common(parser)
+    cli.add_common(parser)
     parser.set_defaults(run=run_add)
 
 
@@ -74,12 +60,8 @@ def run_add(args: argparse.Namespace) -> int:
     """Does what was asked; returns the exit code."""
     from refu_lab.garment import AddOptions, add_garment, added_text
 
-    for path in (args.json, args.picture, args.output):
-        check_writable(path)
-    result = add_garment(AddOptions(**given(args, AddOptions)))
-    print(added_text(result))
-    write_json(args.json, result)
-    return 0
+    result = add_garment(AddOptions(**cli.given(args, AddOptions)))
+    return cli.tell(args, added_text(result), result)
 
 
 def run_list(args: argparse.Namespace) -> int:
@@ -89,6 +71,6 @@ def run_list(args: argparse.Namespace) -> int:
 
     rows = list_garments()
     print(garments_table(rows))
-    print(f"yours go to {garments_folder()} (REFU_GARMENTS)")
-    write_json(args.json, {"folder": str(garments_folder()), "garments": rows})
-    return 0
+    return cli.tell(
+        args, f"yours go to {garments_folder()} (REFU_GARMENTS)", {"folder": str(garments_folder()), "garments": rows}
+    )

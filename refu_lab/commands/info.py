@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import argparse
+from typing import Any
 
-from refu_lab.commands._common import add_common, write_json
-
-if TYPE_CHECKING:
-    import argparse
+from refu_lab.commands import _common as cli
 
 
 def add(commands: Any) -> None:
@@ -16,7 +14,7 @@ def add(commands: Any) -> None:
         "info", help="what is installed, built in and usable", description="What is installed."
     )
     parser.add_argument("--body", metavar="FILE", help="say what a body model (.npz or official .pkl) holds instead")
-    add_common(parser)
+    cli.add_common(parser)
     parser.set_defaults(run=run)
 
 
@@ -25,10 +23,8 @@ def run(args: argparse.Namespace) -> int:
     from refu_lab.info import collect, describe_body
 
     facts = collect() if args.body is None else describe_body(args.body)
-    for name, value in facts.items():
-        print(f"{name:>19}  {value if isinstance(value, str) else _short(value)}")
-    write_json(args.json, facts)
-    return 0
+    lines = (f"{name:>19}  {_short(value)}" for name, value in facts.items())
+    return cli.tell(args, "\n".join(lines), facts)
 
 
 def _short(value: Any) -> str:

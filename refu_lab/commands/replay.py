@@ -2,28 +2,12 @@
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from refu_core import RefuError
-from refu_lab.commands._cluster import add_cluster, place, place_for
-from refu_lab.commands._common import (
-    EXIT_BAD_INPUT,
-    EXIT_INTERRUPTED,
-    add_common,
-    add_pipeline,
-    add_recording,
-    check_writable,
-    given,
-    out_bag,
-    out_folder,
-    positive,
-    word,
-    write_json,
-)
-
-if TYPE_CHECKING:
-    import argparse
+from refu_lab.commands import _common as cli
 
 
 def add(commands: Any) -> None:
@@ -36,7 +20,7 @@ def add(commands: Any) -> None:
     )
     parser.add_argument(
         "input",
-        type=place,
+        type=cli.place,
         nargs="+",
         metavar="INPUT",
         help="an .mcap or .db3, a rosbag2 directory, or a file of motion: AMASS, pose estimators', BVH "
@@ -44,23 +28,21 @@ def add(commands: Any) -> None:
     )
     parser.add_argument(
         "--output",
-        type=place_for(out_bag),
+        type=cli.place_for(cli.out_bag),
         metavar="OUT",
         help="bag to write: OUT.mcap, or a directory for rosbag2; of several inputs: a folder or URL for NAME.mcap",
     )
     parser.add_argument(
         "--report",
-        type=place_for(out_folder),
+        type=cli.place_for(cli.out_folder),
         metavar="DIR",
         help="write DIR/index.html with plots and pictures; of several inputs: a row each, and a page of its own",
     )
-    add_pipeline(parser)
-    add_recording(parser)
-    parser.add_argument(
-        "--speed", choices=("max", "real"), default="max", help="as fast as possible (default), or paced"
-    )
-    parser.add_argument("--frame-id", type=word, default="map", metavar="ID", help="frame_id of the markers (map)")
-    parser.add_argument("--max-frames", type=positive, metavar="N", help="stop after N frames")
+    cli.add_pipeline(parser)
+    cli.add_recording(parser)
+    parser.add_argument("--speed", choices=("max", "real"), help="as fast as possible (default), or paced")
+    parser.add_argument("--frame-id", type=cli.word, metavar="ID", help="frame_id of the markers (map)")
+    parser.add_argument("--max-frames", type=cli.positive, metavar="N", help="stop after N frames")
     parser.add_argument(
         "--no-evaluate", dest="evaluate", action="store_false", help="convert alone: no collision is looked for"
     )
@@ -78,8 +60,8 @@ def add(commands: Any) -> None:
     )
     parser.add_argument("--overwrite", action="store_true", help="replace an output that is there already")
     parser.add_argument("--again", action="store_true", help="of several inputs: also those that are finished")
-    add_cluster(parser)
-    add_common(parser)
+    cli.add_cluster(parser)
+    cli.add_common(parser)
     parser.set_defaults(run=run)
 
 
@@ -92,7 +74,6 @@ def run(args: argparse.Namespace) -> int:
             msg = "a report is of evaluated frames: leave out --report or --no-evaluate"
             raise RefuError(msg)
         import matplotlib  # noqa: F401, ICN001  (what is missing is said before the replay, not after it)
-    check_writable(args.json)
     urls = [text for text in (args.output, args.report) if text is not None and "://" in text]
     if is_plain(args.input) and not urls and args.jobs is None and args.scheduler is None:
         return _replay_one(args)
@@ -104,18 +85,17 @@ def _replay_one(args: argparse.Namespace) -> int:
     from refu_lab.tables import replay_table
 
     report = None if args.report is None else Path(args.report)
-    check_writable(report)
     output = None if args.output is None else Path(args.output)
-    options = ReplayOptions(**given(args, ReplayOptions) | {"input": Path(args.input[0]), "output": output})
+    options = ReplayOptions(**cli.given(args, ReplayOptions) | {"input": Path(args.input[0]), "output": output})
     told = _print_progress if args.progress == "lines" else None
+    cli.check_writable(report)
     result = replay(options, progress=not args.quiet, told=told)
-    print(replay_table(result))
-    write_json(args.json, result.as_dict())
+    cli.tell(args, replay_table(result), result.as_dict())
     if report is not None and result.frames:
         from refu_lab.report import write_report
 
         print(f"report: {write_report(result, report, progress=not args.quiet)}")
-    return EXIT_INTERRUPTED if result.interrupted else 0
+    return cli.EXIT_INTERRUPTED if result.interrupted else 0
 
 
 def _print_progress(done: int, total: int) -> None:
@@ -127,14 +107,11 @@ def _replay_many(args: argparse.Namespace) -> int:
     from refu_lab.replay import ReplayOptions
 
     recordings = find_recordings(args.input)
-    each = ReplayOptions(**given(args, ReplayOptions) | {"input": Path(), "output": None})
+    each = ReplayOptions(**cli.given(args, ReplayOptions) | {"input": Path(), "output": None})
     options = FleetOptions(replay=each, output=args.output, report=args.report, again=args.again or args.overwrite)
     with open_engine(args.jobs, args.scheduler) as engine:
         result = replay_fleet(recordings, options, engine=engine, progress=not args.quiet)
-    print(fleet_table(result))
-    write_json(args.json, result.as_dict())
+    cli.tell(args, fleet_table(result), result.as_dict())
     if args.report is not None:
         print(f"report: {args.report.rstrip('/')}/index.html")
-    if result.interrupted:
-        return EXIT_INTERRUPTED
-    return EXIT_BAD_INPUT if result.failed else 0
+    return cli.EXIT_INTERRUPTED if result.interrupted else cli.EXIT_BAD_INPUT if result.failed else 0

@@ -2,23 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import argparse
+from typing import Any
 
 from refu_core.modes import DEFAULT_MARGIN
-from refu_lab.commands._common import (
-    add_body,
-    add_common,
-    check_writable,
-    given,
-    in_path,
-    out_folder,
-    positive,
-    seed,
-    write_json,
-)
-
-if TYPE_CHECKING:
-    import argparse
+from refu_lab.commands import _common as cli
 
 
 def add(commands: Any) -> None:
@@ -30,33 +18,36 @@ def add(commands: Any) -> None:
         "goes on when the same command is given again; torchrun shares it among GPUs.",
     )
     parser.add_argument("garment", metavar="GARMENT", help="a garment's name (refu garment list), or its .npz")
-    parser.add_argument("--data", type=in_path, required=True, metavar="DIR", help="the garment's data set")
+    parser.add_argument("--data", type=cli.in_path, required=True, metavar="DIR", help="the garment's data set")
     parser.add_argument(
         "--mode",
-        default="hybrid",
         metavar="MODE",
         help="hybrid (default), approx or accurate: with ReFU; none: the backbone alone; collision-approx or "
         "collision-accurate: a collision loss without ReFU, the paper's baseline",
     )
-    parser.add_argument("--backbone", default="tailornet", metavar="NAME", help="tailornet (default), mlp or gcnn")
-    parser.add_argument("--preset", default="realtime", metavar="NAME", help="realtime (default) or paper")
+    parser.add_argument("--backbone", metavar="NAME", help="tailornet (default), mlp or gcnn")
+    parser.add_argument("--preset", metavar="NAME", help="realtime (default) or paper")
     parser.add_argument(
         "--like",
         metavar="GARMENT",
         help="carry the shipped networks of this related garment over: for sets of a hundred samples; writes all modes",
     )
     parser.add_argument(
-        "--output", type=out_folder, metavar="DIR", help="folder of the weights (default: weights/GARMENT)"
+        "--start",
+        type=cli.in_path,
+        metavar="DIR",
+        help="go on from a garment's weights in this folder, those that ship (refu_core/weights/GARMENT) or your own",
+    )
+    parser.add_argument(
+        "--output", type=cli.out_folder, metavar="DIR", help="folder of the weights (default: weights/GARMENT)"
     )
     parser.add_argument(
         "--network",
-        default="garment",
         metavar="NAME",
         help="garment (default), or sdf: the paper's network for the body's distance (preset paper or small)",
     )
     parser.add_argument(
         "--scale",
-        default="vertex",
         metavar="KIND",
         help="what ReFU's scale is predicted from: vertex (default, the paper's), shared (Alt. 1), distance (Alt. 2), "
         "or fixed at 1",
@@ -65,11 +56,11 @@ def add(commands: Any) -> None:
         "--margin", type=float, metavar="M", help=f"clearance that ReFU is trained to keep [m] ({DEFAULT_MARGIN:g})"
     )
     parser.add_argument("--unblended", action="store_true", help="pushed vertices don't take their neighbours along")
-    add_body(parser)
-    parser.add_argument("--seed", type=seed, default=0, metavar="S", help="of everything that is drawn (0)")
-    parser.add_argument("--steps", type=positive, metavar="N", help="steps of each stage (default: the preset's)")
-    parser.add_argument("--device", default="cpu", metavar="DEVICE", help="cpu (default) or cuda")
-    add_common(parser)
+    cli.add_body(parser)
+    parser.add_argument("--seed", type=cli.seed, metavar="S", help="of everything that is drawn (0)")
+    parser.add_argument("--steps", type=cli.positive, metavar="N", help="steps of each stage (default: the preset's)")
+    parser.add_argument("--device", metavar="DEVICE", help="cpu (default) or cuda")
+    cli.add_common(parser)
     parser.set_defaults(run=run)
 
 
@@ -77,10 +68,6 @@ def run(args: argparse.Namespace) -> int:
     """Does what was asked; returns the exit code."""
     from refu_lab.train import TrainOptions, train, training_table
 
-    for path in (args.json, args.output):
-        check_writable(path)
-    options = TrainOptions(**given(args, TrainOptions))
+    options = TrainOptions(**cli.given(args, TrainOptions))
     card = train(options, progress=not args.quiet)
-    print(training_table(card, options))
-    write_json(args.json, card)
-    return 0
+    return cli.tell(args, training_table(card, options), card)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from refu_lab.commands._common import add_pipeline, add_recording, given, in_path, port, word
-
-if TYPE_CHECKING:
-    import argparse
+from refu_lab.commands import _common as cli
 
 
 def add(commands: Any) -> None:
@@ -21,23 +19,21 @@ def add(commands: Any) -> None:
         "view.",
     )
     parser.add_argument(
-        "input", type=in_path, nargs="*", metavar="INPUT", help="a bag or motion file; of several, each is a person"
+        "input", type=cli.in_path, nargs="*", metavar="INPUT", help="a bag or motion file; of several, each is a person"
     )
     parser.add_argument(
         "--live",
-        type=word,
+        type=cli.word,
         nargs="*",
         metavar="TOPIC",
         help="what a running node publishes on topics of markers (garments, body), in place of INPUT; needs rclpy",
     )
     parser.add_argument("--dress", action="store_true", help="dress the motion anew, though the bag has garments")
-    parser.add_argument("--port", type=port, metavar="N", help="where to listen (the first one free from 8080 on)")
-    parser.add_argument(
-        "--host", type=word, default="localhost", metavar="NAME", help="who may look: localhost (default); 0.0.0.0: all"
-    )
+    parser.add_argument("--port", type=cli.port, metavar="N", help="where to listen (the first one free from 8080 on)")
+    parser.add_argument("--host", type=cli.word, metavar="NAME", help="who may look: localhost (default); 0.0.0.0: all")
     parser.add_argument("--no-browser", dest="browser", action="store_false", help="print the address alone")
-    add_pipeline(parser)
-    add_recording(parser)
+    cli.add_pipeline(parser)
+    cli.add_recording(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     parser.set_defaults(run=run)
 
@@ -47,12 +43,7 @@ def run(args: argparse.Namespace) -> int:
     from refu_lab.replay import ReplayOptions
     from refu_lab.view import ViewOptions, view
 
-    replay = ReplayOptions(**given(args, ReplayOptions) | {"input": Path(), "output": None})
-    view(
-        ViewOptions(
-            **given(args, ViewOptions)
-            | {"inputs": tuple(args.input), "live": None if args.live is None else tuple(args.live), "replay": replay}
-        ),
-        progress=not args.quiet,
-    )
+    replay = ReplayOptions(**cli.given(args, ReplayOptions) | {"input": Path(), "output": None})
+    options = ViewOptions(**cli.given(args, ViewOptions) | {"inputs": tuple(args.input), "replay": replay})
+    view(options, progress=not args.quiet)
     return 0

@@ -9,11 +9,11 @@ from contextlib import ExitStack
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from tqdm import tqdm
 
-from refu_core import RefuError, __version__
+from refu_core import GarmentPipeline, RefuError, __version__
 from refu_core._engine import Engine, Lost
 from refu_core.errors import printable
 from refu_lab.fleet._engine import run_function
@@ -21,9 +21,6 @@ from refu_lab.fleet._inputs import Input
 from refu_lab.fleet._storage import Folder, fetched, filesystem, is_url
 from refu_lab.fleet._summary import FleetResult
 from refu_lab.replay import ReplayOptions, ReplayResult, replay
-
-if TYPE_CHECKING:
-    from refu_core import GarmentPipeline
 
 WORST = 5
 """Frames of a recording that its record names, the worst first."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 from urllib.parse import quote
 
-from refu_lab.tables import REPLAY_HEADER, format_table, replay_rows
+from refu_lab.tables import REPLAY_HEADER, format_table, html_page, html_table, replay_rows
 
 _HEADER = ("recording", "frames", "skipped", "p50 ms", "p95 ms", "VFCP %", "free %", "depth mm", "")
 _WORST_HEADER = ("recording", "frame", "time s", "inside", "pairs", "depth mm")
@@ -62,24 +62,19 @@ class FleetResult:
         """The page over all of them, `index.html` of the reports' folder."""
         from refu_lab.report import STYLE
 
-        garments = _html_table(REPLAY_HEADER, [[html.escape(cell) for cell in row] for row in _garment_rows(self)])
+        garments = html_table(REPLAY_HEADER, [[html.escape(cell) for cell in row] for row in _garment_rows(self)])
         rows = [[self._link(row), *(html.escape(cell) for cell in _cells(row)[1:])] for row in self.rows]
         worst = [
             [self._link(frame), *(html.escape(cell) for cell in _worst_cells(frame)[1:])] for frame in self.worst()
         ]
         frames = sum(row.get("frames", 0) for row in self.rows)
         left = f"; {self.n_left} not come to" if self.n_left else ""
-        return f"""<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>Replay of {len(self.rows)} recordings</title><style>{STYLE}</style></head><body>
-<h1>Replay of {len(self.rows)} recordings</h1>
-<p class="note">{frames} frames; {len(self.failed)} recordings couldn't be replayed{left}.</p>
+        body = f"""<p class="note">{frames} frames; {len(self.failed)} recordings couldn't be replayed{left}.</p>
 <h2>Garments, over all frames</h2>{garments}
-<h2>Recordings</h2>{_html_table(_HEADER, rows)}
+<h2>Recordings</h2>{html_table(_HEADER, rows)}
 <p class="note">Free: frames in which no garment has a vertex inside the body or a triangle that cuts it.</p>
-<h2>Worst frames of all</h2>{_html_table(_WORST_HEADER, worst)}
-</body></html>
-"""
+<h2>Worst frames of all</h2>{html_table(_WORST_HEADER, worst)}"""
+        return html_page(f"Replay of {len(self.rows)} recordings", body, style=STYLE)
 
     def _link(self, row: Mapping[str, Any]) -> str:
         text = html.escape(row["name"])
@@ -150,9 +145,3 @@ def _weighed(parts: list[Mapping[str, Any]], name: str) -> Iterator[tuple[float,
     for part in parts:
         if part[name] is not None and part["n_frames"]:
             yield part[name], part["n_frames"]
-
-
-def _html_table(header: tuple[str, ...], rows: list[list[str]]) -> str:
-    lines = ["<tr>" + "".join(f"<th>{name}</th>" for name in header) + "</tr>"]
-    lines += ["<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows]
-    return f"<table>{''.join(lines)}</table>"

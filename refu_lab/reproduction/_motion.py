@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
+from msg_adapters import Motion
 from refu_core.errors import RefuError
+from refu_core.frames import SmplFrame
 from refu_core.metrics import (
     CollisionChecker,
     Figures,
@@ -21,17 +23,10 @@ from refu_core.metrics import (
     SheetChecker,
 )
 from refu_core.modes import DEFAULT_GARMENTS
-from refu_core.realtime import GarmentPipeline
+from refu_core.realtime import GarmentPipeline, PipelineOutput
 from refu_lab.reproduction._load import Library
 from refu_lab.reproduction._methods import METHODS
 from refu_lab.reproduction._tables import Missing, ResultRow, ResultTable
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from msg_adapters import Motion
-    from refu_core.frames import SmplFrame
-    from refu_core.realtime import PipelineOutput
 
 OUTFITS = (DEFAULT_GARMENTS, ("shirt-male",), ("skirt-female",))
 """What is worn together."""

@@ -5,10 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from refu_core.backbones import Skinned
@@ -22,11 +23,7 @@ from refu_core.refu import Refu
 from refu_core.sdf import ApproxSdf, BodySdf, ExactSdf, RestFaces, SdfSample
 from refu_lab.baselines import PostProcess, push_naively
 from refu_lab.reproduction._load import Library
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from refu_lab.reproduction._methods import Method
+from refu_lab.reproduction._methods import Method
 
 
 @dataclass(eq=False)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cache, cached_property, partial
@@ -15,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from refu_core._engine import Engine, InProcess, Lost
-from refu_core._files import read_json
+from refu_core._files import read_json, replacing
 from refu_core.errors import RefuError
 from refu_core.metrics import CollisionChecker, Figures, FrameMetrics, GarmentMetrics
 from refu_lab.reproduction._load import Library
@@ -301,6 +300,5 @@ def _read_cached(file: Path) -> MethodRun | None:
 
 def _write_cached(file: Path, run: MethodRun) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
-    part = file.with_suffix(f".{os.getpid()}")
-    part.write_text(json.dumps(run.as_dict()), encoding="utf-8")
-    part.replace(file)
+    with replacing(file) as part:
+        part.write(json.dumps(run.as_dict()).encode())

@@ -1,51 +1,31 @@
 """Numerical stability, measured: everyday and hostile frames, what collision handling promises, and endurance."""
 
-from refu_lab.stress._checks import CHECKS
-from refu_lab.stress._frames import FRAMES, everyday, promised
-from refu_lab.stress._invariance import mirror_image
-from refu_lab.stress._rounds import StressOptions, StressResult, replay_trial, run_stress
-from refu_lab.stress._soak import (
-    JUDGED_FROM,
-    TOLERANCE,
-    SoakResult,
-    Yardstick,
-    is_slower,
-    resident_mb,
-    soak,
-    soak_frames,
-)
-from refu_lab.stress._subject import Subject, Wardrobe, distance_to_mesh
-from refu_lab.stress._table import length, stress_table
-from refu_lab.stress._trial import Check, Measurement, StressError, Tally, Trial, load_trial, save_trial
-
-__all__ = [
-    "CHECKS",
-    "FRAMES",
-    "JUDGED_FROM",
-    "TOLERANCE",
-    "Check",
-    "Measurement",
-    "SoakResult",
-    "StressError",
-    "StressOptions",
-    "StressResult",
-    "Subject",
-    "Tally",
-    "Trial",
-    "Wardrobe",
-    "Yardstick",
-    "distance_to_mesh",
-    "everyday",
-    "is_slower",
-    "length",
-    "load_trial",
-    "mirror_image",
-    "promised",
-    "replay_trial",
-    "resident_mb",
-    "run_stress",
-    "save_trial",
-    "soak",
-    "soak_frames",
-    "stress_table",
-]
+from refu_lab.stress._checks import CHECKS as CHECKS
+from refu_lab.stress._frames import FRAMES as FRAMES
+from refu_lab.stress._frames import everyday as everyday
+from refu_lab.stress._frames import promised as promised
+from refu_lab.stress._invariance import mirror_image as mirror_image
+from refu_lab.stress._rounds import StressOptions as StressOptions
+from refu_lab.stress._rounds import StressResult as StressResult
+from refu_lab.stress._rounds import replay_trial as replay_trial
+from refu_lab.stress._rounds import run_stress as run_stress
+from refu_lab.stress._soak import JUDGED_FROM as JUDGED_FROM
+from refu_lab.stress._soak import TOLERANCE as TOLERANCE
+from refu_lab.stress._soak import SoakResult as SoakResult
+from refu_lab.stress._soak import Yardstick as Yardstick
+from refu_lab.stress._soak import is_slower as is_slower
+from refu_lab.stress._soak import resident_mb as resident_mb
+from refu_lab.stress._soak import soak as soak
+from refu_lab.stress._soak import soak_frames as soak_frames
+from refu_lab.stress._subject import Subject as Subject
+from refu_lab.stress._subject import Wardrobe as Wardrobe
+from refu_lab.stress._subject import distance_to_mesh as distance_to_mesh
+from refu_lab.stress._table import length as length
+from refu_lab.stress._table import stress_table as stress_table
+from refu_lab.stress._trial import Check as Check
+from refu_lab.stress._trial import Measurement as Measurement
+from refu_lab.stress._trial import StressError as StressError
+from refu_lab.stress._trial import Tally as Tally
+from refu_lab.stress._trial import Trial as Trial
+from refu_lab.stress._trial import load_trial as load_trial
+from refu_lab.stress._trial import save_trial as save_trial

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from refu_core.body import JOINT_NAMES
 from refu_core.frames import N_BETAS, N_JOINTS, N_STYLES, SmplFrame
 from refu_core.realtime import PROMISED_BEND, PROMISED_POSES, PROMISED_SIZE, SPINE, spine_bend
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 Draw = Callable[[np.random.Generator], SmplFrame]
 frame_of: Callable[..., SmplFrame] = SmplFrame  # of numbers of any kind, which it converts

@@ -2,30 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from refu_core.backbones import Skinned
 from refu_core.contact import DEFAULT_CONTACT
+from refu_core.frames import SmplFrame
 from refu_core.garments import inner_first
 from refu_core.modes import DEFAULT_MARGIN
-from refu_core.realtime import Wearer, dress
+from refu_core.realtime import GarmentMesh, GarmentPipeline, PipelineOutput, Wearer, dress
 from refu_core.refu import MAX_DISPLACEMENT
 from refu_lab.stress._closest_kernels import closest_on_sheet
 from refu_lab.stress._numbers import n_not_finite
+from refu_lab.stress._subject import Subject
 from refu_lab.stress._trial import Measurement, Trial
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from numpy.typing import NDArray
-
-    from refu_core.frames import SmplFrame
-    from refu_core.realtime import GarmentMesh, GarmentPipeline, PipelineOutput
-    from refu_lab.stress._subject import Subject
 
 DEPTH = 1e-4
 """No vertex is deeper inside the collider than this [m]."""

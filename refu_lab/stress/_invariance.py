@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
 import numpy as np
 import torch
@@ -11,16 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from refu_core.body import MIRRORED_JOINTS
 from refu_core.frames import SmplFrame
+from refu_core.realtime import PipelineOutput
 from refu_lab.stress._frames import frame_of
 from refu_lab.stress._numbers import ROUNDING
-from refu_lab.stress._subject import distance_to_mesh
+from refu_lab.stress._subject import Subject, distance_to_mesh
 from refu_lab.stress._trial import Measurement, Trial
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from refu_core.realtime import PipelineOutput
-    from refu_lab.stress._subject import Subject
 
 RIGID = 1e-4
 """How closely a garment follows the person [m]."""

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
+from refu_lab.stress._rounds import StressResult
 from refu_lab.stress._trial import Measurement
 from refu_lab.tables import format_table
-
-if TYPE_CHECKING:
-    from refu_lab.stress._rounds import StressResult
 
 
 def stress_table(result: StressResult) -> str:

@@ -6,16 +6,14 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from refu_core._npz import read_npz
 from refu_core.errors import RefuError
 from refu_core.frames import N_STYLES, SmplFrame
-
-if TYPE_CHECKING:
-    from refu_lab.stress._subject import Subject, Wardrobe
+from refu_lab.stress._subject import Subject, Wardrobe
 
 _KEYS = ("check", "garments", "backbone", "sdf", "pose", "betas", "transl", "style", "has_style", "seed")
 
@@ -189,8 +187,6 @@ def load_trial(path: Path) -> tuple[str, Wardrobe, Trial]:
     Raises:
         StressError: the file is missing, damaged or something else.
     """
-    from refu_lab.stress._subject import Wardrobe
-
     data = read_npz(path, keys=_KEYS, error=StressError, wanted="a trial that refu stress has written")
     missing = [key for key in _KEYS if key not in data]
     if missing:

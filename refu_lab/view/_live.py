@@ -4,20 +4,15 @@ from __future__ import annotations
 
 import threading
 import time
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 import msg_adapters as adapters
 from refu_core import RefuError
+from refu_lab.view._film import Shape
 from refu_lab.view._markers import MarkerShapes, meshes_of
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from numpy.typing import NDArray
-
-    from refu_lab.view._film import Shape
 
 TOPICS = ("garments", "body")
 _DELETE, _DELETE_ALL = 2, 3

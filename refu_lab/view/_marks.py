@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from refu_core.metrics import CollisionChecker
 from refu_core.modes import Choice
 from refu_core.sdf import ExactSdf
 from refu_lab.render import COLLIDING
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from refu_lab.view._film import Shape
+from refu_lab.view._film import Shape
 
 Colour = tuple[float, float, float]
 

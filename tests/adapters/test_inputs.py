@@ -261,7 +261,7 @@ def test_smpl_is_read_by_the_definition_it_came_with(frame: SmplFrame, fields: l
     fields = [field.replace("float64", kind) for field in fields]
     definition = "\n".join(["# made up", "std_msgs/Header header  # stamp", *fields, "=" * 80, "MSG: std_msgs/Header"])
     writer = CdrWriter()
-    writer.header(frame.stamp_ns, "map")
+    writer.fields("Ts", frame.stamp_ns, "map")
     values = {"body_pose": frame.pose[1:], "global_orient": frame.pose[0], "betas": frame.betas, "transl": frame.transl}
     for field in fields:
         writer.array({"float32": "f4", "float64": "f8"}[kind], values.get(field.split()[1], np.zeros(72)))
@@ -373,7 +373,7 @@ def test_objects_of_another_type(input_type: str, message: Any) -> None:
 
 def test_strings_must_be_utf8_and_end() -> None:
     good = CdrWriter()
-    good.string("é")
+    good.fields("s", "é")
     assert CdrReader(good.to_bytes()).string() == "é"
     for raw, message in ((b"\xff\0", "UTF-8"), (b"ab", "ends in NUL")):
         with pytest.raises(DecodeError, match=message):

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from refu_core.errors import MeshError
 from refu_core.metrics import CollisionChecker, GarmentMetrics, temporal_jitter
-from refu_lab.sdf_errors import SdfErrors
+from refu_lab.reproduction._sdf import SdfErrors
 
 
 @given(seed=st.integers(0, 2**31), n=st.integers(1, 60))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+import trimesh
 import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -12,10 +13,10 @@ from numpy.typing import NDArray
 from test_layers import sheet, wavy
 from torch import Tensor
 
-from refu_core.contact import DEFAULT_CONTACT, Layer
+from refu_core.contact import DEFAULT_CONTACT, Layer, Parting, Sheet
 from refu_core.contact._parting_kernels import depth_below
 from refu_core.mesh import Connectivity
-from refu_core.metrics import SheetChecker
+from refu_core.metrics import CollisionChecker, SheetChecker
 
 Array = NDArray[np.float64]
 
@@ -136,3 +137,28 @@ def test_a_ridge_through_the_middle_of_a_face_is_cleared() -> None:
     moved = (found - above).norm(dim=1)
     assert moved.max() < 0.006
     assert not layer.find_cuts(found)
+
+
+@pytest.mark.parametrize("also_deep", [False, True])
+def test_cloth_that_runs_through_a_body_between_its_vertices_is_parted_if_that_leaves_fewer_cuts(
+    also_deep: bool,
+) -> None:
+    """A sheet over a ball, no vertex of it inside; and the same with a second ball deep in it, which has no way out."""
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.03)
+    above, faces = sheet(7, step=0.017, height=0.028)
+    above += torch.tensor([0.0085, 0.0, 0.0085]) - torch.tensor([0.051, 0.0, 0.051])
+    other = ball.vertices * [0.3, 1.0, 0.3] + [0.04, 0.02, 0.04]
+    vertices = np.concatenate((ball.vertices, other)) if also_deep else ball.vertices
+    body_faces = np.concatenate((ball.faces, ball.faces + len(ball.vertices))) if also_deep else ball.faces
+    skin = Sheet(torch.from_numpy(body_faces), torch.zeros(len(vertices), 3))
+    skin.take(torch.from_numpy(vertices).float())
+    checker = CollisionChecker(body_faces.astype(np.int32))
+    checker.update(vertices.astype(np.float32))
+    before = checker.check(above.numpy(), faces.numpy())
+    assert before.n_pairs > 0
+    assert also_deep or not before.inside.any()
+    found = Parting(faces, above, skin, settings=DEFAULT_CONTACT).parted(above)
+    after = checker.check(found.numpy(), faces.numpy())
+    assert after.n_pairs < before.n_pairs if not also_deep else after.n_pairs <= before.n_pairs
+    assert also_deep or after.is_free
+    assert (found - above).norm(dim=1).max() <= DEFAULT_CONTACT.parting_most + 1e-6

@@ -231,6 +231,19 @@ def test_training_brings_the_cloth_out_and_nearer_to_the_truth(tmp_path: Path, d
     assert lines[-1]["validation"] < 0.8 * first["validation"]
 
 
+def test_goes_on_from_trained_weights_and_their_layer(tmp_path: Path, dataset: Path, pretrained: Path) -> None:
+    first = tmp_path / "first"
+    finetune(GARMENT, dataset, pretrained, first, mode="hybrid", backbone="mlp", settings=QUICK, quiet=True)
+    settings = replace(QUICK, steps=1, loop=replace(QUICK.loop, learning_rate=1e-9, weight_decay=0.0))
+    card = finetune(
+        GARMENT, dataset, first, tmp_path, mode="hybrid", backbone="mlp", settings=settings, goes_on=True, quiet=True
+    )
+    before, after = (load_weights(folder / "mlp-hybrid") for folder in (first, tmp_path))
+    assert card["goes_on_from"] == before.card["sha256"]
+    for name, tensor in before.tensors.items():
+        assert torch.allclose(after.tensors[name].float(), tensor.float(), atol=1e-3), name
+
+
 def test_a_gcnn_is_trained_from_scratch(tmp_path: Path, dataset: Path, garment: GarmentTemplate) -> None:
     settings = replace(QUICK, steps=2, is_mirrored=False, loop=replace(QUICK.loop, batch_size=1))
     card = finetune(GARMENT, dataset, None, tmp_path, mode="approx", backbone="gcnn", settings=settings, quiet=True)

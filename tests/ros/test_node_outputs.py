@@ -397,7 +397,7 @@ def test_who_is_tracked_is_followed(robot: Callable[..., Robot], foreign: Callab
 
     def says(*ids: str) -> None:
         writer = CdrWriter()
-        writer.header(0, "")
+        writer.fields("Ts", 0, "")
         writer.strings(ids)
         tracked.publish(writer.to_bytes())
 
