@@ -4,17 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from msg_adapters import INPUT_TYPES, KEYPOINT_TYPES, KeypointStream, decoder_for, frame_id_of
-from refu_core import SmplBody, SmplFrame
+from refu_core import SmplFrame
 from refu_core.keypoints import Proportions
 from refu_core.modes import FOREIGN_BETAS
 from refu_core.recordings import axis_of, upright_share
 from refu_ros._scene import check_plausible
 from refu_ros._settings import NodeSettings
+
+if TYPE_CHECKING:
+    from refu_core import SmplBody
 
 _LOOKED_AT = 100
 """Frames that have come before people are said to lie."""

@@ -7,18 +7,20 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from msg_adapters.axes import SMPL_COLUMNS
-from refu_core import GarmentPipeline, RefuError, SmplFrame
-from refu_core.realtime import PipelineOutput
+from refu_core import RefuError, SmplFrame
 from refu_ros._settings import NodeSettings, PipelineKey
-from refu_ros._worker import with_settings
 
-Then = Callable[[PipelineOutput, dict[str, NDArray[np.float64]]], object]
+if TYPE_CHECKING:
+    from refu_core import GarmentPipeline
+    from refu_core.realtime import PipelineOutput
+
+Then = Callable[["PipelineOutput", dict[str, NDArray[np.float64]]], object]
 
 _MOST_WAITING = 8
 """Requests that may wait: who asks more often than frames can be dressed is told so."""
@@ -58,6 +60,8 @@ class Dresser:
 
     def _dress(self, frame: SmplFrame, settings: NodeSettings, then: Then) -> object:
         pipeline = self._pipeline(settings)
+        from refu_ros._worker import with_settings  # loads torch
+
         frame = with_settings(frame, settings)
         output = pipeline(frame)
         rotation = np.eye(3)[list(SMPL_COLUMNS[settings.axes])]
@@ -78,5 +82,7 @@ class Dresser:
 
 
 def _give_way() -> None:
+    import torch
+
     torch.set_num_threads(1)
     os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)  # to Linux a thread is a process

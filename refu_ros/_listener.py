@@ -12,12 +12,12 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 import msg_adapters as adapters
 from refu_core import FrameError, RefuError
 from refu_core.errors import printable
-from refu_core.outputs import PinholeCamera
 from refu_ros._decoding import InputDecoder
 from refu_ros._interfaces import interface, ros_qos
 
 if TYPE_CHECKING:
     from msg_adapters import Placement
+    from refu_core.outputs import PinholeCamera
     from refu_ros._node import GarmentNode
     from refu_ros._scene import Scene
     from refu_ros._settings import NodeSettings
@@ -189,6 +189,8 @@ class Listener:
         if way is None and camera.frame_id not in (self._settings.frame_id, self._frames.get(person)):
             return None
         back = (way or adapters.Placement()).inverse()
+        from refu_core.outputs import PinholeCamera  # loads torch
+
         return PinholeCamera(*camera.numbers, back.rotation, back.translation)
 
     def _on_camera(self, data: bytes) -> None:

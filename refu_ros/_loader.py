@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING
 
-from refu_core import GarmentPipeline
 from refu_ros._settings import PipelineKey
+
+if TYPE_CHECKING:
+    from refu_core import GarmentPipeline
 
 
 class PipelineLoader:

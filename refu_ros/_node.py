@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
@@ -12,9 +12,8 @@ from rclpy.node import SetParametersResult
 
 import msg_adapters as adapters
 from msg_adapters.outputs import GARMENTS, make_outputs
-from refu_core import GarmentPipeline, RefuError
+from refu_core import RefuError
 from refu_core.errors import printable
-from refu_core.outputs import Fittings
 from refu_ros._bank import QOS, Bank
 from refu_ros._diagnostics import Situation, statuses
 from refu_ros._guard import GuardedNode, answer_no, transition
@@ -26,7 +25,11 @@ from refu_ros._recording import Recording
 from refu_ros._requests import Requests
 from refu_ros._scene import Scene
 from refu_ros._settings import NodeSettings, PipelineKey, specs
-from refu_ros._worker import Worker
+
+if TYPE_CHECKING:
+    from refu_core import GarmentPipeline
+    from refu_core.outputs import Fittings
+    from refu_ros._worker import Worker
 
 NODE_NAME = "garment_node"
 DIAGNOSTICS_TOPIC = "/diagnostics"
@@ -101,6 +104,8 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         result = super().on_activate(state)
         scene = self._listener.scene = Scene(self.statistics)
         given: Any = {"settings": self.settings, "pipeline": self._pipeline, "outputs": self._outputs}
+        from refu_ros._worker import Worker  # loads torch
+
         self._worker = Worker(scene, self.statistics, self, **given)
         self._worker.start()
         self._has_sent = False
@@ -243,6 +248,8 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         return SetParametersResult(successful=True)
 
     def _take(self, pipeline: GarmentPipeline, key: PipelineKey) -> None:
+        from refu_core.outputs import Fittings  # loads torch
+
         self._pipeline, self._in_use, self._fittings = pipeline, key, Fittings(pipeline)
         self._listener.decoder.use(self.settings, pipeline.body)
         for text in pipeline.warnings:

@@ -1,4 +1,7 @@
-"""The node's parameters: what each means, what it may be, and whether it may change while the node runs."""
+"""The node's parameters: what each means, what it may be, and whether it may change while the node runs.
+
+What loads torch is imported where it is needed: a mistyped parameter is to be answered before that.
+"""
 
 from __future__ import annotations
 
@@ -7,18 +10,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from msg_adapters import INPUT_TYPES, KEYPOINT_TYPES, POINT_FIELDS, InputAxes, InputType
-from refu_core import GarmentPipeline, GarmentTemplate, RefuError, SmplFrame, load_garment
-from refu_core._device import checked_device
+from refu_core import RefuError, SmplFrame
 from refu_core.frames import N_JOINTS
 from refu_core.keypoints import LAYOUTS
 from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN, MAX_MARGIN, BackboneName, BetasSource, SdfMode
-from refu_core.weights import weights_folder
 from refu_ros._parameters import ParameterSpec, SettingsError, check, coerced, defaults_of, parameter, specs_of
+
+if TYPE_CHECKING:
+    from refu_core import GarmentPipeline, GarmentTemplate
 
 _PERSON = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,99}")
 _FRAME = re.compile(r"[^/\s\x00-\x1f\x7f][^\s\x00-\x1f\x7f]{0,254}")
@@ -46,6 +50,9 @@ class PipelineKey:
 
     def check(self) -> None:
         """Raises `RefuError` for what can't be loaded, as far as that shows without loading it."""
+        from refu_core._device import checked_device
+        from refu_core.weights import weights_folder
+
         checked_device(self.device)
         is_auto = self.backbone == BackboneName.AUTO
         for name in self.garments if self.backbone != BackboneName.SKINNED else ():
@@ -63,6 +70,8 @@ class PipelineKey:
 
         Raises `RefuError`.
         """
+        from refu_core import GarmentPipeline
+
         named = ((item.name, getattr(self, item.name)) for item in fields(self))  # as `load` names them
         asked: dict[str, Any] = {name: None if value == "" else value for name, value in named}
         pipeline = GarmentPipeline.load(**asked)
@@ -289,6 +298,8 @@ def defaults() -> dict[str, Any]:
 
 @cache
 def _template(name: str) -> GarmentTemplate:
+    from refu_core import load_garment
+
     return load_garment(name)
 
 

@@ -33,7 +33,7 @@ class ObservationSettings:
     enough: float = 2.0
     """A cell of space with so many points says half as much as one with very many: what the fields can't follow is
     alike in neighbours, and isn't less for many."""
-    cell: float = 0.04
+    cell: float = 0.035
     """Edge of a cell, whose points are taken for one, their mean [m]."""
     reach: float = 0.04
     """Points farther from the cloth than this are none of its [m]."""
