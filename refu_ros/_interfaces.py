@@ -5,10 +5,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-from rclpy.exceptions import NoTypeSupportImportedException
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.type_support import check_for_type_support
-from rosidl_generator_py.import_type_support_impl import UnsupportedTypeSupport
 
 from msg_adapters import QosProfile
 from refu_core import RefuError
@@ -26,7 +24,7 @@ def interface(name: str) -> Any:
     except (ImportError, AttributeError) as error:  # the latter: a folder of definitions, which Python takes for it
         msg = f"{name} isn't importable: install or source {package} ({error})"
         raise RefuError(msg) from error
-    except (NoTypeSupportImportedException, UnsupportedTypeSupport) as error:
+    except Exception as error:
         msg = f"{name} is of no use: install or build {package} anew, for this ROS and Python ({error})"
         raise RefuError(msg) from error
     return found
