@@ -105,8 +105,8 @@ class ContactSettings:
     layer_later_rounds: int = 2
     """The same of the second push."""
 
-    # Triangles of garments that cut each other. The counts of frames are of a version that levelled cloth deep inside
-    # the body first, and had no `parting_most`.
+    # Triangles of garments that cut each other, or the body where it has no room for them. The counts of frames are of
+    # a version that levelled cloth deep inside the body first, and had no `parting_most`.
     parting_gap: float = 3e-4
     """How far apart they are brought, so that rounding doesn't make them meet again [m]."""
     parting_step: float = 0.004
