@@ -88,27 +88,17 @@ def train(options: TrainOptions, *, progress: bool) -> dict[str, Any]:
             template, dataset, options.folder, like=options.like, settings=few, body=body, quiet=not progress
         )
     common |= {"backbone": options.backbone, "preset": options.preset, "body": body}
-    source: Path | None = options.folder
-    if options.start is not None:
-        settings = _finetuning(options)
-        return finetune(
-            template,
-            dataset,
-            options.start,
-            options.folder,
-            mode=options.mode,
-            settings=settings,
-            goes_on=True,
-            **common,
-        )
     if options.mode == "none":
         return pretrain(template, dataset, options.folder, settings=_pretraining(options), **common)
-    if options.backbone == "gcnn":
+    source: Path | None = options.folder
+    if options.start is not None:
+        source = options.start
+    elif options.backbone == "gcnn":
         source = None
     elif not (options.folder / f"{options.backbone}-none.json").exists():
         pretrain(template, dataset, options.folder, settings=_pretraining(options), **common)
-    settings = _finetuning(options)
-    return finetune(template, dataset, source, options.folder, mode=options.mode, settings=settings, **common)
+    common |= {"settings": _finetuning(options), "goes_on": options.start is not None}
+    return finetune(template, dataset, source, options.folder, mode=options.mode, **common)
 
 
 def _check(options: TrainOptions) -> None:

@@ -24,7 +24,7 @@ def interface(name: str) -> Any:
     except (ImportError, AttributeError) as error:  # the latter: a folder of definitions, which Python takes for it
         msg = f"{name} isn't importable: install or source {package} ({error})"
         raise RefuError(msg) from error
-    except Exception as error:
+    except Exception as error:  # of rosidl's own kind: to import its name is to import a parser of definitions
         msg = f"{name} is of no use: install or build {package} anew, for this ROS and Python ({error})"
         raise RefuError(msg) from error
     return found

@@ -60,9 +60,7 @@ class Controls:
         """The field at all vertices, float32, shape (N, V, K), of its values at the controls (N, C, K)."""
         n_fields, n_controls, width = values.shape
         n, at = self.mesh.n_vertices, self.vertices.numpy()
-        around = _matrix(self.mesh.edges, np.ones(len(self.mesh.edges)), n)
-        per_vertex = sparse.diags(1 / np.maximum(np.asarray(around.sum(1)).ravel(), 1))
-        bend = sparse.eye(n) - per_vertex @ around
+        bend = self.mesh.uniform_laplacian()
         hold = np.full(n, _NEVER_SINGULAR)
         hold[at] += _HOLD
         known = np.zeros((n, n_fields * width))

@@ -62,7 +62,7 @@ class Layer:
         self._is_serial = self.device.type == "cpu"
         self._above = above.detach().to(torch.float32, copy=True).contiguous()
         above_mesh = Connectivity.of(above_faces.cpu(), len(above))
-        self._below = Sheet(below_faces, below)
+        self._below = Sheet(Connectivity.of(below_faces.cpu(), len(below)), below)
         rest, rest_below = self._above.cpu().numpy(), self._below.vertices.cpu().numpy()
         is_near = cKDTree(rest_below).query(rest)[0] < settings.layer_meets
         meets, candidates = np.flatnonzero(is_near), np.argsort(~is_near, kind="stable")  # those that meet first
@@ -82,7 +82,7 @@ class Layer:
             edges = rest_below[self._below.mesh.edges]
             longest = settings.layer_stretch * float(np.linalg.norm(edges[:, 0] - edges[:, 1], axis=1).max())
             rules, later = (_rules(settings, reach, longest) for reach in (farthest, settings.layer_later_reach))
-            self.parting = Parting(above_faces, self._above, self._below, settings=settings)
+            self.parting = Parting(above_mesh, self._above, self._below, settings=settings)
             """What is done where triangles cut each other after all."""
             self._record(rules, later, *lists)
 

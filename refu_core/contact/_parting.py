@@ -30,9 +30,9 @@ class Parting:
     vertex that isn't near a cut is left as it is. A CPU is told when there is none; a GPU isn't waited for.
     """
 
-    def __init__(self, faces: Tensor, rest: Tensor, sheet: Sheet, *, settings: ContactSettings) -> None:
-        """For an outer garment, by faces (F, 3) and vertices in the rest pose (V, 3) [m], over a `sheet`."""
-        self.cut = cut = cut_of(Connectivity.of(faces.cpu(), len(rest)), rest.device)
+    def __init__(self, mesh: Connectivity, rest: Tensor, sheet: Sheet, *, settings: ContactSettings) -> None:
+        """For an outer garment with vertices in the rest pose (V, 3) [m], over a `sheet`."""
+        self.cut = cut = cut_of(mesh, rest.device)
         self._settings, self._device, self._sheet = settings, rest.device, sheet
         self._is_serial = rest.device.type == "cpu"
         n, n_faces = len(rest), len(cut.faces)

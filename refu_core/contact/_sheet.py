@@ -18,10 +18,10 @@ from refu_core.mesh import Connectivity
 class Sheet:
     """A mesh as kernels read it: its places, normals, box and tree. The tree is fitted when it is asked for."""
 
-    def __init__(self, faces: Tensor, rest: Tensor) -> None:
-        """For a mesh by faces (F, 3) and vertices in the rest pose (U, 3) [m]. Raises `MeshError` as `Connectivity`."""
-        self.mesh = Connectivity.of(faces.cpu(), len(rest))
-        self.cut = cut_of(self.mesh, rest.device)
+    def __init__(self, mesh: Connectivity, rest: Tensor) -> None:
+        """For a mesh with vertices (U, 3) [m] in the rest pose."""
+        self.mesh = mesh
+        self.cut = cut_of(mesh, rest.device)
         self.vertices = rest.detach().to(torch.float32, copy=True).contiguous()
         """[m], shape (U, 3)."""
         self._normals = torch.empty_like(self.vertices)

@@ -39,6 +39,6 @@ class FoldBands:
         return np.stack([*bands, rest]).reshape(len(SWEEPS) + 1, *array.shape)
 
     def energies(self, vertices: Any) -> NDArray[np.float64]:
-        """Of vertices (V, 3) [m] the energy of each band, finest first [m^2], shape (4,)."""
-        energies: NDArray[np.float64] = (self.split(vertices)[:-1] ** 2).sum(axis=(1, 2))
+        """Of vertices (V, ..., 3) [m] the energy of each band, finest first [m^2], shape (4, ...)."""
+        energies: NDArray[np.float64] = (self.split(vertices)[:-1] ** 2).sum(axis=(1, -1))
         return energies

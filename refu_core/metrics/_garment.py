@@ -176,7 +176,7 @@ class GarmentMetrics:
             collision_error_mm=1e3 * float(depth.sum()),
             mpve_mm=None if errors is None else 1e3 * float(errors.mean()),
             laplacian_mm=None if laplacians is None or not region.any() else 1e3 * float(laplacians[region].mean()),
-            folds=None if target is None else [self._folds_of(garment), self._folds_of(target)],
+            folds=None if target is None else self._folds_of(garment, target),
         )
         self._frames.append(frame)
         return frame
@@ -185,10 +185,11 @@ class GarmentMetrics:
         """The figures over the frames added so far."""
         return Figures.over(self._frames)
 
-    def _folds_of(self, vertices: NDArray[np.float32]) -> list[float]:
+    def _folds_of(self, *garments: NDArray[np.float32]) -> list[list[float]]:
+        """Of each the energies of its bands: one look at the mesh for all."""
         if self._bands is None:
-            self._bands = FoldBands(Connectivity.of(self.faces, len(vertices)))
-        energies: list[float] = self._bands.energies(vertices).tolist()
+            self._bands = FoldBands(Connectivity.of(self.faces, len(garments[0])))
+        energies: list[list[float]] = self._bands.energies(np.stack(garments, axis=1)).T.tolist()
         return energies
 
     def _laplacian_of(self, vertices: NDArray[np.float32]) -> NDArray[np.float64]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from itertools import product
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +11,7 @@ from scipy.sparse import csc_array, csr_array, diags_array, eye_array
 from scipy.sparse.linalg import splu
 
 from refu_core.body import Surface
-
-if TYPE_CHECKING:
-    from refu_core.mesh import Connectivity
+from refu_core.mesh import Connectivity
 
 Points = NDArray[np.float64]
 _LEAST_WEIGHT = 0.01
@@ -92,9 +89,7 @@ def _drawn(sheet_points: Points, sheet: NDArray[np.int32], cloth: Points, faces:
     """The sheet's vertices (K, 3), drawn to a cloth (V, 3) [m]."""
     n, points = len(sheet_points), sheet_points
     samples, surface = _samples(sheet, n), Surface(cloth, faces)
-    a, b = np.concatenate((sheet[:, [0, 1]], sheet[:, [1, 2]], sheet[:, [2, 0]])).T
-    beside = csr_array((np.ones(len(a)), (a, b)), shape=(n, n))
-    beside = (beside + beside.T).minimum(1.0)
+    beside = Connectivity.of(sheet, n).adjacency_matrix()
     firm = 0.2 * (diags_array(beside.sum(axis=1)) - beside) + 0.1 * eye_array(n)
     for _ in range(_STEPS):
         place, asked = _placed(Surface(points, sheet), cloth), samples @ points

@@ -84,9 +84,9 @@ class ContactStage:
         if outfit.collider is not None:  # or there is no room
             self._limbs = limbs = LimbMeshes(body)
             self._press = {name: Press(one, limbs, settings=settings) for name, one in garments.items()}
-            self._skin = skin = Sheet(body.faces, body.v_template)
+            self._skin = skin = Sheet(outfit.collider.anatomy.mesh, body.v_template)
             self._off_skin = {
-                name: Parting(one.faces, one.v_template, skin, settings=settings) for name, one in garments.items()
+                name: Parting(one.mesh, one.v_template, skin, settings=settings) for name, one in garments.items()
             }
         self._is_serial = body.device.type == "cpu"
         self._outfit, self._farthest, self._kept = outfit, settings.max_displacement, settings.layer_margin

@@ -150,14 +150,14 @@ def test_cloth_that_runs_through_a_body_between_its_vertices_is_parted_if_that_l
     other = ball.vertices * [0.3, 1.0, 0.3] + [0.04, 0.02, 0.04]
     vertices = np.concatenate((ball.vertices, other)) if also_deep else ball.vertices
     body_faces = np.concatenate((ball.faces, ball.faces + len(ball.vertices))) if also_deep else ball.faces
-    skin = Sheet(torch.from_numpy(body_faces), torch.zeros(len(vertices), 3))
+    skin = Sheet(Connectivity.of(body_faces), torch.zeros(len(vertices), 3))
     skin.take(torch.from_numpy(vertices).float())
     checker = CollisionChecker(body_faces.astype(np.int32))
     checker.update(vertices.astype(np.float32))
     before = checker.check(above.numpy(), faces.numpy())
     assert before.n_pairs > 0
     assert also_deep or not before.inside.any()
-    found = Parting(faces, above, skin, settings=DEFAULT_CONTACT).parted(above)
+    found = Parting(Connectivity.of(faces), above, skin, settings=DEFAULT_CONTACT).parted(above)
     after = checker.check(found.numpy(), faces.numpy())
     assert after.n_pairs < before.n_pairs if not also_deep else after.n_pairs <= before.n_pairs
     assert also_deep or after.is_free
