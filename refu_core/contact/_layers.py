@@ -81,10 +81,10 @@ class Layer:
             lists = [ints(values, self.device) for values in (start, places, rows, ring_start, ring)]
             edges = rest_below[self._below.mesh.edges]
             longest = settings.layer_stretch * float(np.linalg.norm(edges[:, 0] - edges[:, 1], axis=1).max())
-            rules, later = (_rules(settings, reach, longest) for reach in (farthest, settings.layer_later_reach))
+            rules = _rules(settings, longest)
             self.parting = Parting(above_mesh, self._above, self._below, settings=settings)
             """What is done where triangles cut each other after all."""
-            self._record(rules, later, *lists)
+            self._record(rules, *lists)
 
     @torch.no_grad()
     def __call__(self, above: Tensor, below: Tensor, *, goes_on: bool = False) -> tuple[Tensor, Tensor]:
@@ -103,30 +103,22 @@ class Layer:
             return above, torch.zeros_like(self._count)
         with torch_stream(self.device):
             self._take(above, below, goes_on=goes_on)
-            self._look("search")
+            self._look()
             n_low = self._count.clone()
-            if not self._may_move():
+            if self._is_serial and not int(n_low):
                 return above, n_low
-            self._move(self._settings.layer_rounds)
-            # What has left the sheet at one place may have come to another, and be too low there.
-            self._look("search again")
-            if self._may_move():
-                self._move(self._settings.layer_later_rounds)
+            self._move()
         return self._above.clone(), n_low
 
-    def find_cuts(self, above: Tensor) -> bool:
-        """Whether triangles of the outer garment, (V, 3) [m], still cut the inner one of the last call.
+    def find_cuts(self, above: Tensor) -> Tensor:
+        """How many pairs of faces of the outer garment, (V, 3) [m], and the inner one of the last call cut each other.
 
-        True on a GPU, which isn't waited for: `parting` has their number, and goes on from what was found.
+        An int32 of shape (1,). `parting` goes on from what was found.
         """
-        if not self._n_candidates:
-            return False
-        with torch_stream(self.device):
+        if self._n_candidates:
             self.parting.find(above)
-        return not self._is_serial or int(self.parting.n_cut) > 0
-
-    def _may_move(self) -> bool:
-        return not self._is_serial or int(self._count) > 0
+            return self.parting.n_cut.clone()
+        return torch.zeros_like(self._count)
 
     def _check(self, above: Tensor, below: Tensor) -> None:
         if above.shape != self._above.shape or below.shape != self._below.vertices.shape:
@@ -146,35 +138,32 @@ class Layer:
         self._moved.zero_()
         self._above.copy_(above)
 
-    def _look(self, search: str) -> None:
+    def _look(self) -> None:
         """What has to be pushed, and how many vertices that are; a device that isn't waited for asks about everyone."""
-        lift, ask = (search.replace("search", step) for step in ("lift", "ask"))
         self._count.zero_()
         self._n_doubtful.zero_()
-        self._commands[search].launch()
-        self._commands[lift].launch()
+        self._commands["search"].launch()
+        self._commands["lift"].launch()
         n = int(self._n_doubtful) if self._is_serial else self._n_candidates
         if n:
             self._below.fit()
-            self._commands[ask].set_dim(n)
-            self._commands[ask].launch()
+            self._commands["ask"].set_dim(n)
+            self._commands["ask"].launch()
 
-    def _move(self, blend_rounds: int) -> None:
-        """Pushes those with their neighbourhood, in an even number of rounds."""
+    def _move(self) -> None:
+        """Pushes those with their neighbourhood."""
         if self._is_serial:
-            self._commands["move all"].set_param_at_index(4, blend_rounds)
             self._commands["move all"].launch()
             return
         self._fields[0].zero_()
         self._fields[0, : self._n_candidates] = self._push
-        for round_ in range(blend_rounds):
+        for round_ in range(self._settings.layer_rounds):
             self._commands[f"spread{round_ % 2}"].launch()
         self._commands["move"].launch()
 
     def _record(
         self,
         rules: Any,
-        later: Any,
         near_start: Any,
         near: Any,
         rows: Any,
@@ -185,33 +174,26 @@ class Layer:
         above, push = (as_warp(tensor, wp.vec3) for tensor in (self._above, self._push))
         sheet = self._below
         fields = [as_warp(field, wp.vec3) for field in self._fields]
-        found, closest, doubtful = (
-            wp.zeros(self._n_candidates, dtype=wp.int32, device=str(self.device)) for _ in range(3)
-        )
-        itself = ints(np.arange(self._n_candidates + 1), self.device)
+        found, doubtful = (wp.zeros(self._n_candidates, dtype=wp.int32, device=str(self.device)) for _ in range(2))
         looks, moved = as_warp(self._looks, wp.int32), as_warp(self._moved, wp.int32)
-        search = [sheet.places, sheet.cut, above, rows]
         garments = [sheet.places, sheet.normals, sheet.cut, above, self.parting.cut, rows]
-        pushed = [closest, push, as_warp(self._count, wp.int32)]
+        pushed = [push, as_warp(self._count, wp.int32)]
         doubts = [doubtful, as_warp(self._n_doubtful, wp.int32)]
         blend = [push, start, ring]
         reached = [wp.zeros(self._n_region, dtype=wp.int32, device=str(self.device)) for _ in range(2)]
-        again = [start, ring, looks, found, sheet.extent, later, *pushed, *doubts]
+        rounds = self._settings.layer_rounds
         for name, kernel, size, arguments in (
-            ("search", kernels.search_kernel, self._n_candidates, [*search, near_start, near, looks, found]),
-            ("search again", kernels.search_kernel, self._n_candidates, [*search, itself, closest, looks, found]),
+            (
+                "search",
+                kernels.search_kernel,
+                self._n_candidates,
+                [sheet.places, sheet.cut, above, rows, near_start, near, looks, found],
+            ),
             (
                 "lift",
                 kernels.lift_kernel,
                 self._n_candidates,
                 [*garments, start, ring, looks, found, sheet.extent, rules, *pushed, *doubts],
-            ),
-            ("lift again", kernels.lift_kernel, self._n_candidates, [*garments, *again]),
-            (
-                "ask again",
-                kernels.tree_kernel,
-                self._n_candidates,
-                [sheet.tree, *garments, found, later, *doubts, *pushed],
             ),
             (
                 "ask",
@@ -221,15 +203,15 @@ class Layer:
             ),
             ("spread0", moving.spread_kernel, self._n_region, [*blend, fields[0], fields[1]]),
             ("spread1", moving.spread_kernel, self._n_region, [*blend, fields[1], fields[0]]),
-            ("move", moving.move_kernel, self._n_region, [rows, fields[0], above, looks, moved]),
-            ("move all", moving.move_all_kernel, 1, [*blend, rows, 0, *reached, *fields, above, looks, moved]),
+            ("move", moving.move_kernel, self._n_region, [rows, fields[0], above, moved]),
+            ("move all", moving.move_all_kernel, 1, [*blend, rows, rounds, *reached, *fields, above, moved]),
         ):
             self._commands[name] = wp.launch(kernel, size, arguments, device=str(self.device), record_cmd=True)
 
 
-def _rules(settings: ContactSettings, reach: float, longest: float) -> Any:
+def _rules(settings: ContactSettings, longest: float) -> Any:
     rules = kernels.LayerRules()
-    rules.gap, rules.reach, rules.fade = settings.layer_gap, reach, settings.layer_fade
+    rules.gap, rules.reach, rules.fade = settings.layer_gap, settings.layer_reach, settings.layer_fade
     rules.agreement, rules.doubt, rules.longest = settings.layer_agreement, settings.layer_doubt, longest
     return rules
 

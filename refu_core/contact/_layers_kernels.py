@@ -131,8 +131,8 @@ def search_kernel(
 ) -> None:
     """Which vertex of the sheet below each candidate that `looks` comes to, downhill.
 
-    From the nearest of those to look from, which are `near[near_start[k]:near_start[k + 1]]`; or -1, if they are -1.
-    `STRANGER` where there are none.
+    From the nearest of those to look from, which are `near[near_start[k]:near_start[k + 1]]`; `STRANGER` where there
+    are none.
     """
     k = wp.tid()
     if looks[k] == 0:
@@ -142,15 +142,13 @@ def search_kernel(
         return
     p = above[candidates[k]]
     v = int(near[near_start[k]])
-    if v >= 0:  # else too far away the last time
-        squared = float(wp.inf)
-        for n in range(near_start[k], near_start[k + 1]):
-            other = wp.length_sq(below[near[n]] - p)
-            if other < squared:
-                squared = other
-                v = near[n]
-        v = nearest_vertex(p, v, below, below_cut)
-    found[k] = v
+    squared = float(wp.inf)
+    for n in range(near_start[k], near_start[k + 1]):
+        other = wp.length_sq(below[near[n]] - p)
+        if other < squared:
+            squared = other
+            v = near[n]
+    found[k] = nearest_vertex(p, v, below, below_cut)
 
 
 @wp.func
@@ -215,7 +213,6 @@ def lift_kernel(
     extent: wp.array[wp.vec3],
     rules: LayerRules,
     # outputs, by candidate
-    closest: wp.array[int],
     push: wp.array[wp.vec3],
     count: wp.array[int],
     doubtful: wp.array[int],
@@ -224,8 +221,7 @@ def lift_kernel(
     """What brings each candidate that `looks` to the gap above the sheet, and how many they are that lack something.
 
     A fold that one candidate's search ended in is seldom in the way of its neighbours': what these `found` is looked
-    at, too. Whoever is far below the sheet is `doubtful`, and only listed. `closest` is the vertex of the sheet that
-    each has come to, -1 where that is too far away.
+    at, too. Whoever is far below the sheet is `doubtful`, and only listed.
     """
     k = wp.tid()
     i = candidates[k]
@@ -234,31 +230,24 @@ def lift_kernel(
     if looks[k] == 0:
         return
     v = int(found[k])
-    closest[k] = -1
     if v == STRANGER:
         if is_within(p, extent, rules.gap):
             doubtful[wp.atomic_add(n_doubtful, 0, 1)] = k
-        return
-    if v < 0:
         return
     squared = wp.length_sq(below[v] - p)
     # As near as that, it is the right fold.
     if 4.0 * squared > rules.longest * rules.longest:
         for r in range(ring_start[k], ring_start[k + 1]):
             j = ring[r]
-            if j < found.shape[0] and found[j] >= 0 and found[j] != v:
+            if j < found.shape[0] and found[j] != STRANGER and found[j] != v:
                 other = wp.length_sq(below[found[j]] - p)
                 if other < squared:
                     squared = other
                     v = found[j]
         if v != found[k]:
             v = nearest_vertex(p, v, below, below_cut)
-    away = wp.length(below[v] - p)
-    if away > rules.reach + rules.longest:
-        return
-    closest[k] = v
     # No point of a face is farther from its closest corner than from the middle of three edges of its longest one.
-    if away > rules.reach + 0.578 * rules.longest:
+    if wp.length(below[v] - p) > rules.reach + 0.578 * rules.longest:
         return
     face, feature, w, offset = nearest_face(p, v, below, below_cut)
     normal = normal_on(face, w, below_normals, below_cut)
@@ -286,7 +275,6 @@ def tree_kernel(
     doubtful: wp.array[int],
     n_doubtful: wp.array[int],
     # outputs, by candidate
-    closest: wp.array[int],
     push: wp.array[wp.vec3],
     count: wp.array[int],
 ) -> None:
@@ -303,5 +291,4 @@ def tree_kernel(
     face = hit.face
     w, feature, offset = closest_on_face(p, face, below, below_cut.faces)
     normal = normal_on(face, w, below_normals, below_cut)
-    closest[k] = below_cut.faces[face, heaviest(w)]
     lift_off(k, i, face, feature, offset, normal, below_cut, above, above_cut, found[k] == STRANGER, rules, push, count)

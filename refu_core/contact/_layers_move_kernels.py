@@ -47,14 +47,12 @@ def move_kernel(
     field: wp.array[wp.vec3],
     # outputs
     points: wp.array[wp.vec3],
-    looks: wp.array[int],
     moved: wp.array[int],
 ) -> None:
-    """Moves the vertices of the region; those that have `moved` look again."""
+    """Moves the vertices of the region, and says which have `moved`."""
     k = wp.tid()
     points[rows[k]] += field[k]
-    looks[k] = wp.where(wp.length_sq(field[k]) > 0.0, 1, 0)
-    moved[k] = wp.max(moved[k], looks[k])
+    moved[k] = wp.where(wp.length_sq(field[k]) > 0.0, 1, 0)
 
 
 @wp.kernel(enable_backward=False)
@@ -71,15 +69,12 @@ def move_all_kernel(
     smoother: wp.array[wp.vec3],
     # outputs
     points: wp.array[wp.vec3],
-    looks: wp.array[int],
     moved: wp.array[int],
 ) -> None:
     """All rounds, and the move, by one thread: of the pushed, and of those that so many rounds reach from there.
 
-    Those have `moved`, and look again.
+    Those have `moved`.
     """
-    for k in range(looks.shape[0]):
-        looks[k] = 0
     n = int(0)
     for k in range(push.shape[0]):
         if wp.length_sq(push[k]) > 0.0:
@@ -107,7 +102,6 @@ def move_all_kernel(
     for i in range(n):
         k = reached[i]
         points[rows[k]] += field[k]
-        looks[k] = 1
         moved[k] = 1
         is_reached[k] = 0
         field[k] = wp.vec3()

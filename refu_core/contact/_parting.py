@@ -38,17 +38,17 @@ class Parting:
         n, n_faces = len(rest), len(cut.faces)
         self._points = torch.zeros(n, 3, device=rest.device)
         self._other = torch.zeros_like(self._points)
-        self._marked, self._wider = torch.zeros(2, n, dtype=torch.int32, device=rest.device)
+        self._marked, self._wider, self._pulled = torch.zeros(3, n, dtype=torch.int32, device=rest.device)
         self._weight = torch.zeros(n, device=rest.device)
         self.n_cut = torch.zeros(1, dtype=torch.int32, device=rest.device)
-        """How many faces were found to cut the sheet, shape (1,)."""
+        """How many pairs of its faces and the sheet's were found to cut each other, shape (1,)."""
         self._n_left = torch.zeros_like(self.n_cut)
         self._ways = torch.zeros(2, n_faces, 3, device=rest.device)
         order = grouped(rest.cpu().numpy()[cut.faces.numpy()].mean(axis=1))
         in_groups = wp.array(order, dtype=wp.int32, device=str(rest.device))
         points, other, way, place = (as_warp(rows, wp.vec3) for rows in (self._points, self._other, *self._ways))
-        marked, wider, count, left = (
-            as_warp(rows, wp.int32) for rows in (self._marked, self._wider, self.n_cut, self._n_left)
+        marked, wider, pulled, count, left = (
+            as_warp(rows, wp.int32) for rows in (self._marked, self._wider, self._pulled, self.n_cut, self._n_left)
         )
         weight = as_warp(self._weight, wp.float32)
         own = [points, cut.faces]
@@ -69,9 +69,9 @@ class Parting:
                 "measure",
                 kernels.measure_kernel,
                 n_faces,
-                [sheet.tree, sheet.normals, sheet.cut.faces, *own, marked, *bounds, left, way, place],
+                [sheet.tree, sheet.normals, sheet.cut.faces, *own, marked, *bounds, left, way, place, pulled],
             ),
-            ("part", kernels.part_kernel, n, [way, place, cut, points, marked]),
+            ("part", kernels.part_kernel, n, [way, place, cut, points, pulled, marked]),
         ):
             self._commands[name] = wp.launch(kernel, size, arguments, device=str(rest.device), record_cmd=True)
 
@@ -96,9 +96,13 @@ class Parting:
         return self._points.clone()
 
     def part(self, above: Tensor) -> Tensor:
-        """The outer garment, (V, 3) [m], with faces around there brought to the outer side of what they cut."""
+        """The outer garment, (V, 3) [m], with faces around there brought to the outer side of what they cut.
+
+        What is marked is what was moved last, so a second call wants another `find`.
+        """
         with torch_stream(self._device):
             self._points.copy_(above)
+            self._ways[1].zero_()
             for _ in range(self._settings.parting_sweeps):
                 self._n_left.zero_()
                 self._commands["measure"].launch()

@@ -40,7 +40,7 @@ def find_kernel(
     marked: wp.array[int],
     count: wp.array[int],
 ) -> None:
-    """Marks the corners of faces that cut the mesh of `tree`, and counts those faces."""
+    """Marks the corners of faces that cut the mesh of `tree`, and counts the pairs."""
     first = BLOCK * wp.tid()
     end = wp.min(first + BLOCK, order.shape[0])
     lower = wp.vec3(wp.inf)
@@ -172,15 +172,17 @@ def measure_kernel(
     count: wp.array[int],
     way: wp.array[wp.vec3],
     place: wp.array[wp.vec3],
+    pulled: wp.array[int],
 ) -> None:
     """The way of each face with a marked corner out of what it cuts deepest, and the place on it where that is.
 
-    Along the normal of the sheet, as far as clears it, but no farther than `most`. Counts the faces that cut.
+    Along the normal of the sheet, as far as clears it, but no farther than `most`. Counts the faces that cut, whose
+    corners are `pulled`.
     """
     face = wp.tid()
-    place[face] = wp.vec3()
     if marked[faces[face, 0]] == 0 and marked[faces[face, 1]] == 0 and marked[faces[face, 2]] == 0:
         return
+    place[face] = wp.vec3()
     a = corner(face, 0, points, faces)
     b = corner(face, 1, points, faces)
     c = corner(face, 2, points, faces)
@@ -204,6 +206,8 @@ def measure_kernel(
                 way[face] = wp.min(depth + gap, most) * n
     if deepest > 0.0:
         wp.atomic_add(count, 0, 1)
+        for k in range(3):
+            pulled[faces[face, k]] = 1
 
 
 @wp.kernel
@@ -213,10 +217,18 @@ def part_kernel(
     cut: Cut,
     # outputs
     points: wp.array[wp.vec3],
+    pulled: wp.array[int],
     marked: wp.array[int],
 ) -> None:
-    """Moves the corners of faces as far as brings their deepest places out; who is moved is marked."""
+    """Moves the corners of faces as far as brings their deepest places out; who is moved is marked, and nobody else.
+
+    A face that cut has a corner that is moved. Where no corner was, there is nothing new to measure.
+    """
     i = wp.tid()
+    marked[i] = 0
+    if pulled[i] == 0:
+        return
+    pulled[i] = 0
     total = wp.vec3()
     weight = float(0.0)
     for f in range(cut.fan_start[i], cut.fan_start[i + 1]):

@@ -82,8 +82,6 @@ class ContactSettings:
     layer_reach: float = 0.03
     """How far the sheet below is felt [m], less and less in the last quarter. Only cloth in a fold is deeper, and which
     side of the fold is closest changes from frame to frame."""
-    layer_later_reach: float = 0.02
-    """The same of the second push, which is a correction [m]."""
     layer_meets: float = 0.1
     """Vertices farther than this from the other garment at rest don't lie on it in any pose [m]. They may come beside
     it, as a sleeve does beside shorts: a tree is asked for what of them is near."""
@@ -102,8 +100,6 @@ class ContactSettings:
     layer_rounds: int = 6
     """How far the neighbourhood of a push reaches [edges], and how often it is swept. Even: the field ends where it
     began."""
-    layer_later_rounds: int = 2
-    """The same of the second push."""
 
     # Triangles of garments that cut each other, or the body where it has no room for them. The counts of frames are of
     # a version that levelled cloth deep inside the body first, and had no `parting_most`.

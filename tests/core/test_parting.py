@@ -89,8 +89,9 @@ def test_what_cuts_is_found_and_levelled(seed: int, height: float) -> None:
     layer(high, low)
     checker = SheetChecker(below_faces.numpy())
     checker.update(low.numpy())
-    cut = np.unique(checker.with_other(high.numpy(), faces.numpy())[:, 0])
-    assert layer.find_cuts(high) is bool(len(cut))
+    pairs = checker.with_other(high.numpy(), faces.numpy())
+    assert int(layer.find_cuts(high)) == len(pairs)
+    cut = np.unique(pairs[:, 0])
     ring, weight = ring_of(faces, len(high)), np.zeros(len(high))
     weight[faces.numpy()[cut].ravel()] = 1
     for _ in range(DEFAULT_CONTACT.parting_reach):
@@ -104,18 +105,21 @@ def test_what_cuts_is_found_and_levelled(seed: int, height: float) -> None:
 def test_sheets_that_cut_are_parted_and_nothing_else_is_moved(seed: int, height: float) -> None:
     layer, high, faces, low, below_faces = over(seed, height, 0.006)
     layer(high, low)
-    is_cut = layer.find_cuts(high)
-    found = layer.parting.part(layer.parting.level(high))
-    if not is_cut:
+    n_cut = layer.find_cuts(high)
+    level = found = layer.parting.level(high)
+    calls = 0
+    while calls < 2 and layer.find_cuts(found) > 0:  # as a frame does, which allows three
+        calls += 1
+        found = layer.parting.part(found)
+    if not n_cut:
         assert torch.equal(found, high)
         return
     checker = SheetChecker(below_faces.numpy())
     checker.update(low.numpy())
-    before = len(checker.with_other(high.numpy(), faces.numpy()))
     after = len(checker.with_other(found.numpy(), faces.numpy()))
-    assert after <= 0.1 * before, "there is room for all"
-    farthest = DEFAULT_CONTACT.parting_sweeps * DEFAULT_CONTACT.parting_step
-    assert (found - layer.parting.level(high)).norm(dim=1).max() <= 3 * farthest
+    assert after == 0, "there is room for all"
+    farthest = calls * DEFAULT_CONTACT.parting_sweeps * DEFAULT_CONTACT.parting_step
+    assert (found - level).norm(dim=1).max() <= 3 * farthest
 
 
 def test_a_ridge_through_the_middle_of_a_face_is_cleared() -> None:
