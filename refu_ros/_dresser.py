@@ -7,6 +7,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -72,7 +73,7 @@ class Dresser:
         return then(output, placed)
 
     def _pipeline(self, settings: NodeSettings) -> GarmentPipeline:
-        key = settings.pipeline
+        key = replace(settings.pipeline, threads=1)
         pipeline = self._pipelines.pop(key, None) or key.load()
         pipeline.margin = settings.margin
         self._pipelines[key] = pipeline

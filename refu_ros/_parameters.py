@@ -65,13 +65,16 @@ def declare(node: Any, kind: type[Settings]) -> Settings:
 
 
 def _descriptor(default: Any, spec: ParameterSpec) -> Any:
-    from rclpy.node import FloatingPointRange, ParameterDescriptor
+    from rclpy.node import FloatingPointRange, IntegerRange, ParameterDescriptor
 
     descriptor = ParameterDescriptor(description=spec.description, read_only=not spec.live)
     if spec.choices:
         descriptor.additional_constraints = " | ".join(spec.choices)
     if spec.low is not None and spec.high is not None:
-        descriptor.floating_point_range = [FloatingPointRange(from_value=spec.low, to_value=spec.high, step=0.0)]
+        if isinstance(default, int):
+            descriptor.integer_range = [IntegerRange(from_value=int(spec.low), to_value=int(spec.high), step=1)]
+        else:
+            descriptor.floating_point_range = [FloatingPointRange(from_value=spec.low, to_value=spec.high, step=0.0)]
     # Whole numbers are fine for floats (`max_rate:=30`); ROS alone would refuse them.
     descriptor.dynamic_typing = isinstance(default[0] if isinstance(default, tuple) else default, float)
     return descriptor
@@ -90,6 +93,8 @@ def coerced(kind: type, values: Mapping[str, Any]) -> dict[str, Any]:
 def _coerced(name: str, value: Any, default: Any) -> Any:
     if isinstance(default, bool):
         right, wanted = isinstance(value, bool), "true or false"
+    elif isinstance(default, int):
+        right, wanted = isinstance(value, int) and not isinstance(value, bool), "a whole number"
     elif isinstance(default, float):
         right, wanted = _is_number(value), "a number"
     elif isinstance(default, str):

@@ -41,6 +41,7 @@ class PipelineKey:
     collider: bool
     body: str
     betas_from: str
+    threads: int
 
     def __str__(self) -> str:
         weights = f", weights {self.weights}" if self.weights else ""
@@ -51,9 +52,14 @@ class PipelineKey:
     def check(self) -> None:
         """Raises `RefuError` for what can't be loaded, as far as that shows without loading it."""
         from refu_core._device import checked_device
+        from refu_core.body import BUILTIN_BODIES
         from refu_core.weights import weights_folder
 
         checked_device(self.device)
+        for body in (self.body, self.betas_from):
+            if body not in ("", *BUILTIN_BODIES) and not Path(body).is_file():
+                msg = f"no body {body!r}: wanted one of {', '.join(BUILTIN_BODIES)}, or an .npz or .pkl file"
+                raise SettingsError(msg)
         is_auto = self.backbone == BackboneName.AUTO
         for name in self.garments if self.backbone != BackboneName.SKINNED else ():
             folder = weights_folder(_template(name).name, self.weights or None)
@@ -72,11 +78,15 @@ class PipelineKey:
         """
         from refu_core import GarmentPipeline
 
-        named = ((item.name, getattr(self, item.name)) for item in fields(self))  # as `load` names them
+        named = ((name, getattr(self, name)) for name in PIPELINE_SETTINGS)  # as `load` names them
         asked: dict[str, Any] = {name: None if value == "" else value for name, value in named}
         pipeline = GarmentPipeline.load(**asked)
         pipeline(SmplFrame(np.zeros((N_JOINTS, 3), np.float32)))
         return pipeline
+
+
+PIPELINE_SETTINGS = tuple(item.name for item in fields(PipelineKey))
+"""Parameters that need another pipeline when they change."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,6 +111,13 @@ class NodeSettings:
         True, "Bring garments off a body whose overlaps are pulled apart, which topic body shows; else off the raw one."
     )
     device: str = parameter("cpu", "Torch device: cpu or cuda.")
+    threads: int = parameter(
+        2,
+        "While a frame takes longer than the next one is away, so many are worked on at the same time; on a GPU one.",
+        low=1,
+        high=64,
+        live=False,
+    )
     on_device_loss: str = parameter(
         "cpu", "When the device fails: go on on the cpu, with an ERROR, or stop the node.", choices=("cpu", "stop")
     )
@@ -253,7 +270,7 @@ class NodeSettings:
     @property
     def pipeline(self) -> PipelineKey:
         """What the pipeline depends on."""
-        return PipelineKey(**{item.name: getattr(self, item.name) for item in fields(PipelineKey)})
+        return PipelineKey(**{name: getattr(self, name) for name in PIPELINE_SETTINGS})
 
     @property
     def betas_are_told(self) -> bool:

@@ -1,10 +1,11 @@
-"""The inference thread: frames of all persons in, one checked MarkerArray out, and nothing done that nobody needs."""
+"""The inference threads: frames of all persons in, one checked MarkerArray out, and nothing done that nobody needs."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -13,7 +14,7 @@ import torch
 
 from msg_adapters import Placement
 from msg_adapters.axes import SMPL_COLUMNS
-from msg_adapters.outputs import Moment, Output, make_outputs
+from msg_adapters.outputs import Moment, make_outputs
 from refu_core import GarmentPipeline, RefuError, SmplFrame
 from refu_core._device import is_device_loss
 from refu_core.modes import BetasSource
@@ -52,15 +53,37 @@ class Outlet(Protocol):
 class _Known:
     """A person as last computed, without the translation."""
 
-    inputs: bytes
+    inputs: tuple[object, ...]
     """What the result depends on."""
     output: PipelineOutput
 
 
-class Worker:
-    """Takes the newest frames from the scene and sends garments, in a thread of its own.
+@dataclass(frozen=True, eq=False)
+class _Job:
+    """A frame each of some persons, from when they were taken until they are sent."""
 
-    `settings` may be replaced at any time; a tick sees one version of it.
+    turn: int
+    settings: NodeSettings
+    pipeline: GarmentPipeline
+    fittings: Fittings
+    arrivals: Mapping[str, Arrival]
+    frames: Mapping[str, SmplFrame]
+    known: Mapping[str, _Known]
+    """Of those for whom nothing has changed but their place."""
+    gone: list[str]
+
+    def inputs(self, frame: SmplFrame) -> tuple[object, ...]:
+        """All that a garment relative to the root depends on."""
+        style = b"" if frame.style is None else frame.style.tobytes()
+        return self.pipeline, self.settings.margin, frame.pose.tobytes() + frame.betas.tobytes() + style
+
+
+class Worker:
+    """Takes the newest frames from the scene and sends garments, in threads of its own.
+
+    While one thread computes, another one takes what has come since, as many as the pipeline has `threads`. They send
+    in the order in which they took, so nobody sees a frame after a later one. `settings` may be replaced at any time; a
+    tick sees one version of it.
     """
 
     def __init__(
@@ -71,7 +94,6 @@ class Worker:
         *,
         settings: NodeSettings,
         pipeline: GarmentPipeline,
-        outputs: Sequence[Output] | None = None,
     ) -> None:
         self.settings = settings
         self._scene = scene
@@ -79,23 +101,31 @@ class Worker:
         self._outlet = outlet
         self._next_pipeline = self._pipeline = pipeline
         self._dressed: dict[str, _Known] = {}
-        self._outputs = make_outputs() if outputs is None else outputs
-        self._fittings = Fittings(pipeline, weights=settings.weights or None)
+        self._outputs = make_outputs(tf=settings.publish_tf)  # they remember what was worn
+        self._sent_with = self._fittings = Fittings(pipeline, weights=settings.weights or None)
         self._here: set[str] = set()
         self._is_lost = False
         self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="inference")
+        self._last = -1e9
+        self._taking = threading.Lock()
+        """Of what is decided when frames are taken."""
+        self._in_order = threading.Condition()
+        """Of what is done in the order of turns: sending, and what is known of who was sent."""
+        self._n_taken = self._n_done = 0
+        self._threads = [threading.Thread(target=self._run, name=f"inference {i}") for i in range(settings.threads)]
 
     def start(self) -> None:
-        """Starts the thread."""
-        self._thread.start()
+        """Starts the threads."""
+        for thread in self._threads:
+            thread.start()
 
     def stop(self) -> None:
-        """Ends the thread after the tick under way and clears the scene of viewers."""
+        """Ends the threads after the ticks under way and clears the scene of viewers."""
         self._stopping.set()
         self._scene.wake()
-        if self._thread.ident is not None:
-            self._thread.join()
+        for thread in self._threads:
+            if thread.ident is not None:
+                thread.join()
         self._remove([*self._here])
 
     def use(self, pipeline: GarmentPipeline) -> None:
@@ -104,49 +134,95 @@ class Worker:
 
     def _run(self) -> None:
         torch.set_num_threads(1)  # the robot's other nodes want their cores, too
-        last = -1e9
         while not self._stopping.is_set():
-            period = 1.0 / self.settings.max_rate if self.settings.max_rate else 0.0
-            idle = _IDLE_S if self._here or self._scene.persons else _EMPTY_S
-            arrivals = self._scene.take(not_before=last + period, timeout=idle)
-            now = time.monotonic()
-            if arrivals:  # on the grid of the rate as long as the frames keep up with it
-                last = last + period if now < last + 2 * period else now
-            try:
-                self.tick(arrivals)
-            except Exception as error:  # whatever one frame brings up, the next may be good
-                self._fail(error, "")
+            self._work()
+
+    def _work(self) -> None:
+        """One tick."""
+        try:
+            with self._taking:
+                job = self._plan(self._take())
+            self._do(job)
+        except Exception as error:  # whatever one frame brings up, the next may be good
+            self._fail(error, "")
+
+    def _take(self) -> Mapping[str, Arrival]:
+        """The newest frames, as soon as there are some, a thread of the pipeline is free, and the rate allows it."""
+        with self._in_order:
+            self._in_order.wait_for(lambda: self._n_taken - self._n_done < self._next_pipeline.threads)
+        period = 1.0 / self.settings.max_rate if self.settings.max_rate else 0.0
+        idle = _IDLE_S if self._here or self._scene.persons else _EMPTY_S
+        arrivals = self._scene.take(not_before=self._last + period, timeout=idle)
+        now = time.monotonic()
+        if arrivals:  # on the grid of the rate as long as the frames keep up with it
+            self._last = self._last + period if now < self._last + 2 * period else now
+        return arrivals
 
     def tick(self, arrivals: Mapping[str, Arrival]) -> None:
         """Works on one frame each of some persons."""
+        with self._taking:
+            job = self._plan(arrivals)
+        self._do(job)
+
+    def _plan(self, arrivals: Mapping[str, Arrival]) -> _Job:
+        """What there is to do for these people, and with what."""
         settings = self.settings
         if self._next_pipeline is not self._pipeline:
             self._pipeline = self._next_pipeline
             self._is_lost = False
-            self._dressed.clear()
             self._fittings = Fittings(self._pipeline, weights=settings.weights or None)
-            for output in self._outputs:
-                output.forget()
         if settings.margin != self._pipeline.margin:
             self._pipeline.margin = settings.margin
-            self._dressed.clear()
-        self._remove(self._scene.leave(settings.person_timeout))
-        arrivals = self._near(arrivals, settings)
-        if not arrivals:
-            return
-        if not self._outlet.is_watched():
-            for _ in arrivals:
+        gone = self._scene.leave(settings.person_timeout)
+        near = self._near(arrivals, settings)
+        gone += [person for person in arrivals if person not in near]
+        if near and not self._outlet.is_watched():
+            for _ in near:
                 self._statistics.count("skip.unwatched")
-            return
-        frames = {person: with_settings(arrival.frame, settings) for person, arrival in arrivals.items()}
-        found, unresolved = self._dress(frames)
-        dressed = {person: frame for person, frame in frames.items() if person in self._dressed}
+            near = {}
+        frames = {person: with_settings(arrival.frame, settings) for person, arrival in near.items()}
+        known: dict[str, _Known] = {}
+        job = _Job(self._n_taken, settings, self._pipeline, self._fittings, near, frames, known, gone)
+        for person, frame in frames.items():
+            last = self._dressed.get(person)
+            if last is not None and last.inputs == job.inputs(frame):
+                self._statistics.count("skip.unchanged")
+                known[person] = last
+        self._n_taken += 1
+        return job
+
+    def _do(self, job: _Job) -> None:
+        """Dresses these people, beside what other threads do, and sends what comes of it when it is their turn."""
+        outputs: dict[str, PipelineOutput] = {}
+        try:
+            outputs = self._infer(
+                job.pipeline, {person: frame for person, frame in job.frames.items() if person not in job.known}
+            )
+        finally:  # a turn that nobody takes would be waited for
+            with self._turn(job):
+                self._finish(job, outputs)
+
+    def _finish(self, job: _Job, outputs: Mapping[str, PipelineOutput]) -> None:
+        self._remove(job.gone)
+        found, unresolved = self._remember(job, outputs)
+        dressed = {person: frame for person, frame in job.frames.items() if person in self._dressed}
         if not dressed:
             return
-        self._send(dressed, arrivals, settings)
+        self._send(job, dressed)
         done = time.monotonic()
-        latencies = [1e3 * (done - arrivals[person].received) for person in dressed]
+        latencies = [1e3 * (done - job.arrivals[person].received) for person in dressed]
         self._statistics.publish(latencies, found=found, unresolved=unresolved)
+
+    @contextmanager
+    def _turn(self, job: _Job) -> Iterator[None]:
+        """After all that was taken before."""
+        with self._in_order:
+            self._in_order.wait_for(lambda: self._n_done == job.turn)
+            try:
+                yield
+            finally:
+                self._n_done += 1
+                self._in_order.notify_all()
 
     def _near(self, arrivals: Mapping[str, Arrival], settings: NodeSettings) -> dict[str, Arrival]:
         near = {}
@@ -154,38 +230,35 @@ class Worker:
             place = arrival.placement.rotation @ arrival.frame.transl + arrival.placement.translation
             if settings.max_distance and np.linalg.norm(place) > settings.max_distance:
                 self._statistics.count("skip.distance")
-                self._remove([person])
             else:
                 near[person] = arrival
         return near
 
-    def _dress(self, frames: Mapping[str, SmplFrame]) -> tuple[int, int]:
+    def _remember(self, job: _Job, outputs: Mapping[str, PipelineOutput]) -> tuple[int, int]:
         """Brings `_dressed` up to date; returns how many vertices were inside, and still are."""
-        todo: dict[str, SmplFrame] = {}
-        for person, frame in frames.items():
-            known = self._dressed.get(person)
-            if known is not None and known.inputs == _inputs(frame):
-                self._statistics.count("skip.unchanged")
-            else:
-                todo[person] = frame
-                self._dressed.pop(person, None)
         found = unresolved = 0
-        for person, output in self._infer(todo).items():
-            if not all(np.isfinite(mesh.local).all() for mesh in output.values()):
-                self._statistics.drop("not_finite", f"{person or 'the person'}: a garment isn't finite")
-                continue
-            self._dressed[person] = _Known(_inputs(todo[person]), output)
-            found += sum(stats.n_inside for stats in output.stats.garments.values())
-            unresolved += sum(stats.n_unresolved for stats in output.stats.garments.values())
-            self._statistics.shift(output.stats.shift.largest)
-            if not output.stats.within_promise:
-                self._statistics.count("beyond_promise")
+        for person, frame in job.frames.items():
+            self._dressed.pop(person, None)
+            if person in job.known:
+                self._dressed[person] = job.known[person]
+            elif (output := outputs.get(person)) is not None:
+                if not all(np.isfinite(mesh.local).all() for mesh in output.values()):
+                    self._statistics.drop("not_finite", f"{person or 'the person'}: a garment isn't finite")
+                    continue
+                self._dressed[person] = _Known(job.inputs(frame), output)
+                found += sum(stats.n_inside for stats in output.stats.garments.values())
+                unresolved += sum(stats.n_unresolved for stats in output.stats.garments.values())
+                self._statistics.shift(output.stats.shift.largest)
+                if not output.stats.within_promise:
+                    self._statistics.count("beyond_promise")
         return found, unresolved
 
-    def _infer(self, frames: Mapping[str, SmplFrame]) -> dict[str, PipelineOutput]:
+    def _infer(self, pipeline: GarmentPipeline, frames: Mapping[str, SmplFrame]) -> dict[str, PipelineOutput]:
         """All persons in one batch; where that fails, one by one, so that one's failure is nobody else's."""
+        if not frames:
+            return {}
         try:
-            return dict(zip(frames, self._pipeline(list(frames.values())), strict=True))
+            return dict(zip(frames, pipeline(list(frames.values())), strict=True))
         except Exception as error:
             if len(frames) == 1:
                 (person,) = frames
@@ -193,7 +266,7 @@ class Worker:
                 return {}
         outputs: dict[str, PipelineOutput] = {}
         for person, frame in frames.items():
-            outputs |= self._infer({person: frame})
+            outputs |= self._infer(pipeline, {person: frame})
         return outputs
 
     def _fail(self, error: Exception, who: str) -> None:
@@ -206,17 +279,21 @@ class Worker:
             self._is_lost = True
             self._outlet.device_lost(str(error))
 
-    def _send(self, frames: Mapping[str, SmplFrame], arrivals: Mapping[str, Arrival], settings: NodeSettings) -> None:
+    def _send(self, job: _Job, frames: Mapping[str, SmplFrame]) -> None:
         """What anybody wants to know of these people."""
-        axes = Placement(np.eye(3)[list(SMPL_COLUMNS[settings.axes])])
+        if job.fittings is not self._sent_with:
+            self._sent_with = job.fittings
+            for row in self._outputs:
+                row.forget()
+        axes = Placement(np.eye(3)[list(SMPL_COLUMNS[job.settings.axes])])
         worn = []
         for person, frame in frames.items():
-            arrival, output = arrivals[person], self._dressed[person].output
+            arrival, output = job.arrivals[person], self._dressed[person].output
             there = arrival.placement.after(axes)
             offset = there.rotation @ frame.transl + there.translation
-            worn.append(Dressed(person, frame, output, self._fittings, there.rotation, offset, arrival.camera))
+            worn.append(Dressed(person, frame, output, job.fittings, there.rotation, offset, arrival.camera))
         self._here.update(frames)
-        moment = self._moment(settings)
+        moment = self._moment(job.settings)
         for row in self._outputs:
             self._publish(row.messages(worn, moment))
 
@@ -249,9 +326,3 @@ def with_settings(frame: SmplFrame, settings: NodeSettings) -> SmplFrame:
     if frame.style is None and any(settings.style):
         frame = replace(frame, style=np.array(settings.style))
     return frame
-
-
-def _inputs(frame: SmplFrame) -> bytes:
-    """All that a garment relative to the root depends on."""
-    style = b"" if frame.style is None else frame.style.tobytes()
-    return frame.pose.tobytes() + frame.betas.tobytes() + style

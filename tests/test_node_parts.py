@@ -8,6 +8,7 @@ import resource
 import tempfile
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -40,6 +41,7 @@ from refu_ros._decoding import InputDecoder
 from refu_ros._diagnostics import Situation, statuses
 from refu_ros._dresser import Dresser
 from refu_ros._loader import PipelineLoader
+from refu_ros._recording import Recording
 from refu_ros._scene import Scene, check_plausible
 from refu_ros._settings import NodeSettings, SettingsError, defaults, specs
 from refu_ros._statistics import Statistics
@@ -149,6 +151,20 @@ def test_who_is_silent_leaves_once() -> None:
     assert scene.persons == ("b",)
 
 
+def test_more_people_than_there_is_room_for_are_left_out_and_counted() -> None:
+    clock, statistics = Clock(), Statistics()
+    scene = Scene(statistics, most=3, clock=clock)
+    for round_ in range(3):  # whoever is here already stays
+        for person in "abcde":
+            scene.put(person, frame(stamp_ns=round_))
+        assert [*scene.take(timeout=0.0)] == ["a", "b", "c"]
+    clock.now = 2.0
+    scene.leave(1.0)
+    scene.put("e", frame())
+    assert scene.persons == ("e",)
+    assert "3 people are here already" in report_of(statistics)["input"].message
+
+
 def test_a_frame_wakes_the_thread_that_waits() -> None:
     scene = Scene(Statistics())
     taken: list[Any] = []
@@ -165,6 +181,7 @@ def test_a_frame_wakes_the_thread_that_waits() -> None:
     [
         (SmplFrame(pose=np.full((24, 3), 5e3)), "pose"),
         (SmplFrame(pose=np.zeros((24, 3)), betas=np.full(10, 50.0)), "betas"),
+        (SmplFrame(pose=np.zeros((24, 3)), style=np.full(4, 50.0)), "style"),
         (SmplFrame(pose=np.zeros((24, 3)), transl=np.full(3, 1e300)), "transl"),
         (SmplFrame(pose=np.zeros((24, 3)), stamp_ns=-1), "stamp"),
         (SmplFrame(pose=np.zeros((24, 3)), stamp_ns=2**63), "stamp"),
@@ -207,6 +224,17 @@ def test_a_recording_never_replaces_another(tmp_path: Path) -> None:
     assert free_path(tmp_path / "empty") == tmp_path / "empty"
 
 
+def test_recordings_that_begin_at_once_each_get_a_bag(tmp_path: Path) -> None:
+    def record(turn: int) -> str:
+        recorder = Recorder(tmp_path / f"{turn}" / "bag")
+        recorder.close()
+        return recorder.path.name
+
+    for turn in range(20):
+        with ThreadPoolExecutor(5) as pool:
+            assert {*pool.map(record, [turn] * 5)} == {"bag", *(f"bag-{i}" for i in range(1, 5))}
+
+
 def test_a_slow_disk_drops_and_never_blocks(tmp_path: Path) -> None:
     gate = threading.Event()
 
@@ -244,6 +272,33 @@ def test_a_full_disk_ends_the_recording_and_nothing_else(tmp_path: Path) -> None
     with BagReader(recorder.path / "bag_0.mcap") as bag:
         count = sum(1 for _ in bag.messages())
     assert 4 <= count <= state.written < 100
+
+
+@pytest.mark.parametrize("replaced", [False, True])
+@pytest.mark.parametrize("sync_period", [0.02, 0.0])
+def test_a_bag_that_is_taken_away_is_an_error(tmp_path: Path, sync_period: float, *, replaced: bool) -> None:
+    """While it is written, or where the disk isn't waited for, as it is closed; nobody else's file is touched."""
+    said: list[str] = []
+    logger = SimpleNamespace(info=said.append, error=lambda text: said.append(f"ERROR {text}"))
+    recording = Recording(logger, sync_period=sync_period)
+    recording.start(str(tmp_path / "bag"))
+    recording.put("/t", "std_msgs/msg/Float32MultiArray", b"\0\1\0\0", QosProfile())
+    file = tmp_path / "bag" / "bag_0.mcap"
+    file.unlink()
+    if replaced:
+        file.write_bytes(b"another's")
+    while sync_period and not recording.state()[1]:
+        time.sleep(0.01)
+    recording.close()
+    words = "another file has taken its place" if replaced else "No such file"
+    assert said[-1].startswith("ERROR ")
+    assert words in said[-1]
+    assert words in recording.state()[1]
+    assert not replaced or file.read_bytes() == b"another's"
+    recording.start(str(tmp_path / "next"))
+    assert recording.state()[1] == ""
+    recording.close()
+    assert said[-1] == f"recorded 0 messages to {tmp_path / 'next'}"
 
 
 def test_a_path_that_cannot_be_written(tmp_path: Path) -> None:
@@ -389,6 +444,7 @@ class Choosy:
     def __init__(self, pipeline: GarmentPipeline) -> None:
         self._pipeline = pipeline
         self.body, self.garments, self.margin = pipeline.body, pipeline.garments, pipeline.margin
+        self.threads = pipeline.threads
 
     def __call__(self, frames: list[SmplFrame]) -> list[Any]:
         if any(frame.pose[1, 0] > 1 for frame in frames):
@@ -436,6 +492,75 @@ def test_the_rate_limit(pipeline: GarmentPipeline, monkeypatch: pytest.MonkeyPat
     assert (total["skip.max_rate"], total["drop.stale"]) == (100 - 10 - 1, 0)  # the last one waits
 
 
+class Uneven(Choosy):
+    """A pipeline of two threads whose first call ends after its second one."""
+
+    def __init__(self, pipeline: GarmentPipeline, *, fails: bool) -> None:
+        super().__init__(pipeline)
+        self.threads, self.fails = 2, fails
+        self.began: list[int] = []
+        self.first_began, self.second_ended = threading.Event(), threading.Event()
+
+    def __call__(self, frames: list[SmplFrame]) -> list[Any]:
+        self.began.append(frames[0].stamp_ns)
+        if frames[0].stamp_ns == 1:
+            self.first_began.set()
+            assert self.second_ended.wait(60)
+            if self.fails:
+                raise MemoryError
+        outputs = super().__call__(frames)
+        if frames[0].stamp_ns == 2:
+            self.second_ended.set()
+        return outputs
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_threads_send_in_the_order_in_which_frames_came(pipeline: GarmentPipeline, *, fails: bool) -> None:
+    uneven, statistics, viewer = Uneven(pipeline, fails=fails), Statistics(), Viewer()
+    scene = Scene(statistics)
+    settings = NodeSettings(garments=(GARMENT,), threads=3)
+    worker = Worker(scene, statistics, viewer, settings=settings, pipeline=uneven)  # type: ignore[arg-type]
+    worker.start()
+    scene.put("", frame(0.1, stamp_ns=1))
+    assert uneven.first_began.wait(60)
+    scene.put("", frame(0.2, stamp_ns=2))
+    assert uneven.second_ended.wait(60), "it was worked on beside the first"
+    worker.stop()
+    sent = [markers[0].stamp_ns for markers in viewer.messages if markers[0].action == 0]
+    assert sent == ([2] if fails else [1, 2])
+    assert uneven.began == [1, 2]
+    assert statistics.report().total["drop.failed"] == int(fails)
+
+
+def test_no_more_is_taken_than_the_pipeline_has_threads(pipeline: GarmentPipeline) -> None:
+    """What waits to be computed is replaced by what is newer, as long as nobody has taken it."""
+    began, may_end = threading.Event(), threading.Event()
+
+    class Waiting(Choosy):
+        def __call__(self, frames: list[SmplFrame]) -> list[Any]:
+            began.set()
+            assert may_end.wait(60)
+            return super().__call__(frames)
+
+    statistics, viewer = Statistics(), Viewer()
+    scene = Scene(statistics)
+    settings = NodeSettings(garments=(GARMENT,), threads=3)
+    worker = Worker(scene, statistics, viewer, settings=settings, pipeline=Waiting(pipeline))  # type: ignore[arg-type]
+    worker.start()
+    scene.put("", frame(0.1, stamp_ns=1))
+    assert began.wait(60)
+    scene.put("", frame(0.2, stamp_ns=2))
+    scene.put("", frame(0.3, stamp_ns=3))
+    assert statistics.report().total["drop.stale"] == 1
+    may_end.set()
+    for _ in range(600):
+        if sum(markers[0].action == 0 for markers in viewer.messages) == 2:
+            break
+        time.sleep(0.1)
+    worker.stop()
+    assert [markers[0].stamp_ns for markers in viewer.messages if markers[0].action == 0] == [1, 3]
+
+
 # Loader -------------------------------------------------------------------------------------------
 
 
@@ -458,18 +583,30 @@ def test_what_cannot_be_loaded_is_reported() -> None:
 
 
 def report_of(
-    statistics: Statistics, recording: RecorderState | None = None, *, has_foreign_betas: bool = False, **settings: Any
+    statistics: Statistics,
+    recording: RecorderState | None = None,
+    *,
+    persons: tuple[str, ...] = ("",),
+    has_foreign_betas: bool = False,
+    **settings: Any,
 ) -> dict[str, Any]:
     now = Situation(
         node="n",
         state="active",
-        persons=("",),
+        persons=persons,
         recording=recording,
         recording_error=recording.error if recording else "",
         has_foreign_betas=has_foreign_betas,
     )
     found = statuses(statistics.report(), NodeSettings().changed(settings), now)
     return {status.name.removeprefix("n: "): status for status in found}
+
+
+def test_messages_with_nobody_in_them_are_no_silence() -> None:
+    statistics = Statistics()
+    statistics.receive()
+    assert report_of(statistics, persons=())["input"].message == "nobody is here, though 1 messages came"
+    assert report_of(statistics, persons=())["input"].message.startswith("no input for")
 
 
 def test_levels_mean_something(tmp_path: Path) -> None:

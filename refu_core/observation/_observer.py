@@ -88,9 +88,7 @@ class Observer:
 
     def _adjusted(self, dressed: Dressed, points: NDArray[np.float64], eye: NDArray[np.float64] | None) -> Dressed:
         turn = dressed.turns[0]
-        near = _to_root(turn, points).astype(np.float32)
-        if len(near) > 4 * self._settings.most_points:  # a picture of more than the person
-            near = self._near(dressed, near)
+        near = self._near(dressed, _to_root(turn, points)).astype(np.float32)
         seen = averaged(near, self._settings) if len(near) else None
         camera = None if eye is None else _to_root(turn, eye[None])[0]
         if seen is not None:
@@ -113,8 +111,8 @@ class Observer:
             )
         return dressed._replace(drapes=drapes)
 
-    def _near(self, dressed: Dressed, points: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Those of the points (N, 3) that may be of a garment."""
+    def _near(self, dressed: Dressed, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Those of the points (N, 3) that may be of a garment: a picture has more than the person, at any distance."""
         every = [drape.vertices[0].cpu().numpy() for drape in dressed.drapes.values()]
         reach = self._settings.reach + self._settings.bound * self._settings.amplitude
         low, high = np.min([v.min(0) for v in every], 0) - reach, np.max([v.max(0) for v in every], 0) + reach

@@ -1,48 +1,28 @@
 """What robots and planners ask of dressed people, besides meshes; nothing of it is computed unless it is asked for."""
 
-from refu_core.outputs._clearance import REACH, Clearance
-from refu_core.outputs._dressed import Dressed, Fittings
-from refu_core.outputs._limbs import PRESSED, LimbContact, LimbContacts
-from refu_core.outputs._normals import VertexNormals
-from refu_core.outputs._openings import Opening, Openings
-from refu_core.outputs._planner import HALF_THICKNESS, MAX_TRIANGLES, PlannerMesh
-from refu_core.outputs._sigma import (
-    RADIUS_90,
-    UNKNOWN_SIGMA,
-    Sigma,
-    SigmaMap,
-    bend_of,
-    fit_sigma,
-    load_sigma,
-    save_sigma,
-)
-from refu_core.outputs._visible import DepthImage, PinholeCamera, all_visible, depth_image, visible
-
-__all__ = [
-    "HALF_THICKNESS",
-    "MAX_TRIANGLES",
-    "PRESSED",
-    "RADIUS_90",
-    "REACH",
-    "UNKNOWN_SIGMA",
-    "Clearance",
-    "DepthImage",
-    "Dressed",
-    "Fittings",
-    "LimbContact",
-    "LimbContacts",
-    "Opening",
-    "Openings",
-    "PinholeCamera",
-    "PlannerMesh",
-    "Sigma",
-    "SigmaMap",
-    "VertexNormals",
-    "all_visible",
-    "bend_of",
-    "depth_image",
-    "fit_sigma",
-    "load_sigma",
-    "save_sigma",
-    "visible",
-]
+from refu_core.outputs._clearance import REACH as REACH
+from refu_core.outputs._clearance import Clearance as Clearance
+from refu_core.outputs._dressed import Dressed as Dressed
+from refu_core.outputs._dressed import Fittings as Fittings
+from refu_core.outputs._limbs import PRESSED as PRESSED
+from refu_core.outputs._limbs import LimbContact as LimbContact
+from refu_core.outputs._limbs import LimbContacts as LimbContacts
+from refu_core.outputs._normals import VertexNormals as VertexNormals
+from refu_core.outputs._openings import Opening as Opening
+from refu_core.outputs._openings import Openings as Openings
+from refu_core.outputs._planner import HALF_THICKNESS as HALF_THICKNESS
+from refu_core.outputs._planner import MAX_TRIANGLES as MAX_TRIANGLES
+from refu_core.outputs._planner import PlannerMesh as PlannerMesh
+from refu_core.outputs._sigma import RADIUS_90 as RADIUS_90
+from refu_core.outputs._sigma import UNKNOWN_SIGMA as UNKNOWN_SIGMA
+from refu_core.outputs._sigma import Sigma as Sigma
+from refu_core.outputs._sigma import SigmaMap as SigmaMap
+from refu_core.outputs._sigma import bend_of as bend_of
+from refu_core.outputs._sigma import fit_sigma as fit_sigma
+from refu_core.outputs._sigma import load_sigma as load_sigma
+from refu_core.outputs._sigma import save_sigma as save_sigma
+from refu_core.outputs._visible import DepthImage as DepthImage
+from refu_core.outputs._visible import PinholeCamera as PinholeCamera
+from refu_core.outputs._visible import all_visible as all_visible
+from refu_core.outputs._visible import depth_image as depth_image
+from refu_core.outputs._visible import visible as visible

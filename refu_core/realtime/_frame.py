@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -74,8 +75,8 @@ class FrameStep:
     """
 
     def __init__(self, outfit: Outfit, contact: ContactStage | None) -> None:
-        """Without `contact` nothing is done about collisions."""
-        self._outfit, self.contact = outfit, contact
+        """Without `contact` nothing is done about collisions. One call at a time: both have memory to work in."""
+        self.outfit, self.contact = outfit, contact
         self._order = list(outfit.wearables) if contact is None else contact.order
         sizes = [outfit.body.n_vertices * 3] * 2 + [N_SHIFT]
         for one in outfit.wearables.values():
@@ -97,13 +98,13 @@ class FrameStep:
         predicted may be changed by `adjust` before anything is done about collisions.
         """
         shared = StageClock()
-        dressed = dress(pose, wearer, lap=shared.lap)
+        dressed = dress(pose, replace(wearer, outfit=self.outfit), lap=shared.lap)
         if adjust is not None:
             dressed = adjust(dressed)
             shared.lap("adjust")
-        margin_of = dict(zip(self._outfit.wearables, margins, strict=True))
+        margin_of = dict(zip(self.outfit.wearables, margins, strict=True))
         persons = []
-        shifts = _shift(dressed, self._outfit.collider)
+        shifts = _shift(dressed, self.outfit.collider)
         for person, (body, skin, turn) in enumerate(zip(dressed.body, dressed.skin, dressed.turns, strict=True)):
             clock = clocks[person] if clocks else StageClock()
             clock.start(shared, share=1 / len(pose))
@@ -127,7 +128,7 @@ class FrameStep:
                         pressed=pressed,
                         on_mean=drape.on_mean[person],
                         margin=margin_of[name],
-                        scale=scale_of(self._outfit.wearables[name], drape, person),
+                        scale=scale_of(self.outfit.wearables[name], drape, person),
                         n_layered=n_layered,
                     )
                 garments[name] = Worn(vertices, raw, numbers, n_clipped)
@@ -138,9 +139,9 @@ class FrameStep:
     def packed(self, inputs: Mapping[str, Tensor], margins: tuple[float, ...]) -> Tensor:
         """The same of `pose` and a wearer's tensors: all results in one tensor (B, …), which `unpacked` reads."""
         rows = []
-        for person in self(inputs["pose"], Wearer.of_tensors(self._outfit, inputs), margins):
+        for person in self(inputs["pose"], Wearer.of_tensors(self.outfit, inputs), margins):
             parts = [person.turn(person.body), person.turn(person.skin), person.shift]
-            for name in self._outfit.wearables:
+            for name in self.outfit.wearables:
                 worn = person.garments[name]
                 parts += [person.turn(worn.vertices), person.turn(worn.raw), worn.numbers]
             rows.append(torch.cat([part.flatten() for part in parts]))

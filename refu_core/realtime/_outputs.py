@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
+
+    from refu_core.frames import SmplFrame
 
 SKIPS: Mapping[str, str] = {
     "band": "distances of vertices that are farther off the skin than they matter (accurate)",
@@ -106,6 +108,9 @@ class GarmentMesh:
         """Vertices with the translation [m], shape (V, 3); added in float64, so that distant bodies stay precise."""
         return self.local + self.transl
 
+    def __repr__(self) -> str:
+        return f"GarmentMesh({len(self.local)} vertices, {len(self.faces)} faces)"
+
 
 @dataclass(frozen=True, eq=False)
 class PipelineOutput(Mapping[str, GarmentMesh]):
@@ -134,8 +139,23 @@ class PipelineOutput(Mapping[str, GarmentMesh]):
         """Translation of the person [m], shape (3,): `body + transl` is where `vertices` of the garments are."""
         return next(iter(self.garments.values())).transl
 
+    def at(self, frame: SmplFrame) -> PipelineOutput:
+        """The same arrays for a person who has moved without changing pose."""
+        garments = {name: replace(mesh, transl=frame.transl) for name, mesh in self.items()}
+        counts = {name: replace(one, ms=0.0) for name, one in self.stats.garments.items()}
+        stage_ms = dict.fromkeys(self.stats.stage_ms, 0.0)
+        took = replace(self.stats, stage_ms=stage_ms, garments=counts, skipped={"unchanged": 1})
+        return PipelineOutput(garments, self.posed_body, self.posed_skin, took)
+
     def __getitem__(self, name: str) -> GarmentMesh:
-        return self.garments[name]
+        try:
+            return self.garments[name]
+        except KeyError as error:
+            msg = f"no garment {name!r}: this person wears {', '.join(self.garments)}"
+            raise KeyError(msg) from error
+
+    def __repr__(self) -> str:
+        return f"PipelineOutput({dict(self.garments)})"
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.garments)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from numbers import Real
+from queue import LifoQueue
 from types import NoneType
 from typing import TYPE_CHECKING, NoReturn, overload
 
@@ -28,7 +30,7 @@ from refu_core.realtime._graph import StepGraphs
 from refu_core.realtime._load import load_outfit
 from refu_core.realtime._outputs import SKIPS, FrameStats, GarmentMesh, GarmentStats, PipelineOutput, SkinShift
 from refu_core.realtime._promise import within_promise
-from refu_core.realtime._wearer import Outfit, Wearer
+from refu_core.realtime._wearer import Wearer
 from refu_core.sdf import require_outward
 
 if TYPE_CHECKING:
@@ -49,9 +51,8 @@ _ON_GPU = threading.Lock()
 class GarmentPipeline:
     """Predicts garments on SMPL bodies, frame by frame, and brings them off the body (paper, Sec. 3).
 
-    Any thread may call a pipeline, set its `margin`, and read what it has returned; calls wait for each other. For
-    frames at the same time, load a pipeline for each thread. Load one in each process, after the fork: it can't be
-    pickled.
+    Any thread may call a pipeline, set its `margin`, and read what it has returned. As many calls run at the same time
+    as it has `threads`, and others wait. Load one in each process, after the fork: it can't be pickled.
 
     Example:
         >>> pipeline = GarmentPipeline.load(["tshirt-male"])
@@ -62,28 +63,33 @@ class GarmentPipeline:
 
     def __init__(
         self,
-        outfit: Outfit,
-        contact: ContactStage | None,
+        steps: Sequence[FrameStep],
         *,
         margin: float | None,
         style: Tensor | None,
         no_skip: Collection[str] = (),
         graph: bool = True,
     ) -> None:
-        self.outfit = outfit
+        self._steps = steps
+        self.outfit = outfit = steps[0].outfit
         """The body model, the garments and their networks."""
         self._margin = margin
         self._style = style
         self._skips = frozenset(SKIPS) - frozenset(no_skip)
-        self._step = FrameStep(outfit, contact)
         on_gpu = outfit.body.device.type == "cuda"
-        self._graphs = StepGraphs(self._step.packed, outfit.body.device) if graph and on_gpu else None
+        self._graphs = StepGraphs(steps[0].packed, outfit.body.device) if graph and on_gpu else None
+        contact = steps[0].contact
         self._is_certified = contact is not None and contact.winding is not None
-        self._lock = _ON_GPU if on_gpu else threading.Lock()
+        self._free: LifoQueue[FrameStep] = LifoQueue()  # the one used last has its memory in the cache
+        for step in steps:
+            self._free.put(step)
+        self._device_lock = _ON_GPU if on_gpu else None
+        self._lock = threading.Lock()
+        """Of what is remembered."""
         self._faces = {name: one.template.faces.cpu().numpy() for name, one in outfit.wearables.items()}
         self._wearers: OrderedDict[bytes, Wearer] = OrderedDict()
         self._batch: tuple[tuple[Wearer, ...], Wearer] | None = None
-        self._last: dict[bytes, PipelineOutput] = {}
+        self._last: tuple[float | None, dict[bytes, PipelineOutput]] = margin, {}
 
     @property
     def body(self) -> SmplBody:
@@ -101,6 +107,11 @@ class GarmentPipeline:
         return [] if self.fit is None else self.fit.warnings
 
     @property
+    def threads(self) -> int:
+        """How many calls may run at the same time."""
+        return len(self._steps)
+
+    @property
     def margin(self) -> float | None:
         """Clearance that is kept from the skin [m]; None for what each garment's weights were trained with."""
         return self._margin
@@ -108,9 +119,10 @@ class GarmentPipeline:
     @margin.setter
     def margin(self, margin: float | None) -> None:
         _check_margin(margin)
-        with self._lock:
-            self._margin = margin
-            self._last = {}  # what nobody moved for is not what it would be now
+        self._margin = margin
+
+    def __repr__(self) -> str:
+        return f"GarmentPipeline({', '.join(self.garments)} on {self.body.name}, {self.body.device})"
 
     def __reduce__(self) -> NoReturn:
         """Raises `RefuError`: memory that kernels work in can't be taken elsewhere."""
@@ -134,6 +146,7 @@ class GarmentPipeline:
         graph: bool = True,
         certify: bool = True,
         collider: bool = True,
+        threads: int = 1,
     ) -> GarmentPipeline:
         """Loads garments and what they need.
 
@@ -157,18 +170,23 @@ class GarmentPipeline:
                 eighth of a frame's time; without, by the distances that pushed it, which may be wrong.
             collider: bring garments off a body whose overlaps were pulled apart (`PipelineOutput.body`); without, off
                 the posed body itself as in the paper, in which there is no room where limbs run through each other.
+            threads: how many calls may run at the same time; each has working memory of its own. On a GPU one.
 
         Raises:
             GarmentError: no garment, an unknown one, garments of two bodies, or a bad style.
             BodyError: no such body, or one that isn't in metres, upright, facing forward, in the T-pose and closed.
             WeightsError: no such backbone, or no weights of it for a garment, a mode, and the garment's body.
-            RefuError: an unknown mode, margin, device or skip.
+            RefuError: an unknown mode, margin, device or skip, or fewer than one thread.
         """
         mode = SdfMode.of(sdf, "sdf mode")
         _check_margin(margin)
         unknown = sorted({no_skip} if isinstance(no_skip, str) else set(no_skip) - set(SKIPS))
         if unknown:
             msg = f"nothing is skipped by the name {', '.join(unknown)}: wanted a collection of {', '.join(SKIPS)}"
+            raise RefuError(msg)
+        require_type(threads, int, "a number of threads")
+        if threads < 1:
+            msg = f"wanted at least one thread, got {threads}"
             raise RefuError(msg)
         torch_device = checked_device(device)
         outfit = load_outfit(
@@ -187,10 +205,14 @@ class GarmentPipeline:
                 one.template.rest(
                     gamma.new_zeros(1, 10), gamma
                 )  # says now, not in the first frame, if it has no styles
-        contact = None
-        if mode is not SdfMode.NONE:
-            contact = ContactStage(outfit, sdf=mode, uses_band="band" not in no_skip, certify=certify)
-        return cls(outfit, contact, margin=margin, style=gamma, no_skip=no_skip, graph=graph)
+        steps = []
+        for k in range(threads if torch_device.type == "cpu" else 1):
+            own = outfit.beside() if k else outfit
+            contact = None
+            if mode is not SdfMode.NONE:
+                contact = ContactStage(own, sdf=mode, uses_band="band" not in no_skip, certify=certify)
+            steps.append(FrameStep(own, contact))
+        return cls(steps, margin=margin, style=gamma, no_skip=no_skip, graph=graph)
 
     @property
     def garments(self) -> dict[str, GarmentTemplate]:
@@ -221,10 +243,10 @@ class GarmentPipeline:
             require_type(frames, Sequence, "a SmplFrame or a sequence of them", error=FrameError)
             for one in frames:
                 require_type(one, SmplFrame, "a SmplFrame in every place of the sequence", error=FrameError)
-        with self._lock:
+        with self._turn() as step:
             if isinstance(frames, SmplFrame):
-                return self._dress_all([frames])[0]
-            return self._dress_all(frames)
+                return self._dress_all(step, [frames])[0]
+            return self._dress_all(step, frames)
 
     def adjusted(self, frame: SmplFrame, adjust: Adjust) -> PipelineOutput:
         """Dresses one frame, and lets `adjust` change what was predicted before it is brought off the body.
@@ -238,37 +260,53 @@ class GarmentPipeline:
             RefuError: as `__call__`, and what `adjust` raises.
         """
         require_type(frame, SmplFrame, "a SmplFrame", error=FrameError)
-        with self._lock:
-            return self._run([frame], adjust)[0]
+        with self._turn() as step:
+            return self._run(step, [frame], self._margin, adjust)[0]
 
-    def _dress_all(self, frames: Sequence[SmplFrame]) -> list[PipelineOutput]:
-        keys = [_key(frame) for frame in frames]
-        known = self._last if "unchanged" in self._skips else {}
+    @contextmanager
+    def _turn(self) -> Iterator[FrameStep]:
+        """What one call computes with, as soon as it is free."""
+        step = self._free.get()
+        try:
+            if self._device_lock is None:
+                yield step
+            else:
+                with self._device_lock:
+                    yield step
+        finally:
+            self._free.put(step)
+
+    def _dress_all(self, step: FrameStep, frames: Sequence[SmplFrame]) -> list[PipelineOutput]:
+        margin, keys = self._margin, [_key(frame) for frame in frames]
+        of_margin, known = self._last
+        if of_margin != margin or "unchanged" not in self._skips:
+            known = {}
         new = {key: frame for key, frame in zip(keys, frames, strict=True) if key not in known}
         outputs = {key: known[key] for key in keys if key in known}
         if new:
-            outputs |= zip(new, self._run(list(new.values())), strict=True)
-        self._last = outputs
+            outputs |= zip(new, self._run(step, list(new.values()), margin), strict=True)
+        self._last = margin, outputs
         return [
-            outputs[key] if new.get(key) is frame else _moved(outputs[key], frame)
+            outputs[key] if new.get(key) is frame else outputs[key].at(frame)
             for key, frame in zip(keys, frames, strict=True)
         ]
 
-    def _run(self, frames: Sequence[SmplFrame], adjust: Adjust | None = None) -> list[PipelineOutput]:
+    def _run(
+        self, step: FrameStep, frames: Sequence[SmplFrame], margin: float | None, adjust: Adjust | None = None
+    ) -> list[PipelineOutput]:
         clocks = [StageClock() for _ in frames]
-        found = [self._wearer(frame) for frame in frames]
-        wearer = self._together(tuple(wearer for wearer, _ in found))
+        with self._lock:
+            found = [self._wearer(frame) for frame in frames]
+            wearer = self._together(tuple(wearer for wearer, _ in found))
         pose = torch.as_tensor(np.stack([f.pose for f in frames]))
-        margins = tuple(one.margin if self.margin is None else self.margin for one in self.outfit.wearables.values())
+        margins = tuple(one.margin if margin is None else margin for one in self.outfit.wearables.values())
         if self._graphs is not None and adjust is None:
             packed = self._graphs({"pose": pose, **wearer.tensors()}, margins)
-            outputs = [
-                self._unpacked(frame, parts) for frame, parts in zip(frames, self._step.unpacked(packed), strict=True)
-            ]
+            outputs = [self._unpacked(frame, parts) for frame, parts in zip(frames, step.unpacked(packed), strict=True)]
             clocks[0].lap("step")
             took = {"step": clocks[0].stages["step"] / len(frames)}
             return [replace(one, stats=replace(one.stats, stage_ms=took)) for one in outputs]
-        persons = self._step(pose.to(self.body.device), wearer, margins, clocks, adjust)
+        persons = step(pose.to(self.body.device), wearer, margins, clocks, adjust)
         return [
             self._output(frame, person, clock, skipped)
             for frame, person, clock, (_, skipped) in zip(frames, persons, clocks, found, strict=True)
@@ -284,7 +322,7 @@ class GarmentPipeline:
         betas = torch.tensor(frame.betas, device=self.body.device)[None]
         style = self._style if frame.style is None else torch.tensor(frame.style, device=self.body.device)[None]
         wearer = Wearer.of(self.outfit, betas, style)
-        if self._step.contact is not None:  # of a body that its β turn inside out, every vertex would be inside
+        if self._steps[0].contact is not None:  # of a body that its β turn inside out, every vertex would be inside
             require_outward(wearer.shape.vertices, self.body.faces)
         while len(self._wearers) >= _MOST_WEARERS:
             self._wearers.popitem(last=False)
@@ -336,15 +374,6 @@ def _key(frame: SmplFrame, *, of_pose: bool = True) -> bytes:
     """Equal for two persons who differ in their place alone."""
     style = b"" if frame.style is None else b"s" + frame.style.tobytes()
     return frame.betas.tobytes() + (frame.pose.tobytes() if of_pose else b"") + style
-
-
-def _moved(output: PipelineOutput, frame: SmplFrame) -> PipelineOutput:
-    """The same arrays for a person who has moved without changing pose."""
-    garments = {name: replace(mesh, transl=frame.transl) for name, mesh in output.items()}
-    counts = {name: replace(one, ms=0.0) for name, one in output.stats.garments.items()}
-    stage_ms = dict.fromkeys(output.stats.stage_ms, 0.0)
-    took = replace(output.stats, stage_ms=stage_ms, garments=counts, skipped={"unchanged": 1})
-    return PipelineOutput(garments, output.posed_body, output.posed_skin, took)
 
 
 def _check_margin(margin: float | None) -> None:

@@ -54,6 +54,10 @@ class Outfit:
         """The skin that each garment lies on, by name."""
         return {name: SkinBelow.of(one.template, self.body) for name, one in self.wearables.items()}
 
+    def beside(self) -> Outfit:
+        """The same with a collider of its own, for another thread: nothing else has memory that a frame works in."""
+        return self if self.collider is None else replace(self, collider=Collider(self.body, gap=self.collider.gap))
+
     def to(self, dtype: torch.dtype) -> Outfit:
         """The same in another precision; nothing is shared."""
         body = self.body.to(dtype=dtype)

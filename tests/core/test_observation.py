@@ -118,6 +118,20 @@ def test_points_inside_the_body_do_not_bring_cloth_into_it(pipeline: GarmentPipe
     assert out.stats.garments[NAME].n_unresolved == 0
 
 
+@pytest.mark.parametrize("far", [1e3, 1e18, float(np.finfo(np.float32).max), 1e300])
+@pytest.mark.filterwarnings("error")
+def test_a_stray_point_changes_nothing(pipeline: GarmentPipeline, observer: Observer, far: float) -> None:
+    """However far: some cameras send the largest number where they have measured nothing."""
+    frame = SmplFrame(pose=np.zeros(72))
+    cloth = pipeline(frame)[NAME].local[::3] + np.array([0.0, 0.0, 0.01])
+    found = []
+    for points in (cloth, np.vstack([cloth, [[far, -far, far]]])):
+        observer.reset()
+        found.append(observer(frame, points)[NAME].local)
+        assert observer.matched[NAME] > 300
+    np.testing.assert_array_equal(*found)
+
+
 def test_it_fades_and_stays_within_bounds(pipeline: GarmentPipeline, observer: Observer) -> None:
     """Points that say the same for long move it only so far; without points it goes back."""
     observer.reset()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from pathlib import Path
 
 import numpy as np
@@ -296,3 +297,30 @@ def test_the_readme_example_runs(capsys: pytest.CaptureFixture[str]) -> None:
     garment, body = capsys.readouterr().out.splitlines()
     assert garment.startswith(f"({load_garment('tshirt-male').n_vertices}, 3)")
     assert body == f"torch.Size([1, {load_body('male').n_vertices}, 3])"
+
+
+@pytest.mark.parametrize("sdf", ["approx", "accurate"])
+def test_a_pipeline_that_nobody_needs_leaves_no_memory_behind(sdf: str) -> None:
+    """Python looks for rings seldom, and counts objects, not bytes: nothing large may be in one."""
+    name = "tshirt-male"
+    GarmentPipeline.load([name], backbone="skinned", sdf=sdf)(SmplFrame(np.zeros((24, 3))))  # what is loaded once
+    gc.collect()
+    gc.set_debug(gc.DEBUG_SAVEALL)
+    try:
+        GarmentPipeline.load([name], backbone="skinned", sdf=sdf)(SmplFrame(np.zeros((24, 3))))
+        gc.collect()
+        left = sum(ring.nbytes for ring in gc.garbage if isinstance(ring, (np.ndarray, torch.Tensor)))
+    finally:
+        gc.set_debug(0)
+        gc.garbage.clear()
+    assert left < 1000
+
+
+def test_what_a_newcomer_types_answers_in_a_line(pipeline: GarmentPipeline) -> None:
+    output = pipeline(SmplFrame(pose=np.zeros((24, 3))))
+    with pytest.raises(KeyError, match="no garment 'tshirt': this person wears"):
+        output["tshirt"]
+    assert "tshirt" not in output
+    for shown in (pipeline, output, next(iter(output.values()))):
+        assert len(repr(shown).splitlines()) == 1
+        assert len(repr(shown)) < 200

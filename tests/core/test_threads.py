@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import copy
 import pickle
+import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
@@ -13,7 +14,7 @@ import pytest
 import torch
 
 from refu_core import GarmentPipeline, RefuError, SmplFrame
-from refu_core.realtime import PipelineOutput
+from refu_core.realtime import Dressed, PipelineOutput
 from refu_lab.stress import everyday
 
 _GARMENTS = ("tshirt-male", "short-pant-male")
@@ -47,10 +48,10 @@ def _in_threads(call: Callable[[SmplFrame], PipelineOutput], frames: list[SmplFr
         return list(threads.map(call, frames))
 
 
-@pytest.mark.parametrize("sdf", ["hybrid", "accurate"])
-def test_eight_threads_give_what_one_gives(pipeline: GarmentPipeline, sdf: str) -> None:
-    if sdf == "accurate":
-        pipeline = GarmentPipeline.load(_GARMENTS[0], sdf=sdf)
+@pytest.mark.parametrize(("sdf", "threads"), [("hybrid", 1), ("hybrid", 2), ("accurate", 3)])
+def test_eight_threads_give_what_one_gives(pipeline: GarmentPipeline, sdf: str, threads: int) -> None:
+    if threads > 1:
+        pipeline = GarmentPipeline.load(_GARMENTS[: 4 - threads], sdf=sdf, threads=threads)
     frames = _frames(16)
     one_by_one = [pipeline(frame) for frame in frames]
     # What is made when it is first asked for (raw, body) is asked for after all frames, by another thread.
@@ -73,7 +74,7 @@ def test_bodies_and_garments_hold_nothing_of_a_call(pipeline: GarmentPipeline) -
 
 
 def test_tasks_and_batches_give_what_one_thread_gives(pipeline: GarmentPipeline) -> None:
-    batches = [_frames(2, seed) for seed in range(4)]
+    batches = [_frames(2, seed) for seed in range(1, 5)]  # nobody whom an earlier call knew
     alone = [pipeline(batch) for batch in batches]
 
     async def together() -> list[list[PipelineOutput]]:
@@ -84,7 +85,10 @@ def test_tasks_and_batches_give_what_one_thread_gives(pipeline: GarmentPipeline)
         assert all(map(_are_equal, outs, expected))
 
 
-def test_a_margin_that_another_thread_sets_holds_for_whole_frames(pipeline: GarmentPipeline) -> None:
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_margin_that_another_thread_sets_holds_for_whole_frames(pipeline: GarmentPipeline, threads: int) -> None:
+    if threads > 1:
+        pipeline = GarmentPipeline.load(_GARMENTS, threads=threads)
     frames, margins = _frames(4), (0.002, 0.006)
     expected: list[list[PipelineOutput]] = []
     for margin in margins:
@@ -120,3 +124,31 @@ def test_a_pipeline_that_is_pickled_says_what_to_do_instead(
 ) -> None:
     with pytest.raises(RefuError, match="load one in each process"):
         take(pipeline)
+
+
+def test_calls_run_at_the_same_time_and_no_more_than_asked_for() -> None:
+    pipeline, frame = GarmentPipeline.load(_GARMENTS[1:], threads=2), _frames(1)[0]
+    inside, most, both = 0, 0, threading.Event()
+    counting = threading.Lock()
+
+    def adjust(dressed: Dressed) -> Dressed:
+        nonlocal inside, most
+        with counting:
+            inside += 1
+            most = max(most, inside)
+            if inside == 2:
+                both.set()
+        assert both.wait(60), "each waits for another one to be there, too"
+        with counting:
+            inside -= 1
+        return dressed
+
+    with _threads(4) as threads:
+        list(threads.map(lambda _: pipeline.adjusted(frame, adjust), range(4)))
+    assert most == 2
+
+
+@pytest.mark.parametrize("threads", [0, -1, 1.5, "2"])
+def test_a_number_of_threads_that_is_none_is_refused(threads: object) -> None:
+    with pytest.raises(RefuError, match="thread"):
+        GarmentPipeline.load(_GARMENTS, threads=threads)  # type: ignore[arg-type]
