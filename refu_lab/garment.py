@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +24,7 @@ from refu_core.fitting import (
     standing_pose,
 )
 from refu_core.frames import N_JOINTS
-from refu_core.garments import garment_files, garments_folder, save_garment
+from refu_core.garments import garment_files, garments_folder, require_name, save_garment
 from refu_core.metrics import CollisionChecker
 from refu_core.modes import BUILTIN_GARMENTS
 from refu_core.recordings import SUFFIXES, read_recording
@@ -59,7 +61,13 @@ class AddOptions:
         """Where the garment's file goes: into the user's folder, unless it is told otherwise."""
         if self.output is not None:
             return self.output
-        return garments_folder() / f"{self.name or self.mesh.stem}.npz"
+        return garments_folder() / f"{self.name or _name_of(self.mesh)}.npz"
+
+
+def _name_of(mesh: Path) -> str:
+    """A name like the file's: `T-Shirt (1).obj` is `T-Shirt-1`."""
+    plain = unicodedata.normalize("NFKD", mesh.stem).encode("ascii", "ignore").decode()
+    return re.sub(r"[^A-Za-z0-9_]+", "-", plain).strip("-_") or mesh.stem
 
 
 def try_on_poses() -> dict[str, NDArray[np.float32]]:
@@ -81,6 +89,9 @@ def add_garment(options: AddOptions) -> dict[str, Any]:
     if name in BUILTIN_GARMENTS:
         msg = f"{name} is a garment that ships: call this one otherwise (--name)"
         raise GarmentError(msg)
+    if options.name is not None:
+        require_name(options.name)  # of which a path may be made, too
+    require_name(name)
     if target.exists() and not options.overwrite:
         msg = f"{target} is there already: give it another --name, or --overwrite it"
         raise GarmentError(msg)
@@ -93,8 +104,8 @@ def add_garment(options: AddOptions) -> dict[str, Any]:
         details=_details(options),
         longest_edge=options.longest_edge,
     )
-    save_garment(made.template, target)
     worn = try_on(made)
+    save_garment(made.template, target)
     template = made.template
     if options.picture is not None:
         save_png(picture([str(target)]), options.picture)

@@ -18,6 +18,8 @@ Ints = NDArray[np.int64]
 
 _SAME_PLACE = 1e-5
 """Vertices nearer than this are one, as a share of the mesh's extent: 10 µm of a dress."""
+_FAR_OFF = 20.0
+"""How many times as far off as nearly all of a mesh what doesn't belong to it is."""
 MAX_VERTICES = 60_000
 """Of a garment that is worn: at 10 mm a frame has a tenth of that many."""
 
@@ -32,7 +34,7 @@ def clean(mesh: SurfaceMesh) -> tuple[SurfaceMesh, list[str]]:
         GarmentError: no surface is left, or it has one side only (a Möbius strip).
     """
     notes: list[str] = []
-    mesh = _without_double_faces(mesh, notes)
+    mesh = _without_double_faces(_without_strays(mesh, notes), notes)
     if not len(mesh.faces):
         msg = "the mesh has no faces that enclose an area"
         raise GarmentError(msg)
@@ -131,6 +133,19 @@ def _edges(f: Ints) -> tuple[Ints, Ints]:
     pairs = np.sort(np.stack((f, np.roll(f, -1, 1)), -1).reshape(-1, 2), 1)
     edges, of_corner = np.unique(pairs, axis=0, return_inverse=True)
     return edges, of_corner.reshape(-1, 3)
+
+
+def _without_strays(mesh: SurfaceMesh, notes: list[str]) -> SurfaceMesh:
+    """Without faces so far off that the garment would be a speck beside them."""
+    v = mesh.vertices
+    low, middle, high = np.percentile(v[mesh.faces].reshape(-1, 3), (2, 50, 98), axis=0)
+    reach = _FAR_OFF * float(np.maximum(high - middle, middle - low).max())
+    kept = (np.abs(v - middle) <= reach).all(axis=1)[mesh.faces].all(axis=1)
+    if kept.all():
+        return mesh
+    notes.append(f"{int((~kept).sum())} faces far off all others were left out")
+    uv = None if mesh.uv is None else replace(mesh.uv, faces=mesh.uv.faces[kept])
+    return replace(mesh, faces=mesh.faces[kept], uv=uv)
 
 
 def _groups_of_place(v: NDArray[np.float64]) -> Ints:

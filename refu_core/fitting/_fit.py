@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from refu_core.body import JOINT_NAMES, SmplBody, blend_transforms, unapply_transforms
+from refu_core.body import BUILTIN_BODIES, JOINT_NAMES, SmplBody, blend_transforms, unapply_transforms
 from refu_core.errors import GarmentError
 from refu_core.fitting._clean import (
     MAX_VERTICES,
@@ -25,7 +25,7 @@ from refu_core.fitting._place import Place, Placing, find_places
 from refu_core.fitting._posed import PosedBody
 from refu_core.fitting._transfer import Transfer
 from refu_core.frames import N_BETAS, N_JOINTS
-from refu_core.garments import GarmentCard, GarmentTemplate
+from refu_core.garments import GarmentCard, GarmentTemplate, require_name
 from refu_core.mesh import Connectivity
 
 F64 = NDArray[np.float64]
@@ -82,10 +82,11 @@ def unsewn(mesh: SurfaceMesh) -> list[str]:
                 gaps.append(np.median(gap[gap < _SEAM]))
     if not pieces:
         return []
-    return [
-        f"{len(pieces)} pieces lie along each other, {1e3 * float(np.median(gaps)):.1f} mm apart, and aren't sewn: "
-        "weld their seams, or simulated cloth comes apart there"
-    ]
+    several = len(pieces) > 1
+    what = f"{len(pieces)} pieces lie along each other" if several else "a piece lies along another"
+    sewn = "and aren't sewn" if several else "and isn't sewn to it"
+    apart = 1e3 * float(np.median(gaps))
+    return [f"{what}, {apart:.1f} mm apart, {sewn}: weld their seams, or simulated cloth comes apart there"]
 
 
 Ints = NDArray[np.int64]
@@ -112,6 +113,8 @@ _SHOULDERS = tuple(
     JOINT_NAMES.index(name) for name in ("neck", "left_collar", "right_collar", "left_shoulder", "right_shoulder")
 )
 _ROUNDS = 20
+_FLAT = 0.99
+"""So much of a mesh faces along one line only where it is laid out flat; a garment has two thirds at most."""
 
 
 @dataclass(frozen=True)
@@ -161,10 +164,18 @@ def fit_garment(
     if details.held_at not in (None, *HOLDS):
         msg = f"a garment is held at {' or '.join(HOLDS)}, got {details.held_at!r}"
         raise GarmentError(msg)
+    require_name(name)
+    if body.name not in BUILTIN_BODIES:
+        msg = (
+            f"a garment is cut for one of {', '.join(BUILTIN_BODIES)}, got the body {body.name}: add it for the one "
+            f"that is most like it; a replay or pipeline with {body.name} as its body (--body) then wears it, too"
+        )
+        raise GarmentError(msg)
     cleaned, notes = clean(mesh)
     if len(cleaned.vertices) > MAX_VERTICES:
         msg = f"it has {len(cleaned.vertices)} vertices, at most {MAX_VERTICES} are worn: decimate the mesh"
         raise GarmentError(msg)
+    _require_worn(cleaned)
     fault: GarmentError | None = None
     makeshift: tuple[SurfaceMesh, list[str]] | None = None
     for place in find_places(cleaned, body, placing or Placing()):
@@ -180,6 +191,16 @@ def fit_garment(
         return _bound(makeshift[0], body, name, details, notes + makeshift[1])
     assert fault is not None  # there is a place, or `find_places` has said that there is none
     raise fault
+
+
+def _require_worn(mesh: SurfaceMesh) -> None:
+    """Raises `GarmentError` for what lies flat."""
+    normals = face_normals(mesh.vertices, mesh.faces)
+    area = np.linalg.norm(normals, axis=1)
+    along = np.linalg.eigvalsh(normals.T @ (normals / np.maximum(area, 1e-300)[:, None]))[-1] / area.sum()
+    if along > _FLAT:
+        msg = "it is flat, as a sewing pattern is: wanted a garment as it is worn; sew and drape it first"
+        raise GarmentError(msg)
 
 
 def _put_on(

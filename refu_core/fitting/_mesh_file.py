@@ -21,8 +21,8 @@ MESH_SUFFIXES: tuple[str, ...] = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf
 _MAX_FILE_BYTES = 256 << 20
 _MAX_FACES = 400_000
 """A larger mesh is refused before anything is computed: no garment that is worn in real time is as fine."""
-_MAX_CORNERS = 64
-"""Of one polygon."""
+_MAX_CORNERS = 1000
+"""Of one polygon: the lid of a fine tube has hundreds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +49,9 @@ def read_surface(path: str | os.PathLike[str]) -> SurfaceMesh:
         raise GarmentError(msg)
     content = read_file(source, most=_MAX_FILE_BYTES, error=GarmentError, wanted="a garment's mesh")
     try:
+        if suffix == ".gltf" and b'"uri"' in content and b'"data:' not in content:
+            msg = "its numbers are in a file beside it; save it as one file, .glb"
+            raise ValueError(msg)
         mesh = _parse_obj(content) if suffix == ".obj" else _by_trimesh(content, suffix)
         _check(mesh)
     except ImportError:
@@ -82,16 +85,17 @@ def _parse_obj(content: bytes) -> SurfaceMesh:
     vertices: list[list[float]] = []
     coordinates: list[list[float]] = []
     corners: list[list[tuple[int, int]]] = []
-    text = content.decode("utf-8", errors="replace").replace("\\\n", " ")
+    text = content.decode("utf-8-sig", errors="replace").replace("\\\n", " ")
     for number, line in enumerate(text.splitlines(), 1):
-        kind, _, rest = line.strip().partition(" ")
+        kind, *words = line.partition("#")[0].split() or [""]
         try:
             if kind == "v":
-                vertices.append([float(x) for x in rest.split()[:3]])
+                x, y, z = words[:3]
+                vertices.append([float(x), float(y), float(z)])
             elif kind == "vt":
-                coordinates.append([float(x) for x in (*rest.split()[:2], "0")[:2]])
+                coordinates.append([float(x) for x in (*words[:2], "0")[:2]])
             elif kind == "f":
-                corners.append([_corner(word, len(vertices), len(coordinates)) for word in rest.split()])
+                corners.append([_corner(word, len(vertices), len(coordinates)) for word in words])
         except (ValueError, IndexError) as error:
             msg = f"line {number}: {line[:60]!r}"
             raise ValueError(msg) from error
@@ -120,19 +124,52 @@ def _corner(word: str, n_vertices: int, n_coordinates: int) -> tuple[int, int]:
 def _triangles(
     polygons: Iterable[list[tuple[int, int]]], points: NDArray[np.float64]
 ) -> Iterable[tuple[tuple[int, int], ...]]:
-    """Polygons as triangles: quads are cut along the shorter diagonal, others as fans."""
+    """Polygons as triangles: quads are cut along the shorter diagonal, others by their ears."""
     for polygon in polygons:
         n = len(polygon)
         if n < 3 or n > _MAX_CORNERS:
             if n > _MAX_CORNERS:
-                msg = f"a polygon of {n} corners"
+                msg = f"a polygon of {n} corners, at most {_MAX_CORNERS} are read: triangulate it"
                 raise ValueError(msg)
             continue
-        if n == 4 and max(corner[0] for corner in polygon) < len(points):
-            a, b, c, d = (points[corner[0]] for corner in polygon)
-            if np.square(b - d).sum() < np.square(a - c).sum():
-                polygon = polygon[1:] + polygon[:1]
-        yield from ((polygon[0], polygon[k], polygon[k + 1]) for k in range(1, n - 1))
+        if n == 3 or max(corner[0] for corner in polygon) >= len(points):
+            yield from ((polygon[0], polygon[k], polygon[k + 1]) for k in range(1, n - 1))
+            continue
+        places = points[[corner[0] for corner in polygon]]
+        yield from (tuple(polygon[k] for k in ear) for ear in _ears(places))
+
+
+def _ears(places: NDArray[np.float64]) -> Iterable[tuple[int, int, int]]:
+    """Triangles of a polygon (N, 3) that needn't be convex: corners that hold no other one, shortest cut first."""
+    normal = np.cross(places, np.roll(places, -1, axis=0)).sum(axis=0)
+    left = list(range(len(places)))
+    while len(left) > 3:
+        before, here, after = (places[np.roll(left, shift)] for shift in (1, 0, -1))
+        cut = after - before
+        turns = np.cross(here - before, after - here) @ normal
+        length = np.square(cut).sum(axis=1) + np.where(turns > 0, 0.0, np.inf)
+        chosen = int(length.argmin())
+        for k in np.argsort(length, kind="stable"):
+            if not np.isfinite(length[k]):
+                break
+            if not _holds(before[k], here[k], after[k], places[left], normal):
+                chosen = int(k)
+                break
+        yield left[chosen - 1], left[chosen], left[(chosen + 1) % len(left)]
+        del left[chosen]
+    yield left[0], left[1], left[2]
+
+
+def _holds(
+    a: NDArray[np.float64],
+    b: NDArray[np.float64],
+    c: NDArray[np.float64],
+    points: NDArray[np.float64],
+    normal: NDArray[np.float64],
+) -> bool:
+    """Whether a triangle, seen along a normal, has any of the points (N, 3) inside."""
+    sides = np.stack([np.cross(q - p, points - p) @ normal for p, q in ((a, b), (b, c), (c, a))])
+    return bool((sides > 1e-9 * np.abs(sides).max(initial=0.0)).all(axis=0).any())
 
 
 def _by_trimesh(content: bytes, suffix: str) -> SurfaceMesh:

@@ -39,6 +39,8 @@ _TRIED_SIZES = (0.25, 0.4, 0.6, 0.85, 1.2, 1.7)
 _NOTHING = 0.01
 """What fits has less than this share of it inside the body; like a glove, if it is less than 6 cm off, too."""
 _N_REFINED = 2
+_OF_NO_UNIT = 1e-3
+"""An extent that is so near to 1, or 2, was made so, as data sets of shapes are: it says nothing of a unit."""
 
 
 @dataclass(frozen=True)
@@ -136,10 +138,16 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
         for k, one in enumerate(tiers)
     ]
     ranked = sorted(range(len(tiers)), key=lambda k: tiers[k].cost(extent) + handicap[k])
-    for k in ranked:
-        if tiers[k].place.fit.is_good:
-            yield _told(tiers[k].place, tiers[k].kind)
-    if good or any(one.place.fit.is_good for one in tiers):
+    order = [tiers[k] for k in ranked if tiers[k].place.fit.is_good]
+    tight = [one for one in found if one.place.fit.is_tight and not one.place.fit.is_good and not one.is_sideways]
+    if tight and not good and abs(np.log2(extent) - round(np.log2(extent))) > _OF_NO_UNIT:
+        # Who models in metres and close to the skin means no garment that is a sixth larger.
+        order = [one for one in order if any(np.isclose(one.place.unit, unit) for unit in units)]
+        # A sleeve that no arm is in costs less and faces the wrong way.
+        order.append(min(tight, key=lambda one: one.cost(extent) + 4 * (1 - one.place.fit.facing)))
+    for one in order:
+        yield _told(one.place, one.kind)
+    if good or order or any(one.place.fit.is_good for one in tiers):
         return
     place = min((one.place for one in tiers), key=lambda one: one.fit.cost)
     fit = place.fit

@@ -40,6 +40,11 @@ class Fit(NamedTuple):
         return self.inside < 0.05 and self.distance < 0.16 and self.facing > 0.85
 
     @property
+    def is_tight(self) -> bool:
+        """Whether it lies on the skin, a little inside it: modelled close to it, or on somebody a little slimmer."""
+        return self.facing > 0.95 and self.distance < 0.16 and self.depth < 0.025
+
+    @property
     def is_plain(self) -> bool:
         """Whether nothing else need be tried."""
         return self.is_good and self.facing > 0.93

@@ -9,6 +9,7 @@ from refu_core.garments._file import garment_files as garment_files
 from refu_core.garments._file import garment_name as garment_name
 from refu_core.garments._file import garments_folder as garments_folder
 from refu_core.garments._file import load_garment as load_garment
+from refu_core.garments._file import require_name as require_name
 from refu_core.garments._file import save_garment as save_garment
 from refu_core.garments._template import GarmentTemplate as GarmentTemplate
 from refu_core.garments._template import UvMap as UvMap

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -66,8 +67,7 @@ def load_garment(
     if isinstance(garment, str) and not garment.endswith(".npz"):
         known = garment_files()
         if garment not in known:
-            msg = f"no garment {garment!r}: wanted one of {', '.join(known)}, or the path of an .npz"
-            raise GarmentError(msg)
+            raise GarmentError(_unknown(garment, list(known)))
         return _read(known[garment], device, dtype)
     try:
         path = Path(garment)
@@ -77,17 +77,38 @@ def load_garment(
     return _read(path, device, dtype)
 
 
+def _unknown(garment: str, known: list[str]) -> str:
+    if Path(garment).suffix.lower() in (".obj", ".ply", ".stl", ".off", ".glb", ".gltf", ".fbx", ".dae"):
+        return f"{garment} is a mesh, wanted a garment: make one of it first, by refu garment add {garment}"
+    like = [name for name in known if name.startswith(f"{garment.lower()}-") or name == garment.lower()]
+    like = like or get_close_matches(garment, known)
+    return (
+        f"no garment {garment!r}: wanted {' or '.join(like)}"
+        if like
+        else f"no garment {garment!r}: wanted one of {', '.join(known)}, or the path of an .npz"
+    )
+
+
 def garment_name(garment: str | os.PathLike[str]) -> str:
     """The name of a garment that was asked for by its name or by its file's path, which needs not be there."""
     text = os.fspath(garment)
     return Path(text).stem.removeprefix("garment_") if text.endswith(".npz") else text
 
 
+def require_name(name: str) -> None:
+    """Raises `GarmentError` for a name that no garment has: topics and files are called by it."""
+    if not _NAME.fullmatch(name):
+        msg = f"no garment is called {name!r}: wanted letters, digits, - and _ (--name)"
+        raise GarmentError(msg)
+
+
 def _read(path: Path, device: str | torch.device, dtype: torch.dtype) -> GarmentTemplate:
     name = path.stem.removeprefix("garment_")
-    if not _NAME.fullmatch(name):
-        msg = f"{path}: a garment has its file's name: wanted one of letters, digits, - and _"
-        raise GarmentError(msg)
+    try:
+        require_name(name)
+    except GarmentError as error:
+        msg = f"{path}: a garment has its file's name; {error}"
+        raise GarmentError(msg) from error
     data = read_npz(
         path, keys=(*_ARRAYS, "styledirs", *_UV, "body", "card"), error=GarmentError, wanted="a garment, as an .npz"
     )

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from typing import Any
 
 from refu_lab.commands import _common as cli
 
 
 def add(commands: Any) -> None:
-    """The command's parser."""
     parser = commands.add_parser(
         "garment",
         help="add a garment of your own, or list those that there are",
@@ -57,15 +57,15 @@ def _add_add(actions: Any) -> None:
 
 
 def run_add(args: argparse.Namespace) -> int:
-    """Does what was asked; returns the exit code."""
     from refu_lab.garment import AddOptions, add_garment, added_text
 
+    if not args.quiet:
+        print(f"{args.mesh}: looking for its unit, its axes and its place on the body …", file=sys.stderr, flush=True)
     result = add_garment(AddOptions(**cli.given(args, AddOptions)))
     return cli.tell(args, added_text(result), result)
 
 
 def run_list(args: argparse.Namespace) -> int:
-    """Does what was asked; returns the exit code."""
     from refu_core.garments import garments_folder
     from refu_lab.garment import garments_table, list_garments
 

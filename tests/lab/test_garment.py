@@ -67,6 +67,7 @@ def test_meshes_from_elsewhere_are_worn(name: str, tmp_path: Path) -> None:
     assert float(stretch.quantile(0.99)) < 1.8
 
 
+@pytest.mark.usefixtures("little_light")
 def test_a_garment_is_added_listed_and_worn_by_name(folder: Path, kilt: Path, tmp_path: Path, capsys) -> None:
     arguments = ["garment", "add", str(kilt), "--body", "female", "--layer", "2", "--color", "0.1,0.2,0.9"]
     assert main([*arguments, "--longest-edge", "0.05", "--picture", str(tmp_path / "kilt.png")]) == 0
@@ -101,6 +102,8 @@ def test_a_garment_is_added_listed_and_worn_by_name(folder: Path, kilt: Path, tm
         (["--unit", "mm"], "wanted a garment of"),
         (["--pose", "sitting"], "no pose 'sitting': wanted t, the angle"),
         (["--body", "robot"], "no body 'robot'"),
+        (["--name", "my kilt"], "no garment is called 'my kilt'"),
+        (["--name", "a/b"], "no garment is called 'a/b'"),
         (["--color", "2,0,0"], "color: wanted three numbers"),
         (["--layer", "-1"], "layer: wanted a whole number"),
     ],
@@ -109,6 +112,20 @@ def test_what_makes_no_garment_is_said(arguments: list[str], wanted: str, folder
     assert main(["garment", "add", str(kilt), "--longest-edge", "0.1", *arguments]) == 2
     assert wanted in capsys.readouterr().err
     assert not folder.exists()
+
+
+def test_a_file_of_any_name_makes_a_garment_that_can_be_worn(folder: Path, kilt: Path, tmp_path: Path, capsys) -> None:
+    mesh = tmp_path / "Männer-Kilt (1).obj"
+    mesh.write_bytes(kilt.read_bytes())
+    assert main(["garment", "add", str(mesh), "--longest-edge", "0.1"]) == 0
+    assert garment_files()["Manner-Kilt-1"] == folder / "Manner-Kilt-1.npz"
+    assert load_garment("Manner-Kilt-1").n_vertices
+    assert "looking for its unit" in capsys.readouterr().err
+    assert [row["garment"] for row in list_garments() if "fault" in row] == []
+    with pytest.raises(RefuError, match="is a mesh, wanted a garment: make one of it first, by refu garment add"):
+        load_garment(str(mesh))
+    with pytest.raises(RefuError, match="no garment 'tshirt': wanted tshirt-male or tshirt-female or tshirt-neutral"):
+        GarmentPipeline.load(["tshirt"])
 
 
 def test_a_node_takes_a_garment_by_its_path(kilt: Path, tmp_path: Path) -> None:
@@ -120,6 +137,7 @@ def test_a_node_takes_a_garment_by_its_path(kilt: Path, tmp_path: Path) -> None:
         replace(settings, backbone="tailornet").pipeline.check()
 
 
+@pytest.mark.usefixtures("no_curves")
 def test_a_garment_of_ones_own_is_simulated_and_trained(kilt: Path, tmp_path: Path) -> None:
     """The whole journey with few samples: a mesh, cloth, networks, and those in the pipeline."""
     body = load_body("female")

@@ -1,0 +1,108 @@
+"""Meshes as people's files have them: every dialect of OBJ, polygons of any form, strays, patterns, tight clothes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from outside_meshes import Wanted, cloth, quads_of_a_skirt
+
+from refu_core import GarmentError, load_body
+from refu_core.fitting import Placing, SurfaceMesh, fit_garment, read_surface
+from refu_core.fitting._clean import clean
+from refu_core.fitting._place import find_places
+
+SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n"
+TSHIRT = Wanted(sleeve=0.35, step=0.028)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "\ufeff" + SQUARE,
+        SQUARE.replace("\n", "\r\n"),
+        SQUARE.replace("v ", "v\t").replace("f ", "f\t"),
+        SQUARE.replace("\n", "  # said beside it\n"),
+        SQUARE.replace("v ", "  v  ").replace(" 0\n", " 0 0.5 0.5 0.5\n"),
+        SQUARE.replace("f 1 2 3 4", "f 1//7 2//7 \\\n 3//7 4//7"),
+    ],
+    ids=["mark", "line ends", "tabs", "comments", "colours", "broken line"],
+)
+def test_dialects_of_obj(text: str, tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_bytes(text.encode())
+    mesh = read_surface(tmp_path / "a.obj")
+    assert (len(mesh.vertices), len(mesh.faces)) == (4, 2)
+    np.testing.assert_array_equal(mesh.vertices[2], [1, 1, 0])
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_polygons_that_are_not_convex(seed: int, tmp_path: Path) -> None:
+    """A star of any corners is covered once: its triangles' areas add up, and none is turned over."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(4, 90))
+    angle = np.linspace(0, 2 * np.pi, n, endpoint=False)
+    flat = np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1) * rng.uniform(0.2, 1.0, (n, 1))
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    points = flat @ turn.T
+    lines = ["v {:.9f} {:.9f} {:.9f}".format(*point) for point in points]
+    (tmp_path / "a.obj").write_text("\n".join([*lines, "f " + " ".join(str(k + 1) for k in range(n))]))
+    mesh = read_surface(tmp_path / "a.obj")
+    assert len(mesh.faces) == n - 2
+    cross = np.cross(flat, np.roll(flat, -1, axis=0))[:, 2].sum() / 2
+    corners = flat[mesh.faces]
+    areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 2] / 2
+    assert areas.min() > -1e-9
+    assert areas.sum() == pytest.approx(cross)
+
+
+def test_a_gltf_whose_numbers_are_elsewhere_is_said(tmp_path: Path) -> None:
+    parts = trimesh.exchange.gltf.export_gltf(trimesh.Scene(trimesh.creation.box()))
+    for name, content in parts.items():
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(GarmentError, match=r"in a file beside it; save it as one file, \.glb"):
+        read_surface(tmp_path / "model.gltf")
+
+
+def test_a_stray_face_takes_nothing_with_it() -> None:
+    v, f = cloth(TSHIRT)
+    stray = np.array([[1000.0, 0, 0], [1000, 0.1, 0], [1000, 0, 0.1]])
+    mesh = SurfaceMesh(np.concatenate([v, stray]), np.concatenate([f, [np.arange(3) + len(v)]]))
+    cleaned, notes = clean(mesh)
+    assert (len(cleaned.vertices), len(cleaned.faces)) == (len(v), len(f))
+    assert notes == ["1 faces far off all others were left out"]
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.5])
+def test_a_sewing_pattern_is_refused(turn: float) -> None:
+    panel = trimesh.creation.box(extents=(0.5, 0.7, 0.0)).subdivide().subdivide()
+    v = np.concatenate([panel.vertices, panel.vertices + np.array([0.6, 0, 0])])
+    f = np.concatenate([panel.faces, panel.faces + len(panel.vertices)]).astype(np.int64)
+    c, s = np.cos(turn), np.sin(turn)
+    with pytest.raises(GarmentError, match="it is flat, as a sewing pattern is"):
+        fit_garment(SurfaceMesh(v @ np.array([[1, 0, 0], [0, c, s], [0, -s, c]]), f), load_body("neutral"), name="a")
+
+
+@pytest.mark.parametrize("ease", [0.002, -0.003])
+def test_tight_clothes_are_not_made_larger(ease: float) -> None:
+    """They lie on the skin, and in it where the wearer isn't whom they were made for: that is no other unit."""
+    v, f = cloth(replace(TSHIRT, ease=ease))
+    place = next(find_places(SurfaceMesh(100 * v, f), load_body("neutral"), Placing()))
+    assert place.unit == pytest.approx(0.01)
+    assert not place.pose.any()
+    assert place.notes == ["lengths are cm", "it stood with the floor at 0 and was moved to the body's feet"]
+
+
+def test_names_and_bodies_that_garments_cannot_have() -> None:
+    v, quads = quads_of_a_skirt(6, 20)
+    mesh = SurfaceMesh(v, np.array([[a, b, c] for a, b, c, _ in quads] + [[a, c, d] for a, _, c, d in quads]))
+    with pytest.raises(GarmentError, match="no garment is called 'my skirt': wanted letters"):
+        fit_garment(mesh, load_body("neutral"), name="my skirt")
+    own = load_body("neutral")
+    own.name = "SMPL_NEUTRAL"
+    with pytest.raises(
+        GarmentError, match="cut for one of male, female, neutral, got the body SMPL_NEUTRAL: add it for"
+    ):
+        fit_garment(mesh, own, name="skirt")
