@@ -38,6 +38,8 @@ class PickledArrays:
                 msg = "a chumpy expression; save the model again with its values as plain arrays"
                 raise ValueError(msg)
             value = value.state["x"]
+        if isinstance(value, Record) and value.kind == "parameter" and value.args:
+            value = value.args[0]
         if isinstance(value, Record) and value.kind in ("array", "buffer"):
             return self._plain(value)
         if isinstance(value, Record) and value.kind == "sparse":

@@ -48,6 +48,7 @@ DATA_NAMES: dict[str, str] = _NAMES | {
     **{f"collections.{name}": "mapping" for name in ("OrderedDict", "defaultdict")},
     "joblib.numpy_pickle.NumpyArrayWrapper": "joblib",
     "torch._utils._rebuild_tensor_v2": "tensor",
+    "torch._utils._rebuild_parameter": "parameter",
     **{
         f"torch.{name}Storage": kind
         for name, kind in (

@@ -38,13 +38,16 @@ def load_body(
         return SmplBody(_builtin(str(source)), name=str(source), device=device, dtype=dtype)
     require_type(source, (str, PathLike), "a body's name or path", error=BodyError)
     path = Path(source)
-    if not path.suffix:
+    if not path.suffix and not path.is_dir():
         msg = f"no body {str(source)!r}: wanted one of {', '.join(BUILTIN_BODIES)}, or the path of an .npz or .pkl file"
         raise BodyError(msg)
-    if path.suffix not in (".npz", ".pkl"):
+    if path.is_dir():
+        msg = f"{path} is a folder: wanted a body model in it, as {path / 'SMPL_FEMALE.pkl'}"
+        raise BodyError(msg)
+    if path.suffix.lower() not in (".npz", ".pkl"):
         msg = f"{path}: a body model must be an .npz or an official .pkl file, got {path.suffix!r}"
         raise BodyError(msg)
-    read = read_npz if path.suffix == ".npz" else read_smpl_pickle
+    read = read_npz if path.suffix.lower() == ".npz" else read_smpl_pickle
     data = read(path, keys=_KEYS, error=BodyError, wanted=_WANTED)
     return SmplBody(BodyArrays.from_mapping(data, source=str(path)), name=path.stem, device=device, dtype=dtype)
 

@@ -288,7 +288,7 @@ _NEAR, _FAR = 0.1, 0.5
 """A keypoint that is nearer to where it was expected is on its side; one that is farther isn't farther yet [m]."""
 
 
-_MOST = 64
+MOST_PEOPLE = 64
 """People who are followed at once; whose keypoints haven't come for longest is forgotten."""
 
 
@@ -312,7 +312,7 @@ class People:
             track = KeypointTracker(self.skeleton, **self._options)  # type: ignore[arg-type]
         self._tracks[person] = track
         self._newest[person] = stamp_ns, now_ns
-        for gone in list(self._tracks)[:-_MOST]:
+        for gone in list(self._tracks)[:-MOST_PEOPLE]:
             del self._tracks[gone], self._newest[gone]
         return track.update(points, stamp_ns, confidence=confidence)
 

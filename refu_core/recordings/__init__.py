@@ -1,9 +1,9 @@
 """Recorded motion: one reader for what archives, pose estimators and motion capture write."""
 
+from refu_core.recordings._layouts import SUFFIXES as SUFFIXES
 from refu_core.recordings._rate import FPS_RANGE as FPS_RANGE
 from refu_core.recordings._rate import MAX_FRAMES as MAX_FRAMES
 from refu_core.recordings._rate import n_resampled as n_resampled
-from refu_core.recordings._recording import SUFFIXES as SUFFIXES
 from refu_core.recordings._recording import Recording as Recording
 from refu_core.recordings._recording import read_recording as read_recording
 from refu_core.recordings._upright import AXES as AXES

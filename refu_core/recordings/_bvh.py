@@ -9,7 +9,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from refu_core._files import read_file
 from refu_core.errors import RefuError
-from refu_core.recordings._followed import follow
+from refu_core.recordings._followed import follow, metres_of
 from refu_core.recordings._layouts import WANTED
 from refu_core.recordings._rate import MAX_FRAMES, check_fps
 from refu_core.recordings._recording import Recording
@@ -32,24 +31,20 @@ _CHANNELS = {f"{axis}{kind}": (kind, i) for kind in ("position", "rotation") for
 _NAMES = {
     "hip": ("upleg", "thigh", "upperleg", "femur", "hip"),
     "knee": ("leg", "knee", "shin", "lowerleg", "lowleg", "calf", "tibia"),
-    "ankle": ("foot", "ankle"),
-    "foot": ("toebase", "toe", "toes", "ball"),
-    "shoulder": ("arm", "upperarm", "uparm", "shldr", "humerus", "shoulder"),
-    "elbow": ("forearm", "elbow", "lowerarm", "lowarm", "radius"),
-    "wrist": ("hand", "wrist"),
+    "ankle": ("ankle", "foot"),
+    "foot": ("toebase", "toe", "toes", "ball", "foot"),
+    "shoulder": ("arm", "upperarm", "uparm", "uarm", "shldr", "humerus", "shoulder"),
+    "elbow": ("forearm", "elbow", "lowerarm", "lowarm", "farm", "radius"),
+    "wrist": ("wrist", "hand"),
     "pelvis": ("hips", "pelvis", "hip"),
-    "neck": ("neck", "neck1", "neck01"),
+    "neck": ("neck",),
     "head": ("head",),
 }
-"""What joints are called, without their side; the first that a file has. A `shoulder` is a collar where there is an
-arm, too."""
+"""What joints are called, without their side; the first that a file has and that is nothing else yet. A `shoulder` is a
+collar where there is an arm, too, and a `foot` the ball of one where there is an ankle (SMPL, Kinect)."""
+_BARE = frozenset(name for names in _NAMES.values() for name in names)
 _SIDED = ("hip", "knee", "ankle", "foot", "shoulder", "elbow", "wrist")
 _NEEDED = tuple(f"{side}_{part}" for side in "lr" for part in ("hip", "knee", "shoulder", "elbow"))
-_UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254, "CMU's units": 0.0254 / 0.45}
-_LEG = 0.82
-"""Hip to knee to ankle of the mean body [m]."""
-_LEGS = (0.45, 1.1)
-"""Of people [m]; a unit with which it's outside isn't meant."""
 
 
 @dataclass(eq=False)
@@ -75,6 +70,7 @@ def read_bvh(path: Path, *, error: type[RefuError], fps: float | None, axes: Axe
 def _parsed(text: str) -> tuple[list[_Joint], Array, float]:
     """Joints, a row of channels a frame, and the seconds between frames. Raises `ValueError`."""
     hierarchy, word, motion = text.partition("MOTION")
+    hierarchy = re.sub(r"(?m)^(\s*(?:ROOT|JOINT)[ \t]+)(.*?)(?=\s*\{?\s*$)", _one_word, hierarchy)
     head = re.match(r"\s*Frames:\s*(\d+)\s+Frame\s+Time:\s*([-+.\deE]+)", motion) if word else None
     if head is None:
         msg = "not a BVH file: wanted HIERARCHY, then MOTION, Frames: and Frame Time:"
@@ -86,6 +82,10 @@ def _parsed(text: str) -> tuple[list[_Joint], Array, float]:
         msg = f"wanted {count} frames (1 to {MAX_FRAMES}) of {n_channels} finite numbers, got {numbers.size} in all"
         raise ValueError(msg)
     return joints, numbers.reshape(count, n_channels), float(head[2])
+
+
+def _one_word(match: re.Match[str]) -> str:
+    return match[1] + re.sub(r"\s+", "_", match[2])
 
 
 def _joints(words: Iterator[str]) -> list[_Joint]:
@@ -157,7 +157,7 @@ def _fitted(joints: list[_Joint], places: Array, fps: float, axes: Axes) -> Reco
         msg = f"not a person's skeleton, or its names aren't known: no {', '.join(missing)} among {names} …"
         raise ValueError(msg)
     notes: list[str] = []
-    scale = _scale(points, places[0], notes)
+    scale = metres_of(list(points), places[0, list(points.values())], notes)
     seen = scale * places[:, list(points.values())]
     notes.append(f"the skeleton of {len(joints)} joints is fitted by the positions of {len(points)}")
     return follow(tuple(points), seen, fps=fps, axes=axes, usual="smpl", notes=notes)
@@ -169,11 +169,11 @@ def _points(joints: list[_Joint]) -> dict[str, int]:
     for i, joint in enumerate(joints):
         if joint.name:
             sides.setdefault(_sided(joint.name), i)
-    points = {}
+    points: dict[str, int] = {}
     for part, names in _NAMES.items():
         for side in ("l", "r") if part in _SIDED else ("",):
             found = next((sides[side, name] for name in names if (side, name) in sides), None)
-            if found is not None:
+            if found is not None and found not in points.values():
                 points[f"{side}_{part}" if side else part] = found
     end = next((i for i, joint in enumerate(joints) if not joint.name and joint.parent == points.get("head")), None)
     if end is not None:
@@ -184,28 +184,16 @@ def _points(joints: list[_Joint]) -> dict[str, int]:
 def _sided(name: str) -> tuple[str, str]:
     """The side, `l`, `r` or none, and the rest of a joint's name, in any of the ways that tools write it."""
     bare = re.split(r"[:|]", name)[-1]
-    match = re.fullmatch(r"(?i)(?:.*[_. ])?(left|right)[_. ]?(.+)", bare)
-    match = match or re.fullmatch(r"(?:.*[_. ])?([lLrR])(?:[_. ]|(?=[A-Z]))(.+)", bare)
+    match = re.fullmatch(r"(?i)(?:.*[_. -])?(left|right)[_. -]?(.+)", bare)
+    match = match or re.fullmatch(r"(?:.*[_. -])?([lLrR])(?:[_. -]|(?=[A-Z]))(.+)", bare)
     if match:
         side, rest = match[1], match[2]
     else:
-        match = re.fullmatch(r"(?i)(.+?)[_. ](left|right|l|r)", bare)
-        rest, side = (match[1], match[2]) if match else (re.sub(r"^[A-Za-z0-9]+_(?=[A-Za-z])", "", bare), "")
-    return side[:1].lower(), re.sub(r"[^a-z0-9]", "", rest.lower())
-
-
-def _scale(points: dict[str, int], places: Array, notes: list[str]) -> float:
-    """Metres a unit of the file."""
-    ends = ("l_hip", "l_knee", "l_ankle") if "l_ankle" in points else ("l_hip", "l_knee")
-    leg = sum(float(np.linalg.norm(places[points[a]] - places[points[b]])) for a, b in pairwise(ends))
-    leg *= 1.0 if len(ends) == 3 else 2.0
-    if not leg > 0:
-        msg = "its legs have no length"
-        raise ValueError(msg)
-    unit = min(_UNITS, key=lambda name: abs(np.log(leg * _UNITS[name] / _LEG)))
-    scale = _UNITS[unit]
-    if not _LEGS[0] <= leg * scale <= _LEGS[1]:
-        notes.append(f"no unit makes its legs as long as people's: scaled so that they are {_LEG:g} m")
-        return _LEG / leg
-    notes.append(f"taken as {unit}: its legs are {leg * scale:.2f} m long")
-    return scale
+        match = re.fullmatch(r"(?i)(.+?)[_. -](left|right|l|r)", bare) or re.fullmatch(r"(.+[a-z])(Left|Right)", bare)
+        rest, side = (match[1], match[2]) if match else (bare, "")
+        rest = re.sub(r"^[A-Za-z0-9]+[_-](?=[A-Za-z])", "", rest)
+    rest = re.sub(r"[^a-z0-9]", "", rest.lower())
+    rest = re.sub(r"(?:bend|0*1)$", "", rest)  # the first of several bones of a limb
+    if not side and rest[:1] in ("l", "r") and rest not in _BARE and rest[1:] in _BARE:  # lfemur
+        side, rest = rest[0], rest[1:]
+    return side[:1].lower(), rest

@@ -19,7 +19,7 @@ from refu_core._npz import ArrayBudget, check_npy, npz_names, read_npz
 from refu_core._pickle import DAMAGE, PickledArrays
 from refu_core._pickle_machine import MAX_PICKLE_BYTES, Machine, Record
 from refu_core.errors import RefuError
-from refu_core.recordings._layouts import ALL_KEYS, POSE_KEYS, UNREAD, WANTED
+from refu_core.recordings._layouts import ALL_KEYS, POSE_KEYS, SUFFIXES, UNREAD, WANTED
 
 Key = str | int
 _ZIP, _NPY, _GZIP = b"PK\x03\x04", b"\x93NUMPY", b"\x1f\x8b"
@@ -39,9 +39,17 @@ class Content:
         self.root = root
         self._arrays = arrays or PickledArrays()
         self._left = _MOST_ITEMS
+        self._made: dict[int, tuple[Any, NDArray[Any]]] = {}
 
-    def array(self, value: Any, depth: int = 0) -> NDArray[Any]:
+    def array(self, value: Any) -> NDArray[Any]:
         """The array that a value stands for; a list of rows is one, too. Raises `ValueError` for anything else."""
+        if isinstance(value, np.ndarray):
+            return value
+        if id(value) not in self._made:  # held beside its array, so that the number stays its own
+            self._made[id(value)] = value, self._array(value, 0)
+        return self._made[id(value)][1]
+
+    def _array(self, value: Any, depth: int) -> NDArray[Any]:
         if isinstance(value, np.ndarray):
             return value
         self._left -= len(value) if _is_list(value) else 0  # lists that are shared count as often as they are seen
@@ -50,7 +58,12 @@ class Content:
             raise ValueError(msg)
         try:
             if isinstance(value, (list, tuple)) and value and not all(type(item) in (int, float) for item in value):
-                return np.stack([self.array(item, depth + 1) for item in value])
+                rows = [self._array(item, depth + 1) for item in value]
+                shapes = sorted({row.shape for row in rows})
+                if len(shapes) > 1:
+                    msg = f"a list of arrays of several shapes: {', '.join(map(str, shapes[:4]))}"
+                    raise ValueError(msg)
+                return np.stack(rows)
             return self._arrays.of(value)
         except (RecursionError, *DAMAGE) as cause:
             raise ValueError(str(cause) or type(cause).__name__) from cause
@@ -105,7 +118,9 @@ def open_content(path: Path, *, error: type[RefuError]) -> Content:
             data = _unpacked(file, is_gzip=magic.startswith(_GZIP)) if is_packed else io.BytesIO(file.read())
             return Content(Machine(is_model=False).run(data))
         except (*DAMAGE, *ARCHIVE_DAMAGE) as cause:
-            msg = f"{path}: can't be read: {str(cause) or type(cause).__name__}; wanted {WANTED}"
+            is_other = path.suffix and path.suffix.lower() not in SUFFIXES
+            why = f"no file of motion is a {path.suffix}" if is_other else str(cause) or type(cause).__name__
+            msg = f"{path}: can't be read: {why}; wanted {WANTED}"
             raise error(msg) from cause
 
 
@@ -115,7 +130,7 @@ def _npz(path: Path, names: list[str], error: type[RefuError]) -> Content:
         for name in names:
             held = _object(path, name)
             if held is not None:
-                return Content(held)
+                return Content({**read_npz(path, keys=wanted, error=error, wanted=WANTED), name: held})
     known = {key for keys in UNREAD.values() for key in keys}
     root: dict[Key, Any] = {key: None for key in names if key in known or not wanted}
     for name, array in read_npz(path, keys=wanted, error=error, wanted=WANTED).items():

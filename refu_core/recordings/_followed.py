@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,9 +11,22 @@ from numpy.typing import NDArray
 from refu_core.keypoints import KeypointTracker, Proportions, Skeleton, TrackerSettings, layout_of
 from refu_core.recordings._recording import Recording
 from refu_core.recordings._upright import Axes, to_smpl
+from refu_core.skeleton import PARENTS
 
 _SETTINGS = TrackerSettings(noise=0.01, rest_after=1.0)
 _FIT = 100  # frames that a person's shape is taken from
+_UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254, "CMU's units": 0.0254 / 0.45}
+_LEG = 0.82
+"""Hip to knee to ankle of the mean body [m]."""
+_LEGS = (0.45, 1.1)
+"""Of people [m]; a unit with which it's outside isn't meant."""
+_SMPL = "pelvis l_hip r_hip spine_low l_knee r_knee spine_mid l_ankle r_ankle spine_high l_foot r_foot neck l_clavicle "
+_SMPL += "r_clavicle head l_shoulder r_shoulder l_elbow r_elbow l_wrist r_wrist"
+SMPL_POINTS = tuple(_SMPL.split())
+"""Joints of SMPL that SMPL-H and SMPL-X have, too, as the keypoint layouts call them."""
+_BONES = (0.4, 2.5)
+"""How long a bone is beside those of the mean body, each as a share of the legs."""
+_NOTHING = 1e-3
 
 
 def follow(
@@ -39,3 +53,43 @@ def follow(
     roots, transl = to_smpl(poses[:, 0].astype(np.float64), transl, axes, notes, usual=usual)
     poses[:, 0] = roots
     return Recording(poses.astype(np.float32), transl, betas.astype(np.float32), fps, "neutral", tuple(notes))
+
+
+def are_places(array: NDArray[np.float64]) -> bool:
+    """Whether (T, n, 3) are places of SMPL's joints: between them are a person's bones, in every frame.
+
+    Rotation vectors have as many numbers, and HumanML3D's and others' files of places no name that tells them apart.
+    """
+    low, high = _BONES
+    n = min(len(SMPL_POINTS), array.shape[1])
+    child = np.arange(1, n)
+    parent = np.array(PARENTS)[child]
+    bones = np.linalg.norm(array[:, child] - array[:, parent], axis=-1)
+    legs = bones[:, [3, 4, 6, 7]].sum(axis=1)
+    if not np.nanmin(legs, initial=np.inf) > _NOTHING:
+        return False
+    known = Proportions.builtin("neutral").joints
+    lengths = np.linalg.norm(known[child] - known[parent], axis=-1)
+    share = bones / legs[:, None] / (lengths / lengths[[3, 4, 6, 7]].sum())
+    return bool((~(share < low) & ~(share > high)).all())
+
+
+def metres_of(points: Sequence[str], places: NDArray[np.float64], notes: list[str]) -> float:
+    """Metres a unit in which points (K, 3) are given: legs are as long as people's. Adds to `notes` which it is.
+
+    Raises `ValueError` where legs have no length.
+    """
+    at = dict(zip(points, places, strict=True))
+    ends = ("l_hip", "l_knee", "l_ankle") if "l_ankle" in at else ("l_hip", "l_knee")
+    leg = sum(float(np.linalg.norm(at[a] - at[b])) for a, b in pairwise(ends))
+    leg *= 1.0 if len(ends) == 3 else 2.0
+    if not leg > 0:
+        msg = "its legs have no length"
+        raise ValueError(msg)
+    unit = min(_UNITS, key=lambda name: abs(np.log(leg * _UNITS[name] / _LEG)))
+    scale = _UNITS[unit]
+    if not _LEGS[0] <= leg * scale <= _LEGS[1]:
+        notes.append(f"no unit makes its legs as long as people's: scaled so that they are {_LEG:g} m")
+        return _LEG / leg
+    notes.append(f"taken as {unit}: its legs are {leg * scale:.2f} m long")
+    return scale

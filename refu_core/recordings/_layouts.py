@@ -8,6 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+SUFFIXES = (".npz", ".npy", ".pkl", ".pickle", ".pk", ".p", ".joblib", ".pt", ".pth", ".smpl", ".bvh")
+"""Of files that hold motion."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
@@ -17,9 +20,9 @@ class Layout:
     """Who writes it."""
     pose: tuple[str, ...]
     """Arrays whose joints, one after another, are the pose; the root first where there is one."""
-    transl: tuple[str, ...] = ("trans", "transl")
+    transl: tuple[str, ...] = ("trans", "transl", "translation")
     """Names that the translation may have [m]."""
-    betas: tuple[str, ...] = ("betas",)
+    betas: tuple[str, ...] = ("betas", "beta", "shape")
     """Names that the shape may have."""
     place: Literal["world", "camera", "screen"] = "world"
     """What the translation means; on a screen its depth is for a focal length that was made up, and it isn't read."""
@@ -28,7 +31,7 @@ class Layout:
 
 LAYOUTS: tuple[Layout, ...] = (
     Layout(writers="WHAM, in the world", pose=("pose_world",), transl=("trans_world",)),
-    Layout(writers="BEDLAM, in the world", pose=("poses_world",), transl=("trans_world",), betas=("betas", "shape")),
+    Layout(writers="BEDLAM, in the world", pose=("poses_world",), transl=("trans_world",)),
     Layout(writers="AMASS, 3DPW, and most others", pose=("poses",)),
     Layout(writers="AMASS's SMPL-X, SLAHMR", pose=("root_orient", "pose_body")),
     Layout(writers="smplx, GVHMR, 4DHumans, HMR 2", pose=("global_orient", "body_pose")),
@@ -43,12 +46,13 @@ LAYOUTS: tuple[Layout, ...] = (
     ),
     Layout(writers="HybrIK", pose=("pred_thetas",), transl=("transl",), betas=("pred_betas",), place="camera"),
     Layout(writers="TRAM", pose=("pred_rotmat",), transl=("pred_trans",), betas=("pred_shape",), place="camera"),
+    Layout(writers="PHC and other humanoid controllers", pose=("pose_aa",), transl=("trans_orig", "trans")),
+    Layout(writers="Meshcapade", pose=("bodyPose",), transl=("bodyTranslation",), betas=("shapeParameters",)),
     Layout(writers="MDM", pose=("thetas",), transl=("root_translation",), is_time_last=True),
     Layout(
         writers="WHAM, VIBE, CLIFF, in the camera",
         pose=("pose",),
         transl=("trans", "global_t", "transl"),
-        betas=("betas", "shape"),
         place="camera",
     ),
     Layout(writers="BEDLAM, in the camera", pose=("poses_cam",), transl=("trans_cam",), place="camera"),
@@ -57,7 +61,7 @@ LAYOUTS: tuple[Layout, ...] = (
 )
 """In the order of preference, where a file holds several."""
 
-RATES = ("mocap_framerate", "mocap_frame_rate", "fps", "framerate", "frame_rate")
+RATES = ("mocap_framerate", "mocap_frame_rate", "fps", "framerate", "frame_rate", "frameRate", "FPS")
 GENDERS = ("gender", "genders")
 FRAME_NUMBERS = ("frame_ids", "frame_id")
 SCALINGS = ("smpl_scaling",)
@@ -79,11 +83,13 @@ UNREAD = {
     "MHR (SAM 3D Body)": ("mhr_model_params", "body_pose_params", "lbs_model_params", "identity_coeffs"),
     "HumanML3D features": ("motion_feats", "new_joint_vecs"),
     "EasyMocap": ("Rh", "Th"),
+    "a body model's": ("J_regressor",),
 }
 """What is recognised and can't be read, by names that give it away."""
 UNREAD_ADVICE = {
     "MHR (SAM 3D Body)": "save pred_keypoints_3d with them, which is read, or convert them with MHR's own tool",
     "HumanML3D features": "fit SMPL to its joints, or give them as keypoints (docs/guide/inputs.md)",
+    "a body model's": "it is who wears the garments, and no motion: give it as --body (in Python: body=)",
     "EasyMocap": "save poses with Rh as their first three columns, and smplx's transl",
 }
 

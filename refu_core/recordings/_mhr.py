@@ -6,15 +6,15 @@ People save lists of those lists, dictionaries by image, or the arrays of one pe
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from refu_core._pickle_machine import Record
-from refu_core.recordings._containers import Content, Key, entries
-from refu_core.recordings._layouts import KEYPOINTS, KEYPOINTS_PLACE, TRACK_IDS
+from refu_core.recordings._containers import Content, Key
+from refu_core.recordings._layouts import KEYPOINTS, KEYPOINTS_PLACE
+from refu_core.recordings._people import name_of, sequences, who_is_who
 from refu_core.recordings._rate import MAX_FRAMES
 
 Array = NDArray[np.float64]
@@ -26,10 +26,6 @@ _PLACES = dict(zip(_BODY.split(), range(21), strict=True))
 _PLACES |= {"r_index": 28, "r_pinky": 40, "r_wrist": 41, "l_index": 49, "l_pinky": 61, "l_wrist": 62, "neck": 69}
 """Which of the 70 are points of the keypoint layouts; of a hand its knuckles, as fingers bend."""
 _HIPS = [_PLACES["l_hip"], _PLACES["r_hip"]]
-_SAME = 0.75
-"""Who is farther from where a person was in the image before is somebody else [m], as for trackers."""
-_MOST_LOOKS = 200_000
-"""Values of a file that are looked at in search of persons: five thousand seconds of somebody at 30 Hz."""
 
 POINTS = tuple(_PLACES)
 
@@ -49,7 +45,7 @@ def tracks_of_mhr(content: Content) -> list[Track]:
 
     Raises `ValueError` for keypoints and places that don't fit each other.
     """
-    for frames in _sequences(content.root):
+    for frames in sequences(content.root, _is_body):
         if len(frames) > MAX_FRAMES:
             msg = f"{len(frames)} frames, at most {MAX_FRAMES} are read; cut the clip"
             raise ValueError(msg)
@@ -59,52 +55,14 @@ def tracks_of_mhr(content: Content) -> list[Track]:
     return []
 
 
-def _sequences(root: Any) -> Iterator[list[list[Mapping[Key, Any]]]]:
-    """Whatever has persons in it, frame by frame, from the outside inwards; lists that are shared are seen once."""
-    if _is_body(root):
-        yield [[entries(root) or {}]]
-        return
-    todo: list[Any] = [root]
-    known: set[int] = set()
-    for value in todo:
-        items = _items(value)
-        if id(value) in known or len(known) + len(todo) + len(items) > _MOST_LOOKS:
-            continue
-        known.add(id(value))
-        frames = [_bodies(item) for item in items]
-        if any(frames):
-            yield frames
-        else:
-            todo += [item for item in items if len(_items(item))]
-
-
 class _Seen(NamedTuple):
     name: str
     places: Array  # (T, K, 3)
     stays: bool
 
 
-def _items(value: Any) -> Sequence[Any]:
-    if isinstance(value, Record) and value.kind == "array":  # NumPy's way to save objects
-        state = value.state
-        return state[4] if isinstance(state, tuple) and len(state) == 5 and isinstance(state[4], list) else ()
-    inside = None if isinstance(value, (list, tuple)) else entries(value)
-    if inside is not None:
-        return list(inside.values())
-    return value if isinstance(value, (list, tuple)) else ()
-
-
-def _is_body(value: Any) -> bool:
-    inside = None if isinstance(value, (list, tuple)) else entries(value)
-    return inside is not None and inside.get(KEYPOINTS) is not None
-
-
-def _bodies(value: Any) -> list[Mapping[Key, Any]]:
-    """The persons of a frame: it is one, or has some; whoever is first shows which."""
-    if _is_body(value):
-        return [entries(value) or {}]
-    items = _items(value)
-    return [entries(one) or {} for one in items if _is_body(one)] if len(items) and _is_body(items[0]) else []
+def _is_body(value: Mapping[Key, Any]) -> bool:
+    return value.get(KEYPOINTS) is not None
 
 
 def _seen(content: Content, body: Mapping[Key, Any]) -> _Seen | None:
@@ -120,8 +78,7 @@ def _seen(content: Content, body: Mapping[Key, Any]) -> _Seen | None:
             msg = f"{KEYPOINTS_PLACE} must be ({len(points)}, 3) like the keypoints, got {transl.dtype} {transl.shape}"
             raise ValueError(msg)
         points = points + transl.reshape(-1, 1, 3)
-    name = next((str(body[key]) for key in TRACK_IDS if isinstance(body.get(key), (int, str))), "")
-    return _Seen(name, points[:, list(_PLACES.values())], place is None)
+    return _Seen(name_of(body), points[:, list(_PLACES.values())], place is None)
 
 
 def _tracks(frames: list[list[_Seen]]) -> list[Track]:
@@ -130,21 +87,12 @@ def _tracks(frames: list[list[_Seen]]) -> list[Track]:
     if whole:
         return [Track(seen.name or str(i), seen.places, seen.stays) for i, seen in enumerate(whole)]
     places: dict[str, Array] = {}
-    last: dict[str, Array] = {}
-    stays = False
-    for number, bodies in enumerate(frames):
-        free = set(last)
-        for seen in bodies:
-            hips = seen.places[0, _HIPS].mean(axis=0)
-            near = {name: float(np.linalg.norm(last[name] - hips)) for name in free}
-            name = seen.name or min(near, key=near.__getitem__, default="")
-            if not seen.name and near.get(name, np.inf) > _SAME:
-                name = str(len(places))
-            free.discard(name)
-            last[name] = hips
-            stays |= seen.stays
+    named = who_is_who([(seen.name, seen.places[0, _HIPS].mean(axis=0)) for seen in bodies] for bodies in frames)
+    for number, (bodies, names) in enumerate(zip(frames, named, strict=True)):
+        for seen, name in zip(bodies, names, strict=True):
             empty = np.full((len(frames), len(_PLACES), 3), np.nan)
             places.setdefault(name, empty)[number] = seen.places[0]
+    stays = any(seen.stays for bodies in frames for seen in bodies)
     return [Track(name, _cut(own), stays) for name, own in places.items()]
 
 

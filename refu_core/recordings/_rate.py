@@ -1,11 +1,16 @@
-"""Frame rates: what is one, and how many frames there are at another."""
+"""Frame rates: what is one, how many frames there are at another, and how fast somebody is by it."""
 
 from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
 
 FPS_RANGE = (1e-3, 10_000.0)
 """Frames a second that anything is recorded or sampled at: a frame in a quarter of an hour, and ten a millisecond."""
 MAX_FRAMES = 1_000_000
 """Of a clip: nine hours at 30 Hz."""
+_FASTEST, _FARTHEST = 12.0, 50.0
+"""What people run [m/s], and how far from its origin a recording shows them [m]; in centimetres everybody is beyond."""
 
 
 def check_fps(fps: float) -> float:
@@ -24,3 +29,17 @@ def n_resampled(n: int, fps: float, wanted: float) -> int:
         msg = f"{n} frames at {fps:g} Hz are {count} at {wanted:g} Hz, at most {MAX_FRAMES} are made; cut the clip"
         raise ValueError(msg)
     return count
+
+
+def tell_pace(transl: NDArray[np.float64], rate: float, notes: list[str]) -> None:
+    """Adds a note where translations (T, 3) [m] at so many frames a second can't be of a person, and in metres."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        steps, away = np.linalg.norm(np.diff(transl, axis=0), axis=1), np.linalg.norm(transl, axis=1)
+    steps, away = steps[np.isfinite(steps)], away[np.isfinite(away)]
+    pace = rate * float(np.median(steps)) if len(steps) else 0.0
+    far = float(np.median(away)) if len(away) else 0.0
+    if pace > _FASTEST or far > _FARTHEST:
+        notes.append(
+            f"the person moves by {pace:.1f} m/s, {far:.0f} m from the origin: divide the translation by 100 or 1000 "
+            "if it is in cm or mm"
+        )

@@ -9,20 +9,17 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
 
 from refu_core.errors import RefuError
 from refu_core.frames import N_BETAS, N_JOINTS
 from refu_core.recordings import _layouts as table
-from refu_core.recordings._containers import Content, Key, open_content
+from refu_core.recordings._containers import Content, Key, entries, open_content
 from refu_core.recordings._mhr import POINTS, Track, tracks_of_mhr
-from refu_core.recordings._rate import MAX_FRAMES, check_fps
+from refu_core.recordings._rate import MAX_FRAMES, check_fps, tell_pace
 from refu_core.recordings._rotations import BODY, WHOLE, rotvecs_of
-from refu_core.recordings._tracks import tracks_of
+from refu_core.recordings._tracks import filled, frames_of, tracks_of
 from refu_core.recordings._upright import Axes, to_smpl
 
-SUFFIXES = (".npz", ".npy", ".pkl", ".pickle", ".pk", ".p", ".joblib", ".pt", ".pth", ".bvh")
-"""Of files that hold motion."""
 _BODY_JOINTS = 22  # what SMPL, SMPL-H and SMPL-X share; SMPL's two hand joints have no counterpart in the others
 _WORLD, _CAMERA = ("world", "global"), ("cam", "incam", "camera")
 _GENDERS = {"m": "male", "male": "male", "f": "female", "female": "female", "n": "neutral", "neutral": "neutral"}
@@ -112,6 +109,8 @@ def _recording(content: Content, *, fps: float | None, axes: Axes, person: str |
     which = _chosen([str(i) for i in range(n_persons)], person, [0] * n_persons, notes) if n_persons > 1 else 0
     if n_persons:
         arrays = {name: array[which] for name, array in arrays.items()}
+    if _is_of_places(arrays):
+        return _of_places(content, above, arrays, fps=fps, axes=axes, notes=notes)
     poses = _poses(arrays, notes)
     n = len(poses)
 
@@ -133,13 +132,14 @@ def _recording(content: Content, *, fps: float | None, axes: Axes, person: str |
     rate = fps if fps is not None else _fps(content, above)
     frames = one(table.FRAME_NUMBERS)
     if frames is not None:
-        poses, transl = _filled(poses, transl, frames, notes)
+        poses, transl = filled(poses, transl, frames, notes)
     of_amass = _columns(arrays) in (156, 165) and _first(above, table.RATES[:2]) is not None
     roots = poses[:, 0].astype(np.float64)
     roots, transl = to_smpl(roots, transl, axes, notes, usual="z-up" if of_amass else "smpl")
     if axes != "frame":
         with np.errstate(over="ignore", invalid="ignore"):
             poses[:, 0] = roots
+    tell_pace(transl, rate, notes)
     gender = _gender(_word(content, _first(above, table.GENDERS), which), notes)
     with np.errstate(over="ignore", invalid="ignore"):  # becomes inf or NaN, which the frame refuses
         return Recording(poses.astype(np.float32), transl, betas, check_fps(rate), gender, tuple(notes))
@@ -160,6 +160,35 @@ def _of_mhr(
     return follow(POINTS, chosen.places, fps=rate, axes=axes, usual="y-down", notes=notes)
 
 
+def _is_of_places(arrays: Mapping[str, NDArray[Any]]) -> bool:
+    from refu_core.recordings._followed import are_places
+
+    if len(arrays) != 1:
+        return False
+    (array,) = arrays.values()
+    is_alike = array.ndim == 3 and array.shape[1] in WHOLE and array.shape[2] == 3 and array.dtype.kind == "f"
+    return is_alike and len(array) > 0 and are_places(array.astype(np.float64))
+
+
+def _of_places(
+    content: Content,
+    above: Sequence[Mapping[Key, Any]],
+    arrays: Mapping[str, NDArray[Any]],
+    *,
+    fps: float | None,
+    axes: Axes,
+    notes: list[str],
+) -> Recording:
+    from refu_core.recordings._followed import SMPL_POINTS, follow, metres_of
+
+    ((name, array),) = arrays.items()
+    rate = check_fps(fps if fps is not None else _fps(content, above))
+    places = array[:, : len(SMPL_POINTS)].astype(np.float64)
+    notes.append(f"{name} {array.shape} holds places of joints and no rotations: SMPL's skeleton is fitted to them")
+    places = metres_of(SMPL_POINTS, places[0], notes) * places
+    return follow(SMPL_POINTS, places, fps=rate, axes=axes, usual="smpl", notes=notes)
+
+
 # Where it is ----------------------------------------------------------------------------------------------------------
 
 
@@ -172,6 +201,12 @@ def _find(content: Content, person: str | None, notes: list[str]) -> tuple[_Foun
     tracks = tracks_of(content)
     if tracks is not None:
         notes.append("PHALP's camera has a made-up focal length: the person stays in one place")
+    else:
+        tracks = frames_of(content)
+        if tracks is not None:
+            notes.append("the file goes frame by frame: each person's frames are put together")
+    whole = entries(content.root) or {}  # of which a frame rate may stand beside the frames
+    if tracks is not None:
         content = Content(tracks)
     nodes = dict(content.nodes())
     every = [
@@ -191,7 +226,7 @@ def _find(content: Content, person: str | None, notes: list[str]) -> tuple[_Foun
     names = [_person(found.path) for found in same]
     lengths = [len(content.array(found.node[found.layout.pose[0]])) for found in same]
     found = same[_chosen(names, person, lengths, notes) if len(same) > 1 else 0]
-    return found, [nodes[found.path[:i]] for i in range(len(found.path), -1, -1) if found.path[:i] in nodes]
+    return found, [nodes[found.path[:i]] for i in range(len(found.path), -1, -1) if found.path[:i] in nodes] + [whole]
 
 
 def _layout(name: str) -> table.Layout:
@@ -324,7 +359,7 @@ def _fps(content: Content, above: Sequence[Mapping[Key, Any]]) -> float:
         raise ValueError(msg)
     if type(value) in (int, float):
         return float(value)
-    array = content.array(value)
+    array = np.asarray(value) if isinstance(value, str) else content.array(value)
     if array.size != 1 or array.dtype.kind not in "iuf":
         msg = f"no frame rate: {table.RATES[0]} must be one number, got {array.dtype} {array.shape}"
         raise ValueError(msg)
@@ -349,19 +384,3 @@ def _gender(word: str, notes: list[str]) -> str:
     if word and word not in _GENDERS:
         notes.append(f"the gender {word[:20]!r} isn't known: neutral")
     return _GENDERS.get(word, "neutral")
-
-
-def _filled(
-    poses: NDArray[np.float64], transl: NDArray[np.float64], frames: NDArray[Any], notes: list[str]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The frames that a tracker has lost in between, on the shorter arc between those around them."""
-    at = frames.reshape(-1)
-    gaps = np.diff(at) if at.dtype.kind in "iu" and len(at) == len(poses) else np.zeros(0)
-    if not len(gaps) or (gaps == 1).all() or gaps.min() < 1 or at[-1] - at[0] >= MAX_FRAMES:
-        return poses, transl
-    if not (np.isfinite(poses).all() and np.isfinite(transl).all()):
-        return poses, transl
-    wanted = np.arange(at[0], at[-1] + 1)
-    joints = [Slerp(at, Rotation.from_rotvec(poses[:, j]))(wanted).as_rotvec() for j in range(N_JOINTS)]
-    notes.append(f"{len(wanted) - len(at)} of {len(wanted)} frames are missing: interpolated")
-    return np.stack(joints, 1), np.stack([np.interp(wanted, at, transl[:, k]) for k in range(3)], 1)

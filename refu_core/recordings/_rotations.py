@@ -48,6 +48,15 @@ def rotvecs_of(
     return _rotvecs(matrices, name), n
 
 
+def is_one_frame(shape: tuple[int, ...], counts: Collection[int]) -> bool:
+    """Whether an array of this shape is one frame of so many joints, in whichever form."""
+    while len(shape) > 1 and shape[0] == 1:
+        shape = shape[1:]
+    forms = {(n, *form) for n in counts for form in ((3,), (6,), (9,), (3, 3))}
+    forms |= {(int(np.prod(form)),) for form in forms}
+    return shape in forms or (1, *shape) in forms
+
+
 def _form(array: NDArray[Any], name: str, counts: Collection[int]) -> tuple[int, int, int]:
     """Numbers a joint, joints, frames."""
     if array.dtype.kind != "f":

@@ -311,6 +311,14 @@ def test_bad_models_are_named(tmp_path: Path, changes: dict[str, object], wanted
     assert "bad.npz" in str(caught.value)
 
 
+def test_a_folder_and_a_suffix_in_capitals(tmp_path: Path) -> None:
+    with pytest.raises(BodyError, match=r"is a folder: wanted a body model in it, as .*SMPL_FEMALE\.pkl"):
+        load_body(tmp_path)
+    (tmp_path / "SMPL_MALE.PKL").write_bytes(pickle.dumps({"f": np.zeros((1, 3))}))
+    with pytest.raises(BodyError, match="not an SMPL-layout model"):
+        load_body(tmp_path / "SMPL_MALE.PKL")
+
+
 def test_files_that_are_no_models(tmp_path: Path) -> None:
     with pytest.raises(BodyError, match="wanted one of male, female, neutral"):
         load_body("mail")

@@ -276,7 +276,8 @@ def test_what_is_no_file(tmp_path: Path, lay: Callable[[Path], object], said: st
         folder = tmp_path / f"{read.__name__} {name}"
         folder.mkdir()
         lay(folder / name)
-        assert "can't be read" in refusal(lambda: read(folder / name))  # type: ignore[operator] # noqa: B023
+        told = refusal(lambda: read(folder / name))  # type: ignore[operator] # noqa: B023
+        assert "can't be read" in told or f"{folder / name} is a folder: wanted" in told
 
 
 def test_a_slow_rate_is_not_resampled_to_gigabytes(tmp_path: Path) -> None:
