@@ -49,7 +49,6 @@ from msg_adapters.markers import MarkerArrayEncoder as MarkerArrayEncoder
 from msg_adapters.markers import MarkerMesh as MarkerMesh
 from msg_adapters.markers import decode_marker_array as decode_marker_array
 from msg_adapters.markers import encode_delete as encode_delete
-from msg_adapters.markers import encode_delete_all as encode_delete_all
 from msg_adapters.markers import encode_points as encode_points
 from msg_adapters.markers import garment_namespace as garment_namespace
 from msg_adapters.markers import vertices_from_points as vertices_from_points

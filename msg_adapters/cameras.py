@@ -10,6 +10,8 @@ from msg_adapters.cdr import Buffer, CdrReader
 from msg_adapters.errors import DecodeError
 
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+_MOST_PIXELS = 1 << 15
+"""Of a picture's width or height: what is seen is drawn, and a picture has to fit into memory."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +35,7 @@ class Camera:
 
 
 def decode_camera_info(data: Buffer) -> Camera:
-    """The camera of a `sensor_msgs/CameraInfo` in CDR. Raises `DecodeError` for one that isn't calibrated."""
+    """The camera of a `sensor_msgs/CameraInfo` in CDR. Raises `DecodeError` for one uncalibrated, or too large."""
     reader = CdrReader(data)
     _, frame_id, height, width, _ = reader.fields("TsIIs")
     reader.array("f8", reader.length(item_bytes=8))
@@ -41,7 +43,8 @@ def decode_camera_info(data: Buffer) -> Camera:
     reader.fields("IIIIII?")  # binning, region of interest
     reader.finish()
     focal, centre = (float(k[0]), float(k[4])), (float(k[2]), float(k[5]))
-    if not (np.isfinite(k[:9]).all() and min(focal) > 0 and width and height):
+    sizes = 0 < width <= _MOST_PIXELS and 0 < height <= _MOST_PIXELS
+    if not (np.isfinite(k[:9]).all() and min(focal) > 0 and sizes):
         msg = f"the camera in {frame_id!r} isn't calibrated: {width} x {height} pixels, focal lengths {focal}"
         raise DecodeError(msg)
     return Camera(frame_id.lstrip("/"), width, height, focal, centre)

@@ -8,7 +8,7 @@ from msg_adapters.cdr import Buffer, CdrReader
 from msg_adapters.errors import DecodeError
 from msg_adapters.inputs import KEYPOINT_TYPES, decode_keypoints
 from refu_core.frames import SmplFrame
-from refu_core.keypoints import LAYOUTS, People, Proportions, Skeleton, TrackerSettings, keypoint_layout
+from refu_core.keypoints import LAYOUTS, MOST_PEOPLE, People, Proportions, Skeleton, TrackerSettings, keypoint_layout
 
 
 class KeypointStream:
@@ -47,7 +47,11 @@ class KeypointStream:
         A name is the sender's and that of the namespace, as far as there are such. Raises `DecodeError`.
         """
         frames, frame_id = {}, ""
-        for name, seen in decode_keypoints(self._input_type, data, len(self._skeleton.layout)).items():
+        people = decode_keypoints(self._input_type, data, len(self._skeleton.layout))
+        if len(people) > MOST_PEOPLE:
+            msg = f"{len(people)} people in a message; up to {MOST_PEOPLE} are followed"
+            raise DecodeError(msg)
+        for name, seen in people.items():
             person, frame_id = "_".join(word for word in (sender, name) if word), frame_id or seen.frame_id
             frame = self._people.update(
                 person, seen.points, confidence=seen.confidence, stamp_ns=seen.stamp_ns or now_ns, now_ns=now_ns

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -12,11 +12,13 @@ from numpy.typing import ArrayLike, NDArray
 from msg_adapters.cdr import Buffer, CdrReader, CdrWriter
 from msg_adapters.errors import TransformError
 from msg_adapters.rotations import matrix_from_quaternion, slerp
+from refu_core.frames import PLAUSIBLE_TRANSL
 
 TF_MESSAGE = "tf2_msgs/msg/TFMessage"
 HISTORY_NS = 10 * 10**9
 """How far back transforms are kept, as tf2 does [ns]."""
-_MOST_FRAMES = 10_000
+_MOST_FRAMES = _MOST_STAMPS = 10_000
+"""Of all, and of one in the time that is kept: stamps are the sender's."""
 _UNIT_TOLERANCE = 1e-2
 """A quaternion's length is no farther from 1, as tf2 wants it."""
 _MIN_TRANSFORM_BYTES = 72
@@ -81,7 +83,7 @@ class Placement:
 
 @dataclass(eq=False)
 class _Track:
-    """What is known of one child frame, the oldest first."""
+    """What is known of one child frame, the oldest first: what came last, and of what came before it what is older."""
 
     parent: str
     is_static: bool
@@ -90,12 +92,12 @@ class _Track:
     """Translation and quaternion, shape (7,) each."""
 
     def put(self, stamp_ns: int, value: NDArray[np.float64]) -> None:
-        if self.is_static or (self.stamps and stamp_ns < self.stamps[-1] - HISTORY_NS):
-            self.stamps, self.values = [], []  # a static one is the newest; and a clock that was set back begins anew
-        at = bisect_right(self.stamps, stamp_ns)
-        self.stamps.insert(at, stamp_ns)
-        self.values.insert(at, value)
-        old = bisect_right(self.stamps, self.stamps[-1] - HISTORY_NS - 1)
+        # Whoever says where a frame was says what comes after it anew: a simulation was reset, a bag begins again.
+        at = 0 if self.is_static else bisect_left(self.stamps, stamp_ns)
+        del self.stamps[at:], self.values[at:]
+        self.stamps.append(stamp_ns)
+        self.values.append(value)
+        old = max(bisect_left(self.stamps, stamp_ns - HISTORY_NS), len(self.stamps) - _MOST_STAMPS)
         del self.stamps[:old], self.values[:old]
 
     def at(self, stamp_ns: int, tolerance_ns: int, child: str) -> Placement:
@@ -144,7 +146,7 @@ class TransformBuffer:
         parent, child = one.parent.lstrip("/"), one.child.lstrip("/")
         value = np.concatenate([np.asarray(one.translation, np.float64), np.asarray(one.quaternion, np.float64)])
         length = float(np.linalg.norm(value[3:]))
-        if not (parent and child and parent != child and np.isfinite(value).all()):
+        if not (parent and child and parent != child and (np.abs(value) <= PLAUSIBLE_TRANSL).all()):
             return False
         if abs(length - 1.0) > _UNIT_TOLERANCE or (child not in self._tracks and len(self) >= _MOST_FRAMES):
             return False

@@ -11,7 +11,6 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from refu_core import RefuError
 from refu_core.errors import printable
 from refu_core.modes import BetasSource
 from refu_ros._dresser import NICE
-from refu_ros._settings import NodeSettings, PipelineKey
+from refu_ros._settings import PIPELINE_SETTINGS, NodeSettings
 
 _PATIENCE_S = 10.0
 """Time for a bag to be closed when its replay is ended [s]."""
@@ -78,7 +77,7 @@ class BagJob:
 
 def _options(settings: NodeSettings) -> list[str]:
     """The node's settings as the command has them."""
-    names = [item.name for item in fields(PipelineKey) if item.name not in ("garments", "collider")]
+    names = [name for name in PIPELINE_SETTINGS if name not in ("garments", "collider", "threads")]
     given: dict[str, Any] = {name.replace("_", "-"): getattr(settings, name) for name in (*names, "margin", "frame_id")}
     given["garments"] = ",".join(settings.garments)
     given["style"] = ",".join(map(str, settings.style)) if any(settings.style) else ""

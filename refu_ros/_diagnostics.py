@@ -80,6 +80,8 @@ def _input(report: Report, settings: NodeSettings, now: Situation) -> Diagnostic
         level, message = WARN, f"{invalid} of {received} messages are invalid: {report.reasons.get('invalid', '')}"
     elif untransformed := report.recent["drop.transform"]:
         level, message = WARN, f"{untransformed} of {received} have no transform: {report.reasons.get('transform', '')}"
+    elif crowded := report.recent["drop.crowd"]:
+        level, message = WARN, f"{crowded} frames of people beyond the first: {report.reasons.get('crowd', '')}"
     elif report.silent_for is None and listening_for > _FIRST_INPUT_S:
         level, message = WARN, "no input yet"
     elif report.recent["back_in_time"]:
@@ -91,6 +93,8 @@ def _input(report: Report, settings: NodeSettings, now: Situation) -> Diagnostic
         who = ", ".join(filter(None, missing))
         level = WARN
         message = f"no input from {who}" if who else f"no input for {min(report.silent_for, listening_for):.1f} s"
+        if received and not persons:
+            message = f"nobody is here, though {received} messages came"
     elif now.has_foreign_betas:
         level, message = WARN, FOREIGN_BETAS
     way = "transformed to" if now.is_transformed else "shown as"

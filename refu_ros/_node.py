@@ -14,6 +14,7 @@ import msg_adapters as adapters
 from msg_adapters.outputs import GARMENTS, make_outputs
 from refu_core import RefuError
 from refu_core.errors import printable
+from refu_core.keypoints import MOST_PEOPLE
 from refu_ros._bank import QOS, Bank
 from refu_ros._diagnostics import Situation, statuses
 from refu_ros._guard import GuardedNode, answer_no, transition
@@ -24,7 +25,7 @@ from refu_ros._parameters import declare
 from refu_ros._recording import Recording
 from refu_ros._requests import Requests
 from refu_ros._scene import Scene
-from refu_ros._settings import NodeSettings, PipelineKey, specs
+from refu_ros._settings import PIPELINE_SETTINGS, NodeSettings, PipelineKey, specs
 
 if TYPE_CHECKING:
     from refu_core import GarmentPipeline
@@ -48,7 +49,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         self.failed = False
         """Whether it ended because its device did."""
         self.settings = declare(self, NodeSettings)
-        self.recording = Recording(self.get_logger().info, sync_period=self.settings.record_sync_period)
+        self.recording = Recording(self.get_logger(), sync_period=self.settings.record_sync_period)
         self._state = "unconfigured"
         self._worker: Worker | None = None
         self._loader: PipelineLoader | None = None
@@ -102,11 +103,11 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         assert self._pipeline is not None
         self.recording.try_start(self.settings.record)  # where it can't: no reason to leave people undressed
         result = super().on_activate(state)
-        scene = self._listener.scene = Scene(self.statistics)
-        given: Any = {"settings": self.settings, "pipeline": self._pipeline, "outputs": self._outputs}
+        room = max(MOST_PEOPLE, len(self.settings.persons))
+        scene = self._listener.scene = Scene(self.statistics, most=room)
         from refu_ros._worker import Worker  # loads torch
 
-        self._worker = Worker(scene, self.statistics, self, **given)
+        self._worker = Worker(scene, self.statistics, self, settings=self.settings, pipeline=self._pipeline)
         self._worker.start()
         self._has_sent = False
         self._state = "active"
@@ -228,9 +229,12 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
             return SetParametersResult(successful=True)
         try:
             settings = self.settings.changed(values)
-            if reload := settings.pipeline != self.settings.pipeline:
+            # What is asked for again is done again, where it has failed or was ended meanwhile.
+            known = self.settings.pipeline == self._in_use == settings.pipeline
+            if reload := not known and not values.keys().isdisjoint(PIPELINE_SETTINGS):
                 settings.pipeline.check()
-            if settings.record != self.settings.record and self._state == "active":
+            recorded = settings.record == self.settings.record and self.recording.running
+            if self._state == "active" and "record" in values and not recorded:
                 self.recording.start(settings.record)
         except RefuError as error:
             self.statistics.fault("refused parameters", printable(error))

@@ -80,7 +80,7 @@ def make_executor() -> Any:
     return EventsExecutor()
 
 
-def spin(executor: Any, node: Any, *, until: Callable[[], bool]) -> None:
+def spin(executor: Any, node: Any, *, until: Callable[[], object]) -> None:
     """The last resort: callbacks are guarded, but what rclpy itself raises mustn't end the node either."""
 
     def pause(*_: Any, **__: Any) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from typing import Any
 
 from msg_adapters import QosProfile
 from msg_adapters.bags import Recorder, RecorderState
@@ -12,10 +12,10 @@ from refu_core.errors import printable
 
 
 class Recording:
-    """All of it belongs to the executor's thread, but for `put` and `running`; `say` logs a line."""
+    """All of it belongs to the executor's thread, but for `put` and `running`; `logger` is the node's."""
 
-    def __init__(self, say: Callable[[str], object], *, sync_period: float) -> None:
-        self._say = say
+    def __init__(self, logger: Any, *, sync_period: float) -> None:
+        self._logger = logger
         self._sync_period = sync_period
         self._recorder: Recorder | None = None
         self._closing: list[Recorder] = []
@@ -36,7 +36,7 @@ class Recording:
         self._stop()
         if recorder is not None:
             self._recorder = recorder
-            self._say(printable(f"recording to {recorder.path}"))
+            self._logger.info(printable(f"recording to {recorder.path}"))
 
     def try_start(self, path: str) -> None:
         """As `start`, but what is wrong with the path is told by `state` from then on."""
@@ -78,11 +78,15 @@ class Recording:
         return state, printable(state.error)
 
     def tell_closed(self) -> None:
-        """Logs the recordings whose files have been closed since the last call."""
+        """Logs the recordings whose files have been closed since the last call; `state` tells what went wrong then."""
         for recorder in [recorder for recorder in self._closing if recorder.finished]:
             self._closing.remove(recorder)
             state = recorder.state()
-            self._say(printable(f"recorded {state.written} messages to {state.path}"))
+            if state.error:
+                self._error = printable(state.error)
+                self._logger.error(printable(f"recorded up to {state.written} messages, then: {state.error}"))
+            else:
+                self._logger.info(printable(f"recorded {state.written} messages to {state.path}"))
 
     def close(self) -> None:
         """Waits until everything is in the files."""

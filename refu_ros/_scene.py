@@ -12,6 +12,7 @@ import numpy as np
 from msg_adapters import Placement
 from refu_core import FrameError
 from refu_core.frames import PLAUSIBLE_ANGLE, PLAUSIBLE_COEFFICIENT, PLAUSIBLE_TRANSL
+from refu_core.keypoints import MOST_PEOPLE
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -44,6 +45,7 @@ def check_plausible(frame: SmplFrame) -> None:
     for name, value, limit in (
         ("pose", frame.pose, PLAUSIBLE_ANGLE),
         ("betas", frame.betas, PLAUSIBLE_COEFFICIENT),
+        ("style", 0.0 if frame.style is None else frame.style, PLAUSIBLE_COEFFICIENT),
         ("transl", frame.transl, PLAUSIBLE_TRANSL),
     ):
         largest = float(np.abs(value).max())
@@ -64,11 +66,14 @@ class Scene:
     """The newest frame of each person: a slot each, never a queue, so that nothing stale is ever worked on.
 
     Thread-safe. A frame that is replaced before it was taken is counted: as `max_rate` while the rate limit held it
-    back, otherwise as `stale`.
+    back, otherwise as `stale`. So is that of a person for whom there is no room beside `most` others: as `crowd`.
     """
 
-    def __init__(self, statistics: Statistics, *, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, statistics: Statistics, *, most: int = MOST_PEOPLE, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         self._statistics = statistics
+        self._most = most
         self._clock = clock
         self._changed = threading.Condition()
         self._pending: dict[str, Arrival] = {}
@@ -83,6 +88,9 @@ class Scene:
         """A person's new frame, where the sender's frame is (the messages' own if not given), and who looks."""
         now = self._clock()
         with self._changed:
+            if person not in self._seen and len(self._seen) >= self._most:
+                self._statistics.drop("crowd", f"{self._most} people are here already")
+                return
             if person in self._pending:
                 if self._held:
                     self._statistics.count("skip.max_rate")

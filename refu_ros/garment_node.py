@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 import sys
-import threading
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # NumPy reads it; its threads wait for busy cores
@@ -50,14 +50,15 @@ def _live() -> int:
     from refu_ros._node import GarmentNode
 
     node = GarmentNode()
-    told = threading.Event()
+    told: list[bool] = []  # no Event: one handler may interrupt the other while it holds the lock
+    hear = partial(on_signals, partial(told.append, True))
     try:
-        if node.settings.autostart and not started(node, lambda: on_signals(told.set)):
+        if node.settings.autostart and not started(node, hear):
             return EXIT_BAD_INPUT
-        on_signals(told.set)
+        hear()
         executor = make_executor()
         executor.add_node(node)
-        spin(executor, node, until=lambda: told.is_set() or node.finalized)
+        spin(executor, node, until=lambda: told or node.finalized)
         end = time.monotonic() + _LAST_WORDS_S * node.finalized
         spin(executor, node, until=lambda: time.monotonic() >= end)
         return EXIT_DEVICE_LOST if node.failed else 0

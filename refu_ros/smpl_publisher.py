@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sys
-import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -158,11 +157,11 @@ class SmplPublisher(GuardedNode):
 
 def _live() -> int:
     node = SmplPublisher()
-    told = threading.Event()
-    on_signals(told.set)
+    told: list[bool] = []  # no Event: one handler may interrupt the other while it holds the lock
+    on_signals(partial(told.append, True))
     executor = make_executor()
     executor.add_node(node)
-    spin(executor, node, until=lambda: told.is_set() or node.finished)
+    spin(executor, node, until=lambda: told or node.finished)
     executor.shutdown()
     node.destroy_node()
     return 0

@@ -35,7 +35,9 @@ _MAX_CHANNELS = 1 << 16
 _FOOTER_BYTES = _RECORD_HEADER.size + _FOOTER.size + len(MAGIC)
 _LONGEST = 1 << 62
 _LONGEST_MAGIC = 16
-_WANTED_FILE = "a .mcap or .db3 file, a rosbag2 directory or an AMASS-style .npz"
+_WANTED_FILE = (
+    "a .mcap or .db3 file, a rosbag2 directory, or a file of motion (.npz, .pkl, .pt, .bvh …: docs/guide/inputs.md)"
+)
 _NO_OPCODE = "zeros where a record should start"  # what many a disk makes of the end that it never got
 BETAS_OF = "betas_of"
 """Key in the metadata of a topic that says whose shape space its betas are of."""

@@ -72,6 +72,17 @@ def free_path(path: Path) -> Path:
     raise BagError(msg)
 
 
+def _opened(path: Path, open_bag: Callable[[Path], BagWriter]) -> tuple[Path, BagWriter]:
+    """A bag at `path`, or at the next that is free: somebody else may take one between the look and the leap."""
+    while True:
+        free = free_path(path)
+        try:
+            return free, open_bag(free)
+        except BagError:
+            if free_path(path) == free:
+                raise
+
+
 class Recorder:
     """Writes messages to a rosbag2 bag in a thread of its own. `put` never blocks: where the disk can't follow,
     messages are dropped and counted. A failure (a full disk) ends the recording, not the caller.
@@ -95,8 +106,7 @@ class Recorder:
         open_bag: Callable[[Path], BagWriter] = BagWriter,
     ) -> None:
         try:
-            self.path = free_path(Path(path).expanduser().absolute())
-            self._bag = open_bag(self.path)
+            self.path, self._bag = _opened(Path(path).expanduser().absolute(), open_bag)
         except BagError:
             raise
         except (OSError, ValueError, RuntimeError) as error:  # ~nobody is a RuntimeError

@@ -194,6 +194,8 @@ class BagWriter:
 
     def _sync_stream(self) -> None:
         _to_disk(self._stream.fileno())
+        if not os.path.samestat(os.fstat(self._stream.fileno()), self.file_path.stat()):
+            raise OSError(errno.ESTALE, "another file has taken its place")
         while self._entered:  # a file that its directory doesn't know is lost with all its content
             _entries_to_disk(self._entered[-1])
             self._entered.pop()
@@ -267,10 +269,12 @@ class BagWriter:
             return
         if writer is not None:
             writer.close()
+        descriptor = os.dup(stream.fileno())  # its name may be another file's by now
         with suppress(OSError):  # it tries to write what it has buffered
             stream.close()
         with suppress(OSError):  # readers cope with a torn end as well
-            os.truncate(self.file_path, 0 if writer is None else writer.whole)
+            os.ftruncate(descriptor, 0 if writer is None else writer.whole)
+        os.close(descriptor)
 
 
 def _to_disk(descriptor: int) -> None:

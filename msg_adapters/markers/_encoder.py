@@ -79,6 +79,7 @@ MARKER_ARRAY = "visualization_msgs/msg/MarkerArray"
 
 LINE_STRIP, POINTS, TRIANGLE_LIST = 4, 8, 11
 ADD, DELETE, DELETE_ALL = 0, 2, 3
+"""What a marker's `action` may be."""
 _IDENTITY_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 _LEAD_BYTES = 4  # before the header, so that the payload, and with it every float64, lies on a multiple of 8
 _NO_COLOR: Rgba = (0.0, 0.0, 0.0, 0.0)
@@ -355,15 +356,4 @@ def encode_delete(keys: Sequence[tuple[str, int]], *, stamp_ns: int, frame_id: s
     writer.fields("I", len(keys))
     for key in keys:
         _write_marker(writer, key=key, action=DELETE, frame_id=frame_id, stamp_ns=stamp_ns)
-    return writer.to_bytes()
-
-
-def encode_delete_all(*, stamp_ns: int, frame_id: str = "map", ns: str = "") -> bytes:
-    """A MarkerArray that removes every marker of the topic, or of a namespace.
-
-    Raises `EncodeError` when the stamp doesn't fit the message.
-    """
-    writer = CdrWriter()
-    writer.fields("I", 1)
-    _write_marker(writer, key=(ns, 0), action=DELETE_ALL, frame_id=frame_id, stamp_ns=stamp_ns)
     return writer.to_bytes()

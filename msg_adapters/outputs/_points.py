@@ -101,7 +101,9 @@ class PointCloudEncoder:
             msg = f"wanted {', '.join(sorted(wanted)) or 'vertices alone'}, got {', '.join(sorted(got)) or 'none'}"
             raise EncodeError(msg)
         struct.pack_into("<iI", self._message.data, HEADER_BYTES + self._stamp_at, *split_stamp(stamp_ns))
-        self._write("vertices", self._place, vertices, np.asarray(offset, np.float32))
+        with np.errstate(over="ignore"):
+            moved = np.asarray(offset).astype(np.float32)
+        self._write("vertices", self._place, vertices, moved)
         if self._normal is not None:
             self._write("normals", self._normal, normals or ())
         for name, column in self._numbers.items():
@@ -124,9 +126,11 @@ class PointCloudEncoder:
                     target[part] = values
                 for k in range(values.shape[1] if values.ndim == 2 else 0):  # by columns: a fifth of what rows take
                     np.add(values[:, k], offset[k], out=target[part, k], casting="same_kind")
-                is_finite = np.isfinite(values.sum())  # a sum is finite only if every term is: nothing is allocated
+                # A sum is finite only if every term is: nothing is allocated.
+                is_finite = np.isfinite(values.sum() + offset.sum())
             if not (is_finite or np.isfinite(target[part]).all()):
-                msg = f"{what}: {int(np.count_nonzero(~np.isfinite(values)))} of {values.size} are NaN or infinite"
+                bad = int(np.count_nonzero(~np.isfinite(target[part])))
+                msg = f"{what}: {bad} of {values.size} are NaN or infinite"
                 raise EncodeError(msg)
 
 
@@ -161,34 +165,44 @@ def _columns(points: NDArray[Any], first: str) -> NDArray[np.float32]:
 def decode_point_cloud(data: Buffer) -> tuple[NDArray[Any], int, str]:
     """The points of a `sensor_msgs/PointCloud2` in CDR, with its stamp [ns] and its frame.
 
-    Points are a structured array, a read-only view of `data`, with the message's fields by name. Raises `DecodeError`.
+    Points are a structured array with the message's fields by name, row by row: a read-only view of `data`, unless rows
+    are padded. Raises `DecodeError`.
     """
     reader = CdrReader(data)
     stamp_ns, frame_id, height, width = reader.fields("TsII")
     fields: Any = [reader.fields("sIBI") for _ in range(reader.length(item_bytes=_MIN_FIELD_BYTES))]
-    is_big, step, _ = reader.fields("?II")
+    is_big, *steps = reader.fields("?II")
     raw = reader.skip(reader.length(item_bytes=1))
     reader.fields("?")
     reader.finish()
-    return _points(raw, fields, step, height * width, is_big=is_big), stamp_ns, frame_id
+    return _points(raw, fields, (height, width), steps, is_big=is_big), stamp_ns, frame_id
 
 
 def points_of(message: Any) -> NDArray[Any]:
     """The points of a `sensor_msgs/PointCloud2` object of rclpy, as a structured array over its memory.
 
-    Raises `DecodeError` for fields that aren't in the data.
+    Of an organised cloud they come row by row; where its rows are padded, they are copied. Raises `DecodeError` for
+    fields or rows that aren't in the data.
     """
     fields = [(one.name, one.offset, one.datatype, one.count) for one in message.fields]
-    n = message.height * message.width
-    return _points(message.data, fields, message.point_step, n, is_big=bool(message.is_bigendian))
+    steps = message.point_step, message.row_step
+    return _points(message.data, fields, (message.height, message.width), steps, is_big=bool(message.is_bigendian))
 
 
-def _points(raw: Any, fields: Sequence[tuple[str, int, int, int]], step: int, n: int, *, is_big: bool) -> NDArray[Any]:
+def _points(
+    raw: Any, fields: Sequence[tuple[str, int, int, int]], shape: tuple[int, int], steps: Sequence[int], *, is_big: bool
+) -> NDArray[Any]:
+    (height, width), (step, row_step) = shape, steps
     try:
+        if height > 1 and row_step < width * step:
+            msg = f"a row has {row_step}"
+            raise ValueError(msg)
         kinds = [(_KINDS[code], (count,)) if count > 1 else _KINDS[code] for _, _, code, count in fields]
         dtype = _structure([name for name, *_ in fields], kinds, [offset for _, offset, *_ in fields], step)
-        return np.frombuffer(raw, dtype.newbyteorder(">" if is_big else "<"), n)
+        order = dtype.newbyteorder(">" if is_big else "<")
+        rows: NDArray[Any] = np.ndarray(shape, order, raw, strides=(row_step, step))
+        return rows.reshape(-1)
     except (KeyError, ValueError, TypeError, OverflowError, MemoryError) as error:
         names = ", ".join(name for name, *_ in fields)
-        msg = f"{n} points of {step} bytes with the fields {names} aren't in {len(raw)} bytes: {error}"
+        msg = f"{width} x {height} points of {step} bytes with the fields {names} aren't in {len(raw)} bytes: {error}"
         raise DecodeError(msg) from None

@@ -121,6 +121,13 @@ def standing(layout: str, place: float = 0.0) -> Any:
     return bones.posed(Pose(np.array([place, 1.0, 0.0]), exp_so3(turns), np.zeros(10))).points
 
 
+def test_a_message_of_more_people_than_are_followed_is_refused() -> None:
+    stream = KeypointStream("keypoint_markers", "coco17", Proportions.builtin("male"))
+    data = marker_array(*(marker(7, ns=f"p{i}", points=standing("coco17", i)) for i in range(65)))
+    with pytest.raises(DecodeError, match="65 people in a message; up to 64"):
+        stream.frames(data, 5)
+
+
 def test_streams_and_bags(tmp_path: Path) -> None:
     stream = KeypointStream("keypoint_markers", "coco17", Proportions.builtin("male"))
     data = marker_array(*(marker(7, ns=ns, points=standing("coco17", x)) for ns, x in (("a", 0.0), ("b", 2.0))))

@@ -22,7 +22,6 @@ from msg_adapters import (
     MarkerMesh,
     decode_marker_array,
     encode_delete,
-    encode_delete_all,
     encode_diagnostics,
     encode_points,
     garment_namespace,
@@ -169,9 +168,6 @@ def test_deletions(keys: list[tuple[str, int]], frame_id: str, stamp_ns: int) ->
     assert encode_delete(keys, stamp_ns=stamp_ns, frame_id=frame_id) == serialise(
         make(MARKER_ARRAY, gone), MARKER_ARRAY
     )
-    everything = reference_marker(ns="person", marker_id=0, action=3, **rest)
-    data = encode_delete_all(stamp_ns=stamp_ns, frame_id=frame_id, ns="person")
-    assert data == serialise(make(MARKER_ARRAY, [everything]), MARKER_ARRAY)
 
 
 @given(

@@ -71,7 +71,10 @@ def test_what_may_be_left_out(tmp_path: Path) -> None:
         ({"poses": np.zeros((T, 24, 2))}, r"got \(12, 24, 2\)"),
         ({"poses": np.full((T, 72), "x")}, "poses must be numbers"),
         ({"poses": np.full((T, 72), None)}, "can't be read as .npz: Object arrays cannot be loaded"),
-        ({"trans": np.zeros((T - 1, 3))}, r"trans or transl must be \(12, 3\) like the pose, got \(11, 3\)"),
+        (
+            {"trans": np.zeros((T - 1, 3))},
+            r"trans or transl or translation must be \(12, 3\) like the pose, got \(11, 3\)",
+        ),
         ({"betas": np.full(10, np.nan)}, "betas has values that are NaN"),
         ({"betas": np.zeros((T - 2, 10))}, "betas must be one row"),
         ({"mocap_framerate": None}, "no frame rate"),

@@ -154,9 +154,41 @@ def test_points_that_cannot_be() -> None:
     for bad in (np.nan, np.inf):
         with pytest.raises(EncodeError, match="2 of 12 are NaN or infinite"):
             encoder.encode([np.where(np.arange(12) < 2, bad, 0.0).reshape(4, 3)], stamp_ns=0, values=clearance)
+    with pytest.raises(EncodeError, match="4 of 12 are NaN or infinite"):
+        encoder.encode(good, stamp_ns=0, values=clearance, offset=(0.0, 1e300, 0.0))
     # A sum that overflows, of numbers that don't, is no reason to refuse them.
     huge = np.full((4, 3), 3e38, np.float32)
     assert np.isfinite(decode_point_cloud(encoder.encode([huge], stamp_ns=0, values=clearance))[0]["x"]).all()
+
+
+@given(
+    shape=st.tuples(st.integers(0, 4), st.integers(0, 5)),
+    steps=st.tuples(st.integers(13, 20), st.integers(0, 9)),
+    offsets=st.permutations([0, 4, 8]),
+    order=st.sampled_from("<>"),
+)
+def test_a_cameras_points_come_row_by_row(
+    shape: tuple[int, int], steps: tuple[int, int], offsets: list[int], order: str
+) -> None:
+    """Rows and points with room after them, fields and bytes in any order."""
+    (height, width), (step, room) = shape, steps
+    row_step = width * step + room
+    wanted = np.arange(3.0 * height * width).reshape(height, width, 3)
+    data = np.full(height * row_step, 255, np.uint8)
+    for (i, j, k), value in np.ndenumerate(wanted):
+        at = i * row_step + j * step + offsets[k]
+        data[at : at + 4] = np.frombuffer(np.array(value, f"{order}f4").tobytes(), np.uint8)
+    field = typestore().types["sensor_msgs/msg/PointField"]
+    fields = [field(name, offset, 7, 1) for name, offset in zip("xyz", offsets, strict=True)]
+    fields.insert(1, field("rgb", 12, 2, 1))
+    cloud = typestore().types[POINT_CLOUD]
+    message = cloud(header(), height, width, fields, order == ">", step, row_step, data, False)
+    for points in (points_of(message), decode_point_cloud(serialise(message, POINT_CLOUD))[0]):
+        np.testing.assert_array_equal(np.stack([points[axis] for axis in "xyz"], -1), wanted.reshape(-1, 3))
+    message.row_step = width * step - 1
+    if height > 1 and width:
+        with pytest.raises(DecodeError, match="a row has"):
+            points_of(message)
 
 
 @given(st.data())
@@ -354,7 +386,11 @@ def test_cameras(frame_id: str, width: int, height: int, focal: float, distortio
     assert camera == decode_camera_info(serialise(message, CAMERA_INFO, little_endian=False))
     assert camera.numbers == (width, height, (focal, 2 * focal), (3.5, 2.5))
     assert camera.frame_id == frame_id.lstrip("/")
-    k[0] = 0
+    for size in (0, (1 << 15) + 1, 2**32 - 1):  # a picture of 1 x 200 million pixels took 1.6 GB
+        message.height = size
+        with pytest.raises(DecodeError, match=f"isn't calibrated: {width} x {size} pixels"):
+            decode_camera_info(serialise(message, CAMERA_INFO))
+    message.height, k[0] = height, 0
     with pytest.raises(DecodeError, match="isn't calibrated"):
         decode_camera_info(serialise(message, CAMERA_INFO))
     with pytest.raises(DecodeError):

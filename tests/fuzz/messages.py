@@ -84,7 +84,7 @@ def markers(_: Path) -> Reader:
     faces = np.array([[0, 1, 2], [2, 1, 3]])
     meshes = adapters.MarkerArrayEncoder([adapters.MarkerMesh("a/b", faces, 4, vertex_colors=True)])
     good = meshes.encode([np.eye(4, 3)], stamp_ns=5, colors=[np.ones((4, 4))])
-    others = [adapters.encode_delete([("a", 0), ("b", 1)], stamp_ns=1), adapters.encode_delete_all(stamp_ns=1)]
+    others = [adapters.encode_delete([("a", 0), ("b", 1)], stamp_ns=1)]
 
     def read(data: bytes) -> None:
         for marker in adapters.decode_marker_array(data):

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).parents[2]
 GARMENTS = ("tshirt-male", "short-pant-male")
+CHEAP = {"input_type": "joint_state", "garments": [GARMENTS[0]], "backbone": "skinned", "sdf": "none"}
+"""Parameters of a node that starts soonest, and says what it says in no time."""
 PATIENCE_S = 300.0
 """How long anything that has to happen may take, on a machine that has a lot to do: nobody waits any longer for what
 has happened, so only what never does takes that long."""
@@ -52,11 +54,12 @@ class NodeProcess:
         *,
         program: str = "",
         packages: Path | None = None,
+        namespace: str = "",
         **parameters: Any,
     ) -> None:
         self._log = log
         start = ["-c", program] if program else ["-m", "refu_ros.garment_node"]
-        command = [sys.executable, *start, *ros_arguments(parameters)]
+        command = [sys.executable, *start, *ros_arguments(parameters), "-r", f"__ns:=/{namespace}"]
         path = [ROOT, *([] if packages is None else [packages]), os.environ.get("PYTHONPATH", "")]
         with log.open("wb") as file:
             self.process = subprocess.Popen(
@@ -111,8 +114,8 @@ def _yaml(value: Any) -> str:
 class Peer:
     """Sender, raw subscriber and operator."""
 
-    def __init__(self, *persons: str, topic: str = "{}/smpl_params") -> None:
-        self.node = rclpy.create_node("peer")
+    def __init__(self, *persons: str, topic: str = "{}/smpl_params", namespace: str = "") -> None:
+        self.node = rclpy.create_node("peer", namespace=namespace)
         self._publishers = {
             person: self.node.create_publisher(
                 JointState, topic.format(person) if person else "smpl_params", QoSProfile(depth=1)
@@ -205,7 +208,7 @@ class Peer:
         """Level, message and values of the newest status of a part of the node."""
         for array in reversed(self.diagnostics):
             for status in array.status:
-                if status.name == f"garment_node: {part}":
+                if status.name.rpartition("/")[2] == f"garment_node: {part}":
                     return status.level[0], status.message, {item.key: item.value for item in status.values}
         return -1, "", {}
 

@@ -41,7 +41,7 @@ from visualization_msgs.msg import MarkerArray
 from msg_adapters import decode_marker_array, encoder_for
 from refu_core import SmplFrame
 from refu_ros._settings import defaults, specs
-from tests.ros.harness import PATIENCE_S, NodeProcess, start
+from tests.ros.harness import CHEAP, PATIENCE_S, NodeProcess, start
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -52,8 +52,6 @@ _PENDING, _ENTITIES = 40, 12
 _QUEUED = 8
 """Requests of one service without an answer: DDS keeps ten."""
 _ANSWER_S = PATIENCE_S
-CHEAP = {"input_type": "joint_state", "garments": ["tshirt-male"], "backbone": "skinned", "sdf": "none"}
-"""Parameters of a node that dresses a frame in milliseconds."""
 _FOREIGN = ("", "use_sim_time", "start_type_description_service", "qos_overrides./garments.publisher.depth", "nobody")
 _SHUTDOWNS = {
     Transition.TRANSITION_UNCONFIGURED_SHUTDOWN,

@@ -12,7 +12,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy isn't installed (extra ros): the node isn't tested")
 
-from harness import GARMENTS, NodeProcess, Peer, frame
+from harness import CHEAP, GARMENTS, NodeProcess, Peer, frame
 
 from msg_adapters import encoder_for, vertices_from_points, vertices_ros_from_smpl
 from refu_core import GarmentPipeline
@@ -203,7 +203,9 @@ def test_a_bad_start_is_one_line(ros: None, tmp_path: Path) -> None:  # noqa: AR
 
 
 def test_a_quality_that_does_not_exist_is_one_line(ros: None, tmp_path: Path) -> None:  # noqa: ARG001
-    with NodeProcess(tmp_path / "log.txt", **{"qos_overrides./smpl_params.subscription.reliability": "magic"}) as node:
+    with NodeProcess(
+        tmp_path / "log.txt", **CHEAP, **{"qos_overrides./smpl_params.subscription.reliability": "magic"}
+    ) as node:
         assert node.ends() == 2
         assert "can't be activated" in node.log
         assert "magic" in node.log
@@ -212,8 +214,7 @@ def test_a_quality_that_does_not_exist_is_one_line(ros: None, tmp_path: Path) ->
 
 def test_humans_come_and_go(ros: None, tmp_path: Path) -> None:  # noqa: ARG001
     peer = Peer("ann", "bob", topic="/humans/bodies/{}/joint_states")
-    parameters = {"input_type": "joint_state", "follow_humans": True, "garments": [GARMENTS[0]], "person_timeout": 0.5}
-    with NodeProcess(tmp_path / "log.txt", **parameters) as node:
+    with NodeProcess(tmp_path / "log.txt", **CHEAP, follow_humans=True, person_timeout=0.5) as node:
         peer.wait_for_node()
         peer.dress(frame(1), "ann")
         peer.dress(frame(2), "bob")

@@ -13,7 +13,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy isn't installed (extra ros): the node isn't tested")
 
-from harness import GARMENTS, NodeProcess, Peer, frame
+from harness import CHEAP, GARMENTS, NodeProcess, Peer, frame
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -82,7 +82,7 @@ def test_a_subscriber_that_does_not_read_holds_nobody_up(scene: Peer) -> None:
 
 
 def test_a_second_node_of_the_name_is_reported_by_both(scene: Peer, tmp_path: Path) -> None:
-    with NodeProcess(tmp_path / "log.txt", input_type="joint_state", garments=[GARMENTS[0]], sdf="accurate") as second:
+    with NodeProcess(tmp_path / "log.txt", **CHEAP) as second:
         scene.spin_until(lambda: "2 nodes have this name" in scene.status("garments")[1], "the twin is seen")
         scene.dress(frame(50))
         scene.spin_until(lambda: "2 nodes are called" in second.log, "the second one says so, too")

@@ -43,6 +43,7 @@ def stamp_of(message: MarkerArray) -> int:
 
 def test_people_of_a_tracker_are_dressed(ros: None, tmp_path: Path) -> None:  # noqa: ARG001
     parameters = {"input_type": "keypoint_markers", "keypoints": "coco17", "keypoint_rate": 30, "frame_id": "camera"}
+    parameters |= {"backbone": "skinned", "sdf": "none"}
     with NodeProcess(tmp_path / "log.txt", **parameters) as node:
         peer = Peer("nobody")
         tracker = peer.node.create_publisher(MarkerArray, "smpl_params", QoSProfile(depth=1))

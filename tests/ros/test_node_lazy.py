@@ -12,7 +12,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy isn't installed (extra ros): the node isn't tested")
 
-from harness import GARMENTS, NodeProcess, Peer, frame, ros_arguments
+from harness import CHEAP, GARMENTS, NodeProcess, Peer, frame, ros_arguments
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")
-CHEAP = {"input_type": "joint_state", "garments": [GARMENTS[0]], "backbone": "skinned", "sdf": "none"}
 
 
 class Stage:

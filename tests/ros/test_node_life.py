@@ -11,9 +11,9 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy isn't installed (extra ros): the node isn't tested")
 
-from harness import PATIENCE_S, NodeProcess, Peer, frame
+from harness import CHEAP, PATIENCE_S, NodeProcess, Peer, frame
 
-from tests.ros.peers import CHEAP, HostilePeers
+from tests.ros.peers import HostilePeers
 
 if TYPE_CHECKING:
     from pathlib import Path

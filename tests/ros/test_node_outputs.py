@@ -300,6 +300,28 @@ def test_obstacles_are_added_moved_and_removed(robot: Callable[..., Robot], fore
     scene.until(lambda: any(one.operation == one.REMOVE for one in heard()), "who has left is removed")
 
 
+@pytest.mark.parametrize("way", ["deactivate", "cleanup"])
+def test_what_was_worn_before_is_forgotten(robot: Callable[..., Robot], way: str) -> None:
+    """Garments that change while nobody is dressed: all that is sent afterwards is of the new ones."""
+    scene = robot(garments=[TSHIRT], lazy=False)
+    node, short = scene.node, GARMENTS[1]
+    for topic, kind in (("garments", MarkerArray), ("openings", MarkerArray), ("points", PointCloud2)):
+        scene.hear(topic, kind)
+    scene.sends(frame(1), "garments", "openings", "points")
+    node.trigger_deactivate()
+    node.set_parameters([Parameter("garments", value=[short])])
+    if way == "cleanup":
+        node.trigger_cleanup()
+        node.trigger_configure()
+    else:
+        scene.until(lambda: node._in_use.garments == (short,), "the other garment is loaded")
+    node.trigger_activate()
+    scene.sends(frame(2), "garments", "openings", "points")
+    assert [marker.ns for marker in scene.heard["garments"][-1].markers] == [short]
+    assert {marker.ns.split("/")[0] for marker in scene.heard["openings"][-1].markers} == {short}
+    assert len(points_of(scene.heard["points"][-1])) == load_garment(short).n_vertices
+
+
 def world() -> tuple[bytes, TransformBuffer]:
     """A camera on a mast, 2 m high, that looks along x, 20° down: /tf_static, and the same for the test."""
     optical = Rotation.from_euler("ZYX", [-90, 0, -90], degrees=True)

@@ -3,28 +3,30 @@
 from __future__ import annotations
 
 import random
+import shutil
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 rclpy = pytest.importorskip("rclpy", reason="rclpy isn't installed (extra ros): the node isn't tested")
 
-from harness import GARMENTS, NodeProcess, Peer, frame  # noqa: E402
+from harness import CHEAP, GARMENTS, NodeProcess, Peer, frame  # noqa: E402
 from lifecycle_msgs.msg import Transition  # noqa: E402
 from lifecycle_msgs.srv import ChangeState  # noqa: E402
 from rcl_interfaces.msg import Parameter, ParameterValue  # noqa: E402
 from rcl_interfaces.srv import GetParameters, SetParameters  # noqa: E402
 from rosgraph_msgs.msg import Clock  # noqa: E402
+from std_srvs.srv import SetBool  # noqa: E402
 from visualization_msgs.msg import MarkerArray  # noqa: E402
 
+import refu_core  # noqa: E402
 from msg_adapters import BagReader  # noqa: E402
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
 pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")
-CHEAP = {"input_type": "joint_state", "garments": [GARMENTS[0]], "backbone": "skinned", "sdf": "none"}
 CYCLE = (
     Transition.TRANSITION_DEACTIVATE,
     Transition.TRANSITION_CLEANUP,
@@ -125,10 +127,36 @@ def test_a_refused_recording_leaves_the_running_one_alone(scene: tuple[Peer, Nod
         assert "/garments" in {message.topic for message in bag.messages()}
 
 
+def test_what_is_asked_for_again_is_done_again(scene: tuple[Peer, NodeProcess], tmp_path: Path) -> None:
+    """Values that the parameters have already: a recording that was ended otherwise, weights that couldn't be read."""
+    peer, _ = scene
+    folder = str(tmp_path / "bag")
+    for name in ("bag", "bag-1"):
+        assert peer.set(record=folder)[0].successful
+        peer.spin_until(lambda name=name: peer.status("recording")[2].get("path") == str(tmp_path / name), "recorded")
+        assert peer.call(SetBool, "garment_node/record", SetBool.Request(data=False)).success
+    assert peer.set(record="")[0].successful
+
+    shipped = Path(refu_core.__file__).parent / "weights" / GARMENTS[0]
+    shutil.copytree(shipped, tmp_path / GARMENTS[0])
+    file = tmp_path / GARMENTS[0] / "tailornet-none.safetensors"
+    file.write_bytes(b"")
+    assert peer.set(weights=str(tmp_path))[0].successful
+    assert peer.set(backbone="tailornet")[0].successful
+    peer.spin_until(lambda: "an empty file" in peer.status("garments")[1], "the weights can't be read")
+    shutil.copy(shipped / file.name, file)
+    assert peer.set(backbone="tailornet")[0].successful
+    peer.spin_until(lambda: peer.status("garments")[2].get("backbone") == "tailornet", "now they can")
+    for name, value in (("backbone", "skinned"), ("weights", "")):
+        assert peer.set(**{name: value})[0].successful
+
+
 @pytest.mark.parametrize(
     ("values", "reason"),
     [
         ({"device": "tpu"}, "cpu or cuda"),
+        ({"body": "nobody"}, "no body .nobody."),
+        ({"betas_from": "/nonexistent.npz"}, "no body"),
         ({"backbone": "gcnn"}, "no weights of gcnn"),
         ({"weights": "/nonexistent", "backbone": "tailornet"}, "no weights"),
         ({"frame_id": "/map"}, "leading slash"),
