@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import tempfile
 from collections.abc import Collection, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -48,3 +50,13 @@ def keep(name: str, arrays: Mapping[str, NDArray[Any]]) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         with replacing(folder / f"{name}.npz") as file:
             np.savez(file, allow_pickle=False, **arrays)
+
+
+@cache
+def code_hash(*patterns: str) -> str:
+    """Of the names and content of the project's files that match: other code or weights would make something else."""
+    root = Path(__file__).parents[1]
+    digest = hashlib.sha256()
+    for file in sorted({file for pattern in patterns for file in root.glob(pattern) if file.is_file()}):
+        digest.update(file.relative_to(root).as_posix().encode() + file.read_bytes())
+    return digest.hexdigest()

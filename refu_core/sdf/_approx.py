@@ -147,7 +147,8 @@ class ApproxSdf(MeshSdf):
                 device=str(self.device),
                 record_cmd=True,
             )
-            self._walk = Recorded(walk_kernel, self._inputs) if self.device.type == "cpu" else None
+            if self.device.type == "cpu":
+                self._walk = Recorded(walk_kernel, (self._posed, self._guides), (self._none,))
         with torch_stream(self.device):
             self._enter.launch()
 
@@ -164,7 +165,7 @@ class ApproxSdf(MeshSdf):
                 wp.launch(
                     walk_kernel,
                     dim=len(points),
-                    inputs=self._inputs(as_warp(points, wp.vec3), as_warp(near, wp.int32)),
+                    inputs=[self._posed, self._guides, as_warp(points, wp.vec3), as_warp(near, wp.int32), self._none],
                     outputs=found.as_warp(),
                     device=str(self.device),
                 )
@@ -182,10 +183,6 @@ class ApproxSdf(MeshSdf):
                 outputs=found.as_warp(),
                 device=str(self.device),
             )
-
-    def _inputs(self, points: Any, near: Any) -> list[Any]:
-        """What `walk_kernel` reads."""
-        return [self._posed, self._guides, points, near, self._none]
 
     def _order(self, near: Tensor) -> Any:
         """Points over the same cube of the rest pose in a row, so that each finds in the cache what the last one read.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -138,7 +139,7 @@ class BandSdf(MeshSdf):
         if near is not None or len(points) < _FEW:
             skin = self.skin()
             if self._few is None:
-                self._few = Recorded(query_skin_kernel, lambda points, near: [skin, points, near, self._none])
+                self._few = Recorded(query_skin_kernel, (skin,), (self._none,))
             return self._few.ask(points, near)
         scan = self._scan_of_pose()
         found = scan.near(points, beyond=math.inf)
@@ -159,14 +160,15 @@ class BandSdf(MeshSdf):
 
     def _scan_of_pose(self) -> Scan:
         if self._scan is None:
-            self._scan = Scan(self._posed, len(self.faces), self.band, self._record)
+            self._scan = Scan(self._posed, len(self.faces), self.band, partial(_record, self.skin()))
         return self._scan
 
-    def _record(self, points: Any, rows: Any, answers: Found) -> Any:
-        """A recorded launch that asks for the points in `rows`; the faces that `answers` has already are hints."""
-        outputs = answers.as_warp()
-        inputs = [self.skin(), points, outputs[0], rows]
-        return wp.launch(query_skin_kernel, len(rows), inputs, outputs, device="cpu", record_cmd=True)
+
+def _record(skin: Any, points: Any, rows: Any, answers: Found) -> Any:
+    """A recorded launch that asks for the points in `rows`; the faces that `answers` has already are hints."""
+    outputs = answers.as_warp()
+    inputs = [skin, points, outputs[0], rows]
+    return wp.launch(query_skin_kernel, len(rows), inputs, outputs, device="cpu", record_cmd=True)
 
 
 def exact_sdf(body: SmplBody, *, uses_band: bool = True) -> BandSdf | ExactSdf:

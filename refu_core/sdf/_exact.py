@@ -130,24 +130,20 @@ class ExactSdf(MeshSdf):
     def _find(self, points: Tensor, near: Tensor | None) -> Found:
         if self.device.type == "cpu" and len(points) <= _FEW:
             if self._few is None:
-                self._few = Recorded(closest_kernel, self._inputs)
+                self._few = Recorded(closest_kernel, (self._mesh.id, self._posed), (_UNLIMITED, self._by_winding))
             return self._few.ask(points, near)
         return self._launch(points, _UNLIMITED, near)
 
     def _launch(self, points: Tensor, max_distance: float, near: Tensor | None = None) -> Found:
         found = Found.empty(len(points), self.device)
         if len(points):
-            near = self._none if near is None else as_warp(near, wp.int32)
+            asked = as_warp(points, wp.vec3), self._none if near is None else as_warp(near, wp.int32)
             with torch_stream(self.device):
                 wp.launch(
                     closest_kernel,
                     dim=len(points),
-                    inputs=self._inputs(as_warp(points, wp.vec3), near, max_distance=max_distance),
+                    inputs=[self._mesh.id, self._posed, *asked, max_distance, self._by_winding],
                     outputs=found.as_warp(),
                     device=str(self.device),
                 )
         return found
-
-    def _inputs(self, points: Any, near: Any, *, max_distance: float = _UNLIMITED) -> list[Any]:
-        """What `closest_kernel` reads, for points with or without near faces."""
-        return [self._mesh.id, self._posed, points, near, max_distance, self._by_winding]

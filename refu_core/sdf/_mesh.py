@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
@@ -56,9 +56,9 @@ class Recorded:
     the system first.
     """
 
-    def __init__(self, kernel: Any, inputs: Callable[[Any, Any], list[Any]]) -> None:
-        """`inputs` makes a list of the kernel's inputs from the points and their near faces; outputs are `Found`'s."""
-        self._kernel, self._inputs = kernel, inputs
+    def __init__(self, kernel: Any, before: Sequence[Any], after: Sequence[Any]) -> None:
+        """The kernel's inputs `before` and `after` the points and their near faces; outputs are `Found`'s."""
+        self._kernel, self._before, self._after = kernel, before, after
         self._room = self._dim = 0
         self._make_room(256)
 
@@ -77,7 +77,7 @@ class Recorded:
             self._near[:n] = near
         if n:
             if last is not None:
-                self._command.set_param_at_index(self._n_inputs - 1, last)
+                self._command.set_param_at_index(len(self._before) + 1 + len(self._after), last)
             if n != self._dim:
                 self._command.set_dim(n)
                 self._dim = n
@@ -89,8 +89,8 @@ class Recorded:
         self._points = torch.zeros(n, 3)
         self._near = torch.zeros(n, dtype=torch.int32)
         self._found = Found.empty(n, self._points.device)
-        inputs = self._inputs(as_warp(self._points, wp.vec3), as_warp(self._near, wp.int32))
-        self._n_inputs = len(inputs)
+        asked = as_warp(self._points, wp.vec3), as_warp(self._near, wp.int32)
+        inputs = [*self._before, *asked, *self._after]
         self._command = wp.launch(
             self._kernel, dim=n, inputs=inputs, outputs=self._found.as_warp(), device="cpu", record_cmd=True
         )

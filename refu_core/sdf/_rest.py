@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 import warp as wp
+from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, distance_transform_edt
 from torch import Tensor
 
@@ -28,7 +30,7 @@ _ROOM = 0.1
 
 
 class RestFaces:
-    """A grid over the rest pose that names a near body face, built once a body in three tenths of a second.
+    """A grid over the rest pose that names a near body face; built in two tenths of a second, and remembered.
 
     The face need not be the closest, so one grid of the mean shape does for all shapes. Of a garment vertex t(β, γ) +
     D it wants the place on the mean shape, without what `GarmentTemplate.rest` adds for β:
@@ -38,26 +40,11 @@ class RestFaces:
     """
 
     def __init__(self, body: SmplBody) -> None:
-        """Asks for the closest faces around the mean shape of `body`, on its device."""
-        exact = ExactSdf(body.faces, device=body.device)
-        exact.update(body.v_template.float())
-        low = body.v_template.float().amin(0).cpu() - _ROOM
-        high = body.v_template.float().amax(0).cpu() + _ROOM
-        blocks = ((high - low) / (_BLOCK * _CELL)).ceil().int()
-        shape = _BLOCK * blocks
-        middles = body.v_template.float()[body.faces].mean(1).cpu()
-        on_skin = np.zeros(shape.tolist(), np.bool_)
-        on_skin[tuple(((middles - low) / _CELL).long().numpy().T)] = True
-        band = binary_dilation(on_skin, np.ones((3, 3, 3), np.bool_), iterations=_BAND)
-        centres = low + (torch.from_numpy(np.argwhere(band)) + 0.5).float() * _CELL
-        face = np.zeros(shape.tolist(), np.int32)
-        face[band] = exact.closest(centres).face.cpu().numpy()
-        nearest = distance_transform_edt(~band, return_distances=False, return_indices=True)
+        """Around the mean shape of `body`, on its device."""
         self._device = torch.device(body.device)
-        self._low = wp.vec3(*low.tolist())
-        self._shape = wp.vec3i(*shape.tolist())
-        by_block = face[tuple(nearest)].reshape([n for count in blocks.tolist() for n in (count, _BLOCK)])
-        rows = by_block.transpose(0, 2, 4, 1, 3, 5).reshape(-1, _BLOCK**3)
+        rest, faces = body.v_template.float().cpu().numpy(), body.faces.cpu().numpy().astype(np.int32)
+        low, shape, rows = _grid_of(rest.tobytes(), faces.tobytes(), str(self._device))
+        self._low, self._shape = wp.vec3(*low), wp.vec3i(*shape)
         self._grid = wp.array(rows, dtype=wp.int32, device=str(self._device))
         self._dim = 0
         self._make_room(1024)
@@ -98,3 +85,29 @@ class RestFaces:
             device=str(self._device),
             record_cmd=True,
         )
+
+
+@lru_cache(maxsize=3)
+def _grid_of(rest_bytes: bytes, face_bytes: bytes, device: str) -> tuple[list[float], list[int], NDArray[np.int32]]:
+    """Least corner [m], cells along each axis, and near face of each cell, block by block.
+
+    Of arrays as bytes, by which they are known again: every pipeline of one body asks for the same.
+    """
+    rest = torch.from_numpy(np.frombuffer(rest_bytes, np.float32).reshape(-1, 3).copy())
+    faces = torch.from_numpy(np.frombuffer(face_bytes, np.int32).reshape(-1, 3).copy())
+    exact = ExactSdf(faces, device=device)
+    exact.update(rest.to(device))
+    low, high = rest.amin(0) - _ROOM, rest.amax(0) + _ROOM
+    blocks = ((high - low) / (_BLOCK * _CELL)).ceil().int()
+    shape = (_BLOCK * blocks).tolist()
+    middles = rest[faces.long()].mean(1)
+    on_skin = np.zeros(shape, np.bool_)
+    on_skin[tuple(((middles - low) / _CELL).long().numpy().T)] = True
+    band = binary_dilation(on_skin, np.ones((3, 3, 3), np.bool_), iterations=_BAND)
+    centres = low + (torch.from_numpy(np.argwhere(band)) + 0.5).float() * _CELL
+    face = np.zeros(shape, np.int32)
+    face[band] = exact.closest(centres).face.cpu().numpy()
+    nearest = distance_transform_edt(~band, return_distances=False, return_indices=True)
+    by_block = face[tuple(nearest)].reshape([n for count in blocks.tolist() for n in (count, _BLOCK)])
+    rows = by_block.transpose(0, 2, 4, 1, 3, 5).reshape(-1, _BLOCK**3)
+    return low.tolist(), shape, rows

@@ -1,4 +1,4 @@
-"""Errors of a signed distance, jitter, and the figures that the exact check gives, against loops over single points."""
+"""Errors of a signed distance, and the figures that the exact check gives, against loops over single points."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from refu_core.errors import MeshError
-from refu_core.metrics import CollisionChecker, GarmentMetrics, temporal_jitter
+from refu_core.metrics import CollisionChecker, GarmentMetrics
 from refu_lab.reproduction._sdf import SdfErrors
 
 
@@ -47,24 +47,6 @@ def test_distance_errors_of_nothing_and_of_what_does_not_fit() -> None:
     for approximate, accurate in (([0.1], [0.1, 0.2]), ([math.nan], [0.0]), ([[0.1]], [[0.1]])):
         with pytest.raises(MeshError, match="one shape"):
             SdfErrors.between(approximate, accurate)
-
-
-@given(seed=st.integers(0, 2**31), n=st.integers(1, 20))
-def test_jitter_equals_the_slow_reference(seed: int, n: int) -> None:
-    before, now, after = np.random.default_rng(seed).normal(size=(3, n, 3))
-    total = 0.0
-    for i in range(n):
-        second = [after[i, k] - now[i, k] - (now[i, k] - before[i, k]) for k in range(3)]
-        total += math.sqrt(sum(x * x for x in second))
-    assert temporal_jitter(before, now, after) == pytest.approx(1000 * total / n)
-
-
-def test_steady_motion_has_no_jitter() -> None:
-    x = np.random.default_rng(0).normal(size=(50, 3))
-    assert temporal_jitter(x, x + 0.01, x + 0.02) == pytest.approx(0, abs=1e-9)
-    assert temporal_jitter(x, x, x + np.array([0, 3e-3, 4e-3])) == pytest.approx(5)
-    with pytest.raises(MeshError, match="one shape"):
-        temporal_jitter(x, x, x[:3])
 
 
 def test_energy_and_collision_error_from_the_mesh_alone() -> None:

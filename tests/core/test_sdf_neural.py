@@ -190,6 +190,7 @@ def test_samples_are_of_three_kinds_and_true(body: SmplBody, garment: GarmentTem
     assert torch.equal(again.points, batch.points)
 
 
+@pytest.mark.usefixtures("no_curves")
 def test_training_lowers_the_error_and_resumes_to_the_same_weights(
     body: SmplBody, garment: GarmentTemplate, dataset: GarmentDataset, tmp_path: Path
 ) -> None:
