@@ -15,10 +15,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from asset_tools.styles import build_styles
 
 from refu_core.body import load_body
 from refu_core.garments import BUILTIN_GARMENTS, load_garment
-from refu_core.simulation import build_styles
 
 
 def main() -> int:

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from refu_core.errors import MeshError
@@ -198,20 +198,3 @@ class GarmentMetrics:
             self._laplacian = Connectivity.of(self.faces, len(vertices)).uniform_laplacian()
         product: NDArray[np.float64] = self._laplacian @ vertices.astype(np.float64)
         return product
-
-
-def temporal_jitter(before: ArrayLike, now: ArrayLike, after: ArrayLike) -> float:
-    """Mean over the vertices of |x(t+1) - 2 x(t) + x(t-1)|, in millimetres a frame squared.
-
-    Three consecutive frames of a garment [m], each of shape (N, 3). A moving body accelerates too, so the figure means
-    something beside that of a garment skinned to the same motion at the same frame rate, and not on its own.
-
-    Raises:
-        MeshError: arrays of other or differing shapes.
-    """
-    frames = [np.asarray(frame, np.float64) for frame in (before, now, after)]
-    if frames[0].ndim != 2 or frames[0].shape[1] != 3 or len({frame.shape for frame in frames}) > 1:
-        msg = f"wanted three frames of one shape (N, 3), got {', '.join(str(frame.shape) for frame in frames)}"
-        raise MeshError(msg)
-    acceleration = frames[2] - 2 * frames[1] + frames[0]
-    return 1e3 * float(np.linalg.norm(acceleration, axis=1).mean()) if len(acceleration) else 0.0

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from refu_core.backbones import Backbone, Skinned, backbone_from_weights, backbone_weights
+from refu_core.backbones import Backbone, backbone_from_weights
 from refu_core.errors import WeightsError
 from refu_core.garments import GarmentTemplate
 from refu_core.modes import MAX_MARGIN
@@ -29,23 +28,6 @@ class Trained(NamedTuple):
     backbone: Backbone
     refu: Refu | None
     """None where it was trained without."""
-
-
-def load_trained(
-    name: str,
-    garment: GarmentTemplate,
-    *,
-    mode: str,
-    body_fingerprint: str | None = None,
-    folder: Path | None = None,
-    device: str | torch.device = "cpu",
-) -> Trained:
-    """The backbone `name` of a garment and the layer that was trained with it, each file read once.
-
-    Arguments and errors are those of `refu_core.backbones.load_backbone`.
-    """
-    weights = backbone_weights(name, garment.name, mode=mode, body_fingerprint=body_fingerprint, folder=folder)
-    return Trained(Skinned(), None) if weights is None else trained_from_weights(weights, garment, device=device)
 
 
 def trained_from_weights(weights: Weights, garment: GarmentTemplate, *, device: str | torch.device = "cpu") -> Trained:

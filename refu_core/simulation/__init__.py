@@ -24,8 +24,6 @@ from refu_core.simulation._selection import SelectionSettings as SelectionSettin
 from refu_core.simulation._sequences import SequencePlan as SequencePlan
 from refu_core.simulation._sequences import SequenceSettings as SequenceSettings
 from refu_core.simulation._sequences import simulate_sequences as simulate_sequences
-from refu_core.simulation._styles import StyleBasis as StyleBasis
-from refu_core.simulation._styles import build_styles as build_styles
 from refu_core.simulation._summary import summarise as summarise
 from refu_core.simulation._summary import summarise_sequences as summarise_sequences
 from refu_core.simulation._worker import SimulationSettings as SimulationSettings

@@ -26,7 +26,3 @@ from refu_core.training._pretrain import pretrain as pretrain
 from refu_core.training._progress import TrainingLog as TrainingLog
 from refu_core.training._sdf import SdfSettings as SdfSettings
 from refu_core.training._sdf import train_sdf as train_sdf
-from refu_core.training._sharpen import in_new_codes as in_new_codes
-from refu_core.training._sharpen import next_gains as next_gains
-from refu_core.training._sharpen import orthonormal as orthonormal
-from refu_core.training._sharpen import sharpened as sharpened

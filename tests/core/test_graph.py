@@ -119,7 +119,7 @@ class Tape:
 
 def as_on_a_gpu(pipeline: GarmentPipeline) -> FrameStep:
     """The pipeline's step, with the launches that a GPU gets, and a tree that isn't built anew."""
-    contact, collider = pipeline._step.contact, pipeline.outfit.collider
+    contact, collider = pipeline._steps[0].contact, pipeline.outfit.collider
     if collider is not None:
         collider._is_serial = False
     if contact is not None:
@@ -135,7 +135,7 @@ def as_on_a_gpu(pipeline: GarmentPipeline) -> FrameStep:
         for layers in contact._below.values():
             for layer in layers.values():
                 layer._is_serial = layer.parting._is_serial = False
-    return pipeline._step
+    return pipeline._steps[0]
 
 
 def frames(*seeds: int, style: bool = False) -> list[SmplFrame]:
@@ -220,8 +220,8 @@ def test_the_step_of_a_cpu_waits() -> None:
     pipeline = GarmentPipeline.load(["tshirt-male"], sdf="hybrid")
     inputs = step_inputs(pipeline, frames(0))
     with pytest.raises(RuntimeError, match="would wait for the device"):
-        Tape(lambda: pipeline._step.packed(inputs, (0.004,)), CPU)
-    waited_for = pipeline._step.packed(inputs, (0.004,))
+        Tape(lambda: pipeline._steps[0].packed(inputs, (0.004,)), CPU)
+    waited_for = pipeline._steps[0].packed(inputs, (0.004,))
     step = as_on_a_gpu(GarmentPipeline.load(["tshirt-male"], sdf="hybrid"))
     torch.testing.assert_close(Tape(lambda: step.packed(inputs, (0.004,)), CPU).output, waited_for, atol=2e-3, rtol=0)
 
@@ -314,7 +314,7 @@ def test_packed_and_unpacked() -> None:
     """Without a copy, and refused where it isn't finite."""
     pipeline = GarmentPipeline.load(["tshirt-male", "short-pant-male"], backbone="skinned", sdf="none")
     people = frames(0, 1)
-    step = pipeline._step
+    step = pipeline._steps[0]
     packed = step.packed(step_inputs(pipeline, people), (0.0, 0.0)).numpy()
     for (body, skin, shift, *parts), old in zip(step.unpacked(packed), pipeline(people), strict=True):
         assert np.shares_memory(body, packed)

@@ -486,6 +486,7 @@ def test_damaged_sets_are_refused(simulated: Path, tmp_path: Path) -> None:
         GarmentDataset(tmp_path)
 
 
+@pytest.mark.usefixtures("little_light")
 def test_contact_sheet_shows_each_sample_twice(dataset: GarmentDataset) -> None:
     sheet = contact_sheet(dataset, count=2, columns=1)
     assert sheet.dtype == np.uint8
@@ -689,6 +690,7 @@ def test_impossible_plans_are_refused(numbers: dict[str, Any]) -> None:
         SamplePlan(GARMENT, **({"count": 10} | numbers))
 
 
+@pytest.mark.usefixtures("little_light")
 def test_command_makes_a_set_and_its_picture(clips: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["simulate", GARMENT, "--count", "2", "--motions", str(clips), "--output", str(tmp_path / "set")]
     assert main([*arguments, "--quiet", "--json", str(tmp_path / "card.json")]) == 0

@@ -36,6 +36,7 @@ from refu_core.training import (
     Mirror,
     PretrainSettings,
     TrainingLog,
+    TrainingSamples,
     displacements,
     load_checkpoint,
     mirror_pose,
@@ -100,6 +101,12 @@ def dataset(tmp_path_factory: pytest.TempPathFactory, garment: GarmentTemplate, 
     )
 
 
+@pytest.fixture(scope="module")
+def samples(dataset: Path, garment: GarmentTemplate, body: SmplBody) -> TrainingSamples:
+    """What the set is trained with."""
+    return read_samples(GarmentDataset(dataset), body, garment, split="train")
+
+
 # Samples
 
 
@@ -115,11 +122,11 @@ class Told(WithoutWearerCode):
 
 
 def test_a_network_that_says_what_samples_say_makes_the_simulated_garment(
-    dataset: Path, garment: GarmentTemplate, body: SmplBody
+    dataset: Path, samples: TrainingSamples, garment: GarmentTemplate, body: SmplBody
 ) -> None:
     """Where limbs touch, too: the collider takes cloth along, and no network has to say that."""
     opened = GarmentDataset(dataset)
-    few = read_samples(opened, body, garment, split="train").take(torch.arange(6))
+    few = samples.take(torch.arange(6))
     true = opened.column("vertices")[np.flatnonzero(opened.train)[:6]] * float(opened.card["quantum_m"])
     outfit = Outfit(body, {GARMENT: Wearable(garment, Told(few.displacement), None, 0.0)}, Collider(body))
     dressed = dress(few.pose, Wearer.of(outfit, few.betas, garment.own(few.style)))
@@ -127,9 +134,9 @@ def test_a_network_that_says_what_samples_say_makes_the_simulated_garment(
         assert np.abs(turn.to_host(made) - wanted).max() < 2e-4
 
 
-def test_samples_are_unposed_displacements(dataset: Path, garment: GarmentTemplate, body: SmplBody) -> None:
-    opened = GarmentDataset(dataset)
-    samples = read_samples(opened, body, garment, split="train")
+def test_samples_are_unposed_displacements(
+    dataset: Path, samples: TrainingSamples, garment: GarmentTemplate, body: SmplBody
+) -> None:
     assert len(samples) == 200
     whole = TakenAlong(body, garment).with_it(samples.displacement, samples.betas, samples.pose, samples.style)
     torch.testing.assert_close(whole, cloth(garment, samples.pose), atol=2e-4, rtol=0)
@@ -141,7 +148,7 @@ def test_samples_are_unposed_displacements(dataset: Path, garment: GarmentTempla
     distance = garment.pose(rest + samples.displacement[:1], transforms) - garment.pose(rest, transforms)
     torch.testing.assert_close(errors[0], 1e3 * distance[0].norm(dim=-1), atol=1e-3, rtol=1e-4)
     with pytest.raises(RefuError, match="wanted a set whose garment is skirt-female"):
-        read_samples(opened, load_body("female"), load_garment("skirt-female"), split="train")
+        read_samples(GarmentDataset(dataset), load_body("female"), load_garment("skirt-female"), split="train")
 
 
 @pytest.mark.parametrize("name", ["shirt-male", "tshirt-male", "short-pant-male", "skirt-female"])
@@ -177,8 +184,7 @@ def test_an_asymmetric_garment_has_no_mirror_image(garment: GarmentTemplate) -> 
         Mirror.of(leaning)
 
 
-def test_pairs_are_held_out_whole(dataset: Path, garment: GarmentTemplate, body: SmplBody) -> None:
-    samples = read_samples(GarmentDataset(dataset), body, garment, split="train")
+def test_pairs_are_held_out_whole(samples: TrainingSamples) -> None:
     train, validation = split_validation(samples, share=0.3, seed=1)
     assert not set(train.pair.tolist()) & set(validation.pair.tolist())
     assert len(train) + len(validation) == 200
@@ -187,8 +193,7 @@ def test_pairs_are_held_out_whole(dataset: Path, garment: GarmentTemplate, body:
     assert len(split_validation(samples, share=0.0, seed=1)[1]) == 0
 
 
-def test_the_basis_is_the_principal_components(dataset: Path, garment: GarmentTemplate, body: SmplBody) -> None:
-    samples = read_samples(GarmentDataset(dataset), body, garment, split="train")
+def test_the_basis_is_the_principal_components(samples: TrainingSamples, garment: GarmentTemplate) -> None:
     both = samples.joined(mirrored(samples, Mirror.of(garment)))
     basis = output_basis(both.displacement, rank=2)
     torch.testing.assert_close(basis.components @ basis.components.T, torch.eye(2), atol=2e-3, rtol=0)
@@ -200,9 +205,9 @@ def test_the_basis_is_the_principal_components(dataset: Path, garment: GarmentTe
     assert (rebuilt - both.displacement).norm(dim=-1).mean() < 8e-3
 
 
-def test_a_basis_of_few_samples_has_fewer_components(dataset: Path, garment: GarmentTemplate, body: SmplBody) -> None:
+def test_a_basis_of_few_samples_has_fewer_components(samples: TrainingSamples) -> None:
     """So that a first trial of the whole way needs no set of hundreds."""
-    displacement = read_samples(GarmentDataset(dataset), body, garment, split="train").displacement[:5]
+    displacement = samples.displacement[:5]
     basis = output_basis(displacement, rank=128)
     assert basis.size == 4
     torch.testing.assert_close(basis(basis.encode(displacement)), displacement, atol=2e-4, rtol=0)
@@ -238,6 +243,7 @@ def test_a_trained_tailornet_beats_the_mean(
         ("gcnn", GcnnConfig(JOINTS, hidden=(24,), channels=(6, 6, 6), bases=2, dropout=0.0)),
     ],
 )
+@pytest.mark.usefixtures("no_curves")
 def test_other_backbones_are_trained_the_same_way(
     tmp_path: Path, dataset: Path, name: str, config: MlpConfig | GcnnConfig
 ) -> None:
@@ -251,6 +257,7 @@ def weights(folder: Path) -> dict[str, Tensor]:
     return dict(load_weights(folder / "tailornet-none").tensors)
 
 
+@pytest.mark.usefixtures("no_curves")
 def test_interrupted_it_resumes_to_the_same_weights(
     tmp_path: Path, dataset: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -290,11 +297,11 @@ def test_interrupted_it_resumes_to_the_same_weights(
     assert any(not torch.equal(t, whole[k]) for k, t in weights(tmp_path / "other").items())
 
 
-def test_low_frequency_targets_are_smoothed_garments(dataset: Path, garment: GarmentTemplate, body: SmplBody) -> None:
+def test_low_frequency_targets_are_smoothed_garments(samples: TrainingSamples, garment: GarmentTemplate) -> None:
     from refu_core.backbones import TailorNet, build_backbone
     from refu_core.training._pretrain import low_frequency_code, pivots_of
 
-    samples = read_samples(GarmentDataset(dataset), body, garment, split="train").take(torch.arange(20))
+    samples = samples.take(torch.arange(20))
     smooth = LaplacianSmoothing(garment)
     rest = garment.rest(samples.betas, samples.style)
     wanted = smooth(rest + samples.displacement) - rest
@@ -305,6 +312,7 @@ def test_low_frequency_targets_are_smoothed_garments(dataset: Path, garment: Gar
         torch.testing.assert_close(code, net.decoder.encode(wanted), atol=2e-4, rtol=0)
 
 
+@pytest.mark.usefixtures("no_curves")
 def test_it_stops_when_nothing_gets_better(tmp_path: Path, dataset: Path) -> None:
     loop = replace(QUICK.loop, learning_rate=0.0, check_every=5, patience=2)
     settings = replace(QUICK, loop=loop, is_mirrored=False)
@@ -359,7 +367,11 @@ if __name__ == "__main__":
 
 
 @pytest.mark.skipif(not torch.distributed.is_available(), reason="this torch build has no torch.distributed")
-def test_two_processes_make_the_training_of_one(tmp_path: Path, dataset: Path) -> None:
+@pytest.mark.usefixtures("no_curves")
+def test_two_processes_make_the_training_of_one(tmp_path: Path, garment: GarmentTemplate, body: SmplBody) -> None:
+    dataset = write_set(
+        tmp_path / GARMENT, garment, body, pairs=12, poses=6, spread=0.4, displacement=lambda pose: cloth(garment, pose)
+    )
     script = tmp_path / "train.py"
     script.write_text(_PARALLEL)
     torchrun = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")

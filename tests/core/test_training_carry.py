@@ -22,6 +22,7 @@ from refu_core.training._carried import Carried
 from refu_core.training._carry import _borne_out
 from refu_core.weights import load_card, weights_folder
 
+pytestmark = pytest.mark.usefixtures("no_curves_in_module")
 GARMENT, LIKE = "tshirt-neutral", "tshirt-male"
 SMALL = CarrySettings(rank=40, controls=60, hidden=(16,), poses=40, steps=40)
 ARMS_DOWN = np.zeros((24, 3))
@@ -50,7 +51,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def made(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made(data: Path, no_curves_in_module: None, tmp_path_factory: pytest.TempPathFactory) -> Path:  # noqa: ARG001
     folder = tmp_path_factory.mktemp("weights")
     carry_over(GARMENT, data, folder / GARMENT, like=LIKE, settings=SMALL, quiet=True)
     return folder

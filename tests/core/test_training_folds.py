@@ -16,9 +16,9 @@ from refu_core import load_body, load_garment
 from refu_core.backbones import BasisDecoder, TailorNetConfig, build_backbone
 from refu_core.garments import GarmentTemplate
 from refu_core.metrics import FoldBands
-from refu_core.training import in_new_codes, orthonormal, sharpened
 from refu_core.weights import load_card, weights_folder
 
+SCRIPT = Path(__file__).parents[2] / "scripts" / "sharpen_folds.py"
 GAINS = (2.0, 1.5, 1.2, 1.0)
 SMALL = TailorNetConfig((0, 1, 2, 4, 5), low=(24, 16), high=(8, 6), style_shape=(8,))
 
@@ -45,13 +45,14 @@ def test_bands_add_up_and_a_plane_has_none() -> None:
 def test_a_network_in_other_codes_says_the_same_but_louder(garment: GarmentTemplate) -> None:
     basis, bands = random_basis(garment), FoldBands(garment.mesh)
     net = build_backbone(SMALL, garment, basis=basis, pivots=torch.randn(3, 14)).eval()
-    mean, components = sharpened(basis, bands, GAINS)
-    rows, to_new = orthonormal(components)
+    script = runpy.run_path(str(SCRIPT))
+    mean, components = script["sharpened"](basis, bands, GAINS)
+    rows, to_new = script["orthonormal"](components)
     assert torch.allclose(rows @ rows.T, torch.eye(8), atol=1e-5)
     assert bool((torch.einsum("rc,rc->r", rows, components) > 0).all())
     louder = build_backbone(SMALL, garment, basis=BasisDecoder(mean, rows), pivots=net.pivots).eval()
     state = {name: tensor for name, tensor in net.state_dict().items() if not name.startswith("decoder.")}
-    louder.load_state_dict(in_new_codes(state, to_new), strict=False)
+    louder.load_state_dict(script["in_new_codes"](state, to_new), strict=False)
     betas, pose, style = torch.randn(2, 10), 0.5 * torch.randn(2, 24, 3), torch.randn(2, 4)
     code = net.wearer_code(betas, style)
     with torch.no_grad():
@@ -69,10 +70,9 @@ def test_the_script_rewrites_all_modes(
     folder = tmp_path / garment.name
     shutil.copytree(weights_folder(garment.name), folder)
     write_set(tmp_path / "data", garment, load_body(garment.body), pairs=2, poses=1, test_pairs=1)
-    script = Path(__file__).parents[2] / "scripts/sharpen_folds.py"
     arguments = [str(folder), "--data", str(tmp_path / "data"), "--count", "1", "--rounds", "2"]
-    monkeypatch.setattr(sys, "argv", [str(script), *arguments])
-    runpy.run_path(str(script), run_name="__main__")
+    monkeypatch.setattr(sys, "argv", [str(SCRIPT), *arguments])
+    runpy.run_path(str(SCRIPT), run_name="__main__")
     said = capsys.readouterr().out.splitlines()
     tried, rewritten = ([float(one) for one in line.split("[")[-1].split("]")[0].split()] for line in said[-2:])
     assert rewritten == pytest.approx(tried, abs=0.01)

@@ -195,6 +195,7 @@ def test_every_mode_writes_what_can_be_read(
     assert not any(parameter.requires_grad for parameter in refu.parameters())
 
 
+@pytest.mark.usefixtures("no_curves")
 def test_interrupted_it_resumes_to_the_same_weights(
     tmp_path: Path, dataset: Path, pretrained: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -222,6 +223,7 @@ def test_interrupted_it_resumes_to_the_same_weights(
     assert all(torch.equal(whole[name], parts[name]) for name in whole)
 
 
+@pytest.mark.usefixtures("no_curves")
 def test_training_brings_the_cloth_out_and_nearer_to_the_truth(tmp_path: Path, dataset: Path, pretrained: Path) -> None:
     settings = replace(QUICK, steps=40, loop=replace(QUICK.loop, check_every=20))
     finetune(GARMENT, dataset, pretrained, tmp_path, mode="hybrid", backbone="mlp", settings=settings, quiet=True)
@@ -231,6 +233,7 @@ def test_training_brings_the_cloth_out_and_nearer_to_the_truth(tmp_path: Path, d
     assert lines[-1]["validation"] < 0.8 * first["validation"]
 
 
+@pytest.mark.usefixtures("no_curves")
 def test_goes_on_from_trained_weights_and_their_layer(tmp_path: Path, dataset: Path, pretrained: Path) -> None:
     first = tmp_path / "first"
     finetune(GARMENT, dataset, pretrained, first, mode="hybrid", backbone="mlp", settings=QUICK, quiet=True)
@@ -244,6 +247,7 @@ def test_goes_on_from_trained_weights_and_their_layer(tmp_path: Path, dataset: P
         assert torch.allclose(after.tensors[name].float(), tensor.float(), atol=1e-3), name
 
 
+@pytest.mark.usefixtures("no_curves")
 def test_a_gcnn_is_trained_from_scratch(tmp_path: Path, dataset: Path, garment: GarmentTemplate) -> None:
     settings = replace(QUICK, steps=2, is_mirrored=False, loop=replace(QUICK.loop, batch_size=1))
     card = finetune(GARMENT, dataset, None, tmp_path, mode="approx", backbone="gcnn", settings=settings, quiet=True)

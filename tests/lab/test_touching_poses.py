@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import runpy
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from refu_core import FrameError, GarmentPipeline, SmplFrame
 from refu_core.body import JOINT_NAMES
 from refu_core.metrics import SelfContactDetector
-from refu_lab.touching_poses import TOUCHING_POSES, collider_sheet, touching_pose
+from refu_lab.touching_poses import TOUCHING_POSES, touching_pose
 
 
 @pytest.fixture(scope="module")
@@ -37,8 +40,10 @@ def test_an_unknown_pose_is_refused() -> None:
         touching_pose("flying")
 
 
+@pytest.mark.usefixtures("little_light")
 def test_sheet_has_a_column_a_pose() -> None:
-    sheet = collider_sheet(garments=["short-pant-male"], poses=["prayer", "squat"], size=(30, 40), samples=1)
+    script = runpy.run_path(str(Path(__file__).parents[2] / "scripts" / "make_collider_picture.py"))
+    sheet = script["collider_sheet"](garments=["short-pant-male"], poses=["prayer", "squat"], size=(30, 40), samples=1)
     assert sheet.shape == (120, 60, 3)
     skin, collider, dressed = sheet[:40].astype(int), sheet[40:80].astype(int), sheet[80:].astype(int)
     assert 0 < np.abs(skin - collider).max(2).astype(bool).mean() < 0.5  # what was moved is red
