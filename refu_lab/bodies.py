@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 from refu_core import GarmentPipeline
-from refu_core.body import BUILTIN_BODIES, BodyFit
+from refu_core.body import BodyFit
 from refu_core.modes import FOREIGN_BETAS, BetasSource
+
+_GENDERS = {"m": "male", "male": "male", "f": "female", "female": "female", "n": "neutral", "neutral": "neutral"}
 
 
 def body_facts(pipeline: GarmentPipeline) -> dict[str, Any]:
@@ -24,14 +27,20 @@ def fit_facts(fit: BodyFit) -> dict[str, float]:
 def body_warnings(pipeline: GarmentPipeline, *, gender: str = "") -> list[str]:
     """What there is to warn of, for a recording that says it is of a `gender`, or (empty) doesn't."""
     warnings = pipeline.warnings
-    known = pipeline.body.name if pipeline.fit is None or pipeline.body.name in BUILTIN_BODIES else ""
+    known = _gender_of(pipeline.body.name)
     said = gender.strip().lower()
     if said in ("male", "female") and known and said != known:
         warnings.append(
-            f"the recording is of a {said} body and is dressed as {known}: name a body (body, --body {said}), "
-            "and garments are transferred to it"
+            f"the recording is of a {said} body and is dressed as {pipeline.body.name}: name a body (body, "
+            f"--body {said} or a file), and garments are transferred to it"
         )
     return warnings
+
+
+def _gender_of(body: str) -> str:
+    """Whose body it is by its name, as `SMPL_FEMALE` and `basicModel_f_lbs_10_207_0_v1.0.0` are; empty if unsaid."""
+    words = [word for word in re.split(r"[^a-z]+", body.lower()) if word in _GENDERS]
+    return _GENDERS[words[0]] if words else ""
 
 
 def betas_warnings(pipeline: GarmentPipeline, *, source: str) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -110,8 +111,9 @@ def export(
 
     if path.suffix.lower() not in FORMATS:  # said before the work is done
         write_meshes((), path)
-    pipeline = options.load_pipeline()
-    with open_source(options, pipeline.body) as source:
+    load = cache(options.load_pipeline)
+    with open_source(options, lambda: load().body) as source:
+        pipeline = load()
         frames, warnings = [], body_warnings(pipeline, gender=source.gender)
         for number, record in enumerate(islice(source.records, first, first + count), first):
             with _left_out(number, warnings):

@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -317,12 +318,13 @@ def replay(
         RefuError: a bad input file, an unknown garment, an output that can't be written, or no frame that could be
             replayed.
     """
-    pipeline = pipeline or options.load_pipeline()
-    pipeline(
-        SmplFrame(pose=np.zeros((24, 3), np.float32))
-    )  # compiles kernels, so that the first frame's latency is a frame's
+    load = cache(lambda: pipeline or options.load_pipeline())
     with ExitStack() as stack:
-        source = stack.enter_context(open_source(options, pipeline.body))
+        source = stack.enter_context(open_source(options, lambda: load().body))  # whose faults are told at once
+        pipeline = load()
+        pipeline(
+            SmplFrame(pose=np.zeros((24, 3), np.float32))
+        )  # compiles kernels, so that the first frame's latency is a frame's
         result = ReplayResult(options, source.description, body=body_facts(pipeline))
         result.warnings += body_warnings(pipeline, gender=source.gender)
         if options.backbone == BackboneName.AUTO:

@@ -15,7 +15,7 @@ from refu_core.modes import BetasSource
 from refu_core.recordings import SUFFIXES
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from msg_adapters import FrameRecord
     from refu_core import SmplBody, SmplFrame
@@ -65,8 +65,11 @@ class Source:
 
 
 @contextmanager
-def open_source(options: ReplayOptions, body: SmplBody) -> Iterator[Source]:
-    """Opens the input. Raises `RefuError` for one that can't be read, or with options that it has no use for."""
+def open_source(options: ReplayOptions, body: Callable[[], SmplBody]) -> Iterator[Source]:
+    """Opens the input; `body` is whose bones keypoints have, and isn't asked for where there are none.
+
+    Raises `RefuError` for an input that can't be read, or with options that it has no use for.
+    """
     if options.input.suffix.lower() in SUFFIXES:
         motion = adapters.read_motion(options.input, fps=options.fps, axes=options.input_axes, person=options.person)
         description = f"{options.input.name}, {len(motion)} frames at {motion.fps:g} Hz"
@@ -83,7 +86,7 @@ def open_source(options: ReplayOptions, body: SmplBody) -> Iterator[Source]:
         msg = f"{options.input}: {what} is for files of motion ({', '.join(SUFFIXES)}); bags take smpl or frame"
         raise RefuError(msg)
     is_of_keypoints = options.input_type in adapters.KEYPOINT_TYPES
-    own = _keypoint_decoder(options, body) if is_of_keypoints else None
+    own = _keypoint_decoder(options, body()) if is_of_keypoints else None
     with adapters.open_smpl_bag(options.input, topic=options.topic, input_type=options.input_type, decoder=own) as bag:
         topic, kind = bag.topic.name, bag.topic.message_type
         records = bag.undecoded() if is_of_keypoints else iter(bag)

@@ -7,6 +7,7 @@ import importlib.util
 import os
 import signal
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -32,28 +33,35 @@ if importlib.util.find_spec("torch"):  # the adapters' tests run without it
 
 LONGEST = (
     "lab/test_replay.py",
-    "ros/test_node_requests.py",
+    "test_style.py",
+    "core/test_training_backbone.py",
     "core/test_simulation.py",
+    "core/test_stability.py",
+    "ros/test_node_requests.py",
     "test_faults.py",
     "ros/test_node_recording.py",
-    "lab/test_fleet.py",
-    "test_style.py",
-    "lab/test_view.py",
-    "lab/test_garment.py",
     "lab/test_evaluate.py",
-    "ros/test_node_lazy.py",
-    "ros/test_node.py",
-    "core/test_stability.py",
-    "lab/test_reproduction.py",
-    "ros/test_node_life.py",
-    "core/test_hostile_files.py",
-    "core/test_training_backbone.py",
-    "lab/test_stress.py",
-    "lab/test_train.py",
-    "lab/test_benchmark.py",
-    "fuzz/test_targets.py",
     "core/test_kernel_bounds.py",
+    "lab/test_garment.py",
+    "lab/test_stress.py",
+    "ros/test_node.py",
+    "ros/test_node_lazy.py",
+    "lab/test_fleet.py",
+    "lab/test_benchmark.py",
+    "lab/test_train.py",
+    "core/test_training_refu.py",
+    "ros/test_node_life.py",
+    "core/test_kernel_cache.py",
+    "lab/test_reproduction.py",
+    "ros/test_node_faults.py",
+    "core/test_assets.py",
+    "core/test_own_body.py",
+    "fuzz/test_targets.py",
+    "lab/test_own_body_commands.py",
+    "core/test_hostile_files.py",
     "ros/test_node_stays_up.py",
+    "core/test_repulsion.py",
+    "lab/test_view.py",
 )
 """Files of tests, the one that takes longest first: begun last, one of them would keep a single process busy while all
 others have nothing left to do."""
@@ -97,8 +105,9 @@ def pytest_pycollect_makemodule(module_path: Path, parent: pytest.Collector) -> 
 
 @pytest.fixture(scope="session", autouse=True)
 def cache(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """What is kept from one process to the next is kept apart from the user's own."""
-    os.environ["REFU_CACHE"] = str(tmp_path_factory.getbasetemp() / "cache")
+    """What is kept from one process to the next is kept apart from the user's own; the workers of a run share it."""
+    base = tmp_path_factory.getbasetemp()
+    os.environ["REFU_CACHE"] = str((base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "cache")
 
 
 @pytest.fixture(scope="session")
@@ -110,3 +119,22 @@ def motions() -> list[Path]:
     if not clips:
         pytest.skip(f"no recorded motion in {folder}: set REFU_MOTIONS to a folder of AMASS-style npz files")
     return clips
+
+
+@pytest.fixture
+def little_light(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures with few rays from sun and sky, small ones in reports: what light does, lab/test_render.py tests."""
+    for name, value in (("_SUN_RAYS", 4), ("_SKY_RAYS", 8), ("_GROUND_STEP", 0.2)):
+        monkeypatch.setattr(f"refu_lab.render.{name}", value)
+    monkeypatch.setattr("refu_lab.report._PICTURE", (105, 160))
+
+
+def _without_curves() -> Iterator[None]:
+    """Trainings that draw no loss curves after each stage, which takes longer than a stage of twenty steps."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("refu_core.training.TrainingLog.draw", lambda _: None)
+        yield
+
+
+no_curves = pytest.fixture(_without_curves)
+no_curves_in_module = pytest.fixture(_without_curves, scope="module")

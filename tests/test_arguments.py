@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from refu_core import RefuError
+from refu_core import GarmentPipeline, RefuError
 from refu_core._device import checked_device
 from refu_lab import cli
 from refu_lab.cli import main
@@ -194,3 +194,18 @@ def test_a_gap_of_centuries_isnt_waited_for(monkeypatch: pytest.MonkeyPatch) -> 
     times = (2, 10_000_002, 60_000_000_002)
     assert [r.log_time_ns for r in _paced([Record(t) for t in times], "real")] == list(times)  # type: ignore[arg-type]
     assert time.now == pytest.approx(60, abs=0.01)  # a minute is
+
+
+def test_an_input_that_is_not_there_is_told_before_anything_is_loaded(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A mistyped path is answered at once: its pipeline would take seconds, and then be of no use."""
+
+    def load(*_args: object, **_options: object) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr(GarmentPipeline, "load", load)
+    (tmp_path / "a.json").write_text("{}")
+    for name in ("nope", "nope.npz", str(tmp_path / "a.json")):
+        assert "wanted a" in refused(["replay", name], capsys)
+        assert "wanted a" in refused(["export", name, "--output", str(tmp_path / "a.glb")], capsys)

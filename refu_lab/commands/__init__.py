@@ -1,4 +1,4 @@
-"""The subcommands of `refu`, a module each: `add` makes the parser, `run` does the work.
+"""The subcommands of `refu`, a module each: `add` makes the parser, `run` does the work and gives the exit code back.
 
 What a command needs is imported when it runs, so that `refu --help` doesn't wait for torch.
 """
@@ -7,5 +7,3 @@ from refu_lab.commands import benchmark, evaluate, export, garment, info, replay
 
 COMMANDS = (replay, view, garment, export, simulate, train, evaluate, benchmark, stress, info)
 """In the order of the help."""
-
-__all__ = ["COMMANDS"]

@@ -9,7 +9,6 @@ from refu_lab.commands import _common as cli
 
 
 def add(commands: Any) -> None:
-    """The command's parser."""
     parser = commands.add_parser(
         "benchmark",
         help="measure run time against error of every mode and signed distance",
@@ -39,7 +38,6 @@ def add(commands: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Does what was asked; returns the exit code."""
     from refu_lab.benchmark import BenchmarkOptions, benchmark, benchmark_text, write_results
 
     options = BenchmarkOptions(**cli.given(args, BenchmarkOptions))

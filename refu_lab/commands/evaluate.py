@@ -10,7 +10,6 @@ from refu_lab.tables import RESULT_TABLES
 
 
 def add(commands: Any) -> None:
-    """The command's parser."""
     parser = commands.add_parser(
         "evaluate",
         help="make the paper's tables and figures on own data, beside the paper's figures",
@@ -60,7 +59,6 @@ def add(commands: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Does what was asked; returns the exit code."""
     from refu_lab.fleet import find_data_sets, open_engine
 
     if args.quick:

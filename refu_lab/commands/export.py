@@ -9,7 +9,6 @@ from refu_lab.commands import _common as cli
 
 
 def add(commands: Any) -> None:
-    """The command's parser."""
     parser = commands.add_parser(
         "export",
         help="write dressed persons as GLB, OBJ or USD",
@@ -32,7 +31,6 @@ def add(commands: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Does what was asked; returns the exit code."""
     from refu_lab.export import export
     from refu_lab.replay import ReplayOptions
 

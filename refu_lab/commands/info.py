@@ -9,7 +9,6 @@ from refu_lab.commands import _common as cli
 
 
 def add(commands: Any) -> None:
-    """The command's parser."""
     parser = commands.add_parser(
         "info", help="what is installed, built in and usable", description="What is installed."
     )
@@ -19,7 +18,6 @@ def add(commands: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Does what was asked; returns the exit code."""
     from refu_lab.info import collect, describe_body
 
     facts = collect() if args.body is None else describe_body(args.body)

@@ -11,7 +11,6 @@ from refu_lab.commands import _common as cli
 
 
 def add(commands: Any) -> None:
-    """The command's parser."""
     parser = commands.add_parser(
         "replay",
         help="run recorded motion through the pipeline and measure it",
@@ -66,7 +65,6 @@ def add(commands: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Does what was asked; returns the exit code."""
     from refu_lab.fleet import is_plain
 
     if args.report is not None:

@@ -9,7 +9,6 @@ from refu_lab.commands import _common as cli
 
 
 def add(commands: Any) -> None:
-    """The command's parser."""
     parser = commands.add_parser(
         "simulate",
         help="make a data set of simulated garments",
@@ -45,7 +44,6 @@ def add(commands: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Does what was asked; returns the exit code."""
     from refu_lab.fleet import open_engine
     from refu_lab.simulate import SimulateOptions, simulate, simulation_table
 

@@ -10,7 +10,6 @@ from refu_lab.commands import _common as cli
 
 
 def add(commands: Any) -> None:
-    """The command's parser."""
     parser = commands.add_parser(
         "stress",
         help="try to break the pipeline: numbers, guarantees, invariance, endurance",
@@ -53,7 +52,6 @@ def add(commands: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Does what was asked; returns the exit code."""
     from refu_lab.stress import StressOptions, StressResult, replay_trial, run_stress, stress_table
 
     options = StressOptions(**cli.given(args, StressOptions))

@@ -10,7 +10,6 @@ from refu_lab.commands import _common as cli
 
 
 def add(commands: Any) -> None:
-    """The command's parser."""
     parser = commands.add_parser(
         "train",
         help="train a garment's networks on a data set",
@@ -65,7 +64,6 @@ def add(commands: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Does what was asked; returns the exit code."""
     from refu_lab.train import TrainOptions, train, training_table
 
     options = TrainOptions(**cli.given(args, TrainOptions))

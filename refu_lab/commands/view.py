@@ -10,7 +10,6 @@ from refu_lab.commands import _common as cli
 
 
 def add(commands: Any) -> None:
-    """The command's parser."""
     parser = commands.add_parser(
         "view",
         help="look at recorded motion, dressed, or at a node that runs, in the browser",
@@ -39,7 +38,6 @@ def add(commands: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Does what was asked; returns the exit code."""
     from refu_lab.replay import ReplayOptions
     from refu_lab.view import ViewOptions, view
 

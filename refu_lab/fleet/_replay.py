@@ -7,13 +7,13 @@ import json
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, fields, replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
 from refu_core import GarmentPipeline, RefuError, __version__
+from refu_core._cache import code_hash
 from refu_core._engine import Engine, Lost
 from refu_core.errors import printable
 from refu_lab.fleet._engine import run_function
@@ -205,7 +205,7 @@ def _over_all(result: ReplayResult) -> dict[str, Any]:
 
 def _key(job: _Job, path: Path) -> str:
     """Of what is read, how it is replayed, and with what code and weights."""
-    told: list[Any] = [__version__, _code_hash(), job.recording.name, _recording_hash(job.recording.source, path)]
+    told: list[Any] = [__version__, code_hash(*_CODE), job.recording.name, _recording_hash(job.recording.source, path)]
     names = [option.name for option in fields(ReplayOptions) if option.name not in _NOT_CONTENT]
     told += [[name, _told(getattr(job.options.replay, name))] for name in names]
     return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
@@ -244,12 +244,3 @@ def _files(path: Path) -> Iterator[Path]:
         yield from sorted(file for file in path.rglob("*") if file.is_file())
     elif path.is_file():
         yield path
-
-
-@cache
-def _code_hash() -> str:
-    root = Path(__file__).parents[2]
-    digest = hashlib.sha256()
-    for file in sorted({file for pattern in _CODE for file in root.glob(pattern) if file.is_file()}):
-        digest.update(file.relative_to(root).as_posix().encode() + file.read_bytes())
-    return digest.hexdigest()

@@ -6,13 +6,14 @@ import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from functools import cache, cached_property, partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from refu_core._cache import code_hash
 from refu_core._engine import Engine, InProcess, Lost
 from refu_core._files import read_json, replacing
 from refu_core.errors import RefuError
@@ -275,20 +276,10 @@ def _with_bases(names: Sequence[str]) -> list[Method]:
 
 def _cache_name(garment: str, method: Method, samples_key: str, library: Library) -> str:
     told = json.dumps(
-        [asdict(method), samples_key, library.key(method, garment), library.collider, library.body, _code_hash()],
+        [asdict(method), samples_key, library.key(method, garment), library.collider, library.body, code_hash(*_CODE)],
         sort_keys=True,
     )
     return f"{garment}-{method.name}-{hashlib.sha256(told.encode()).hexdigest()[:16]}.json"
-
-
-@cache
-def _code_hash() -> str:
-    root = Path(__file__).parents[2]
-    digest = hashlib.sha256()
-    for file in sorted(file for pattern in _CODE for file in root.glob(pattern)):
-        digest.update(file.relative_to(root).as_posix().encode())
-        digest.update(file.read_bytes())
-    return digest.hexdigest()
 
 
 def _read_cached(file: Path) -> MethodRun | None:

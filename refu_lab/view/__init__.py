@@ -1,5 +1,4 @@
 """A viewer in the browser: recorded motion, dressed while one looks, or garments as they were recorded."""
 
-from refu_lab.view._view import ViewOptions, view
-
-__all__ = ["ViewOptions", "view"]
+from refu_lab.view._view import ViewOptions as ViewOptions
+from refu_lab.view._view import view as view

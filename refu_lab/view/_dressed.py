@@ -172,7 +172,7 @@ class DressedFilm:
 
     def _frames(self, options: ReplayOptions) -> list[SmplFrame]:
         """In the order of their stamps, one at least."""
-        with open_source(options, self._pipeline.body) as source:
+        with open_source(options, lambda: self._pipeline.body) as source:
             found = [_frame_of(source, record, options) for record in source.records]
             frames = [frame for frame in found if frame is not None]
             n_bad = len(found) - len(frames)

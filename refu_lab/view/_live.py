@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 import msg_adapters as adapters
+from msg_adapters.markers import DELETE, DELETE_ALL
 from refu_core import RefuError
 from refu_lab.view._film import Shape
 from refu_lab.view._markers import MarkerShapes, meshes_of
 
 TOPICS = ("garments", "body")
-_DELETE, _DELETE_ALL = 2, 3
 _LOOK_S = 0.2
 """How often who waits for the first garments looks whether it is to end [s]."""
 _TOGETHER_S = 2.0
@@ -90,11 +90,11 @@ class LiveFilm:
     def _show(self, topic: str, data: bytes) -> None:
         markers = adapters.decode_marker_array(data)
         for marker in markers:
-            if marker.action in (_DELETE, _DELETE_ALL):
+            if marker.action in (DELETE, DELETE_ALL):
                 gone = [
                     key
                     for key in self._shapes
-                    if key[0] == topic and (marker.action == _DELETE_ALL or key[1:] == (marker.ns, marker.id))
+                    if key[0] == topic and (marker.action == DELETE_ALL or key[1:] == (marker.ns, marker.id))
                 ]
                 for key in gone:
                     del self._shapes[key]

@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from msg_adapters import Marker
-from msg_adapters.markers import TRIANGLE_LIST
+from msg_adapters.markers import ADD, TRIANGLE_LIST
 from refu_lab.view._film import Shape
-
-_ADD = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,4 +60,4 @@ class MarkerShapes:
 
 def meshes_of(markers: Iterable[Marker]) -> list[Marker]:
     """Those that are triangles to show."""
-    return [one for one in markers if one.type == TRIANGLE_LIST and one.action == _ADD and len(one.points)]
+    return [one for one in markers if one.type == TRIANGLE_LIST and one.action == ADD and len(one.points)]

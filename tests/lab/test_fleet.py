@@ -140,6 +140,7 @@ def test_a_bad_bag_is_reported_and_the_rest_is_done(bags: Path, alone: Path, tmp
     assert order == sorted(order, reverse=True)
 
 
+@pytest.mark.usefixtures("little_light")
 def test_page_over_all_leads_to_each_report(bags: Path, tmp_path: Path) -> None:
     assert run(bags / "b", "--report", tmp_path / "report") == 2
     page = (tmp_path / "report" / "index.html").read_text()

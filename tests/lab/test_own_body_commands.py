@@ -105,7 +105,7 @@ def test_betas_of_unknown_meaning_are_warned_of_once(tmp_path: Path) -> None:
     assert not warnings_of(tmp_path / "out.mcap", plain, max_frames=1)  # and so does what is made of it
 
 
-def test_a_recording_of_another_gender_is_warned_of(tmp_path: Path) -> None:
+def test_a_recording_of_another_gender_is_warned_of(tmp_path: Path, body: Path) -> None:
     def doubts(path: Path, pipeline: GarmentPipeline) -> list[str]:
         return [text for text in warnings_of(path, pipeline) if "is dressed as" in text]
 
@@ -113,12 +113,17 @@ def test_a_recording_of_another_gender_is_warned_of(tmp_path: Path) -> None:
     (warning,) = doubts(path, bare())
     assert "of a female body and is dressed as male" in warning
     assert not doubts(path, bare("female"))
-    assert not doubts(write_motion(tmp_path / "him.npz", gender="male"), bare())
+    him = write_motion(tmp_path / "him.npz", gender="male")
+    assert not doubts(him, bare())
+    own = bare(str(body))
+    (warning,) = doubts(path, own)
+    assert "of a female body and is dressed as SMPL_MALE" in warning
+    assert not doubts(him, own)
 
 
 def test_a_poor_fit_is_warned_of(body: Path) -> None:
     pipeline = bare(str(body))
-    assert not body_warnings(pipeline, gender="female")
+    assert not body_warnings(pipeline, gender="male")
     found = pipeline.fit.registration
     pipeline.outfit.fit.__dict__["registration"] = Registration(found.vertices, found.place, 0.004, 0.02)
     (warning,) = body_warnings(pipeline)

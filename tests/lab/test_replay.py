@@ -158,11 +158,12 @@ def test_motion_files_replay(motions: list[Path], tmp_path: Path) -> None:
 @pytest.mark.parametrize("garment", PAPER_GARMENTS)
 def test_nothing_is_inside_the_body(garment: str, backbone: str, motions: list[Path]) -> None:
     """Judged by libigl's winding number, on frames of every motion and shipped bag: none within the promised range, and
-    beyond it as many as the frame itself says."""
+    beyond it as many as the frame itself says. Every other frame is worn by skinning, the rest as a network drapes it.
+    """
     pipeline = GarmentPipeline.load([garment], sdf="accurate", backbone=backbone)
     faces = pipeline.body.faces.numpy().astype(np.int64)
     n_promised = 0
-    for frame in sampled_frames(motions):
+    for frame in sampled_frames(motions)[backbone == "tailornet" :: 2]:
         out = pipeline(frame)
         mesh = out[garment]
         winding = igl.fast_winding_number(out.body.astype(np.float64), faces, mesh.local.astype(np.float64))
@@ -201,6 +202,7 @@ def sampled_frames(motions: list[Path]) -> list[SmplFrame]:
     return frames
 
 
+@pytest.mark.usefixtures("little_light")
 def test_report_is_complete_in_its_folder(small_bag: Path, tmp_path: Path) -> None:
     assert run(small_bag, "--report", tmp_path / "report", "--garments", "short-pant-male") == 0
     page = (tmp_path / "report" / "index.html").read_text(encoding="utf-8")
@@ -292,7 +294,7 @@ def empty_bag(path: Path) -> Path:
 def bag_of_something_else(path: Path) -> Path:
     with adapters.BagWriter(path) as writer:
         writer.add_topic("/markers", adapters.MARKER_ARRAY)
-        writer.write("/markers", adapters.encode_delete_all(stamp_ns=0), log_time_ns=0)
+        writer.write("/markers", adapters.encode_delete([("a", 0)], stamp_ns=0), log_time_ns=0)
     return path
 
 

@@ -249,6 +249,7 @@ def test_plots_of_the_same_figures_are_the_same_files(study: rp.Study, tmp_path:
     assert contents[0] == contents[1]
 
 
+@pytest.mark.usefixtures("little_light")
 def test_pictures(study: rp.Study, samples: rp.SampleSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_pictures, "_SIZE", (60, 80))
     ((file, caption),) = rp.picture_garments(study, [samples], tmp_path, library=Emulated())

@@ -12,18 +12,19 @@ from small_set import write_set
 from refu_core import GarmentPipeline, SmplFrame, load_body, load_garment
 from refu_lab.cli import main
 
+pytestmark = pytest.mark.usefixtures("no_curves_in_module")
 GARMENT = "short-pant-male"
 
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_set(
-        tmp_path_factory.mktemp("data") / GARMENT, load_garment(GARMENT), load_body("male"), pairs=20, poses=6
+        tmp_path_factory.mktemp("data") / GARMENT, load_garment(GARMENT), load_body("male"), pairs=12, poses=3
     )
 
 
 @pytest.fixture(scope="module")
-def weights(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def weights(data: Path, no_curves_in_module: None, tmp_path_factory: pytest.TempPathFactory) -> Path:  # noqa: ARG001
     """A backbone and three modes of it, hardly trained."""
     folder = tmp_path_factory.mktemp("weights")
     common = ["train", GARMENT, "--data", str(data), "--output", str(folder / GARMENT), "--quiet"]
