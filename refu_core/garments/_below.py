@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 import warp as wp
 from scipy.spatial import cKDTree
@@ -11,12 +12,16 @@ from torch import Tensor
 from torch.nn import functional
 
 from refu_core._warp import Repeated, is_plain, strips
-from refu_core.body import SmplBody
+from refu_core.body import LEGS, SEGMENTS, SmplBody, weight_of_parts
 from refu_core.garments._below_kernels import N_BELOW, Vertices, Weights, follow_kernel
 from refu_core.garments._template import GarmentTemplate
 
 _WIDTH = 0.01
-"""How much farther than the nearest one these may be to count for much [m]: the length of a body's shorter edges."""
+"""How much farther than a part's nearest vertex others of it may be to count for much [m]: the length of a body's
+shorter edges."""
+_REST = tuple(sorted(set(sum(SEGMENTS.values(), ())) - {*LEGS[0], *LEGS[1]}))
+_PARTS = (_REST, *LEGS)
+"""A skirt hangs from both legs, however near one of them is: cloth between them goes half way with either."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,11 +41,22 @@ class SkinBelow:
     @classmethod
     def of(cls, garment: GarmentTemplate, body: SmplBody) -> SkinBelow:
         """From both in their rest poses; on the body's device and in its precision."""
-        tree = cKDTree(body.v_template.detach().cpu().double().numpy())
-        found, vertex = tree.query(garment.v_template.detach().cpu().double().numpy(), N_BELOW)
-        distance = torch.from_numpy(found)
-        weight = torch.softmax((distance[:, :1] ** 2 - distance**2) / (2 * _WIDTH**2), dim=1)
-        return cls(torch.from_numpy(vertex).int().to(body.device), weight.to(body.v_template))
+        skin, cloth = (one.v_template.detach().cpu().double().numpy() for one in (body, garment))
+        part_of = weight_of_parts(body.weights.cpu(), _PARTS).argmax(1).numpy()
+        square, vertex = [], []
+        for part in range(len(_PARTS)):
+            (own,) = np.nonzero(part_of == part)
+            distance, nearest = cKDTree(skin[own]).query(cloth, N_BELOW)
+            square.append(torch.from_numpy(distance**2))
+            vertex.append(torch.from_numpy(own[nearest]))
+        # A part counts by how much farther it is than the nearest one, for how far off that is.
+        nearest_of = torch.stack([one[:, 0] for one in square], 1)
+        height = nearest_of.amin(1, keepdim=True).clamp(min=torch.finfo(torch.float64).tiny)
+        by_part = (-2 * nearest_of / height).log_softmax(1)
+        within = [((one[:, :1] - one) / (2 * _WIDTH**2)).log_softmax(1) for one in square]
+        score = torch.cat([one + by_part[:, k, None] for k, one in enumerate(within)], 1)
+        best, which = score.topk(N_BELOW, 1)
+        return cls(torch.cat(vertex, 1).gather(1, which).int().to(body.device), best.softmax(1).to(body.v_template))
 
     def __call__(self, shift: Tensor) -> Tensor:
         """How far cloth goes along [m], shape (B, N, 3), with skin that moves by `shift` (B, V, 3). Differentiable."""

@@ -19,6 +19,8 @@ from refu_core.contact import (
     Resolution,
     Resolver,
     Sheet,
+    Shins,
+    Tent,
 )
 from refu_core.garments import inner_first
 from refu_core.modes import SdfMode
@@ -80,8 +82,10 @@ class ContactStage:
         self.resolvers = {
             name: Resolver(one.faces, one.n_vertices, settings=settings) for name, one in garments.items()
         }
-        self._limbs, self._press, self._off_skin = None, {}, {}
+        self._limbs, self._tents, self._press, self._off_skin = None, {}, {}, {}
         if outfit.collider is not None:  # or there is no room
+            self._shins = shins = Shins(body)
+            self._tents = {name: Tent(one, shins) for name, one in garments.items()}
             self._limbs = limbs = LimbMeshes(body)
             self._press = {name: Press(one, limbs, settings=settings) for name, one in garments.items()}
             self._skin = skin = Sheet(outfit.collider.anatomy.mesh, body.v_template)
@@ -120,11 +124,13 @@ class ContactStage:
             self.winding.update(body)
         if self._limbs is not None:
             self._limbs.update(body)
+            self._shins.update(body)
 
     def press(self, name: str, vertices: Tensor) -> Tensor:
-        """Vertices (V, 3) [m] on their own side of other limbs: between where they were and the skin they lie on."""
+        """Vertices (V, 3) [m] behind the shins, then between where they are and the skin they lie on, before limbs."""
         if name not in self._press:
             return vertices
+        vertices = self._tents[name](vertices)
         return self._press[name](vertices, self._outfit.below[name](self._body[None])[0])
 
     def lift(

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from refu_core import GarmentError, GarmentPipeline, SmplFrame, WeightsError, load_body, load_garment
-from refu_core.body import apply_transforms, blend_transforms
+from refu_core.body import LEGS, apply_transforms, blend_transforms, weight_of_parts
 from refu_core.garments import BUILTIN_GARMENTS, PAPER_GARMENTS, SkinBelow
 from refu_core.sdf import ExactSdf
 
@@ -202,12 +202,35 @@ def test_cloth_goes_with_the_skin_that_it_lies_on(name: str) -> None:
     torch.testing.assert_close(as_one, together.expand(2, garment.n_vertices, 3))
     shift = torch.randn(2, body.n_vertices, 3, generator=torch.Generator().manual_seed(0))
     moved = below(shift)
+    parts = weight_of_parts(body.weights, (tuple({*range(24)} - {*LEGS[0], *LEGS[1]}), *LEGS)).argmax(1)
     for i in range(0, garment.n_vertices, 500):
-        distance = (body.v_template - garment.v_template[i]).norm(dim=1)
-        nearest = distance.argsort()[:8]
-        weight = torch.exp(-(distance[nearest] ** 2 - distance.min() ** 2) / (2 * 0.01**2))
-        wanted = (weight[:, None] * shift[:, nearest]).sum(1) / weight.sum()
+        square = (body.v_template - garment.v_template[i]).norm(dim=1) ** 2
+        nearest = torch.stack([square[parts == part].min() for part in range(3)])
+        of_part = (-2 * nearest / nearest.min()).softmax(0)
+        weight = torch.zeros(body.n_vertices)
+        for part in range(3):
+            own = torch.nonzero(parts == part)[:, 0]
+            own = own[square[own].argsort()[:8]]
+            within = (-(square[own] - square[own].min()) / (2 * 0.01**2)).softmax(0)
+            weight[own] = of_part[part] * within
+        weight[weight.argsort()[:-8]] = 0
+        wanted = (weight[:, None] * shift).sum(1) / weight.sum()
         torch.testing.assert_close(moved[:, i], wanted, atol=1e-4, rtol=1e-4)
+
+
+def test_cloth_between_the_legs_goes_half_way_with_either() -> None:
+    garment = load_garment("skirt-female")
+    body = load_body(garment.body)
+    shift = torch.zeros(1, body.n_vertices, 3)
+    shift[0, weight_of_parts(body.weights, LEGS)[:, 0] > 0.5, 0] = 1.0
+    moved = SkinBelow.of(garment, body)(shift)[0, :, 0]
+    hem = torch.nonzero(garment.v_template[:, 1] < garment.v_template[:, 1].min() + 0.02)[:, 0]
+    front = hem[(garment.v_template[hem, 2] > 0.1)]
+    middle = front[garment.v_template[front, 0].abs().argmin()]
+    assert 0.35 < float(moved[middle]) < 0.65
+    # Along the hem from one leg to the other it is a slope, not a step.
+    across = front[garment.v_template[front, 0].argsort()]
+    assert float(moved[across].diff().abs().max()) < 0.25
 
 
 def test_gradcheck_of_cloth_that_goes_with_the_skin() -> None:

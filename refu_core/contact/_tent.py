@@ -1,0 +1,110 @@
+"""Cloth that hangs behind the legs: it stays behind them."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+import warp as wp
+from numpy.typing import NDArray
+from torch import Tensor
+
+from refu_core._warp import as_warp, strips, torch_stream
+from refu_core.body import LEGS, SmplBody, weight_of_parts
+from refu_core.contact import _tent_kernels as kernels
+from refu_core.frames import N_BETAS
+from refu_core.garments import GarmentTemplate
+from refu_core.skeleton import JOINT_NAMES
+
+_BACKWARDS = np.array([0.0, 0.0, -1.0])
+"""In the T-pose, SMPL axes."""
+_BONES = [[JOINT_NAMES.index(f"{side}_{joint}") for joint in ("knee", "ankle")] for side in ("left", "right")]
+
+
+class Shins:
+    """How the lower legs of one posed body stand: one for all garments on it."""
+
+    def __init__(self, body: SmplBody) -> None:
+        """For poses of this body, on its device."""
+        self._device = body.device
+        self._vertices = torch.zeros_like(body.v_template).copy_(body.v_template)
+        skin, self._joints = (
+            one.detach().cpu().double().numpy()
+            for one in (body.v_template, body.rest_joints(body.v_template.new_zeros(1, N_BETAS))[0])
+        )
+        owner = body.weights.argmax(1).cpu().numpy()
+        of_legs, shares, radii = [], [], []
+        for knee, ankle in _BONES:
+            (own,) = np.nonzero(owner == knee)
+            places = np.stack([self._joints[knee], self._joints[ankle], self._joints[knee] + _BACKWARDS])
+            # What moves the skin by an affine map moves these places by the same.
+            shares.append(np.linalg.pinv(np.c_[skin[own], np.ones(len(own))]).T @ np.c_[places, np.ones(3)].T)
+            of_legs.append(own)
+            bone = places[1] - places[0]
+            off = np.linalg.norm(np.cross(skin[own] - places[0], bone), axis=1) / np.linalg.norm(bone)
+            radii.append(off.mean() if len(own) else np.inf)  # without skin there is no tent
+        self.radius = np.array(radii)
+        """How far the skin of each is from its bone at rest, on average [m]."""
+        name = str(self._device)
+        self.data = data = kernels.Shins()
+        """As kernels read it."""
+        data.start = wp.array(np.cumsum([0, *map(len, of_legs)]), dtype=wp.int32, device=name)
+        data.vertex = wp.array(np.concatenate(of_legs), dtype=wp.int32, device=name)
+        data.share = wp.array2d(np.concatenate(shares), dtype=wp.float32, device=name)
+        data.radius = wp.array(self.radius, dtype=wp.float32, device=name)
+        data.places = wp.zeros((kernels.N_LEGS, kernels.N_PLACES), dtype=wp.vec3, device=name)
+        points = as_warp(self._vertices, wp.vec3)
+        self._stand = wp.launch(kernels.stand_kernel, kernels.N_LEGS, [points, data], device=name, record_cmd=True)
+
+    def update(self, body: Tensor) -> None:
+        """Takes over a pose: vertices (V, 3) [m]."""
+        self._vertices.copy_(body)
+        with torch_stream(self._device):
+            self._stand.launch()
+
+    def behind(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """How far points (N, 3) [m] are behind each leg's bone at rest [m], shape (N, 2)."""
+        far = []
+        for knee, ankle in _BONES:
+            start, bone = self._joints[knee], self._joints[ankle] - self._joints[knee]
+            along = np.clip((points - start) @ bone / (bone @ bone), 0, 1)
+            far.append((points - start - along[:, None] * bone) @ _BACKWARDS)
+        return np.stack(far, 1)
+
+
+class Tent:
+    """Keeps cloth that hangs behind the legs at rest behind the shins in any pose.
+
+    The back of a skirt follows the thighs. A heel that goes up behind meets it, and networks leave it centimetres
+    inside the calf, from where the gradient leads to one side in one frame and to the other in the next. So before
+    cloth is brought off anything it goes backwards, out of a tent over each shin, by the shortest way out of both.
+
+    It is a continuous function of the pose, and no number of it is tuned. The tent is as wide as the shin. Cloth that
+    is farther behind the bone than that at rest goes all the way, other cloth in proportion, and none at rest.
+    """
+
+    def __init__(self, garment: GarmentTemplate, shins: Shins) -> None:
+        """For a garment on the body whose shins these are."""
+        self._device = garment.v_template.device
+        at_rest = shins.behind(garment.v_template.detach().cpu().double().numpy())
+        # What hangs from both legs goes all the way with either.
+        follows = np.minimum(2 * weight_of_parts(garment.weights, LEGS).cpu().numpy(), 1)
+        weight = np.clip(at_rest / shins.radius, 0, 1) * follows
+        (rows,) = np.nonzero(weight.max(1))
+        name = str(self._device)
+        hanging = kernels.Hanging()
+        hanging.vertex = wp.array(rows, dtype=wp.int32, device=name)
+        hanging.at_rest = wp.array2d(at_rest[rows], dtype=wp.float32, device=name)
+        hanging.weight = wp.array2d(weight[rows], dtype=wp.float32, device=name)
+        self._cloth = torch.zeros_like(garment.v_template, dtype=torch.float32)
+        n_strips, each = strips(len(rows), self._device)
+        inputs = [hanging, shins.data, int(each), as_warp(self._cloth, wp.vec3)]
+        self._pitch = wp.launch(kernels.tent_kernel, n_strips, inputs, device=name, record_cmd=True)
+
+    @torch.no_grad()
+    def __call__(self, points: Tensor) -> Tensor:
+        """The garment (N, 3) [m] out of the tents over the shins as they are. Not differentiable."""
+        self._cloth.copy_(points)
+        with torch_stream(self._device):
+            self._pitch.launch()
+        moved: Tensor = self._cloth.clone()
+        return moved
