@@ -81,6 +81,6 @@ def collect() -> dict[str, Any]:
             g.name: f"{g.n_vertices} vertices, {len(g.faces)} faces, for {g.body}; {networks_of(g.name)}"
             for g in garments
         },
-        "backbones": list(BackboneName),
-        "sdf modes": list(SdfMode),
+        "backbones": [str(one) for one in BackboneName],
+        "sdf modes": [str(one) for one in SdfMode],
     }

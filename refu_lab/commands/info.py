@@ -26,4 +26,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _short(value: Any) -> str:
+    if isinstance(value, dict):
+        return f"\n{'':>21}".join(f"{name}: {_short(one)}" for name, one in value.items())
+    if isinstance(value, list):
+        return ", ".join(map(_short, value))
     return f"{value:.2f}" if isinstance(value, float) else str(value)
