@@ -11,6 +11,7 @@ from torch import Tensor
 from refu_core._warp import as_warp, strips, torch_stream
 from refu_core.body import LEGS, SmplBody, weight_of_parts
 from refu_core.contact import _tent_kernels as kernels
+from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
 from refu_core.frames import N_BETAS
 from refu_core.garments import GarmentTemplate
 from refu_core.skeleton import JOINT_NAMES
@@ -78,17 +79,17 @@ class Tent:
     inside the calf, from where the gradient leads to one side in one frame and to the other in the next. So before
     cloth is brought off anything it goes backwards, out of a tent over each shin, by the shortest way out of both.
 
-    It is a continuous function of the pose, and no number of it is tuned. The tent is as wide as the shin. Cloth that
-    is farther behind the bone than that at rest goes all the way, other cloth in proportion, and none at rest.
+    It is a continuous function of the pose. The tent is as wide as the shin. Cloth that is farther behind the bone than
+    that at rest goes by `tent_share`, other cloth by less, and none at rest.
     """
 
-    def __init__(self, garment: GarmentTemplate, shins: Shins) -> None:
+    def __init__(self, garment: GarmentTemplate, shins: Shins, *, settings: ContactSettings = DEFAULT_CONTACT) -> None:
         """For a garment on the body whose shins these are."""
         self._device = garment.v_template.device
         at_rest = shins.behind(garment.v_template.detach().cpu().double().numpy())
-        # What hangs from both legs goes all the way with either.
+        # What hangs from both legs goes as far with either.
         follows = np.minimum(2 * weight_of_parts(garment.weights, LEGS).cpu().numpy(), 1)
-        weight = np.clip(at_rest / shins.radius, 0, 1) * follows
+        weight = settings.tent_share * np.clip(at_rest / shins.radius, 0, 1) * follows
         (rows,) = np.nonzero(weight.max(1))
         name = str(self._device)
         hanging = kernels.Hanging()

@@ -85,7 +85,7 @@ class ContactStage:
         self._limbs, self._tents, self._press, self._off_skin = None, {}, {}, {}
         if outfit.collider is not None:  # or there is no room
             self._shins = shins = Shins(body)
-            self._tents = {name: Tent(one, shins) for name, one in garments.items()}
+            self._tents = {name: Tent(one, shins, settings=settings) for name, one in garments.items()}
             self._limbs = limbs = LimbMeshes(body)
             self._press = {name: Press(one, limbs, settings=settings) for name, one in garments.items()}
             self._skin = skin = Sheet(outfit.collider.anatomy.mesh, body.v_template)
