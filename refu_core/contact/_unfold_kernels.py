@@ -49,6 +49,8 @@ def fold_kernel(
 def widest(i: int, weight: wp.array[float], share: wp.array[float], cut: Cut, fade: float) -> float:
     """The weight of a vertex, or what is left of the largest of its neighbours'."""
     most = float(0.0)
+    if share[i] == 0.0:
+        return most
     for r in range(cut.ring_start[i], cut.ring_start[i + 1]):
         most = wp.max(most, weight[cut.ring[r]])
     return wp.max(weight[i], wp.min(fade * most, share[i]))
