@@ -13,3 +13,4 @@ from refu_core.contact._settings import ContactSettings as ContactSettings
 from refu_core.contact._sheet import Sheet as Sheet
 from refu_core.contact._tent import Shins as Shins
 from refu_core.contact._tent import Tent as Tent
+from refu_core.contact._unfold import Unfold as Unfold

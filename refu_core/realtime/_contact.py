@@ -21,6 +21,7 @@ from refu_core.contact import (
     Sheet,
     Shins,
     Tent,
+    Unfold,
 )
 from refu_core.garments import inner_first
 from refu_core.modes import SdfMode
@@ -92,6 +93,11 @@ class ContactStage:
             self._off_skin = {
                 name: Parting(one.mesh, one.v_template, skin, settings=settings) for name, one in garments.items()
             }
+        self._unfold = {
+            name: Unfold(one, [other for other in garments.values() if other is not one], settings=settings)
+            for name, one in garments.items()
+            if len(garments) > 1
+        }
         self._is_serial = body.device.type == "cpu"
         self._outfit, self._farthest, self._kept = outfit, settings.max_displacement, settings.layer_margin
         self._partings, self._part_most = settings.partings, settings.parting_most
@@ -125,6 +131,10 @@ class ContactStage:
         if self._limbs is not None:
             self._limbs.update(body)
             self._shins.update(body)
+
+    def unfold(self, name: str, vertices: Tensor, rotation: Tensor) -> Tensor:
+        """Vertices (V, 3) [m] levelled where folded over beside another garment; joints are turned by (24, 3, 3)."""
+        return self._unfold[name](vertices, rotation) if name in self._unfold else vertices
 
     def press(self, name: str, vertices: Tensor) -> Tensor:
         """Vertices (V, 3) [m] behind the shins, then between where they are and the skin they lie on, before limbs."""

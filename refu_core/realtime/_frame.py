@@ -117,7 +117,8 @@ class FrameStep:
                 raw = vertices = drape.vertices[person]
                 numbers, n_clipped = raw.new_zeros(N_NUMBERS), raw.new_zeros(())
                 if self.contact is not None:
-                    pressed = self.contact.press(name, raw)
+                    flat = self.contact.unfold(name, raw, dressed.transforms.rotation[person])
+                    pressed = self.contact.press(name, flat)
                     vertices, n_layered = self.contact.lift(name, pressed, garments)
                     if len(self._order) > 1:
                         clock.lap("layers", name)

@@ -120,7 +120,9 @@ def bounded(subject: Subject, trial: Trial) -> Iterator[Measurement]:
         (out,) = pipeline(trial.frames)
         moved = np.linalg.norm(out[name].local - out[name].raw, axis=1)
         yield _finite(out)
-        yield _farthest(moved, _pressed(subject, trial.frames[0])[name] + MAX_DISPLACEMENT + _BOUND_SLACK)
+        yield _farthest(
+            moved, _pressed(subject, trial.frames[0], together=True)[name] + MAX_DISPLACEMENT + _BOUND_SLACK
+        )
 
 
 def no_jumps(subject: Subject, trial: Trial) -> Iterator[Measurement]:
@@ -157,7 +159,7 @@ def bounded_jumps(subject: Subject, trial: Trial) -> Iterator[Measurement]:
     before: dict[str, NDArray[np.floating]] = {}
     for frame, (last, out) in zip(trial.frames, _pairs(subject.pipeline, trial), strict=True):
         yield _finite(out)
-        pressed = _pressed(subject, frame)
+        pressed = _pressed(subject, frame, together=True)
         for name, mesh in out.items() if last is not None else ():
             pace = PACE * float(np.linalg.norm(out.body - last.body, axis=1).max())
             way = np.linalg.norm(mesh.local - last[name].local, axis=1)
@@ -165,15 +167,23 @@ def bounded_jumps(subject: Subject, trial: Trial) -> Iterator[Measurement]:
         before = pressed
 
 
-def _pressed(subject: Subject, frame: SmplFrame) -> dict[str, NDArray[np.floating]]:
-    """How far limbs press the vertices of each garment towards the skin that it lies on [m], (N,)."""
+def _pressed(subject: Subject, frame: SmplFrame, *, together: bool = False) -> dict[str, NDArray[np.floating]]:
+    """How far limbs press the vertices of each garment towards the skin that it lies on [m], (N,).
+
+    Of garments worn `together`, how far unfolding them beforehand takes them as well.
+    """
     stage, outfit = subject.contact_stage, subject.pipeline.outfit
     pose, betas = torch.tensor(frame.pose)[None], torch.tensor(frame.betas)[None]
     style = None if frame.style is None else torch.tensor(frame.style)[None]
     with torch.no_grad():
         dressed = dress(pose, Wearer.of(outfit, betas, style))
         stage.update(dressed.body[0])
-        ways = {name: stage.press(name, one.vertices[0]) - one.vertices[0] for name, one in dressed.drapes.items()}
+        ways = {}
+        for name, one in dressed.drapes.items():
+            raw = flat = one.vertices[0]
+            if together:
+                flat = stage.unfold(name, raw, dressed.transforms.rotation[0])
+            ways[name] = stage.press(name, flat) - raw
     return {name: np.linalg.norm(way.numpy(), axis=1) for name, way in ways.items()}
 
 
