@@ -99,8 +99,7 @@ class Anatomy:
         self.farthest = self._thickness(rest, mesh).mul(settings.thin).clamp(max=settings.farthest)
         """How far skin may be moved [m], shape (V,)."""
         joints = body.rest_joints(body.v_template.new_zeros(1, N_BETAS))[0].double().cpu().numpy()
-        how = {"farthest": settings.aside_farthest, "rounds": settings.aside_rounds}
-        self.aside = Aside(rest, mesh, weights, joints, **how, device=self.device)
+        self.aside = Aside(rest, mesh, weights, joints, settings.aside_farthest, settings.aside_rounds, self.device)
         """Arms out of what isn't an arm."""
         self.work = self.tensors.bound()
         self.work.farthest = as_warp(self.farthest, wp.float32)

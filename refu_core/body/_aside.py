@@ -48,7 +48,6 @@ class Aside:
         mesh: Connectivity,
         weights: Array,
         joints: Array,
-        *,
         farthest: float,
         rounds: int,
         device: torch.device,
