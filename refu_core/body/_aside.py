@@ -126,11 +126,13 @@ class Aside:
         return self._means(skin)[len(ARMS) : self._first_cap]
 
     def _means(self, skin: Tensor) -> Tensor:
-        return embedding_bag(self._vertex, skin, self._start, mode="sum", per_sample_weights=self._weight.to(skin))
+        weight = self._weight.to(skin)
+        means: Tensor = embedding_bag(self._vertex, skin, self._start, mode="sum", per_sample_weights=weight)
+        return means
 
     def _is_in_box(self, points: Tensor) -> Tensor:
-        low, high = self._box
-        return ((points > low) & (points < high)).all(1)
+        is_in: Tensor = ((points > self._box[0]) & (points < self._box[1])).all(1)
+        return is_in
 
     def _way_out(self, points: Tensor, at: Tensor) -> Tensor:
         """From each place (C, 3) [m] to the surface, of those that are inside; zeros for others."""
