@@ -13,11 +13,13 @@ from numpy.typing import ArrayLike, NDArray
 from refu_core._warp import as_warp
 from refu_core.body import _collider_kernels as kernels
 from refu_core.body import _part_kernels as parting
+from refu_core.body._aside import Aside
 from refu_core.body._bundles import bundled
 from refu_core.body._creases import LEVELS, find_creases
 from refu_core.body._kinematics import PARENTS
 from refu_core.body._model import SmplBody
 from refu_core.body._segments import SOFTNESS, cut
+from refu_core.frames import N_BETAS
 from refu_core.mesh import Connectivity, vertex_normals
 
 DEFAULT_GAP = 0.012
@@ -44,10 +46,15 @@ class ColliderSettings:
     """Share of its distance from another segment in the rest pose that skin keeps, at most the gap: at a joint
     segments are 0 apart. Half of it leaves 93 % of recorded frames free of intersections, in place of 97 %."""
     farthest: float = 0.035
-    """No skin moves farther than this [m]. Where two parts overlap by more than twice as much they still do: no flesh
-    gives way to a pose that no body can take."""
+    """No skin gives way by more than this [m]. Where two parts overlap by more than twice as much they still do: no
+    flesh gives way to a pose that no body can take."""
     thin: float = 0.4
     """Nor farther than this share of what is below it: a finger gives way by millimetres, and isn't turned over."""
+    aside_farthest: float = 0.07
+    """No arm goes aside by more than this [m]. Recorded motion is of slim people: on a body with 4.5 cm wider hips, 101
+    of 116 T-shirts and 108 shorts are free with 35 mm, 105 and 112 with 50 mm, 108 and 113 with 70 mm."""
+    aside_rounds: int = 3
+    """Newton's steps of an arm out of the body."""
     crease_rounds: int = 2
     """How often skin is brought to its side: at the groin several seams meet."""
     part_rounds: int = 4
@@ -91,6 +98,9 @@ class Anatomy:
         self.segments = self._bind_segments(rest, mesh, weights)
         self.farthest = self._thickness(rest, mesh).mul(settings.thin).clamp(max=settings.farthest)
         """How far skin may be moved [m], shape (V,)."""
+        joints = body.rest_joints(body.v_template.new_zeros(1, N_BETAS))[0].double().cpu().numpy()
+        self.aside = Aside(rest, mesh, weights, joints, settings.aside_farthest, settings.aside_rounds, self.device)
+        """Arms out of what isn't an arm."""
         self.work = self.tensors.bound()
         self.work.farthest = as_warp(self.farthest, wp.float32)
 

@@ -15,20 +15,22 @@ from refu_core.body import _launch_kernels as launches
 from refu_core.body import _part_kernels as parting
 from refu_core.body import _serial_kernels as serial
 from refu_core.body._anatomy import DEFAULT_GAP, Anatomy, ColliderSettings
-from refu_core.body._collider_gradient import Closest, part_with_gradient
+from refu_core.body._closest import Closest
+from refu_core.body._collider_gradient import part_with_gradient
 from refu_core.body._kinematics import PARENTS, RigidTransforms
 from refu_core.body._model import SmplBody
 
 
 class Collider:
-    """Gives way where a posed body runs through itself, as flesh does; pose and joints stay.
+    """Gives way where a posed body runs through itself, as flesh does; the pose stays.
 
-    1. *Creases.* Where a joint bends, skinning folds skin over itself. Skin is brought back to its own side of the
+    1. *Arms* that are inside the body by more than half of their thickness go aside as a whole (`Aside`).
+    2. *Creases.* Where a joint bends, skinning folds skin over itself. Skin is brought back to its own side of the
        seams near by (`Creases`), along the normal of a plane that turns with the joint.
-    2. *Segments.* Parts that are in each other, or nearer than the gap, each give way until they are on their own side
+    3. *Segments.* Parts that are in each other, or nearer than the gap, each give way until they are on their own side
        of the surface half way between them, by the softness of each: ReFU with the distance of one part from the other.
        Of no pair of parts can both then be at the same place.
-    3. Dents are levelled, and edges that cut their corners raised.
+    4. Dents are levelled, and edges that cut their corners raised.
 
     The result depends on the pose alone, not on the frames before, and continuously. Nothing moves where nothing is
     near: skin keeps its distance only as far as it has one in the rest pose.
@@ -57,7 +59,19 @@ class Collider:
 
         `transforms` are those that they were posed with, leading shape (B, 24).
         """
-        rotation = transforms.rotation
+        return self.apart(*self.aside(skin, transforms.rotation))
+
+    def aside(self, skin: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor]:
+        """The first step: bodies `skin` [m], shape (B, V, 3), and their joints' `rotation` (B, 24, 3, 3) with arms
+        aside. Differentiable."""
+        if not len(skin):
+            return skin, rotation
+        found = [self.anatomy.aside(one, turn) for one, turn in zip(skin, rotation, strict=True)]
+        skins, turns = zip(*found, strict=True)
+        return torch.stack(skins), torch.stack(turns)
+
+    def apart(self, skin: Tensor, rotation: Tensor) -> Tensor:
+        """All other steps: bodies with arms `aside`, their joints' `rotation` and the result as there."""
         if not is_plain(skin, rotation):
             apart = [part_with_gradient(self, one, turn) for one, turn in zip(skin, rotation, strict=True)]
             return torch.stack(apart) if apart else torch.zeros_like(skin)
@@ -202,12 +216,13 @@ class Collider:
     def _recorded(self, kernel: Any, dim: int, inputs: list[Any]) -> Any:
         return wp.launch(kernel, dim, inputs, device=str(self.device), record_cmd=True)
 
-    def is_held(self, way: Tensor) -> Tensor:
-        """Whether skin that went so far, (B, V) [m], has gone as far as it may: bool, shape (B, V).
+    def is_held(self, aside: Tensor, way: Tensor) -> Tensor:
+        """Whether skin that went `aside` with its arm, and gave `way` from there, (B, V) both [m], has gone as far as
+        it may in one of the two: bool, shape (B, V).
 
         Where it has, two parts may still be in each other: as deep as flesh doesn't give way to.
         """
-        return way > _HELD * self.anatomy.farthest.to(way)
+        return (aside > _HELD * self.settings.aside_farthest) | (way > _HELD * self.anatomy.farthest.to(way))
 
     @torch.no_grad()
     def touched(self, skin: Tensor) -> Tensor:

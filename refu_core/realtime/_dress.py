@@ -42,6 +42,8 @@ class Dressed(NamedTuple):
     """The collider: `skin` with its overlaps pulled apart; the same where the outfit has none [m], shape (B, V, 3)."""
     skin: Tensor
     """The posed body, which runs through itself where limbs meet [m], shape (B, V, 3)."""
+    aside: Tensor
+    """`skin` with arms out of the body, before anything gives way (`Collider.aside`) [m], shape (B, V, 3)."""
     drapes: Mapping[str, Drape]
     turns: list[RootTurn]
     """Bring each person to the world's axes."""
@@ -60,9 +62,10 @@ def dress(pose: Tensor, wearer: Wearer, *, lap: Lap = _no_lap) -> Dressed:
     turns, at_root = RootTurn.taken_off(pose, wearer.shape.joints)
     posed = wearer.outfit.body.posed(at_root, wearer.shape)
     lap("body", None)
-    outfit, body = wearer.outfit, posed.vertices
+    outfit, body, aside = wearer.outfit, posed.vertices, posed.vertices
     if outfit.collider is not None:
-        body = outfit.collider(posed.vertices, posed.transforms)
+        aside, rotation = outfit.collider.aside(posed.vertices, posed.transforms.rotation)
+        body = outfit.collider.apart(aside, rotation)
         lap("collider", None)
     drapes = {}
     for name, garment in wearer.garments.items():
@@ -71,7 +74,7 @@ def dress(pose: Tensor, wearer: Wearer, *, lap: Lap = _no_lap) -> Dressed:
             drape = drape._replace(vertices=drape.vertices + outfit.below[name](body - posed.vertices))
         drapes[name] = drape
         lap("backbone", name)
-    return Dressed(body, posed.vertices, drapes, turns, posed.transforms)
+    return Dressed(body, posed.vertices, aside, drapes, turns, posed.transforms)
 
 
 def scale_of(wearable: Wearable, drape: Drape, person: int) -> float | VertexScale:

@@ -170,5 +170,6 @@ def _shift(dressed: Dressed, collider: Collider | None) -> Tensor:
     if collider is None:
         return dressed.body.new_zeros(len(dressed.body), N_SHIFT)
     way = torch.linalg.vector_norm(dressed.body - dressed.skin, dim=-1)
-    n_moved, n_held = (which.sum(1).to(way) for which in (way > _MOVED, collider.is_held(way)))
+    went, gave = (torch.linalg.vector_norm(one - dressed.aside, dim=-1) for one in (dressed.skin, dressed.body))
+    n_moved, n_held = (which.sum(1).to(way) for which in (way > _MOVED, collider.is_held(went, gave)))
     return torch.stack((n_moved, way.amax(1), way.mean(1), n_held), 1)

@@ -31,8 +31,8 @@ class SkinShift:
     mean: float = 0.0
     """The mean of all vertices' ways, those that stayed among them [m]."""
     n_held: int = 0
-    """Vertices that went as far as skin may (`Collider.is_held`): there the body may run through itself still, deeper
-    than any body does, and cloth has no room."""
+    """Vertices that went as far as skin, or their arm, may (`Collider.is_held`): there the body may run through itself
+    still, deeper than any body does, and cloth has no room."""
 
     @classmethod
     def of(cls, numbers: Sequence[float]) -> SkinShift:

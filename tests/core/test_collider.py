@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from refu_core import load_body
-from refu_core.body import Collider, RigidTransforms, SmplBody, rotvec_to_rotmat
+from refu_core.body import ARMS, Collider, RigidTransforms, SmplBody, rotvec_to_rotmat
 from refu_core.errors import MeshError
 from refu_core.metrics import SelfContactDetector
 
@@ -29,6 +29,14 @@ POSES = {
     "sitting": {"left_hip": (-1.5, 0, 0.1), "right_hip": (-1.5, 0, -0.1), "left_knee": (1.5, 0, 0)},
     "bent forward": {"left_hip": (-1.0, 0, 0), "right_hip": (-1.0, 0, 0), "spine1": (0.6, 0, 0)},
 }
+
+
+INSIDE = {
+    "hand in the hip": {"left_shoulder": (0, 0, -1.54), "right_shoulder": (0, 0, 1.53)},
+    "hand in a thigh that is lifted": {"left_shoulder": (0, 0, -1.5), "left_hip": (0, 0, 0.23)},
+}
+"""Poses in which an arm is inside the body: it goes aside as a whole."""
+ALL = POSES | INSIDE
 
 
 def posed(body: SmplBody, turns: dict[str, tuple[float, float, float]]) -> torch.Tensor:
@@ -94,20 +102,20 @@ def test_it_sees_the_pose_alone(body: SmplBody, collider: Collider) -> None:
     torch.testing.assert_close(collider(together.vertices, together.transforms), torch.cat(alone), rtol=0, atol=1e-5)
 
 
-@given(st.sampled_from(sorted(POSES)), st.floats(0.2, 1.0))
+@given(st.sampled_from(sorted(ALL)), st.floats(0.2, 1.0))
 def test_it_follows_the_pose_without_jumps(name: str, share: float) -> None:
     body, collider = _the_same()
-    poses = torch.cat([s * posed(body, POSES[name]) for s in (share, share - 0.005)])
+    poses = torch.cat([s * posed(body, ALL[name]) for s in (share, share - 0.005)])
     skin = body(pose=poses)
     apart = collider(skin.vertices, skin.transforms)
     (a, b), (skin_a, skin_b) = apart, skin.vertices
     assert ((a - b).norm(dim=1) <= 1.5 * (skin_a - skin_b).norm(dim=1).max() + 3 * MM).all()
 
 
-@pytest.mark.parametrize("name", POSES)
+@pytest.mark.parametrize("name", ALL)
 def test_in_double_precision_it_is_the_same_to_a_micrometre(name: str, body: SmplBody, collider: Collider) -> None:
     double = body.to(dtype=torch.float64)
-    skin, exact = (one(pose=posed(one, POSES[name])) for one in (body, double))
+    skin, exact = (one(pose=posed(one, ALL[name])) for one in (body, double))
     fast, slow = collider(skin.vertices, skin.transforms), collider(exact.vertices, exact.transforms)
     assert slow.dtype == torch.float64
     torch.testing.assert_close(fast.double(), slow, rtol=0, atol=2e-6)
@@ -131,9 +139,28 @@ def test_its_derivative_is_that_of_finite_differences(name: str, body: SmplBody,
     torch.testing.assert_close((gradient * way).sum(), slope, rtol=2e-2, atol=1e-2)
 
 
-@pytest.mark.parametrize("name", POSES)
+@pytest.mark.parametrize("name", INSIDE)
+def test_the_derivative_of_arms_that_go_aside(name: str, body: SmplBody, collider: Collider) -> None:
+    double = body.to(dtype=torch.float64)
+    random = torch.Generator().manual_seed(1)
+    pose = posed(double, INSIDE[name]).requires_grad_()
+    way, weight = (torch.randn(shape, generator=random, dtype=torch.float64) for shape in ((1, 24, 3), (6909, 3)))
+
+    def seen(at: torch.Tensor) -> torch.Tensor:
+        skin = double(pose=at)
+        aside, rotation = collider.aside(skin.vertices, skin.transforms.rotation)
+        return (aside[0] * weight).sum() + (rotation * way[..., None]).sum()
+
+    (gradient,) = torch.autograd.grad(seen(pose), pose)
+    step = 1e-6
+    with torch.no_grad():
+        slope = (seen(pose + step * way) - seen(pose - step * way)) / (2 * step)
+    torch.testing.assert_close((gradient * way).sum(), slope, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", ALL)
 def test_it_turns_with_the_body(name: str, body: SmplBody, collider: Collider) -> None:
-    skin = body(pose=posed(body, POSES[name]))
+    skin = body(pose=posed(body, ALL[name]))
     turn = rotvec_to_rotmat(torch.tensor([0.7, -1.9, 0.4]))
     turned = RigidTransforms(turn @ skin.transforms.rotation, skin.transforms.translation @ turn.T)
     apart, apart_turned = collider(skin.vertices, skin.transforms), collider(skin.vertices @ turn.T, turned)
@@ -147,6 +174,55 @@ def test_a_larger_gap_pushes_farther(body: SmplBody) -> None:
         for gap in (0.004, 0.012)
     )
     assert narrow + 2 * MM < wide < narrow + 8 * MM
+
+
+@pytest.mark.parametrize("name", INSIDE)
+def test_arms_that_are_inside_go_aside(name: str, body: SmplBody, collider: Collider) -> None:
+    """As a whole, hands unbent, by what it takes; nothing else moves."""
+    skin = body(pose=posed(body, INSIDE[name]))
+    aside, rotation = collider.aside(skin.vertices, skin.transforms.rotation)
+    deep = collider.anatomy.aside._way_out(*_asked(collider, skin.vertices[0])).norm(dim=1)
+    left = collider.anatomy.aside._way_out(*_asked(collider, aside[0])).norm(dim=1)
+    assert deep.max() > 10 * MM
+    assert left.max() < 1 * MM
+    way = (aside - skin.vertices)[0].norm(dim=1)
+    assert 10 * MM < way.max() < 60 * MM
+    is_arm = body.weights[:, [joint for arm in ARMS for joint in arm]].sum(1) > 0
+    assert way[~is_arm].max() == 0
+    edges = collider.anatomy.edges[is_arm[collider.anatomy.edges].all(1)]
+    before, after = ((one[0, edges[:, 0]] - one[0, edges[:, 1]]).norm(dim=1) for one in (skin.vertices, aside))
+    hand = body.weights[:, [20, 21, 22, 23]].sum(1) > 0.999
+    is_hand = hand[edges].all(1)
+    torch.testing.assert_close(before[is_hand], after[is_hand], atol=1e-5, rtol=0)
+    assert not torch.equal(rotation, skin.transforms.rotation)
+    assert not collider.is_held(way[None], torch.zeros_like(way[None])).any()
+
+
+def test_an_arm_that_is_too_deep_is_held(body: SmplBody, collider: Collider) -> None:
+    """Its middles go as far as an arm may, and it is said."""
+    skin = body(pose=posed(body, {"left_shoulder": (0, 0, -1.75)}))
+    aside, _ = collider.aside(skin.vertices, skin.transforms.rotation)
+    middles = [collider.anatomy.aside.middles(one[0]) for one in (skin.vertices, aside)]
+    assert float((middles[1] - middles[0]).norm(dim=1).max()) == pytest.approx(
+        collider.settings.aside_farthest, rel=0.02
+    )
+    way = (aside - skin.vertices).norm(dim=2)
+    assert collider.is_held(way, torch.zeros_like(way)).any()
+
+
+def _asked(collider: Collider, skin: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Skin (V, 3) [m] with the middles of its caps, which the tree is of from now on, and what may be inside of it."""
+    aside = collider.anatomy.aside
+    aside(skin, torch.eye(3).expand(24, 3, 3))
+    return torch.cat((skin, aside._means(skin)[aside._first_cap :])), aside.middles(skin)
+
+
+def test_arms_that_are_outside_stay(body: SmplBody, collider: Collider) -> None:
+    for turns in ({}, POSES["hanging arms"], POSES["bent elbows"], POSES["sitting"]):
+        skin = body(pose=posed(body, turns))
+        aside, rotation = collider.aside(skin.vertices, skin.transforms.rotation)
+        assert torch.equal(aside, skin.vertices)
+        assert torch.equal(rotation, skin.transforms.rotation)
 
 
 def test_no_body_at_all(body: SmplBody, collider: Collider) -> None:

@@ -1,0 +1,171 @@
+"""Arms that are inside the body go aside, before skin gives way."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from torch import Tensor
+from torch.nn.functional import embedding_bag
+
+from refu_core._warp import as_warp, is_plain, torch_stream
+from refu_core.body import _part_kernels as parting
+from refu_core.body._closest import weights_at
+from refu_core.body._kinematics import rotvec_to_rotmat
+from refu_core.body._parts import ARMS, joints_of
+from refu_core.body._segments import cut
+from refu_core.mesh import Connectivity
+
+Array = NDArray[np.float64]
+
+_SLICES = 24
+"""Slices of a forearm with its hand: one in 2 cm, as thick as a finger."""
+_FEWEST = 4
+"""A piece of fewer vertices has no middle."""
+_FOREARMS = (joints_of("left_forearm"), joints_of("right_forearm"))
+
+
+class Aside:
+    """Swings arms about their shoulders until no middle of a forearm, palm, finger or thumb is inside the body.
+
+    Flesh gives way to what dents it, and not to what is wholly inside: each side of a hand would go its own way, and
+    the skin around it has no reason to go any. Cloth that goes around a hip would have to go through the arm. And a
+    thumb bores a hole that is narrower than cloth's triangles. What has its middle outside is inside by half of its
+    thickness at most, so it is a dent.
+
+    Each middle that is inside asks for the least turn that brings it to the surface, and those that are deep are heard
+    most. So arms go continuously; where none is inside, nothing moves.
+    """
+
+    def __init__(
+        self,
+        rest: Array,
+        mesh: Connectivity,
+        weights: Array,
+        joints: Array,
+        farthest: float,
+        rounds: int,
+        device: torch.device,
+    ) -> None:
+        """Of a rest pose (V, 3) [m], skinning weights (V, 24) and joints (24, 3) [m].
+
+        No arm goes by more than `farthest` [m], in as many `rounds`.
+        """
+        self._farthest, self._rounds, self._device = farthest, rounds, device
+        self._is_serial = device.type == "cpu"
+        share = np.stack([weights[:, list(one)].sum(1) for one in ARMS], axis=1)
+        solids = cut(mesh.faces, np.concatenate((1 - share.sum(1, keepdims=True), share), axis=1))
+        # What is averaged: the skin around each shoulder, the pieces of the arms, and where they were cut off.
+        rows = [np.clip(0.25 - np.abs(one - 0.5), 0.0, None) for one in share.T]
+        arm: list[int] = []
+        for i, fore in enumerate(_FOREARMS):
+            pieces = _pieces(rest, mesh, weights[:, list(fore)].sum(1) > 0.5, joints[fore[-1]] - joints[fore[0]])
+            rows += pieces
+            arm += [i] * len(pieces)
+        self._first_cap = len(rows)
+        for some in np.split(solids.middle_vertex, solids.middle_start[1:-1]):
+            rows.append(np.bincount(some, minlength=len(rest)).astype(np.float64))
+        row, vertex = np.nonzero(rows)
+        weight = np.stack(rows)[row, vertex]
+        self._start, self._vertex = self._tensor(np.searchsorted(row, np.arange(len(rows)))), self._tensor(vertex)
+        self._weight = self._tensor(weight / np.bincount(row, weight)[row])
+        self._arm = self._tensor(np.array(arm, np.int64))
+        self._is_of = self._arm == torch.arange(len(ARMS), device=device)[:, None]
+        """Which of C middles are each arm's, shape (2, C)."""
+        self._share = self._tensor(share.T[:, :, None])
+        """How much of a vertex moves with each arm, shape (2, V, 1)."""
+        self._joints = [self._tensor(np.array(one, np.int64)) for one in ARMS]
+        self._other = self._tensor(np.flatnonzero(solids.of_vertex == 0))
+        self._faces = self._tensor(solids.faces[0].astype(np.int64))
+        """Of the body without its arms, closed, shape (F, 3)."""
+        self._box = torch.zeros(2, 1, 3, device=device)
+        self._corners = [as_warp(corner, wp.vec3) for corner in self._box]
+        self._points = torch.zeros(len(rest) + len(rows) - self._first_cap, 3, device=device)
+        indices = wp.array(np.ascontiguousarray(solids.faces[0].ravel()), dtype=wp.int32, device=str(device))
+        self._tree: Any = wp.Mesh(as_warp(self._points, wp.vec3), indices)
+
+    def __call__(self, skin: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor]:
+        """Of one body: skin (V, 3) [m] and the joints' `rotation` (24, 3, 3), both with the arms aside.
+
+        Differentiable. On a CPU the very same tensors where nothing is inside; a GPU isn't asked.
+        """
+        means = self._means(skin)
+        shoulder = means[: len(ARMS)][self._arm]
+        arm = means[len(ARMS) : self._first_cap] - shoulder
+        self._box[:, 0] = torch.stack(skin.detach()[self._other].aminmax(dim=0))
+        if self._is_serial and not self._is_in_box((shoulder + arm).detach()).any():
+            return skin, rotation
+        points = torch.cat((skin, means[self._first_cap :]))
+        self._points.copy_(points.detach())
+        with torch_stream(self._device):
+            self._tree.refit()
+        turn, length2, is_of = skin.new_zeros(len(ARMS), 3), (arm * arm).sum(1), self._is_of.to(skin)
+        longest = torch.where(self._is_of, length2.sqrt(), 0.0).amax(1, keepdim=True)
+        for round_ in range(self._rounds):
+            at = (rotvec_to_rotmat(turn)[self._arm] @ arm[..., None])[..., 0]
+            out = self._way_out(points, shoulder + at)
+            if self._is_serial and not round_ and not out.detach().any():
+                return skin, rotation
+            squared = (out * out).sum(1, keepdim=True)
+            asked = squared * torch.linalg.cross(at, out) / length2[:, None]
+            total = is_of @ squared
+            turn = _within(turn + is_of @ asked / torch.where(total > 0, total, 1.0), self._farthest / longest)
+        turns = rotvec_to_rotmat(turn)
+        for pivot, by, share, joints in zip(means, turns, self._share.to(skin), self._joints, strict=False):
+            skin = skin + share * ((skin - pivot) @ by.T - (skin - pivot))
+            rotation = rotation.index_copy(0, joints, by @ rotation[joints])
+        return skin, rotation
+
+    def middles(self, skin: Tensor) -> Tensor:
+        """The middles of forearms, palms, fingers and thumbs of `skin` (V, 3) [m], shape (C, 3)."""
+        return self._means(skin)[len(ARMS) : self._first_cap]
+
+    def _means(self, skin: Tensor) -> Tensor:
+        weight = self._weight.to(skin)
+        means: Tensor = embedding_bag(self._vertex, skin, self._start, mode="sum", per_sample_weights=weight)
+        return means
+
+    def _is_in_box(self, points: Tensor) -> Tensor:
+        is_in: Tensor = ((points > self._box[0]) & (points < self._box[1])).all(1)
+        return is_in
+
+    def _way_out(self, points: Tensor, at: Tensor) -> Tensor:
+        """From each place (C, 3) [m] to the surface, of those that are inside; zeros for others."""
+        face = torch.zeros(len(at), dtype=torch.int32, device=self._device)
+        known = torch.zeros(len(at), 3, device=self._device)
+        inputs = [self._tree.id, *self._corners, as_warp(at.detach().float().contiguous(), wp.vec3)]
+        outputs = [as_warp(face, wp.int32), as_warp(known, wp.vec3)]
+        with torch_stream(self._device):
+            wp.launch(parting.inside_kernel, len(at), inputs, outputs, device=str(self._device))
+        corners = points[self._faces[face.clamp_min(0).long()]]
+        weights = known if is_plain(points) else weights_at(at, corners, known.to(at))
+        out = (weights[..., None] * corners).sum(1) - at
+        return torch.where((face >= 0)[:, None], out, torch.zeros_like(out))
+
+    def _tensor(self, values: NDArray[Any]) -> Tensor:
+        return torch.as_tensor(np.ascontiguousarray(values), device=self._device)
+
+
+def _pieces(rest: Array, mesh: Connectivity, is_fore: NDArray[np.bool_], along: Array) -> list[Array]:
+    """Which vertices each connected piece of a slice of a forearm and hand has, (V,) each: fingers are apart."""
+    (on,) = np.nonzero(is_fore)
+    height = rest[on] @ along
+    slices = np.full(len(rest), -1)
+    slices[on] = np.digitize(height, np.linspace(height.min(), height.max(), _SLICES + 1)[1:-1])
+    of_ends = slices[mesh.edges]
+    start, end = mesh.edges[(of_ends[:, 0] == of_ends[:, 1]) & (of_ends[:, 0] >= 0)].T
+    _, piece = connected_components(coo_array((np.ones(len(start)), (start, end)), (len(rest), len(rest))), False)
+    names, sizes = np.unique(piece[on], return_counts=True)
+    return [(piece == name).astype(np.float64) for name in names[sizes >= _FEWEST]]
+
+
+def _within(turn: Tensor, most: Tensor) -> Tensor:
+    """Turns (N, 3) [rad], none by more than `most` (N, 1)."""
+    squared = (turn * turn).sum(1, keepdim=True)
+    is_far = squared > most**2
+    return torch.where(is_far, most / torch.where(is_far, squared, 1.0).sqrt() * turn, turn)
