@@ -14,11 +14,11 @@ from torch import Tensor
 from torch.nn.functional import embedding_bag
 
 from refu_core._warp import as_warp, is_plain, torch_stream
-from refu_core.body import _part_kernels as parting
+from refu_core.body import _aside_kernels as kernels
 from refu_core.body._closest import weights_at
 from refu_core.body._kinematics import rotvec_to_rotmat
-from refu_core.body._parts import ARMS, joints_of
-from refu_core.body._segments import cut
+from refu_core.body._parts import ARMS, joints_of, part_of_faces
+from refu_core.body._segments import SOFTNESS, cut
 from refu_core.mesh import Connectivity
 
 Array = NDArray[np.float64]
@@ -88,29 +88,31 @@ class Aside:
         self._points = torch.zeros(len(rest) + len(rows) - self._first_cap, 3, device=device)
         indices = wp.array(np.ascontiguousarray(solids.faces[0].ravel()), dtype=wp.int32, device=str(device))
         self._tree: Any = wp.Mesh(as_warp(self._points, wp.vec3), indices)
+        self._n_near = torch.zeros(1, dtype=torch.int32)
+        self._inside = torch.zeros(len(arm), dtype=torch.int32)
+        if self._is_serial:
+            self._looks = self._recorded_looks(mesh, weights, rows[len(ARMS) :], len(arm))
 
     def __call__(self, skin: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor]:
         """Of one body: skin (V, 3) [m] and the joints' `rotation` (24, 3, 3), both with the arms aside.
 
         Differentiable. On a CPU the very same tensors where nothing is inside; a GPU isn't asked.
         """
+        if self._is_serial and not self._is_any_inside(skin):
+            return skin, rotation
         means = self._means(skin)
         shoulder = means[: len(ARMS)][self._arm]
         arm = means[len(ARMS) : self._first_cap] - shoulder
         self._box[:, 0] = torch.stack(skin.detach()[self._other].aminmax(dim=0))
-        if self._is_serial and not self._is_in_box((shoulder + arm).detach()).any():
-            return skin, rotation
         points = torch.cat((skin, means[self._first_cap :]))
         self._points.copy_(points.detach())
         with torch_stream(self._device):
             self._tree.refit()
         turn, length2, is_of = skin.new_zeros(len(ARMS), 3), (arm * arm).sum(1), self._is_of.to(skin)
         longest = torch.where(self._is_of, length2.sqrt(), 0.0).amax(1, keepdim=True)
-        for round_ in range(self._rounds):
+        for _ in range(self._rounds):
             at = (rotvec_to_rotmat(turn)[self._arm] @ arm[..., None])[..., 0]
             out = self._way_out(points, shoulder + at)
-            if self._is_serial and not round_ and not out.detach().any():
-                return skin, rotation
             squared = (out * out).sum(1, keepdim=True)
             asked = squared * torch.linalg.cross(at, out) / length2[:, None]
             total = is_of @ squared
@@ -130,9 +132,46 @@ class Aside:
         means: Tensor = embedding_bag(self._vertex, skin, self._start, mode="sum", per_sample_weights=weight)
         return means
 
-    def _is_in_box(self, points: Tensor) -> Tensor:
-        is_in: Tensor = ((points > self._box[0]) & (points < self._box[1])).all(1)
-        return is_in
+    def _recorded_looks(self, mesh: Connectivity, weights: Array, means: list[Array], n_middles: int) -> list[Any]:
+        """What `_is_any_inside` launches."""
+        body = [joints for joints, _ in SOFTNESS if not any(set(joints) & set(arm) for arm in ARMS)]
+        part_of = part_of_faces(torch.from_numpy(weights), torch.from_numpy(mesh.faces).long(), [*body, *ARMS]).numpy()
+        corners = [np.unique(mesh.faces[part_of == k]) for k in range(len(body))]
+        vertices = [np.flatnonzero(one) for one in means]
+        middles = kernels.Middles()
+        for name, lists in (("start", vertices), ("segment_start", [one for one in corners if len(one)])):
+            setattr(middles, name, wp.array(np.cumsum([0, *map(len, lists)]), dtype=wp.int32, device="cpu"))
+        for name, lists in (("vertex", vertices), ("corner", corners)):
+            setattr(middles, name, wp.array(np.concatenate(lists), dtype=wp.int32, device="cpu"))
+        each = np.concatenate([np.full(len(one), 1 / len(one)) for one in vertices])
+        middles.weight = wp.array(each, dtype=wp.float32, device="cpu")
+        middles.mean = wp.zeros(n_middles, dtype=wp.vec3, device="cpu")
+        skin, n_near, inside = (
+            as_warp(self._points, wp.vec3),
+            *(as_warp(one, wp.int32) for one in (self._n_near, self._inside)),
+        )
+        unused = wp.zeros(n_middles, dtype=wp.vec3, device="cpu")
+        return [
+            wp.launch(kernel, dim, inputs, device="cpu", record_cmd=True)
+            for kernel, dim, inputs in (
+                (kernels.near_kernel, 1, [skin, mesh.n_vertices, middles, *self._corners, n_near]),
+                (kernels.inside_kernel, n_middles, [self._tree.id, *self._corners, middles.mean, inside, unused]),
+            )
+        ]
+
+    def _is_any_inside(self, skin: Tensor) -> bool:
+        """Whether any middle is inside the body. First by boxes of its segments: no tree is asked where none is near.
+
+        Only of a CPU.
+        """
+        near, inside = self._looks
+        self._points[: len(skin)].copy_(skin.detach())
+        near.launch()
+        if not self._n_near:
+            return False
+        self._tree.refit()
+        inside.launch()
+        return bool(self._inside.amax() >= 0)
 
     def _way_out(self, points: Tensor, at: Tensor) -> Tensor:
         """From each place (C, 3) [m] to the surface, of those that are inside; zeros for others."""
@@ -141,7 +180,7 @@ class Aside:
         inputs = [self._tree.id, *self._corners, as_warp(at.detach().float().contiguous(), wp.vec3)]
         outputs = [as_warp(face, wp.int32), as_warp(known, wp.vec3)]
         with torch_stream(self._device):
-            wp.launch(parting.inside_kernel, len(at), inputs, outputs, device=str(self._device))
+            wp.launch(kernels.inside_kernel, len(at), inputs, outputs, device=str(self._device))
         corners = points[self._faces[face.clamp_min(0).long()]]
         weights = known if is_plain(points) else weights_at(at, corners, known.to(at))
         out = (weights[..., None] * corners).sum(1) - at

@@ -320,31 +320,6 @@ def closest_kernel(
 
 
 @wp.kernel
-def inside_kernel(
-    tree: wp.uint64,
-    low: wp.array[wp.vec3],
-    high: wp.array[wp.vec3],
-    points: wp.array[wp.vec3],
-    # outputs
-    face: wp.array[int],
-    corners: wp.array[wp.vec3],
-) -> None:
-    """The closest face of each point inside a mesh within a box, and the weights of its corners there; -1 outside."""
-    i = wp.tid()
-    p = points[i]
-    face[i] = -1
-    for c in range(3):
-        if p[c] < low[0][c] or p[c] > high[0][c]:
-            return
-    # Away from the middle of the box a ray is the soonest out of it, and meets few boxes of the tree.
-    side = wp.vec3(wp.where(p[0] < 0.5 * (low[0][0] + high[0][0]), -0.9418, 0.9418), 0.2389, 0.2361)
-    if wp.mesh_query_ray_count_intersections(tree, p, side) % 2 == 1:
-        hit = wp.mesh_query_point_no_sign(tree, p, 1.0e3)
-        face[i] = hit.face
-        corners[i] = wp.vec3(hit.u, hit.v, 1.0 - hit.u - hit.v)
-
-
-@wp.kernel
 def thickness_kernel(
     body: wp.uint64, points: wp.array[wp.vec3], normal: wp.array[wp.vec3], thickness: wp.array[float]
 ) -> None:

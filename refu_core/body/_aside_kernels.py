@@ -1,0 +1,89 @@
+"""Which places are inside the body."""
+
+import warp as wp
+
+from refu_core.body._bundle_kernels import greater, lesser
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Middles:
+    """Means of some of the skin, and what they may be inside of. The last of them close what arms were cut off."""
+
+    start: wp.array[int]
+    vertex: wp.array[int]
+    weight: wp.array[float]
+    """Middle c is the mean of `vertex[start[c]:start[c + 1]]` by their weights."""
+    segment_start: wp.array[int]
+    corner: wp.array[int]
+    """The vertices of segment k's faces are `corner[segment_start[k]:segment_start[k + 1]]`."""
+    mean: wp.array[wp.vec3]
+    """Memory for all but those."""
+
+
+@wp.kernel
+def near_kernel(
+    skin: wp.array[wp.vec3],
+    n_skin: int,
+    middles: Middles,
+    # outputs
+    low_of_all: wp.array[wp.vec3],
+    high_of_all: wp.array[wp.vec3],
+    count: wp.array[int],
+) -> None:
+    """How many middles are in the box of any segment, counted for each; by one thread, as a CPU has it.
+
+    What closes the body is appended to its skin.
+    """
+    n = middles.mean.shape[0]
+    for c in range(middles.start.shape[0] - 1):
+        mean = wp.vec3()
+        for i in range(middles.start[c], middles.start[c + 1]):
+            mean += middles.weight[i] * skin[middles.vertex[i]]
+        if c < n:
+            middles.mean[c] = mean
+        else:
+            skin[n_skin + c - n] = mean
+    near = int(0)
+    low_of_all[0] = wp.vec3(1.0e9)
+    high_of_all[0] = wp.vec3(-1.0e9)
+    for k in range(middles.segment_start.shape[0] - 1):
+        low = skin[middles.corner[middles.segment_start[k]]]
+        high = low
+        for i in range(middles.segment_start[k] + 1, middles.segment_start[k + 1]):
+            at = skin[middles.corner[i]]
+            low = lesser(low, at)
+            high = greater(high, at)
+        low_of_all[0] = lesser(low_of_all[0], low)
+        high_of_all[0] = greater(high_of_all[0], high)
+        for c in range(n):
+            at = middles.mean[c]
+            if low == lesser(low, at) and high == greater(high, at):
+                near += 1
+    count[0] = near
+
+
+@wp.kernel
+def inside_kernel(
+    tree: wp.uint64,
+    low: wp.array[wp.vec3],
+    high: wp.array[wp.vec3],
+    points: wp.array[wp.vec3],
+    # outputs
+    face: wp.array[int],
+    corners: wp.array[wp.vec3],
+) -> None:
+    """The closest face of each point inside a mesh within a box, and the weights of its corners there; -1 outside."""
+    i = wp.tid()
+    p = points[i]
+    face[i] = -1
+    for c in range(3):
+        if p[c] < low[0][c] or p[c] > high[0][c]:
+            return
+    # Away from the middle of the box a ray is the soonest out of it, and meets few boxes of the tree.
+    side = wp.vec3(wp.where(p[0] < 0.5 * (low[0][0] + high[0][0]), -0.9418, 0.9418), 0.2389, 0.2361)
+    if wp.mesh_query_ray_count_intersections(tree, p, side) % 2 == 1:
+        hit = wp.mesh_query_point_no_sign(tree, p, 1.0e3)
+        face[i] = hit.face
+        corners[i] = wp.vec3(hit.u, hit.v, 1.0 - hit.u - hit.v)
