@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections import OrderedDict
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -9,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from numbers import Real
-from queue import LifoQueue
+from queue import Empty, LifoQueue
 from types import NoneType
 from typing import TYPE_CHECKING, NoReturn, overload
 
@@ -80,7 +81,7 @@ class GarmentPipeline:
         self._graphs = StepGraphs(steps[0].packed, outfit.body.device) if graph and on_gpu else None
         contact = steps[0].contact
         self._is_certified = contact is not None and contact.winding is not None
-        self._free: LifoQueue[FrameStep] = LifoQueue()  # the one used last has its memory in the cache
+        self._process, self._free = os.getpid(), LifoQueue[FrameStep]()  # the one used last has its memory in the cache
         for step in steps:
             self._free.put(step)
         self._device_lock = _ON_GPU if on_gpu else None
@@ -269,7 +270,11 @@ class GarmentPipeline:
     @contextmanager
     def _turn(self) -> Iterator[FrameStep]:
         """What one call computes with, as soon as it is free."""
-        step = self._free.get()
+        try:
+            step = self._free.get(block=os.getpid() == self._process)  # other threads don't outlive a fork
+        except Empty as error:
+            msg = "this pipeline was busy when its process was forked: load one in each process, after the fork"
+            raise RefuError(msg) from error
         try:
             if self._device_lock is None:
                 yield step

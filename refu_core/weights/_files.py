@@ -145,7 +145,8 @@ def _load_stored(stem: Path, *, expect: Mapping[str, Any] | None = None) -> Weig
     card = _read_card(_with_suffix(stem, ".json"))
     for key, wanted in (expect or {}).items():
         if card.get(key) != wanted:
-            msg = f"{path}: wanted weights whose {key} is {wanted}, got {card.get(key)}; train some with `refu train`"
+            msg = f"{path}: wanted weights whose {key} is {wanted}, got {card.get(key)}; train some with `refu train`, "
+            msg += "into a folder of their own (--output)"
             raise WeightsError(msg)
     tensors = _read_tensors(path, card.get("sha256"))
     _require_sense(path, tensors)
