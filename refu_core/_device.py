@@ -13,7 +13,7 @@ _LOSSES = ("CUDA error", "Warp CUDA error", "HIP error", "cudaError")
 """What torch and warp begin with when they report the driver's errors, which have no common class in all versions."""
 
 
-def checked_device(name: str) -> torch.device:
+def checked_device(name: str | torch.device) -> torch.device:
     """The torch device of a name. Raises `RefuError` for one that there isn't."""
     try:
         device = torch.device(name)
@@ -29,7 +29,7 @@ def checked_device(name: str) -> torch.device:
     if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
         msg = f"no device {name!r}: the last one is cuda:{torch.cuda.device_count() - 1}"
         raise RefuError(msg)
-    return device
+    return torch.device("cpu") if device.type == "cpu" else device  # of processors there is one, whatever its number
 
 
 @contextmanager

@@ -28,12 +28,16 @@ PLAUSIBLE_TRANSL = 1e9
 """[m]"""
 
 
-def _array(
+def checked_numbers(
     name: str, value: Any, shape: tuple[int, ...], dtype: type[np.floating[Any]], limit: float = np.inf
 ) -> NDArray[Any]:
     """`value` as a read-only array of numbers up to `limit`; accepts any layout with the right number of elements."""
     try:
-        array = np.asarray(value, dtype=np.float64)
+        given = np.ma.asanyarray(value) if isinstance(value, np.ma.MaskedArray) else np.asarray(value)
+        if given.dtype.kind not in "iufO":  # NumPy makes numbers of truth values, texts, dates and complex ones, too
+            msg = f"values of the type {given.dtype}"
+            raise TypeError(msg)
+        array = np.ma.filled(given.astype(np.float64), np.nan)
     except (TypeError, ValueError, RuntimeError) as error:  # the last: a tensor that tracks gradients
         msg = f"{name} must be {shape} numbers, got {type(value).__name__}: {error}"
         raise FrameError(msg) from error
@@ -79,13 +83,20 @@ class SmplFrame:
 
     def __post_init__(self) -> None:
         # A frozen dataclass is normalised through object.__setattr__, once, here.
-        object.__setattr__(self, "pose", _array("pose", self.pose, (N_JOINTS, 3), np.float32, MAX_ANGLE))
-        object.__setattr__(self, "betas", _array("betas", self.betas, (N_BETAS,), np.float32, MAX_COEFFICIENT))
-        object.__setattr__(self, "transl", _array("transl", self.transl, (3,), np.float64))
+        object.__setattr__(self, "pose", checked_numbers("pose", self.pose, (N_JOINTS, 3), np.float32, MAX_ANGLE))
+        object.__setattr__(self, "betas", checked_numbers("betas", self.betas, (N_BETAS,), np.float32, MAX_COEFFICIENT))
+        object.__setattr__(self, "transl", checked_numbers("transl", self.transl, (3,), np.float64))
         if self.style is not None:
-            object.__setattr__(self, "style", _array("style", self.style, (N_STYLES,), np.float32, MAX_COEFFICIENT))
+            object.__setattr__(
+                self, "style", checked_numbers("style", self.style, (N_STYLES,), np.float32, MAX_COEFFICIENT)
+            )
         try:
             object.__setattr__(self, "stamp_ns", int(self.stamp_ns))
         except (TypeError, ValueError, OverflowError) as error:
             msg = f"stamp_ns must be a whole number of nanoseconds, got {self.stamp_ns!r}"
             raise FrameError(msg) from error
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """A copy is checked and read-only, too: NumPy forgets that when it copies or pickles."""
+        self.__dict__.update(state)
+        self.__post_init__()

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from refu_lab.sources import Source
 
 GARMENTS_TOPIC, BODY_TOPIC, DIAGNOSTICS_TOPIC = "/garments", "/body", "/diagnostics"
+_LAST_STAMP_NS = 2**31 * 10**9 - 1
+"""The last time that a message holds."""
 
 
 def garment_encoder(pipeline: GarmentPipeline, options: ReplayOptions) -> adapters.MarkerArrayEncoder:
@@ -77,7 +79,8 @@ class DressedBag:
     def add_skip(self, record: FrameRecord, reason: str) -> None:
         """Why a message was not replayed."""
         self._skipped += 1
-        self._say(record, record.stamp_ns, [self._input(ERROR, reason)])
+        stamp_ns = min(record.stamp_ns, _LAST_STAMP_NS)  # it may be the very reason
+        self._say(record, stamp_ns, [self._input(ERROR, reason)])
 
     def add_frame(
         self,

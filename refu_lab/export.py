@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from msg_adapters import DecodeError
 from refu_core.errors import RefuError
 from refu_lab.render import SKIN
 
@@ -114,17 +113,19 @@ def export(
     load = cache(options.load_pipeline)
     with open_source(options, lambda: load().body) as source:
         pipeline = load()
-        frames, warnings = [], body_warnings(pipeline, gender=source.gender)
+        frames, outputs, warnings = [], [], body_warnings(pipeline, gender=source.gender)
         for number, record in enumerate(islice(source.records, first, first + count), first):
             with _left_out(number, warnings):
-                frames.append(source.frame_of(record, options.betas))
+                frame = source.frame_of(record, options.betas)
+                outputs.append(pipeline(frame))
+                frames.append(frame)
         if options.betas is None and any(frame.betas.any() for frame in frames) and not source.betas_are_known:
             warnings += betas_warnings(pipeline, source=options.betas_source)
         warnings += source.warnings
     if not frames:
-        msg = f"{options.input}: has no frame that can be dressed from number {first} on"
+        why = f": {warnings[-1]}" if warnings else ""
+        msg = f"{options.input}: has no frame that can be dressed from number {first} on{why}"
         raise RefuError(msg)
-    outputs = [pipeline(frame) for frame in frames]
     stamps = np.array([frame.stamp_ns for frame in frames])
     step = 1e-9 * float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
     fps = round(1 / step, 3) if step > 0 else 30.0
@@ -133,10 +134,10 @@ def export(
 
 @contextmanager
 def _left_out(number: int, warnings: list[str]) -> Iterator[None]:
-    """Says of a frame that can't be read that it can't."""
+    """Says of a frame that can't be read or dressed that it can't."""
     try:
         yield
-    except DecodeError as error:
+    except RefuError as error:
         warnings.append(f"frame {number} is left out: {error}")
 
 

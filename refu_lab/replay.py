@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 import msg_adapters as adapters
 from msg_adapters import FrameRecord
-from refu_core import GarmentPipeline, SmplFrame
+from refu_core import GarmentPipeline, RefuError, SmplFrame
 from refu_core._device import one_thread
 from refu_core.metrics import CollisionChecker, Figures, GarmentMetrics
 from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN, BackboneName, BetasSource
@@ -261,7 +261,7 @@ class _Replayer:
             data = self._encoder.encode(
                 [mesh.local for mesh in output.values()], stamp_ns=frame.stamp_ns, transl=frame.transl
             )
-        except (adapters.DecodeError, adapters.EncodeError) as error:
+        except RefuError as error:  # no body, a body that nobody has, or what can't be written
             self._skip(record, str(error), bag)
             return
         latency_ms = 1e3 * (time.perf_counter() - start)

@@ -108,7 +108,11 @@ def _coerced(name: str, value: Any, default: Any) -> Any:
             wanted = f"a list of {len(default)} numbers"
         value = items
     if not right:
-        hint = "" if value is not None else ": no value, or whole numbers and decimals mixed; write all as decimals"
+        hint = ""
+        if value is None:  # what becomes of all these on their way
+            of_text = "a list of strings" in wanted
+            hint = "an empty list" if of_text else "whole numbers and decimals mixed; write all as decimals"
+            hint = f": no value, or {hint}"
         msg = f"{name}: wanted {wanted}, got {value!r}{hint}"
         raise SettingsError(msg)
     return tuple(map(type(default[0]), value)) if isinstance(default, tuple) else type(default)(value)

@@ -8,10 +8,11 @@ Nothing but what is subscribed to here is computed by the node.
 
 from __future__ import annotations
 
+import signal
+
 import numpy as np
 import rclpy
 from geometry_msgs.msg import PolygonStamped, PoseStamped
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
 
@@ -53,8 +54,10 @@ class SleeveListener(Node):
 
 
 if __name__ == "__main__":
-    rclpy.init()
+    signal.signal(signal.SIGINT, lambda *_: None)  # Python's handler raises in the middle of a message
+    rclpy.init()  # whose own one ends `spin`
     try:
         rclpy.spin(SleeveListener())
-    except (KeyboardInterrupt, ExternalShutdownException):
-        rclpy.try_shutdown()
+    except Exception:
+        if rclpy.ok():  # else it was told to end, perhaps while it published
+            raise

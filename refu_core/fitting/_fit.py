@@ -29,6 +29,7 @@ from refu_core.garments import GarmentCard, GarmentTemplate, require_name
 from refu_core.mesh import Connectivity
 
 F64 = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 _ENDS = tuple(JOINT_NAMES.index(name) for name in ("head", "left_hand", "right_hand", "left_foot", "right_foot"))
 _ON_SKIN = 0.02
@@ -49,13 +50,12 @@ def without_bodies(mesh: SurfaceMesh, posed: PosedBody) -> tuple[SurfaceMesh, li
         GarmentError: nothing else is left.
     """
     n_pieces, label = components(mesh.faces, len(mesh.vertices))
-    is_body = np.zeros(n_pieces, np.bool_)
     joint = posed.body.weights.argmax(1).numpy()[posed.body.faces[:, 0].numpy()]
-    for piece in range(n_pieces):
-        points = mesh.vertices[label == piece]
-        face, _ = posed.closest(points)
-        if np.isin(_ENDS, joint[face]).all():
-            is_body[piece] = np.median(np.abs(posed(points)[0])) < _ON_SKIN
+    has = np.zeros((n_pieces, N_JOINTS), np.bool_)
+    has[label, joint[posed.closest(mesh.vertices)[0]]] = True
+    is_body = np.all(has[:, _ENDS], axis=1)
+    for piece in np.flatnonzero(is_body):
+        is_body[piece] = np.median(np.abs(posed(mesh.vertices[label == piece])[0])) < _ON_SKIN
     if not is_body.any():
         return mesh, []
     kept = ~is_body[label[mesh.faces[:, 0]]]
@@ -72,24 +72,31 @@ def unsewn(mesh: SurfaceMesh) -> list[str]:
     """A note of pieces whose rims lie along each other, for a mesh in metres."""
     _, label = components(mesh.faces, len(mesh.vertices))
     rim = rim_of(mesh.faces)
-    gaps, pieces = [], set()
-    for piece in np.unique(label[rim]):
-        own, others = rim[label[rim] == piece], rim[label[rim] != piece]
-        if len(others):
-            gap = np.asarray(cKDTree(mesh.vertices[others]).query(mesh.vertices[own])[0])
-            if (gap < _SEAM).mean() > _SHARE:
-                pieces.add(int(piece))
-                gaps.append(np.median(gap[gap < _SEAM]))
-    if not pieces:
+    label = label[rim]
+    gap = _gaps(mesh.vertices[rim], label)
+    near = np.bincount(label, weights=gap < _SEAM)
+    is_along = near > _SHARE * np.bincount(label)
+    n_along = int(is_along.sum())
+    if not n_along:
         return []
-    several = len(pieces) > 1
-    what = f"{len(pieces)} pieces lie along each other" if several else "a piece lies along another"
-    sewn = "and aren't sewn" if several else "and isn't sewn to it"
-    apart = 1e3 * float(np.median(gaps))
+    what = f"{n_along} pieces lie along each other" if n_along > 1 else "a piece lies along another"
+    sewn = "and aren't sewn" if n_along > 1 else "and isn't sewn to it"
+    apart = 1e3 * float(np.median(gap[is_along[label] & (gap < _SEAM)]))
     return [f"{what}, {apart:.1f} mm apart, {sewn}: weld their seams, or simulated cloth comes apart there"]
 
 
-Ints = NDArray[np.int64]
+def _gaps(points: F64, label: Ints) -> F64:
+    """How far each point is from the next one of another label [m], infinity where that is `_SEAM` or more."""
+    tree, labels = cKDTree(points), np.append(label, -1)
+    gap, left, k = np.full(len(points), np.inf), np.arange(len(points)), 4
+    while len(left):  # of those that have seen none but their own within reach
+        distance, other = tree.query(points[left], k=k, distance_upper_bound=_SEAM)
+        is_there = np.isfinite(distance)
+        of_others = is_there & (labels[other] != label[left, None])
+        gap[left] = np.where(of_others, distance, np.inf).min(axis=1)
+        left, k = left[is_there[:, -1] & ~of_others.any(axis=1)], 4 * k
+    return gap
+
 
 HOLDS: tuple[str, ...] = ("waist", "shoulders")
 LONGEST_EDGE = 0.02
@@ -110,9 +117,12 @@ the cloth. The few are between toes or fingers, where there is no room for it.""
 _FELT = 0.02
 """A joint is felt where it has this share at some vertex."""
 _SHOULDERS = tuple(
-    JOINT_NAMES.index(name) for name in ("neck", "left_collar", "right_collar", "left_shoulder", "right_shoulder")
+    JOINT_NAMES.index(name)
+    for name in ("head", "neck", "left_collar", "right_collar", "left_shoulder", "right_shoulder")
 )
 _ROUNDS = 20
+_MOST_PIECES = 1000
+"""A coat has some dozens with its buttons; triangles that nearly touch are thousands, and take minutes."""
 _FLAT = 0.99
 """So much of a mesh faces along one line only where it is laid out flat; a garment has two thirds at most."""
 
@@ -194,7 +204,11 @@ def fit_garment(
 
 
 def _require_worn(mesh: SurfaceMesh) -> None:
-    """Raises `GarmentError` for what lies flat."""
+    """Raises `GarmentError` for what lies flat, and for what is no cloth but shreds."""
+    n_pieces, _ = components(mesh.faces, len(mesh.vertices))
+    if n_pieces > _MOST_PIECES:
+        msg = f"it is in {n_pieces} pieces, at most {_MOST_PIECES} are worn: merge the vertices that lie on each other"
+        raise GarmentError(msg)
     normals = face_normals(mesh.vertices, mesh.faces)
     area = np.linalg.norm(normals, axis=1)
     along = np.linalg.eigvalsh(normals.T @ (normals / np.maximum(area, 1e-300)[:, None]))[-1] / area.sum()
@@ -334,7 +348,7 @@ def _cleared(mesh: SurfaceMesh, body: PosedBody, notes: list[str]) -> F64:
         near = _near(v[moved > _FARTHEST], body)
         msg = (
             f"to be outside the body {body.body.name} the garment had to move by {1e3 * moved.max():.0f} mm near the "
-            f"{near}: it was made for another body or pose; say its --pose, or try another --body"
+            f"{near}: it was made for another body or pose; say its --pose or --up, or try another --body"
         )
         raise GarmentError(msg)
     if moved.max() > 1e-3:

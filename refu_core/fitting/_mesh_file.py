@@ -52,7 +52,8 @@ def read_surface(path: str | os.PathLike[str]) -> SurfaceMesh:
         if suffix == ".gltf" and b'"uri"' in content and b'"data:' not in content:
             msg = "its numbers are in a file beside it; save it as one file, .glb"
             raise ValueError(msg)
-        mesh = _parse_obj(content) if suffix == ".obj" else _by_trimesh(content, suffix)
+        with np.errstate(all="ignore"):  # of what isn't finite; it is asked for below
+            mesh = _parse_obj(content) if suffix == ".obj" else _by_trimesh(content, suffix)
         _check(mesh)
     except ImportError:
         raise

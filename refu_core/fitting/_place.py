@@ -141,10 +141,13 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
     order = [tiers[k] for k in ranked if tiers[k].place.fit.is_good]
     tight = [one for one in found if one.place.fit.is_tight and not one.place.fit.is_good and not one.is_sideways]
     if tight and not good and abs(np.log2(extent) - round(np.log2(extent))) > _OF_NO_UNIT:
-        # Who models in metres and close to the skin means no garment that is a sixth larger.
-        order = [one for one in order if any(np.isclose(one.place.unit, unit) for unit in units)]
         # A sleeve that no arm is in costs less and faces the wrong way.
-        order.append(min(tight, key=lambda one: one.cost(extent) + 4 * (1 - one.place.fit.facing)))
+        best = min(tight, key=lambda one: one.cost(extent) + 4 * (1 - one.place.fit.facing))
+        # Who models in metres and close to the skin means no garment that is a sixth larger, and none that lies.
+        known = [any(np.isclose(one.place.unit, unit) for unit in units) for one in order]
+        upright = [np.array_equal(one.place.turn, best.place.turn) for one in order]
+        first_of_all = [one for one, *is_so in zip(order, known, upright, strict=True) if all(is_so)]
+        order = [*first_of_all, best, *(one for one, is_known in zip(order, known, strict=True) if not is_known)]
     for one in order:
         yield _told(one.place, one.kind)
     if good or order or any(one.place.fit.is_good for one in tiers):

@@ -10,8 +10,9 @@ from torch import Tensor
 from refu_core.backbones import MAX_OFFSET
 from refu_core.body import RigidTransforms
 from refu_core.errors import FrameError, require_type
+from refu_core.frames import N_JOINTS
 from refu_core.realtime._turn import RootTurn
-from refu_core.realtime._wearer import UnposedGarment, Wearable, Wearer
+from refu_core.realtime._wearer import UnposedGarment, Wearable, Wearer, require_batch
 from refu_core.refu import VertexScale
 
 Lap = Callable[[str, str | None], None]
@@ -58,7 +59,8 @@ def dress(pose: Tensor, wearer: Wearer, *, lap: Lap = _no_lap) -> Dressed:
     Pipeline, CUDA graph, training, evaluation and benchmark all call this. It is a pure function of tensors and
     differentiable: nothing is remembered, and no device is waited for. `lap` is called at the end of each stage.
     """
-    require_type(pose, Tensor, "a pose as a torch.Tensor, such as torch.as_tensor(array) gives", error=FrameError)
+    require_type(wearer, Wearer, "a Wearer, such as Wearer.of(outfit, betas) gives", error=FrameError)
+    require_batch("pose", pose, (N_JOINTS, 3), wearer.outfit, sizes=(len(wearer.betas),))
     turns, at_root = RootTurn.taken_off(pose, wearer.shape.joints)
     posed = wearer.outfit.body.posed(at_root, wearer.shape)
     lap("body", None)

@@ -61,7 +61,7 @@ def _templates(
     if isinstance(garments, (str, os.PathLike, GarmentTemplate)):
         garments = [garments]
     require_type(garments, Collection, "names of garments", error=GarmentError)
-    if not garments:
+    if not len(garments):
         msg = "no garment was asked for: name at least one"
         raise GarmentError(msg)
     loaded = [one if isinstance(one, GarmentTemplate) else load_garment(one) for one in garments]

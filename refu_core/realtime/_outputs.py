@@ -4,13 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
     from refu_core.frames import SmplFrame
+
+T = TypeVar("T")
+
+
+def itself(value: T) -> T:
+    """For what isn't made when it is asked for, since it is there already."""
+    return value
+
 
 SKIPS: Mapping[str, str] = {
     "band": "distances of vertices that are farther off the skin than they matter (accurate)",
@@ -108,6 +117,10 @@ class GarmentMesh:
         """Vertices with the translation [m], shape (V, 3); added in float64, so that distant bodies stay precise."""
         return self.local + self.transl
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copied or pickled with all arrays made."""
+        return GarmentMesh, (self.local, partial(itself, self.raw), self.faces, self.transl)
+
     def __repr__(self) -> str:
         return f"GarmentMesh({len(self.local)} vertices, {len(self.faces)} faces)"
 
@@ -153,6 +166,11 @@ class PipelineOutput(Mapping[str, GarmentMesh]):
         except KeyError as error:
             msg = f"no garment {name!r}: this person wears {', '.join(self.garments)}"
             raise KeyError(msg) from error
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copied or pickled with all arrays made."""
+        made = partial(itself, self.body), partial(itself, self.skin)
+        return PipelineOutput, (self.garments, *made, self.stats)
 
     def __repr__(self) -> str:
         return f"PipelineOutput({dict(self.garments)})"

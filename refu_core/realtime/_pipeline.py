@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections import OrderedDict
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -9,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from numbers import Real
-from queue import LifoQueue
+from queue import Empty, LifoQueue
 from types import NoneType
 from typing import TYPE_CHECKING, NoReturn, overload
 
@@ -21,14 +22,14 @@ from refu_core._device import checked_device
 from refu_core.backbones import Skinned
 from refu_core.body import BodyFit, SmplBody
 from refu_core.errors import FrameError, GarmentError, RefuError, require_type
-from refu_core.frames import SmplFrame
-from refu_core.garments import N_STYLES, GarmentTemplate
+from refu_core.frames import MAX_COEFFICIENT, N_STYLES, SmplFrame, checked_numbers
+from refu_core.garments import GarmentTemplate
 from refu_core.modes import MAX_MARGIN, BackboneName, SdfMode
 from refu_core.realtime._contact import ContactStage
 from refu_core.realtime._frame import FrameStep, StageClock
 from refu_core.realtime._graph import StepGraphs
 from refu_core.realtime._load import load_outfit
-from refu_core.realtime._outputs import SKIPS, FrameStats, GarmentMesh, GarmentStats, PipelineOutput, SkinShift
+from refu_core.realtime._outputs import SKIPS, FrameStats, GarmentMesh, GarmentStats, PipelineOutput, SkinShift, itself
 from refu_core.realtime._promise import within_promise
 from refu_core.realtime._wearer import Wearer
 from refu_core.sdf import require_outward
@@ -80,13 +81,15 @@ class GarmentPipeline:
         self._graphs = StepGraphs(steps[0].packed, outfit.body.device) if graph and on_gpu else None
         contact = steps[0].contact
         self._is_certified = contact is not None and contact.winding is not None
-        self._free: LifoQueue[FrameStep] = LifoQueue()  # the one used last has its memory in the cache
+        self._process, self._free = os.getpid(), LifoQueue[FrameStep]()  # the one used last has its memory in the cache
         for step in steps:
             self._free.put(step)
         self._device_lock = _ON_GPU if on_gpu else None
         self._lock = threading.Lock()
         """Of what is remembered."""
-        self._faces = {name: one.template.faces.cpu().numpy() for name, one in outfit.wearables.items()}
+        self._faces = {name: one.template.faces.cpu().numpy().copy() for name, one in outfit.wearables.items()}
+        for faces in self._faces.values():
+            faces.flags.writeable = False  # all frames share them
         self._wearers: OrderedDict[bytes, Wearer] = OrderedDict()
         self._batch: tuple[tuple[Wearer, ...], Wearer] | None = None
         self._last: tuple[float | None, dict[bytes, PipelineOutput]] = margin, {}
@@ -180,7 +183,8 @@ class GarmentPipeline:
         """
         mode = SdfMode.of(sdf, "sdf mode")
         _check_margin(margin)
-        unknown = sorted({no_skip} if isinstance(no_skip, str) else set(no_skip) - set(SKIPS))
+        require_type(no_skip, Collection, f"a collection of {', '.join(SKIPS)}")
+        unknown = sorted(map(str, {no_skip} if isinstance(no_skip, str) else set(no_skip) - set(SKIPS)))
         if unknown:
             msg = f"nothing is skipped by the name {', '.join(unknown)}: wanted a collection of {', '.join(SKIPS)}"
             raise RefuError(msg)
@@ -266,7 +270,11 @@ class GarmentPipeline:
     @contextmanager
     def _turn(self) -> Iterator[FrameStep]:
         """What one call computes with, as soon as it is free."""
-        step = self._free.get()
+        try:
+            step = self._free.get(block=os.getpid() == self._process)  # other threads don't outlive a fork
+        except Empty as error:
+            msg = "this pipeline was busy when its process was forked: load one in each process, after the fork"
+            raise RefuError(msg) from error
         try:
             if self._device_lock is None:
                 yield step
@@ -352,10 +360,10 @@ class GarmentPipeline:
         meshes, stats = {}, {}
         for i, name in enumerate(self.outfit.wearables):
             vertices, raw, numbers = rest[3 * i : 3 * i + 3]
-            meshes[name] = GarmentMesh(vertices, partial(_itself, raw), self._faces[name], frame.transl)
+            meshes[name] = GarmentMesh(vertices, partial(itself, raw), self._faces[name], frame.transl)
             stats[name] = GarmentStats.of(numbers.tolist())
         took = self._stats(frame, {}, stats, {}, shift.tolist())
-        return PipelineOutput(meshes, partial(_itself, body), partial(_itself, skin), took)
+        return PipelineOutput(meshes, partial(itself, body), partial(itself, skin), took)
 
     def _stats(
         self,
@@ -383,17 +391,9 @@ def _check_margin(margin: float | None) -> None:
         raise RefuError(msg)
 
 
-def _itself(array: NDArray[np.float32]) -> NDArray[np.float32]:
-    return array
-
-
 def _style(value: ArrayLike, device: torch.device) -> Tensor:
     try:
-        style = np.asarray(value, dtype=np.float32)
-    except (TypeError, ValueError) as error:
-        msg = f"style must be {N_STYLES} finite numbers, got {value!r}"
-        raise GarmentError(msg) from error
-    if style.shape != (N_STYLES,) or not np.isfinite(style).all():
-        msg = f"style must be {N_STYLES} finite numbers, got {np.array2string(style, threshold=8)}"
-        raise GarmentError(msg)
-    return torch.as_tensor(style, device=device)[None]
+        style = checked_numbers("style", value, (N_STYLES,), np.float32, MAX_COEFFICIENT)
+    except FrameError as error:
+        raise GarmentError(*error.args) from error
+    return torch.tensor(style, device=device)[None]

@@ -16,6 +16,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
+from types import NoneType
 from typing import Any
 
 import torch
@@ -25,7 +26,7 @@ from torch import Tensor
 
 from refu_core._files import InputFile, open_file, parse_json, replacing
 from refu_core._npz import DAMAGE
-from refu_core.errors import WeightsError
+from refu_core.errors import WeightsError, require_type
 
 FORMAT = "refu-weights-1"
 MAX_BYTES = 3 << 30
@@ -55,6 +56,7 @@ class Weights:
 
 def weights_folder(garment: str, root: str | os.PathLike[str] | None = None) -> Path:
     """The folder of a garment's weights below `root`, or of those that ship; it needs not exist."""
+    require_type(root, (str, os.PathLike, NoneType), "a folder of weights", error=WeightsError)
     return (Path(__file__).parent if root is None else Path(root)) / garment
 
 
@@ -143,7 +145,8 @@ def _load_stored(stem: Path, *, expect: Mapping[str, Any] | None = None) -> Weig
     card = _read_card(_with_suffix(stem, ".json"))
     for key, wanted in (expect or {}).items():
         if card.get(key) != wanted:
-            msg = f"{path}: wanted weights whose {key} is {wanted}, got {card.get(key)}; train some with `refu train`"
+            msg = f"{path}: wanted weights whose {key} is {wanted}, got {card.get(key)}; train some with `refu train`, "
+            msg += "into a folder of their own (--output)"
             raise WeightsError(msg)
     tensors = _read_tensors(path, card.get("sha256"))
     _require_sense(path, tensors)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -317,3 +318,30 @@ def test_a_skirt_of_quads_is_worn_saved_and_loaded(tmp_path: Path) -> None:
     assert np.isfinite(output["kilt"].local).all()
     with pytest.raises(GarmentError, match=r"wanted the path of an \.npz"):
         save_garment(replace(template, name="x"), tmp_path / "kilt.obj")
+
+
+def test_a_childs_shirt_is_made_larger_and_not_worn_round_the_ankles() -> None:
+    v, f = cloth(Wanted(low=0.80, ease=0.018, sleeve=0.4, step=0.02))
+    made = fit_garment(SurfaceMesh(0.7 * v, f), load_body("neutral"), name="shirt")
+    assert any("scaled by" in note for note in made.notes)
+    heights = made.template.v_template[:, 1]
+    assert float(heights.min()) > -0.5
+    assert float(heights.max()) > 0.25  # the collar
+
+
+def test_shreds_are_refused_before_they_take_minutes() -> None:
+    v, f = cloth(Wanted(low=0.80, ease=0.018, step=0.025))
+    apart = v[f].reshape(-1, 3) + np.random.default_rng(0).normal(0, 1e-4, (f.size, 3))
+    shreds = SurfaceMesh(apart, np.arange(f.size).reshape(-1, 3))
+    begun = time.process_time()
+    with pytest.raises(GarmentError, match=r"it is in \d+ pieces, at most 1000 are worn: merge the vertices"):
+        fit_garment(shreds, load_body("neutral"), name="shreds")
+    assert time.process_time() - begun < 10
+
+
+def test_a_hat_isnt_held_at_the_waist() -> None:
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.13)
+    upper = ball.vertices[ball.faces].mean(axis=1)[:, 1] > 0
+    hat = SurfaceMesh(ball.vertices + np.array([0, 1.60, 0.04]), ball.faces[upper])
+    made = fit_garment(hat, load_body("neutral"), name="hat")
+    assert not made.template.card.held_at_waist

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import copy
 import gc
+import pickle
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 
 from refu_core import (
     FrameError,
@@ -16,7 +19,9 @@ from refu_core import (
     GarmentPipeline,
     RefuError,
     SmplFrame,
+    Wearer,
     WeightsError,
+    dress,
     load_body,
     load_garment,
 )
@@ -250,7 +255,13 @@ def test_skips_are_named() -> None:
         (["tshirt-male"], {"margin": -1}, RefuError, "margin must be between"),
         (["tshirt-male"], {"margin": float("nan")}, RefuError, "margin must be between"),
         (["tshirt-male"], {"device": "quantum"}, RefuError, "no device 'quantum'"),
-        (["tshirt-male"], {"style": [1, 2]}, GarmentError, "style must be 4 finite numbers"),
+        (["tshirt-male"], {"style": [1, 2]}, GarmentError, r"style must have the shape \(4,\), got \(2,\)"),
+        (["tshirt-male"], {"style": [1e9] * 4}, GarmentError, "style has magnitudes up to 1e.09, wanted 100 at most"),
+        (["tshirt-male"], {"style": torch.zeros(4, requires_grad=True)}, GarmentError, "style must be .* got Tensor"),
+        (["tshirt-male"], {"no_skip": 5}, RefuError, f"wanted a collection of {', '.join(SKIPS)}, got int"),
+        (["tshirt-male"], {"no_skip": [1, "a"]}, RefuError, "nothing is skipped by the name 1, a"),
+        (["tshirt-male"], {"weights": 5}, WeightsError, "wanted a folder of weights, got int"),
+        (np.array(["tshirt-male", "kilt"]), {}, GarmentError, "no garment .*'kilt'"),
     ],
 )
 def test_bad_options_are_named(garments: list[str], options: dict[str, object], error: type, wanted: str) -> None:
@@ -267,6 +278,11 @@ def test_bad_options_are_named(garments: list[str], options: dict[str, object], 
         ({"pose": np.zeros(72), "betas": np.zeros(9)}, r"betas must have the shape \(10,\)"),
         ({"pose": np.zeros(72), "transl": [0, np.inf, 0]}, "transl has 1 value that is NaN or infinite"),
         ({"pose": np.full(72, 1e300)}, "beyond the range of float32"),
+        ({"pose": np.zeros(72, complex)}, "pose must be .* numbers, got ndarray: values of the type complex128"),
+        ({"pose": np.zeros(72, bool)}, "values of the type bool"),
+        ({"pose": ["1"] * 72}, "values of the type <U1"),
+        ({"pose": np.zeros(72, "M8[ns]")}, "values of the type datetime64"),
+        ({"pose": np.ma.masked_less(np.arange(72.0), 3)}, "pose has 3 values that are NaN"),
     ],
 )
 def test_bad_frames_are_named(values: dict[str, object], wanted: str) -> None:
@@ -325,3 +341,52 @@ def test_what_a_newcomer_types_answers_in_a_line(pipeline: GarmentPipeline) -> N
     for shown in (pipeline, output, next(iter(output.values()))):
         assert len(repr(shown).splitlines()) == 1
         assert len(repr(shown)) < 200
+
+
+def test_copies_of_a_frame_are_as_safe_as_it_is() -> None:
+    frame = SmplFrame(pose=np.ones(72, np.float16), betas=range(10), transl=np.zeros(3, np.longdouble))
+    for other in (pickle.loads(pickle.dumps(frame)), copy.copy(frame), copy.deepcopy(frame)):
+        np.testing.assert_array_equal(other.pose, frame.pose)
+        for array in (other.pose, other.betas, other.transl):
+            with pytest.raises(ValueError, match="read-only"):
+                array[:] = np.nan
+
+
+def test_what_was_returned_travels_between_processes(pipeline: GarmentPipeline) -> None:
+    output = pipeline(SmplFrame(pose=np.zeros(72), transl=[0, 1, 0]))
+    for other in (pickle.loads(pickle.dumps(output)), copy.deepcopy(output)):
+        np.testing.assert_array_equal(other.body, output.body)
+        np.testing.assert_array_equal(other.skin, output.skin)
+        for name, mesh in output.items():
+            np.testing.assert_array_equal(other[name].vertices, mesh.vertices)
+            np.testing.assert_array_equal(other[name].raw, mesh.raw)
+        assert other.stats == output.stats
+    with pytest.raises(ValueError, match="read-only"):  # all frames share them
+        next(iter(output.values())).faces[0] = 0
+
+
+@pytest.mark.parametrize(
+    ("pose", "betas", "style", "wanted"),
+    [
+        (torch.zeros(24, 3), torch.zeros(1, 10), None, r"pose must be torch.float32 of the shape \(1, 24, 3\)"),
+        (torch.zeros(3, 24, 3), torch.zeros(2, 10), None, r"pose .* \(2, 24, 3\), got .* \(3, 24, 3\)"),
+        (torch.zeros(1, 24, 3).double(), torch.zeros(1, 10), None, "got torch.float64"),
+        (torch.zeros(1, 24, 3), torch.zeros(10), None, r"betas must be torch.float32 of the shape \(B, 10\)"),
+        (torch.zeros(1, 24, 3), torch.zeros(1, 300), None, r"betas .* got .* \(1, 300\)"),
+        (torch.zeros(3, 24, 3), torch.zeros(3, 10), torch.zeros(2, 4), r"style .* \(1 or 3, 4\), got .* \(2, 4\)"),
+        (torch.zeros(1, 24, 3), torch.zeros(1, 10), np.zeros((1, 4)), "style as a torch.Tensor"),
+    ],
+)
+def test_tensors_of_other_shapes_are_named(
+    pipeline: GarmentPipeline, pose: Tensor, betas: Tensor, style: Tensor, wanted: str
+) -> None:
+    with pytest.raises(FrameError, match=wanted):
+        dress(pose, Wearer.of(pipeline.outfit, betas, style))
+    with pytest.raises(FrameError, match="wanted a Wearer"):
+        dress(pose, None)  # type: ignore[arg-type]
+
+
+def test_a_processor_has_no_number_and_no_other_name() -> None:
+    assert GarmentPipeline.load("tshirt-male", device="cpu:0").body.device == torch.device("cpu")
+    with pytest.raises(RefuError, match="no device 'gpu': wanted cpu or cuda"):
+        load_body("male", device="gpu")

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import copy
+import os
 import pickle
+import signal
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -124,6 +126,23 @@ def test_a_pipeline_that_is_pickled_says_what_to_do_instead(
 ) -> None:
     with pytest.raises(RefuError, match="load one in each process"):
         take(pipeline)
+
+
+def test_a_fork_in_the_middle_of_a_call_is_told_and_not_waited_for() -> None:
+    """Other threads don't outlive it: the memory that they work in never comes back."""
+    pipeline = GarmentPipeline.load(_GARMENTS[1:], backbone="skinned", sdf="none")
+    frame = _frames(1)[0]
+    with pipeline._turn():
+        child = os.fork()
+        if not child:
+            signal.alarm(20)
+            try:
+                pipeline(frame)
+            except RefuError as error:
+                os._exit(0 if "busy when its process was forked: load one in each process" in str(error) else 1)
+            os._exit(2)
+    assert os.waitpid(child, 0)[1] == 0
+    pipeline(frame)
 
 
 def test_calls_run_at_the_same_time_and_no_more_than_asked_for() -> None:

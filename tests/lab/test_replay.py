@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -254,6 +255,26 @@ def test_bad_messages_are_counted_and_skipped(tmp_path: Path, capsys: pytest.Cap
     said = [ros.status[0] for _, _, ros in decoded(out, "/diagnostics")]
     assert [status.level for status in said] == [0, 2, 2, 0, 2, 0]
     assert "NaN" in said[4].message
+
+
+def test_a_body_that_nobody_has_and_a_time_that_no_message_holds_are_skipped(tmp_path: Path) -> None:
+    frames = motion(5)
+    frames[1] = replace(frames[1], betas=np.full(10, -99.0))  # inside out
+    frames[3] = replace(frames[3], stamp_ns=2**31 * 10**9 - 1)
+    late = adapters.encoder_for("joint_state")(replace(frames[3], stamp_ns=0))  # received later than that
+    bag = write_bag(tmp_path / "odd.mcap", frames, extra={3: late})
+    out, told = tmp_path / "out.mcap", tmp_path / "r.json"
+    assert run(bag, "--output", out, "--json", told, "--garments", "short-pant-male", "--backbone", "skinned") == 0
+    result = json.loads(told.read_text())
+    assert result["frames"] == 3
+    assert sum(result["skipped"].values()) == 2
+    assert all("negative volume" in reason or "impossible time" in reason for reason in result["skipped"])
+    assert [topic for topic, _, _ in raw_messages(out)].count("/garments") == 3
+    glb, options = tmp_path / "odd.glb", ("--garments", "short-pant-male", "--backbone", "skinned", "--count", "5")
+    assert main(["export", str(bag), "--output", str(glb), *options, "--json", str(told)]) == 0
+    said = json.loads(told.read_text())
+    assert len(said["files"]) == 3
+    assert sum("is left out" in warning for warning in said["warnings"]) == 2
 
 
 def raw_messages(path: Path) -> list[tuple[str, int, bytes]]:

@@ -485,6 +485,27 @@ def test_the_example_in_python_hears_the_node(robot: Callable[..., Robot], tmp_p
     assert into @ sleeve.rotation[:, 2] < -0.9
 
 
+def test_the_example_in_python_ends_in_silence_wherever_a_signal_meets_it(tmp_path: Path) -> None:
+    """In the middle of taking a message, and of publishing: rclpy makes other errors of it."""
+    program = f"""
+import os, runpy, signal, time, rclpy
+def spin(node):
+    try:
+        os.kill(os.getpid(), signal.SIGINT)
+        while rclpy.ok():
+            time.sleep(0.01)
+    except KeyboardInterrupt:
+        pass
+    raise RuntimeError("Unable to convert call argument '0' to Python object")
+rclpy.spin = spin
+runpy.run_path({str(ROOT / "examples" / "ros" / "sleeve_listener.py")!r}, run_name="__main__")
+"""
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{os.environ.get('PYTHONPATH', '')}"}
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, check=False, timeout=PATIENCE_S)
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
 @pytest.mark.skipif(shutil.which("colcon") is None or shutil.which("ros2") is None, reason="there is no rclcpp here")
 def test_the_example_in_cpp_builds(tmp_path: Path) -> None:
     source = ROOT / "examples" / "ros" / "refu_listener_cpp"
