@@ -86,6 +86,8 @@ class BetasSource(Choice):
     """Of nobody: those that were set are used instead."""
 
 
+ONE_STYLE = "a style arrives, which garments of one style don't hear of: {}"
+"""The warning, once, with the garments' names."""
 FOREIGN_BETAS = (
     "betas arrive, and nothing says what they are of: they are taken for the built-in body's own, and SMPL's mean "
     "other shapes; name the SMPL file that they are of (body or betas_from), or set betas_source to builtin or fixed"

@@ -23,7 +23,7 @@ from msg_adapters import FrameRecord
 from refu_core import GarmentPipeline, RefuError, SmplFrame
 from refu_core._device import one_thread
 from refu_core.metrics import CollisionChecker, Figures, GarmentMetrics
-from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN, BackboneName, BetasSource
+from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN, ONE_STYLE, BackboneName, BetasSource
 from refu_core.realtime import PipelineOutput, SkinShift
 from refu_core.recordings import Axes, axis_of, upright_share
 from refu_lab.bodies import betas_warnings, body_facts, body_warnings
@@ -247,7 +247,7 @@ class _Replayer:
             is_bag = source.bag is not None
             truth = GroundTruth.of_bag(options.input, faces, axes=options.axes) if is_bag else None
             self._evaluator = Evaluator(pipeline, truth)
-        self._has_betas = False
+        self._has_betas = self._has_style = False
         self._encoder = garment_encoder(pipeline, options)
 
     def run(self, record: FrameRecord, bag: DressedBag | None) -> None:
@@ -268,6 +268,7 @@ class _Replayer:
         result, shift = self._result, output.stats.shift
         result.latencies_ms.append(latency_ms)
         self._has_betas = self._has_betas or bool(frame.betas.any())
+        self._has_style = self._has_style or frame.style is not None
         result.shift_sum += shift.mean
         result.shift_largest = max(result.shift_largest, shift.largest)
         garments = None
@@ -292,6 +293,9 @@ class _Replayer:
             is_told = True
         if self._has_betas and not is_told:
             self._result.warnings += betas_warnings(self._pipeline, source=options.betas_source)
+        plain = [name for name, one in self._pipeline.garments.items() if one.styledirs is None]
+        if self._has_style and plain:
+            self._result.warnings.append(ONE_STYLE.format(", ".join(plain)))
         if self._evaluator is None:
             return
         self._result.before = {name: metrics.summary() for name, metrics in self._evaluator.before.items()}

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from msg_adapters import INPUT_TYPES, KEYPOINT_TYPES, KeypointStream, decoder_for, frame_id_of
 from refu_core import SmplFrame
 from refu_core.keypoints import Proportions
-from refu_core.modes import FOREIGN_BETAS
+from refu_core.modes import FOREIGN_BETAS, ONE_STYLE
 from refu_core.recordings import axis_of, upright_share
 from refu_ros._scene import check_plausible
 from refu_ros._settings import NodeSettings
@@ -33,7 +33,7 @@ class InputDecoder:
         self._decoder = decoder_for(self._layout) if settings.input_type in INPUT_TYPES else None
         self._stream: KeypointStream | None = None
         self._body: SmplBody | None = None
-        self._is_doubted = self._lie = False
+        self._is_doubted = self._is_styled = self._lie = False
         self._roots: list[NDArray[np.float32]] = []
 
     @property
@@ -84,6 +84,10 @@ class InputDecoder:
         if not (self._is_doubted or self._settings.betas_are_told) and any(frame.betas.any() for frame in frames):
             self._is_doubted = True
             return FOREIGN_BETAS
+        if not self._is_styled and any(frame.style is not None for frame in frames):
+            self._is_styled = True
+            if plain := self._settings.of_one_style:
+                return ONE_STYLE.format(", ".join(plain))
         return "" if self._lie or self._settings.axes != "smpl" else self._doubt_of_axes(frames)
 
     def _doubt_of_axes(self, frames: Iterable[SmplFrame]) -> str:

@@ -258,14 +258,18 @@ class NodeSettings:
             cut_for = ", ".join(f"{name} ({template.body})" for name, template in templates.items())
             msg = f"garments: one person wears garments of one body, got {cut_for}"
             raise SettingsError(msg)
-        plain = [name for name, template in templates.items() if template.styledirs is None]
-        if any(self.style) and plain:
+        if any(self.style) and (plain := self.of_one_style):
             msg = f"style: {', '.join(plain)} has no styles; set it to zeros"
             raise SettingsError(msg)
 
     def changed(self, values: Mapping[str, Any]) -> NodeSettings:
         """These settings with some values as ROS has them (lists, numbers of any kind). Raises `SettingsError`."""
         return replace(self, **coerced(NodeSettings, values))
+
+    @property
+    def of_one_style(self) -> list[str]:
+        """The garments that hear of no style."""
+        return [name for name in self.garments if _template(name).styledirs is None]
 
     @property
     def pipeline(self) -> PipelineKey:

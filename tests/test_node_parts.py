@@ -35,7 +35,7 @@ from msg_adapters.cdr import CdrWriter
 from refu_core import BodyError, FrameError, GarmentPipeline, MeshError, RefuError, SmplFrame, load_body
 from refu_core.keypoints import Proportions, Skeleton, keypoint_layout
 from refu_core.keypoints._pose import Pose
-from refu_core.modes import FOREIGN_BETAS
+from refu_core.modes import FOREIGN_BETAS, ONE_STYLE
 from refu_ros._asked import asked_path
 from refu_ros._decoding import InputDecoder
 from refu_ros._diagnostics import Situation, statuses
@@ -732,6 +732,13 @@ def test_people_who_lie_are_warned_of_once(root: tuple[float, ...], words: str) 
     assert words in "".join(said)
     of_frame = InputDecoder(NodeSettings().changed({"input_axes": "frame"}))
     assert not any(of_frame.doubt([SmplFrame(pose)]) for _ in range(300))
+
+
+def test_a_style_that_a_garment_has_no_ear_for_is_told_once() -> None:
+    styled = SmplFrame(np.zeros((24, 3), np.float32), style=np.ones(4))
+    decoder = InputDecoder(NodeSettings().changed({"garments": ["tshirt-female", "skirt-female"]}))
+    assert [decoder.doubt([styled]) for _ in range(2)] == [ONE_STYLE.format("tshirt-female"), ""]
+    assert InputDecoder(NodeSettings()).doubt([styled]) == ""
 
 
 @pytest.mark.parametrize("collider", [True, False])

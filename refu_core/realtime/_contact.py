@@ -179,11 +179,12 @@ class ContactStage:
             vertices, _ = self.lift(name, vertices, worn, goes_on=True)
             again = resolver(vertices, self.sdf, None, margin=self._kept * margin)
             again = self._part(name, again, worn, margin=self._kept * margin)
-            # Each step goes no farther than that; together they may.
-            vertices = pressed + torch.renorm(again.vertices - pressed, 2, 0, self._farthest)
+            vertices = again.vertices
             numbers[_N_UNRESOLVED] = again.numbers[_N_UNRESOLVED]
         if self._is_tight:
             vertices = self._off_skin[name].parted(vertices)
+        if worn or self._is_tight:  # Each step goes no farther than that; together they may.
+            vertices = pressed + torch.renorm(vertices - pressed, 2, 0, self._farthest)
         if self.winding is not None:
             numbers[_N_UNRESOLVED] = torch.count_nonzero(self.winding(vertices))
         return Resolved(vertices, torch.cat((numbers, n_layered)), n_clipped)

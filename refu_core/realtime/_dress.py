@@ -89,12 +89,13 @@ def scale_of(wearable: Wearable, drape: Drape, person: int) -> float | VertexSca
 def _drape(
     pose: Tensor, wearer: Wearer, wearable: Wearable, garment: UnposedGarment, transforms: RigidTransforms
 ) -> Drape:
-    predicted = wearable.backbone(garment.betas, pose, wearer.style, wearer_code=garment.code)
+    style = wearable.template.own(wearer.style)
+    predicted = wearable.backbone(garment.betas, pose, style, wearer_code=garment.code)
     unposed, on_mean = garment.rest, garment.on_mean
     if predicted.displacement is not None:
         displacement = predicted.displacement.clamp(-MAX_OFFSET, MAX_OFFSET).to(unposed)
         unposed, on_mean = unposed + displacement, on_mean + displacement
     z = None
     if wearable.refu is not None:
-        z = wearable.refu.feature(garment.betas, pose, wearer.style, predicted.feature)
+        z = wearable.refu.feature(garment.betas, pose, style, predicted.feature)
     return Drape(wearable.template.pose(unposed, transforms), unposed, on_mean, z)

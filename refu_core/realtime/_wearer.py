@@ -92,11 +92,9 @@ class Wearer:
 
     @classmethod
     def of(cls, outfit: Outfit, betas: Tensor, style: Tensor | None = None) -> Wearer:
-        """Of betas (B, 10) and style (B, 4), the mean style if not given. Differentiable.
+        """Of betas (B, 10) and style (B, 4), the mean style if not given. Garments of one style keep theirs.
 
-        Raises:
-            FrameError: no tensors of these shapes, or of another precision than the body.
-            GarmentError: a style for a garment that has one style only.
+        Differentiable. Raises `FrameError` for no tensors of these shapes, or of another precision than the body.
         """
         require_batch("betas", betas, (N_BETAS,), outfit)
         if style is not None:
@@ -104,10 +102,10 @@ class Wearer:
         mean = betas.new_zeros(1, betas.shape[1])
         garments = {}
         for name, one in outfit.wearables.items():
-            rest = one.template.rest(betas, style)
-            on_mean = one.template.rest(mean, style).expand_as(rest)
-            known = one.known_as(betas)
-            garments[name] = UnposedGarment(rest, on_mean, one.backbone.wearer_code(known, style), known)
+            own, known = one.template.own(style), one.known_as(betas)
+            rest = one.template.rest(betas, own)
+            on_mean = one.template.rest(mean, own).expand_as(rest)
+            garments[name] = UnposedGarment(rest, on_mean, one.backbone.wearer_code(known, own), known)
         given = betas.new_zeros(len(betas), N_STYLES) if style is None else style
         return cls(outfit, betas, given, outfit.body.shape(betas), garments)
 

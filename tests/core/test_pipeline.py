@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import gc
 import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -235,6 +236,13 @@ def test_what_is_skipped_changes_nothing(sdf: str, skips: list[str]) -> None:
         for name, mesh in one.items():
             np.testing.assert_array_equal(mesh.raw, other[name].raw)
             np.testing.assert_allclose(mesh.local, other[name].local, atol=1e-4)
+
+
+def test_garments_of_one_style_keep_it() -> None:
+    plain = GarmentPipeline.load(["tshirt-female"], sdf="none")
+    given = frame(3)
+    styled = plain(replace(given, style=np.ones(4)))["tshirt-female"].vertices
+    np.testing.assert_array_equal(styled, plain(given)["tshirt-female"].vertices)
 
 
 def test_skips_are_named() -> None:

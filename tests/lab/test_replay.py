@@ -25,6 +25,7 @@ from rosbags.highlevel import AnyReader
 import msg_adapters as adapters
 from refu_core import GarmentPipeline, SmplFrame, load_body, load_garment
 from refu_core.garments import BUILTIN_GARMENTS, PAPER_GARMENTS
+from refu_core.modes import ONE_STYLE
 from refu_lab.cli import main
 from refu_lab.touching_poses import touching_pose
 
@@ -222,6 +223,15 @@ def test_betas_can_be_given(small_bag: Path, tmp_path: Path) -> None:
         (marker,) = adapters.decode_marker_array(raw_messages(out)[1][2])
         depths.append(np.ptp(marker.points[:, 0]))
     assert depths[1] > depths[0] + 0.02, "the second component is girth"
+
+
+def test_a_style_that_a_garment_has_no_ear_for_is_told(tmp_path: Path) -> None:
+    styled = [replace(frame, style=np.ones(4)) for frame in motion(2)]
+    bag = write_bag(tmp_path / "styled.mcap", styled, "multiarray")
+    for garment, said in (("tshirt-female", [ONE_STYLE.format("tshirt-female")]), ("skirt-female", [])):
+        path = tmp_path / f"{garment}.json"
+        assert run(bag, "--garments", garment, "--sdf", "none", "--json", path) == 0
+        assert [one for one in json.loads(path.read_text())["warnings"] if "style" in one] == said
 
 
 def test_real_speed_keeps_the_pace(small_bag: Path) -> None:
