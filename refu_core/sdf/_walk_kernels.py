@@ -296,6 +296,14 @@ def walk_from(p: wp.vec3, near: int, mesh: PosedMesh, guides: Guides) -> tuple[i
     return face, feature, w, above
 
 
+@wp.func
+def first_at(face: int, feature: int, mesh: PosedMesh) -> int:
+    """Of two faces whose edge is closest the first one: which of them a walk comes to hangs on rounding."""
+    if feature >= EDGE:
+        return wp.min(face, mesh.across[face, feature - EDGE])
+    return face
+
+
 @wp.kernel(enable_backward=False)
 def walk_kernel(
     mesh: PosedMesh,
@@ -318,7 +326,7 @@ def walk_kernel(
     if feature != FACE:
         offset = offset_from(p, face, w, mesh.points, mesh.faces)
     distance, gradient = distance_and_gradient(offset, face, feature, wp.normalize(above), mesh)
-    out_face[i] = face
+    out_face[i] = first_at(face, feature, mesh)
     out_distance[i] = distance
     out_gradient[i] = gradient
 

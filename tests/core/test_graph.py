@@ -121,14 +121,14 @@ def as_on_a_gpu(pipeline: GarmentPipeline) -> FrameStep:
     """The pipeline's step, with the launches that a GPU gets, and a tree that isn't built anew."""
     contact, collider = pipeline._steps[0].contact, pipeline.outfit.collider
     if collider is not None:
-        collider._is_serial = False
+        collider._is_serial = collider.anatomy.aside._is_serial = False
     if contact is not None:
         if isinstance(contact.sdf, ExactSdf):
             contact.sdf._rebuild_distance = math.inf
         if isinstance(contact.sdf, ApproxSdf):
             contact.sdf._is_serial = False
         contact._is_serial = False
-        for one in (*contact._press.values(), *contact._off_skin.values()):
+        for one in (*contact._press.values(), *contact._off_skin.values(), *contact._unfold.values()):
             one._is_serial = False
         for resolver in contact.resolvers.values():
             resolver._is_serial = False
