@@ -67,7 +67,7 @@ def test_what_nobody_has_measured_is_said_to_be_unknown(pipeline: GarmentPipelin
     found = every(frame, pipeline(frame))
     assert (found["longsleeve-male"] == np.float32(UNKNOWN_SIGMA)).all()
     assert 0.001 < found["short-pant-male"].min() < found["short-pant-male"].max() < 0.02
-    assert not load_sigma(load_garment("dress-female")).is_measured
+    assert not load_sigma(load_garment("longsleeve-male")).is_measured
     assert np.isfinite(SigmaMap.unknown(3).at(1.0)).all()
 
 
