@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from difflib import get_close_matches
 from typing import Any, TypeVar
 
 from refu_core import RefuError
+from refu_core.errors import printable
 
 Settings = TypeVar("Settings")
 
@@ -52,7 +54,7 @@ def listing(kind: type) -> str:
 
 
 def declare(node: Any, kind: type[Settings]) -> Settings:
-    """Declares every parameter, and takes what the node was started with.
+    """Declares every parameter, and takes what the node was started with. What it doesn't know is warned of.
 
     Raises `SettingsError` for values that have no meaning, and rclpy's own errors for values of a wrong type.
     """
@@ -61,6 +63,12 @@ def declare(node: Any, kind: type[Settings]) -> Settings:
         default = defaults_of(kind)[name]
         value = list(default) if isinstance(default, tuple) else default
         values[name] = node.declare_parameter(name, value, _descriptor(default, spec)).value
+    # A file of parameters may be for several nodes (`/**`), so it is no error.
+    for name in getattr(node, "_parameter_overrides", {}):
+        if not node.has_parameter(name) and not name.startswith("qos_overrides."):
+            like = get_close_matches(name, values, n=1)
+            hint = f": is {like[0]} meant?" if like else ""
+            node.get_logger().warning(f"there is no parameter {printable(name)}{hint}")
     return kind(**coerced(kind, values))
 
 

@@ -25,10 +25,12 @@ from rclpy.context import Context  # noqa: E402
 from rclpy.exceptions import ParameterException  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.node import Node  # noqa: E402
+from rclpy.parameter import Parameter  # noqa: E402
 from rclpy.qos import QoSProfile  # noqa: E402
 
 from refu_ros._interfaces import interface  # noqa: E402
-from refu_ros.smpl_publisher import SmplPublisher, in_place, load_motion, march  # noqa: E402
+from refu_ros._parameters import declare  # noqa: E402
+from refu_ros.smpl_publisher import PublisherOptions, SmplPublisher, in_place, load_motion, march  # noqa: E402
 
 # rclpy's parser of message definitions uses a module that Python 3.11 deprecates.
 pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")
@@ -182,6 +184,17 @@ def test_ends_with_the_motion(context: Context) -> None:
 def test_refuses(context: Context, parameters: dict[str, Any], words: str) -> None:
     with pytest.raises((RefuError, ParameterException), match=re.escape(words)):
         publisher(context, **parameters)
+
+
+def test_a_parameter_that_there_is_not_is_warned_of(context: Context) -> None:
+    given = [
+        Parameter(name, value=1.0) for name in ("rat", "qos_overrides./smpl_params.publisher.depth", "use_sim_tine")
+    ]
+    node, said = Node("probe", context=context, parameter_overrides=given), []
+    node.get_logger = lambda: SimpleNamespace(warning=said.append)  # type: ignore[assignment, method-assign, return-value]
+    declare(node, PublisherOptions)
+    node.destroy_node()
+    assert said == ["there is no parameter rat: is rate meant?", "there is no parameter use_sim_tine"]
 
 
 def test_bad_parameters_are_one_line() -> None:
