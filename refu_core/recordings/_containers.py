@@ -43,19 +43,21 @@ class Content:
 
     def array(self, value: Any) -> NDArray[Any]:
         """The array that a value stands for; a list of rows is one, too. Raises `ValueError` for anything else."""
-        if isinstance(value, np.ndarray):
-            return value
-        if id(value) not in self._made:  # held beside its array, so that the number stays its own
-            self._made[id(value)] = value, self._array(value, 0)
-        return self._made[id(value)][1]
+        if id(value) in self._made:
+            return self._made[id(value)][1]
+        return self._array(value, 0)
 
     def _array(self, value: Any, depth: int) -> NDArray[Any]:
         if isinstance(value, np.ndarray):
             return value
-        self._left -= len(value) if _is_list(value) else 0  # lists that are shared count as often as they are seen
+        known = self._made.get(id(value))
+        if _is_list(value):  # one that is shared is made once, and counts as often as it is seen
+            self._left -= len(value) if known is None else known[1].size
         if depth > _MOST_DEPTH or self._left < 0:
             msg = f"lists of lists, more than {_MOST_DEPTH} deep or of more than {_MOST_ITEMS} items"
             raise ValueError(msg)
+        if known is not None:
+            return known[1]
         try:
             if isinstance(value, (list, tuple)) and value and not all(type(item) in (int, float) for item in value):
                 rows = [self._array(item, depth + 1) for item in value]
@@ -63,10 +65,13 @@ class Content:
                 if len(shapes) > 1:
                     msg = f"a list of arrays of several shapes: {', '.join(map(str, shapes[:4]))}"
                     raise ValueError(msg)
-                return np.stack(rows)
-            return self._arrays.of(value)
+                array = np.stack(rows)
+            else:
+                array = self._arrays.of(value)
         except (RecursionError, *DAMAGE) as cause:
             raise ValueError(str(cause) or type(cause).__name__) from cause
+        self._made[id(value)] = value, array  # held beside its array, so that the number stays its own
+        return array
 
     def nodes(self) -> Iterator[tuple[tuple[Key, ...], Mapping[Key, Any]]]:
         """Every mapping in the file and the way to it, from the outside inwards."""
