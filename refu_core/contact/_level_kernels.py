@@ -5,6 +5,22 @@ import warp as wp
 from refu_core import _warp  # noqa: F401  (quiets Warp before it starts)
 
 
+@wp.func
+def levelled(
+    i: int, points: wp.array[wp.vec3], weight: float, ring_start: wp.array[int], ring: wp.array[int]
+) -> wp.vec3:
+    """A vertex by its weight towards the middle of its neighbours, `ring[ring_start[i]:ring_start[i + 1]]`."""
+    place = points[i]
+    start = ring_start[i]
+    end = ring_start[i + 1]
+    if weight > 0.0 and end > start:
+        total = wp.vec3()
+        for r in range(start, end):
+            total += points[ring[r]]
+        place += weight * (total / float(end - start) - place)
+    return place
+
+
 @wp.kernel(enable_backward=False)
 def level_kernel(
     points: wp.array[wp.vec3],
@@ -14,14 +30,6 @@ def level_kernel(
     # output
     leveller: wp.array[wp.vec3],
 ) -> None:
-    """Each vertex by its weight towards the middle of its neighbours, `ring[ring_start[i]:ring_start[i + 1]]`."""
+    """`levelled` of one vertex a thread."""
     i = wp.tid()
-    place = points[i]
-    start = ring_start[i]
-    end = ring_start[i + 1]
-    if weight[i] > 0.0 and end > start:
-        total = wp.vec3()
-        for r in range(start, end):
-            total += points[ring[r]]
-        place += weight[i] * (total / float(end - start) - place)
-    leveller[i] = place
+    leveller[i] = levelled(i, points, weight[i], ring_start, ring)

@@ -14,6 +14,7 @@ from torch import Tensor
 from refu_core._warp import as_warp, torch_stream
 from refu_core.contact import _layers_kernels as layers
 from refu_core.contact import _unfold_kernels as kernels
+from refu_core.contact._level_kernels import level_kernel
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
 from refu_core.contact._sheet import cut_of
 from refu_core.garments import GarmentTemplate
@@ -62,8 +63,8 @@ class Unfold:
             ("fold", kernels.fold_kernel, n, [points, turned, cut, flat, folded, may, weight, count]),
             ("widen0", kernels.widen_kernel, n, [weight, may, cut, fade, wider]),
             ("widen1", kernels.widen_kernel, n, [wider, may, cut, fade, weight]),
-            ("level0", kernels.level_kernel, n, [points, weight, cut, other]),
-            ("level1", kernels.level_kernel, n, [other, weight, cut, points]),
+            ("level0", level_kernel, n, [points, weight, cut.ring_start, cut.ring, other]),
+            ("level1", level_kernel, n, [other, weight, cut.ring_start, cut.ring, points]),
             (
                 "unfold all",
                 kernels.unfold_all_kernel,

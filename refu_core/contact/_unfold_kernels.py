@@ -3,6 +3,7 @@
 import warp as wp
 
 from refu_core.contact._layers_kernels import Cut
+from refu_core.contact._level_kernels import levelled
 
 
 @wp.func
@@ -56,17 +57,6 @@ def widest(i: int, weight: wp.array[float], share: wp.array[float], cut: Cut, fa
     return wp.max(weight[i], wp.min(fade * most, share[i]))
 
 
-@wp.func
-def levelled(i: int, points: wp.array[wp.vec3], weight: float, cut: Cut) -> wp.vec3:
-    """A vertex by its weight towards the middle of its neighbours."""
-    start = cut.ring_start[i]
-    end = cut.ring_start[i + 1]
-    total = wp.vec3()
-    for r in range(start, end):
-        total += points[cut.ring[r]]
-    return points[i] + weight * (total / float(wp.max(end - start, 1)) - points[i])
-
-
 @wp.kernel(enable_backward=False)
 def widen_kernel(
     weight: wp.array[float],
@@ -79,22 +69,6 @@ def widen_kernel(
     """`widest` of one vertex a thread."""
     i = wp.tid()
     wider[i] = widest(i, weight, share, cut, fade)
-
-
-@wp.kernel(enable_backward=False)
-def level_kernel(
-    points: wp.array[wp.vec3],
-    weight: wp.array[float],
-    cut: Cut,
-    # output
-    leveller: wp.array[wp.vec3],
-) -> None:
-    """`levelled` of one vertex a thread."""
-    i = wp.tid()
-    place = points[i]
-    if weight[i] > 0.0:
-        place = levelled(i, points, weight[i], cut)
-    leveller[i] = place
 
 
 @wp.kernel(enable_backward=False)
@@ -129,6 +103,6 @@ def unfold_all_kernel(
         for r in range(n):
             i = rows[r]
             if k % 2 == 0:
-                leveller[i] = levelled(i, points, weight[i], cut)
+                leveller[i] = levelled(i, points, weight[i], cut.ring_start, cut.ring)
             else:
-                points[i] = levelled(i, leveller, weight[i], cut)
+                points[i] = levelled(i, leveller, weight[i], cut.ring_start, cut.ring)

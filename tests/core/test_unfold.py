@@ -17,6 +17,7 @@ from refu_core.metrics import SheetChecker
 from refu_core.modes import SdfMode
 from refu_core.realtime import ContactStage, Outfit, Wearer, dress
 from refu_core.realtime._frame import FrameStep
+from tests.core.test_layers import normals
 
 Array = NDArray[np.float64]
 SHIRT, SHORTS = "tshirt-male", "short-pant-male"
@@ -44,15 +45,6 @@ def shorts_in(bend: float) -> tuple[Tensor, Tensor]:
 def made(**settings: float) -> Unfold:
     shirt, shorts = (outfit().wearables[name].template for name in (SHIRT, SHORTS))
     return Unfold(shorts, [shirt], settings=replace(DEFAULT_CONTACT, **settings))  # type: ignore[arg-type]
-
-
-def normals(points: Array, faces: NDArray[np.int64]) -> Array:
-    a, b, c = points[faces].transpose(1, 0, 2)
-    total = np.zeros_like(points)
-    for k in range(3):
-        np.add.at(total, faces[:, k], np.cross(b - a, c - a))
-    unit: Array = total / np.linalg.norm(total, axis=1, keepdims=True)
-    return unit
 
 
 def slowly(points: Tensor, rotation: Tensor) -> Array:
