@@ -16,6 +16,7 @@ from torch.nn.functional import embedding_bag
 from refu_core._warp import as_warp, is_plain, torch_stream
 from refu_core.body import _aside_kernels as kernels
 from refu_core.body._closest import weights_at
+from refu_core.body._collider_kernels import Means
 from refu_core.body._kinematics import rotvec_to_rotmat
 from refu_core.body._parts import ARMS, joints_of, part_of_faces
 from refu_core.body._segments import SOFTNESS, cut
@@ -91,7 +92,7 @@ class Aside:
         self._n_near = torch.zeros(1, dtype=torch.int32)
         self._inside = torch.zeros(len(arm), dtype=torch.int32)
         if self._is_serial:
-            self._looks = self._recorded_looks(mesh, weights, rows[len(ARMS) :], len(arm))
+            self._looks = self._recorded_looks(mesh, weights)
 
     def __call__(self, skin: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor]:
         """Of one body: skin (V, 3) [m] and the joints' `rotation` (24, 3, 3), both with the arms aside.
@@ -103,11 +104,12 @@ class Aside:
         means = self._means(skin)
         shoulder = means[: len(ARMS)][self._arm]
         arm = means[len(ARMS) : self._first_cap] - shoulder
-        self._box[:, 0] = torch.stack(skin.detach()[self._other].aminmax(dim=0))
         points = torch.cat((skin, means[self._first_cap :]))
-        self._points.copy_(points.detach())
-        with torch_stream(self._device):
-            self._tree.refit()
+        if not self._is_serial:  # a CPU has fitted box and tree to know that much
+            self._box[:, 0] = torch.stack(skin.detach()[self._other].aminmax(dim=0))
+            self._points.copy_(points.detach())
+            with torch_stream(self._device):
+                self._tree.refit()
         turn, length2, is_of = skin.new_zeros(len(ARMS), 3), (arm * arm).sum(1), self._is_of.to(skin)
         longest = torch.where(self._is_of, length2.sqrt(), 0.0).amax(1, keepdim=True)
         for _ in range(self._rounds):
@@ -132,37 +134,36 @@ class Aside:
         means: Tensor = embedding_bag(self._vertex, skin, self._start, mode="sum", per_sample_weights=weight)
         return means
 
-    def _recorded_looks(self, mesh: Connectivity, weights: Array, means: list[Array], n_middles: int) -> list[Any]:
+    def _recorded_looks(self, mesh: Connectivity, weights: Array) -> list[Any]:
         """What `_is_any_inside` launches."""
         body = [joints for joints, _ in SOFTNESS if not any(set(joints) & set(arm) for arm in ARMS)]
         part_of = part_of_faces(torch.from_numpy(weights), torch.from_numpy(mesh.faces).long(), [*body, *ARMS]).numpy()
-        corners = [np.unique(mesh.faces[part_of == k]) for k in range(len(body))]
-        vertices = [np.flatnonzero(one) for one in means]
-        middles = kernels.Middles()
-        for name, lists in (("start", vertices), ("segment_start", [one for one in corners if len(one)])):
-            setattr(middles, name, wp.array(np.cumsum([0, *map(len, lists)]), dtype=wp.int32, device="cpu"))
-        for name, lists in (("vertex", vertices), ("corner", corners)):
-            setattr(middles, name, wp.array(np.concatenate(lists), dtype=wp.int32, device="cpu"))
-        each = np.concatenate([np.full(len(one), 1 / len(one)) for one in vertices])
-        middles.weight = wp.array(each, dtype=wp.float32, device="cpu")
-        middles.mean = wp.zeros(n_middles, dtype=wp.vec3, device="cpu")
+        corners = [np.unique(mesh.faces[part_of == k]) for k in range(len(body)) if (part_of == k).any()]
+        means, n_middles = Means(), len(self._arm)
+        start = np.append(self._start.numpy(), len(self._vertex))[len(ARMS) :]  # of all but the shoulders
+        means.start, means.vertex, segment_start, corner = (
+            wp.array(one, dtype=wp.int32, device="cpu")
+            for one in (start, self._vertex, np.cumsum([0, *map(len, corners)]), np.concatenate(corners))
+        )
+        means.weight = wp.array(self._weight.numpy(), dtype=wp.float32, device="cpu")
+        means.mean, unused = (wp.zeros(len(start) - 1, dtype=wp.vec3, device="cpu") for _ in range(2))
         skin, n_near, inside = (
             as_warp(self._points, wp.vec3),
             *(as_warp(one, wp.int32) for one in (self._n_near, self._inside)),
         )
-        unused = wp.zeros(n_middles, dtype=wp.vec3, device="cpu")
+        near = [skin, mesh.n_vertices, n_middles, means, segment_start, corner, *self._corners, n_near]
         return [
             wp.launch(kernel, dim, inputs, device="cpu", record_cmd=True)
             for kernel, dim, inputs in (
-                (kernels.near_kernel, 1, [skin, mesh.n_vertices, middles, *self._corners, n_near]),
-                (kernels.inside_kernel, n_middles, [self._tree.id, *self._corners, middles.mean, inside, unused]),
+                (kernels.near_kernel, 1, near),
+                (kernels.inside_kernel, n_middles, [self._tree.id, *self._corners, means.mean, inside, unused]),
             )
         ]
 
     def _is_any_inside(self, skin: Tensor) -> bool:
         """Whether any middle is inside the body. First by boxes of its segments: no tree is asked where none is near.
 
-        Only of a CPU.
+        Only of a CPU. Box and tree are those of `skin` where it is true.
         """
         near, inside = self._looks
         self._points[: len(skin)].copy_(skin.detach())

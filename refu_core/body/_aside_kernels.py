@@ -3,62 +3,47 @@
 import warp as wp
 
 from refu_core.body._bundle_kernels import greater, lesser
+from refu_core.body._collider_kernels import Means, find_mean
 
 wp.set_module_options({"enable_backward": False})
-
-
-@wp.struct
-class Middles:
-    """Means of some of the skin, and what they may be inside of. The last of them close what arms were cut off."""
-
-    start: wp.array[int]
-    vertex: wp.array[int]
-    weight: wp.array[float]
-    """Middle c is the mean of `vertex[start[c]:start[c + 1]]` by their weights."""
-    segment_start: wp.array[int]
-    corner: wp.array[int]
-    """The vertices of segment k's faces are `corner[segment_start[k]:segment_start[k + 1]]`."""
-    mean: wp.array[wp.vec3]
-    """Memory for all but those."""
 
 
 @wp.kernel
 def near_kernel(
     skin: wp.array[wp.vec3],
     n_skin: int,
-    middles: Middles,
+    n_middles: int,
+    means: Means,
+    segment_start: wp.array[int],
+    corner: wp.array[int],
     # outputs
     low_of_all: wp.array[wp.vec3],
     high_of_all: wp.array[wp.vec3],
     count: wp.array[int],
 ) -> None:
-    """How many middles are in the box of any segment, counted for each; by one thread, as a CPU has it.
+    """How many of the first means are in the box of any segment, counted for each; by one thread, as a CPU has it.
 
-    What closes the body is appended to its skin.
+    The vertices of segment k's faces are `corner[segment_start[k]:segment_start[k + 1]]`. The other means close the
+    body: they are appended to its skin.
     """
-    n = middles.mean.shape[0]
-    for c in range(middles.start.shape[0] - 1):
-        mean = wp.vec3()
-        for i in range(middles.start[c], middles.start[c + 1]):
-            mean += middles.weight[i] * skin[middles.vertex[i]]
-        if c < n:
-            middles.mean[c] = mean
-        else:
-            skin[n_skin + c - n] = mean
+    for c in range(means.mean.shape[0]):
+        find_mean(c, skin, means)
+        if c >= n_middles:
+            skin[n_skin + c - n_middles] = means.mean[c]
     near = int(0)
     low_of_all[0] = wp.vec3(1.0e9)
     high_of_all[0] = wp.vec3(-1.0e9)
-    for k in range(middles.segment_start.shape[0] - 1):
-        low = skin[middles.corner[middles.segment_start[k]]]
+    for k in range(segment_start.shape[0] - 1):
+        low = skin[corner[segment_start[k]]]
         high = low
-        for i in range(middles.segment_start[k] + 1, middles.segment_start[k + 1]):
-            at = skin[middles.corner[i]]
+        for i in range(segment_start[k] + 1, segment_start[k + 1]):
+            at = skin[corner[i]]
             low = lesser(low, at)
             high = greater(high, at)
         low_of_all[0] = lesser(low_of_all[0], low)
         high_of_all[0] = greater(high_of_all[0], high)
-        for c in range(n):
-            at = middles.mean[c]
+        for c in range(n_middles):
+            at = means.mean[c]
             if low == lesser(low, at) and high == greater(high, at):
                 near += 1
     count[0] = near
