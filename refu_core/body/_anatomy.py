@@ -19,7 +19,6 @@ from refu_core.body._creases import LEVELS, find_creases
 from refu_core.body._kinematics import PARENTS
 from refu_core.body._model import SmplBody
 from refu_core.body._segments import SOFTNESS, cut
-from refu_core.frames import N_BETAS
 from refu_core.mesh import Connectivity, vertex_normals
 
 DEFAULT_GAP = 0.012
@@ -98,7 +97,7 @@ class Anatomy:
         self.segments = self._bind_segments(rest, mesh, weights)
         self.farthest = self._thickness(rest, mesh).mul(settings.thin).clamp(max=settings.farthest)
         """How far skin may be moved [m], shape (V,)."""
-        joints = body.rest_joints(body.v_template.new_zeros(1, N_BETAS))[0].double().cpu().numpy()
+        joints = body.joint_template.double().cpu().numpy()
         self.aside = Aside(rest, mesh, weights, joints, settings.aside_farthest, settings.aside_rounds, self.device)
         """Arms out of what isn't an arm."""
         self.work = self.tensors.bound()

@@ -161,7 +161,7 @@ class BodyFit:
 def _regressor(body: SmplBody, vertices: Array, directions: Array) -> Array:
     """The body's joints, for every β, from vertices (V, 3) near them that move by `directions` (V, 3, 10)."""
     exact = body.to(device="cpu", dtype=torch.float64)
-    joints = exact.rest_joints(torch.zeros(1, N_BETAS, dtype=torch.float64))[0].numpy()
+    joints = exact.joint_template.numpy()
     moved = exact.rest_joints(torch.eye(N_BETAS, dtype=torch.float64)).numpy() - joints  # (10, 24, 3)
     tree, rows = cKDTree(vertices), np.zeros((N_JOINTS, len(vertices)))
     for j, joint in enumerate(joints):

@@ -159,7 +159,8 @@ class SmplBody:
         self._shapedirs = tensor(arrays.shapedirs.reshape(n * 3, N_BETAS).T.copy())
         self._posedirs = tensor(arrays.posedirs.reshape(n * 3, -1)) if arrays.posedirs is not None else None
         # Joints are linear in β, so the regressor is applied once to the basis and not to each body.
-        self._joint_template = tensor(arrays.joint_regressor @ arrays.v_template)
+        self.joint_template = tensor(arrays.joint_regressor @ arrays.v_template)
+        """Joints of the mean shape [m], shape (24, 3)."""
         self._joint_shapedirs = tensor(np.einsum("jv,vcb->jcb", arrays.joint_regressor, arrays.shapedirs))
 
     def __repr__(self) -> str:
@@ -200,7 +201,7 @@ class SmplBody:
     def rest_joints(self, betas: Tensor) -> Tensor:
         """Joints of the unposed shapes [m], shape (B, 24, 3), for betas (B, 10)."""
         require_type(betas, Tensor, _TENSOR.format("betas"), error=FrameError)
-        return self._joint_template + torch.einsum("jck,bk->bjc", self._joint_shapedirs, betas)
+        return self.joint_template + torch.einsum("jck,bk->bjc", self._joint_shapedirs, betas)
 
     def rest_vertices(self, betas: Tensor) -> Tensor:
         """Unposed bodies without pose blend shapes [m], shape (B, V, 3), for betas (B, 10)."""

@@ -121,7 +121,7 @@ class _Registrar:
         self.target = target.to(device="cpu", dtype=torch.float64)
         self.mesh = Connectivity.of(source.faces.cpu().numpy(), source.n_vertices)
         self.surface = Surface(self.target.v_template.numpy(), target.faces.cpu().numpy().astype(np.int32))
-        self.joints = self.target.rest_joints(torch.zeros(1, N_BETAS, dtype=torch.float64))[0].numpy()
+        self.joints = self.target.joint_template.numpy()
         self.is_end = self.source.weights[:, list(ENDS)].sum(1).numpy() > 0.5
 
     def run(self) -> Registration:
@@ -146,7 +146,7 @@ class _Registrar:
     def _articulated(self) -> Array:
         """The source in the shape, pose and place that are nearest to the target [m], shape (V, 3)."""
         how, linear = self.how, derivatives(self.source.name)
-        own = self.source.rest_joints(torch.zeros(1, N_BETAS, dtype=torch.float64))[0].numpy()
+        own = self.source.joint_template.numpy()
         state = np.zeros(linear.vertices.shape[2])
         state[-3:] = (self.joints - own)[list(_LOOKED_AT)].mean(0)
         at, joints = self._at(state)

@@ -12,7 +12,6 @@ from refu_core._warp import as_warp, strips, torch_stream
 from refu_core.body import LEGS, SmplBody, weight_of_parts
 from refu_core.contact import _tent_kernels as kernels
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
-from refu_core.frames import N_BETAS
 from refu_core.garments import GarmentTemplate
 from refu_core.skeleton import JOINT_NAMES
 
@@ -28,10 +27,7 @@ class Shins:
         """For poses of this body, on its device."""
         self._device = body.device
         self._vertices = torch.zeros_like(body.v_template).copy_(body.v_template)
-        skin, self._joints = (
-            one.detach().cpu().double().numpy()
-            for one in (body.v_template, body.rest_joints(body.v_template.new_zeros(1, N_BETAS))[0])
-        )
+        skin, self._joints = (one.detach().cpu().double().numpy() for one in (body.v_template, body.joint_template))
         owner = body.weights.argmax(1).cpu().numpy()
         of_legs, shares, radii = [], [], []
         for knee, ankle in _BONES:

@@ -12,15 +12,14 @@ from torch import Tensor
 from torch.nn import functional
 
 from refu_core._warp import Repeated, is_plain, strips
-from refu_core.body import LEGS, SEGMENTS, SmplBody, weight_of_parts
+from refu_core.body import ARMS, LEGS, SmplBody, joints_of, weight_of_parts
 from refu_core.garments._below_kernels import N_BELOW, Vertices, Weights, follow_kernel
 from refu_core.garments._template import GarmentTemplate
 
 _WIDTH = 0.01
 """How much farther than a part's nearest vertex others of it may be to count for much [m]: the length of a body's
 shorter edges."""
-_REST = tuple(sorted(set(sum(SEGMENTS.values(), ())) - {*LEGS[0], *LEGS[1]}))
-_PARTS = (_REST, *LEGS)
+_PARTS = (joints_of("trunk", "head") + ARMS[0] + ARMS[1], *LEGS)
 """A skirt hangs from both legs, however near one of them is: cloth between them goes half way with either."""
 
 
