@@ -25,6 +25,8 @@ _MODEL_OPCODES, _DATA_OPCODES = 100_000, 1_000_000
 """An official file has some hundreds; a tracker's has a thousand a frame."""
 _MAX_MARKS = 10_000
 """Values in values; Python itself writes no more than a thousand."""
+_MAX_NAMES = 10_000
+"""Python writes each name once in a file, and then refers to it."""
 _MAX_NESTED = 4
 """Pickles in a pickle: joblib writes arrays of objects so."""
 _LONG_TEXT = 1 << 16
@@ -62,7 +64,12 @@ _READABLE = (
     *("INT", "LONG", "LONG1", "BININT", "BININT1", "BININT2", "FLOAT", "BINFLOAT", "BINSTRING", "SHORT_BINSTRING"),
     *("SHORT_BINUNICODE", "SHORT_BINBYTES", "BINBYTES", "BINBYTES8"),
 )
-_WITH_ARGUMENT = ("PROTO", "FRAME", "PUT", "BINPUT", "LONG_BINPUT", "GET", "BINGET", "LONG_BINGET", "GLOBAL")
+_ARGUMENTS: dict[str, Callable[[BinaryIO], Any]] = {
+    **{name: _READERS[name] for name in ("PROTO", "FRAME", "PUT", "BINPUT", "LONG_BINPUT")},
+    **{name: _READERS[name] for name in ("GET", "BINGET", "LONG_BINGET")},
+    "GLOBAL": lambda file: [file.readline().rstrip().decode("ascii") for _ in range(2)],
+}
+"""Of opcodes that change what is there, and what reads it."""
 
 
 @dataclass(eq=False, slots=True)
@@ -93,6 +100,7 @@ class Machine:
         self._stack: list[Any] = []
         self._marked: list[list[Any]] = []
         self._memo: dict[int, Any] = {}
+        self._n_names = 0
         self._is_model = is_model
         self._nested = nested
 
@@ -109,7 +117,7 @@ class Machine:
             if opcode.name in _VALUES:
                 self._stack.append(_VALUES[opcode.name](file))
             else:
-                self._do(opcode.name, _READERS[opcode.name](file) if opcode.name in _WITH_ARGUMENT else None)
+                self._do(opcode.name, _ARGUMENTS[opcode.name](file) if opcode.name in _ARGUMENTS else None)
                 top = self._stack[-1] if opcode.name == "BUILD" else None
                 if type(top) is Record and top.kind == "joblib":
                     self._stack[-1] = self._array_behind(top, file)
@@ -149,8 +157,8 @@ class Machine:
                     top = top.items
                 exactly(dict, top).update(self._dict(items))
             case "GLOBAL" | "STACK_GLOBAL":
-                words = self._last(2) if argument is None else argument.split(" ", 1)
-                self._stack.append(self._named(".".join(exactly(str, word) for word in words)))
+                module, name = self._last(2) if argument is None else argument
+                self._stack.append(self._named(f"{exactly(str, module)}.{exactly(str, name)}"))
             case "REDUCE" | "NEWOBJ":
                 called, args = self._last(2)
                 kind = "foreign" if self._is_foreign(called) else exactly(_Name, called).kind
@@ -179,7 +187,12 @@ class Machine:
                 raise ValueError(msg)
 
     def _last(self, n: int) -> list[Any]:
-        return [self._stack.pop() for _ in range(n)][::-1]
+        if len(self._stack) < n:
+            msg = f"{n} values wanted, and {len(self._stack)} there"
+            raise LookupError(msg)
+        items = self._stack[-n:]
+        del self._stack[-n:]
+        return items
 
     def _since_mark(self) -> list[Any]:
         items, self._stack = self._stack, self._marked.pop()
@@ -190,6 +203,10 @@ class Machine:
         return not self._is_model and type(value) in (Record, _Name) and value.kind == "foreign"
 
     def _named(self, name: str) -> _Name:
+        self._n_names += 1
+        if self._n_names > _MAX_NAMES:
+            msg = f"it names objects more than {_MAX_NAMES} times"
+            raise ValueError(msg)
         if not self._is_model:
             return _Name(DATA_NAMES.get(name, "foreign"))
         if name not in _NAMES:

@@ -24,7 +24,8 @@ from refu_core.recordings._layouts import ALL_KEYS, POSE_KEYS, SUFFIXES, UNREAD,
 Key = str | int
 _ZIP, _NPY, _GZIP = b"PK\x03\x04", b"\x93NUMPY", b"\x1f\x8b"
 _MOST_NODES = 20_000
-_MOST_DEPTH = 5
+MOST_DEPTH = 5
+"""Values in values that are looked into; trackers write three."""
 _MOST_ITEMS = 2_000_000
 """Of lists: a quarter of an hour of poses at 30 Hz."""
 _MOST_HELD = 256 << 20
@@ -53,8 +54,8 @@ class Content:
         known = self._made.get(id(value))
         if _is_list(value):  # one that is shared is made once, and counts as often as it is seen
             self._left -= len(value) if known is None else known[1].size
-        if depth > _MOST_DEPTH or self._left < 0:
-            msg = f"lists of lists, more than {_MOST_DEPTH} deep or of more than {_MOST_ITEMS} items"
+        if depth > MOST_DEPTH or self._left < 0:
+            msg = f"lists of lists, more than {MOST_DEPTH} deep or of more than {_MOST_ITEMS} items"
             raise ValueError(msg)
         if known is not None:
             return known[1]
@@ -82,7 +83,7 @@ class Content:
                 continue
             if not _is_list(value):
                 yield path, inside
-            if len(path) < _MOST_DEPTH and len(todo) < _MOST_NODES:
+            if len(path) < MOST_DEPTH and len(todo) < _MOST_NODES:
                 todo += [((*path, key), item) for key, item in inside.items() if entries(item) is not None]
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from refu_core._pickle_machine import Record
-from refu_core.recordings._containers import Key, entries
+from refu_core.recordings._containers import MOST_DEPTH, Key, entries
 from refu_core.recordings._layouts import TRACK_IDS
 
 Array = NDArray[np.float64]
@@ -17,6 +17,8 @@ Body = Mapping[Key, Any]
 
 _SAME = 0.75
 """Who is farther from where a person was in the image before is somebody else [m], as for trackers."""
+_HOLDERS = (dict, list, tuple, Record)
+"""What holds anything; most values of a file are numbers, and aren't looked into."""
 _MOST_LOOKS = 200_000
 """Values of a file that are looked at in search of persons: five thousand seconds of somebody at 30 Hz."""
 
@@ -29,32 +31,42 @@ def sequences(root: Any, is_body: Callable[[Body], bool]) -> Iterator[list[list[
 
     def bodies(value: Any) -> list[Body]:
         """The persons of a frame: it is one, or has some; whoever is first shows which."""
-        inside = None if isinstance(value, (list, tuple)) else entries(value)
+        if type(value) not in _HOLDERS:
+            return []
+        if id(value) not in persons:
+            persons[id(value)] = _persons(value)
+        return persons[id(value)]
+
+    def _persons(value: Any) -> list[Body]:
+        inside = _mapping(value)
         if inside is not None and is_body(inside):
             return [inside]
-        items = _items(value)
-        first = next((one for one in items if _mapping(one) is not None), None)
-        if first is None or not is_body(_mapping(first) or {}):
-            return []
-        return [found for one in items if (found := _mapping(one)) is not None and is_body(found)]
+        inner = (found for one in _items(value) if type(one) in _HOLDERS and (found := _mapping(one)) is not None)
+        first = next(inner, None)
+        return [] if first is None or not is_body(first) else [first, *filter(is_body, inner)]
 
     inside = _mapping(root)
     if inside is not None and is_body(inside):
         yield [[inside]]
         return
-    todo: list[Any] = [root]
+    persons: dict[int, list[Body]] = {}
     known: set[int] = set()
-    for value in todo:
-        items = _items(value)
-        if id(value) in known or len(known) + len(todo) + len(items) > _MOST_LOOKS:
-            continue
-        known.add(id(value))
-        frames = [bodies(item) for item in items]
-        most = max(map(len, frames), default=0)
-        if most and (most <= len(frames) or not isinstance(value, dict)):
-            yield frames
-        else:
-            todo += [item for item in items if len(_items(item))]
+    level, looks = [root], 0
+    for _ in range(MOST_DEPTH):
+        below: list[Any] = []
+        for value in level:
+            items = _items(value)
+            looks += len(items)
+            if id(value) in known or looks > _MOST_LOOKS:
+                continue
+            known.add(id(value))
+            frames = [bodies(item) for item in items]
+            most = max(map(len, frames), default=0)
+            if most and (most <= len(frames) or not isinstance(value, dict)):
+                yield frames
+            else:
+                below += [item for item in items if type(item) in _HOLDERS and len(_items(item))]
+        level = below
 
 
 def name_of(body: Body) -> str:

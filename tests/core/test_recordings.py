@@ -230,6 +230,7 @@ def test_nothing_in_a_pickle_is_executed(tmp_path: Path) -> None:
         wide,
         b"N" * 1_100_000 + b".",
         b"(" * 1_100_000 + b".",
+        b"ca\nb\n" * 1_100_000 + b".",
         b"]" * 90_000 + b"a" * 89_999 + b".",
     ):
         (tmp_path / "a.pkl").write_bytes(content)
