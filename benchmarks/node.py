@@ -231,12 +231,15 @@ def summary(sent: dict[str, list[int]], got: dict[str, dict[str, float]]) -> dic
     n_sent = sum(map(len, sent.values()))
     ms = [(int(stamp), value) for person in got.values() for stamp, value in person.items()]
     n_got = sum(len(set(map(int, got[person])) & set(stamps)) for person, stamps in sent.items())
+    came = {person: {*map(int, stamps)} for person, stamps in got.items()}
+    lost = [i for person, stamps in sent.items() for i, stamp in enumerate(stamps) if stamp not in came[person]]
     ms.sort()
     third = max(len(ms) // 3, 1)
     return {
         "sent": n_sent,
         "received": n_got,
         "received_percent": round(100 * n_got / n_sent, 2),
+        "first_lost": lost[:20],
         "unknown_stamps": len(ms) - n_got,
         "latency_ms": percentiles([value for _, value in ms]),
         "latency_p50_first_third_ms": percentiles([value for _, value in ms[:third]]).get("p50"),

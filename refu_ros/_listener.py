@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from refu_ros._scene import Scene
     from refu_ros._settings import NodeSettings
 
-INPUT_QOS = adapters.QosProfile(reliability="best_effort", depth=1)
+INPUT_QOS = adapters.QosProfile(reliability="best_effort", depth=5)
 _HUMANS = re.compile(r"/humans/bodies/([A-Za-z0-9_]+)/joint_states")
 _TRACKED = "/humans/bodies/tracked"
 _LOG_PERIOD_S = 5.0

@@ -72,16 +72,23 @@ class PipelineKey:
                 raise SettingsError(msg)
 
     def load(self) -> GarmentPipeline:
-        """Loads it, which takes some tenths of a second, and runs it once: the first frame is the slowest.
+        """Loads it, which takes some tenths of a second, and asks it once for all that a subscriber may want.
 
-        Raises `RefuError`.
+        Kernels are loaded when they first run, and the frames that come meanwhile would be lost. Raises `RefuError`.
         """
         from refu_core import GarmentPipeline
+        from refu_core.outputs import Dressed, Fittings
 
         named = ((name, getattr(self, name)) for name in PIPELINE_SETTINGS)  # as `load` names them
         asked: dict[str, Any] = {name: None if value == "" else value for name, value in named}
         pipeline = GarmentPipeline.load(**asked)
-        pipeline(SmplFrame(np.zeros((N_JOINTS, 3), np.float32)))
+        frame, fittings = (
+            SmplFrame(np.zeros((N_JOINTS, 3), np.float32)),
+            Fittings(pipeline, weights=self.weights or None),
+        )
+        worn = Dressed("", frame, pipeline(frame), fittings, np.eye(3), np.zeros(3))
+        for ask in (worn.normals, worn.clearance, worn.sigma, worn.contacts):
+            ask()
         return pipeline
 
 

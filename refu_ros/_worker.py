@@ -99,10 +99,10 @@ class Worker:
         self._scene = scene
         self._statistics = statistics
         self._outlet = outlet
-        self._next_pipeline = self._pipeline = pipeline
+        self._next = self._fitted(pipeline)
         self._dressed: dict[str, _Known] = {}
         self._outputs = make_outputs(tf=settings.publish_tf)  # they remember what was worn
-        self._sent_with = self._fittings = Fittings(pipeline, weights=settings.weights or None)
+        self._pipeline, self._sent_with = self._next
         self._here: set[str] = set()
         self._is_lost = False
         self._stopping = threading.Event()
@@ -130,7 +130,10 @@ class Worker:
 
     def use(self, pipeline: GarmentPipeline) -> None:
         """Another pipeline from the next tick on."""
-        self._next_pipeline = pipeline
+        self._next = self._fitted(pipeline)
+
+    def _fitted(self, pipeline: GarmentPipeline) -> tuple[GarmentPipeline, Fittings]:
+        return pipeline, Fittings(pipeline, weights=self.settings.weights or None).prepare()
 
     def _run(self) -> None:
         torch.set_num_threads(1)  # the robot's other nodes want their cores, too
@@ -149,7 +152,7 @@ class Worker:
     def _take(self) -> Mapping[str, Arrival]:
         """The newest frames, as soon as there are some, a thread of the pipeline is free, and the rate allows it."""
         with self._in_order:
-            self._in_order.wait_for(lambda: self._n_taken - self._n_done < self._next_pipeline.threads)
+            self._in_order.wait_for(lambda: self._n_taken - self._n_done < self._next[0].threads)
         period = 1.0 / self.settings.max_rate if self.settings.max_rate else 0.0
         idle = _IDLE_S if self._here or self._scene.persons else _EMPTY_S
         arrivals = self._scene.take(not_before=self._last + period, timeout=idle)
@@ -167,12 +170,12 @@ class Worker:
     def _plan(self, arrivals: Mapping[str, Arrival]) -> _Job:
         """What there is to do for these people, and with what."""
         settings = self.settings
-        if self._next_pipeline is not self._pipeline:
-            self._pipeline = self._next_pipeline
+        pipeline, fittings = self._next
+        if pipeline is not self._pipeline:
+            self._pipeline = pipeline
             self._is_lost = False
-            self._fittings = Fittings(self._pipeline, weights=settings.weights or None)
-        if settings.margin != self._pipeline.margin:
-            self._pipeline.margin = settings.margin
+        if settings.margin != pipeline.margin:
+            pipeline.margin = settings.margin
         gone = self._scene.leave(settings.person_timeout)
         near = self._near(arrivals, settings)
         gone += [person for person in arrivals if person not in near]
@@ -182,7 +185,7 @@ class Worker:
             near = {}
         frames = {person: with_settings(arrival.frame, settings) for person, arrival in near.items()}
         known: dict[str, _Known] = {}
-        job = _Job(self._n_taken, settings, self._pipeline, self._fittings, near, frames, known, gone)
+        job = _Job(self._n_taken, settings, pipeline, fittings, near, frames, known, gone)
         for person, frame in frames.items():
             last = self._dressed.get(person)
             if last is not None and last.inputs == job.inputs(frame):

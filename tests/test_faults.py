@@ -245,6 +245,7 @@ class Failing:
     def __init__(self, pipeline: GarmentPipeline) -> None:
         self._pipeline = pipeline
         self.body, self.garments, self.margin = pipeline.body, pipeline.garments, pipeline.margin
+        self.untrained = pipeline.untrained
         self.threads, self.frames = 1, 0
 
     def __call__(self, frames: list[SmplFrame]) -> list[Any]:

@@ -44,6 +44,14 @@ class Fittings:
         self._known: dict[tuple[Any, str], Any] = {}
         self._preparing: dict[str, threading.Thread] = {}
 
+    def prepare(self) -> Fittings:
+        """Finds at once what it would be asked for with the first frame, but planners' meshes: they take too long."""
+        for name in self.names:
+            self.openings(name)
+            self.normals(name)
+        _ = self.clearance, self.contacts, self.sigma
+        return self
+
     def _once(self, make: Any, name: str, *arguments: Any) -> Any:
         if (make, name) not in self._known:
             self._known[make, name] = make(*arguments)
