@@ -26,7 +26,8 @@ _MAX_FILE_BYTES = 1 << 32
 """Of which only the directory and the arrays that are wanted are read."""
 _MAX_READ = 1 << 20
 """A directory of more is cut off there, and so refused; the arrays are read in smaller steps."""
-_MAX_TEXT_BYTES = 4096
+_MAX_TEXT_BYTES = 1 << 15
+"""Names of a skeleton's joints take a quarter of it."""
 _MAX_AXES = 32
 _MAX_HEADER_BYTES = 1 << 14
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
@@ -45,7 +46,7 @@ class ArrayBudget:
         self._left = MAX_BYTES // 8
 
     def take(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
-        """Raises `ValueError` where an array is too much, has no size, or isn't of plain numbers or a word of text."""
+        """Raises `ValueError` where an array is too much, has no size, or isn't of plain numbers or words of text."""
         if len(shape) > _MAX_AXES:
             msg = f"an array of {len(shape)} axes"
             raise ValueError(msg)
@@ -65,7 +66,7 @@ class ArrayBudget:
 
 
 def read_npz(path: Path, *, keys: Collection[str], error: type[RefuError], wanted: str) -> dict[str, NDArray[Any]]:
-    """The arrays of an `.npz` whose names are in `keys` (those that are there): numbers, or a word of text.
+    """The arrays of an `.npz` whose names are in `keys` (those that are there): numbers, or words of text.
 
     Raises:
         error: the file can't be read, holds anything else under one of the keys, or more than `MAX_BYTES`.

@@ -70,12 +70,14 @@ MODELS = ("surface_model_type",)
 
 KEYPOINTS, KEYPOINTS_PLACE = "pred_keypoints_3d", "pred_cam_t"
 """Of SAM 3D Body, about the body, and where that is before the camera [m]."""
+SOMA_NAMES = "joint_names"
+_SOMA = (SOMA_NAMES, "absolute_pose", "unit", "identity_model_type", "identity_coeffs")
 TRACK_IDS = ("track_id", "person_id", "tid", "id")
 
 POSE_KEYS = frozenset(name for layout in LAYOUTS for name in layout.pose)
 ALL_KEYS = frozenset(
     {name for layout in LAYOUTS for names in (layout.pose, layout.transl, layout.betas) for name in names}
-    | {*RATES, *GENDERS, *FRAME_NUMBERS, *SCALINGS, *MODELS, KEYPOINTS, KEYPOINTS_PLACE}
+    | {*RATES, *GENDERS, *FRAME_NUMBERS, *SCALINGS, *MODELS, *_SOMA, KEYPOINTS, KEYPOINTS_PLACE}
 )
 """Everything that is read; all else in a file, meshes and pictures, is left unread."""
 

@@ -17,6 +17,7 @@ from refu_core.recordings._containers import Content, Key, entries, open_content
 from refu_core.recordings._mhr import POINTS, Track, tracks_of_mhr
 from refu_core.recordings._rate import MAX_FRAMES, check_fps, tell_pace
 from refu_core.recordings._rotations import BODY, WHOLE, rotvecs_of
+from refu_core.recordings._soma import smpl_of_soma
 from refu_core.recordings._tracks import filled, frames_of, tracks_of
 from refu_core.recordings._upright import Axes, to_smpl
 
@@ -100,6 +101,7 @@ def _recording(content: Content, *, fps: float | None, axes: Axes, person: str |
     people = tracks_of_mhr(content)
     if people:
         return _of_mhr(content, people, fps=fps, axes=axes, person=person, notes=notes)
+    content = smpl_of_soma(content, notes)
     found, above = _find(content, person, notes)
     layout, node = found.layout, found.node
     arrays = {name: content.array(node[name]) for name in layout.pose}

@@ -445,6 +445,61 @@ def test_sam_3d_body_is_followed_by_its_keypoints(tmp_path: Path, form: str) -> 
         assert np.linalg.norm(limbs_of(second) - joints[2:] - [2.0, 0, 0], axis=2)[:, limbs].max() < 0.03
 
 
+SOMA = {"Hips": 0, "Spine1": 3, "Spine2": 6, "Chest": 9, "Neck2": 12, "Head": 15}
+SOMA |= {
+    f"{side}{name}": joint + (side == "Right")
+    for side in ("Left", "Right")
+    for name, joint in (
+        *(("Leg", 1), ("Shin", 4), ("Foot", 7), ("ToeBase", 10)),
+        *(("Shoulder", 13), ("Arm", 16), ("ForeArm", 18), ("Hand", 20)),
+    )
+}
+
+
+def soma(**changed: Any) -> dict[str, Any]:
+    """The walk as SOMA's package saves it: 77 joints by their names, half of the neck's turn in each of its bones."""
+    poses, transl = walk()
+    names = [*SOMA, "Neck1", *(f"LeftHandIndex{i}" for i in range(54))]
+    turns = np.zeros((len(poses), 77, 3), np.float32)
+    turns[:, : len(SOMA)] = poses[:, [*SOMA.values()]]
+    turns[:, names.index("Neck1")] = turns[:, names.index("Neck2")] = poses[:, 12] / 2
+    places = transl + load_body("neutral").joint_template[0].numpy()
+    arrays = {"poses": turns, "transl": 100 * places, "unit": np.array("centimeters"), "joint_names": np.array(names)}
+    arrays |= {"absolute_pose": np.bool_(False), "rotation_repr": np.array("rotvec"), "keep_root": np.bool_(False)}
+    return {**arrays, "identity_model_type": np.array("mhr"), "identity_coeffs": np.ones((1, 45)), **changed}
+
+
+@pytest.mark.parametrize("as_matrices", [False, True])
+def test_soma_turns_the_joints_that_smpl_has(tmp_path: Path, *, as_matrices: bool) -> None:
+    arrays = soma()
+    if as_matrices:
+        arrays["poses"] = Rotation.from_rotvec(arrays["poses"].reshape(-1, 3)).as_matrix().reshape(-1, 77, 3, 3)
+    motion = read_motion(save(tmp_path / "soma.npz", **arrays), fps=30)
+    same(motion, joints=22)
+    assert np.abs(motion.transl - walk()[1]).max() < 0.02
+    assert any("SOMA's 77 joints" in note for note in motion.notes)
+    assert any("identity of the kind 'mhr'" in note for note in motion.notes)
+    assert not motion.betas.any()
+    betas = np.linspace(-1, 1, 10)[None]
+    of_smpl = soma(identity_model_type=np.array("smpl"), identity_coeffs=betas)
+    np.testing.assert_allclose(read_motion(save(tmp_path / "s.npz", **of_smpl), fps=30).betas, betas[0], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"absolute_pose": np.bool_(True)}, "relative to the T-pose"),
+        ({"joint_names": np.array(["Hand", "Thumb1"]), "poses": np.zeros((4, 2, 3))}, "without Hips"),
+        ({"unit": np.array("parsecs")}, "wanted meters"),
+        ({"poses": np.zeros((4, 78, 3))}, "poses must be"),
+        ({"transl": np.zeros((4, 2))}, "transl"),
+        ({"joint_names": np.zeros(0)}, "without Hips"),
+    ],
+)
+def test_soma_that_is_refused(tmp_path: Path, changed: dict[str, Any], said: str) -> None:
+    assert said in refusal(lambda: read_motion(save(tmp_path / "soma.npz", **soma(**changed)), fps=30))
+
+
 def test_keypoints_of_others_are_not_taken_for_mhr(tmp_path: Path) -> None:
     points, place, _ = mhr()
     path = save(tmp_path / "a.npz", pred_keypoints_3d=points[:, :44], pred_cam_t=place)

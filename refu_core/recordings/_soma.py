@@ -1,0 +1,82 @@
+"""SOMA: a body that isn't SMPL's, but whose files turn its joints about the axes of a T-pose, as SMPL's do.
+
+So a joint's turns are those of SMPL's joint in its place, and where SMPL has one joint for two they are put together.
+Nothing of SOMA's own package or model is needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from refu_core.frames import N_JOINTS
+from refu_core.recordings._containers import Content
+from refu_core.recordings._layouts import RATES, SOMA_NAMES
+from refu_core.recordings._rotations import rotvecs_of
+from refu_core.recordings._upright import PELVIS
+
+_CHAINS = "Hips LeftLeg RightLeg Spine1 LeftShin RightShin Spine2 LeftFoot RightFoot Chest LeftToeBase RightToeBase "
+_CHAINS += "Neck1+Neck2 LeftShoulder RightShoulder Head LeftArm RightArm LeftForeArm RightForeArm LeftHand RightHand"
+_METRES = {"meters": 1.0, "centimeters": 0.01, "millimeters": 0.001}
+_SMPL = ("smpl", "smplh", "smplx")
+
+
+def smpl_of_soma(content: Content, notes: list[str]) -> Content:
+    """A file of SOMA as one of SMPL; any other as it is.
+
+    Raises `ValueError` for one without the body's joints, or whose turns aren't about the axes of the T-pose.
+    """
+    root = content.root
+    if not isinstance(root, dict) or any(root.get(name) is None for name in ("poses", SOMA_NAMES)):
+        return content
+    names = [str(name) for name in np.asarray(content.array(root[SOMA_NAMES])).reshape(-1)]
+    chains = [chain.split("+") for chain in _CHAINS.split()]
+    missing = [name for chain in chains for name in chain if name not in names]
+    if missing:
+        msg = f"{SOMA_NAMES}: wanted those of SOMA's body, without {', '.join(missing[:4])} among {len(names)}"
+        raise ValueError(msg)
+    if bool(_value(content, root, "absolute_pose", default=False)):
+        msg = "SOMA's poses are absolute: save them relative to the T-pose (with joint_orient), which needs no model"
+        raise ValueError(msg)
+    turns, _ = rotvecs_of(content.array(root["poses"]), "poses", (len(names),), notes, has_root=True)
+    poses = np.zeros((len(turns), N_JOINTS, 3))
+    for joint, chain in enumerate(chains):
+        poses[:, joint] = _together([turns[:, names.index(name)] for name in chain])
+    notes.append(f"SOMA's {len(names)} joints, another body than SMPL's: {len(chains)} of SMPL's turn as they do")
+    found: dict[str | int, Any] = {"poses": poses, **{name: root[name] for name in RATES if name in root}}
+    unit = str(_value(content, root, "unit", default="meters"))
+    if unit not in _METRES:
+        msg = f"unit: wanted {', '.join(_METRES)}, got {unit[:20]!r}"
+        raise ValueError(msg)
+    if root.get("transl") is not None:  # where SOMA's hips are: SMPL's is added to the pelvis at rest
+        transl = content.array(root["transl"])
+        is_place = transl.dtype.kind in "iuf" and transl.shape[-1:] == (3,)
+        found["transl"] = _METRES[unit] * transl - PELVIS if is_place else transl
+    kind = str(_value(content, root, "identity_model_type", default=""))
+    if kind in _SMPL and root.get("identity_coeffs") is not None:
+        found["betas"] = content.array(root["identity_coeffs"])
+        found["surface_model_type"] = kind
+    elif kind:
+        notes.append(f"SOMA's identity of the kind {kind[:20]!r} isn't read")
+    return Content(found)
+
+
+def _together(turns: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """One joint's rotation vectors [rad], (T, 3), for those of several, from the root outwards."""
+    if len(turns) == 1:
+        return turns[0]
+    sound = np.isfinite(turns).all(axis=(0, 2))
+    whole = np.full(turns[0].shape, np.nan)
+    first, second = (Rotation.from_rotvec(turn[sound]) for turn in turns)
+    whole[sound] = (first * second).as_rotvec()
+    return whole
+
+
+def _value(content: Content, root: Mapping[str | int, Any], name: str, *, default: Any) -> Any:
+    """The one value of an entry."""
+    values = [] if root.get(name) is None else content.array(root[name]).reshape(-1).tolist()
+    return values[0] if values else default
