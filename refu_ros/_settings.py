@@ -120,7 +120,7 @@ class NodeSettings:
     device: str = parameter("cpu", "Torch device: cpu or cuda.")
     threads: int = parameter(
         2,
-        "While a frame takes longer than the next one is away, so many are worked on at the same time; on a GPU one.",
+        "So many frames, or people of a frame, are worked on at the same time; on a GPU one.",
         low=1,
         high=64,
         live=False,

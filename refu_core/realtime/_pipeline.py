@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import threading
 from collections import OrderedDict
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from numbers import Real
-from queue import Empty, LifoQueue
 from types import NoneType
 from typing import TYPE_CHECKING, NoReturn, overload
 
@@ -26,6 +23,7 @@ from refu_core.frames import MAX_COEFFICIENT, N_STYLES, SmplFrame, checked_numbe
 from refu_core.garments import GarmentTemplate
 from refu_core.modes import MAX_MARGIN, BackboneName, SdfMode
 from refu_core.realtime._contact import ContactStage
+from refu_core.realtime._crew import Crew
 from refu_core.realtime._frame import FrameStep, StageClock
 from refu_core.realtime._graph import StepGraphs
 from refu_core.realtime._load import load_outfit
@@ -45,15 +43,12 @@ _MOST_WEARERS = 64
 """Persons whose (β, γ) are remembered, those seen last; each takes about half a megabyte a garment."""
 
 
-_ON_GPU = threading.Lock()
-"""Shared by all pipelines on a GPU: the stream that Warp works on is the device's, not the thread's."""
-
-
 class GarmentPipeline:
     """Predicts garments on SMPL bodies, frame by frame, and brings them off the body (paper, Sec. 3).
 
     Any thread may call a pipeline, set its `margin`, and read what it has returned. As many calls run at the same time
-    as it has `threads`, and others wait. Load one in each process, after the fork: it can't be pickled.
+    as it has `threads`, and others wait; a batch is shared out among those that are free. Load one in each process,
+    after the fork: it can't be pickled.
 
     Example:
         >>> pipeline = GarmentPipeline.load(["tshirt-male"])
@@ -81,17 +76,14 @@ class GarmentPipeline:
         self._graphs = StepGraphs(steps[0].packed, outfit.body.device) if graph and on_gpu else None
         contact = steps[0].contact
         self._is_certified = contact is not None and contact.winding is not None
-        self._process, self._free = os.getpid(), LifoQueue[FrameStep]()  # the one used last has its memory in the cache
-        for step in steps:
-            self._free.put(step)
-        self._device_lock = _ON_GPU if on_gpu else None
+        self._crew = Crew(steps, on_gpu=on_gpu)
         self._lock = threading.Lock()
         """Of what is remembered."""
         self._faces = {name: one.template.faces.cpu().numpy().copy() for name, one in outfit.wearables.items()}
         for faces in self._faces.values():
             faces.flags.writeable = False  # all frames share them
         self._wearers: OrderedDict[bytes, Wearer] = OrderedDict()
-        self._batch: tuple[tuple[Wearer, ...], Wearer] | None = None
+        self._batches: OrderedDict[tuple[Wearer, ...], Wearer] = OrderedDict()
         self._last: tuple[float | None, dict[bytes, PipelineOutput]] = margin, {}
 
     @property
@@ -173,7 +165,8 @@ class GarmentPipeline:
                 eighth of a frame's time; without, by the distances that pushed it, which may be wrong.
             collider: bring garments off a body whose overlaps were pulled apart (`PipelineOutput.body`); without, off
                 the posed body itself as in the paper, in which there is no room where limbs run through each other.
-            threads: how many calls may run at the same time; each has working memory of its own. On a GPU one.
+            threads: how many calls, or parts of a batch, may run at the same time; each has working memory of its own.
+                On a GPU one.
 
         Raises:
             GarmentError: no garment, an unknown one, garments of two bodies, or a bad style.
@@ -247,7 +240,7 @@ class GarmentPipeline:
             require_type(frames, Sequence, "a SmplFrame or a sequence of them", error=FrameError)
             for one in frames:
                 require_type(one, SmplFrame, "a SmplFrame in every place of the sequence", error=FrameError)
-        with self._turn() as step:
+        with self._crew.turn() as step:
             if isinstance(frames, SmplFrame):
                 return self._dress_all(step, [frames])[0]
             return self._dress_all(step, frames)
@@ -264,25 +257,8 @@ class GarmentPipeline:
             RefuError: as `__call__`, and what `adjust` raises.
         """
         require_type(frame, SmplFrame, "a SmplFrame", error=FrameError)
-        with self._turn() as step:
+        with self._crew.turn() as step:
             return self._run(step, [frame], self._margin, adjust)[0]
-
-    @contextmanager
-    def _turn(self) -> Iterator[FrameStep]:
-        """What one call computes with, as soon as it is free."""
-        try:
-            step = self._free.get(block=os.getpid() == self._process)  # other threads don't outlive a fork
-        except Empty as error:
-            msg = "this pipeline was busy when its process was forked: load one in each process, after the fork"
-            raise RefuError(msg) from error
-        try:
-            if self._device_lock is None:
-                yield step
-            else:
-                with self._device_lock:
-                    yield step
-        finally:
-            self._free.put(step)
 
     def _dress_all(self, step: FrameStep, frames: Sequence[SmplFrame]) -> list[PipelineOutput]:
         margin, keys = self._margin, [_key(frame) for frame in frames]
@@ -292,13 +268,15 @@ class GarmentPipeline:
         new = {key: frame for key, frame in zip(keys, frames, strict=True) if key not in known}
         outputs = {key: known[key] for key in keys if key in known}
         if new:
-            outputs |= zip(new, self._run(step, list(new.values()), margin), strict=True)
+            run = partial(self._run, margin=margin)
+            outputs |= zip(new, self._crew.share(step, run, list(new.values())), strict=True)
         self._last = margin, outputs
         return [
             outputs[key] if new.get(key) is frame else outputs[key].at(frame)
             for key, frame in zip(keys, frames, strict=True)
         ]
 
+    @torch.no_grad()  # each thread's own setting
     def _run(
         self, step: FrameStep, frames: Sequence[SmplFrame], margin: float | None, adjust: Adjust | None = None
     ) -> list[PipelineOutput]:
@@ -338,10 +316,12 @@ class GarmentPipeline:
         return wearer, {}
 
     def _together(self, wearers: tuple[Wearer, ...]) -> Wearer:
-        """One wearer of all; that of the last call for the same persons."""
-        if self._batch is None or self._batch[0] != wearers:
-            self._batch = wearers, Wearer.together(wearers)
-        return self._batch[1]
+        """One wearer of all; that of the last calls for the same persons."""
+        known = self._batches.pop(wearers, None)
+        while len(self._batches) >= self.threads:
+            self._batches.popitem(last=False)
+        self._batches[wearers] = known or Wearer.together(wearers)
+        return self._batches[wearers]
 
     def _output(self, frame: SmplFrame, person: Person, clock: StageClock, skipped: dict[str, int]) -> PipelineOutput:
         meshes, stats, n_clipped = {}, {}, 0

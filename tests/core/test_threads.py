@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import copy
 import os
 import pickle
@@ -10,6 +11,7 @@ import signal
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ import torch
 
 from refu_core import GarmentPipeline, RefuError, SmplFrame
 from refu_core.realtime import Dressed, PipelineOutput
+from refu_core.realtime._frame import FrameStep
 from refu_lab.stress import everyday
 
 _GARMENTS = ("tshirt-male", "short-pant-male")
@@ -132,7 +135,7 @@ def test_a_fork_in_the_middle_of_a_call_is_told_and_not_waited_for() -> None:
     """Other threads don't outlive it: the memory that they work in never comes back."""
     pipeline = GarmentPipeline.load(_GARMENTS[1:], backbone="skinned", sdf="none")
     frame = _frames(1)[0]
-    with pipeline._turn():
+    with pipeline._crew.turn():
         child = os.fork()
         if not child:
             signal.alarm(20)
@@ -171,3 +174,45 @@ def test_calls_run_at_the_same_time_and_no_more_than_asked_for() -> None:
 def test_a_number_of_threads_that_is_none_is_refused(threads: object) -> None:
     with pytest.raises(RefuError, match="thread"):
         GarmentPipeline.load(_GARMENTS, threads=threads)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 8])
+def test_a_batch_is_shared_out_among_threads(pipeline: GarmentPipeline, n: int) -> None:
+    shared = GarmentPipeline.load(_GARMENTS, threads=3)
+    frames = _frames(n, seed=n)
+    for out, alone in zip(shared(frames), pipeline(frames), strict=True):
+        assert np.abs(out.body - alone.body).max() < 1e-5
+        assert all(np.abs(mesh.local - alone[name].local).max() < 1e-3 for name, mesh in out.items())
+    assert len({id(step) for step in _all_steps(shared)}) == 3, "all have come back"
+
+
+def test_who_fails_in_a_batch_leaves_the_pipeline_as_it_was() -> None:
+    pipeline, frames = GarmentPipeline.load(_GARMENTS[1:], threads=2), _frames(4)
+    good = pipeline._run
+
+    def bad(step: Any, part: list[SmplFrame], **options: Any) -> list[PipelineOutput]:
+        if frames[3] in part:
+            raise MemoryError
+        return good(step, part, **options)
+
+    pipeline._run = bad  # type: ignore[method-assign, assignment]
+    with pytest.raises(MemoryError):
+        pipeline(frames)
+    assert len({id(step) for step in _all_steps(pipeline)}) == 2
+    assert len(pipeline(frames[:3])) == 3
+
+
+def test_a_batch_after_a_fork_is_dressed_by_one_thread() -> None:
+    """The others of its parent's pool don't outlive it."""
+    pipeline, frames = GarmentPipeline.load(_GARMENTS[1:], backbone="skinned", threads=2), _frames(3)
+    pipeline(frames)
+    child = os.fork()
+    if not child:
+        signal.alarm(20)
+        os._exit(0 if len(pipeline(_frames(3, seed=1))) == 3 else 1)
+    assert os.waitpid(child, 0)[1] == 0
+
+
+def _all_steps(pipeline: GarmentPipeline) -> list[FrameStep]:
+    with contextlib.ExitStack() as stack:
+        return [stack.enter_context(pipeline._crew.turn()) for _ in range(pipeline.threads)]

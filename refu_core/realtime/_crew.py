@@ -1,0 +1,75 @@
+"""What the calls of a pipeline compute with, so that several may run at the same time."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from functools import cached_property, partial
+from itertools import pairwise
+from queue import Empty, LifoQueue
+from typing import TypeVar
+
+import torch
+
+from refu_core.errors import RefuError
+from refu_core.realtime._frame import FrameStep
+
+In = TypeVar("In")
+Out = TypeVar("Out")
+
+_ON_GPU = threading.Lock()
+"""Shared by all pipelines on a GPU: the stream that Warp works on is the device's, not the thread's."""
+
+
+class Crew:
+    """Frame steps, each with memory of its own, which calls take in turns; one that is free helps with a batch."""
+
+    def __init__(self, steps: Sequence[FrameStep], *, on_gpu: bool) -> None:
+        self._n_steps = len(steps)
+        self._process, self._free = os.getpid(), LifoQueue[FrameStep]()  # the one used last has its memory in the cache
+        for step in steps:
+            self._free.put(step)
+        self._device_lock = _ON_GPU if on_gpu else None
+
+    @contextlib.contextmanager
+    def turn(self) -> Iterator[FrameStep]:
+        """What one call computes with, as soon as it is free. Raises `RefuError` where it never will be."""
+        try:
+            step = self._free.get(block=os.getpid() == self._process)  # other threads don't outlive a fork
+        except Empty as error:
+            msg = "this pipeline was busy when its process was forked: load one in each process, after the fork"
+            raise RefuError(msg) from error
+        try:
+            if self._device_lock is None:
+                yield step
+            else:
+                with self._device_lock:
+                    yield step
+        finally:
+            self._free.put(step)
+
+    def share(
+        self, step: FrameStep, work: Callable[[FrameStep, Sequence[In]], list[Out]], items: Sequence[In]
+    ) -> list[Out]:
+        """`work` on items with a step, and beside it on some of them with each step that is free."""
+        steps = [step]
+        with contextlib.suppress(Empty):
+            while len(steps) < len(items) and os.getpid() == self._process:
+                steps.append(self._free.get_nowait())
+        ends = [len(items) * i // len(steps) for i in range(len(steps) + 1)]
+        own, *others = (items[start:end] for start, end in pairwise(ends))
+        started = [self._pool.submit(work, *pair) for pair in zip(steps[1:], others, strict=True)]
+        try:
+            done = work(step, own)
+        finally:
+            wait(started)  # nobody else may take a step before
+            for other in steps[1:]:
+                self._free.put(other)
+        return [*done, *(one for part in started for one in part.result())]
+
+    @cached_property
+    def _pool(self) -> ThreadPoolExecutor:
+        return ThreadPoolExecutor(self._n_steps - 1, "dress", initializer=partial(torch.set_num_threads, 1))
