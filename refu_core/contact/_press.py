@@ -16,7 +16,7 @@ from refu_core.body._bundles import bundled
 from refu_core.contact import _press_kernels as kernels
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
 from refu_core.garments import GarmentTemplate
-from refu_core.mesh import Connectivity, grouped
+from refu_core.mesh import grouped
 
 _LIMBS = (joints_of("trunk", "head"), *ARMS, LEGS[0] + LEGS[1])
 """Joints of each limb; both legs are one, as a skirt lies on either."""
@@ -86,14 +86,15 @@ class Press:
         self._commands: dict[str, Any] = {}
         own = weight_of_parts(garment.weights, _LIMBS) > settings.own_weight
         foreign = (~own).cpu().numpy() @ (1 << np.arange(len(_LIMBS)))
+        is_asked = garment.mesh.independent()
         order = grouped(garment.v_template.cpu().numpy())
-        ring = Connectivity.of(garment.faces.cpu(), n).ring
+        order, ring = order[is_asked[order]], garment.mesh.ring
         self._fabric = fabric = kernels.Fabric()
         fabric.skin, fabric.points = as_warp(self._skin, wp.vec3), as_warp(self._points, wp.vec3)
         fabric.cut, fabric.spread = (as_warp(one, wp.float32) for one in self._cut)
         fabric.counts = as_warp(self._counts, wp.int32)
         lists = {
-            "start": [*range(0, n, _PIECE), n],
+            "start": [*range(0, len(order), _PIECE), len(order)],
             "vertex": order,
             "foreign": foreign,
             "ring_start": ring.start,
