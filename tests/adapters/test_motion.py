@@ -85,7 +85,7 @@ def test_what_may_be_left_out(tmp_path: Path) -> None:
         ({"poses": np.full((T, 72), complex("nan"))}, "wanted plain numbers"),
         ({"poses": np.zeros((T, 72), np.int8)}, "poses must be numbers with a fraction"),
         ({"betas": np.full(10, 1e300)}, "too large for float32"),
-        ({"gender": "x" * 10_000}, "at most 4096 bytes of text"),
+        ({"gender": "x" * 10_000}, "at most 32768 bytes of text"),
         ({"mocap_framerate": np.nan}, "frame rate"),
         ({"mocap_framerate": "fast"}, "mocap_framerate must be one number"),
     ],

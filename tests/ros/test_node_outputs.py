@@ -173,7 +173,7 @@ def test_points_openings_and_meshes_are_those_of_the_pipeline(
     made = count(monkeypatch)
     wanted = GarmentPipeline.load(GARMENTS, backbone="skinned", sdf="none")
     sleeve = "openings/tshirt_male/left_sleeve"
-    sent = frame(3, transl=(1.0, 2.0, 3.0))
+    sent = frame(3, stamp_ns=5 * 10**9, transl=(1.0, 2.0, 3.0))
     mesh = wanted(sent)[TSHIRT]
     made.clear()
     vertices = mesh.vertices[:, [2, 0, 1]]
