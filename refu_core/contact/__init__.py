@@ -14,3 +14,4 @@ from refu_core.contact._sheet import Sheet as Sheet
 from refu_core.contact._tent import Shins as Shins
 from refu_core.contact._tent import Tent as Tent
 from refu_core.contact._unfold import Unfold as Unfold
+from refu_core.contact._way_out import WayOut as WayOut

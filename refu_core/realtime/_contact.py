@@ -22,12 +22,13 @@ from refu_core.contact import (
     Shins,
     Tent,
     Unfold,
+    WayOut,
 )
 from refu_core.garments import inner_first
 from refu_core.modes import SdfMode
 from refu_core.realtime._wearer import Outfit
 from refu_core.refu import VertexScale
-from refu_core.sdf import ApproxSdf, MeshSdf, Winding, exact_sdf
+from refu_core.sdf import ApproxSdf, MeshSdf, exact_sdf
 
 
 class Worn(NamedTuple):
@@ -72,11 +73,12 @@ class ContactStage:
     ) -> None:
         """With the exact distance, within a band of the skin or everywhere, or with the approximate one.
 
-        Where it is to `certify`, what is unresolved is counted by winding numbers.
+        Where it is to `certify`, vertices that winding numbers find inside leave, and those without a way out are
+        counted.
         """
         body, garments = outfit.body, {name: one.template for name, one in outfit.wearables.items()}
         self.sdf: MeshSdf = exact_sdf(body, uses_band=uses_band) if sdf is SdfMode.ACCURATE else ApproxSdf(body)
-        self.winding = Winding(body.faces) if certify else None
+        self.way_out = WayOut(body.faces, body.v_template, settings=settings) if certify else None
         self.order = inner_first(garments)
         """Names from the skin outwards."""
         self._asked = {name: self.sdf.of_garment(one) for name, one in garments.items()}
@@ -126,8 +128,8 @@ class ContactStage:
         if self._is_tight:
             self._skin.take(body)
         self.sdf.update(body)
-        if self.winding is not None:
-            self.winding.update(body)
+        if self.way_out is not None:
+            self.way_out.update(body)
         if self._limbs is not None:
             self._limbs.update(body)
             self._shins.update(body)
@@ -185,8 +187,8 @@ class ContactStage:
             vertices = self._off_skin[name].parted(vertices)
         if worn or self._is_tight:  # Each step goes no farther than that; together they may.
             vertices = pressed + torch.renorm(vertices - pressed, 2, 0, self._farthest)
-        if self.winding is not None:
-            numbers[_N_UNRESOLVED] = torch.count_nonzero(self.winding(vertices))
+        if self.way_out is not None:
+            vertices, numbers[_N_UNRESOLVED] = self.way_out(vertices, pressed, margin)
         return Resolved(vertices, torch.cat((numbers, n_layered)), n_clipped)
 
     def _part(self, name: str, done: Resolution, worn: Mapping[str, Worn], *, margin: float) -> Resolution:

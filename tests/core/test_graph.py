@@ -128,6 +128,8 @@ def as_on_a_gpu(pipeline: GarmentPipeline) -> FrameStep:
         if isinstance(contact.sdf, ApproxSdf):
             contact.sdf._is_serial = False
         contact._is_serial = False
+        if contact.way_out is not None:
+            contact.way_out._is_serial = False
         for one in (*contact._press.values(), *contact._off_skin.values(), *contact._unfold.values()):
             one._is_serial = False
         for resolver in contact.resolvers.values():
