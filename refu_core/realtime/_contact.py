@@ -20,6 +20,7 @@ from refu_core.contact import (
     Resolver,
     Sheet,
     Shins,
+    StrainLimit,
     Tent,
     Unfold,
     WayOut,
@@ -85,6 +86,7 @@ class ContactStage:
         self.resolvers = {
             name: Resolver(one.faces, one.n_vertices, settings=settings) for name, one in garments.items()
         }
+        self._strain = {name: StrainLimit(one.mesh, body.device, settings=settings) for name, one in garments.items()}
         self._limbs, self._tents, self._press, self._off_skin = None, {}, {}, {}
         if outfit.collider is not None:  # or there is no room
             self._shins = shins = Shins(body)
@@ -166,17 +168,24 @@ class ContactStage:
         *,
         pressed: Tensor,
         on_mean: Tensor,
+        rest: Tensor,
         margin: float,
         scale: float | VertexScale,
         n_layered: Tensor,
     ) -> Resolved:
-        """Vertices (V, 3) [m] off the body, which has the last word, and within reach of where limbs `pressed` them."""
+        """Vertices (V, 3) [m] off the body, which has the last word, and within reach of where limbs `pressed` them.
+
+        `on_mean` is as in `Drape`, and `rest` (V, 3) [m] the wearer's garment in the rest pose.
+        """
         start = self._asked[name](vertices, on_mean=on_mean, reach=margin + ASKED_FROM)
         assert start.face is not None  # these distances are to faces
         n_clipped = (start.face < 0).sum()
         resolver = self.resolvers[name]
         done = resolver(vertices, self.sdf, start, margin=margin, scale=scale)
-        vertices, numbers = done.vertices, done.numbers
+        vertices, numbers = self._strain[name](done.vertices, rest), done.numbers
+        if vertices is not done.vertices:
+            done = resolver(vertices, self.sdf, None, margin=margin)
+            vertices, numbers[_N_UNRESOLVED] = done.vertices, done.numbers[_N_UNRESOLVED]
         if worn:
             vertices, _ = self.lift(name, vertices, worn, goes_on=True)
             again = resolver(vertices, self.sdf, None, margin=self._kept * margin)

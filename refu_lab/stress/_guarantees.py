@@ -89,6 +89,7 @@ def buried(subject: Subject, trial: Trial) -> Iterator[Measurement]:
                 {},
                 pressed=points,
                 on_mean=drape.on_mean[0],
+                rest=skinned[name].template.rest(betas)[0],
                 margin=skinned[name].margin,
                 scale=1.0,
                 n_layered=torch.zeros(1, dtype=torch.int32),
