@@ -34,8 +34,10 @@ class StrainLimit:
         self._count = torch.zeros(1, dtype=torch.int32, device=device)
         net = kernels.Net()
         net.rest, net.points, net.other = (as_warp(one, wp.vec3) for one in (self._rest, self._points, self._other))
-        net.ring_start, net.ring = (
-            wp.array(np.ascontiguousarray(one, np.int32), dtype=wp.int32, device=name) for one in mesh.ring
+        lower, higher = mesh.edges.T
+        lists = (*mesh.ring, np.searchsorted(lower, np.arange(n + 1)), higher)
+        net.ring_start, net.ring, net.edge_start, net.edge_end = (
+            wp.array(np.ascontiguousarray(one, np.int32), dtype=wp.int32, device=name) for one in lists
         )
         net.limit, net.count = settings.strain_limit, as_warp(self._count, wp.int32)
         net.rows, net.is_listed = (wp.zeros(n, dtype=wp.int32, device=name) for _ in range(2))

@@ -16,6 +16,9 @@ class Net:
     """Vertices [m], and the same a sweep later."""
     ring_start: wp.array[int]
     ring: wp.array[int]
+    edge_start: wp.array[int]
+    edge_end: wp.array[int]
+    """The edges of vertex v to those of higher number are to `edge_end[edge_start[v]:edge_start[v + 1]]`."""
     limit: float
     """How many times their rest length edges may be."""
     rows: wp.array[int]
@@ -31,16 +34,17 @@ def is_long(v: int, w: int, points: wp.array[wp.vec3], net: Net) -> bool:
 
 @wp.func
 def drawn(v: int, points: wp.array[wp.vec3], net: Net) -> wp.vec3:
-    """Where the edges that are too long draw a vertex: by half of what each is too long, on average."""
+    """Where its edges draw a vertex: by half of what each is too long, on average.
+
+    Edges that aren't too long count, too: so a vertex that was thrown comes back, and its neighbours hardly follow it.
+    """
     total = wp.vec3()
-    n = float(0.0)
     for r in range(net.ring_start[v], net.ring_start[v + 1]):
         w = net.ring[r]
         if is_long(v, w, points, net):
             way = points[w] - points[v]
             total += (0.5 - 0.5 * net.limit * wp.length(net.rest[v] - net.rest[w]) / wp.length(way)) * way
-            n += 1.0
-    return points[v] + total / wp.max(n, 1.0)
+    return points[v] + total / float(wp.max(net.ring_start[v + 1] - net.ring_start[v], 1))
 
 
 @wp.func
@@ -61,10 +65,13 @@ def sweep_kernel(net: Net, points: wp.array[wp.vec3], other: wp.array[wp.vec3]) 
 @wp.kernel
 def limit_kernel(net: Net, sweeps: int) -> None:
     """All sweeps, by one thread: over the ends of edges that are too long, and of those that become it."""
+    squared = net.limit * net.limit
     for v in range(net.points.shape[0]):
-        for r in range(net.ring_start[v], net.ring_start[v + 1]):
-            w = net.ring[r]
-            if w > v and is_long(v, w, net.points, net):
+        here = net.points[v]
+        rest = net.rest[v]
+        for e in range(net.edge_start[v], net.edge_start[v + 1]):
+            w = net.edge_end[e]
+            if wp.length_sq(here - net.points[w]) > squared * wp.length_sq(rest - net.rest[w]):
                 enlist(v, net)
                 enlist(w, net)
     for _ in range(sweeps):

@@ -69,10 +69,7 @@ class WayOut:
         n_inside = torch.count_nonzero(winding)
         if self._is_serial and not int(n_inside):
             return points, n_inside
-        with torch_stream(self.device):
-            self._tree.refit()
-            self._lift.launch()
-        above = self._winding(self._above).clone()
+        above = self._winding_above()
         farthest, least = self._settings.max_displacement, self._settings.tolerance
         is_inside = winding != 0
         for of_samples in (False, True):
@@ -87,13 +84,27 @@ class WayOut:
                 is_inside = is_inside & is_in
         return points, torch.count_nonzero(is_inside)
 
+    @torch.no_grad()
+    def ways(self, points: Tensor) -> Tensor:
+        """How far those of the points (N, 3) [m] that are inside are from open skin [m], (N,); zero for the others."""
+        is_inside = self._winding(points) != 0
+        foot, normal = self._nearest_skin(points, is_inside, self._winding_above(), of_samples=False)
+        way = torch.linalg.vector_norm(foot - points, dim=1)
+        return torch.where(is_inside & (normal != 0).any(1), way, 0.0)
+
+    def _winding_above(self) -> Tensor:
+        """The winding numbers above the samples of the skin: its vertices, and the middles of its faces."""
+        with torch_stream(self.device):
+            self._tree.refit()
+            self._lift.launch()
+        return self._winding(self._above).clone()
+
     def _nearest_skin(
         self, points: Tensor, is_inside: Tensor, above: Tensor, *, of_samples: bool
     ) -> tuple[Tensor, Tensor]:
         """For those of the points that are inside, the closest place on open skin (N, 3) [m], the normal there (N, 3).
 
-        `above` are the winding numbers above the samples of the skin, which are its vertices and the middles of its
-        faces. `of_samples` no other place is taken.
+        `above` are the `_winding_above`; with `of_samples` no other place than these samples is taken.
         """
         foot, normal = torch.zeros(2, len(points), 3, device=self.device)
         points, asked = points.contiguous(), is_inside.int()

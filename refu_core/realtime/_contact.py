@@ -182,19 +182,21 @@ class ContactStage:
         n_clipped = (start.face < 0).sum()
         resolver = self.resolvers[name]
         done = resolver(vertices, self.sdf, start, margin=margin, scale=scale)
-        vertices, numbers = self._strain[name](done.vertices, rest), done.numbers
-        if vertices is not done.vertices:
-            done = resolver(vertices, self.sdf, None, margin=margin)
-            vertices, numbers[_N_UNRESOLVED] = done.vertices, done.numbers[_N_UNRESOLVED]
+        numbers, kept = done.numbers, margin
         if worn:
-            vertices, _ = self.lift(name, vertices, worn, goes_on=True)
-            again = resolver(vertices, self.sdf, None, margin=self._kept * margin)
-            again = self._part(name, again, worn, margin=self._kept * margin)
-            vertices = again.vertices
-            numbers[_N_UNRESOLVED] = again.numbers[_N_UNRESOLVED]
+            vertices, _ = self.lift(name, done.vertices, worn, goes_on=True)
+            kept = self._kept * margin
+            done = resolver(vertices, self.sdf, None, margin=kept)
+        vertices = self._strain[name](done.vertices, rest)
+        was_torn = vertices is not done.vertices
+        if was_torn:
+            done = resolver(vertices, self.sdf, None, margin=kept)
+        if worn:
+            done = self._part(name, done, worn, margin=kept)
+        vertices, numbers[_N_UNRESOLVED] = done.vertices, done.numbers[_N_UNRESOLVED]
         if self._is_tight:
             vertices = self._off_skin[name].parted(vertices)
-        if worn or self._is_tight:  # Each step goes no farther than that; together they may.
+        if was_torn or worn or self._is_tight:  # Each step goes no farther than that; together they may.
             vertices = pressed + torch.renorm(vertices - pressed, 2, 0, self._farthest)
         if self.way_out is not None:
             vertices, numbers[_N_UNRESOLVED] = self.way_out(vertices, pressed, margin)
