@@ -88,6 +88,16 @@ class Connectivity:
         """The faces around each vertex."""
         return _grouped(self.faces.ravel(), np.repeat(np.arange(len(self.faces)), 3), self.n_vertices)
 
+    def independent(self) -> NDArray[np.bool_]:
+        """A maximal independent set, shape (V,): no edge joins two of it, and whoever isn't in it is next to one."""
+        is_free, chosen = np.ones(self.n_vertices, np.bool_), np.zeros(self.n_vertices, np.bool_)
+        start, items = self.ring
+        for vertex in range(self.n_vertices):
+            if is_free[vertex]:
+                chosen[vertex] = True
+                is_free[items[start[vertex] : start[vertex + 1]]] = False
+        return chosen
+
     def require_closed(self) -> None:
         """Nothing, where the mesh is a closed, consistently oriented surface.
 

@@ -260,7 +260,8 @@ class Tensors:
         for name in ("moved", "near", "boxed", "ends", "touching"):
             setattr(work, name, wp.zeros(n, dtype=wp.int32, device=str(self._device)))
         work.front = wp.zeros((self._rounds + 1, n), dtype=wp.int32, device=str(self._device))
-        work.share = wp.zeros(n, dtype=wp.float32, device=str(self._device))
+        work.share, work.reach = (wp.zeros(n, dtype=wp.float32, device=str(self._device)) for _ in range(2))
+        work.parted = wp.zeros(n, dtype=wp.vec3, device=str(self._device))
         work.hot = wp.zeros(n_edges, dtype=wp.int32, device=str(self._device))
         work.steps = wp.zeros(n_edges, dtype=wp.vec3, device=str(self._device))
         for i, name in enumerate(_BY_VERTEX):

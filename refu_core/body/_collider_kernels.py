@@ -104,6 +104,10 @@ class Work:
     """The last round in whose front a vertex was, counted from 1."""
     touched: wp.array[int]
     outside: wp.array[int]
+    parted: wp.array[wp.vec3]
+    """Where each vertex in `touched` was brought by the distances from segments, before it was levelled."""
+    reach: wp.array[float]
+    """How far from there the surfaces of those segments are at most [m]."""
     steps: wp.array[wp.vec3]
     """Of each edge."""
     counts: wp.array[int]

@@ -218,11 +218,14 @@ def part(v: int, work: Work, segments: Segments, bones: Bones, rings: Rings, rou
                 step += wp.length_sq(found) * found
                 total += wp.length_sq(found)
                 most = wp.max(most, away)
-        if total == 0.0:
-            break
-        step /= total
+        if total > 0.0:
+            step /= total
         p += step
         reach = wp.min(most + wp.length(step) + ROUNDED, DEEPEST)
+        if total == 0.0:
+            break
+    work.parted[v] = p
+    work.reach[v] = reach
     if wp.length_sq(p - start) > 0.0:
         p = within(p, work.skin[v], work.farthest[v])
         work.here[v] = p
@@ -273,9 +276,15 @@ def raise_edge(
         middle = 0.5 * (moved[v] + moved[w])
         for k in range(segments.trees.shape[0]):
             if (either >> k) & 1 == 1 and k != segments.own[v] and k != segments.own[w]:
+                # Surfaces are no farther from the middle than from where its ends were when they were asked.
+                far = float(DEEPEST)
+                if (work.touched[v] >> k) & 1 == 1:
+                    far = wp.min(far, work.reach[v] + wp.length(middle - work.parted[v]))
+                if (work.touched[w] >> k) & 1 == 1:
+                    far = wp.min(far, work.reach[w] + wp.length(middle - work.parted[w]))
                 keeps = wp.min(segments.gap[v, k], segments.gap[w, k])
                 ratio = segments.ratio[segments.own[v], k]
-                found, _ = way_out(middle, normal, sunk, k, ratio, keeps, DEEPEST, segments, bones)
+                found, _ = way_out(middle, normal, sunk, k, ratio, keeps, far, segments, bones)
                 step += wp.length_sq(found) * found
                 total += wp.length_sq(found)
     if total > 0.0:

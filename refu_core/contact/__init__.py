@@ -11,6 +11,8 @@ from refu_core.contact._resolver import Resolver as Resolver
 from refu_core.contact._settings import DEFAULT_CONTACT as DEFAULT_CONTACT
 from refu_core.contact._settings import ContactSettings as ContactSettings
 from refu_core.contact._sheet import Sheet as Sheet
+from refu_core.contact._strain import StrainLimit as StrainLimit
 from refu_core.contact._tent import Shins as Shins
 from refu_core.contact._tent import Tent as Tent
 from refu_core.contact._unfold import Unfold as Unfold
+from refu_core.contact._way_out import WayOut as WayOut

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from refu_core.contact._state import BESIDE, CUTTING, NEAR, RAISED, Cloth, Rules, State, bounded, keep
+from refu_core.contact._state import BESIDE, CUTTING, NEAR, RAISED, SHIFTED, Cloth, Rules, State, bounded, keep
 from refu_core.sdf import Skin, query_skin
 
 
@@ -22,15 +22,18 @@ def middle_deficit(edge: int, state: State, cloth: Cloth, skin: Skin, rules: Rul
 @wp.kernel(enable_backward=False)
 def suspect_kernel(each: int, state: State, cloth: Cloth, rules: Rules) -> None:
     """Lists the edges whose middle may be closer to the skin than half the margin (`_raise_edges`)."""
-    if state.counts[NEAR] == 0:
+    if state.counts[NEAR] + state.counts[SHIFTED] == 0:
         return  # nothing is moved then
     # An edge's lower end has it. Most are far off, which is to be seen by few numbers, and without guesses between.
     begin = wp.tid() * each
     for a in range(begin, begin + each):
         first = state.distance[a]
         here = state.place[a]
+        fresh = state.fresh[a]
         for edge in range(cloth.edge_start[a], cloth.edge_start[a + 1]):
             b = cloth.edges[edge, 1]
+            if fresh + state.fresh[b] == 0:
+                continue
             second = state.distance[b]
             way = here - state.place[b]
             beyond = 2.0 * wp.where(first > second, first, second) - rules.margin

@@ -16,10 +16,18 @@ from refu_core.body._bundles import bundled
 from refu_core.contact import _press_kernels as kernels
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
 from refu_core.garments import GarmentTemplate
-from refu_core.mesh import Connectivity, grouped
+from refu_core.mesh import grouped
 
-_LIMBS = (joints_of("trunk", "head"), *ARMS, LEGS[0] + LEGS[1])
+_HANDS = ((20, 22), (21, 23))
+_LIMBS = (
+    joints_of("trunk", "head"),
+    *(tuple(joint for joint in arm if joint not in hand) for arm, hand in zip(ARMS, _HANDS, strict=True)),
+    LEGS[0] + LEGS[1],
+    *_HANDS,
+)
 """Joints of each limb; both legs are one, as a skirt lies on either."""
+_WHOLE = (joints_of("trunk", "head"), *ARMS, LEGS[0] + LEGS[1], *ARMS)
+"""What each is of: cloth on an arm lies on its hand, too."""
 
 
 class LimbMeshes:
@@ -84,10 +92,13 @@ class Press:
         self._cut = torch.zeros(2, n, device=self.device)
         self._counts = torch.zeros(kernels.N_COUNTS, dtype=torch.int32, device=self.device)
         self._commands: dict[str, Any] = {}
-        own = weight_of_parts(garment.weights, _LIMBS) > settings.own_weight
-        foreign = (~own).cpu().numpy() @ (1 << np.arange(len(_LIMBS)))
-        order = grouped(garment.v_template.cpu().numpy())
-        ring = Connectivity.of(garment.faces.cpu(), n).ring
+        is_foreign = (weight_of_parts(garment.weights, _WHOLE) <= settings.own_weight).cpu().numpy()
+        # Of what is thicker than cloth's edges are long, every vertex learns from one beside it.
+        is_one_of_few = garment.mesh.independent()
+        is_foreign[~is_one_of_few, : -len(_HANDS)] = False
+        foreign = is_foreign @ (1 << np.arange(len(_LIMBS)))
+        order, ring = grouped(garment.v_template.cpu().numpy()), garment.mesh.ring
+        order = np.concatenate((order[is_one_of_few[order]], order[~is_one_of_few[order]]))
         self._fabric = fabric = kernels.Fabric()
         fabric.skin, fabric.points = as_warp(self._skin, wp.vec3), as_warp(self._points, wp.vec3)
         fabric.cut, fabric.spread = (as_warp(one, wp.float32) for one in self._cut)

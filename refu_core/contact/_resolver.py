@@ -105,7 +105,9 @@ class Resolver:
             n = self._length(_state.NEAR)
             if n:
                 self._push(n, scale)
+            if n or self._length(_state.SHIFTED):
                 self._raise_edges()
+            if n:
                 self._run("tally")
         depth = -self._floats["first"].amin(0, keepdim=True)
         counts = self._counts[_state.INSIDE : _state.STUCK + 1].float()
@@ -273,7 +275,7 @@ _MOST_MARGINS = 8
 """Margins whose launches are kept: of an outer garment there are two a frame."""
 _VECTORS = ("origin", "first_gradient", "place", "gradient", "field", "smoother")
 _FLOATS = ("first", "distance", "way", "goal", "alpha", "largest")
-_INTS = ("first_face", "face", "mark", "near", "reached", "moved")
+_INTS = ("first_face", "face", "mark", "fresh", "near", "reached", "moved")
 
 
 def _cloth(mesh: Connectivity, device: str) -> Any:

@@ -9,6 +9,7 @@ from refu_core.contact._state import (
     MOVED,
     NEAR,
     REACHED,
+    SHIFTED,
     SOURCE,
     STUCK,
     SUSPECTS,
@@ -64,6 +65,7 @@ def begin_kernel(each: int, state: State) -> None:
     first = wp.tid() * each
     for i in range(first, first + each):
         keep(i, state.origin[i], state.first[i], state.first_gradient[i], state.first_face[i], state)
+        state.fresh[i] = 1
         if state.first_face[i] < 0:
             state.gradient[i] = wp.vec3()  # beyond a band nothing is known
 
@@ -76,7 +78,9 @@ def go_on_kernel(each: int, reach: float, state: State, skin: Skin) -> None:
         here = state.origin[i]
         way = wp.length(here - state.place[i])
         state.place[i] = here
+        state.fresh[i] = wp.where(way > 0.0, 1, 0)
         if way > 0.0:
+            wp.atomic_add(state.counts, SHIFTED, 1)
             # No vertex gets nearer by more than it moves.
             if state.distance[i] - way >= reach:
                 state.distance[i] -= way
@@ -130,6 +134,7 @@ def adopt(i: int, state: State, cloth: Cloth) -> None:
     if state.first[i] == state.distance[i]:
         return
     wp.atomic_add(state.counts, CHANGED, 1)
+    state.fresh[i] = 1
     keep(i, state.origin[i], state.first[i], state.first_gradient[i], state.first_face[i], state)
     for k in range(cloth.ring_start[i], cloth.ring_start[i + 1]):
         suspect(cloth.ring[k], state)
@@ -145,11 +150,11 @@ def adopt_kernel(each: int, state: State, cloth: Cloth) -> None:
 
 @wp.kernel(enable_backward=False)
 def list_near_kernel(each: int, state: State, rules: Rules) -> None:
-    """Lists who is nearer than the margin."""
+    """Lists who is nearer than the margin, of those who were moved."""
     first = wp.tid() * each
     for i in range(first, first + each):
         state.mark[i] = 0
-        if state.distance[i] < rules.margin:
+        if state.distance[i] < rules.margin and state.fresh[i] == 1:
             state.near[wp.atomic_add(state.counts, NEAR, 1)] = i
 
 
@@ -185,6 +190,7 @@ def settle(i: int, state: State, skin: Skin, rules: Rules) -> None:
     state.field[i] = wp.vec3()
     state.smoother[i] = wp.vec3()
     state.mark[i] = 0
+    state.fresh[i] = 1
     origin = state.origin[i]
     here = bounded(origin + shift, origin, rules.max_displacement)
     known = state.distance[i]

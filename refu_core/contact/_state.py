@@ -18,6 +18,7 @@ RAISED = wp.constant(6)  # ends of edges that cut the skin
 CHANGED = wp.constant(7)  # distances that were replaced
 CUTTING = wp.constant(8)  # such edges; a number for each round follows
 N_COUNTS = 16
+SHIFTED = wp.constant(15)  # vertices that were moved since the last call
 
 # A vertex reached by pushes, or pushed itself.
 BESIDE = wp.constant(1)
@@ -73,6 +74,8 @@ class State:
     goal: wp.array[wp.float32]
     """Distance that this leads to."""
     mark: wp.array[wp.int32]
+    fresh: wp.array[wp.int32]
+    """Whether a vertex isn't where the last call left it: others were brought off the skin as far as they can be."""
     counts: wp.array[wp.int32]
     begins: wp.array[wp.int32]
     ends: wp.array[wp.int32]

@@ -20,14 +20,16 @@ from refu_core.contact import (
     Resolver,
     Sheet,
     Shins,
+    StrainLimit,
     Tent,
     Unfold,
+    WayOut,
 )
 from refu_core.garments import inner_first
 from refu_core.modes import SdfMode
 from refu_core.realtime._wearer import Outfit
 from refu_core.refu import VertexScale
-from refu_core.sdf import ApproxSdf, MeshSdf, Winding, exact_sdf
+from refu_core.sdf import ApproxSdf, MeshSdf, exact_sdf
 
 
 class Worn(NamedTuple):
@@ -72,17 +74,19 @@ class ContactStage:
     ) -> None:
         """With the exact distance, within a band of the skin or everywhere, or with the approximate one.
 
-        Where it is to `certify`, what is unresolved is counted by winding numbers.
+        Where it is to `certify`, vertices that winding numbers find inside leave, and those without a way out are
+        counted.
         """
         body, garments = outfit.body, {name: one.template for name, one in outfit.wearables.items()}
         self.sdf: MeshSdf = exact_sdf(body, uses_band=uses_band) if sdf is SdfMode.ACCURATE else ApproxSdf(body)
-        self.winding = Winding(body.faces) if certify else None
+        self.way_out = WayOut(body.faces, body.v_template, settings=settings) if certify else None
         self.order = inner_first(garments)
         """Names from the skin outwards."""
         self._asked = {name: self.sdf.of_garment(one) for name, one in garments.items()}
         self.resolvers = {
             name: Resolver(one.faces, one.n_vertices, settings=settings) for name, one in garments.items()
         }
+        self._strain = {name: StrainLimit(one.mesh, body.device, settings=settings) for name, one in garments.items()}
         self._limbs, self._tents, self._press, self._off_skin = None, {}, {}, {}
         if outfit.collider is not None:  # or there is no room
             self._shins = shins = Shins(body)
@@ -126,8 +130,8 @@ class ContactStage:
         if self._is_tight:
             self._skin.take(body)
         self.sdf.update(body)
-        if self.winding is not None:
-            self.winding.update(body)
+        if self.way_out is not None:
+            self.way_out.update(body)
         if self._limbs is not None:
             self._limbs.update(body)
             self._shins.update(body)
@@ -164,29 +168,38 @@ class ContactStage:
         *,
         pressed: Tensor,
         on_mean: Tensor,
+        rest: Tensor,
         margin: float,
         scale: float | VertexScale,
         n_layered: Tensor,
     ) -> Resolved:
-        """Vertices (V, 3) [m] off the body, which has the last word, and within reach of where limbs `pressed` them."""
+        """Vertices (V, 3) [m] off the body, which has the last word, and within reach of where limbs `pressed` them.
+
+        `on_mean` is as in `Drape`, and `rest` (V, 3) [m] the wearer's garment in the rest pose.
+        """
         start = self._asked[name](vertices, on_mean=on_mean, reach=margin + ASKED_FROM)
         assert start.face is not None  # these distances are to faces
         n_clipped = (start.face < 0).sum()
         resolver = self.resolvers[name]
         done = resolver(vertices, self.sdf, start, margin=margin, scale=scale)
-        vertices, numbers = done.vertices, done.numbers
+        numbers, kept = done.numbers, margin
         if worn:
-            vertices, _ = self.lift(name, vertices, worn, goes_on=True)
-            again = resolver(vertices, self.sdf, None, margin=self._kept * margin)
-            again = self._part(name, again, worn, margin=self._kept * margin)
-            vertices = again.vertices
-            numbers[_N_UNRESOLVED] = again.numbers[_N_UNRESOLVED]
+            vertices, _ = self.lift(name, done.vertices, worn, goes_on=True)
+            kept = self._kept * margin
+            done = resolver(vertices, self.sdf, None, margin=kept)
+        vertices = self._strain[name](done.vertices, rest)
+        was_torn = vertices is not done.vertices
+        if was_torn:
+            done = resolver(vertices, self.sdf, None, margin=kept)
+        if worn:
+            done = self._part(name, done, worn, margin=kept)
+        vertices, numbers[_N_UNRESOLVED] = done.vertices, done.numbers[_N_UNRESOLVED]
         if self._is_tight:
             vertices = self._off_skin[name].parted(vertices)
-        if worn or self._is_tight:  # Each step goes no farther than that; together they may.
+        if was_torn or worn or self._is_tight:  # Each step goes no farther than that; together they may.
             vertices = pressed + torch.renorm(vertices - pressed, 2, 0, self._farthest)
-        if self.winding is not None:
-            numbers[_N_UNRESOLVED] = torch.count_nonzero(self.winding(vertices))
+        if self.way_out is not None:
+            vertices, numbers[_N_UNRESOLVED] = self.way_out(vertices, pressed, margin)
         return Resolved(vertices, torch.cat((numbers, n_layered)), n_clipped)
 
     def _part(self, name: str, done: Resolution, worn: Mapping[str, Worn], *, margin: float) -> Resolution:

@@ -128,6 +128,7 @@ class FrameStep:
                         garments,
                         pressed=pressed,
                         on_mean=drape.on_mean[person],
+                        rest=wearer.garments[name].rest[person],
                         margin=margin_of[name],
                         scale=scale_of(self.outfit.wearables[name], drape, person),
                         n_layered=n_layered,

@@ -75,7 +75,7 @@ class GarmentPipeline:
         on_gpu = outfit.body.device.type == "cuda"
         self._graphs = StepGraphs(steps[0].packed, outfit.body.device) if graph and on_gpu else None
         contact = steps[0].contact
-        self._is_certified = contact is not None and contact.winding is not None
+        self._is_certified = contact is not None and contact.way_out is not None
         self._crew = Crew(steps, on_gpu=on_gpu)
         self._lock = threading.Lock()
         """Of what is remembered."""

@@ -14,7 +14,7 @@ from refu_core.backbones import Skinned
 from refu_core.contact import DEFAULT_CONTACT
 from refu_core.frames import SmplFrame
 from refu_core.garments import inner_first
-from refu_core.modes import DEFAULT_MARGIN
+from refu_core.modes import DEFAULT_MARGIN, SdfMode
 from refu_core.realtime import GarmentMesh, GarmentPipeline, PipelineOutput, Wearer, dress
 from refu_core.refu import MAX_DISPLACEMENT
 from refu_lab.stress._closest_kernels import closest_on_sheet
@@ -89,6 +89,7 @@ def buried(subject: Subject, trial: Trial) -> Iterator[Measurement]:
                 {},
                 pressed=points,
                 on_mean=drape.on_mean[0],
+                rest=skinned[name].template.rest(betas)[0],
                 margin=skinned[name].margin,
                 scale=1.0,
                 n_layered=torch.zeros(1, dtype=torch.int32),
@@ -105,7 +106,14 @@ def not_thrown(subject: Subject, trial: Trial) -> Iterator[Measurement]:
         sdf = subject.distances["exact"]
         sdf.update(torch.from_numpy(out.body))
         moved = np.linalg.norm(mesh.local - mesh.raw, axis=1)
-        lack = np.maximum(DEFAULT_MARGIN - sdf.query(torch.from_numpy(mesh.raw)).distance.numpy(), 0)
+        raw = torch.from_numpy(mesh.raw)
+        lack = np.maximum(DEFAULT_MARGIN - sdf.query(raw).distance.numpy(), 0)
+        if subject.wardrobe.sdf != SdfMode.NONE:  # where limbs overlap, the closest skin may be inside
+            stage = subject.contact_stage
+            stage.update(torch.from_numpy(out.body))
+            assert stage.way_out is not None  # it certifies
+            way = stage.way_out.ways(raw).numpy()
+            lack = np.where(way > 0, way + DEFAULT_MARGIN, lack)
         near = _largest_near(lack, pipeline.garments[name].edges.numpy())
         limit = (
             np.minimum(MAX_DISPLACEMENT, MULTIPLE * (near + DEFAULT_MARGIN)) + _pressed(subject, trial.frames[0])[name]

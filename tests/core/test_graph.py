@@ -128,8 +128,11 @@ def as_on_a_gpu(pipeline: GarmentPipeline) -> FrameStep:
         if isinstance(contact.sdf, ApproxSdf):
             contact.sdf._is_serial = False
         contact._is_serial = False
-        for one in (*contact._press.values(), *contact._off_skin.values(), *contact._unfold.values()):
-            one._is_serial = False
+        if contact.way_out is not None:
+            contact.way_out._is_serial = False
+        for steps in (contact._press, contact._off_skin, contact._unfold, contact._strain):
+            for one in steps.values():
+                one._is_serial = False
         for resolver in contact.resolvers.values():
             resolver._is_serial = False
         for layers in contact._below.values():

@@ -75,3 +75,13 @@ def test_what_isnt_closed_is_refused(faces: np.ndarray, wanted: str) -> None:
         Connectivity.of(faces).require_closed()
     with pytest.raises(MeshError, match=wanted):
         _ = Connectivity.of(faces).across
+
+
+def test_an_independent_set_is_one_and_leaves_nobody_alone(reference: trimesh.Trimesh) -> None:
+    mesh = Connectivity.of(reference.faces)
+    chosen = mesh.independent()
+    ends = chosen[mesh.edges]
+    assert not ends.all(axis=1).any()
+    is_beside = np.zeros(mesh.n_vertices, np.bool_)
+    np.logical_or.at(is_beside, mesh.edges, ends[:, ::-1])
+    assert (chosen | is_beside).all()

@@ -70,12 +70,15 @@ def test_is_what_a_look_from_the_skin_says() -> None:
     points, skin, body = beside(1.45)
     pressed = made(body, sweeps=0)(points, skin).double().numpy()
     x, at = points.double().numpy(), skin.double().numpy()
-    parts = (joints_of("trunk", "head"), *ARMS)
-    of_face = part_of_faces(outfit().body.weights, outfit().body.faces, (*parts, joints_of("left_thigh"))).numpy()
+    hands = ((20, 22), (21, 23))
+    arms = tuple(tuple(joint for joint in arm if joint < 20) for arm in ARMS)
+    parts = (joints_of("trunk", "head", "left_thigh"), *arms, *hands)
+    of_face = part_of_faces(outfit().body.weights, outfit().body.faces, parts).numpy()
+    is_one_of_few = outfit().wearables[SKIRT].template.mesh.independent()
     how, moved = DEFAULT_CONTACT, np.linalg.norm(pressed - x, axis=1)
     near = np.flatnonzero((moved > 0) | (np.arange(len(x)) % 40 == 0))
     height = np.linalg.norm(x - at, axis=1)
-    arms = [body.double().numpy()[outfit().body.faces.numpy()[of_face == arm]] for arm in (1, 2)]
+    limbs = [body.double().numpy()[outfit().body.faces.numpy()[of_face == limb]] for limb in (1, 2, 3, 4)]
     wanted = x.copy()
     for v in near:
         h, whole = height[v], height[v] + how.press_room
@@ -83,7 +86,7 @@ def test_is_what_a_look_from_the_skin_says() -> None:
             continue
         aside = min(how.press_beside, h * h / how.press_flat)
         least = whole
-        for triangles in arms:
+        for triangles in limbs if is_one_of_few[v] else limbs[2:]:
             go = 0.0
             for _ in range(how.press_looks):
                 off = distances((at[v] + go / h * (x[v] - at[v]))[None], triangles)[0]

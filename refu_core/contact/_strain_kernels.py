@@ -1,0 +1,89 @@
+"""Strain limiting: edges that are too long draw their ends together. One code for CPU and CUDA."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Net:
+    """A garment and memory to draw it together in."""
+
+    rest: wp.array[wp.vec3]
+    """Vertices in the rest pose [m]."""
+    points: wp.array[wp.vec3]
+    other: wp.array[wp.vec3]
+    """Vertices [m], and the same a sweep later."""
+    ring_start: wp.array[int]
+    ring: wp.array[int]
+    edge_start: wp.array[int]
+    edge_end: wp.array[int]
+    """The edges of vertex v to those of higher number are to `edge_end[edge_start[v]:edge_start[v + 1]]`."""
+    limit: float
+    """How many times their rest length edges may be."""
+    rows: wp.array[int]
+    """On a CPU the ends of edges that are too long, in the order in which they were found."""
+    is_listed: wp.array[int]
+    count: wp.array[int]
+
+
+@wp.func
+def is_long(v: int, w: int, points: wp.array[wp.vec3], net: Net) -> bool:
+    return wp.length_sq(points[v] - points[w]) > net.limit * net.limit * wp.length_sq(net.rest[v] - net.rest[w])
+
+
+@wp.func
+def drawn(v: int, points: wp.array[wp.vec3], net: Net) -> wp.vec3:
+    """Where its edges draw a vertex: by half of what each is too long, on average.
+
+    Edges that aren't too long count, too: so a vertex that was thrown comes back, and its neighbours hardly follow it.
+    """
+    total = wp.vec3()
+    for r in range(net.ring_start[v], net.ring_start[v + 1]):
+        w = net.ring[r]
+        if is_long(v, w, points, net):
+            way = points[w] - points[v]
+            total += (0.5 - 0.5 * net.limit * wp.length(net.rest[v] - net.rest[w]) / wp.length(way)) * way
+    return points[v] + total / float(wp.max(net.ring_start[v + 1] - net.ring_start[v], 1))
+
+
+@wp.func
+def enlist(v: int, net: Net) -> None:
+    if net.is_listed[v] == 0:
+        net.is_listed[v] = 1
+        net.rows[net.count[0]] = v
+        net.count[0] += 1
+
+
+@wp.kernel
+def sweep_kernel(net: Net, points: wp.array[wp.vec3], other: wp.array[wp.vec3]) -> None:
+    """A sweep, a vertex a thread."""
+    v = wp.tid()
+    other[v] = drawn(v, points, net)
+
+
+@wp.kernel
+def limit_kernel(net: Net, sweeps: int) -> None:
+    """All sweeps, by one thread: over the ends of edges that are too long, and of those that become it."""
+    squared = net.limit * net.limit
+    for v in range(net.points.shape[0]):
+        here = net.points[v]
+        rest = net.rest[v]
+        for e in range(net.edge_start[v], net.edge_start[v + 1]):
+            w = net.edge_end[e]
+            if wp.length_sq(here - net.points[w]) > squared * wp.length_sq(rest - net.rest[w]):
+                enlist(v, net)
+                enlist(w, net)
+    for _ in range(sweeps):
+        i = int(0)
+        while i < net.count[0]:
+            v = net.rows[i]
+            net.other[v] = drawn(v, net.points, net)
+            for r in range(net.ring_start[v], net.ring_start[v + 1]):
+                if net.is_listed[net.ring[r]] == 0 and is_long(v, net.ring[r], net.points, net):
+                    enlist(net.ring[r], net)
+            i += 1
+        for i in range(net.count[0]):
+            net.points[net.rows[i]] = net.other[net.rows[i]]
+    for i in range(net.count[0]):
+        net.is_listed[net.rows[i]] = 0

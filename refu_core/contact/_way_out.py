@@ -1,0 +1,121 @@
+"""The last step of contact: whoever the winding number finds inside the body leaves it."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+import warp as wp
+from torch import Tensor
+
+from refu_core._warp import as_warp, torch_stream
+from refu_core.contact import _way_out_kernels as kernels
+from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
+from refu_core.mesh import Connectivity
+from refu_core.sdf import Winding
+
+
+class WayOut:
+    """Takes vertices that are inside a posed body to the closest skin that is outside of it.
+
+    A distance has a sign by the face that is closest. An approximate distance may have missed that face, and where the
+    body still overlaps itself the closest face may lie inside: then a vertex is believed to be outside. A winding
+    number is right in both cases. So it is asked about every vertex at the end. Faces with an interior above them are
+    covered by another part of the body, and don't count as skin. As a face may be covered in part, who is inside after
+    that goes to a vertex or to the middle of a face that is known to be open.
+
+    In most frames nobody is inside, and the winding numbers are all that this costs.
+    """
+
+    def __init__(self, faces: Tensor, body: Tensor, *, settings: ContactSettings = DEFAULT_CONTACT) -> None:
+        """For bodies of closed `faces` (F, 3) and vertices like `body` (V, 3) [m], on their device.
+
+        Raises `MeshError` when they aren't a closed, consistently oriented surface.
+        """
+        self._settings, self.device = settings, body.device
+        self._is_serial = body.device.type == "cpu"
+        self._winding = Winding(faces)
+        self._body = torch.zeros_like(body, dtype=torch.float32).copy_(body)
+        mesh = Connectivity.of(faces.cpu(), len(body))
+        name, n_places = str(body.device), len(body) + len(faces)
+        self._points = as_warp(self._body, wp.vec3)
+        self._faces, fan_start, fan = (
+            wp.array(np.ascontiguousarray(one, np.int32), dtype=wp.int32, device=name)
+            for one in (mesh.faces, *mesh.fan)
+        )
+        self._tree = wp.Mesh(self._points, self._faces.flatten())
+        self._above = torch.zeros(n_places, 3, device=body.device)
+        self._lift = wp.launch(
+            kernels.above_kernel,
+            n_places,
+            [settings.tolerance, self._points, self._faces, fan_start, fan],
+            [as_warp(self._above, wp.vec3)],
+            device=name,
+            record_cmd=True,
+        )
+
+    def update(self, body: Tensor) -> None:
+        """Takes over a pose: the body's vertices (V, 3) [m]."""
+        self._body.copy_(body)
+        self._winding.update(body)
+
+    @torch.no_grad()
+    def __call__(self, points: Tensor, around: Tensor, margin: float) -> tuple[Tensor, Tensor]:
+        """The points (N, 3) [m] with nobody inside who has a way out, and how many are inside after all, shape ().
+
+        Who leaves stays `margin` [m] off the skin, or less where that is inside again, and at most `max_displacement`
+        away from `around` (N, 3) [m]. A GPU isn't waited for. Not differentiable.
+        """
+        winding = self._winding(points).clone()
+        n_inside = torch.count_nonzero(winding)
+        if self._is_serial and not int(n_inside):
+            return points, n_inside
+        above = self._winding_above()
+        farthest, least = self._settings.max_displacement, self._settings.tolerance
+        is_inside = winding != 0
+        for of_samples in (False, True):
+            foot, normal = self._nearest_skin(points, is_inside, above, of_samples=of_samples)
+            has_skin = (normal != 0).any(1)
+            for share in _SHARES:
+                at = foot + max(share * margin, least) * normal
+                at = around + torch.renorm(at - around, 2, 0, farthest)
+                tried = torch.where((is_inside & has_skin)[:, None], at, points)
+                is_in = self._winding(tried) != 0
+                points = torch.where((is_inside & ~is_in)[:, None], tried, points)
+                is_inside = is_inside & is_in
+        return points, torch.count_nonzero(is_inside)
+
+    @torch.no_grad()
+    def ways(self, points: Tensor) -> Tensor:
+        """How far those of the points (N, 3) [m] that are inside are from open skin [m], (N,); zero for the others."""
+        is_inside = self._winding(points) != 0
+        foot, normal = self._nearest_skin(points, is_inside, self._winding_above(), of_samples=False)
+        way = torch.linalg.vector_norm(foot - points, dim=1)
+        return torch.where(is_inside & (normal != 0).any(1), way, 0.0)
+
+    def _winding_above(self) -> Tensor:
+        """The winding numbers above the samples of the skin: its vertices, and the middles of its faces."""
+        with torch_stream(self.device):
+            self._tree.refit()
+            self._lift.launch()
+        return self._winding(self._above).clone()
+
+    def _nearest_skin(
+        self, points: Tensor, is_inside: Tensor, above: Tensor, *, of_samples: bool
+    ) -> tuple[Tensor, Tensor]:
+        """For those of the points that are inside, the closest place on open skin (N, 3) [m], the normal there (N, 3).
+
+        `above` are the `_winding_above`; with `of_samples` no other place than these samples is taken.
+        """
+        foot, normal = torch.zeros(2, len(points), 3, device=self.device)
+        points, asked = points.contiguous(), is_inside.int()
+        inputs = [self._tree.id, self._settings.max_displacement, self._points, self._faces]
+        inputs += [as_warp(self._above, wp.vec3), as_warp(above, wp.int32), of_samples]
+        inputs += [as_warp(points, wp.vec3), as_warp(asked, wp.int32)]
+        outputs = [as_warp(foot, wp.vec3), as_warp(normal, wp.vec3)]
+        with torch_stream(self.device):
+            wp.launch(kernels.nearest_kernel, len(points), inputs, outputs, device=str(self.device))
+        return foot, normal
+
+
+_SHARES = (1.0, 0.0)
+"""Of the margin, tried one after another: in a crease there is less room."""
