@@ -161,8 +161,9 @@ class GarmentPipeline:
             device: torch device, `cpu` or `cuda`.
             no_skip: names of `SKIPS` that are computed nevertheless, to see what skipping them is worth.
             graph: on CUDA, capture the whole of a frame as a CUDA graph; without, it is launched stage by stage.
-            certify: count what is still inside (`n_unresolved`) by winding numbers, which nothing escapes, for an
-                eighth of a frame's time; without, by the distances that pushed it, which may be wrong.
+            certify: ask for the winding number of every vertex at the end, take those inside out, and count those that
+                have no way out (`n_unresolved`); for a twentieth of a frame's time. Without, what is counted are the
+                distances that pushed them, which may be wrong.
             collider: bring garments off a body whose overlaps were pulled apart (`PipelineOutput.body`); without, off
                 the posed body itself as in the paper, in which there is no room where limbs run through each other.
             threads: how many calls, or parts of a batch, may run at the same time; each has working memory of its own.
