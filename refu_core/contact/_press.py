@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 import warp as wp
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from refu_core._warp import as_warp, torch_stream
@@ -18,16 +19,8 @@ from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
 from refu_core.garments import GarmentTemplate
 from refu_core.mesh import grouped
 
-_HANDS = ((20, 22), (21, 23))
-_LIMBS = (
-    joints_of("trunk", "head"),
-    *(tuple(joint for joint in arm if joint not in hand) for arm, hand in zip(ARMS, _HANDS, strict=True)),
-    LEGS[0] + LEGS[1],
-    *_HANDS,
-)
+_LIMBS = (joints_of("trunk", "head"), *ARMS, LEGS[0] + LEGS[1])
 """Joints of each limb; both legs are one, as a skirt lies on either."""
-_WHOLE = (joints_of("trunk", "head"), *ARMS, LEGS[0] + LEGS[1], *ARMS)
-"""What each is of: cloth on an arm lies on its hand, too."""
 
 
 class LimbMeshes:
@@ -38,6 +31,8 @@ class LimbMeshes:
         self._device = str(body.device)
         self._vertices = torch.zeros_like(body.v_template).copy_(body.v_template)
         self._is_late = np.zeros(len(_LIMBS), np.bool_)
+        self.rest = body.v_template.cpu().numpy()
+        """The body's vertices in the rest pose [m], shape (V, 3)."""
         points = as_warp(self._vertices, wp.vec3)
         limb_of = part_of_faces(body.weights, body.faces, _LIMBS).cpu().numpy()
         faces = body.faces.cpu().numpy()
@@ -92,19 +87,20 @@ class Press:
         self._cut = torch.zeros(2, n, device=self.device)
         self._counts = torch.zeros(kernels.N_COUNTS, dtype=torch.int32, device=self.device)
         self._commands: dict[str, Any] = {}
-        is_foreign = (weight_of_parts(garment.weights, _WHOLE) <= settings.own_weight).cpu().numpy()
-        # Of what is thicker than cloth's edges are long, every vertex learns from one beside it.
-        is_one_of_few = garment.mesh.independent()
-        is_foreign[~is_one_of_few, : -len(_HANDS)] = False
-        foreign = is_foreign @ (1 << np.arange(len(_LIMBS)))
-        order, ring = grouped(garment.v_template.cpu().numpy()), garment.mesh.ring
-        order = np.concatenate((order[is_one_of_few[order]], order[~is_one_of_few[order]]))
+        own = weight_of_parts(garment.weights, _LIMBS) > settings.own_weight
+        foreign = (~own).cpu().numpy() @ (1 << np.arange(len(_LIMBS)))
+        # Cloth that lies on the skin gives way as one piece: of its vertices a few are asked, and others follow those.
+        rest = garment.v_template.cpu().numpy()
+        is_loose = cKDTree(limbs.rest).query(rest)[0] > settings.press_lies[0]
+        is_asked = is_loose | garment.mesh.independent()
+        order, ring = grouped(rest), garment.mesh.ring
+        order = order[is_asked[order]]
         self._fabric = fabric = kernels.Fabric()
         fabric.skin, fabric.points = as_warp(self._skin, wp.vec3), as_warp(self._points, wp.vec3)
         fabric.cut, fabric.spread = (as_warp(one, wp.float32) for one in self._cut)
         fabric.counts = as_warp(self._counts, wp.int32)
         lists = {
-            "start": [*range(0, n, _PIECE), n],
+            "start": [*range(0, len(order), _PIECE), len(order)],
             "vertex": order,
             "foreign": foreign,
             "ring_start": ring.start,

@@ -70,23 +70,23 @@ def test_is_what_a_look_from_the_skin_says() -> None:
     points, skin, body = beside(1.45)
     pressed = made(body, sweeps=0)(points, skin).double().numpy()
     x, at = points.double().numpy(), skin.double().numpy()
-    hands = ((20, 22), (21, 23))
-    arms = tuple(tuple(joint for joint in arm if joint < 20) for arm in ARMS)
-    parts = (joints_of("trunk", "head", "left_thigh"), *arms, *hands)
+    parts = (joints_of("trunk", "head", "left_thigh"), *ARMS)
     of_face = part_of_faces(outfit().body.weights, outfit().body.faces, parts).numpy()
-    is_one_of_few = outfit().wearables[SKIRT].template.mesh.independent()
+    rest = outfit().wearables[SKIRT].template.v_template.numpy()
+    to_skin = np.linalg.norm(rest[:, None] - outfit().body.v_template.numpy()[None], axis=2).min(1)
+    is_asked = outfit().wearables[SKIRT].template.mesh.independent() | (to_skin > DEFAULT_CONTACT.press_lies[0])
     how, moved = DEFAULT_CONTACT, np.linalg.norm(pressed - x, axis=1)
     near = np.flatnonzero((moved > 0) | (np.arange(len(x)) % 40 == 0))
     height = np.linalg.norm(x - at, axis=1)
-    limbs = [body.double().numpy()[outfit().body.faces.numpy()[of_face == limb]] for limb in (1, 2, 3, 4)]
+    arms = [body.double().numpy()[outfit().body.faces.numpy()[of_face == arm]] for arm in (1, 2)]
     wanted = x.copy()
     for v in near:
         h, whole = height[v], height[v] + how.press_room
-        if not how.press_room < h < how.press_lies[1]:
+        if not (is_asked[v] and how.press_room < h < how.press_lies[1]):
             continue
         aside = min(how.press_beside, h * h / how.press_flat)
         least = whole
-        for triangles in limbs if is_one_of_few[v] else limbs[2:]:
+        for triangles in arms:
             go = 0.0
             for _ in range(how.press_looks):
                 off = distances((at[v] + go / h * (x[v] - at[v]))[None], triangles)[0]
