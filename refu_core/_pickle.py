@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import operator
 import re
 import struct
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from refu_core._files import open_file
 from refu_core._npz import ArrayBudget
 from refu_core._pickle_machine import MAX_PICKLE_BYTES, Machine, Record, exactly, kind_of_name
+from refu_core._torch_stream import MAGIC, read_stream
 from refu_core.errors import RefuError
 
 DAMAGE = (ValueError, TypeError, LookupError, struct.error, OverflowError, MemoryError, OSError)
@@ -77,9 +79,12 @@ class PickledArrays:
     def _tensor(self, record: Record) -> NDArray[Any]:
         """A tensor of torch: a view of a storage."""
         storage, offset, shape, strides = record.args[:4]
+        given = self._storage
+        if exactly(Record, storage).kind == "stream":  # a pickle of tensors that torch knows nothing of
+            storage, given = _streamed(storage)
         _, name, key = exactly(Record, storage).args[:3]
         kind = kind_of_name(name)
-        if self._storage is None or kind not in _STORAGES or type(key) is not str:
+        if given is None or kind not in _STORAGES or type(key) is not str:
             msg = "a tensor without its numbers, or of a type that isn't read"
             raise ValueError(msg)
         shape, strides = (tuple(operator.index(n) for n in exactly(tuple, pair)) for pair in (shape, strides))
@@ -87,7 +92,7 @@ class PickledArrays:
             msg = f"a tensor of the shape {str(shape)[:80]} and the strides {str(strides)[:80]}"
             raise ValueError(msg)
         self._budget.take(shape, np.dtype(kind))
-        flat = np.frombuffer(self._storage(key), np.dtype("<" + kind))
+        flat = np.frombuffer(given(key), np.dtype("<" + kind))
         if 0 in shape:
             return np.zeros(shape, kind)
         last = offset + sum((n - 1) * stride for n, stride in zip(shape, strides, strict=True))
@@ -115,6 +120,16 @@ class PickledArrays:
         column = np.repeat(np.arange(columns), counts)
         np.add.at(dense, (indices, column), data)
         return dense
+
+
+def _streamed(record: Record) -> tuple[Record, Callable[[str], bytes]]:
+    """A storage that torch has written as a stream of its own, and what gives its bytes."""
+    file = io.BytesIO(exactly(bytes, record.args[0] if record.args else None))
+    if Machine(is_model=False).run(file) != MAGIC:
+        msg = "a tensor whose numbers are no stream of torch"
+        raise ValueError(msg)
+    storage, given = read_stream(file)
+    return exactly(Record, storage), given
 
 
 def _dtype(record: Record) -> np.dtype[Any]:

@@ -51,6 +51,7 @@ DATA_NAMES: dict[str, str] = _NAMES | {
     "joblib.numpy_pickle.NumpyArrayWrapper": "joblib",
     "torch._utils._rebuild_tensor_v2": "tensor",
     "torch._utils._rebuild_parameter": "parameter",
+    "torch.storage._load_from_bytes": "stream",
     **{
         f"torch.{name}Storage": kind
         for name, kind in (
@@ -103,6 +104,8 @@ class Machine:
         self._n_names = 0
         self._is_model = is_model
         self._nested = nested
+        self.storages: dict[str, str] = {}
+        """The types of the storages beside the pickle, as `f4`, by their keys: torch's."""
 
     def run(self, file: BinaryIO) -> Any:
         """What a pickle holds. Raises `ValueError`, `LookupError` or `struct.error` where it is damaged."""
@@ -171,7 +174,7 @@ class Machine:
                 msg = f"it uses {name}, which no SMPL model needs: refused, nothing was executed"
                 raise ValueError(msg)
             case "BINPERSID":
-                self._stack.append(Record("storage", exactly(tuple, self._stack.pop())))
+                self._stack.append(self._storage(exactly(tuple, self._stack.pop())))
             case "EMPTY_SET":
                 self._stack.append([])
             case "ADDITEMS":
@@ -185,6 +188,12 @@ class Machine:
             case _:
                 msg = f"it uses {name}, which no file of plain data needs: refused, nothing was executed"
                 raise ValueError(msg)
+
+    def _storage(self, args: tuple[Any, ...]) -> Record:
+        kind, key = (kind_of_name(args[1]), args[2]) if len(args) > 2 else ("", "")
+        if re.fullmatch("[biuf][1248]", kind) and type(key) is str:
+            self.storages[key] = kind
+        return Record("storage", args)
 
     def _last(self, n: int) -> list[Any]:
         if len(self._stack) < n:

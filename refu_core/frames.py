@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -41,24 +42,24 @@ def checked_numbers(
     except (TypeError, ValueError, RuntimeError) as error:  # the last: a tensor that tracks gradients
         msg = f"{name} must be {shape} numbers, got {type(value).__name__}: {error}"
         raise FrameError(msg) from error
-    if array.size != np.prod(shape) or array.shape not in (shape, (array.size,)):
-        wanted = dict.fromkeys((shape, (int(np.prod(shape)),)))
+    size = math.prod(shape)
+    if array.size != size or array.shape not in (shape, (size,)):
+        wanted = dict.fromkeys((shape, (size,)))
         msg = f"{name} must have the shape {' or '.join(map(str, wanted))}, got {array.shape}"
         msg += f": take the first {shape[0]}" if len(shape) == array.ndim == 1 and array.size > shape[0] else ""
         raise FrameError(msg)
-    bad = int(np.count_nonzero(~np.isfinite(array)))
-    if bad:
+    largest = float(np.abs(array).max())  # NaN or infinite as soon as one is
+    if not math.isfinite(largest):
+        bad = int(np.count_nonzero(~np.isfinite(array)))
         msg = f"{name} has {bad} value{'s' if bad > 1 else ''} that {'are' if bad > 1 else 'is'} NaN or infinite"
         raise FrameError(msg)
-    with np.errstate(over="ignore"):
-        array = array.reshape(shape).astype(dtype)  # always a copy: the frame owns its data
-    if not np.isfinite(array).all():
+    if largest > float(np.finfo(dtype).max):
         msg = f"{name} has values beyond the range of {np.dtype(dtype)}"
         raise FrameError(msg)
-    largest = float(np.abs(array).max())
     if largest > limit:
         msg = f"{name} has magnitudes up to {largest:g}, wanted {limit:g} at most"
         raise FrameError(msg)
+    array = array.reshape(shape).astype(dtype)  # always a copy: the frame owns its data
     array.setflags(write=False)
     return array
 

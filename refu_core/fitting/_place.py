@@ -13,6 +13,7 @@ from scipy.optimize import minimize
 
 from refu_core.body import SmplBody
 from refu_core.errors import GarmentError
+from refu_core.fitting._clean import face_normals
 from refu_core.fitting._mesh_file import SurfaceMesh
 from refu_core.fitting._posed import LEFT_HIP, RIGHT_SHOULDER, PosedBody, standing_pose
 from refu_core.fitting._surround import Fit, Samples, fit_of, sample
@@ -39,6 +40,10 @@ _TRIED_SIZES = (0.25, 0.4, 0.6, 0.85, 1.2, 1.7)
 _NOTHING = 0.01
 """What fits has less than this share of it inside the body; like a glove, if it is less than 6 cm off, too."""
 _N_REFINED = 2
+_ASKEW = np.radians(10)
+"""A garment's breadth lies along an axis as nearly as that, or it stands askew."""
+_BROADER = 1.7
+"""How much larger the variance along its breadth is than that along its depth, for these to show."""
 _OF_NO_UNIT = 1e-3
 """An extent that is so near to 1, or 2, was made so, as data sets of shapes are: it says nothing of a unit."""
 
@@ -102,7 +107,7 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
         raise GarmentError(msg)
     poses = [placing.pose] if placing.pose is not None else [standing_pose(arms) for arms in _ARMS]
     bodies = [PosedBody(body, pose) for pose in poses]
-    turns = _turns(placing.up)
+    turns = _turns(placing.up, mesh)
     found = [
         _Candidate(_at(samples, unit, turn, shift, here), kind, here)
         for here, turn, unit in itertools.product(bodies, turns, units)
@@ -170,7 +175,7 @@ class _Candidate(NamedTuple):
     @property
     def is_sideways(self) -> bool:
         """Whether the mesh would have been modelled facing x, as nobody does."""
-        return abs(float(self.place.turn[0, 0])) < 0.5
+        return _is_sideways(self.place.turn)
 
     def cost(self, extent: float) -> float:
         """As a share of the garment's size, or the smallest one would always be the nearest to the skin.
@@ -197,7 +202,7 @@ def _searched(
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     few = Samples(*(array[::4] for array in samples))  # type: ignore[arg-type]
     if scales:  # there is much to try: what nobody does isn't
-        bodies, turns = bodies[:3], turns[: len(turns) // 2]
+        bodies, turns = bodies[:3], [turn for turn in turns if not _is_sideways(turn)]
     found = [
         _Candidate(_at(few, unit, turn, shift, here), "searched", here)
         for here, turn, unit in itertools.product(bodies[::2], turns, units)
@@ -215,13 +220,36 @@ def _at(samples: Samples, unit: float, turn: F64, shift: F64, body: PosedBody) -
     return Place(unit, turn, shift, body.pose, fit_of(unit * samples.points @ turn.T + shift, turned, body))
 
 
-def _turns(up: str | None) -> list[F64]:
+def _turns(up: str | None, mesh: SurfaceMesh) -> list[F64]:
     """Rotations that may bring a mesh upright and to face z; the likeliest first."""
     z_up = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     bases = {"y": [np.eye(3)], "z": [z_up], None: [np.eye(3), z_up]}[up]
-    about_y = [np.diag([np.cos(a), 1.0, np.cos(a)]) for a in (0.0, np.pi)]
-    about_y += [np.array([[0, 0, sign], [0, 1, 0], [-sign, 0, 0]]) for sign in (1.0, -1.0)]
-    return [about @ base for about in about_y for base in bases]
+    found = [_about_y(quarters * np.pi / 2) @ base for quarters in (0, 2, 1, -1) for base in bases]
+    askew = [(_skew(mesh, base), base) for base in bases]
+    return found + [_about_y(half - angle) @ base for half in (0, np.pi) for angle, base in askew if angle]
+
+
+def _about_y(angle: float) -> F64:
+    cos, sin = np.cos(angle).round(12), np.sin(angle).round(12)
+    return np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
+
+
+def _skew(mesh: SurfaceMesh, base: F64) -> float:
+    """By how much a mesh that is turned upright by `base` is askew [rad]: people are broader than deep.
+
+    Zero where it isn't, or where its breadth doesn't show.
+    """
+    area = np.linalg.norm(face_normals(mesh.vertices, mesh.faces), axis=1)
+    flat = (mesh.vertices[mesh.faces].mean(1) @ base.T)[:, ::2]
+    flat = flat - np.average(flat, axis=0, weights=area)
+    (depth, breadth), axes = np.linalg.eigh((flat.T * area) @ flat)
+    angle = float(np.arctan2(-axes[1, 1], axes[0, 1]))
+    off_axis = abs(angle - np.pi / 2 * round(angle / (np.pi / 2)))
+    return angle if breadth > _BROADER * depth and off_axis > _ASKEW else 0.0
+
+
+def _is_sideways(turn: F64) -> bool:
+    return abs(float(turn[0, 0])) < 0.5
 
 
 def _shifts(body: PosedBody, *, is_placed: bool) -> list[tuple[str, F64]]:
@@ -294,7 +322,9 @@ def _told(place: Place, kind: str) -> Place:
         up = "y" if np.isclose(turn[1, 1], 1) else "z"
         front = turn.T @ [0.0, 0.0, 1.0]
         axis = int(np.abs(front).argmax())
-        notes.append(f"{up} is up and {'+' if front[axis] > 0 else '-'}{'xyz'[axis]} is in front")
+        askew = np.degrees(np.arccos(min(1.0, abs(front[axis]))))
+        about = f"{askew:.0f}° off " if askew > 1 else ""
+        notes.append(f"{up} is up and {about}{'+' if front[axis] > 0 else '-'}{'xyz'[axis]} is in front")
     if kind == "floor":
         notes.append("it stood with the floor at 0 and was moved to the body's feet")
     elif np.abs(place.shift).max() > 1e-3:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib import resources
 from typing import Any, NamedTuple
 
@@ -19,20 +19,27 @@ from refu_core.skeleton import PARENTS
 Array = NDArray[np.float64]
 
 _ABOVE = np.array(PARENTS)
-_DEPTH = np.zeros(N_JOINTS, int)
-for _joint in range(1, N_JOINTS):
-    _DEPTH[_joint] = _DEPTH[_ABOVE[_joint]] + 1
-# Joints as deep as each other follow one another in SMPL's order.
-_LEVELS = [
-    (slice(int(found[0]), int(found[-1]) + 1), _ABOVE[found])
-    for found in (np.flatnonzero(depth == _DEPTH) for depth in range(1, _DEPTH.max() + 1))
-]
-_BELOW, _OVER = [7, 2, 3], [5, 6, 1]  # entries of a 3 x 3 matrix across the diagonal from each other
-_NEARLY_HALF = -1.98  # twice the cosine of 172°
 CARRIES = np.eye(N_JOINTS, dtype=bool)
 """Whether what hangs from a joint (row) moves when another (column) turns, shape (24, 24)."""
 for _joint in range(1, N_JOINTS):
     CARRIES[_joint] |= CARRIES[_ABOVE[_joint]]
+_CHAINS = CARRIES.astype(np.float64)
+
+
+def _hops() -> list[NDArray[np.intp]]:
+    """The joint that is 1, 2, 4, 8 above each, shape (24,); 24 beyond the root."""
+    hops, above = [], np.append(np.where(_ABOVE < 0, N_JOINTS, _ABOVE), N_JOINTS)
+    while (above < N_JOINTS).any():
+        hops.append(above[:-1])
+        above = above[above]
+    return hops
+
+
+_HOPS = _hops()
+_IDENTITY = np.eye(3)
+_CROSSES = np.stack([np.cross(axis, _IDENTITY).T.ravel() for axis in _IDENTITY])  # 3, 9: each axis as a skew matrix
+_NEARLY_HALF = -1.98  # twice the cosine of 172°
+_TINY = 1e-40  # beside a square, lest nothing is divided by nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +83,8 @@ class Posed(NamedTuple):
     """Of each joint in the world, shape (24, 3, 3)."""
     joints: Array
     """[m], shape (24, 3)."""
+    moves: Array
+    """How a unit of each beta moves a joint, and all that it carries [m], shape (24, 3, 10)."""
     points: Array
     """Keypoints [m], shape (K, 3)."""
 
@@ -91,10 +100,14 @@ class Pose:
     betas: Array
     """Shape (10,)."""
 
-    def moved(self, step: Array) -> Pose:
-        """By (pelvis 3 [m], turns 24 * 3 [rad] in the joint's own axes, betas 10), shape (85,)."""
+    def moved(self, step: Array, *, most_beta: float = np.inf) -> Pose:
+        """By (pelvis 3 [m], turns 24 * 3 [rad] in the joint's own axes, betas 10), shape (85,).
+
+        Betas stay within `most_beta`.
+        """
         turns = self.turns @ exp_so3(step[3 : 3 + 3 * N_JOINTS].reshape(N_JOINTS, 3))
-        return replace(self, pelvis=self.pelvis + step[:3], turns=turns, betas=self.betas + step[3 + 3 * N_JOINTS :])
+        betas = np.minimum(np.maximum(self.betas + step[3 + 3 * N_JOINTS :], -most_beta), most_beta)
+        return Pose(self.pelvis + step[:3], turns, betas)
 
 
 class Skeleton:
@@ -104,21 +117,19 @@ class Skeleton:
         self.layout = layout
         self.proportions = proportions
         above = np.maximum(_ABOVE, 0)
-        self._bones = proportions.joints - proportions.joints[above]
-        self._bone_dirs = proportions.shapedirs - proportions.shapedirs[above]
+        bones, dirs = (given - given[above] for given in (proportions.joints, proportions.shapedirs))
+        self._bones = np.concatenate([bones[:, :, None], dirs], axis=2)  # from its parent to each joint, and by beta
         carried = CARRIES[layout.joints].astype(np.float64)
         carried[np.arange(len(layout)), layout.joints] *= layout.offsets.any(axis=1)
         self.turning = np.flatnonzero(carried.any(axis=0))
-        """Joints that move a keypoint when they turn."""
-        self._carried = carried[None, :, self.turning]
-        parts = np.concatenate([np.arange(3), (3 + 3 * self.turning[:, None] + np.arange(3)).ravel()])
-        self.parts = np.concatenate([parts, 3 + 3 * N_JOINTS + np.arange(N_BETAS)])
-        """Which of the 85 numbers of a step that `Pose.moved` takes the keypoints depend on, in order, shape (P,)."""
+        """Joints that move a keypoint when they turn, shape (m,)."""
+        self.carried = carried[:, self.turning]
+        """Whether a keypoint moves when each of those turns, 0 or 1, shape (K, m)."""
         self._last: tuple[Pose, Posed] | None = None
 
     def bones(self, betas: Array) -> Array:
         """From each joint's parent to it in the T-pose [m], shape (24, 3)."""
-        bones: Array = self._bones + self._bone_dirs @ betas
+        bones: Array = self._bones[:, :, 0] + self._bones[:, :, 1:] @ betas
         return bones
 
     def posed(self, pose: Pose) -> Posed:
@@ -128,58 +139,36 @@ class Skeleton:
         return self._last[1]
 
     def _posed(self, pose: Pose) -> Posed:
-        placed = np.empty((N_JOINTS, 3, 4))  # a joint's turn, and the way to it from its parent
-        placed[:, :, :3], placed[:, :, 3] = pose.turns, self.bones(pose.betas)
-        joints = np.empty((N_JOINTS, 3))
-        joints[0] = pose.pelvis
-        for here, above in _LEVELS:
-            placed[here] = placed[above, :, :3] @ placed[here]
-            joints[here] = joints[above] + placed[here, :, 3]
-        at, turns = self.layout.joints, placed[:, :, :3]
-        points = joints[at] + (turns[at] @ self.layout.offsets[:, :, None])[:, :, 0]
-        return Posed(turns, joints, points)
-
-    def jacobian(self, posed: Posed) -> Array:
-        """How keypoints move with `parts`, shape (3 K, P): first the x of all of them, then y, then z."""
-        n, m = len(self.layout), len(self.turning)
-        jacobian = np.zeros((3, n, len(self.parts)))
-        for axis in range(3):
-            jacobian[axis, :, axis] = 1.0
-        arms = (posed.points.T[:, :, None] - posed.joints[self.turning].T[:, None]) * self._carried  # 3, K, m
-        x, y, z = arms[:, :, :, None]
-        u, v, w = (np.ascontiguousarray(posed.turns[self.turning, i]) for i in range(3))  # m, 3: rows of the axes
-        turning = jacobian[:, :, 3 : 3 + 3 * m]
-        turning[0] = (v * z - w * y).reshape(n, 3 * m)
-        turning[1] = (w * x - u * z).reshape(n, 3 * m)
-        turning[2] = (u * y - v * x).reshape(n, 3 * m)
-        moves = np.zeros((N_JOINTS, 3, N_BETAS))
-        for here, above in _LEVELS:
-            moves[here] = moves[above] + posed.turns[above] @ self._bone_dirs[here]
-        jacobian[:, :, 3 + 3 * m :] = moves[self.layout.joints].swapaxes(0, 1)
-        return jacobian.reshape(3 * n, -1)
+        turns = np.empty((N_JOINTS + 1, 3, 3))
+        turns[:N_JOINTS], turns[N_JOINTS] = pose.turns, _IDENTITY
+        for above in _HOPS:  # each turn is that of a chain twice as long after each round
+            turns[:N_JOINTS] = turns[above] @ turns[:N_JOINTS]
+        bones = turns[_HOPS[0]] @ self._bones
+        reach = (_CHAINS @ bones.reshape(N_JOINTS, -1)).reshape(bones.shape)
+        moves, turns = reach[:, :, 1:], turns[:N_JOINTS]
+        joints = pose.pelvis + reach[:, :, 0] + moves @ pose.betas
+        at = self.layout.joints
+        points = joints[at] + np.einsum("kij,kj->ki", turns[at], self.layout.offsets)
+        return Posed(turns, joints, moves, points)
 
 
 def exp_so3(vectors: Array) -> Array:
     """Rotation matrices (n, 3, 3) of rotation vectors (n, 3) [rad]: Rodrigues' formula."""
-    squared = np.einsum("ij,ij->i", vectors, vectors)
-    angle = np.sqrt(squared)
-    small = angle < 1e-4
-    safe = np.where(small, 1.0, angle)
-    a = np.where(small, 1 - squared / 6, np.sin(safe) / safe)
-    b = np.where(small, 0.5 - squared / 24, (1 - np.cos(safe)) / (safe * safe))
-    k = skew(vectors)
-    matrices: Array = np.eye(3) + a[:, None, None] * k + b[:, None, None] * (k @ k)
+    squared = np.einsum("ij,ij->i", vectors, vectors)[:, None, None]
+    half = np.sqrt(0.25 * squared + _TINY)
+    sinc = np.sin(half) / half
+    b = 0.5 * sinc * sinc
+    matrices: Array = (1 - b * squared) * _IDENTITY + (sinc * np.cos(half)) * skew(vectors)
+    matrices += (b * vectors[:, :, None]) * vectors[:, None, :]
     return matrices
 
 
 def log_so3(matrices: Array) -> Array:
     """Rotation vectors (n, 3) [rad], no longer than pi, of rotation matrices (n, 3, 3)."""
-    flat = matrices.reshape(-1, 9)
-    vector = flat[:, _BELOW] - flat[:, _OVER]
-    twice_sine = np.sqrt(np.einsum("ij,ij->i", vector, vector))
-    twice_cosine = flat[:, 0] + flat[:, 4] + flat[:, 8] - 1
-    scale = np.where(twice_sine < 1e-9, 0.5, np.arctan2(twice_sine, twice_cosine) / np.maximum(twice_sine, 1e-9))
-    result: Array = scale[:, None] * vector
+    vector = axes_of(matrices)
+    twice_sine = np.sqrt(np.einsum("ij,ij->i", vector, vector) + _TINY)
+    twice_cosine = np.einsum("ijj->i", matrices) - 1
+    result: Array = (np.arctan2(twice_sine, twice_cosine) / twice_sine)[:, None] * vector
     for i in np.flatnonzero(twice_cosine < _NEARLY_HALF):  # the difference vanishes there
         result[i] = Rotation.from_matrix(matrices[i]).as_rotvec()
     return result
@@ -187,7 +176,11 @@ def log_so3(matrices: Array) -> Array:
 
 def skew(vectors: Array) -> Array:
     """Matrices (n, 3, 3) that multiply as the cross product with vectors (n, 3) does."""
-    k = np.zeros((len(vectors), 3, 3))
-    k[:, 0, 1], k[:, 0, 2], k[:, 1, 2] = -vectors[:, 2], vectors[:, 1], -vectors[:, 0]
-    k[:, 1, 0], k[:, 2, 0], k[:, 2, 1] = vectors[:, 2], -vectors[:, 1], vectors[:, 0]
-    return k
+    matrices: Array = (vectors @ _CROSSES).reshape(-1, 3, 3)
+    return matrices
+
+
+def axes_of(matrices: Array) -> Array:
+    """Vectors (n, 3) of what is skew in matrices (n, 3, 3), times two: of a bᵀ it is b × a."""
+    vectors: Array = matrices.reshape(-1, 9) @ _CROSSES.T
+    return vectors

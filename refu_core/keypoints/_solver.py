@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
+from scipy.linalg.lapack import dpotrf, dpotrs, dtrtri
 
 from refu_core.frames import N_BETAS, N_JOINTS
-from refu_core.keypoints._pose import Pose, Skeleton, log_so3, skew
+from refu_core.keypoints._normal import NormalEquations
+from refu_core.keypoints._pose import Pose, Posed, Skeleton, log_so3, skew
 from refu_core.keypoints._settings import TrackerSettings
 from refu_core.skeleton import JOINT_NAMES
 
@@ -74,68 +74,122 @@ class Solution(NamedTuple):
     """From where it was looked for to it, shape (85,)."""
 
 
-def solve(
-    skeleton: Skeleton,
-    pose: Pose,
-    points: Array,
-    weights: Array,
-    *,
-    free: NDArray[np.intp],
-    deviation: Array,
-    prior: Array | None,
-    rest: float,
-    steps: int,
-    settings: TrackerSettings,
-) -> Solution:
-    """The most likely pose near `pose`.
+class Solver:
+    """Finds the most likely pose of one skeleton's keypoints.
 
     Args:
-        skeleton: whose keypoints they are.
-        pose: where it is looked for: the prediction, or a guess.
-        points: keypoints [m], shape (K, 3).
-        weights: how far each is believed, 0 to 1, shape (K,).
-        free: which of `skeleton.parts` may change.
-        deviation: of each keypoint along an axis [m], shape (K,).
-        prior: precision of the prediction's parts, shape (85,); None for a guess, which pulls at nothing.
-        rest: the share of a look that joints at rest count as.
-        steps: of Gauss and Newton at most.
+        skeleton: whose they are.
+        fits_betas: whether the shape is looked for, too.
         settings: the tuned numbers.
     """
-    precision = np.full(N_PARTS, _FLAT) if prior is None else prior
-    step, factor, info = np.zeros(N_PARTS), np.zeros((0, 0)), 1
-    resting_ = _Resting(pose, rest)
-    for _ in range(steps):
-        posed = skeleton.posed(pose)
-        off = points - posed.points
-        jacobian = skeleton.jacobian(posed)[:, : len(free)]
+
+    def __init__(self, skeleton: Skeleton, *, fits_betas: bool, settings: TrackerSettings) -> None:
+        self._skeleton = skeleton
+        self._settings = settings
+        self._turning = turning = skeleton.turning
+        self._turns = slice(3, 3 + 3 * len(turning))
+        parts = [np.arange(3), (3 + 3 * turning[:, None] + np.arange(3)).ravel()]
+        parts += [np.arange(N_PARTS)[BETAS]] if fits_betas else []
+        self._free = np.concatenate(parts)
+        """The unknowns among the parts of a step."""
+        self._equations = NormalEquations(skeleton, fits_betas=fits_betas)
+
+    def solve(
+        self,
+        pose: Pose,
+        points: Array,
+        weights: Array,
+        *,
+        deviation: Array,
+        prior: Array | None,
+        rest: float,
+        steps: int,
+    ) -> Solution:
+        """The most likely pose near `pose`.
+
+        Args:
+            pose: where it is looked for: the prediction, or a guess.
+            points: keypoints [m], shape (K, 3).
+            weights: how far each is believed, 0 to 1, shape (K,).
+            deviation: of each keypoint along an axis [m], shape (K,).
+            prior: precision of the prediction's parts, shape (85,); None for a guess, which pulls at nothing.
+            rest: the share of a look that joints at rest count as.
+            steps: of Gauss and Newton at most.
+        """
+        precision = np.full(N_PARTS, _FLAT) if prior is None else prior
+        noise = np.square(deviation)
+        posed = self._skeleton.posed(pose)
         # How far off a keypoint may be that is none the worse: by its own noise and by that of the prediction.
-        doubt = _LOOSE**2 if prior is None else (np.square(jacobian) @ (1 / prior[free])).reshape(3, -1).mean(axis=0)
-        far = (off * off).sum(axis=1) / (settings.outlier**2 * 3 * (deviation**2 + doubt))
-        root = np.tile(np.sqrt(weights) / ((1 + far) * deviation), 3)
-        scaled = jacobian * root[:, None]
-        normal = scaled.T @ scaled
-        diagonal = precision.copy()
-        diagonal[BETAS] += rest
-        _add_blocks(normal, resting_.stiffness, skeleton.turning, diagonal[free])
-        pull = resting_.pull - precision * step
-        pull[BETAS] -= rest * pose.betas
-        factor, info = dpotrf(normal, lower=1)
-        if info:  # not positive: keypoints that say nothing
-            break
-        change = np.zeros(N_PARTS)
-        change[free] = dpotrs(factor, scaled.T @ (off.T.reshape(-1) * root) + pull[free], lower=1)[0]
-        change *= min(1.0, _BOLDEST / max(float(np.abs(change[TURNS]).max()), 1e-9))
-        betas = np.clip(pose.betas + change[BETAS], -settings.most_beta, settings.most_beta)
-        pose = replace(pose.moved(change), betas=betas)
-        step += change  # turns that follow each other add up, as long as the second one is small
-        moved = posed.points + (jacobian @ change[free]).reshape(3, -1).T
-        if np.square(skeleton.posed(pose).points - moved).sum(axis=1).max() < _CLOSE**2:
-            break
-        resting_ = _Resting(pose, rest) if prior is None else resting_.after(change)
-    variance = 1 / np.maximum(precision, _FLAT)
-    if not info:
-        variance[free] = np.diag(dpotri(factor, lower=1)[0])
-    return Solution(pose, variance, step)
+        doubt = _LOOSE**2 if prior is None else self._doubt(posed, 1 / prior)
+        tolerated = self._settings.outlier**2 * 3 * (noise + doubt)
+        step, factor, resting = np.zeros(N_PARTS), None, _Resting(pose, rest)
+        for k in range(steps):
+            off = points - posed.points
+            far = np.einsum("ki,ki->k", off, off) / tolerated
+            counted = weights / (np.square(1 + far) * noise)
+            axes = posed.turns[self._turning]
+            matrix = self._matrix(posed, axes, counted, precision, resting.stiffness, rest)
+            found, info = dpotrf(matrix, lower=1, overwrite_a=1)
+            if info:  # not positive: keypoints that say nothing
+                break
+            factor = found
+            pull = resting.pull - precision * step
+            pull[BETAS] -= rest * pose.betas
+            right = self._equations.right(posed, counted, off) + self._in_world(pull, axes)
+            turned = dpotrs(factor, right, lower=1)[0]
+            change = np.zeros(N_PARTS)
+            change[self._free] = self._in_joints(turned, axes)
+            short = min(1.0, _BOLDEST / max(float(np.abs(change[TURNS]).max()), 1e-9))
+            change *= short
+            pose = pose.moved(change, most_beta=self._settings.most_beta)
+            step += change  # turns that follow each other add up, as long as the second one is small
+            if k + 1 == steps:
+                break
+            linear = self._equations.moved(posed, short * turned)
+            posed = self._skeleton.posed(pose)
+            bent = posed.points - linear
+            if (np.einsum("ki,ki->k", bent, bent) < _CLOSE**2).all():
+                break
+            resting = _Resting(pose, rest) if prior is None else resting.after(change)
+        variance = 1 / np.maximum(precision, _FLAT)
+        if factor is not None:
+            variance[self._free] = self._variance(factor, axes)
+        return Solution(pose, variance, step)
+
+    def _matrix(
+        self, posed: Posed, axes: Array, weights: Array, precision: Array, stiffness: Array, rest: float
+    ) -> Array:
+        held = stiffness[self._turning]
+        held.reshape(-1, 9)[:, ::4] += precision[TURNS].reshape(N_JOINTS, 3)[self._turning]
+        diagonal = precision[self._free]
+        diagonal[self._turns] = 0.0
+        diagonal[self._turns.stop :] += rest
+        return self._equations.matrix(posed, weights, diagonal, axes @ held @ axes.swapaxes(1, 2))
+
+    def _doubt(self, posed: Posed, variance: Array) -> Array:
+        """How unsure keypoints are along an axis, on average [m²], shape (K,)."""
+        turns = variance[TURNS].reshape(N_JOINTS, 3)[self._turning]
+        return self._equations.doubt(posed, variance[:3], turns, variance[BETAS])
+
+    def _in_world(self, parts: Array, axes: Array) -> Array:
+        """The unknowns, of parts (85,) of a step."""
+        given: Array = parts[self._free]
+        given[self._turns] = (axes @ given[self._turns].reshape(-1, 3, 1)).ravel()
+        return given
+
+    def _in_joints(self, given: Array, axes: Array) -> Array:
+        """The unknowns, turned from the world's axes to the joints' own ones."""
+        own: Array = given.copy()
+        own[self._turns] = (given[self._turns].reshape(-1, 1, 3) @ axes).ravel()
+        return own
+
+    def _variance(self, factor: Array, axes: Array) -> Array:
+        """Of the unknowns, turns about the joints' own axes: the diagonal of (L Lᵀ)⁻¹."""
+        root, n = dtrtri(factor, lower=1)[0].T, len(factor)
+        turns = root[self._turns].reshape(-1, 3, n)
+        root[self._turns] = (axes.swapaxes(1, 2) @ turns).reshape(-1, n)
+        variance: Array = np.einsum("ij,ij->i", root, root)
+        return variance
 
 
 class _Resting:
@@ -161,17 +215,10 @@ class _Resting:
 
 def _inverse_right_jacobian(vectors: Array) -> Array:
     """How rotation vectors (n, 3) change with a turn in the joint's own axes, shape (n, 3, 3)."""
-    angle = np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
-    safe = np.maximum(angle, 1e-3)
+    squared = np.einsum("ij,ij->i", vectors, vectors)
+    half = 0.5 * np.sqrt(np.maximum(squared, 1e-6))
     # Finite and smooth up to 2π, since a cotangent has the cosine over the sine.
-    factor = np.where(angle < 1e-3, 1 / 12, 1 / safe**2 - 1 / (2 * safe * np.tan(safe / 2)))
-    k = skew(vectors)
-    result: Array = np.eye(3) + 0.5 * k + factor[:, None, None] * (k @ k)
+    factor = np.where(squared < 1e-6, 1 / 12, (1 - half / np.tan(half)) / (4 * half * half))[:, None, None]
+    result: Array = (1 - factor * squared[:, None, None]) * np.eye(3) + 0.5 * skew(vectors)
+    result += (factor * vectors[:, :, None]) * vectors[:, None, :]
     return result
-
-
-def _add_blocks(matrix: Array, blocks: Array, joints: NDArray[np.intp], diagonal: Array) -> None:
-    """Adds the blocks of some joints, of (24, 3, 3), and a diagonal (P,), to a matrix (P, P)."""
-    rows = 3 + 3 * np.arange(len(joints))[:, None] + np.arange(3)
-    matrix[rows[:, :, None], rows[:, None, :]] += blocks[joints]
-    matrix[np.arange(len(matrix)), np.arange(len(matrix))] += diagonal

@@ -8,6 +8,7 @@ seen goes on for a while and then comes to rest, and how much a keypoint moves t
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +19,7 @@ from refu_core.frames import N_BETAS, N_JOINTS, SmplFrame
 from refu_core.keypoints._guess import first_pose
 from refu_core.keypoints._pose import Pose, Skeleton, exp_so3, log_so3
 from refu_core.keypoints._settings import DEFAULTS, TrackerSettings
-from refu_core.keypoints._solver import BETAS, MEAN, N_PARTS, SPREAD, Solution, solve
+from refu_core.keypoints._solver import BETAS, MEAN, N_PARTS, SPREAD, Solution, Solver
 
 Array = NDArray[np.float64]
 
@@ -47,10 +48,11 @@ class KeypointTracker:
         self.skeleton = skeleton
         self._settings = settings
         self._known = None if betas is None else np.asarray(betas, np.float64)
-        n_fixed = 0 if self._known is None else N_BETAS
-        self._free = skeleton.parts[: len(skeleton.parts) - n_fixed]
+        self._solver = Solver(skeleton, fits_betas=betas is None, settings=settings)
         joints, other = skeleton.layout.joints, skeleton.layout.mirrored
         self._sides = [np.flatnonzero(np.isin(joints, group) & (other != np.arange(len(other)))) for group in _GROUPS]
+        power = [np.full(3, settings.push), np.full(3 * N_JOINTS, settings.twist), np.zeros(N_BETAS)]
+        self._power = np.concatenate(power) / settings.smoothing**2
         self._offset = settings.offset_noise * skeleton.layout.offsets.any(axis=1)
         self.reset()
 
@@ -111,7 +113,7 @@ class KeypointTracker:
         if self._pose is None or 1e-9 * (stamp_ns - self._seen_at) > self._settings.hold:
             return None
         coast = self._settings.coast
-        ahead = coast * (1 - np.exp(-max(0.0, 1e-9 * (stamp_ns - self._stamp)) / coast))
+        ahead = coast * (1 - math.exp(-max(0.0, 1e-9 * (stamp_ns - self._stamp)) / coast))
         pose = self._pose.moved(ahead * self._rate) if ahead else self._pose
         betas = self._steady_betas(pose.betas)
         transl = pose.pelvis - self.skeleton.proportions.of(betas)[0]
@@ -220,12 +222,10 @@ class KeypointTracker:
         """Constant rates that die away; variances of the same."""
         assert self._pose is not None
         own = self._settings
-        keep = np.exp(-dt / own.coast)
+        keep = math.exp(-dt / own.coast)
         ahead = own.coast * (1 - keep)
         self._pose = self._pose.moved(ahead * self._rate)
-        power = np.concatenate([np.full(3, own.push), np.full(3 * N_JOINTS, own.twist), np.zeros(N_BETAS)])
-        power = power / own.smoothing**2
-        p, m, r = self._variance, self._mixed, self._rate_variance
+        power, p, m, r = self._power, self._variance, self._mixed, self._rate_variance
         self._variance = p + 2 * ahead * m + ahead**2 * r + power * dt**3 / 3
         self._variance[BETAS] += own.growth * dt
         self._mixed = keep * (m + ahead * r) + power * dt**2 / 2
@@ -240,7 +240,7 @@ class KeypointTracker:
         )
         gain = self._mixed / self._variance
         shrunk = 1 - variance / self._variance
-        self._rate = np.clip(self._rate + gain * step, -_FASTEST, _FASTEST)
+        self._rate = np.minimum(np.maximum(self._rate + gain * step, -_FASTEST), _FASTEST)
         self._rate_variance = np.maximum(self._rate_variance - gain * self._mixed * shrunk, 0.0)
         self._mixed = gain * variance
         self._variance = variance
@@ -251,28 +251,20 @@ class KeypointTracker:
     def _learn_noise(self, seen: _Seen, dt: float) -> None:
         """Follows what the tracker's noise is, by the median of what is left."""
         assert self._pose is not None
-        off = np.linalg.norm(self.skeleton.posed(self._pose).points - seen.points, axis=1)[seen.weights > 0]
-        if len(off) < 4:
+        off = self.skeleton.posed(self._pose).points - seen.points
+        squared = np.sort(np.einsum("ki,ki->k", off, off)[seen.weights > 0])
+        if len(squared) < 4:
             return
-        own, median = self._settings, float(np.median(off))
+        own, median = self._settings, math.sqrt(squared[len(squared) // 2])
         # Of three normal components the median length is 1.54 deviations; the fit takes up about a quarter of them.
-        target = np.clip(median / 1.54 * 1.25, own.least_noise, own.most_noise)
-        self._noise += min(1.0, dt) * (float(target) - self._noise)
+        target = min(max(median / 1.54 * 1.25, own.least_noise), own.most_noise)
+        self._noise += min(1.0, dt) * (target - self._noise)
         self._unfit_for = self._unfit_for + dt if median > max(4 * self._noise, 0.08) else 0.0
 
     def _solved(self, pose: Pose, seen: _Seen, *, prior: Array | None, rest: float, steps: int) -> Solution:
         deviation = np.sqrt(self._noise**2 + self._offset**2)
-        return solve(
-            self.skeleton,
-            pose,
-            seen.points,
-            seen.weights,
-            free=self._free,
-            deviation=deviation,
-            prior=prior,
-            rest=rest,
-            steps=steps,
-            settings=self._settings,
+        return self._solver.solve(
+            pose, seen.points, seen.weights, deviation=deviation, prior=prior, rest=rest, steps=steps
         )
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import bz2
 import io
+import lzma
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -18,11 +20,19 @@ from refu_core._npz import DAMAGE as ARCHIVE_DAMAGE
 from refu_core._npz import ArrayBudget, check_npy, npz_names, read_npz
 from refu_core._pickle import DAMAGE, PickledArrays
 from refu_core._pickle_machine import MAX_PICKLE_BYTES, Machine, Record
+from refu_core._torch_stream import MAGIC, read_stream
 from refu_core.errors import RefuError
-from refu_core.recordings._layouts import ALL_KEYS, POSE_KEYS, SUFFIXES, UNREAD, WANTED
+from refu_core.recordings._layouts import ALL_KEYS, POSE_KEYS, SUFFIXES, WANTED, is_like_known
 
 Key = str | int
-_ZIP, _NPY, _GZIP = b"PK\x03\x04", b"\x93NUMPY", b"\x1f\x8b"
+_ZIP, _NPY = b"PK\x03\x04", b"\x93NUMPY"
+_UNPACKERS: dict[bytes, Callable[[], Any]] = {
+    b"x": zlib.decompressobj,
+    b"\x1f\x8b": lambda: zlib.decompressobj(wbits=31),
+    b"BZh": bz2.BZ2Decompressor,
+    b"\xfd7zXZ": lambda: lzma.LZMADecompressor(memlimit=_MOST_HELD),
+}
+"""Of what packed files begin with, as gzip and joblib make them."""
 _MOST_NODES = 20_000
 MOST_DEPTH = 5
 """Values in values that are looked into; trackers write three."""
@@ -30,7 +40,6 @@ _MOST_ITEMS = 2_000_000
 """Of lists: a quarter of an hour of poses at 30 Hz."""
 _MOST_HELD = 256 << 20
 """Of a dictionary in an array, and of what was packed [bytes]."""
-_STEP = 1 << 20
 
 
 class Content:
@@ -86,6 +95,18 @@ class Content:
             if len(path) < MOST_DEPTH and len(todo) < _MOST_NODES:
                 todo += [((*path, key), item) for key, item in inside.items() if entries(item) is not None]
 
+    def renamed(self, names: Mapping[Key, Key]) -> Content:
+        """The same with other names, wherever they stand."""
+
+        def other(value: Any, depth: int) -> Any:
+            inside = entries(value)
+            if inside is None or depth > MOST_DEPTH:
+                return value
+            found = {names.get(key, key): other(item, depth + 1) for key, item in inside.items()}
+            return list(found.values()) if _is_list(value) else found
+
+        return Content(other(self.root, 0), self._arrays)
+
 
 def _is_list(value: Any) -> bool:
     return isinstance(value, (list, tuple))
@@ -119,11 +140,15 @@ def open_content(path: Path, *, error: type[RefuError]) -> Content:
         try:
             if magic == _NPY:
                 return _npy(file, file.size)
-            is_packed = magic[:1] == b"x" or magic.startswith(_GZIP)
+            unpacker = next((made for start, made in _UNPACKERS.items() if magic.startswith(start)), None)
             # All at once: the machine reads byte by byte, which takes three times as long from a file.
-            data = _unpacked(file, is_gzip=magic.startswith(_GZIP)) if is_packed else io.BytesIO(file.read())
-            return Content(Machine(is_model=False).run(data))
-        except (*DAMAGE, *ARCHIVE_DAMAGE) as cause:
+            data = io.BytesIO(file.read() if unpacker is None else _unpacked(file.read(), unpacker()))
+            root = Machine(is_model=False).run(data)
+            if type(root) is int and root == MAGIC:
+                root, storage = read_stream(data)
+                return Content(root, PickledArrays(storage))
+            return Content(root)
+        except (*DAMAGE, *ARCHIVE_DAMAGE, lzma.LZMAError) as cause:
             is_other = path.suffix and path.suffix.lower() not in SUFFIXES
             why = f"no file of motion is a {path.suffix}" if is_other else str(cause) or type(cause).__name__
             msg = f"{path}: can't be read: {why}; wanted {WANTED}"
@@ -132,13 +157,13 @@ def open_content(path: Path, *, error: type[RefuError]) -> Content:
 
 def _npz(path: Path, names: list[str], error: type[RefuError]) -> Content:
     wanted = {name for name in names if _steps(name)[-1] in ALL_KEYS}
-    if not any(_steps(name)[-1] in POSE_KEYS for name in names):  # a dictionary that NumPy has pickled into an array
-        for name in names:
+    if not any(_steps(name)[-1] in POSE_KEYS for name in names):
+        for name in names:  # a dictionary that NumPy has pickled into an array
             held = _object(path, name)
             if held is not None:
                 return Content({**read_npz(path, keys=wanted, error=error, wanted=WANTED), name: held})
-    known = {key for keys in UNREAD.values() for key in keys}
-    root: dict[Key, Any] = {key: None for key in names if key in known or not wanted}
+        wanted |= {name for name in names if is_like_known(_steps(name)[-1])}
+    root: dict[Key, Any] = dict.fromkeys(name for name in names if name not in wanted)
     for name, array in read_npz(path, keys=wanted, error=error, wanted=WANTED).items():
         node = root
         *above, last = _steps(name)
@@ -180,17 +205,12 @@ def _npy(file: BinaryIO, size: int) -> Content:
     return Content(npy.read_array(file, allow_pickle=False))
 
 
-def _unpacked(file: BinaryIO, *, is_gzip: bool) -> BinaryIO:
+def _unpacked(packed: bytes, unpacker: Any) -> bytes:
     """Raises `ValueError` for more than a pickle may have."""
-    unpacker, unpacked = zlib.decompressobj(wbits=31 if is_gzip else 15), io.BytesIO()
-    packed = file.read(_STEP)
-    while packed and not unpacker.eof and unpacked.tell() <= _MOST_HELD:
-        unpacked.write(unpacker.decompress(packed, _STEP))
-        packed = unpacker.unconsumed_tail or file.read(_STEP)
-    if not unpacker.eof:
+    unpacked: bytes = unpacker.decompress(packed, _MOST_HELD + 1)
+    if not unpacker.eof or len(unpacked) > _MOST_HELD:
         msg = f"unpacks to more than {_MOST_HELD >> 20} MiB, or was cut short"
         raise ValueError(msg)
-    unpacked.seek(0)
     return unpacked
 
 

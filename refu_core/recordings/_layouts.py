@@ -5,11 +5,17 @@ A file is recognised by the names of its arrays; how each holds its rotations is
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
+from refu_core.recordings._rotations import BODY, WHOLE
+
 SUFFIXES = (".npz", ".npy", ".pkl", ".pickle", ".pk", ".p", ".joblib", ".pt", ".pth", ".smpl", ".bvh")
 """Of files that hold motion."""
+
+
+ROOT_PLACES = ("root_translation", "root_trans", "root_transl")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,18 +26,41 @@ class Layout:
     """Who writes it."""
     pose: tuple[str, ...]
     """Arrays whose joints, one after another, are the pose; the root first where there is one."""
-    transl: tuple[str, ...] = ("trans", "transl", "translation")
+    transl: tuple[str, ...] = ("trans", "transl", "translation", *ROOT_PLACES)
     """Names that the translation may have [m]."""
     betas: tuple[str, ...] = ("betas", "beta", "shape")
     """Names that the shape may have."""
     place: Literal["world", "camera", "screen"] = "world"
     """What the translation means; on a screen its depth is for a focal length that was made up, and it isn't read."""
     is_time_last: bool = False
+    repeats_root: bool = False
+    """Whether the second array has room for the root, too, and is zero there."""
+    is_whole: bool = True
+    """Whether that is the whole pose; beside others there may be a root, or rotations, under unknown names."""
+    holds_places: bool = False
+    """Whether the pose is places of joints, and no rotations."""
+    turns_about_origin: bool = False
+    """Whether the root turns the body about the origin of its mesh, and not about its pelvis."""
+
+    @property
+    def joints(self) -> tuple[tuple[int, ...], ...]:
+        """How many each array may have."""
+        if len(self.pose) == 1:
+            return ((*WHOLE, *BODY),)
+        return (1,), (*BODY, *WHOLE) if self.repeats_root else BODY
 
 
 LAYOUTS: tuple[Layout, ...] = (
     Layout(writers="WHAM, in the world", pose=("pose_world",), transl=("trans_world",)),
     Layout(writers="BEDLAM, in the world", pose=("poses_world",), transl=("trans_world",)),
+    Layout(
+        writers="EasyMocap",
+        pose=("Rh", "poses"),
+        transl=("Th",),
+        betas=("shapes",),
+        repeats_root=True,
+        turns_about_origin=True,
+    ),
     Layout(writers="AMASS, 3DPW, and most others", pose=("poses",)),
     Layout(writers="AMASS's SMPL-X, SLAHMR", pose=("root_orient", "pose_body")),
     Layout(writers="smplx, GVHMR, 4DHumans, HMR 2", pose=("global_orient", "body_pose")),
@@ -47,7 +76,13 @@ LAYOUTS: tuple[Layout, ...] = (
     Layout(writers="HybrIK", pose=("pred_thetas",), transl=("transl",), betas=("pred_betas",), place="camera"),
     Layout(writers="TRAM", pose=("pred_rotmat",), transl=("pred_trans",), betas=("pred_shape",), place="camera"),
     Layout(writers="PHC and other humanoid controllers", pose=("pose_aa",), transl=("trans_orig", "trans")),
-    Layout(writers="Meshcapade", pose=("bodyPose",), transl=("bodyTranslation",), betas=("shapeParameters",)),
+    Layout(
+        writers="Meshcapade",
+        pose=("bodyPose",),
+        transl=("bodyTranslation",),
+        betas=("shapeParameters",),
+        is_whole=False,
+    ),
     Layout(writers="MDM", pose=("thetas",), transl=("root_translation",), is_time_last=True),
     Layout(
         writers="WHAM, VIBE, CLIFF, in the camera",
@@ -56,8 +91,10 @@ LAYOUTS: tuple[Layout, ...] = (
         place="camera",
     ),
     Layout(writers="BEDLAM, in the camera", pose=("poses_cam",), transl=("trans_cam",), place="camera"),
-    Layout(writers="a body without its root", pose=("pose_body",)),
-    Layout(writers="a body without its root", pose=("body_pose",)),
+    Layout(writers="a body without its root", pose=("pose_body",), is_whole=False),
+    Layout(writers="a body without its root", pose=("body_pose",), is_whole=False),
+    Layout(writers="joints alone", pose=("joints",), is_whole=False, holds_places=True),
+    Layout(writers="MDM's samples", pose=("motion",), is_whole=False, is_time_last=True, holds_places=True),
 )
 """In the order of preference, where a file holds several."""
 
@@ -74,17 +111,51 @@ SOMA_NAMES = "joint_names"
 _SOMA = (SOMA_NAMES, "absolute_pose", "unit", "identity_model_type", "identity_coeffs")
 TRACK_IDS = ("track_id", "person_id", "tid", "id")
 
-POSE_KEYS = frozenset(name for layout in LAYOUTS for name in layout.pose)
+POSE_KEYS = frozenset(name for layout in LAYOUTS if layout.is_whole for name in layout.pose)
+"""Of whole poses."""
 ALL_KEYS = frozenset(
     {name for layout in LAYOUTS for names in (layout.pose, layout.transl, layout.betas) for name in names}
     | {*RATES, *GENDERS, *FRAME_NUMBERS, *SCALINGS, *MODELS, *_SOMA, KEYPOINTS, KEYPOINTS_PLACE}
 )
 """Everything that is read; all else in a file, meshes and pictures, is left unread."""
 
+
+def spelled(key: object) -> str:
+    """A name without regard to how its words are put together: `globalOrient` is `global_orient`."""
+    return str(key).replace("_", "").replace("-", "").lower()
+
+
+_SPELLED = {spelled(name): name for name in sorted(ALL_KEYS)}
+
+
+def is_like_known(key: object) -> bool:
+    """Whether a name ends like a known one."""
+    return spelled(key).endswith(tuple(_SPELLED))
+
+
+def names_like(keys: Iterable[str | int]) -> dict[str | int, str]:
+    """Known names for names that are spelled otherwise, or with a word before them; none where there is no pose.
+
+    Trackers write `smpl_body_pose`, `globalOrient` and `Body-Pose`.
+    """
+    by_spelling = {spelled(key): key for key in keys}
+    for layout in LAYOUTS:
+        first, *others = map(spelled, layout.pose)
+        for word in by_spelling:
+            before = word.removesuffix(first)
+            if not word.endswith(first) or not all(before + other in by_spelling for other in others):
+                continue
+            known = {
+                key: _SPELLED.get(word.removeprefix(before), _SPELLED.get(word)) for word, key in by_spelling.items()
+            }
+            known |= {by_spelling[before + spelled(name)]: name for name in layout.pose}
+            return {key: name for key, name in known.items() if name not in (None, key)}
+    return {}
+
+
 UNREAD = {
     "MHR (SAM 3D Body)": ("mhr_model_params", "body_pose_params", "lbs_model_params", "identity_coeffs"),
     "HumanML3D features": ("motion_feats", "new_joint_vecs"),
-    "EasyMocap": ("Rh", "Th"),
     "a body model's": ("J_regressor",),
 }
 """What is recognised and can't be read, by names that give it away."""
@@ -92,7 +163,6 @@ UNREAD_ADVICE = {
     "MHR (SAM 3D Body)": "save pred_keypoints_3d with them, which is read, or convert them with MHR's own tool",
     "HumanML3D features": "fit SMPL to its joints, or give them as keypoints (docs/guide/inputs.md)",
     "a body model's": "it is who wears the garments, and no motion: give it as --body (in Python: body=)",
-    "EasyMocap": "save poses with Rh as their first three columns, and smplx's transl",
 }
 
 WANTED = "a motion: .npz, .npy, .pkl, .pt of an estimator or archive, or .bvh (docs/guide/inputs.md lists them)"

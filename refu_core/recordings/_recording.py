@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from refu_core.errors import RefuError
-from refu_core.frames import N_BETAS, N_JOINTS
+from refu_core.frames import N_JOINTS
 from refu_core.recordings import _layouts as table
 from refu_core.recordings._containers import Content, Key, entries, open_content
 from refu_core.recordings._mhr import POINTS, Track, tracks_of_mhr
@@ -19,13 +19,15 @@ from refu_core.recordings._rate import MAX_FRAMES, check_fps, tell_pace
 from refu_core.recordings._rotations import BODY, WHOLE, rotvecs_of
 from refu_core.recordings._soma import smpl_of_soma
 from refu_core.recordings._tracks import filled, frames_of, tracks_of
-from refu_core.recordings._upright import Axes, to_smpl
+from refu_core.recordings._upright import PELVIS, Axes, to_smpl
+from refu_core.recordings._values import betas_of, fps_of, gender_of, pelvis_of, transl_of, word_of
 
 _BODY_JOINTS = 22  # what SMPL, SMPL-H and SMPL-X share; SMPL's two hand joints have no counterpart in the others
 _WORLD, _CAMERA = ("world", "global"), ("cam", "incam", "camera")
-_GENDERS = {"m": "male", "male": "male", "f": "female", "female": "female", "n": "neutral", "neutral": "neutral"}
-_STEADY = 1e-3  # betas that differ by less between frames are one shape
 _SHOWN = 8
+_ROOTS = ("root", "orient", "globalrot")
+_NO_ROOTS = ("trans", "pos", "loc", "vel")
+"""Parts of what roots are called, and of what else is called so."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,19 +103,23 @@ def _recording(content: Content, *, fps: float | None, axes: Axes, person: str |
     people = tracks_of_mhr(content)
     if people:
         return _of_mhr(content, people, fps=fps, axes=axes, person=person, notes=notes)
-    content = smpl_of_soma(content, notes)
+    content, like = _spelled(smpl_of_soma(content, notes))
+    if like:
+        notes.append(f"taken by like names: {', '.join(f'{key} as {name}' for key, name in like.items())}")
     found, above = _find(content, person, notes)
     layout, node = found.layout, found.node
     arrays = {name: content.array(node[name]) for name in layout.pose}
     if layout.is_time_last:
         arrays = {name: np.moveaxis(array, -1, 0) for name, array in arrays.items()}
+    if layout.holds_places:
+        arrays = {name: _places(array, name) for name, array in arrays.items()}
     n_persons = _persons(arrays)
     which = _chosen([str(i) for i in range(n_persons)], person, [0] * n_persons, notes) if n_persons > 1 else 0
     if n_persons:
         arrays = {name: array[which] for name, array in arrays.items()}
     if _is_of_places(arrays):
         return _of_places(content, above, arrays, fps=fps, axes=axes, notes=notes)
-    poses = _poses(arrays, notes)
+    poses = _poses(arrays, layout, node, notes)
     n = len(poses)
 
     def one(names: Sequence[str]) -> NDArray[Any] | None:
@@ -124,14 +130,20 @@ def _recording(content: Content, *, fps: float | None, axes: Axes, person: str |
         array = np.moveaxis(array, -1, 0) if layout.is_time_last and array.ndim == 2 else array
         return array[which] if n_persons and len(array) == n_persons and array.ndim > 1 else array
 
-    transl = _transl(one(layout.transl), layout, n, notes)
+    transl = transl_of(one(layout.transl), layout, n, notes)
     scaling = one(table.SCALINGS)
     if scaling is not None:
         transl = transl / float(scaling.reshape(-1)[0])
         notes.append(f"translations are divided by {table.SCALINGS[0]}")
-    is_smplx = "x" in _word(content, _first(above, table.MODELS)) or _columns(arrays) in (165, 330, 495)
-    betas = _betas(one(layout.betas), n, notes, is_smplx=is_smplx)
-    rate = fps if fps is not None else _fps(content, above)
+    if layout.turns_about_origin:
+        transl = transl + pelvis_of(poses[:, 0]) - PELVIS
+    is_smplx = (
+        any("smplx" in table.spelled(key) for key in like)
+        or "x" in word_of(content, _first(above, table.MODELS))
+        or _columns(arrays) in (165, 330, 495)
+    )
+    betas = betas_of(one(layout.betas), n, notes, is_smplx=is_smplx)
+    rate = fps if fps is not None else fps_of(content, _first(above, table.RATES))
     frames = one(table.FRAME_NUMBERS)
     if frames is not None:
         poses, transl = filled(poses, transl, frames, notes)
@@ -142,7 +154,7 @@ def _recording(content: Content, *, fps: float | None, axes: Axes, person: str |
         with np.errstate(over="ignore", invalid="ignore"):
             poses[:, 0] = roots
     tell_pace(transl, rate, notes)
-    gender = _gender(_word(content, _first(above, table.GENDERS), which), notes)
+    gender = gender_of(word_of(content, _first(above, table.GENDERS), which), notes)
     with np.errstate(over="ignore", invalid="ignore"):  # becomes inf or NaN, which the frame refuses
         return Recording(poses.astype(np.float32), transl, betas, check_fps(rate), gender, tuple(notes))
 
@@ -157,9 +169,22 @@ def _of_mhr(
     if chosen.stays:
         notes.append(f"no translation ({table.KEYPOINTS_PLACE}): the person stays in one place")
     root = content.root if isinstance(content.root, dict) else {}
-    rate = check_fps(fps if fps is not None else _fps(content, [root]))
+    rate = check_fps(fps if fps is not None else fps_of(content, _first([root], table.RATES)))
     notes.append("MHR, another body than SMPL's: followed by its keypoints")
     return follow(POINTS, chosen.places, fps=rate, axes=axes, usual="y-down", notes=notes)
+
+
+def _places(array: NDArray[Any], name: str) -> NDArray[Any]:
+    """Places of joints (T, n, 3), or of several persons (N, T, n, 3)."""
+    if array.ndim == 4:  # the time was last: it is first now, and persons are second
+        array = array.swapaxes(0, 1)
+    if array.ndim == 2 and array.shape[1] % 3 == 0:
+        array = array.reshape(len(array), -1, 3)
+    shown = array[0] if array.ndim == 4 and len(array) else array
+    if not _is_of_places({name: shown}):
+        msg = f"{name} {array.shape}: no places of SMPL's joints, (T, n, 3) with n = 22 or 24, between which are bones"
+        raise ValueError(msg)
+    return array
 
 
 def _is_of_places(arrays: Mapping[str, NDArray[Any]]) -> bool:
@@ -184,7 +209,7 @@ def _of_places(
     from refu_core.recordings._followed import SMPL_POINTS, follow, metres_of
 
     ((name, array),) = arrays.items()
-    rate = check_fps(fps if fps is not None else _fps(content, above))
+    rate = check_fps(fps if fps is not None else fps_of(content, _first(above, table.RATES)))
     places = array[:, : len(SMPL_POINTS)].astype(np.float64)
     notes.append(f"{name} {array.shape} holds places of joints and no rotations: SMPL's skeleton is fitted to them")
     places = metres_of(SMPL_POINTS, places[0], notes) * places
@@ -226,9 +251,21 @@ def _find(content: Content, person: str | None, notes: list[str]) -> tuple[_Foun
     if is_both or (best[0] == 0 and others):
         notes.append("the file has the motion in a camera, too: the one in the world is taken")
     names = [_person(found.path) for found in same]
-    lengths = [len(content.array(found.node[found.layout.pose[0]])) for found in same]
-    found = same[_chosen(names, person, lengths, notes) if len(same) > 1 else 0]
+    lengths = [content.array(found.node[found.layout.pose[0]]).shape[:1] for found in same]
+    found = same[_chosen(names, person, [sum(length) for length in lengths], notes) if len(same) > 1 else 0]
     return found, [nodes[found.path[:i]] for i in range(len(found.path), -1, -1) if found.path[:i] in nodes] + [whole]
+
+
+def _spelled(content: Content) -> tuple[Content, Mapping[Key, str]]:
+    """With known names, and which they are, where a pose's are spelled otherwise or have a word before them."""
+    names = None
+    for _, node in content.nodes():
+        exact = [one for one in table.LAYOUTS if all(node.get(name) is not None for name in one.pose)]
+        if any(one.is_whole for one in exact):
+            return content, {}
+        known = table.names_like([key for key, value in node.items() if value is not None])
+        names = names or known
+    return (content.renamed(names), names) if names else (content, {})
 
 
 def _layout(name: str) -> table.Layout:
@@ -254,6 +291,7 @@ def _persons(arrays: Mapping[str, NDArray[Any]]) -> int:
     """How many persons the first axis counts (SLAHMR), 0 where there is no such axis."""
     ways = [3 * n for n in (*WHOLE, *BODY)]
     batched = [array for array in arrays.values() if array.ndim == 3 and array.shape[2] in ways and array.shape[1] > 1]
+    batched += [array for array in arrays.values() if array.ndim == 4 and array.shape[3] == 3 and array.shape[2] > 3]
     return len(batched[0]) if batched else 0
 
 
@@ -291,18 +329,34 @@ def _columns(arrays: Mapping[str, NDArray[Any]]) -> int:
     return sum(int(np.prod(array.shape[1:])) for array in arrays.values())
 
 
-def _poses(arrays: Mapping[str, NDArray[Any]], notes: list[str]) -> NDArray[np.float64]:
+def _poses(
+    arrays: Mapping[str, NDArray[Any]], layout: table.Layout, node: Mapping[Key, Any], notes: list[str]
+) -> NDArray[np.float64]:
     """SMPL's 24 joints of any layout."""
     names, given = list(arrays), list(arrays.values())
     if len(given) == 2:
         root, _ = rotvecs_of(given[0], names[0], (1,), notes, has_root=True)
-        body, n = rotvecs_of(given[1], names[1], BODY, notes, has_root=False)
+        body, n = rotvecs_of(given[1], names[1], layout.joints[1], notes, has_root=False)
+        if n in WHOLE:
+            if body[:, 0].any():
+                msg = f"{names[1]} has a root of its own beside {names[0]}; wanted zeros there, or no {names[0]}"
+                raise ValueError(msg)
+            body, n = body[:, 1:], n - 1
         if len(root) != len(body):
             msg = f"{names[0]} has {len(root)} frames, {names[1]} {len(body)}; wanted as many"
             raise ValueError(msg)
     else:
         whole, n = rotvecs_of(given[0], names[0], (*WHOLE, *BODY), notes, has_root=True)
         if n in BODY:
+            words = {key: table.spelled(key) for key in node}
+            others = [
+                key
+                for key, word in words.items()
+                if any(part in word for part in _ROOTS) and not any(part in word for part in _NO_ROOTS)
+            ]
+            if others:
+                msg = f"{names[0]} has no root, and {others[0]} may be it: save it as root_orient with pose_body"
+                raise ValueError(msg)
             notes.append(f"{names[0]} has no root: the person stands upright and looks along z")
             root, body = np.zeros((len(whole), 1, 3)), whole
         else:
@@ -314,75 +368,3 @@ def _poses(arrays: Mapping[str, NDArray[Any]], notes: list[str]) -> NDArray[np.f
     poses = np.zeros((len(body), N_JOINTS, 3))
     poses[:, :1], poses[:, 1 : 1 + kept] = root, body[:, :kept]
     return poses
-
-
-def _transl(array: NDArray[Any] | None, layout: table.Layout, n: int, notes: list[str]) -> NDArray[np.float64]:
-    if array is None:
-        notes.append(f"no translation ({' or '.join(layout.transl)}): the person stays in one place")
-        return np.zeros((n, 3))
-    if array.dtype.kind not in "iuf":
-        msg = f"{' or '.join(layout.transl)} must be numbers, got {array.dtype} {array.shape}"
-        raise ValueError(msg)
-    if array.shape not in ((n, 3), (n, 1, 3), (1, n, 3)) and (n, *array.shape) != (1, 3):
-        msg = f"{' or '.join(layout.transl)} must be ({n}, 3) like the pose, got {array.shape}"
-        raise ValueError(msg)
-    return array.reshape(n, 3).astype(np.float64)
-
-
-def _betas(array: NDArray[Any] | None, n: int, notes: list[str], *, is_smplx: bool) -> NDArray[np.float32]:
-    """The first 10 coefficients; the mean shape's zeros where there are fewer. A person has one shape: the median."""
-    betas = np.zeros(N_BETAS, np.float32)
-    if array is None:
-        notes.append("no betas: the mean shape")
-        return betas
-    if array.dtype.kind not in "iuf" or array.ndim > 3 or (array.ndim > 1 and len(array) not in (1, n)):
-        msg = f"betas must be one row of coefficients, or a row for each of {n} frames, got {array.dtype} {array.shape}"
-        raise ValueError(msg)
-    rows = np.atleast_1d(array).astype(np.float64)
-    rows = rows.reshape(-1, rows.shape[-1])[:, :N_BETAS]
-    if len(rows) > 1:
-        spread = float(np.ptp(rows, axis=0).max(initial=0.0))
-        if spread > _STEADY:
-            notes.append(f"betas differ by up to {spread:.2g} between frames: a person has one shape, the median")
-    with np.errstate(over="ignore"):
-        betas[: rows.shape[1]] = np.median(rows, axis=0) if len(rows) else 0.0
-    if not np.isfinite(betas).all():
-        msg = "betas has values that are NaN or infinite, or too large for float32"
-        raise ValueError(msg)
-    if is_smplx and betas.any():
-        notes.append("betas are SMPL-X's: another shape space than SMPL's")
-    return betas
-
-
-def _fps(content: Content, above: Sequence[Mapping[Key, Any]]) -> float:
-    value = _first(above, table.RATES)
-    if value is None:
-        msg = "no frame rate in the file: say it, as in --fps 30 (in Python: fps=30)"
-        raise ValueError(msg)
-    if type(value) in (int, float):
-        return float(value)
-    array = np.asarray(value) if isinstance(value, str) else content.array(value)
-    if array.size != 1 or array.dtype.kind not in "iuf":
-        msg = f"no frame rate: {table.RATES[0]} must be one number, got {array.dtype} {array.shape}"
-        raise ValueError(msg)
-    return float(array.item())
-
-
-def _word(content: Content, value: Any, which: int = 0) -> str:
-    """A word of text in any of its disguises."""
-    if isinstance(value, (list, tuple)) and value:
-        value = value[min(which, len(value) - 1)]
-    if value is not None and not isinstance(value, (str, bytes)):
-        try:
-            found = content.array(value).reshape(-1)[:1].tolist()
-        except ValueError:
-            found = []
-        value = found[0] if found else ""
-    word = value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value or "")
-    return word.strip().removeprefix("b'").removesuffix("'").lower()
-
-
-def _gender(word: str, notes: list[str]) -> str:
-    if word and word not in _GENDERS:
-        notes.append(f"the gender {word[:20]!r} isn't known: neutral")
-    return _GENDERS.get(word, "neutral")

@@ -13,7 +13,7 @@ from refu_core.recordings import _layouts as table
 from refu_core.recordings._containers import Content, Key, entries
 from refu_core.recordings._people import name_of, sequences, who_is_who
 from refu_core.recordings._rate import MAX_FRAMES
-from refu_core.recordings._rotations import BODY, WHOLE, is_one_frame
+from refu_core.recordings._rotations import is_one_frame
 
 _IMAGES = (".jpg", ".jpeg", ".png", ".bmp", ".webp")
 _ARRAYS = ("global_orient", "body_pose", "betas")
@@ -130,12 +130,11 @@ def _layout_of(content: Content, node: Mapping[Key, Any]) -> table.Layout | None
     for layout in table.LAYOUTS:
         if layout.is_time_last or not all(node.get(name) is not None for name in layout.pose):
             continue
-        counts = ((1,), BODY) if len(layout.pose) == 2 else ((*WHOLE, *BODY),)
         try:
             shapes = [content.array(node[name]).shape for name in layout.pose]
         except ValueError:
             continue
-        if all(map(is_one_frame, shapes, counts)):
+        if all(map(is_one_frame, shapes, layout.joints)):
             return layout
     return None
 

@@ -26,7 +26,7 @@ from refu_core.fitting import (
     standing_pose,
 )
 from refu_core.fitting._clean import clean, components, split_long_edges
-from refu_core.fitting._fit import unsewn
+from refu_core.fitting._pieces import unsewn
 from refu_core.fitting._place import find_places
 from refu_core.garments import UvMap, save_garment
 from refu_core.mesh import Connectivity

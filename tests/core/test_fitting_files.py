@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from outside_meshes import Wanted, cloth, quads_of_a_skirt
+from outside_meshes import Wanted, cloth, placed, quads_of_a_skirt, together
+from scipy.spatial.transform import Rotation
 
 from refu_core import GarmentError, load_body
 from refu_core.fitting import Placing, SurfaceMesh, fit_garment, read_surface
@@ -106,3 +107,31 @@ def test_names_and_bodies_that_garments_cannot_have() -> None:
         GarmentError, match="cut for one of male, female, neutral, got the body SMPL_NEUTRAL: add it for"
     ):
         fit_garment(mesh, own, name="skirt")
+
+
+@pytest.mark.parametrize(
+    ("askew", "axis", "front"), [(30, "y", "+z"), (-20, "z", "-y"), (200, "y", "-z"), (65, "y", "+x")]
+)
+def test_a_garment_that_stands_askew_is_put_straight(askew: float, axis: str, front: str) -> None:
+    """As a scanner leaves it: it was made a fifth larger until it went round the body as it stood."""
+    wanted = replace(TSHIRT, turn=(axis, 100))
+    v, f = cloth(wanted)
+    turn = Rotation.from_euler("y", askew, degrees=True)
+    place = next(find_places(SurfaceMesh(placed(turn.apply(v), wanted), f), load_body("neutral"), Placing()))
+    assert place.unit == pytest.approx(0.01)
+    assert place.turn[1] @ np.eye(3)["xyz".index(axis)] == pytest.approx(1)
+    assert any(f"{axis} is up and" in note and f"° off {front} is in front" in note for note in place.notes)
+    moved = place(placed(turn.apply(v), wanted))
+    assert np.abs(moved - v - place.shift).max() < 0.03  # as it was before it was turned
+
+
+def test_clothes_worn_together_are_said() -> None:
+    top, shorts = (
+        cloth(Wanted(low=1.12, high=1.30, step=0.03)),
+        cloth(Wanted(low=0.72, high=0.97, legs=True, step=0.03)),
+    )
+    v, f = together([top, shorts])
+    notes = fit_garment(SurfaceMesh(v, f), load_body("neutral"), name="set", longest_edge=0.1).notes
+    assert "2 parts of it are one above the other and touch nowhere: add each as a garment of its own" in notes
+    notes = fit_garment(SurfaceMesh(*shorts), load_body("neutral"), name="shorts", longest_edge=0.1).notes
+    assert not any("touch nowhere" in note for note in notes)

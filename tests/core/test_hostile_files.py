@@ -209,10 +209,12 @@ ARCHIVES: dict[str, dict[str, Any]] = {
     "parts": {"poses": npy(np.zeros(3, [("a", "f8"), ("b", "O")]))},
     "long doubles": {"poses": npy(np.zeros((3, 72), np.longdouble))},
     "dates": {"poses": npy(np.zeros((3, 72), "M8[s]"))},
+    "one number": {"poses": npy(1.0), "mocap_framerate": npy(30.0)},
+    "a root of one number": {"Rh": npy(1.0), "poses": npy(POSES), "mocap_framerate": npy(30.0)},
     "no rate": {"poses": npy(POSES), "rate": npy(RATE)},
     "a rate near zero": {"poses": npy(POSES), "mocap_framerate": npy(1e-300)},
     "a rate that isn't a number": {"poses": npy(POSES), "mocap_framerate": npy(np.nan)},
-    "a rate in words": {"poses": npy(POSES), "mocap_framerate": npy("30")},
+    "a rate in words": {"poses": npy(POSES), "mocap_framerate": npy("thirty")},
     "a rate of truth": {"poses": npy(POSES), "mocap_framerate": npy(True)},
 }
 

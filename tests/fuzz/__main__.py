@@ -146,6 +146,7 @@ def _fuzz(name: str, seconds: float, seed: int, folder: Path, output: Path) -> i
         max_examples=_BATCH,
         suppress_health_check=list(HealthCheck),
         database=None,
+        deadline=None,  # the contract has limits of its own
         phases=[Phase.generate],
         verbosity=Verbosity.quiet,
     )

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import bz2
+import io
 import json
+import lzma
 import pickle
 import struct
 import zlib
@@ -190,7 +193,7 @@ def _claiming(array: NDArray[Any]) -> bytes:
 
 
 def motion_pickles() -> list[bytes]:
-    """Motions as pickles of every protocol: a dictionary a person, a dictionary a frame, packed."""
+    """Motions as pickles of every protocol: a dictionary a person, a dictionary a frame, packed, of tensors."""
     rng = np.random.default_rng(0)
     person = {
         "pose_world": rng.normal(size=(4, 72)),
@@ -201,6 +204,11 @@ def motion_pickles() -> list[bytes]:
     frames = {f"{i}.jpg": {"smpl": [body], "tid": [1], "path": "x"} for i in range(3)}
     found = [pickle.dumps({np.int64(1): person, 2: person}, protocol) for protocol in range(6)]
     found.append(pickle.dumps(frames, 4))
+    tensors = {"smpl_global_orient": torch.zeros(3, 3), "smplBodyPose": torch.zeros(3, 69), "Th": torch.zeros(3)}
+    stream = io.BytesIO()
+    torch.save(tensors, stream, _use_new_zipfile_serialization=False)
+    found += [pickle.dumps(tensors, 4), stream.getvalue(), bz2.compress(found[2]), lzma.compress(found[2])]
+    found.append(pickle.dumps({"Rh": np.zeros((3, 3)), "poses": np.zeros((3, 72)), "joints": np.zeros((3, 22, 3))}, 4))
     return [*found, *(data[:-1] + gadget + b"." for data in found[2:3] for gadget in GADGETS), zlib.compress(found[2])]
 
 

@@ -1,0 +1,106 @@
+"""Pieces of a mesh that aren't one garment: its wearer, panels that nobody has sewn, clothes worn together."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from refu_core.body import JOINT_NAMES
+from refu_core.errors import GarmentError
+from refu_core.fitting._clean import components, face_normals, rim_of
+from refu_core.fitting._mesh_file import SurfaceMesh
+from refu_core.fitting._posed import PosedBody
+from refu_core.frames import N_JOINTS
+
+F64 = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+_ENDS = tuple(JOINT_NAMES.index(name) for name in ("head", "left_hand", "right_hand", "left_foot", "right_foot"))
+_ON_SKIN = 0.02
+"""Half of a body lies nearer than this to another one's skin [m]; of an overall with hood and gloves it doesn't."""
+_SEAM = 0.01
+"""Rims of two pieces that are nearer to each other than this were meant to be sewn [m]: panels are laid out so."""
+_SHARE = 0.1
+"""Of a piece's rim that has to be so near to another one's."""
+_LARGE = 0.05
+"""Share of a mesh's area that a garment of several has at least."""
+_BETWEEN = 0.02
+"""So far apart [m] along the body there are two garments."""
+
+
+def without_bodies(mesh: SurfaceMesh, posed: PosedBody) -> tuple[SurfaceMesh, list[str]]:
+    """The mesh on a body, without pieces that are bodies themselves, and a note of each.
+
+    Characters come in one file with their clothes. A piece is a body if it has a head, hands and feet and lies on the
+    skin.
+
+    Raises:
+        GarmentError: nothing else is left.
+    """
+    n_pieces, label = components(mesh.faces, len(mesh.vertices))
+    joint = posed.body.weights.argmax(1).numpy()[posed.body.faces[:, 0].numpy()]
+    has = np.zeros((n_pieces, N_JOINTS), np.bool_)
+    has[label, joint[posed.closest(mesh.vertices)[0]]] = True
+    is_body = np.all(has[:, _ENDS], axis=1)
+    for piece in np.flatnonzero(is_body):
+        is_body[piece] = np.median(np.abs(posed(mesh.vertices[label == piece])[0])) < _ON_SKIN
+    if not is_body.any():
+        return mesh, []
+    kept = ~is_body[label[mesh.faces[:, 0]]]
+    if not kept.any():
+        msg = "it is a body with head, hands and feet, and no garment: wanted clothes (--body says who wears them)"
+        raise GarmentError(msg)
+    used, local = np.unique(mesh.faces[kept], return_inverse=True)
+    uv = None if mesh.uv is None else replace(mesh.uv, faces=mesh.uv.faces[kept])
+    note = "a piece with head, hands and feet was taken for the wearer's body and left out"
+    return SurfaceMesh(mesh.vertices[used], local.reshape(-1, 3).astype(np.int64), uv), [note] * int(is_body.sum())
+
+
+def unsewn(mesh: SurfaceMesh) -> list[str]:
+    """A note of pieces whose rims lie along each other, for a mesh in metres."""
+    _, label = components(mesh.faces, len(mesh.vertices))
+    rim = rim_of(mesh.faces)
+    label = label[rim]
+    gap = _gaps(mesh.vertices[rim], label)
+    near = np.bincount(label, weights=gap < _SEAM)
+    is_along = near > _SHARE * np.bincount(label)
+    n_along = int(is_along.sum())
+    if not n_along:
+        return []
+    what = f"{n_along} pieces lie along each other" if n_along > 1 else "a piece lies along another"
+    sewn = "and aren't sewn" if n_along > 1 else "and isn't sewn to it"
+    apart = 1e3 * float(np.median(gap[is_along[label] & (gap < _SEAM)]))
+    return [f"{what}, {apart:.1f} mm apart, {sewn}: weld their seams, or simulated cloth comes apart there"]
+
+
+def _gaps(points: F64, label: Ints) -> F64:
+    """How far each point is from the next one of another label [m], infinity where that is `_SEAM` or more."""
+    tree, labels = cKDTree(points), np.append(label, -1)
+    gap, left, k = np.full(len(points), np.inf), np.arange(len(points)), 4
+    while len(left):  # of those that have seen none but their own within reach
+        distance, other = tree.query(points[left], k=k, distance_upper_bound=_SEAM)
+        is_there = np.isfinite(distance)
+        of_others = is_there & (labels[other] != label[left, None])
+        gap[left] = np.where(of_others, distance, np.inf).min(axis=1)
+        left, k = left[is_there[:, -1] & ~of_others.any(axis=1)], 4 * k
+    return gap
+
+
+def apart(mesh: SurfaceMesh) -> list[str]:
+    """A note of clothes one above the other that touch nowhere, for a mesh in metres, y up: a top and shorts, say."""
+    n_pieces, label = components(mesh.faces, len(mesh.vertices))
+    low, high = np.full(n_pieces, np.inf), np.full(n_pieces, -np.inf)
+    np.minimum.at(low, label, mesh.vertices[:, 1])
+    np.maximum.at(high, label, mesh.vertices[:, 1])
+    area = np.linalg.norm(face_normals(mesh.vertices, mesh.faces), axis=1)
+    share = np.bincount(label[mesh.faces[:, 0]], area, n_pieces) / area.sum()
+    large = np.flatnonzero(share > _LARGE)
+    large = large[np.argsort(low[large])]
+    gaps = low[large[1:]] - np.maximum.accumulate(high[large])[:-1]
+    n = 1 + int((gaps > _BETWEEN).sum())
+    if n == 1:
+        return []
+    return [f"{n} parts of it are one above the other and touch nowhere: add each as a garment of its own"]

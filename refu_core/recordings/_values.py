@@ -1,0 +1,108 @@
+"""What the arrays beside a pose mean: a place, a shape, a frame rate, words."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from refu_core.frames import N_BETAS
+from refu_core.recordings import _layouts as table
+from refu_core.recordings._containers import Content
+from refu_core.recordings._upright import PELVIS
+
+_GENDERS = {"m": "male", "male": "male", "f": "female", "female": "female", "n": "neutral", "neutral": "neutral"}
+_STEADY = 1e-3  # betas that differ by less between frames are one shape
+
+
+def pelvis_of(roots: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Where roots (T, 3) [rad] turn the pelvis to about the mesh's origin [m], shape (T, 3)."""
+    turned = np.full(roots.shape, np.nan)
+    sound = np.isfinite(roots).all(axis=1)
+    turned[sound] = Rotation.from_rotvec(roots[sound]).apply(PELVIS)
+    return turned
+
+
+def transl_of(array: NDArray[Any] | None, layout: table.Layout, n: int, notes: list[str]) -> NDArray[np.float64]:
+    """A translation for each frame [m], shape (n, 3); zeros for none. Raises `ValueError` for another shape."""
+    names = " or ".join(name for name in layout.transl if name not in table.ROOT_PLACES)
+    if array is None:
+        notes.append(f"no translation ({names}): the person stays in one place")
+        return np.zeros((n, 3))
+    if array.dtype.kind not in "iuf":
+        msg = f"{names} must be numbers, got {array.dtype} {array.shape}"
+        raise ValueError(msg)
+    if array.shape not in ((n, 3), (n, 1, 3), (1, n, 3)) and (n, *array.shape) != (1, 3):
+        msg = f"{names} must be ({n}, 3) like the pose, got {array.shape}"
+        raise ValueError(msg)
+    return array.reshape(n, 3).astype(np.float64)
+
+
+def betas_of(array: NDArray[Any] | None, n: int, notes: list[str], *, is_smplx: bool) -> NDArray[np.float32]:
+    """The first 10 coefficients; the mean shape's zeros where there are fewer. A person has one shape: the median.
+
+    Raises `ValueError` for another shape, and for what isn't finite.
+    """
+    betas = np.zeros(N_BETAS, np.float32)
+    if array is None:
+        notes.append("no betas: the mean shape")
+        return betas
+    if array.dtype.kind not in "iuf" or array.ndim > 3 or (array.ndim > 1 and len(array) not in (1, n)):
+        msg = f"betas must be one row of coefficients, or a row for each of {n} frames, got {array.dtype} {array.shape}"
+        raise ValueError(msg)
+    rows = np.atleast_1d(array).astype(np.float64)
+    rows = rows.reshape(-1, rows.shape[-1])[:, :N_BETAS]
+    if len(rows) > 1:
+        spread = float(np.ptp(rows, axis=0).max(initial=0.0))
+        if spread > _STEADY:
+            notes.append(f"betas differ by up to {spread:.2g} between frames: a person has one shape, the median")
+    with np.errstate(over="ignore"):
+        betas[: rows.shape[1]] = np.median(rows, axis=0) if len(rows) else 0.0
+    if not np.isfinite(betas).all():
+        msg = "betas has values that are NaN or infinite, or too large for float32"
+        raise ValueError(msg)
+    if is_smplx and betas.any():
+        notes.append("betas are SMPL-X's: another shape space than SMPL's")
+    return betas
+
+
+def fps_of(content: Content, value: Any) -> float:
+    """Frames a second. Raises `ValueError` for none."""
+    if value is None:
+        msg = "no frame rate in the file: say it, as in --fps 30 (in Python: fps=30)"
+        raise ValueError(msg)
+    if type(value) in (int, float):
+        return float(value)
+    array = np.asarray(value) if isinstance(value, str) else content.array(value)
+    try:
+        if array.size == 1 and array.dtype.kind in "iuf":
+            return float(array.item())
+        if array.size == 1 and array.dtype.kind in "US":
+            return float(word_of(content, array))
+    except ValueError:
+        pass
+    msg = f"no frame rate: {table.RATES[0]} must be one number, got {array.dtype} {array.shape}"
+    raise ValueError(msg)
+
+
+def word_of(content: Content, value: Any, which: int = 0) -> str:
+    """A word of text in any of its disguises."""
+    if isinstance(value, (list, tuple)) and value:
+        value = value[min(which, len(value) - 1)]
+    if value is not None and not isinstance(value, (str, bytes)):
+        try:
+            found = content.array(value).reshape(-1)[:1].tolist()
+        except ValueError:
+            found = []
+        value = found[0] if found else ""
+    word = value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value or "")
+    return word.strip().removeprefix("b'").removesuffix("'").lower()
+
+
+def gender_of(word: str, notes: list[str]) -> str:
+    """`male`, `female` or `neutral`, which an unknown word is, too."""
+    if word and word not in _GENDERS:
+        notes.append(f"the gender {word[:20]!r} isn't known: neutral")
+    return _GENDERS.get(word, "neutral")

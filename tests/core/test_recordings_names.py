@@ -1,0 +1,134 @@
+"""Files of motion whose arrays have other names, whose root is apart, or whose numbers are packed in another way."""
+
+from __future__ import annotations
+
+import bz2
+import lzma
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from test_recordings import POSES, TRANSL, T, same
+
+from msg_adapters import MotionFileError, read_motion
+from refu_core import load_body
+
+BETAS = np.linspace(-1, 1, 10)
+
+
+@pytest.mark.parametrize("form", ["npz", "pickle"])
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("smpl_global_orient", "smpl_body_pose", "smpl_transl", "smpl_betas"),
+        ("globalOrient", "bodyPose", "transl", "Betas"),
+        ("Root_Orient", "Pose_Body", "Trans", "betas"),
+        ("gt_root_orient", "gt_pose_body", "gt_root_transl", "gt_shape"),
+    ],
+)
+def test_names_that_are_spelled_otherwise(form: str, names: tuple[str, str, str, str], tmp_path: Path) -> None:
+    values = (POSES[:, 0], POSES[:, 1:].reshape(T, 69), TRANSL, BETAS)
+    content: dict[str, Any] = {**dict(zip(names, values, strict=True)), "joints": np.zeros((T, 24, 3)), "fps": 25.0}
+    if form == "npz":
+        np.savez(tmp_path / "a", **content)
+    else:
+        (tmp_path / "a.npz").write_bytes(pickle.dumps({"results": content}))
+        (tmp_path / "a.npz").rename(tmp_path / "a.pkl")
+    motion = read_motion(tmp_path / ("a.npz" if form == "npz" else "a.pkl"))
+    same(motion)
+    np.testing.assert_allclose(motion.transl, TRANSL)
+    np.testing.assert_allclose(motion.betas, BETAS, atol=1e-6)
+    assert motion.fps == 25
+    assert any(note.startswith("taken by like names: ") and names[0] in note for note in motion.notes)
+
+
+def test_a_root_that_may_be_one_is_not_left_out(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a", pose_body=POSES[:, 1:22], root_rot=POSES[:, 0], fps=30)
+    with pytest.raises(MotionFileError, match="pose_body has no root, and root_rot may be it: save it as root_orient"):
+        read_motion(tmp_path / "a.npz")
+
+
+def test_an_error_names_what_the_file_has(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a", rotations=POSES, root_positions=TRANSL, fps=30)
+    with pytest.raises(MotionFileError, match="the file has rotations, root_positions, fps"):
+        read_motion(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("n_joints", [23, 24])
+def test_easymocap_turns_people_about_the_origin(n_joints: int, tmp_path: Path) -> None:
+    """Its vertices are those of a body without a root, turned by Rh and moved by Th."""
+    poses = POSES.copy()
+    poses[:, 0] = 0
+    file = {"Rh": POSES[:, 0], "Th": TRANSL, "poses": poses[:, 24 - n_joints :].reshape(T, -1), "shapes": BETAS[None]}
+    np.savez(tmp_path / "a", **file)
+    motion = read_motion(tmp_path / "a.npz", fps=30)
+    same(motion)
+    np.testing.assert_allclose(motion.betas, BETAS, atol=1e-6)
+    body = load_body("neutral")
+    upright = body(poses.astype(np.float32), BETAS[None].astype(np.float32)).vertices.double().numpy()
+    wanted = np.stack([Rotation.from_rotvec(r).apply(v) for r, v in zip(POSES[:, 0], upright, strict=True)])
+    wanted += TRANSL[:, None]
+    got = body(motion.poses, motion.betas[None], motion.transl.astype(np.float32)).vertices.double().numpy()
+    assert np.linalg.norm(got - wanted, axis=2).max() < 0.01  # the pelvis of any betas is within 5 mm of one place
+
+
+def test_two_roots_are_refused(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a", Rh=POSES[:, 0], Th=TRANSL, poses=POSES.reshape(T, 72), fps=30)
+    with pytest.raises(MotionFileError, match="poses has a root of its own beside Rh; wanted zeros there, or no Rh"):
+        read_motion(tmp_path / "a.npz")
+
+
+def tensors() -> dict[str, Any]:
+    whole = torch.tensor(POSES.reshape(T, 72))
+    body = {"global_orient": whole[:, :3], "body_pose": whole[:, 3:].float(), "transl": torch.tensor(TRANSL)}
+    return {"smpl": body, "fps": 25}
+
+
+def write_tensors(path: Path, how: str) -> None:
+    content = tensors()
+    match how:
+        case "pickled":
+            path.write_bytes(pickle.dumps(content))
+        case "torch before 1.6":
+            torch.save(content, path, _use_new_zipfile_serialization=False)
+        case "bz2":
+            path.write_bytes(bz2.compress(pickle.dumps(content)))
+        case "xz":
+            path.write_bytes(lzma.compress(pickle.dumps(content)))
+
+
+@pytest.mark.parametrize("how", ["pickled", "torch before 1.6", "bz2", "xz"])
+def test_tensors_by_other_ways(how: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.pkl"
+    write_tensors(path, how)
+    motion = read_motion(path)
+    same(motion)
+    np.testing.assert_allclose(motion.transl, TRANSL)
+    data = path.read_bytes()
+    for cut in range(0, len(data) - 1, max(1, len(data) // 40)):
+        path.write_bytes(data[:cut])
+        with pytest.raises(MotionFileError):
+            read_motion(path)
+
+
+def test_places_under_a_name(tmp_path: Path) -> None:
+    joints = load_body("male")(POSES.astype(np.float32), transl=TRANSL.astype(np.float32)).joints.double().numpy()
+    np.savez(tmp_path / "a", joints=100 * joints, fps=30)
+    assert "taken as centimetres" in "; ".join(read_motion(tmp_path / "a.npz").notes)
+    np.savez(tmp_path / "a", joints=np.random.default_rng(0).normal(size=joints.shape), fps=30)
+    with pytest.raises(MotionFileError, match=r"joints .* no places of SMPL's joints"):
+        read_motion(tmp_path / "a.npz")
+    samples = np.stack([joints[:, :22], joints[:, :22] + [1, 0, 0]]).transpose(0, 2, 3, 1)  # as MDM leaves them
+    np.save(tmp_path / "results", {"motion": samples, "text": ["walks", "runs"]}, allow_pickle=True)
+    first, second = (read_motion(tmp_path / "results.npy", fps=20, person=person) for person in ("0", "1"))
+    assert len(first) == T
+    np.testing.assert_allclose(second.transl - first.transl, np.tile([1.0, 0, 0], (T, 1)), atol=1e-6)
+
+
+def test_a_rate_that_is_text(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a", poses=POSES, mocap_framerate="29.97")
+    assert read_motion(tmp_path / "a.npz").fps == 29.97
