@@ -29,7 +29,7 @@ CORE = (
     {"refu", "fitting"},
     {"contact"},
     {"realtime"},
-    {"outputs"},
+    {"outputs", "options"},
     {"observation"},
     {"metrics"},
     {"simulation"},

@@ -23,8 +23,9 @@ import msg_adapters as adapters
 from refu_core import GarmentPipeline, RefuError, SmplFrame
 from refu_core.metrics import CollisionChecker
 from refu_lab.cli import main
-from refu_lab.replay import ReplayOptions
-from refu_lab.view import ViewOptions, view
+from refu_lab.commands.replay import RecordingOptions
+from refu_lab.commands.view import ViewOptions
+from refu_lab.view import view
 from refu_lab.view._dressed import DressedFilm, Track
 from refu_lab.view._film import BODY, SKIN, Cache, Shape
 from refu_lab.view._markers import Topology
@@ -64,7 +65,7 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def film(bag: Path) -> DressedFilm:
-    return DressedFilm([bag], ReplayOptions(input=Path(), garments=SHORTS))
+    return DressedFilm([bag], RecordingOptions(input=Path(), garments=SHORTS))
 
 
 def by_name(shapes: Any, person: str = "") -> dict[str, Shape]:
@@ -89,7 +90,7 @@ def test_a_dressed_film_shows_what_the_pipeline_says(film: DressedFilm) -> None:
 def test_a_recorded_film_shows_the_same_as_the_dressed_one(film: DressedFilm, bag: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     assert main(["replay", str(bag), "--output", str(out), "--garments", SHORTS[0], "--no-evaluate", "--quiet"]) == 0
-    recorded = open_film(ViewOptions(inputs=(out,), replay=ReplayOptions(input=Path())))
+    recorded = open_film(ViewOptions(inputs=(out,), dressing=RecordingOptions(input=Path())))
     assert isinstance(recorded, RecordedFilm)
     np.testing.assert_allclose(recorded.times, film.times, atol=1e-9)
     shift = None
@@ -103,7 +104,7 @@ def test_a_recorded_film_shows_the_same_as_the_dressed_one(film: DressedFilm, ba
             assert len(shape.vertices) == len(dressed[name].vertices)
             assert shape.color == pytest.approx(dressed[name].color, abs=0.1)
     recorded.close()
-    again = open_film(ViewOptions(inputs=(out,), replay=ReplayOptions(input=Path(), garments=SHORTS), dress=True))
+    again = open_film(ViewOptions(inputs=(out,), dressing=RecordingOptions(input=Path(), garments=SHORTS), dress=True))
     assert isinstance(again, DressedFilm)
 
 
@@ -112,7 +113,7 @@ def test_people_of_a_bag_are_shown_together_while_they_are_there(tmp_path: Path)
     both = write_bag(
         tmp_path / "two.mcap", {"/anna/smpl_params": motion(14), "/ben/smpl_params": late, "/robot": motion(1)}
     )
-    film = DressedFilm([both], ReplayOptions(input=Path(), garments=SHORTS))
+    film = DressedFilm([both], RecordingOptions(input=Path(), garments=SHORTS))
     assert {shape.person for shape in film.shapes(0)} == {"anna"}
     shapes = film.shapes(10)
     middles = [by_name(shapes, person)[BODY].vertices[:, 1].mean() for person in ("anna", "ben")]
@@ -128,7 +129,7 @@ def test_what_stays_from_frame_to_frame_is_one_array(film: DressedFilm) -> None:
 def test_files_are_a_person_each_and_garments_can_be_changed(bag: Path, tmp_path: Path) -> None:
     clip = tmp_path / "clip.npz"
     np.savez(clip, poses=np.zeros((3, 72)), trans=np.tile([0.0, 1.0, 0.0], (3, 1)), mocap_framerate=10.0)
-    film = DressedFilm([bag, clip, bag], ReplayOptions(input=Path(), garments=SHORTS))
+    film = DressedFilm([bag, clip, bag], RecordingOptions(input=Path(), garments=SHORTS))
     assert {shape.person for shape in film.shapes(0)} == {"knee", "clip", "knee-2"}
     assert {*SHORTS, "tshirt-male"} <= set(film.wardrobe)
     assert "skirt-female" not in film.wardrobe
@@ -364,6 +365,6 @@ def test_an_empty_stage_has_no_colour(chromium: browser.Browser, film: DressedFi
 def test_view_ends_when_it_is_told_to(bag: Path) -> None:
     pytest.importorskip("viser", reason="viser isn't installed (extra view)")
     lines: list[str] = []
-    options = ViewOptions(inputs=(bag,), replay=ReplayOptions(input=Path(), garments=SHORTS), browser=False)
+    options = ViewOptions(inputs=(bag,), dressing=RecordingOptions(input=Path(), garments=SHORTS), browser=False)
     view(options, say=lines.append, until=until(2))
     assert any(re.search(r"http://localhost:\d+", line) for line in lines)
