@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
-import signal
 import socket
-import subprocess
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -265,15 +266,12 @@ def test_the_player_plays_seeks_and_dresses_anew(film: DressedFilm, server: Any)
 # ---- the command -----------------------------------------------------------------------------------------------------
 
 
-def test_without_viser_one_line_says_how_to_get_it(bag: Path, tmp_path: Path) -> None:
-    (tmp_path / "viser.py").write_text("raise ModuleNotFoundError(name='viser')")
-    code = f"import sys; sys.path[:0] = [{str(tmp_path)!r}, {str(ROOT)!r}]; from refu_lab.cli import main; "
-    code += "sys.exit(main())"
-    done = subprocess.run(
-        [sys.executable, "-c", code, "view", str(bag)], capture_output=True, text=True, check=False, cwd=tmp_path
-    )
-    assert done.returncode == 2
-    assert done.stderr.splitlines() == ['refu: error: the viewer needs viser: pip install "refu-ros[view]"']
+def test_without_viser_one_line_says_how_to_get_it(
+    bag: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert main(["view", str(bag)]) == 2
+    assert capsys.readouterr().err == 'refu: error: the viewer needs viser: pip install "refu-ros[view]"\n'
 
 
 def test_a_port_that_is_taken_is_said(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -299,14 +297,12 @@ def test_what_cannot_be_shown_is_said(where: str, tmp_path: Path, capsys: pytest
 # ---- what a browser shows --------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[browser.Browser]:
+def chromium(profile: Path) -> closing[browser.Browser]:
+    """A browser that leaves before the server ends: that would wait six seconds for it."""
     pytest.importorskip("viser", reason="viser isn't installed (extra view)")
     if browser.PROGRAM is None:
         pytest.skip("no Chromium: apt-get install chromium")
-    found = browser.Browser(tmp_path_factory.mktemp("chromium"), size=(640, 420))
-    yield found
-    found.close()
+    return closing(browser.Browser(profile, size=(640, 420)))
 
 
 def coloured(picture: np.ndarray, hue: tuple[float, float]) -> np.ndarray:
@@ -331,35 +327,58 @@ def dressed_in_the_middle(picture: np.ndarray) -> bool:
     return bool(0.15 < row / height < 0.6 and 0.33 < column / width < 0.67)
 
 
-def test_a_browser_shows_somebody_in_a_green_t_shirt(chromium: browser.Browser, tmp_path: Path) -> None:
+def test_a_browser_shows_somebody_in_a_green_t_shirt(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "still.mcap", {"/smpl_params": motion(1)})  # who draws in software is slow enough
-    chromium.open("about:blank")
-    assert not coloured(chromium.picture(), GREEN).any()
-    code = "import sys; from refu_lab.cli import main; sys.exit(main())"
-    command = [sys.executable, "-u", "-c", code, "view", str(bag), "--no-browser", "--garments", "tshirt-male"]
-    viewer = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    try:
-        assert viewer.stdout is not None
-        said = re.search(r"still.mcap: 1 frames at (http://localhost:\d+) ", viewer.stdout.readline())
+    with running(bag, "tshirt-male") as lines, chromium(tmp_path / "profile") as page:
+        assert not coloured(page.picture(), GREEN).any()
+        said = re.search(r"still.mcap: 1 frames at (http://localhost:\d+) ", lines[0])
         assert said is not None
-        chromium.open(said[1])
-        seen = chromium.picture_when(dressed_in_the_middle)  # a mesh may come before the camera has its place
+        page.open(said[1])
+        seen = page.picture_when(dressed_in_the_middle)  # a mesh may come before the camera has its place
         assert dressed_in_the_middle(seen)
-        assert chromium.errors == []
-    finally:
-        viewer.send_signal(signal.SIGINT)
-        out, err = viewer.communicate(timeout=60)
-    assert (viewer.returncode, out, err) == (0, "viewer closed\n", "")
+        assert page.errors == []
 
 
-def test_an_empty_stage_has_no_colour(chromium: browser.Browser, film: DressedFilm, server: Any) -> None:
+def test_an_empty_stage_has_no_colour(film: DressedFilm, server: Any, tmp_path: Path) -> None:
     player = Player(server, film, playing=False)
     player._body.value = "hidden"
     player._stage.draw([], wireframe=False)
-    chromium.open(f"http://localhost:{server.get_port()}")
-    seen = chromium.picture_when(lambda picture: coloured(picture, (200, 220)).sum() > 800)  # the panel's button
+    with chromium(tmp_path / "profile") as page:
+        page.open(f"http://localhost:{server.get_port()}")
+        seen = page.picture_when(lambda picture: coloured(picture, (200, 220)).sum() > 800)  # the panel's button
     assert coloured(seen, (200, 220)).sum() > 800
     assert coloured(seen, GREEN).sum() < 100
+
+
+@contextmanager
+def running(bag: Path, *garments: str) -> Iterator[list[str]]:
+    """A viewer in a thread, from its first line on; what it says."""
+    lines: list[str] = []
+    end = threading.Event()
+    options = ViewOptions(inputs=(bag,), dressing=RecordingOptions(input=Path(), garments=garments), browser=False)
+    how: dict[str, Any] = {"say": lines.append, "until": end.is_set}
+    thread = threading.Thread(target=view, args=(options,), kwargs=how)
+    thread.start()
+    try:
+        while not lines:
+            assert thread.is_alive()
+            time.sleep(0.01)
+        yield lines
+    finally:
+        end.set()
+        thread.join()
+
+
+def test_an_interrupt_closes_the_viewer(bag: Path) -> None:
+    pytest.importorskip("viser", reason="viser isn't installed (extra view)")
+    lines: list[str] = []
+    options = ViewOptions(inputs=(bag,), dressing=RecordingOptions(input=Path(), garments=SHORTS), browser=False)
+
+    def interrupt() -> bool:
+        raise KeyboardInterrupt
+
+    view(options, say=lines.append, until=interrupt)
+    assert lines[1:] == ["viewer closed"]
 
 
 def test_view_ends_when_it_is_told_to(bag: Path) -> None:
