@@ -22,8 +22,9 @@ import numpy as np
 
 import msg_adapters as adapters
 from refu_core import SmplFrame
+from refu_lab.commands.replay import ReplayOptions
 from refu_lab.fleet import FleetOptions, find_recordings, open_engine, replay_fleet
-from refu_lab.replay import ReplayOptions, replay
+from refu_lab.replay import replay
 
 ROOT = Path(__file__).parents[1]
 

@@ -53,6 +53,7 @@ from msg_adapters.markers import encode_points as encode_points
 from msg_adapters.markers import garment_namespace as garment_namespace
 from msg_adapters.markers import vertices_from_points as vertices_from_points
 from msg_adapters.motion import Motion as Motion
+from msg_adapters.motion import load_motion as load_motion
 from msg_adapters.motion import read_motion as read_motion
 from msg_adapters.outputs import COLLISION_OBJECT as COLLISION_OBJECT
 from msg_adapters.outputs import MESH as MESH
@@ -73,7 +74,11 @@ from msg_adapters.outputs import encode_rims as encode_rims
 from msg_adapters.outputs import encode_scene as encode_scene
 from msg_adapters.outputs import points_of as points_of
 from msg_adapters.people import IDS_LIST as IDS_LIST
+from msg_adapters.people import Doubts as Doubts
+from msg_adapters.people import InputStream as InputStream
 from msg_adapters.people import KeypointStream as KeypointStream
+from msg_adapters.people import check_plausible as check_plausible
+from msg_adapters.people import check_stamp as check_stamp
 from msg_adapters.people import decode_ids as decode_ids
 from msg_adapters.rotations import matrix_from_quaternion as matrix_from_quaternion
 from msg_adapters.rotations import quaternion_from_matrix as quaternion_from_matrix

@@ -8,12 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
+from msg_adapters.bags import iter_smpl_frames
 from msg_adapters.cdr import NS_PER_S
-from msg_adapters.errors import MotionFileError
+from msg_adapters.errors import BagError, MotionFileError
 from msg_adapters.joints import SMPL_JOINTS
 from msg_adapters.rotations import quaternion_from_rotvec, quaternion_product, rotvec_from_quaternion, slerp
 from refu_core.frames import N_JOINTS, SmplFrame
-from refu_core.recordings import MAX_FRAMES, Axes, Recording, n_resampled, read_recording
+from refu_core.recordings import MAX_FRAMES, SUFFIXES, Axes, Recording, n_resampled, read_recording
 
 _BLOCK = 10_000  # frames that are resampled at once: a clip of hours would take gigabytes
 
@@ -68,6 +69,12 @@ class Motion(Recording):
         transl = self.transl[before] + fraction[:, None] * (self.transl[after] - self.transl[before])
         return replace(self, poses=poses, transl=transl, fps=float(fps))
 
+    def in_place(self, *, up: int) -> Motion:
+        """The motion with its translations held where the first frame is, but along the axis `up`."""
+        held = np.repeat(self.transl[:1], len(self), axis=0)
+        held[:, up] = self.transl[:, up]
+        return replace(self, transl=held)
+
 
 def read_motion(
     path: str | Path,
@@ -94,6 +101,25 @@ def read_motion(
         msg = f"{path}: {len(recording.poses)} frames, at most {max_frames} are read; cut the clip"
         raise MotionFileError(msg)
     return Motion(**{item.name: getattr(recording, item.name) for item in fields(recording)})
+
+
+def load_motion(path: str, *, axes: Axes = "auto", fps: float = 0.0) -> Motion:
+    """The motion of a file, of a bag (evenly spaced, with the betas of its first frame), or `march` for an empty path.
+
+    A file's axes and rate (0 for its own) are as `read_motion` takes them. Raises `MotionFileError` and `BagError`.
+    """
+    if not path:
+        return march()
+    if Path(path).suffix.lower() in SUFFIXES:
+        return read_motion(path, axes=axes, fps=fps or None)
+    frames = [record.frame for record in iter_smpl_frames(path) if record.frame is not None]
+    if not frames:
+        msg = f"{path}: no frame of its SMPL topic can be decoded; `refu replay {path}` says why"
+        raise BagError(msg)
+    seconds = (frames[-1].stamp_ns - frames[0].stamp_ns) / NS_PER_S
+    fps = (len(frames) - 1) / seconds if seconds > 0 else MARCH_FPS
+    poses, transl = (np.stack(arrays) for arrays in zip(*((f.pose, f.transl) for f in frames), strict=True))
+    return Motion(poses, transl, frames[0].betas, fps)
 
 
 MARCH_FPS = 30.0

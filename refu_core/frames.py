@@ -15,7 +15,7 @@ N_JOINTS = 24
 N_BETAS = 10
 N_STYLES = 4
 # Limits of two levels. A frame holds whatever can be computed with: a study may go beyond all bodies. A stream of
-# messages has no such wish, so a node refuses (`refu_ros._scene.check_plausible`) what is beyond the plausible: no
+# messages has no such wish, so a node refuses (`msg_adapters.check_plausible`) what is beyond the plausible: no
 # sender means it.
 MAX_ANGLE = 1e4
 """Rotation vectors have components up to this [rad]; in float32 larger ones no longer say which way a limb points."""

@@ -7,7 +7,6 @@ from typing import Any
 
 from refu_core import GarmentPipeline
 from refu_core.body import BodyFit
-from refu_core.modes import FOREIGN_BETAS, BetasSource
 
 _GENDERS = {"m": "male", "male": "male", "f": "female", "female": "female", "n": "neutral", "neutral": "neutral"}
 
@@ -41,8 +40,3 @@ def _gender_of(body: str) -> str:
     """Whose body it is by its name, as `SMPL_FEMALE` and `basicModel_f_lbs_10_207_0_v1.0.0` are; empty if unsaid."""
     words = [word for word in re.split(r"[^a-z]+", body.lower()) if word in _GENDERS]
     return _GENDERS[words[0]] if words else ""
-
-
-def betas_warnings(pipeline: GarmentPipeline, *, source: str) -> list[str]:
-    """Whether nothing says what recorded betas are of."""
-    return [FOREIGN_BETAS] if pipeline.fit is None and source == BetasSource.MESSAGE else []

@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from msg_adapters import FrameRecord
     from refu_core import GarmentPipeline, SmplFrame
     from refu_core.realtime import PipelineOutput
-    from refu_lab.replay import GarmentRecord, ReplayOptions
+    from refu_lab.commands.replay import ReplayOptions
+    from refu_lab.replay import GarmentRecord
     from refu_lab.sources import Source
 
 GARMENTS_TOPIC, BODY_TOPIC, DIAGNOSTICS_TOPIC = "/garments", "/body", "/diagnostics"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -17,41 +17,26 @@ from refu_core import RefuError
 from refu_core._device import one_thread
 from refu_core._engine import Engine
 from refu_lab import reproduction as rp
+from refu_lab.commands.evaluate import EvaluateOptions
 from refu_lab.tables import RESULT_TABLES
 
-OUTPUT = Path("docs/results")
 _TIMED = 40
 """Test samples of a garment that times are measured on."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class EvaluateOptions:
-    """What to evaluate; the fields are the options of `refu evaluate`."""
-
-    data: tuple[Path, ...] = ()
-    table: str = "all"
-    weights: tuple[Path, ...] = ()
-    motions: Path | None = None
-    output: Path = OUTPUT
-    cache: Path | None = None
-    every: int = 1
-    motion_every: int = 1
-    collider: bool = True
-    body: str | None = None
-
-    def command(self, table: str) -> str:
-        """The command that makes a table again, with the names of folders alone."""
-        parts = ["refu evaluate", f"--table {table}"]
-        if table == "motion":
-            parts += ["--motions motions/"]
-            parts += [f"--motion-every {self.motion_every}"] if self.motion_every > 1 else []
-        else:
-            parts += [f"--data {' '.join(f'data/{path.resolve().name}' for path in self.data)}"]
-            parts += [f"--every {self.every}"] if self.every > 1 else []
-        parts += [f"--body {Path(self.body).name}"] if self.body is not None else []
-        parts += [] if self.collider else ["--no-collider"]
-        parts += [f"--weights {path.resolve().name}" for path in self.weights]
-        return " ".join(parts)
+def _command(options: EvaluateOptions, table: str) -> str:
+    """The command that makes a table again, with the names of folders alone."""
+    parts = ["refu evaluate", f"--table {table}"]
+    if table == "motion":
+        parts += ["--motions motions/"]
+        parts += [f"--motion-every {options.motion_every}"] if options.motion_every > 1 else []
+    else:
+        parts += [f"--data {' '.join(f'data/{path.resolve().name}' for path in options.data)}"]
+        parts += [f"--every {options.every}"] if options.every > 1 else []
+    parts += [f"--body {Path(options.body).name}"] if options.body is not None else []
+    parts += [] if options.collider else ["--no-collider"]
+    parts += [f"--weights {path.resolve().name}" for path in options.weights]
+    return " ".join(parts)
 
 
 def evaluate(options: EvaluateOptions, *, progress: bool, engine: Engine | None = None) -> list[rp.ResultTable]:
@@ -118,7 +103,7 @@ class _Maker:
                 table.plots += rp.PLOTS[name](self._study, output)
             if name == "comparison":
                 table.plots += rp.picture_garments(self._study, self._posed, output, library=self._library)
-        table.write(output, command=self._options.command(name), n_samples=n_samples)
+        table.write(output, command=_command(self._options, name), n_samples=n_samples)
         return table
 
     @cached_property

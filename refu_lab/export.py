@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from refu_core import GarmentPipeline, PipelineOutput
     from refu_core.garments import UvMap
-    from refu_lab.replay import ReplayOptions
+    from refu_lab.commands.replay import RecordingOptions
 
 FORMATS: tuple[str, ...] = (".glb", ".obj", ".usda", ".usdc", ".usd")
 """Suffixes of what is written."""
@@ -93,7 +93,7 @@ def write_meshes(meshes: Sequence[ExportMesh], path: Path, *, fps: float = 30.0)
 
 
 def export(
-    options: ReplayOptions, path: Path, *, first: int, count: int, with_body: bool
+    options: RecordingOptions, path: Path, *, first: int, count: int, with_body: bool
 ) -> tuple[list[Path], list[str]]:
     """What `refu export` does: some frames of a bag or motion file, dressed, as files.
 
@@ -105,23 +105,20 @@ def export(
     Raises:
         RefuError: as `write_meshes`; options that make no pipeline, an input that can't be read, or no frame.
     """
-    from refu_lab.bodies import betas_warnings, body_warnings
     from refu_lab.sources import open_source
 
     if path.suffix.lower() not in FORMATS:  # said before the work is done
         write_meshes((), path)
     load = cache(options.load_pipeline)
-    with open_source(options, lambda: load().body) as source:
-        pipeline = load()
-        frames, outputs, warnings = [], [], body_warnings(pipeline, gender=source.gender)
-        for number, record in enumerate(islice(source.records, first, first + count), first):
-            with _left_out(number, warnings):
-                frame = source.frame_of(record, options.betas)
-                outputs.append(pipeline(frame))
-                frames.append(frame)
-        if options.betas is None and any(frame.betas.any() for frame in frames) and not source.betas_are_known:
-            warnings += betas_warnings(pipeline, source=options.betas_source)
-        warnings += source.warnings
+    source = open_source(options, lambda: load().body)
+    pipeline = load()
+    frames, outputs, left_out = [], [], list[str]()
+    for number, record in enumerate(islice(source.records, first, first + count), first):
+        with _left_out(number, left_out):
+            frame = source.frame_of(record)
+            outputs.append(pipeline(frame))
+            frames.append(frame)
+    warnings = [*source.warnings(pipeline), *left_out]
     if not frames:
         why = f": {warnings[-1]}" if warnings else ""
         msg = f"{options.input}: has no frame that can be dressed from number {first} on{why}"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,6 @@ from numpy.typing import NDArray
 
 from refu_core import GarmentError, GarmentPipeline, SmplFrame, load_body, load_garment
 from refu_core.fitting import (
-    LONGEST_EDGE,
     UNITS,
     FittedGarment,
     GarmentDetails,
@@ -29,39 +27,12 @@ from refu_core.metrics import CollisionChecker
 from refu_core.modes import BUILTIN_GARMENTS
 from refu_core.recordings import SUFFIXES, read_recording
 from refu_core.weights import weights_folder
+from refu_lab.commands.garment import AddOptions
 from refu_lab.render import Camera, RenderMesh, render, save_png
 from refu_lab.tables import format_table
 
 _TILE = (260, 400)
 """Width and height of one picture [pixels]."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class AddOptions:
-    """The options of `refu garment add`."""
-
-    mesh: Path
-    body: str = "neutral"
-    name: str | None = None
-    output: Path | None = None
-    layer: int = 1
-    color: tuple[float, ...] | None = None
-    held_at: str | None = None
-    unit: str | None = None
-    up: str | None = None
-    pose: str | None = None
-    as_placed: bool = False
-    longest_edge: float = LONGEST_EDGE
-    source: str = "a mesh of the user's"
-    picture: Path | None = None
-    overwrite: bool = False
-
-    @property
-    def target(self) -> Path:
-        """Where the garment's file goes: into the user's folder, unless it is told otherwise."""
-        if self.output is not None:
-            return self.output
-        return garments_folder() / f"{self.name or _name_of(self.mesh)}.npz"
 
 
 def _name_of(mesh: Path) -> str:
@@ -84,7 +55,7 @@ def add_garment(options: AddOptions) -> dict[str, Any]:
 
     Raises `RefuError` for a mesh that can't be worn, and for a file that is there already.
     """
-    target = options.target
+    target = options.output or garments_folder() / f"{options.name or _name_of(options.mesh)}.npz"
     name = target.stem.removeprefix("garment_")
     if name in BUILTIN_GARMENTS:
         msg = f"{name} is a garment that ships: call this one otherwise (--name)"

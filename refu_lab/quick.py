@@ -15,8 +15,9 @@ from refu_core._engine import Engine, InProcess, Lost
 from refu_core._files import read_json
 from refu_core.metrics import Figures
 from refu_core.modes import DEFAULT_GARMENTS
+from refu_lab.commands.replay import ReplayOptions
 from refu_lab.fleet import fetched, find_recordings, run_function
-from refu_lab.replay import ReplayOptions, replay
+from refu_lab.replay import replay
 from refu_lab.reproduction import METRICS, format_value, label_of
 from refu_lab.tables import format_table, write_json
 from refu_lab.truth import TOPIC

@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import cache
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -23,10 +22,11 @@ from msg_adapters import FrameRecord
 from refu_core import GarmentPipeline, RefuError, SmplFrame
 from refu_core._device import one_thread
 from refu_core.metrics import CollisionChecker, Figures, GarmentMetrics
-from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN, ONE_STYLE, BackboneName, BetasSource
+from refu_core.modes import BackboneName
 from refu_core.realtime import PipelineOutput, SkinShift
-from refu_core.recordings import Axes, axis_of, upright_share
-from refu_lab.bodies import betas_warnings, body_facts, body_warnings
+from refu_core.recordings import axis_of, upright_share
+from refu_lab.bodies import body_facts
+from refu_lab.commands.replay import ReplayOptions
 from refu_lab.dressed_bag import DressedBag, garment_encoder
 from refu_lab.sources import Source, open_source
 from refu_lab.truth import GroundTruth
@@ -35,60 +35,6 @@ _MAX_REASONS = 20
 """Reasons of skips that are counted apart."""
 _LONGEST_PAUSE_S = 60.0
 _TOLD_S = 0.2
-
-
-@dataclass(frozen=True, kw_only=True)
-class ReplayOptions:
-    """What to replay and how; the fields are the options of `refu replay`."""
-
-    input: Path
-    garments: tuple[str, ...] = DEFAULT_GARMENTS
-    body: str | None = None
-    betas_from: str | None = None
-    betas_source: str = BetasSource.MESSAGE
-    output: Path | None = None
-    backbone: str = BackboneName.AUTO
-    sdf: str = "hybrid"
-    weights: Path | None = None
-    margin: float = DEFAULT_MARGIN
-    betas: tuple[float, ...] | None = None
-    style: tuple[float, ...] | None = None
-    speed: Literal["max", "real"] = "max"
-    topic: str | None = None
-    input_type: str | None = None
-    input_axes: Axes = "auto"
-    fps: float | None = None
-    person: str | None = None
-    keypoints: str = "zed38"
-    frame_id: str = "map"
-    device: str = "cpu"
-    max_frames: int | None = None
-    overwrite: bool = False
-    collider: bool = True
-    with_body: bool = True
-    """Whether the output carries the body, too."""
-    evaluate: bool = True
-    """Whether collisions are checked; otherwise nothing is kept of a frame but its latency."""
-
-    @property
-    def axes(self) -> adapters.InputAxes:
-        """What the frames' roots, and so the garments, are expressed in."""
-        return "frame" if self.input_axes == "frame" or self.input_type in adapters.KEYPOINT_TYPES else "smpl"
-
-    def load_pipeline(self) -> GarmentPipeline:
-        """The pipeline that these options ask for. Raises `RefuError` for options that make none."""
-        return GarmentPipeline.load(
-            self.garments,
-            body=self.body,
-            betas_from=self.betas_from,
-            sdf=self.sdf,
-            backbone=self.backbone,
-            style=self.style,
-            margin=self.margin,
-            weights=self.weights,
-            device=self.device,
-            collider=self.collider,
-        )
 
 
 @dataclass(frozen=True)
@@ -247,7 +193,6 @@ class _Replayer:
             is_bag = source.bag is not None
             truth = GroundTruth.of_bag(options.input, faces, axes=options.axes) if is_bag else None
             self._evaluator = Evaluator(pipeline, truth)
-        self._has_betas = self._has_style = False
         self._encoder = garment_encoder(pipeline, options)
 
     def run(self, record: FrameRecord, bag: DressedBag | None) -> None:
@@ -256,7 +201,7 @@ class _Replayer:
             bag.add_input(record)
         start = time.perf_counter()
         try:
-            frame = self._source.frame_of(record, self._options.betas)
+            frame = self._source.frame_of(record)
             output = self._pipeline(frame)
             data = self._encoder.encode(
                 [mesh.local for mesh in output.values()], stamp_ns=frame.stamp_ns, transl=frame.transl
@@ -267,8 +212,6 @@ class _Replayer:
         latency_ms = 1e3 * (time.perf_counter() - start)
         result, shift = self._result, output.stats.shift
         result.latencies_ms.append(latency_ms)
-        self._has_betas = self._has_betas or bool(frame.betas.any())
-        self._has_style = self._has_style or frame.style is not None
         result.shift_sum += shift.mean
         result.shift_largest = max(result.shift_largest, shift.largest)
         garments = None
@@ -286,16 +229,8 @@ class _Replayer:
 
     def summarise(self) -> None:
         """Completes the result."""
-        options = self._options
-        is_told = options.betas is not None or options.input_type in adapters.KEYPOINT_TYPES
-        is_told = is_told or self._source.betas_are_known
-        if self._evaluator is not None and self._evaluator.truth.garments:  # with it, of the built-in bodies
-            is_told = True
-        if self._has_betas and not is_told:
-            self._result.warnings += betas_warnings(self._pipeline, source=options.betas_source)
-        plain = [name for name, one in self._pipeline.garments.items() if one.styledirs is None]
-        if self._has_style and plain:
-            self._result.warnings.append(ONE_STYLE.format(", ".join(plain)))
+        has_truth = self._evaluator is not None and bool(self._evaluator.truth.garments)  # of the built-in bodies
+        self._result.warnings += self._source.warnings(self._pipeline, betas_are_told=has_truth)
         if self._evaluator is None:
             return
         self._result.before = {name: metrics.summary() for name, metrics in self._evaluator.before.items()}
@@ -324,13 +259,12 @@ def replay(
     """
     load = cache(lambda: pipeline or options.load_pipeline())
     with ExitStack() as stack:
-        source = stack.enter_context(open_source(options, lambda: load().body))  # whose faults are told at once
+        source = open_source(options, lambda: load().body)  # whose faults are told at once
         pipeline = load()
         pipeline(
             SmplFrame(pose=np.zeros((24, 3), np.float32))
         )  # compiles kernels, so that the first frame's latency is a frame's
         result = ReplayResult(options, source.description, body=body_facts(pipeline))
-        result.warnings += body_warnings(pipeline, gender=source.gender)
         if options.backbone == BackboneName.AUTO:
             result.warnings += [f"{name} has no trained weights: worn by skinning" for name in pipeline.untrained]
         replayer = _Replayer(options, pipeline, source, result)
@@ -344,9 +278,8 @@ def replay(
                 replayer.run(record, bag)
         except KeyboardInterrupt:
             result.interrupted = True
-        result.warnings += source.warnings
+        replayer.summarise()
     result.warnings += _doubts(result, source)
-    replayer.summarise()
     if not result.latencies_ms and not result.interrupted:
         reasons = "; ".join(f"{count} x {reason}" for reason, count in result.skips.most_common(3))
         msg = f"{options.input}: no frame could be replayed: {reasons or 'the input is empty'}"

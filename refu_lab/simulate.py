@@ -4,38 +4,20 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
 from refu_core._engine import Engine
-from refu_core.recordings import Axes
 from refu_core.simulation import GarmentDataset, Progress, load_clips, simulate_dataset, simulate_sequences
+from refu_lab.commands.simulate import SimulateOptions
 from refu_lab.contact_sheet import contact_sheet
 from refu_lab.render import save_png
 from refu_lab.tables import format_table
 
 SHEET = "samples.png"
 """Random samples of a finished set, to look at before anything is trained on it."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class SimulateOptions:
-    """What is simulated; the fields are the options of `refu simulate`."""
-
-    garment: str
-    count: int
-    output: Path
-    motions: Path | None = None
-    input_axes: Axes = "auto"
-    fps: float | None = None
-    body: str | None = None
-    seed: int = 0
-    sequences: bool = False
-    shapes: int = 5
-    seconds: float = 10.0
 
 
 def simulate(options: SimulateOptions, *, engine: Engine | None = None, progress: bool) -> dict[str, Any]:

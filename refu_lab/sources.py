@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -11,15 +10,16 @@ import numpy as np
 import msg_adapters as adapters
 from refu_core import FrameError, RefuError
 from refu_core.keypoints import Proportions
-from refu_core.modes import BetasSource
+from refu_core.modes import FOREIGN_BETAS, ONE_STYLE, BetasSource
 from refu_core.recordings import SUFFIXES
+from refu_lab.bodies import body_warnings
+from refu_lab.commands.replay import RecordingOptions
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from msg_adapters import FrameRecord
-    from refu_core import SmplBody, SmplFrame
-    from refu_lab.replay import ReplayOptions
+    from refu_core import GarmentPipeline, SmplBody, SmplFrame
 
 INPUT_TOPIC = "/smpl_params"
 
@@ -28,11 +28,12 @@ INPUT_TOPIC = "/smpl_params"
 class Source:
     """Frames of a bag or of a motion file, as records of one kind."""
 
+    options: RecordingOptions
     description: str
     """A topic and its type, or a motion file."""
     topic: str
     message_type: str
-    decoder: adapters.Decoder
+    decode: Callable[[bytes], SmplFrame]
     records: Iterator[FrameRecord]
     count: int | None
     """Records, where the file says how many there are."""
@@ -43,29 +44,37 @@ class Source:
     gender: str = "neutral"
     """Whose motion it is, where the file says it."""
 
-    @property
-    def betas_are_known(self) -> bool:
-        """Whether the file itself says that its betas are the built-in body's."""
-        return self.bag is not None and self.bag.topic.betas_of == BetasSource.BUILTIN
+    has_betas: bool = False
+    """Whether there were shapes, and a style, in its frames."""
+    has_style: bool = False
 
-    def frame_of(self, record: FrameRecord, betas: Sequence[float] | None = None) -> SmplFrame:
-        """A record's frame, with `betas` in place of its own where they are given.
-
-        Raises `DecodeError` for a record that has none.
-        """
+    def frame_of(self, record: FrameRecord) -> SmplFrame:
+        """A record's frame, in the shape that was asked for. Raises `DecodeError` for a record that has none."""
         if record.error is not None:
             raise record.error
-        frame = replace(self.decoder.from_bytes(record.raw), stamp_ns=record.stamp_ns)
+        frame = replace(self.decode(record.raw), stamp_ns=record.stamp_ns)
+        self.has_betas = self.has_betas or bool(frame.betas.any())
+        self.has_style = self.has_style or frame.style is not None
+        betas = self.options.known_betas
         return frame if betas is None else replace(frame, betas=np.asarray(betas, np.float32))
 
-    @property
-    def warnings(self) -> list[str]:
-        """What was wrong with the file as a whole; complete after the last record."""
-        return [*self.notes, *(self.bag.reader.warnings if self.bag else ())]
+    def warnings(self, pipeline: GarmentPipeline, *, betas_are_told: bool = False) -> list[str]:
+        """What there is to say of the file and of who wears what in it; complete after the last record."""
+        options, bag = self.options, self.bag
+        is_told = betas_are_told or options.betas_are_told or pipeline.fit is not None
+        is_told = is_told or options.input_type in adapters.KEYPOINT_TYPES
+        is_told = is_told or (bag is not None and bag.topic.betas_of == BetasSource.BUILTIN)
+        plain = [name for name, one in pipeline.garments.items() if one.styledirs is None]
+        return [
+            *body_warnings(pipeline, gender=self.gender),
+            *self.notes,
+            *(() if bag is None else bag.reader.warnings),
+            *([FOREIGN_BETAS] if self.has_betas and not is_told else []),
+            *([ONE_STYLE.format(", ".join(plain))] if self.has_style and plain else []),
+        ]
 
 
-@contextmanager
-def open_source(options: ReplayOptions, body: Callable[[], SmplBody]) -> Iterator[Source]:
+def open_source(options: RecordingOptions, body: Callable[[], SmplBody]) -> Source:
     """Opens the input; `body` is whose bones keypoints have, and isn't asked for where there are none.
 
     Raises `RefuError` for an input that can't be read, or with options that it has no use for.
@@ -73,24 +82,18 @@ def open_source(options: ReplayOptions, body: Callable[[], SmplBody]) -> Iterato
     if options.input.suffix.lower() in SUFFIXES:
         motion = adapters.read_motion(options.input, fps=options.fps, axes=options.input_axes, person=options.person)
         description = f"{options.input.name}, {len(motion)} frames at {motion.fps:g} Hz"
-        records, decoder = _motion_records(motion, INPUT_TOPIC), adapters.decoder_for("multiarray")
-        message_type = adapters.INPUT_TYPES["multiarray"]
-        yield Source(
-            *(description, INPUT_TOPIC, message_type, decoder, records, len(motion)),
-            notes=motion.notes,
-            gender=motion.gender,
-        )
-        return
+        of_message = adapters.INPUT_TYPES["multiarray"], adapters.decoder_for("multiarray").from_bytes
+        records = _motion_records(motion, INPUT_TOPIC)
+        source = Source(options, description, INPUT_TOPIC, *of_message, records, len(motion))
+        return replace(source, notes=motion.notes, gender=motion.gender)
     if options.fps is not None or options.input_axes in ("z-up", "y-down"):
         what = "--fps" if options.fps is not None else f"--input-axes {options.input_axes}"
         msg = f"{options.input}: {what} is for files of motion ({', '.join(SUFFIXES)}); bags take smpl or frame"
         raise RefuError(msg)
-    is_of_keypoints = options.input_type in adapters.KEYPOINT_TYPES
-    own = _keypoint_decoder(options, body()) if is_of_keypoints else None
-    with adapters.open_smpl_bag(options.input, topic=options.topic, input_type=options.input_type, decoder=own) as bag:
-        topic, kind = bag.topic.name, bag.topic.message_type
-        records = bag.undecoded() if is_of_keypoints else iter(bag)
-        yield Source(f"{topic} ({kind})", topic, kind, bag.decoder, records, bag.message_count, bag)
+    bag = adapters.open_smpl_bag(options.input, topic=options.topic, input_type=options.input_type)
+    topic, kind = bag.topic.name, bag.topic.message_type
+    decode = _follower(options, body()) if bag.decoder is None else bag.decoder.from_bytes
+    return Source(options, f"{topic} ({kind})", topic, kind, decode, iter(bag), bag.message_count, bag)
 
 
 def _motion_records(motion: adapters.Motion, topic: str) -> Iterator[FrameRecord]:
@@ -108,15 +111,15 @@ def _motion_records(motion: adapters.Motion, topic: str) -> Iterator[FrameRecord
         )
 
 
-def _keypoint_decoder(options: ReplayOptions, body: SmplBody) -> adapters.Decoder:
-    """A decoder that follows one person: `options.person`, or who comes first."""
+def _follower(options: RecordingOptions, body: SmplBody) -> Callable[[bytes], SmplFrame]:
+    """Decodes messages of keypoints to the frames of one person: `options.person`, or who comes first."""
     assert options.input_type is not None
     stream = adapters.KeypointStream(
-        options.input_type, options.keypoints, Proportions.of_body(body), betas=options.betas
+        options.input_type, options.keypoints, Proportions.of_body(body), betas=options.known_betas
     )
     followed = options.person
 
-    def from_bytes(data: bytes | bytearray | memoryview) -> SmplFrame:
+    def decode(data: bytes) -> SmplFrame:
         nonlocal followed
         people, _ = stream.frames(data, 0)
         followed = followed if followed is not None or not people else next(iter(people))
@@ -125,10 +128,4 @@ def _keypoint_decoder(options: ReplayOptions, body: SmplBody) -> adapters.Decode
             raise adapters.DecodeError(msg)
         return people[followed]
 
-    def from_message(message: object) -> SmplFrame:
-        msg = f"wanted the bytes of a message of keypoints, got {type(message).__name__}"
-        raise adapters.DecodeError(msg)
-
-    types = dict(adapters.KEYPOINT_TYPES)
-    message_type = next(kind for name, kind in types.items() if name == options.input_type)
-    return adapters.Decoder("pose_array", message_type, from_bytes, from_message)
+    return decode

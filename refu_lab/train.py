@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -11,12 +11,11 @@ from refu_core._device import checked_device
 from refu_core.backbones import PRESETS
 from refu_core.body import load_fit
 from refu_core.garments import worn_on
-from refu_core.modes import MAX_MARGIN
+from refu_core.options import check
 from refu_core.refu import ScaleKind
 from refu_core.sdf import SDF_PRESETS
 from refu_core.simulation import GarmentDataset, open_dataset
 from refu_core.training import (
-    FINETUNE_MODES,
     CarrySettings,
     FinetuneSettings,
     PretrainSettings,
@@ -26,42 +25,8 @@ from refu_core.training import (
     pretrain,
     train_sdf,
 )
+from refu_lab.commands.train import TrainOptions
 from refu_lab.tables import format_table
-
-TRAIN_MODES: tuple[str, ...] = ("none", *FINETUNE_MODES)
-NETWORKS: tuple[str, ...] = ("garment", "sdf")
-SCALES: tuple[str, ...] = ("vertex", "shared", "distance", "fixed")
-"""What α is predicted from: the paper's choice, its alternatives 1 and 2, or nothing."""
-
-
-@dataclass(frozen=True)
-class TrainOptions:
-    """What is trained on what."""
-
-    garment: str
-    data: Path
-    network: str = "garment"
-    mode: str = "hybrid"
-    backbone: str = "tailornet"
-    preset: str = "realtime"
-    output: Path | None = None
-    """Folder of the weights; weights/GARMENT by default, where `GarmentPipeline.load(weights="weights")` finds them."""
-    scale: str = "vertex"
-    margin: float | None = None
-    unblended: bool = False
-    body: str | None = None
-    like: str | None = None
-    """A related garment whose networks are carried over: what a small set is enough for."""
-    start: Path | None = None
-    """Folder of a garment's weights that training goes on from, with their ReFU."""
-    seed: int = 0
-    steps: int | None = None
-    device: str = "cpu"
-
-    @property
-    def folder(self) -> Path:
-        """Where the weights are written."""
-        return Path("weights") / load_garment(self.garment).name if self.output is None else self.output
 
 
 def train(options: TrainOptions, *, progress: bool) -> dict[str, Any]:
@@ -113,18 +78,11 @@ def _check(options: TrainOptions) -> None:
     if options.start is not None and (options.mode == "none" or options.like is not None):
         msg = "--start goes on with a mode that has ReFU: leave --like and --mode none out"
         raise RefuError(msg)
-    if options.margin is not None and not 0 <= options.margin <= MAX_MARGIN:
-        msg = f"the margin must be between 0 and {MAX_MARGIN} m, got {options.margin}"
+    presets = SDF_PRESETS if options.network == "sdf" else PRESETS
+    if options.preset not in presets:
+        msg = f"no preset {options.preset!r} of training: wanted {', '.join(presets)}"
         raise RefuError(msg)
-    for name, value, choices in (
-        ("network", options.network, NETWORKS),
-        ("mode", options.mode, TRAIN_MODES),
-        ("scale", options.scale, SCALES),
-        ("preset", options.preset, SDF_PRESETS if options.network == "sdf" else PRESETS),
-    ):
-        if value not in choices:
-            msg = f"no {name} {value!r} of training: wanted {', '.join(choices)}"
-            raise RefuError(msg)
+    check(options)
 
 
 def _sdf_training(options: TrainOptions) -> SdfSettings:

@@ -11,14 +11,14 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 from refu_core import RefuError
-from refu_core.errors import printable
-from refu_core.modes import BetasSource
-from refu_ros._dresser import NICE
-from refu_ros._settings import PIPELINE_SETTINGS, NodeSettings
+from refu_core.options import PIPELINE_OPTIONS, arguments
+from refu_ros._beside import NICE
+from refu_ros._settings import NodeSettings
 
 _PATIENCE_S = 10.0
 """Time for a bag to be closed when its replay is ended [s]."""
@@ -26,46 +26,48 @@ _INTERRUPTED = 130
 
 
 class BagJob:
-    """`wait` for it in a thread; `cancel` from any. Raises `RefuError` where the process can't be started."""
+    """Tells, in a thread of its own, how many frames are done, and of how many. `cancel` it from any thread.
 
-    def __init__(self, bag: Path, output: Path, settings: NodeSettings) -> None:
+    Raises `RefuError` where the process can't be started.
+    """
+
+    def __init__(self, bag: Path, output: Path, settings: NodeSettings, told: Callable[[int, int], object]) -> None:
         self.output = output
         self._folder = tempfile.TemporaryDirectory(prefix="refu-replay-")
-        self._result, errors = (Path(self._folder.name, name) for name in ("result.json", "errors.txt"))
-        self._errors = errors
+        self._result = Path(self._folder.name, "result.json")
         command = [sys.executable, "-m", "refu_lab.cli", "replay", str(bag), f"--output={output}", "--progress=lines"]
-        command += [f"--json={self._result}", *_options(settings)]
+        given = ["betas_source", *["betas"] * bool(settings.known_betas), *["style"] * any(settings.style)]
+        command += [f"--json={self._result}", *arguments(settings, *PIPELINE_OPTIONS, "margin", "frame_id", *given)]
+        pipes: Any = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
         try:
-            with errors.open("wb") as file:
-                self._process = subprocess.Popen(
-                    command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=file, start_new_session=True
-                )
+            self._process = subprocess.Popen(command, **pipes, start_new_session=True)
             os.setpriority(os.PRIO_PROCESS, self._process.pid, NICE)
         except ProcessLookupError:  # it has ended already: `wait` says why
             pass
         except OSError as error:
             msg = f"no bag can be replayed: {error}"
             raise RefuError(msg) from error
+        pool = ThreadPoolExecutor(1, "bag")
+        self.done = pool.submit(self._wait, told)
+        """The result of `refu replay --json`, or a `RefuError` with the reason that the command gives."""
+        pool.shutdown(wait=False)
 
-    def wait(self, told: Callable[[int, int], object]) -> dict[str, Any]:
-        """The result of `refu replay --json`; meanwhile `told` how many frames are done, and of how many.
-
-        Raises `RefuError` for a bag that can't be replayed, with the reason that the command gives.
-        """
+    def _wait(self, told: Callable[[int, int], object]) -> dict[str, Any]:
         assert self._process.stdout is not None
+        said = ""
         with self._folder, self._process.stdout as lines:
             for line in lines:
                 if line.startswith(b"progress "):
                     told(*map(int, line.split()[1:]))
+                else:
+                    said = line.decode(errors="replace").strip() or said
             code = self._process.wait()
             with contextlib.suppress(OSError, ValueError):
                 result: dict[str, Any] = json.loads(self._result.read_bytes())
                 return result
-            with self._errors.open("rb") as file:
-                file.seek(max(0, self._errors.stat().st_size - 4096))
-                said = file.read().decode(errors="replace").strip().splitlines() or [f"it ended with {code}"]
-        reason = "cancelled before a frame was done" if code in (_INTERRUPTED, -signal.SIGTERM) else said[-1]
-        raise RefuError(printable(reason.removeprefix("refu: ").removeprefix("error: ")))
+        if code in (_INTERRUPTED, -signal.SIGTERM):
+            said = "cancelled before a frame was done"
+        raise RefuError((said or f"it ended with {code}").removeprefix("refu: ").removeprefix("error: "))
 
     def cancel(self) -> None:
         """Ends it; the bag is closed, with the frames that are done."""
@@ -73,17 +75,3 @@ class BagJob:
         last = threading.Timer(_PATIENCE_S, self._process.kill)
         last.daemon = True
         last.start()
-
-
-def _options(settings: NodeSettings) -> list[str]:
-    """The node's settings as the command has them."""
-    names = [name for name in PIPELINE_SETTINGS if name not in ("garments", "collider", "threads")]
-    given: dict[str, Any] = {name.replace("_", "-"): getattr(settings, name) for name in (*names, "margin", "frame_id")}
-    given["garments"] = ",".join(settings.garments)
-    given["style"] = ",".join(map(str, settings.style)) if any(settings.style) else ""
-    if settings.betas_source == BetasSource.FIXED:
-        given["betas"] = ",".join(map(str, settings.betas))
-    else:
-        given["betas-source"] = settings.betas_source
-    options = [f"--{name}={value}" for name, value in given.items() if value != ""]
-    return [*options, *([] if settings.collider else ["--no-collider"])]

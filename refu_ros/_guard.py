@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import functools
+import math
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 from rclpy.action import ActionServer
@@ -12,10 +14,10 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.node import Node, SetParametersResult
 
+from msg_adapters import check_stamp
+from msg_adapters.statistics import Statistics
 from refu_core import RefuError
 from refu_core.errors import printable
-from refu_ros._scene import check_stamp
-from refu_ros._statistics import Statistics
 
 _CLOCK = "/clock"
 _MOST_ITEMS = 1000
@@ -41,10 +43,9 @@ class GuardedNode(Node):  # type: ignore[misc]
 
     def fault(self, what: str, error: Exception) -> None:
         """Counts and logs what has gone wrong in a callback, and not only there."""
-        text = printable(f"{what}: {_reason(error)}")
+        text, now = printable(f"{what}: {_reason(error)}"), time.monotonic()
         self.statistics.fault(what, text)
-        now = time.monotonic()
-        if now > self._said.get(what, -_LOG_PERIOD_S) + _LOG_PERIOD_S:  # one kind's flood doesn't hide another
+        if now > self._said.get(what, -math.inf) + _LOG_PERIOD_S:  # one kind's flood doesn't hide another
             self._said[what] = now
             self.get_logger().warning(text)
 
@@ -67,8 +68,14 @@ class GuardedNode(Node):  # type: ignore[misc]
         self, msg_type: Any, topic: str, callback: Callable[..., Any], *arguments: Any, **options: Any
     ) -> Any:
         """As rclpy's, also for the clock, which rclpy subscribes to itself."""
-        checked = _checked_clock(callback) if topic == _CLOCK else callback
-        return super().create_subscription(msg_type, topic, self.guarded(topic, checked), *arguments, **options)
+
+        def checked(message: Any) -> None:
+            # A time that no message can carry would raise wherever a stamp is made, in rclpy itself, too.
+            check_stamp(message.clock.sec * 10**9 + message.clock.nanosec)
+            callback(message)
+
+        taken = self.guarded(topic, checked if topic == _CLOCK else callback)
+        return super().create_subscription(msg_type, topic, taken, *arguments, **options)
 
     def add_waitable(self, waitable: Any) -> None:
         """As rclpy's, for the events of publishers and subscriptions.
@@ -76,20 +83,17 @@ class GuardedNode(Node):  # type: ignore[misc]
         An event may be queued when its publisher or subscription is destroyed: then there is nothing to take any more,
         which the C++ executor would raise.
         """
-        if isinstance(waitable, ActionServer):
-            waitable.take_data = self.guarded("action", waitable.take_data, lambda *_: {})
-            super().add_waitable(waitable)
-            return
-        waitable.callback = self.guarded("event", waitable.callback)
         take = waitable.take_data
 
         def take_data() -> Any:
-            try:
+            with suppress(InvalidHandle):
                 return take()
-            except InvalidHandle:
-                return None
 
-        waitable.take_data = self.guarded("event", take_data)
+        if isinstance(waitable, ActionServer):
+            waitable.take_data = self.guarded("action", take, lambda *_: {})
+        else:
+            waitable.callback = self.guarded("event", waitable.callback)
+            waitable.take_data = self.guarded("event", take_data)
         super().add_waitable(waitable)
 
 
@@ -98,11 +102,7 @@ def transition(method: Callable[..., TransitionCallbackReturn]) -> Callable[...,
 
     @functools.wraps(method)
     def call(node: GuardedNode, state: Any) -> TransitionCallbackReturn:
-        try:
-            return method(node, state)
-        except Exception as error:
-            node.fault(method.__name__, error)
-            return TransitionCallbackReturn.ERROR
+        return node.guarded(method.__name__, method, lambda *_: TransitionCallbackReturn.ERROR)(node, state)
 
     return call
 
@@ -132,13 +132,3 @@ def answer_no(error: Exception, request: Any, response: Any) -> Any:
     elif isinstance(getattr(response, "result", None), SetParametersResult):
         response.result = refused
     return response
-
-
-def _checked_clock(callback: Callable[..., Any]) -> Callable[..., Any]:
-    """A time that no message can carry would raise wherever a stamp is made, in rclpy itself, too."""
-
-    def call(message: Any) -> None:
-        check_stamp(message.clock.sec * 10**9 + message.clock.nanosec)
-        callback(message)
-
-    return call

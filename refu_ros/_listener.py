@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import time
+from contextlib import suppress
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -12,14 +14,16 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 import msg_adapters as adapters
 from refu_core import FrameError, RefuError
 from refu_core.errors import printable
-from refu_ros._decoding import InputDecoder
 from refu_ros._interfaces import interface, ros_qos
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from msg_adapters import Placement
+    from msg_adapters.scene import Scene
+    from refu_core import SmplBody
     from refu_core.outputs import PinholeCamera
     from refu_ros._node import GarmentNode
-    from refu_ros._scene import Scene
     from refu_ros._settings import NodeSettings
 
 INPUT_QOS = adapters.QosProfile(reliability="best_effort", depth=5)
@@ -28,7 +32,6 @@ _TRACKED = "/humans/bodies/tracked"
 _LOG_PERIOD_S = 5.0
 _GRACE_S = 5.0
 """How long the inputs stay subscribed to when nobody is left: many a viewer is only restarted [s]."""
-_OVERRIDABLE = QoSOverridingOptions.with_default_policies()
 _TF_DEPTH = 100
 _FIRST_TF_S = 1.0
 """How long the first transform is waited for; then people are shown as if their frame were that of the messages [s]."""
@@ -39,7 +42,7 @@ class Listener:
 
     def __init__(self, node: GarmentNode) -> None:
         self._node = node
-        self.decoder = InputDecoder(node.settings)
+        self.stream, self.doubts = adapters.InputStream(node.settings.input_type), adapters.Doubts()
         self.scene: Scene | None = None
         """Where people go who have come; None while nobody is dressed."""
         self.since: float | None = None
@@ -58,6 +61,17 @@ class Listener:
     @property
     def _settings(self) -> NodeSettings:
         return self._node.settings
+
+    @property
+    def is_steady(self) -> bool:
+        """Whether frames come from `predict`, at a rate of their own, and not with the messages."""
+        return self.stream.is_of_keypoints and self._settings.keypoint_rate > 0
+
+    def follow(self, body: SmplBody) -> None:
+        """Other settings, or another body; keypoints are of somebody with its proportions."""
+        settings = self._settings
+        betas, smoothing = settings.known_betas, settings.keypoint_smoothing
+        self.stream.follow(body, settings.keypoints, betas=betas, smoothing=smoothing)
 
     @property
     def persons(self) -> list[str]:
@@ -90,8 +104,7 @@ class Listener:
             for person in self._settings.persons:
                 self._listen(person, f"{person}/smpl_params" if person else "smpl_params")
         if topic := self._settings.camera_info:
-            given = interface(adapters.CAMERA_INFO), topic, self._on_camera, ros_qos(INPUT_QOS)
-            self._inputs["/camera"] = self._node.create_subscription(*given, raw=True)
+            self._hear("/camera", adapters.CAMERA_INFO, topic, self._on_camera, ros_qos(INPUT_QOS))
 
     def unsubscribe(self) -> None:
         """Listens no longer."""
@@ -105,45 +118,49 @@ class Listener:
 
     def _listen(self, person: str, topic: str) -> None:
         full_name = self._node.resolve_topic_name(topic)
-        self._node.get_logger().info(f"listening to {full_name} ({self.decoder.message_type})")
-        self._inputs[person] = self._node.create_subscription(
-            interface(self.decoder.message_type),
-            topic,
-            lambda data: self._on_input(person, full_name, data),
-            ros_qos(INPUT_QOS),
-            # Overrides are parameters, which never go: only topics that don't come and go have them.
-            qos_overriding_options=None if self._settings.follow_humans else _OVERRIDABLE,
-            raw=True,
-        )
+        self._node.get_logger().info(f"listening to {full_name} ({self.stream.message_type})")
+        # Overrides are parameters, which never go: only topics that don't come and go have them.
+        overrides = None if self._settings.follow_humans else QoSOverridingOptions.with_default_policies()
+        take = partial(self._on_input, person, full_name)
+        self._hear(person, self.stream.message_type, topic, take, ros_qos(INPUT_QOS), qos_overriding_options=overrides)
+
+    def _hear(
+        self, name: str, kind: str, topic: str, take: Callable[[bytes], object], qos: QoSProfile, **options: Any
+    ) -> None:
+        """Subscribes; what isn't a person's has a name that begins with a slash. Raises `RefuError`."""
+        subscription = self._node.create_subscription(interface(kind), topic, take, qos, raw=True, **options)
+        self._inputs[name] = subscription
 
     def _on_input(self, person: str, topic: str, data: bytes) -> None:
         node = self._node
         if self.scene is None:
             return
         node.statistics.receive()
-        node.recording.put(topic, self.decoder.message_type, data, INPUT_QOS)
+        node.recording.put(topic, self.stream.message_type, data, INPUT_QOS)
         if not node.is_watched():
             node.statistics.count("skip.unwatched")
             return
         try:
-            frames, given = self.decoder.frames(person, data, node.now_ns())
+            frames, given = self.stream.frames(data, node.now_ns(), sender=person)
         except (adapters.AdapterError, FrameError) as error:
             node.statistics.drop("invalid", str(error))
             node.get_logger().warning(f"{topic}: {printable(error)}", throttle_duration_sec=_LOG_PERIOD_S)
             return
         given = printable(given.lstrip("/"))
-        if doubt := self.decoder.doubt(frames.values()):
+        # Keypoints' betas are measured on the body that is dressed, and their axes those of `frame_id`.
+        known = [] if self.stream.is_of_keypoints else [*frames.values()]
+        if doubt := self.doubts.of(known, self._settings, is_y_up=self._settings.axes == "smpl"):
             node.get_logger().warning(f"{topic}: {doubt}")
         self.input_frame = given if self._need_transforms(topic, given) else ""
         for name, frame in frames.items():
             self._frames[name] = given
-            if not self.decoder.is_steady:
+            if not self.is_steady:
                 self._put(name, frame)
 
     def predict(self) -> None:
         """Everybody whose keypoints are followed, by now."""
         if self.scene is not None and self._node.is_watched():
-            for name, frame in self.decoder.predicted(self._node.now_ns()).items():
+            for name, frame in self.stream.predicted(self._node.now_ns()).items():
                 self._put(name, frame)
 
     def _put(self, person: str, frame: Any) -> None:
@@ -220,18 +237,12 @@ class Listener:
         return differs
 
     def _listen_to_tf(self) -> None:
-        kind = interface(adapters.TF_MESSAGE)
-        self._tf, self._tf_asked_at = adapters.TransformBuffer(), time.monotonic()
         for topic, durability in (("/tf", DurabilityPolicy.VOLATILE), ("/tf_static", DurabilityPolicy.TRANSIENT_LOCAL)):
-            self._inputs[topic] = self._node.create_subscription(
-                kind,
-                topic,
-                lambda data, is_static=topic == "/tf_static": self._on_transforms(data, is_static),
-                QoSProfile(depth=_TF_DEPTH, durability=durability),
-                raw=True,
-            )
+            take = partial(self._on_transforms, topic == "/tf_static")
+            self._hear(topic, adapters.TF_MESSAGE, topic, take, QoSProfile(depth=_TF_DEPTH, durability=durability))
+        self._tf, self._tf_asked_at = adapters.TransformBuffer(), time.monotonic()
 
-    def _on_transforms(self, data: bytes, is_static: bool) -> None:
+    def _on_transforms(self, is_static: bool, data: bytes) -> None:
         if n := self._tf.put(data, is_static=is_static):
             msg = f"{n} transforms make no sense: no frame, no finite numbers, or no rotation"
             raise RefuError(msg)
@@ -251,11 +262,8 @@ class Listener:
             self._tracked = adapters.decode_ids(data)
             self._follow_humans()
 
-        try:
-            kind = interface(adapters.IDS_LIST)
-        except RefuError:  # then whoever has a topic is there
-            return
-        self._inputs[_TRACKED] = self._node.create_subscription(kind, _TRACKED, take, QoSProfile(depth=1), raw=True)
+        with suppress(RefuError):  # without its type, whoever has a topic is there
+            self._hear(_TRACKED, adapters.IDS_LIST, _TRACKED, take, QoSProfile(depth=1))
 
     def _follow_humans(self) -> None:
         """Listens to bodies that have come and no longer to those that have gone."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -11,21 +12,22 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.node import SetParametersResult
 
 import msg_adapters as adapters
+from msg_adapters.bags import Recording
 from msg_adapters.outputs import GARMENTS, make_outputs
+from msg_adapters.scene import Scene
 from refu_core import RefuError
 from refu_core.errors import printable
 from refu_core.keypoints import MOST_PEOPLE
+from refu_core.options import PIPELINE_OPTIONS, PipelineOptions, specs_of
 from refu_ros._bank import QOS, Bank
+from refu_ros._beside import PipelineLoader, load
 from refu_ros._diagnostics import Situation, statuses
-from refu_ros._guard import GuardedNode, answer_no, transition
+from refu_ros._guard import GuardedNode, transition
 from refu_ros._interfaces import interface
 from refu_ros._listener import Listener
-from refu_ros._loader import PipelineLoader
 from refu_ros._parameters import declare
-from refu_ros._recording import Recording
 from refu_ros._requests import Requests
-from refu_ros._scene import Scene
-from refu_ros._settings import PIPELINE_SETTINGS, NodeSettings, PipelineKey, specs
+from refu_ros._settings import NodeSettings
 
 if TYPE_CHECKING:
     from refu_core import GarmentPipeline
@@ -35,6 +37,8 @@ if TYPE_CHECKING:
 NODE_NAME = "garment_node"
 DIAGNOSTICS_TOPIC = "/diagnostics"
 _LOG_PERIOD_S = 5.0
+_LAST_WORDS_S = 0.3
+"""Time for the answer to a shutdown request to leave."""
 
 
 class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
@@ -45,7 +49,8 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
 
     def __init__(self, **options: Any) -> None:
         super().__init__(NODE_NAME, **options)
-        self.finalized = False
+        self.ends_at = math.inf
+        """When there is nothing left to do, on the steady clock [s]: it was told to end, or can't go on."""
         self.failed = False
         """Whether it ended because its device did."""
         self.settings = declare(self, NodeSettings)
@@ -54,7 +59,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         self._worker: Worker | None = None
         self._loader: PipelineLoader | None = None
         self._pipeline: GarmentPipeline | None = None
-        self._in_use: PipelineKey | None = None
+        self._in_use: PipelineOptions | None = None
         self._lost = ""
         self._has_sent = False
         self._listener = Listener(self)
@@ -65,14 +70,12 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         lasting = {topic: one.message_type for one in self._outputs for topic in one.topics((), None)}
         self._bank.hold(lasting, lasting=True)
         self._diagnostics = self.create_publisher(interface(adapters.DIAGNOSTIC_ARRAY), DIAGNOSTICS_TOPIC, 10)
-        switch = self.guarded("record", self._on_record, answer_no)
-        self.create_service(interface("std_srvs/srv/SetBool"), "~/record", switch)
         self._requests = Requests(self)
         self.add_on_set_parameters_callback(self._on_parameters)
         # Steady time: a simulation that stands still must not stop the diagnostics.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(1.0, self.guarded("each second", self._on_second), clock=steady)
-        if self._listener.decoder.is_steady:
+        if self._listener.is_steady:
             predict = self.guarded("predict", self._listener.predict)
             self.create_timer(1 / self.settings.keypoint_rate, predict, clock=steady)
 
@@ -87,12 +90,12 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Loads the garments."""
         try:
-            interface(self._listener.decoder.message_type)
-            self._take(self.settings.pipeline.load(), self.settings.pipeline)
+            interface(self._listener.stream.message_type)
+            self._take(load(self.settings, threads=self.settings.threads), self.settings.pipeline)
         except RefuError as error:
             self.get_logger().error(f"can't be configured: {printable(error)}")
             return TransitionCallbackReturn.FAILURE
-        self._loader = PipelineLoader(self._on_loaded, self._on_not_loaded)
+        self._loader = PipelineLoader(self._on_loaded, self._on_not_loaded, threads=self.settings.threads)
         self._state = "inactive"
         self.get_logger().info(f"configured with {self._in_use}")
         return super().on_configure(state)
@@ -101,7 +104,8 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Dresses who sends, as soon as somebody wants that."""
         assert self._pipeline is not None
-        self.recording.try_start(self.settings.record)  # where it can't: no reason to leave people undressed
+        if self.settings.record:
+            self.recording.try_start(self.settings.record)  # where it can't: no reason to leave people undressed
         result = super().on_activate(state)
         room = max(MOST_PEOPLE, len(self.settings.persons))
         scene = self._listener.scene = Scene(self.statistics, most=room)
@@ -136,9 +140,9 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
     @transition
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Everything that is queued gets into the file before this returns. The node ends: it was told to."""
-        self.finalized = True
         self.close()
         self._state = "finalized"
+        self.ends_at = time.monotonic() + _LAST_WORDS_S
         return super().on_shutdown(state)
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -211,12 +215,12 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         self.statistics.set_error(f"{self._lost}: {'the node ends' if stops else 'loading for the cpu'}")
         self.get_logger().error(f"{self._lost}: {'the node ends' if stops else 'the cpu takes over'}")
         if stops:
-            self.failed = self.finalized = True
+            self.failed, self.ends_at = True, time.monotonic()
         elif self._loader is not None:
             self._loader.request(self._pipeline_key)
 
     @property
-    def _pipeline_key(self) -> PipelineKey:
+    def _pipeline_key(self) -> PipelineOptions:
         """What is to be loaded: for the CPU once the device has failed."""
         key = self.settings.pipeline
         return replace(key, device="cpu") if self._lost else key
@@ -224,18 +228,19 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
     # Parameters -----------------------------------------------------------------------------------
 
     def _on_parameters(self, parameters: list[Any]) -> SetParametersResult:
-        values = {parameter.name: parameter.value for parameter in parameters if parameter.name in specs()}
+        own = specs_of(NodeSettings)
+        values = {parameter.name: parameter.value for parameter in parameters if parameter.name in own}
         if not values:  # rclpy's own, the QoS of a topic for instance
             return SetParametersResult(successful=True)
         try:
             settings = self.settings.changed(values)
             # What is asked for again is done again, where it has failed or was ended meanwhile.
             known = self.settings.pipeline == self._in_use == settings.pipeline
-            if reload := not known and not values.keys().isdisjoint(PIPELINE_SETTINGS):
-                settings.pipeline.check()
+            if reload := not known and not values.keys().isdisjoint(PIPELINE_OPTIONS):
+                settings.pipeline.check_files()
             recorded = settings.record == self.settings.record and self.recording.running
             if self._state == "active" and "record" in values and not recorded:
-                self.recording.start(settings.record)
+                self.recording.start(settings.record) if settings.record else self.recording.stop()
         except RefuError as error:
             self.statistics.fault("refused parameters", printable(error))
             return SetParametersResult(successful=False, reason=printable(error))
@@ -244,41 +249,42 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         self.settings = settings
         self._attend()  # a recording may have begun
         if self._pipeline is not None:
-            self._listener.decoder.use(settings, self._pipeline.body)
+            self._listener.follow(self._pipeline.body)
         if self._worker is not None:
             self._worker.settings = settings
         if reload and self._loader is not None:
             self._loader.request(self._pipeline_key)
         return SetParametersResult(successful=True)
 
-    def _take(self, pipeline: GarmentPipeline, key: PipelineKey) -> None:
+    def _take(self, pipeline: GarmentPipeline, key: PipelineOptions) -> None:
         from refu_core.outputs import Fittings  # loads torch
 
         self._pipeline, self._in_use, self._fittings = pipeline, key, Fittings(pipeline)
-        self._listener.decoder.use(self.settings, pipeline.body)
+        self._listener.follow(pipeline.body)
         for text in pipeline.warnings:
             self.get_logger().warning(text)
 
-    def _on_loaded(self, pipeline: GarmentPipeline, key: PipelineKey) -> None:
+    def _on_loaded(self, pipeline: GarmentPipeline, key: PipelineOptions) -> None:
         self._take(pipeline, key)
         if self._worker is not None:
             self._worker.use(pipeline)
         self.statistics.set_error(f"{self._lost}: on the cpu now; set device to try it again" if self._lost else "")
         self.get_logger().info(f"now with {key}")
 
-    def _on_not_loaded(self, error: Exception, key: PipelineKey) -> None:
+    def _on_not_loaded(self, error: Exception, key: PipelineOptions) -> None:
         text = printable(f"{key} can't be loaded, {self._in_use} stays: {error}")
         self.statistics.set_error(text)
         self.get_logger().error(text)
 
-    def _on_record(self, request: Any, response: Any) -> Any:
-        response.success, response.message, _ = self.record(on=request.data)
-        return response
+    def record(self, *, on: bool, path: str = "") -> tuple[str, str]:
+        """Starts or stops a recording, by default to the parameter's path: what has been done, and the bag.
 
-    def record(self, *, on: bool, path: str = "") -> tuple[bool, str, str]:
-        """Starts or stops a recording, by default to the parameter's path: whether, what or why not, and where."""
-        refusal = "" if self._state == "active" else f"the node is {self._state}: activate it first"
-        done = self.recording.switch(path or self.settings.record, on=on, refusal=refusal)
+        Raises `RefuError` where that can't be.
+        """
+        if on and self._state != "active":
+            msg = f"the node is {self._state}: activate it first"
+            raise RefuError(msg)
+        done = self.recording.switch(path or self.settings.record, on=on)
         self._attend()
         return done
 
@@ -288,7 +294,6 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         self._attend()
         if self._state == "active":
             self._hold_topics()
-        self.recording.tell_closed()
         report = self.statistics.report()
         recording, error = self.recording.state()
         scene, since = self._listener.scene, self._listener.since
@@ -302,7 +307,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
             in_use=self._in_use,
             input_frame=self._listener.input_frame,
             is_transformed=self._listener.is_transformed,
-            has_foreign_betas=self._listener.decoder.has_foreign_betas,
+            has_foreign_betas=self._listener.doubts.has_foreign_betas and not self.settings.betas_are_told,
             persons=() if scene is None else scene.persons,
             recording=recording,
             recording_error=error,

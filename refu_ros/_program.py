@@ -34,8 +34,7 @@ def run(
         return _refuse(program, f'source a ROS 2 installation, or pip install "refu-ros[ros]" ({error})')
     given = sys.argv if arguments is None else [program, *arguments]
     try:
-        own = remove_ros_args(given)[1:]
-        if own:
+        if own := remove_ros_args(given)[1:]:
             argparse.ArgumentParser(
                 prog=program,
                 usage=f"{program} [--help] [--ros-args -p NAME:=VALUE ... --params-file FILE -r FROM:=TO ...]",
@@ -58,34 +57,30 @@ def _refuse(program: str, text: str) -> int:
     return EXIT_BAD_INPUT
 
 
-def on_signals(told: Callable[[], object]) -> None:
-    """From now on SIGINT and SIGTERM are answered by `told`."""
-    _on_signals(lambda *_: told())
-
-
 def _on_signals(handler: Any) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, handler)
+
+
+def hear(told: list[bool]) -> None:
+    """From now on `told` gets a SIGINT or SIGTERM: no Event, as one handler may interrupt the other in its lock."""
+    _on_signals(lambda *_: told.append(True))
 
 
 def make_executor() -> Any:
     """What waits for messages, requests and timers."""
     try:
         # Waits in C++ for events: the other one tells the middleware anew, in Python, what it waits for after each.
-        from rclpy.experimental import EventsExecutor
+        from rclpy.experimental import EventsExecutor as Executor
     except ImportError:  # an older rclpy
-        from rclpy.executors import SingleThreadedExecutor
-
-        return SingleThreadedExecutor()
-    return EventsExecutor()
+        from rclpy.executors import SingleThreadedExecutor as Executor
+    return Executor()
 
 
-def spin(executor: Any, node: Any, *, until: Callable[[], object]) -> None:
-    """The last resort: callbacks are guarded, but what rclpy itself raises mustn't end the node either."""
-
-    def pause(*_: Any, **__: Any) -> None:
-        time.sleep(_BREATH_S)
-
-    spin_once = node.guarded("executor", executor.spin_once, pause)
+def spin(node: Any, *, until: Callable[[], object]) -> None:
+    """Lets a `GuardedNode` answer what comes. Callbacks are guarded; what rclpy itself raises mustn't end it either."""
+    executor = make_executor()
+    executor.add_node(node)
+    spin_once = node.guarded("executor", executor.spin_once, lambda *_, **__: time.sleep(_BREATH_S))
     while not until():
         spin_once(timeout_sec=_LOOK_UP_S)

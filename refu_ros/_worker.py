@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from typing import Protocol
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -15,14 +14,13 @@ import torch
 from msg_adapters import Placement
 from msg_adapters.axes import SMPL_COLUMNS
 from msg_adapters.outputs import Moment, make_outputs
+from msg_adapters.scene import Arrival, Scene
+from msg_adapters.statistics import Statistics
 from refu_core import GarmentPipeline, RefuError, SmplFrame
 from refu_core._device import is_device_loss
-from refu_core.modes import BetasSource
 from refu_core.outputs import Dressed, Fittings
 from refu_core.realtime import PipelineOutput
-from refu_ros._scene import Arrival, Scene
 from refu_ros._settings import NodeSettings
-from refu_ros._statistics import Statistics
 
 _IDLE_S = 0.1
 """How often the thread looks for persons who have left when nobody sends [s]."""
@@ -49,8 +47,7 @@ class Outlet(Protocol):
         """The pipeline's device has failed: nothing comes before there is another pipeline."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Known:
+class _Known(NamedTuple):
     """A person as last computed, without the translation."""
 
     inputs: tuple[object, ...]
@@ -141,11 +138,8 @@ class Worker:
             self._work()
 
     def _work(self) -> None:
-        """One tick."""
         try:
-            with self._taking:
-                job = self._plan(self._take())
-            self._do(job)
+            self.tick(self._take)
         except Exception as error:  # whatever one frame brings up, the next may be good
             self._fail(error, "")
 
@@ -161,19 +155,30 @@ class Worker:
             self._last = self._last + period if now < self._last + 2 * period else now
         return arrivals
 
-    def tick(self, arrivals: Mapping[str, Arrival]) -> None:
-        """Works on one frame each of some persons."""
+    def tick(self, take: Callable[[], Mapping[str, Arrival]]) -> None:
+        """Works on one frame each of some persons: those that `take` gives."""
         with self._taking:
-            job = self._plan(arrivals)
-        self._do(job)
+            job = self._plan(take())
+        outputs: dict[str, PipelineOutput] = {}
+        try:
+            outputs = self._infer(
+                job.pipeline, {person: frame for person, frame in job.frames.items() if person not in job.known}
+            )
+        finally:  # a turn that nobody takes would be waited for
+            with self._in_order:
+                self._in_order.wait_for(lambda: self._n_done == job.turn)
+                try:
+                    self._finish(job, outputs)
+                finally:
+                    self._n_done += 1
+                    self._in_order.notify_all()
 
     def _plan(self, arrivals: Mapping[str, Arrival]) -> _Job:
         """What there is to do for these people, and with what."""
         settings = self.settings
         pipeline, fittings = self._next
         if pipeline is not self._pipeline:
-            self._pipeline = pipeline
-            self._is_lost = False
+            self._pipeline, self._is_lost = pipeline, False
         if settings.margin != pipeline.margin:
             pipeline.margin = settings.margin
         gone = self._scene.leave(settings.person_timeout)
@@ -183,7 +188,7 @@ class Worker:
             for _ in near:
                 self._statistics.count("skip.unwatched")
             near = {}
-        frames = {person: with_settings(arrival.frame, settings) for person, arrival in near.items()}
+        frames = {person: settings.applied(arrival.frame) for person, arrival in near.items()}
         known: dict[str, _Known] = {}
         job = _Job(self._n_taken, settings, pipeline, fittings, near, frames, known, gone)
         for person, frame in frames.items():
@@ -194,18 +199,8 @@ class Worker:
         self._n_taken += 1
         return job
 
-    def _do(self, job: _Job) -> None:
-        """Dresses these people, beside what other threads do, and sends what comes of it when it is their turn."""
-        outputs: dict[str, PipelineOutput] = {}
-        try:
-            outputs = self._infer(
-                job.pipeline, {person: frame for person, frame in job.frames.items() if person not in job.known}
-            )
-        finally:  # a turn that nobody takes would be waited for
-            with self._turn(job):
-                self._finish(job, outputs)
-
     def _finish(self, job: _Job, outputs: Mapping[str, PipelineOutput]) -> None:
+        """Sends what came of a job."""
         self._remove(job.gone)
         found, unresolved = self._remember(job, outputs)
         dressed = {person: frame for person, frame in job.frames.items() if person in self._dressed}
@@ -215,17 +210,6 @@ class Worker:
         done = time.monotonic()
         latencies = [1e3 * (done - job.arrivals[person].received) for person in dressed]
         self._statistics.publish(latencies, found=found, unresolved=unresolved)
-
-    @contextmanager
-    def _turn(self, job: _Job) -> Iterator[None]:
-        """After all that was taken before."""
-        with self._in_order:
-            self._in_order.wait_for(lambda: self._n_done == job.turn)
-            try:
-                yield
-            finally:
-                self._n_done += 1
-                self._in_order.notify_all()
 
     def _near(self, arrivals: Mapping[str, Arrival], settings: NodeSettings) -> dict[str, Arrival]:
         near = {}
@@ -258,19 +242,14 @@ class Worker:
 
     def _infer(self, pipeline: GarmentPipeline, frames: Mapping[str, SmplFrame]) -> dict[str, PipelineOutput]:
         """All persons in one batch; where that fails, one by one, so that one's failure is nobody else's."""
-        if not frames:
-            return {}
         try:
-            return dict(zip(frames, pipeline(list(frames.values())), strict=True))
+            return dict(zip(frames, pipeline([*frames.values()]), strict=True)) if frames else {}
         except Exception as error:
             if len(frames) == 1:
-                (person,) = frames
-                self._fail(error, f"{person or 'the person'}: ")
+                self._fail(error, f"{next(iter(frames)) or 'the person'}: ")
                 return {}
-        outputs: dict[str, PipelineOutput] = {}
-        for person, frame in frames.items():
-            outputs |= self._infer(pipeline, {person: frame})
-        return outputs
+        alone = [self._infer(pipeline, {person: frame}) for person, frame in frames.items()]
+        return {person: output for found in alone for person, output in found.items()}
 
     def _fail(self, error: Exception, who: str) -> None:
         """Counts what a frame was lost to; a device that has failed is reported once."""
@@ -296,9 +275,8 @@ class Worker:
             offset = there.rotation @ frame.transl + there.translation
             worn.append(Dressed(person, frame, output, job.fittings, there.rotation, offset, arrival.camera))
         self._here.update(frames)
-        moment = self._moment(job.settings)
         for row in self._outputs:
-            self._publish(row.messages(worn, moment))
+            self._publish(row.messages(worn, self._moment(job.settings)))
 
     def _publish(self, messages: Iterable[tuple[str, bytes]]) -> None:
         try:
@@ -309,23 +287,14 @@ class Worker:
 
     def _remove(self, persons: Iterable[str]) -> None:
         """Takes persons out of viewers' scenes."""
-        everyone = [*persons]
-        for person in everyone:
+        gone = []
+        for person in persons:
             self._dressed.pop(person, None)
-        gone = [person for person in everyone if person in self._here]
+            if person in self._here:
+                gone.append(person)
         self._here -= {*gone}
-        moment = self._moment(self.settings)
-        for output in self._outputs if gone else ():
-            self._publish(output.gone(gone, moment))
+        for row in self._outputs if gone else ():
+            self._publish(row.gone(gone, self._moment(self.settings)))
 
     def _moment(self, settings: NodeSettings) -> Moment:
         return Moment(settings, self._outlet.watchers, self._outlet.now_ns())
-
-
-def with_settings(frame: SmplFrame, settings: NodeSettings) -> SmplFrame:
-    """The frame with the shape and style that the parameters ask for."""
-    if settings.betas_source == BetasSource.FIXED:
-        frame = replace(frame, betas=np.array(settings.betas))
-    if frame.style is None and any(settings.style):
-        frame = replace(frame, style=np.array(settings.style))
-    return frame

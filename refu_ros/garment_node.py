@@ -12,12 +12,10 @@ from typing import Any
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # NumPy reads it; its threads wait for busy cores
 
 from refu_ros._parameters import listing
-from refu_ros._program import EXIT_BAD_INPUT, make_executor, on_signals, run, spin
+from refu_ros._program import EXIT_BAD_INPUT, hear, run, spin
 from refu_ros._transport import make_room
 
 EXIT_DEVICE_LOST = 3
-_LAST_WORDS_S = 0.3
-"""Time for the answer to a shutdown request to leave."""
 _TOPICS = """\
 topics:
   smpl_params   in: a person's body, of the type in input_type; <person>/smpl_params for each of persons
@@ -49,18 +47,12 @@ def _live() -> int:
     """The node from its beginning to its end. Raises what is wrong with its parameters."""
     from refu_ros._node import GarmentNode
 
-    node = GarmentNode()
-    told: list[bool] = []  # no Event: one handler may interrupt the other while it holds the lock
-    hear = partial(on_signals, partial(told.append, True))
+    node, told = GarmentNode(), list[bool]()
     try:
-        if node.settings.autostart and not started(node, hear):
+        if node.settings.autostart and not started(node, partial(hear, told)):
             return EXIT_BAD_INPUT
-        hear()
-        executor = make_executor()
-        executor.add_node(node)
-        spin(executor, node, until=lambda: told or node.finalized)
-        end = time.monotonic() + _LAST_WORDS_S * node.finalized
-        spin(executor, node, until=lambda: time.monotonic() >= end)
+        hear(told)
+        spin(node, until=lambda: told or time.monotonic() >= node.ends_at)
         return EXIT_DEVICE_LOST if node.failed else 0
     finally:
         node.close()

@@ -5,9 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import partial
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any, cast
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # NumPy reads it; its threads wait for busy cores
@@ -16,80 +14,50 @@ import numpy as np
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from msg_adapters import INPUT_TYPES, BagError, Encoder, InputType, Motion, encoder_for, iter_smpl_frames, read_motion
-from msg_adapters.motion import MARCH_FPS, march
+from msg_adapters import INPUT_TYPES, Encoder, InputType, Motion, encoder_for, load_motion
 from refu_core import FrameError, SmplFrame
-from refu_core.recordings import SUFFIXES, Axes
+from refu_core.options import SettingsError, check, fixed
+from refu_core.recordings import Axes
 from refu_ros._guard import GuardedNode
 from refu_ros._interfaces import interface
-from refu_ros._parameters import SettingsError, check, declare, listing, parameter
-from refu_ros._program import make_executor, on_signals, run, spin
+from refu_ros._parameters import declare, listing
+from refu_ros._program import hear, run, spin
 
 TOPIC = "smpl_params"
-
-
-_fixed = partial(parameter, live=False)
 
 
 @dataclass(frozen=True, kw_only=True)
 class PublisherOptions:
     """The node's parameters: what is played, and how. Raises `SettingsError` for values that have no meaning."""
 
-    motion: str = _fixed(
+    motion: str = fixed(
         "", "File of motion (docs/guide/inputs.md), .mcap, or rosbag2 directory to play; empty: a march on the spot."
     )
-    input_type: str = _fixed("multiarray", f"Message to send: {', '.join(INPUT_TYPES)}.")
-    input_axes: str = _fixed(
+    input_type: str = fixed("multiarray", f"Message to send: {', '.join(INPUT_TYPES)}.")
+    input_axes: str = fixed(
         "smpl",
         "Axes that are sent: smpl (y up; files are turned), or frame (as files have them).",
         choices=("smpl", "frame"),
     )
-    frame_id: str = _fixed("map", "Frame of messages that have a header.")
-    fps: float = _fixed(0.0, "Frame rate of a file of motion, in place of its own; 0 for that [Hz].", low=0.0, high=1e4)
-    rate: float = _fixed(
+    frame_id: str = fixed("map", "Frame of messages that have a header.")
+    fps: float = fixed(0.0, "Frame rate of a file of motion, in place of its own; 0 for that [Hz].", within=(0.0, 1e4))
+    rate: float = fixed(
         30.0,
         "Messages a second, the motion resampled to it; 0 for the rate it was recorded at [Hz].",
-        low=0.0,
-        high=1e4,
+        within=(0.0, 1e4),
     )
-    loop: bool = _fixed(True, "Start again after the last frame, instead of stopping the node.")
-    in_place: bool = _fixed(False, "Hold the horizontal position of the first frame.")
-    persons: tuple[str, ...] = _fixed(
+    loop: bool = fixed(True, "Start again after the last frame, instead of stopping the node.")
+    in_place: bool = fixed(False, "Hold the horizontal position of the first frame.")
+    persons: tuple[str, ...] = fixed(
         ("",), "Names of several persons: each plays the motion from another time, on <name>/smpl_params."
     )
-    spacing: float = _fixed(1.0, "Distance between persons, to the left [m].", low=-1e6, high=1e6)
+    spacing: float = fixed(1.0, "Distance between persons, to the left [m].", within=(-1e6, 1e6))
 
     def __post_init__(self) -> None:
         check(self)
         if not all(name.isidentifier() for name in self.persons if name):
             msg = f"persons: wanted names of letters, digits and underscores, got {list(self.persons)}"
             raise SettingsError(msg)
-
-
-def load_motion(path: str, *, axes: Axes = "auto", fps: float = 0.0) -> Motion:
-    """The motion of a file, of a bag (evenly spaced, with the betas of its first frame), or `march` for an empty path.
-
-    A file's axes and rate (0 for its own) are as `read_motion` takes them. Raises `MotionFileError` and `BagError`.
-    """
-    if not path:
-        return march()
-    if Path(path).suffix.lower() in SUFFIXES:
-        return read_motion(path, axes=axes, fps=fps or None)
-    frames = [record.frame for record in iter_smpl_frames(path) if record.frame is not None]
-    if not frames:
-        msg = f"{path}: no frame of its SMPL topic can be decoded; `refu replay {path}` says why"
-        raise BagError(msg)
-    seconds = (frames[-1].stamp_ns - frames[0].stamp_ns) * 1e-9
-    fps = (len(frames) - 1) / seconds if seconds > 0 else MARCH_FPS
-    poses, transl = (np.stack(arrays) for arrays in zip(*((f.pose, f.transl) for f in frames), strict=True))
-    return Motion(poses, transl, frames[0].betas, fps)
-
-
-def in_place(motion: Motion, *, up: int) -> Motion:
-    """The motion with its translations held where the first frame is, but along the axis `up`."""
-    held = np.repeat(motion.transl[:1], len(motion), axis=0)
-    held[:, up] = motion.transl[:, up]
-    return replace(motion, transl=held)
 
 
 class SmplPublisher(GuardedNode):
@@ -127,7 +95,7 @@ class SmplPublisher(GuardedNode):
 
     def _prepare(self, motion: Motion) -> Motion:
         if self.options.in_place:
-            motion = in_place(motion, up=1 if self.options.input_axes == "smpl" else 2)
+            motion = motion.in_place(up=1 if self.options.input_axes == "smpl" else 2)
         if self.options.rate not in (0, motion.fps):
             motion = motion.resampled(self.options.rate)
         return motion
@@ -156,13 +124,9 @@ class SmplPublisher(GuardedNode):
 
 
 def _live() -> int:
-    node = SmplPublisher()
-    told: list[bool] = []  # no Event: one handler may interrupt the other while it holds the lock
-    on_signals(partial(told.append, True))
-    executor = make_executor()
-    executor.add_node(node)
-    spin(executor, node, until=lambda: told or node.finished)
-    executor.shutdown()
+    node, told = SmplPublisher(), list[bool]()
+    hear(told)
+    spin(node, until=lambda: told or node.finished)
     node.destroy_node()
     return 0
 

@@ -28,6 +28,8 @@ from safetensors.torch import save as save_tensors
 from msg_adapters import BagError, BagReader, BagWriter, QosProfile
 from msg_adapters.bags import Recorder
 from msg_adapters.diagnostics import DiagnosticStatus
+from msg_adapters.scene import Scene
+from msg_adapters.statistics import Statistics
 from refu_core import GarmentPipeline, SmplFrame, WeightsError, load_body
 from refu_core._device import is_device_loss
 from refu_core.backbones import TailorNetConfig
@@ -35,9 +37,7 @@ from refu_core.training import load_checkpoint, save_checkpoint
 from refu_core.weights import save_weights
 from refu_lab.cli import main
 from refu_ros._diagnostics import Situation, statuses
-from refu_ros._scene import Scene
 from refu_ros._settings import NodeSettings
-from refu_ros._statistics import Statistics
 from refu_ros._worker import Worker
 from tests.core.test_files import SPECIAL
 from tests.fuzz.corpus import small_weights
@@ -299,7 +299,7 @@ def test_a_lost_device_is_reported_once_and_another_pipeline_takes_over() -> Non
 
     def tick(i: int) -> None:
         scene.put("", turned(i))
-        worker.tick(scene.take(timeout=0.0))
+        worker.tick(lambda: scene.take(timeout=0.0))
 
     for i in range(1, 6):
         tick(i)

@@ -15,10 +15,11 @@ import pytest
 
 from msg_adapters import BagError, BagReader, BagWriter, EncodeError, MarkerMesh, decoder_for, read_motion
 from refu_core import BodyError, WeightsError, load_body
+from refu_core.options import SettingsError
 from refu_core.simulation import SimulationError, load_clips
 from refu_core.simulation._store import Shard
 from refu_core.training import TrainingLog, load_checkpoint, save_checkpoint
-from refu_ros._settings import NodeSettings, SettingsError
+from refu_ros._settings import NodeSettings
 from tests.fuzz.containers import join_mcap, mcap_chunk, split_mcap
 
 

@@ -9,7 +9,6 @@ import tempfile
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -25,31 +24,32 @@ from msg_adapters import (
     BagReader,
     BagWriter,
     DecodeError,
+    Doubts,
+    InputStream,
     Marker,
     QosProfile,
+    check_plausible,
     decode_marker_array,
     decode_point_cloud,
 )
-from msg_adapters.bags import Recorder, RecorderState, free_path
+from msg_adapters.bags import Recorder, RecorderState, Recording, free_path
 from msg_adapters.cdr import CdrWriter
+from msg_adapters.scene import Scene
+from msg_adapters.statistics import Statistics
 from refu_core import BodyError, FrameError, GarmentPipeline, MeshError, RefuError, SmplFrame, load_body
 from refu_core.keypoints import Proportions, Skeleton, keypoint_layout
 from refu_core.keypoints._pose import Pose
 from refu_core.modes import FOREIGN_BETAS, ONE_STYLE
-from refu_ros._asked import asked_path
-from refu_ros._decoding import InputDecoder
+from refu_core.options import SettingsError, specs_of
+from refu_ros._beside import Dresser, PipelineLoader, asked_path, load
 from refu_ros._diagnostics import Situation, statuses
-from refu_ros._dresser import Dresser
-from refu_ros._loader import PipelineLoader
-from refu_ros._recording import Recording
-from refu_ros._scene import Scene, check_plausible
-from refu_ros._settings import NodeSettings, SettingsError, defaults, specs
-from refu_ros._statistics import Statistics
+from refu_ros._settings import NodeSettings
 from refu_ros._transport import PROFILES, SEGMENT_BYTES, make_room
 from refu_ros._worker import Worker
 from tests.virtual_time import VirtualTime
 
 TOPIC, TYPE = "/garments", "visualization_msgs/msg/MarkerArray"
+KEYPOINT_POSES = "geometry_msgs/msg/PoseArray"
 GARMENT = "short-pant-male"
 
 
@@ -63,8 +63,9 @@ def frame(angle: float = 0.0, *, stamp_ns: int = 1, transl: tuple[float, ...] = 
 
 
 def test_every_parameter_is_described() -> None:
-    assert all(spec.description.endswith(".") for spec in specs().values())
-    assert NodeSettings().changed(dict(defaults())) == NodeSettings()
+    specs = specs_of(NodeSettings)
+    assert all(spec.description.endswith(".") for spec in specs.values())
+    assert NodeSettings().changed({name: spec.default for name, spec in specs.items()}) == NodeSettings()
 
 
 @pytest.mark.parametrize(
@@ -364,7 +365,7 @@ class Setup:
     def tick(self, **frames: SmplFrame) -> None:
         for person, sent in frames.items():
             self.scene.put(person, sent)
-        self.worker.tick(self.scene.take(timeout=0.0))
+        self.worker.tick(lambda: self.scene.take(timeout=0.0))
 
     def total(self, key: str) -> int:
         return self.statistics.report().total[key]
@@ -472,7 +473,7 @@ def test_one_persons_failure_is_nobody_elses(pipeline: GarmentPipeline) -> None:
 def test_the_rate_limit(pipeline: GarmentPipeline, monkeypatch: pytest.MonkeyPatch) -> None:
     """A message each 50 ms, with the newest frame of those that come each 4.9 ms."""
     time = VirtualTime()
-    time.rules("refu_ros._scene", monkeypatch)
+    time.rules("msg_adapters.scene", monkeypatch)
     monkeypatch.setattr("refu_ros._worker.time", time)
     began: list[tuple[float, int]] = []
 
@@ -573,7 +574,7 @@ def test_no_more_is_taken_than_the_pipeline_has_threads(pipeline: GarmentPipelin
 
 def test_what_cannot_be_loaded_is_reported() -> None:
     came: list[Any] = []
-    loader = PipelineLoader(lambda _, key: came.append(key), lambda error, _: came.append(error))
+    loader = PipelineLoader(lambda _, key: came.append(key), lambda error, _: came.append(error), threads=1)
     missing = NodeSettings(garments=(GARMENT,), device="nonsense").pipeline
     good = NodeSettings(garments=(GARMENT,)).pipeline
     for i, key in enumerate((missing, good)):
@@ -711,11 +712,11 @@ def test_who_wears_the_garments_is_a_parameter_that_needs_another_pipeline(how: 
         NodeSettings().changed(two)
     asked = NodeSettings().changed({**two, how: "neutral"})
     assert " on neutral " in str(asked.pipeline)
-    assert asked.pipeline.load().body.name == "neutral"
+    assert load(asked.pipeline).body.name == "neutral"
     assert asked.betas_are_told
     missing = asked.changed({"body": "", "betas_from": "", "garments": ["short-pant-male"], how: "/none/SMPL.pkl"})
     with pytest.raises(BodyError, match=r"/none/SMPL\.pkl: can't be read"):
-        missing.pipeline.load()
+        load(missing.pipeline)
 
 
 def test_betas_of_unknown_meaning_are_warned_of() -> None:
@@ -731,21 +732,22 @@ def test_betas_of_unknown_meaning_are_warned_of() -> None:
 @pytest.mark.parametrize(("root", "words"), [((0.0, 1.0, 0.0), ""), ((np.pi / 2, 0.0, 0.0), "towards +z")])
 def test_people_who_lie_are_warned_of_once(root: tuple[float, ...], words: str) -> None:
     """Of a sender whose z is up, everybody lies; who turns round stands."""
-    decoder = InputDecoder(NodeSettings())
+    settings, doubts = NodeSettings(), Doubts()
     pose = np.zeros((24, 3), np.float32)
     pose[0] = root
-    said = [doubt for _ in range(300) if (doubt := decoder.doubt([SmplFrame(pose)]))]
+    said = [doubt for _ in range(300) if (doubt := doubts.of([SmplFrame(pose)], settings, is_y_up=True))]
     assert len(said) == bool(words)
     assert words in "".join(said)
-    of_frame = InputDecoder(NodeSettings().changed({"input_axes": "frame"}))
-    assert not any(of_frame.doubt([SmplFrame(pose)]) for _ in range(300))
+    of_frame = Doubts()
+    assert not any(of_frame.of([SmplFrame(pose)], settings, is_y_up=False) for _ in range(300))
 
 
 def test_a_style_that_a_garment_has_no_ear_for_is_told_once() -> None:
     styled = SmplFrame(np.zeros((24, 3), np.float32), style=np.ones(4))
-    decoder = InputDecoder(NodeSettings().changed({"garments": ["tshirt-female", "skirt-female"]}))
-    assert [decoder.doubt([styled]) for _ in range(2)] == [ONE_STYLE.format("tshirt-female"), ""]
-    assert InputDecoder(NodeSettings()).doubt([styled]) == ""
+    doubts, settings = Doubts(), NodeSettings().changed({"garments": ["tshirt-female", "skirt-female"]})
+    said = [doubts.of([styled], settings, is_y_up=True) for _ in range(2)]
+    assert said == [ONE_STYLE.format("tshirt-female"), ""]
+    assert Doubts().of([styled], NodeSettings(), is_y_up=True) == ""
 
 
 @pytest.mark.parametrize("collider", [True, False])
@@ -755,7 +757,7 @@ def test_the_collider_is_a_parameter_that_needs_another_pipeline(collider: bool)
     assert plain.collider
     assert (asked.pipeline == plain.pipeline) is collider
     assert ("no collider" in str(asked.pipeline)) is not collider
-    assert (asked.pipeline.load().outfit.collider is not None) is collider
+    assert (load(asked.pipeline).outfit.collider is not None) is collider
     with pytest.raises(SettingsError, match="true or false"):
         plain.changed({"collider": "yes"})
 
@@ -766,9 +768,9 @@ def test_the_collider_is_a_parameter_that_needs_another_pipeline(collider: bool)
 def test_keypoints_are_followed_from_message_to_frames() -> None:
     settings = NodeSettings(input_type="keypoint_poses", keypoints="coco17", keypoint_rate=30.0)
     assert (settings.axes, settings.known_betas) == ("frame", None)
-    decoder, body = InputDecoder(settings), load_body("male")
-    assert (decoder.message_type, decoder.is_steady, decoder.predicted(0)) == ("geometry_msgs/msg/PoseArray", True, {})
-    decoder.use(settings, body)
+    decoder, body = InputStream(settings.input_type), load_body("male")
+    assert (decoder.message_type, decoder.is_of_keypoints, decoder.predicted(0)) == (KEYPOINT_POSES, True, {})
+    decoder.follow(body, "coco17", betas=None, smoothing=1.0)
     bones = Skeleton(keypoint_layout("coco17"), Proportions.of_body(body))
     turns = np.tile(np.eye(3), (24, 1, 1))
 
@@ -781,7 +783,8 @@ def test_keypoints_are_followed_from_message_to_frames() -> None:
         return cdr.to_bytes()
 
     for i in range(10):
-        frames, frame_id = decoder.frames("ann", message(10**9 + i * 33_333_333, 0.05 * i), 5 * 10**9 + i * 33_333_333)
+        data, now_ns = message(10**9 + i * 33_333_333, 0.05 * i), 5 * 10**9 + i * 33_333_333
+        frames, frame_id = decoder.frames(data, now_ns, sender="ann")
     assert (list(frames), frame_id) == (["ann"], "camera")
     now = 5 * 10**9 + 9 * 33_333_333
     held, ahead = decoder.predicted(now)["ann"], decoder.predicted(now + 66_666_666)["ann"]
@@ -789,8 +792,10 @@ def test_keypoints_are_followed_from_message_to_frames() -> None:
     assert ahead.stamp_ns - held.stamp_ns == 66_666_666
     assert decoder.predicted(now + 10**9) == {}
     with pytest.raises(DecodeError, match="wanted 17 poses"):
-        decoder.frames("ann", _of_ones(33), 0)
-    decoder.use(replace(settings, betas_source="fixed"), body)  # other settings: everybody begins anew
+        decoder.frames(_of_ones(33), 0, sender="ann")
+    decoder.follow(body, "coco17", betas=None, smoothing=1.0)  # the same settings
+    assert decoder.predicted(now) != {}
+    decoder.follow(body, "coco17", betas=(0.0,) * 10, smoothing=1.0)  # other settings: everybody begins anew
     assert decoder.predicted(now) == {}
 
 

@@ -30,7 +30,7 @@ CORE = (
     {"refu", "fitting"},
     {"contact"},
     {"realtime"},
-    {"outputs"},
+    {"outputs", "options"},
     {"observation"},
     {"metrics"},
     {"simulation"},

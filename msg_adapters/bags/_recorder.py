@@ -104,7 +104,9 @@ class Recorder:
         sync_period: float = SYNC_PERIOD_S,
         max_queued_bytes: int = MAX_QUEUED_BYTES,
         open_bag: Callable[[Path], BagWriter] = BagWriter,
+        ended: Callable[[RecorderState], object] = lambda _: None,
     ) -> None:
+        """`ended` is called by the recorder's thread when the file is closed, or can't be written any more."""
         try:
             self.path, self._bag = _opened(Path(path).expanduser().absolute(), open_bag)
         except BagError:
@@ -125,6 +127,7 @@ class Recorder:
         """When the disk was waited for last: of a queue that has grown, each message has waited long enough."""
         self._error = ""
         self._stopping = False
+        self._ended = ended
         self._thread = threading.Thread(target=self._run, name="recorder")
         self._thread.start()
 
@@ -160,7 +163,7 @@ class Recorder:
 
     @property
     def finished(self) -> bool:
-        """Whether the file is closed."""
+        """Whether the file is closed, and that has been told."""
         return not self._thread.is_alive()
 
     def state(self) -> RecorderState:
@@ -207,6 +210,7 @@ class Recorder:
                 self._dropped += 1 + len(self._queue)
                 self._queue.clear()
                 self._queued_bytes = 0
+        self._ended(self.state())
 
     def _next(self) -> _Message | None:
         """The next message, `_SYNC` when one has waited for the disk long enough, or None at the end."""

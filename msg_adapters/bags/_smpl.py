@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from msg_adapters.bags._metadata import TopicInfo
 from msg_adapters.bags._reader import BagReader
 from msg_adapters.cdr import split_stamp
 from msg_adapters.errors import BagError, DecodeError, EncodeError
-from msg_adapters.inputs import INPUT_TYPES, Decoder, decoder_for
+from msg_adapters.inputs import INPUT_TYPES, KEYPOINT_TYPES, Decoder, decoder_for
 from refu_core.frames import SmplFrame
 
 _USUAL_NAME = "smpl_params"
@@ -33,7 +33,8 @@ class FrameRecord:
 class SmplBag:
     """A bag and the topic of it that carries a body; iterating yields a `FrameRecord` for each message."""
 
-    def __init__(self, reader: BagReader, topic: TopicInfo, decoder: Decoder) -> None:
+    def __init__(self, reader: BagReader, topic: TopicInfo, decoder: Decoder | None) -> None:
+        """Without a decoder, records are messages as they are: keypoints are of who is followed."""
         self.reader = reader
         self.topic = topic
         self.decoder = decoder
@@ -42,14 +43,6 @@ class SmplBag:
     def message_count(self) -> int:
         """Messages of the topic."""
         return self.topic.message_count
-
-    def undecoded(self) -> Iterator[FrameRecord]:
-        """Each message as it is, stamped with its log time: for a decoder that remembers and so may see it but once."""
-        for message in self.reader.messages({self.topic.name}):
-            log = message.log_time_ns
-            yield FrameRecord(
-                frame=None, error=None, stamp_ns=log, log_time_ns=log, topic=message.topic, raw=message.data
-            )
 
     def __enter__(self) -> SmplBag:
         return self
@@ -61,11 +54,10 @@ class SmplBag:
         for message in self.reader.messages({self.topic.name}):
             frame, error = None, None
             try:
-                frame = self.decoder.from_bytes(message.data)
-                if not frame.stamp_ns:
-                    frame = _stamped(frame, message.log_time_ns)
+                if self.decoder is not None:
+                    frame = _stamped(self.decoder.from_bytes(message.data), message.log_time_ns)
             except DecodeError as cause:
-                frame, error = None, cause
+                error = cause
             yield FrameRecord(
                 frame=frame,
                 error=error,
@@ -77,7 +69,9 @@ class SmplBag:
 
 
 def _stamped(frame: SmplFrame, log_time_ns: int) -> SmplFrame:
-    """The frame with the time it was received; a time that no message can hold is the message's fault."""
+    """The frame, where it has no stamp with that of its receipt; one that no message holds is the message's fault."""
+    if frame.stamp_ns:
+        return frame
     try:
         split_stamp(log_time_ns)
     except EncodeError as error:
@@ -86,27 +80,24 @@ def _stamped(frame: SmplFrame, log_time_ns: int) -> SmplFrame:
     return replace(frame, stamp_ns=log_time_ns)
 
 
-def _listing(topics: tuple[TopicInfo, ...] | list[TopicInfo]) -> str:
+def _listing(topics: Sequence[TopicInfo]) -> str:
     return ", ".join(f"{topic.name} ({topic.message_type or 'no type'})" for topic in topics)
 
 
-def _choose(
-    path: Path, topics: tuple[TopicInfo, ...], name: str | None, input_type: str | None, own: Decoder | None
-) -> TopicInfo:
+def _choose(path: Path, topics: Sequence[TopicInfo], name: str | None, kinds: Sequence[str]) -> TopicInfo:
+    """The topic of a name, or the one that a body may be on, by the types that it may have."""
+    wanted = ", ".join(kinds)
     if name is not None:
         chosen = next((topic for topic in topics if topic.name.lstrip("/") == name.lstrip("/")), None)
         if chosen is None:
             msg = f"{path}: no topic {name}; the bag has {_listing(topics)}"
             raise BagError(msg)
-        wanted = own.message_type if own else input_type and decoder_for(input_type).message_type
-        known = (wanted,) if own else INPUT_TYPES.values()
-        if wanted not in (None, chosen.message_type) or chosen.message_type not in known:
-            msg = f"{path}: {_listing([chosen])} doesn't carry {wanted or 'a body'}; wanted {wanted or _supported()}"
+        if chosen.message_type not in kinds:
+            what = "a body" if len(kinds) > 1 else wanted
+            msg = f"{path}: {_listing([chosen])} doesn't carry {what}; wanted {wanted}"
             raise BagError(msg)
         return chosen
-    types = {decoder_for(input_type).message_type} if input_type and not own else set(INPUT_TYPES.values())
-    types = {own.message_type} if own else types
-    found = [topic for topic in topics if topic.message_type in types and topic.message_count]
+    found = [topic for topic in topics if topic.message_type in kinds and topic.message_count]
     # A robot's own joint states are of an input type too: the name the node listens to decides before giving up.
     usual = [topic for topic in found if topic.name.rsplit("/", maxsplit=1)[-1] == _USUAL_NAME]
     if len(found) == 1 or len(usual) == 1:
@@ -114,19 +105,12 @@ def _choose(
     if found:
         msg = f"{path}: {len(found)} topics could carry the body: {_listing(found)}; choose one with --topic"
     else:
-        wanted = own.message_type if own else _supported()
         msg = f"{path}: no SMPL topic; the bag has {_listing(topics)}, wanted a topic of {wanted}"
     raise BagError(msg)
 
 
-def _supported() -> str:
-    return ", ".join(INPUT_TYPES.values())
-
-
-def open_smpl_bag(
-    path: str | Path, *, topic: str | None = None, input_type: str | None = None, decoder: Decoder | None = None
-) -> SmplBag:
-    """Open a bag and find the topic that carries a body; a `decoder` of one's own is used for its type of message.
+def open_smpl_bag(path: str | Path, *, topic: str | None = None, input_type: str | None = None) -> SmplBag:
+    """Open a bag and find the topic that carries a body, or of an input type of keypoints, people's keypoints.
 
     Without `topic` it is the only one of an input type (of `input_type` where given), or the only one of those named
     `smpl_params`.
@@ -139,26 +123,26 @@ def open_smpl_bag(
         why = "; " + "; ".join(reader.warnings) if reader.warnings else ""
         msg = f"{reader.path}: no message in this bag{why}"
         raise BagError(msg)
+    of_keypoints = [kind for name, kind in KEYPOINT_TYPES.items() if name == input_type]
+    kinds = of_keypoints or ([decoder_for(input_type).message_type] if input_type else [*INPUT_TYPES.values()])
     try:
-        chosen = _choose(reader.path, topics, topic, input_type, decoder)
+        chosen = _choose(reader.path, topics, topic, kinds)
         doubtful = not chosen.message_count
     except BagError:
-        types = {decoder.message_type} if decoder else set(INPUT_TYPES.values())
-        doubtful = any(not info.message_count and info.message_type in types for info in topics)
+        doubtful = any(not info.message_count and info.message_type in kinds for info in topics)
         if not doubtful:
             raise
     if doubtful:  # a summary isn't believed that a topic is empty
-        chosen = _choose(reader.path, reader.count(), topic, input_type, decoder)
+        chosen = _choose(reader.path, reader.count(), topic, kinds)
     if chosen.encoding != "cdr":
         msg = (
             f"{reader.path}: {chosen.name} is encoded as {chosen.encoding or 'nothing'}; wanted cdr, as ROS 2 writes it"
         )
         raise BagError(msg)
-    return SmplBag(reader, chosen, decoder or decoder_for(chosen.message_type, definition=chosen.definition or None))
+    decoder = None if of_keypoints else decoder_for(chosen.message_type, definition=chosen.definition or None)
+    return SmplBag(reader, chosen, decoder)
 
 
-def iter_smpl_frames(
-    path: str | Path, *, topic: str | None = None, input_type: str | None = None
-) -> Iterator[FrameRecord]:
+def iter_smpl_frames(path: str | Path) -> Iterator[FrameRecord]:
     """The frames of a bag; a message that can't be decoded is a record with its error. Raises as `open_smpl_bag`."""
-    return iter(open_smpl_bag(path, topic=topic, input_type=input_type))
+    return iter(open_smpl_bag(path))

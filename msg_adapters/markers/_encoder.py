@@ -57,8 +57,6 @@ class MarkerMesh:
     color: Rgba = CLOTH
     """Red, green, blue, alpha in [0, 1]."""
     id: int = 0
-    vertex_colors: bool = False
-    """Whether frames bring a colour for each vertex (RViz draws those without shading)."""
 
     def __post_init__(self) -> None:
         faces = numbers(f"{self.ns}: faces", self.faces)
@@ -94,23 +92,20 @@ def _write_marker(
     stamp_ns: int = 0,
     color: Rgba = _NO_COLOR,
     n_points: int = 0,
-    n_colors: int = 0,
     kind: int = TRIANGLE_LIST,
     size: float = 1.0,
     lifetime_ns: int = 0,
     pose: Sequence[float] = _IDENTITY_POSE,
-) -> tuple[int, int, int]:
-    """Append one visualization_msgs/Marker; returns the payload offsets of its stamp, points and colours."""
+) -> tuple[int, int]:
+    """Append one visualization_msgs/Marker; returns the payload offsets of its stamp and points."""
     stamp_at = writer.fields("Tssiii", stamp_ns, frame_id, *key, kind, action)
     writer.fields("ddddddddddffff", *pose, size, size, size, *color)
     writer.fields("T?", lifetime_ns, False)  # frame_locked
     writer.fields("I", n_points)
     points_at = writer.array("f8", np.zeros(n_points * 3))
-    writer.fields("I", n_colors)
-    colors_at = writer.array("f4", np.zeros(n_colors * 4))
-    writer.fields("sTssI", "", 0, "", "", 0)  # texture_resource, texture
+    writer.fields("IsTssI", 0, "", 0, "", "", 0)  # colors, texture_resource, texture
     writer.fields("IsssI?", 0, "", "", "", 0, False)  # uv_coordinates, text, mesh_resource, mesh_file and its materials
-    return stamp_at, points_at, colors_at
+    return stamp_at, points_at
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,8 +118,6 @@ class _Slot:
     stamp_at: int
     points: NDArray[np.float64]
     """Shape (3F, 3)."""
-    colors: NDArray[np.float32] | None
-    """Shape (3F, 4)."""
     placed: NDArray[np.float64]
     """Vertices where the message wants them, shape (V, 3): scratch, a fourth of the corners' size."""
 
@@ -163,7 +156,6 @@ class MarkerArrayEncoder:
                 frame_id=frame_id,
                 color=mesh.color,
                 n_points=mesh.faces.size,
-                n_colors=mesh.faces.size if mesh.vertex_colors else 0,
                 lifetime_ns=lifetime_ns,
             )
             for mesh in meshes
@@ -178,17 +170,13 @@ class MarkerArrayEncoder:
         self._slots = tuple(self._slot(mesh, payload, *place) for mesh, place in zip(meshes, places, strict=True))
 
     @staticmethod
-    def _slot(mesh: MarkerMesh, payload: NDArray[np.uint8], stamp_at: int, points_at: int, colors_at: int) -> _Slot:
+    def _slot(mesh: MarkerMesh, payload: NDArray[np.uint8], stamp_at: int, points_at: int) -> _Slot:
         corners = np.ascontiguousarray(mesh.faces, dtype=np.intp).reshape(-1)
-        colors = None
-        if mesh.vertex_colors:
-            colors = payload[colors_at : colors_at + corners.size * 16].view("<f4").reshape(-1, 4)
         return _Slot(
             mesh=mesh,
             corners=corners,
             stamp_at=stamp_at,
             points=payload[points_at : points_at + corners.size * 24].view("<f8").reshape(-1, 3),
-            colors=colors,
             placed=np.empty((mesh.n_vertices, 3)),
         )
 
@@ -198,7 +186,6 @@ class MarkerArrayEncoder:
         *,
         stamp_ns: int | Sequence[int],
         transl: ArrayLike | None = None,
-        colors: Sequence[ArrayLike | None] | None = None,
     ) -> bytes:
         """One frame.
 
@@ -207,15 +194,13 @@ class MarkerArrayEncoder:
                 `axes="frame"`, in the axes of the frame).
             stamp_ns: time of the measurement [ns], of all meshes or of each.
             transl: added in float64 [m], in the same axes: shape (3,) for all meshes or (M, 3) for each.
-            colors: for each mesh with `vertex_colors` its red, green, blue, alpha, shape (V, 4); None for the others.
 
         Raises:
             EncodeError: a shape is wrong, a vertex isn't finite, or the stamp doesn't fit a ROS time.
         """
         n = len(self._slots)
-        if len(vertices) != n or (colors is not None and len(colors) != n):
-            got = len(vertices) if colors is None else (len(vertices), len(colors))
-            msg = f"wanted vertices (and colours, if any) of {n} meshes, got {got}"
+        if len(vertices) != n:
+            msg = f"wanted vertices of {n} meshes, got {len(vertices)}"
             raise EncodeError(msg)
         each = [stamp_ns] * n if isinstance(stamp_ns, (int, np.integer)) else stamp_ns
         stamps = [split_stamp(stamp) for stamp in each]
@@ -226,7 +211,6 @@ class MarkerArrayEncoder:
         for i, slot in enumerate(self._slots):
             struct.pack_into("<iI", self._payload, slot.stamp_at, *stamps[i])
             self._write_points(slot, numbers(slot.mesh.ns, vertices[i]), offsets[i])
-            self._write_colors(slot, None if colors is None else colors[i])
         return self._message.tobytes()
 
     def _offsets(self, transl: ArrayLike | None) -> NDArray[np.float64]:
@@ -253,21 +237,6 @@ class MarkerArrayEncoder:
             raise EncodeError(msg)
         # mode="clip" writes in place ("raise" would buffer the output); the indices were checked with the mesh.
         np.take(slot.placed, slot.corners, axis=0, out=slot.points, mode="clip")
-
-    @staticmethod
-    def _write_colors(slot: _Slot, colors: ArrayLike | None) -> None:
-        mesh = slot.mesh
-        if (slot.colors is None) != (colors is None):
-            wanted = "no vertex colours" if slot.colors is None else f"vertex colours ({mesh.n_vertices}, 4)"
-            msg = f"{mesh.ns}: wanted {wanted}, got {'none' if colors is None else 'some'}"
-            raise EncodeError(msg)
-        if slot.colors is None:
-            return
-        rgba = numbers(mesh.ns, colors).astype(np.float32)
-        if rgba.shape != (mesh.n_vertices, 4) or not np.isfinite(rgba).all():
-            msg = f"{mesh.ns}: wanted finite vertex colours ({mesh.n_vertices}, 4), got {rgba.shape}"
-            raise EncodeError(msg)
-        np.take(rgba, slot.corners, axis=0, out=slot.colors, mode="clip")
 
 
 def encode_points(
@@ -326,7 +295,7 @@ def encode_lists(
         if points.ndim != 2 or points.shape[1] != 3 or not len(points) or not is_finite:
             msg = f"{ns}: wanted finite points of shape (K, 3), K > 0, in a finite pose, got {points.shape}"
             raise EncodeError(msg)
-        _, at, _ = _write_marker(
+        _, at = _write_marker(
             writer,
             key=(ns, 0),
             action=ADD,

@@ -5,8 +5,6 @@ from refu_lab.benchmark._measure import Timing as Timing
 from refu_lab.benchmark._measure import measure as measure
 from refu_lab.benchmark._measure import one_core as one_core
 from refu_lab.benchmark._measure import processor_clock as processor_clock
-from refu_lab.benchmark._options import OUTPUT as OUTPUT
-from refu_lab.benchmark._options import BenchmarkOptions as BenchmarkOptions
 from refu_lab.benchmark._paper import PaperSettings as PaperSettings
 from refu_lab.benchmark._paper import PaperStructure as PaperStructure
 from refu_lab.benchmark._rows import BenchmarkResult as BenchmarkResult

@@ -20,9 +20,9 @@ from refu_lab.benchmark import _sections as sections
 from refu_lab.benchmark._frames import load_pipelines
 from refu_lab.benchmark._inputs import moments, read_stretches
 from refu_lab.benchmark._measure import one_core
-from refu_lab.benchmark._options import BenchmarkOptions
 from refu_lab.benchmark._rows import BenchmarkResult
 from refu_lab.benchmark._starts import start_row
+from refu_lab.commands.benchmark import BenchmarkOptions
 from refu_lab.truth import GroundTruth
 
 

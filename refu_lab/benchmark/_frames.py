@@ -15,7 +15,7 @@ from refu_core import GarmentPipeline, SmplFrame, WeightsError
 from refu_core.garments import GarmentTemplate
 from refu_core.realtime import PipelineOutput
 from refu_lab.benchmark._inputs import Moment
-from refu_lab.benchmark._options import BenchmarkOptions
+from refu_lab.commands.benchmark import BenchmarkOptions
 
 BACKBONES = ("tailornet", "skinned")
 """The default one, and the one that needs no weights."""

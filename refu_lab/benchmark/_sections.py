@@ -15,10 +15,10 @@ from refu_core.realtime import FrameStats, GarmentMesh, PipelineOutput
 from refu_lab.benchmark._frames import FrameRunner
 from refu_lab.benchmark._inputs import Moment, Window
 from refu_lab.benchmark._measure import Timing, measure, processor_clock
-from refu_lab.benchmark._options import BenchmarkOptions
 from refu_lab.benchmark._paper import PaperSettings, PaperStructure
 from refu_lab.benchmark._rows import BenchmarkResult, BenchmarkRow
 from refu_lab.benchmark._sdfs import PLAIN_QUERY, SdfFrame, sdf_methods
+from refu_lab.commands.benchmark import BenchmarkOptions
 
 Pipelines = Mapping[tuple[str, str], GarmentPipeline]
 """By backbone and mode, the default backbone, or the one that is there, first."""

@@ -13,9 +13,10 @@ from pathlib import Path
 
 from refu_core import RefuError, WeightsError
 from refu_core.modes import DEFAULT_GARMENTS
+from refu_core.options import arguments
 from refu_core.weights import load_weights, weights_folder
-from refu_lab.benchmark._options import BenchmarkOptions
 from refu_lab.benchmark._rows import BenchmarkRow
+from refu_lab.commands.benchmark import BenchmarkOptions
 
 TWO = DEFAULT_GARMENTS
 """The garments that are loaded together."""
@@ -36,9 +37,7 @@ def start_row(
     backbone = backbone if len(sizes) == len(TWO) else "skinned"
     command = [sys.executable, str(Path(__file__).with_name("start.py"))]
     command += ["--garments", ",".join(TWO), "--sdf", mode, "--backbone", backbone]
-    command += ["--weights", str(options.weights)] if options.weights is not None else []
-    command += ["--body", options.body] if options.body is not None else []
-    command += [] if options.collider else ["--no-collider"]
+    command += arguments(options, "weights", "body", "collider")
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     with tempfile.TemporaryDirectory() as empty:
         if first_ever:

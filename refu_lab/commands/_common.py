@@ -15,8 +15,8 @@ from typing import Any, NoReturn, TypeVar
 
 from refu_core import RefuError
 from refu_core.errors import printable
-from refu_core.keypoints import LAYOUTS
-from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN
+from refu_core.modes import BetasSource
+from refu_core.options import Spec, setting, specs_of
 
 Number = TypeVar("Number", int, float)
 
@@ -156,91 +156,35 @@ def add_common(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
-def add_collider(parser: argparse.ArgumentParser) -> None:
-    """What every command has that dresses bodies."""
-    parser.add_argument(
-        "--no-collider",
-        dest="collider",
-        action="store_false",
-        help="bring garments off the posed body as it is, which runs through itself",
-    )
+def add_options(parser: argparse.ArgumentParser, options: type) -> None:
+    """An option for each field of a dataclass that says what it is for (`refu_core.options.setting`)."""
+    for name, spec in specs_of(options).items():
+        flag, told = f"--{name.replace('_', '-')}", dict[str, Any](dest=name, default=None, help=_help(spec))
+        if isinstance(spec.default, bool):
+            action: Any = argparse.BooleanOptionalAction if spec.default else "store_true"
+            parser.add_argument(flag, action=action, **told)
+        elif spec.choices:
+            parser.add_argument(flag, choices=spec.choices, **told)
+        else:
+            parser.add_argument(flag, type=_parse(spec), metavar=spec.metavar or name.upper(), **told)
 
 
-def add_axes(parser: argparse.ArgumentParser, what: str, frame: str) -> None:
-    """What every command has that reads files of motion: how their numbers are meant."""
-    parser.add_argument(
-        "--input-axes",
-        choices=("auto", "smpl", "z-up", "y-down", "frame"),
-        help=f"axes of the {what} root: seen from the people, and said (auto, default); y up (smpl); z-up (AMASS); "
-        f"y-down (a camera); or {frame} (frame)",
-    )
-    parser.add_argument(
-        "--fps", type=between(0.001, 10_000), metavar="HZ", help="frame rate of motion files, in place of their own"
-    )
+def _help(spec: Spec) -> str:
+    text, default = spec.description.rstrip("."), spec.default
+    values = default if isinstance(default, tuple) else (default,)
+    is_shown = not isinstance(default, bool) and (any(values) or type(default) in (int, float))
+    shown = f" ({','.join(map(str, values))})" if is_shown else ""
+    return f"{text[:1].lower()}{text[1:]}{shown}".replace("%", "%%")
 
 
-def add_pipeline(parser: argparse.ArgumentParser) -> None:
-    """What every command has that dresses recorded people: by which pipeline."""
-    parser.add_argument(
-        "--garments",
-        type=names,
-        metavar="A,B",
-        help=f"garments of one body, by name or .npz (default: {','.join(DEFAULT_GARMENTS)})",
-    )
-    parser.add_argument(
-        "--backbone",
-        metavar="NAME",
-        help="tailornet, mlp, gcnn, or skinned: no network; auto (default): tailornet where its weights ship",
-    )
-    parser.add_argument("--sdf", metavar="MODE", help="hybrid (default), approx, accurate, or none for no ReFU")
-    parser.add_argument(
-        "--weights", type=in_path, metavar="DIR", help="folder with a folder a garment of weights of one's own"
-    )
-    parser.add_argument("--margin", type=float, metavar="M", help=f"clearance from the skin [m] ({DEFAULT_MARGIN:g})")
-    parser.add_argument("--betas", type=numbers(10), metavar="B0,…", help="shape to use instead of the recorded one")
-    parser.add_argument("--style", type=numbers(4), metavar="G0,…", help="garment style γ")
-    parser.add_argument("--device", metavar="DEVICE", help="cpu (default) or cuda")
-    add_body(parser)
-    parser.add_argument(
-        "--betas-from",
-        type=word,
-        metavar="FILE",
-        help="an SMPL file whose betas the recording has: the built-in mesh follows them",
-    )
-    parser.add_argument(
-        "--betas-source",
-        choices=("message", "builtin"),
-        help="message (default): the recorded betas are those of --body or --betas-from, and without either of unknown "
-        "meaning, which is warned of; builtin: the built-in body's own",
-    )
-    add_collider(parser)
-
-
-def add_recording(parser: argparse.ArgumentParser) -> None:
-    """What every command has that dresses recorded people: how the recording is read."""
-    parser.add_argument(
-        "--topic", type=word, metavar="NAME", help="input topic, where a bag has several of SMPL parameters"
-    )
-    parser.add_argument(
-        "--input-type",
-        type=word,
-        metavar="TYPE",
-        help="multiarray, joint_state, pose_array, smpl_msgs, keypoint_poses or keypoint_markers",
-    )
-    parser.add_argument("--keypoints", choices=LAYOUTS, help="which points of the body, with keypoints as input")
-    parser.add_argument("--person", type=word, metavar="NAME", help="whose motion, where the input has several people")
-    add_axes(parser, "recorded", "those of the frame itself, left as they are")
-
-
-def add_body(parser: argparse.ArgumentParser) -> None:
-    """What every command has that dresses bodies: whose betas, and whose skin."""
-    parser.add_argument(
-        "--body",
-        type=word,
-        metavar="FILE",
-        help="who wears it: an SMPL file (.npz, official .pkl), or a built-in body's name; garments and networks are "
-        "transferred (default: the garments' own)",
-    )
+def _parse(spec: Spec) -> Callable[[str], Any]:
+    if spec.parse is not None:
+        return spec.parse
+    if isinstance(spec.default, tuple):
+        return names if spec.kind is str else numbers(len(spec.default))
+    if spec.kind is float:
+        return between(*(spec.within or (-math.inf, math.inf)))
+    return (lambda text: str(in_path(text))) if spec.metavar in ("FILE", "DIR") else word
 
 
 def place(text: str) -> str:
@@ -251,6 +195,44 @@ def place(text: str) -> str:
 def place_for(kind: Callable[[str], Path]) -> Callable[[str], str]:
     """A path that is written to, as `kind` takes it, or a URL."""
     return lambda text: word(text) if "://" in text else str(kind(text))
+
+
+def axes_of(what: str, frame: str) -> Any:
+    """The setting of commands that read files of motion: how their numbers are meant."""
+    return setting(
+        "auto",
+        f"axes of the {what} root: seen from the people, and said (auto); y up (smpl); z-up (AMASS); y-down (a "
+        f"camera); or {frame} (frame)",
+        choices=("auto", "smpl", "z-up", "y-down", "frame"),
+    )
+
+
+def rate_of_files() -> Any:
+    """The setting of commands that read files of motion: at what rate."""
+    return setting(
+        None, "frame rate of motion files, in place of their own", parse=between(0.001, 10_000), metavar="HZ"
+    )
+
+
+def worn_by() -> Any:
+    """The setting of commands that dress bodies: whose betas, and whose skin."""
+    return setting(
+        None,
+        "who wears it: an SMPL file (.npz, official .pkl), or a built-in body's name; garments and networks are "
+        "transferred (default: the garments' own)",
+        parse=word,
+        metavar="FILE",
+    )
+
+
+def off_collider() -> Any:
+    """The setting of commands that dress bodies: what garments are brought off."""
+    return setting(True, "bring garments off a body whose overlaps are pulled apart, or off the posed body as it is")
+
+
+def seeded() -> Any:
+    """The setting of commands that draw."""
+    return setting(0, "of everything that is drawn", parse=seed, metavar="S")
 
 
 def add_cluster(parser: argparse.ArgumentParser) -> None:
@@ -267,6 +249,8 @@ def given(args: argparse.Namespace, options: type) -> dict[str, Any]:
     """The arguments that are fields of a dataclass of options, by name; what wasn't given is left to its defaults."""
     known = {field.name for field in fields(options)}
     named = {name: value for name, value in vars(args).items() if name in known and value is not None}
+    if "betas" in named:  # whatever has been recorded
+        named.setdefault("betas_source", BetasSource.FIXED)
     return {name: tuple(value) if isinstance(value, list) else value for name, value in named.items()}
 
 

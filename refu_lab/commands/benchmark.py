@@ -3,9 +3,147 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+from refu_core import RefuError
+from refu_core.modes import PAPER_GARMENTS
+from refu_core.options import setting
 from refu_lab.commands import _common as cli
+
+if TYPE_CHECKING:
+    from refu_core import GarmentPipeline, GarmentTemplate, SmplBody
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchmarkSizes:
+    """How much is measured; the defaults are those of a run whose figures are kept."""
+
+    rounds: int
+    windows: int = 8
+    """Stretches of motion."""
+    frames: int = 9
+    """Frames of a stretch, at 30 Hz, the first of which isn't counted."""
+    persons: tuple[int, ...] = (1, 2, 4, 8)
+    test_frames: int | None = None
+    """Frames with ground truth of a garment; None for all there are."""
+    has_network: bool = True
+    """Whether the paper's networks are measured at the paper's sizes."""
+    modes: tuple[str, ...] = ("none", "approx", "hybrid", "accurate")
+    starts: tuple[str, ...] = ("hybrid", "accurate")
+    """Modes of which a process of its own is started."""
+
+
+_QUICK = BenchmarkSizes(
+    rounds=1,
+    windows=2,
+    frames=4,
+    persons=(1, 2),
+    test_frames=3,
+    has_network=False,
+    modes=("hybrid", "accurate"),
+    starts=("hybrid",),
+)
+
+
+MAIN_GARMENT = "tshirt-male"
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchmarkOptions:
+    """What to measure and how."""
+
+    garments: tuple[str, ...] | None = setting(
+        None, "what is worn, the main one first (default: all)", parse=cli.names, metavar="A,B"
+    )
+    motions: Path | None = setting(
+        None, "folder of AMASS-style .npz files (default: the bags)", parse=cli.in_path, metavar="DIR"
+    )
+    bags: Path = setting(Path("bags"), "the repository's bags", parse=cli.in_path, metavar="DIR")
+    rounds: int = setting(3, "times that all motion is run", parse=cli.positive, metavar="N")
+    quick: bool = setting(False, "a tiny round of one garment, as continuous integration runs it")
+    output: Path = setting(Path("docs/results"), "where page, data and plot go", parse=cli.out_folder, metavar="DIR")
+    weights: Path | None = setting(
+        None, "folder with a folder a garment of one's own weights", parse=cli.in_path, metavar="DIR"
+    )
+    body: str | None = cli.worn_by()
+    collider: bool = cli.off_collider()
+    device: str | None = setting(None, "cpu, or cuda for both (default: cuda where there is one)")
+
+    def __post_init__(self) -> None:
+        """Raises `RefuError` for options of which nothing can be measured."""
+        unknown = [name for name in self.garments or () if name not in PAPER_GARMENTS]
+        if unknown:
+            msg = f"no garment {unknown[0]!r}: wanted some of {', '.join(PAPER_GARMENTS)}"
+            raise RefuError(msg)
+        if self.device not in (None, "cpu", "cuda"):
+            msg = f"no device {self.device!r}: wanted cpu or cuda"
+            raise RefuError(msg)
+        if self.weights is not None and not self.weights.is_dir():
+            msg = f"{self.weights}: not a folder; wanted one with a folder a garment, as refu train writes them"
+            raise RefuError(msg)
+
+    @property
+    def worn(self) -> tuple[str, ...]:
+        """The garments that are measured, the main one first."""
+        if self.garments is not None:
+            return self.garments
+        others = () if self.quick else tuple(name for name in PAPER_GARMENTS if name != MAIN_GARMENT)
+        return (MAIN_GARMENT, *others)
+
+    @property
+    def devices(self) -> tuple[str, ...]:
+        """Where frames are computed, the CPU first."""
+        import torch
+
+        from refu_core._device import checked_device
+
+        with_gpu = torch.cuda.is_available() if self.device is None else checked_device(self.device).type == "cuda"
+        return ("cpu", "cuda") if with_gpu else ("cpu",)
+
+    @property
+    def sizes(self) -> BenchmarkSizes:
+        """How much is measured."""
+        return _QUICK if self.quick else BenchmarkSizes(rounds=self.rounds)
+
+    def on_body(self, garment: str, *, device: str = "cpu") -> tuple[GarmentTemplate, SmplBody]:
+        """A garment, and who wears it. Raises `RefuError` where there is no such body."""
+        from refu_core.body import load_fit
+        from refu_core.garments import load_garment, worn_on
+
+        template = load_garment(garment, device=device)
+        fit = load_fit(template.body if self.body is None else self.body, device=device)
+        return worn_on(template, fit), fit.body
+
+    def load_pipeline(
+        self, garment: str, *, mode: str, backbone: str, device: str, graph: bool = True
+    ) -> GarmentPipeline:
+        """A pipeline of one garment. Raises `WeightsError` where there are no weights of the backbone for it."""
+        from refu_core import GarmentPipeline
+
+        return GarmentPipeline.load(
+            [garment],
+            body=self.body,
+            sdf=mode,
+            backbone=backbone,
+            weights=self.weights,
+            device=device,
+            graph=graph,
+            collider=self.collider,
+        )
+
+    @property
+    def command(self) -> str:
+        """The command that measures the same again, with the names of folders alone."""
+        parts = ["refu benchmark"]
+        parts += [f"--garments {','.join(self.garments)}"] if self.garments is not None else []
+        parts += [f"--motions {self.motions.resolve().name}/"] if self.motions is not None else []
+        parts += [f"--weights {self.weights.resolve().name}/"] if self.weights is not None else []
+        parts += [f"--body {Path(self.body).name}"] if self.body is not None else []
+        parts += [] if self.collider else ["--no-collider"]
+        parts += ["--quick"] if self.quick else [f"--rounds {self.rounds}"]
+        return " ".join(parts)
 
 
 def add(commands: Any) -> None:
@@ -15,30 +153,13 @@ def add(commands: Any) -> None:
         description="Measure stages, signed distances, modes, persons, memory and errors side by side "
         "in one process on one core, and write a page, a JSON file and a plot.",
     )
-    parser.add_argument("--garments", type=cli.names, metavar="A,B", help="what is worn, the main one first (all)")
-    parser.add_argument(
-        "--motions", type=cli.in_path, metavar="DIR", help="folder of AMASS-style .npz files (the bags)"
-    )
-    parser.add_argument("--bags", type=cli.in_path, metavar="DIR", help="the repository's bags (bags)")
-    parser.add_argument("--rounds", type=cli.positive, metavar="N", help="times that all motion is run (3)")
-    parser.add_argument(
-        "--quick", action="store_true", help="a tiny round of one garment, as continuous integration runs it"
-    )
-    parser.add_argument(
-        "--weights", type=cli.in_path, metavar="DIR", help="folder with a folder a garment of one's own weights"
-    )
-    parser.add_argument("--device", metavar="DEVICE", help="cpu, or cuda for both (default: cuda where there is one)")
-    parser.add_argument(
-        "--output", type=cli.out_folder, metavar="DIR", help="where page, data and plot go (docs/results)"
-    )
-    cli.add_body(parser)
-    cli.add_collider(parser)
+    cli.add_options(parser, BenchmarkOptions)
     cli.add_common(parser)
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    from refu_lab.benchmark import BenchmarkOptions, benchmark, benchmark_text, write_results
+    from refu_lab.benchmark import benchmark, benchmark_text, write_results
 
     options = BenchmarkOptions(**cli.given(args, BenchmarkOptions))
     cli.check_writable(options.output)

@@ -3,10 +3,31 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+from refu_core.options import setting
 from refu_lab.commands import _common as cli
 from refu_lab.tables import RESULT_TABLES
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateOptions:
+    """What to evaluate."""
+
+    data: tuple[Path, ...] = ()
+    table: str = setting("all", "one table, or all", choices=(*RESULT_TABLES, "all"))
+    weights: tuple[Path, ...] = ()
+    motions: Path | None = setting(
+        None, "folder of AMASS-style .npz files, for motion", parse=cli.in_path, metavar="DIR"
+    )
+    output: Path = setting(Path("docs/results"), "where the pages go", parse=cli.out_folder, metavar="DIR")
+    cache: Path | None = setting(None, "keep what was measured, and use it again", parse=cli.out_folder, metavar="DIR")
+    every: int = setting(1, "every N-th test sample", parse=cli.positive, metavar="N")
+    motion_every: int = setting(1, "every N-th frame of a motion", parse=cli.positive, metavar="N")
+    body: str | None = cli.worn_by()
+    collider: bool = cli.off_collider()
 
 
 def add(commands: Any) -> None:
@@ -24,7 +45,7 @@ def add(commands: Any) -> None:
         metavar="DIR",
         help="data sets of refu simulate, one a garment, or folders and globs of them; with --quick: bags",
     )
-    parser.add_argument("--table", choices=(*RESULT_TABLES, "all"), help="one table (default: all)")
+    cli.add_options(parser, EvaluateOptions)
     parser.add_argument(
         "--weights",
         type=cli.in_path,
@@ -32,15 +53,6 @@ def add(commands: Any) -> None:
         metavar="DIR",
         help="folders with GARMENT/NAME.safetensors that are looked at before the weights that ship",
     )
-    parser.add_argument(
-        "--motions", type=cli.in_path, metavar="DIR", help="folder of AMASS-style .npz files, for motion"
-    )
-    parser.add_argument("--output", type=cli.out_folder, metavar="DIR", help="where the pages go (docs/results)")
-    parser.add_argument("--cache", type=cli.out_folder, metavar="DIR", help="keep what was measured, and use it again")
-    parser.add_argument("--every", type=cli.positive, metavar="N", help="every N-th test sample (1)")
-    parser.add_argument("--motion-every", type=cli.positive, metavar="N", help="every N-th frame of a motion (1)")
-    cli.add_body(parser)
-    cli.add_collider(parser)
     parser.add_argument(
         "--quick",
         action="store_true",
@@ -71,7 +83,7 @@ def run(args: argparse.Namespace) -> int:
         return cli.tell(
             args, quick_table(result), result.as_dict(), code=0 if result.is_passed else cli.EXIT_CHECK_FAILED
         )
-    from refu_lab.evaluate import EvaluateOptions, evaluate, results_dict, results_text
+    from refu_lab.evaluate import evaluate, results_dict, results_text
 
     options = EvaluateOptions(**cli.given(args, EvaluateOptions) | {"data": tuple(find_data_sets(args.data))})
     with open_engine(args.jobs, args.scheduler) as engine:

@@ -6,6 +6,7 @@ import argparse
 from typing import Any
 
 from refu_lab.commands import _common as cli
+from refu_lab.commands.replay import RecordingOptions
 
 
 def add(commands: Any) -> None:
@@ -24,17 +25,15 @@ def add(commands: Any) -> None:
     parser.add_argument("--first", type=cli.seed, default=0, metavar="N", help="number of the first frame (0)")
     parser.add_argument("--count", type=cli.positive, default=1, metavar="N", help="how many frames (1)")
     parser.add_argument("--no-body", dest="with_body", action="store_false", help="the garments alone")
-    cli.add_pipeline(parser)
-    cli.add_recording(parser)
+    cli.add_options(parser, RecordingOptions)
     cli.add_common(parser)
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     from refu_lab.export import export
-    from refu_lab.replay import ReplayOptions
 
-    options = ReplayOptions(**{**cli.given(args, ReplayOptions), "output": None})
+    options = RecordingOptions(**cli.given(args, RecordingOptions))
     written, warnings = export(options, args.output, first=args.first, count=args.count, with_body=args.with_body)
     lines = [f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB)" for path in written]
     lines += [f"warning: {warning}" for warning in warnings]

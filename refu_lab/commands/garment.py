@@ -4,9 +4,37 @@ from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+from refu_core.options import setting
 from refu_lab.commands import _common as cli
+
+
+@dataclass(frozen=True, kw_only=True)
+class AddOptions:
+    """What is made of which mesh."""
+
+    mesh: Path
+    body: str = setting("neutral", "male, female or neutral")
+    name: str | None = setting(None, "what it is called (default: as the mesh's file)")
+    output: Path | None = setting(
+        None, "where it goes (default: NAME.npz in the user's folder)", parse=cli.out_file, metavar="FILE"
+    )
+    layer: int = setting(1, "0 under 1 under 2 …", parse=int, metavar="N")
+    color: tuple[float, ...] | None = setting(None, "sRGB, each from 0 to 1", parse=cli.numbers(3), metavar="R,G,B")
+    held_at: str | None = setting(
+        None, "what holds it: waist or shoulders (default: as its place says)", choices=("waist", "shoulders")
+    )
+    unit: str | None = setting(None, "of lengths: m, dm, cm, mm, in, or metres of one", metavar="U")
+    up: str | None = setting(None, "the axis that is up", choices=("y", "z"))
+    pose: str | None = setting(None, "it was modelled in: t, degrees of hanging arms, or a motion .npz")
+    as_placed: bool = setting(False, "its origin is the body's own: don't look for another place")
+    longest_edge: float = setting(0.02, "longer edges are split [m]", within=(0.005, 0.2), metavar="M")
+    source: str = setting("a mesh of the user's", "author and licence", metavar="TEXT")
+    picture: Path | None = setting(None, "write a picture (.png) of it, worn", parse=cli.out_file, metavar="FILE")
+    overwrite: bool = setting(False, "replace a garment that is there already")
 
 
 def add(commands: Any) -> None:
@@ -30,34 +58,13 @@ def _add_add(actions: Any) -> None:
         "axes, place and pose are found out, unless they are given. It can be worn at once, simulated and trained.",
     )
     parser.add_argument("mesh", type=cli.in_path, metavar="MESH", help="the mesh's file")
-    parser.add_argument("--body", metavar="BODY", help="male, female or neutral (default)")
-    parser.add_argument("--name", type=cli.word, metavar="NAME", help="what it is called (default: as the mesh's file)")
-    parser.add_argument(
-        "--output", type=cli.out_file, metavar="FILE", help="where it goes (default: NAME.npz in the user's folder)"
-    )
-    parser.add_argument("--layer", type=int, metavar="N", help="0 under 1 under 2 … (1)")
-    parser.add_argument("--color", type=cli.numbers(3), metavar="R,G,B", help="sRGB, each from 0 to 1")
-    parser.add_argument("--held-at", choices=("waist", "shoulders"), help="what holds it (default: as its place says)")
-    parser.add_argument("--unit", type=cli.word, metavar="U", help="of lengths: m, dm, cm, mm, in, or metres of one")
-    parser.add_argument("--up", choices=("y", "z"), help="the axis that is up")
-    parser.add_argument(
-        "--pose", type=cli.word, metavar="POSE", help="it was modelled in: t, degrees of hanging arms, or a motion .npz"
-    )
-    parser.add_argument(
-        "--as-placed", action="store_true", help="its origin is the body's own: don't look for another place"
-    )
-    parser.add_argument(
-        "--longest-edge", type=cli.between(0.005, 0.2), metavar="M", help="longer edges are split [m] (0.02)"
-    )
-    parser.add_argument("--source", type=cli.word, metavar="TEXT", help="author and licence")
-    parser.add_argument("--picture", type=cli.out_file, metavar="FILE", help="write a picture (.png) of it, worn")
-    parser.add_argument("--overwrite", action="store_true", help="replace a garment that is there already")
+    cli.add_options(parser, AddOptions)
     cli.add_common(parser)
     parser.set_defaults(run=run_add)
 
 
 def run_add(args: argparse.Namespace) -> int:
-    from refu_lab.garment import AddOptions, add_garment, added_text
+    from refu_lab.garment import add_garment, added_text
 
     if not args.quiet:
         print(f"{args.mesh}: looking for its unit, its axes and its place on the body …", file=sys.stderr, flush=True)

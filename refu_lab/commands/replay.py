@@ -3,11 +3,62 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
+from msg_adapters import KEYPOINT_TYPES, InputAxes
 from refu_core import RefuError
+from refu_core.keypoints import LAYOUTS
+from refu_core.options import DressOptions, check, setting
+from refu_core.recordings import Axes
 from refu_lab.commands import _common as cli
+
+if TYPE_CHECKING:
+    from refu_core import GarmentPipeline
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordingOptions(DressOptions):
+    """A recording, how it is read, and how who is in it is dressed."""
+
+    input: Path
+    topic: str | None = setting(None, "input topic, where a bag has several of SMPL parameters", metavar="NAME")
+    input_type: str | None = setting(
+        None,
+        "multiarray, joint_state, pose_array, smpl_msgs, keypoint_poses or keypoint_markers",
+        metavar="TYPE",
+    )
+    keypoints: str = setting("zed38", "which points of the body, with keypoints as input", choices=LAYOUTS)
+    person: str | None = setting(None, "whose motion, where the input has several people", metavar="NAME")
+    input_axes: Axes = cli.axes_of("recorded", "those of the frame itself, left as they are")
+    fps: float | None = cli.rate_of_files()
+
+    def __post_init__(self) -> None:
+        check(self)
+
+    @property
+    def axes(self) -> InputAxes:
+        """What the frames' roots, and so the garments, are expressed in."""
+        return "frame" if self.input_axes == "frame" or self.input_type in KEYPOINT_TYPES else "smpl"
+
+    def load_pipeline(self) -> GarmentPipeline:
+        """The pipeline that these options ask for. Raises `RefuError` for options that make none."""
+        return self.load(margin=self.margin, style=self.style if any(self.style) else None)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayOptions(RecordingOptions):
+    """What to replay and how."""
+
+    output: Path | None = None
+    speed: Literal["max", "real"] = setting("max", "as fast as possible, or paced (real)", choices=("max", "real"))
+    frame_id: str = setting("map", "frame_id of the markers", metavar="ID")
+    max_frames: int | None = setting(None, "stop after N frames", parse=cli.positive, metavar="N")
+    overwrite: bool = setting(False, "replace an output that is there already")
+    evaluate: bool = setting(True, "look for collisions; without, nothing is kept of a frame but its latency")
+    with_body: bool = True
+    """Whether the output carries the body, too."""
 
 
 def add(commands: Any) -> None:
@@ -37,14 +88,7 @@ def add(commands: Any) -> None:
         metavar="DIR",
         help="write DIR/index.html with plots and pictures; of several inputs: a row each, and a page of its own",
     )
-    cli.add_pipeline(parser)
-    cli.add_recording(parser)
-    parser.add_argument("--speed", choices=("max", "real"), help="as fast as possible (default), or paced")
-    parser.add_argument("--frame-id", type=cli.word, metavar="ID", help="frame_id of the markers (map)")
-    parser.add_argument("--max-frames", type=cli.positive, metavar="N", help="stop after N frames")
-    parser.add_argument(
-        "--no-evaluate", dest="evaluate", action="store_false", help="convert alone: no collision is looked for"
-    )
+    cli.add_options(parser, ReplayOptions)
     parser.add_argument(
         "--no-body",
         dest="with_body",
@@ -57,7 +101,6 @@ def add(commands: Any) -> None:
         default="bar",
         help="bar (default), or lines `progress DONE TOTAL` on the standard output, for programs; TOTAL 0: unknown",
     )
-    parser.add_argument("--overwrite", action="store_true", help="replace an output that is there already")
     parser.add_argument("--again", action="store_true", help="of several inputs: also those that are finished")
     cli.add_cluster(parser)
     cli.add_common(parser)
@@ -68,7 +111,7 @@ def run(args: argparse.Namespace) -> int:
     from refu_lab.fleet import is_plain
 
     if args.report is not None:
-        if not args.evaluate:
+        if args.evaluate is False:
             msg = "a report is of evaluated frames: leave out --report or --no-evaluate"
             raise RefuError(msg)
         import matplotlib  # noqa: F401, ICN001  (what is missing is said before the replay, not after it)
@@ -79,7 +122,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _replay_one(args: argparse.Namespace) -> int:
-    from refu_lab.replay import ReplayOptions, replay
+    from refu_lab.replay import replay
     from refu_lab.tables import replay_table
 
     report = None if args.report is None else Path(args.report)
@@ -102,7 +145,6 @@ def _print_progress(done: int, total: int) -> None:
 
 def _replay_many(args: argparse.Namespace) -> int:
     from refu_lab.fleet import FleetOptions, find_recordings, fleet_table, open_engine, replay_fleet
-    from refu_lab.replay import ReplayOptions
 
     recordings = find_recordings(args.input)
     each = ReplayOptions(**cli.given(args, ReplayOptions) | {"input": Path(), "output": None})

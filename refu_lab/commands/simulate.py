@@ -3,9 +3,32 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+from refu_core.options import setting
+from refu_core.recordings import Axes
 from refu_lab.commands import _common as cli
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulateOptions:
+    """What is simulated."""
+
+    garment: str
+    count: int
+    output: Path
+    motions: Path | None = setting(
+        None, "folder of motion files, two at least; without, poses are drawn alone", parse=cli.in_path, metavar="DIR"
+    )
+    input_axes: Axes = cli.axes_of("motions'", "z up, as ROS has it")
+    fps: float | None = cli.rate_of_files()
+    body: str | None = cli.worn_by()
+    seed: int = cli.seeded()
+    sequences: bool = setting(False, "continuous motions at 30 Hz with dynamics, instead of poses at rest")
+    shapes: int = setting(5, "body shapes of the sequences", parse=cli.positive, metavar="K")
+    seconds: float = setting(10.0, "length of each sequence [s]", within=(0.1, 3600.0), metavar="T")
 
 
 def add(commands: Any) -> None:
@@ -24,28 +47,15 @@ def add(commands: Any) -> None:
         help="samples (or sequences), training and test together",
     )
     parser.add_argument("--output", type=cli.out_folder, required=True, metavar="DIR", help="folder of the data set")
-    parser.add_argument(
-        "--motions",
-        type=cli.in_path,
-        metavar="DIR",
-        help="folder of motion files, two at least (default: drawn poses alone)",
-    )
-    cli.add_axes(parser, "motions'", "z up, as ROS has it")
-    cli.add_body(parser)
-    parser.add_argument("--seed", type=cli.seed, metavar="S", help="of everything that is drawn (0)")
+    cli.add_options(parser, SimulateOptions)
     cli.add_cluster(parser)
-    parser.add_argument(
-        "--sequences", action="store_true", help="continuous motions at 30 Hz with dynamics, instead of poses at rest"
-    )
-    parser.add_argument("--shapes", type=cli.positive, metavar="K", help="body shapes of the sequences (5)")
-    parser.add_argument("--seconds", type=cli.between(0.1, 3600), metavar="T", help="length of each sequence [s] (10)")
     cli.add_common(parser)
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     from refu_lab.fleet import open_engine
-    from refu_lab.simulate import SimulateOptions, simulate, simulation_table
+    from refu_lab.simulate import simulate, simulation_table
 
     with open_engine(args.jobs, args.scheduler) as engine:
         options = SimulateOptions(**cli.given(args, SimulateOptions))

@@ -3,10 +3,67 @@
 from __future__ import annotations
 
 import argparse
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from refu_core.modes import PAPER_GARMENTS
+from refu_core.options import SettingsError, setting
 from refu_lab.commands import _common as cli
+
+PARTS = ("numbers", "guarantees", "invariance", "soak")
+MODES: tuple[tuple[str, str], ...] = (("skinned", "accurate"), ("tailornet", "accurate"), ("tailornet", "hybrid"))
+"""Backbone and signed distance of the modes that are tried if none is named."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StressOptions:
+    """What to try."""
+
+    parts: tuple[str, ...] = setting(PARTS, "what is tried", metavar="A,B")
+    garments: tuple[str, ...] = setting(PAPER_GARMENTS, "garments of any body", metavar="A,B")
+    backbone: str | None = setting(None, f"one mode (default: {', '.join(map(' '.join, MODES))})", metavar="NAME")
+    sdf: str | None = setting(None, "accurate, hybrid, approx or none, with --backbone", metavar="MODE")
+    weights: Path | None = setting(
+        None, "folder with a folder a garment of weights of one's own", parse=cli.in_path, metavar="DIR"
+    )
+    frames: int | None = setting(None, "frames of each soak (3000)", parse=cli.positive, metavar="N")
+    persons: int = setting(1, "persons of a soak, each one's frame counting", parse=cli.positive, metavar="P")
+    rounds: int | None = setting(None, "turns of each check (3)", parse=cli.positive, metavar="N")
+    hours: float | None = None
+    quick: bool = False
+    seed: int = cli.seeded()
+    output: Path | None = setting(None, "where the worst trials go (stress)", parse=cli.out_folder, metavar="DIR")
+    collider: bool = cli.off_collider()
+
+    def __post_init__(self) -> None:
+        unknown = [part for part in self.parts if part not in PARTS]
+        if unknown:
+            msg = f"no part {unknown[0]!r}: wanted {', '.join(PARTS)}"
+            raise SettingsError(msg)
+        if self.hours is not None and not 0 < self.hours < math.inf:
+            msg = f"hours must be above zero, got {self.hours:g}"
+            raise SettingsError(msg)
+
+    @property
+    def modes(self) -> Sequence[tuple[str, str]]:
+        """Backbone and signed distance of each mode."""
+        if self.backbone is None and self.sdf is None:
+            return MODES
+        backbone = self.backbone or "skinned"
+        return [(backbone, self.sdf or ("accurate" if backbone == "skinned" else "hybrid"))]
+
+    @property
+    def n_rounds(self) -> int:
+        """How often each check has its turn, at least."""
+        return self.rounds or (1 if self.quick or self.hours is not None else 3)
+
+    @property
+    def n_frames(self) -> int:
+        """Of each soak, at most."""
+        return self.frames or (10_000_000 if self.hours is not None else 200 if self.quick else 3_000)
 
 
 def add(commands: Any) -> None:
@@ -16,45 +73,21 @@ def add(commands: Any) -> None:
         description="Run random and adversarial frames through the pipeline and hold the results against float64 and "
         "against what is promised; the worst trial of each check is kept as a file. Exits with 1 where one failed.",
     )
-    parser.add_argument(
-        "--parts", type=cli.names, metavar="A,B", help="numbers, guarantees, invariance, soak (default: all)"
-    )
-    parser.add_argument("--garments", type=cli.names, metavar="A,B", help="garments of any body (default: all four)")
-    parser.add_argument(
-        "--backbone", metavar="NAME", help="one mode (default: skinned accurate, tailornet accurate and hybrid)"
-    )
-    parser.add_argument("--sdf", metavar="MODE", help="accurate, hybrid, approx or none, with --backbone")
-    parser.add_argument(
-        "--weights", type=cli.in_path, metavar="DIR", help="folder with a folder a garment of weights of one's own"
-    )
     length = parser.add_mutually_exclusive_group()
     length.add_argument("--quick", action="store_true", help="each check once: for CI")
     length.add_argument(
         "--hours", type=cli.between(0, 10_000), metavar="H", help="go on for so long (default: some minutes)"
     )
-    parser.add_argument("--rounds", type=cli.positive, metavar="N", help="turns of each check (3)")
-    parser.add_argument("--frames", type=cli.positive, metavar="N", help="frames of each soak (3000)")
-    parser.add_argument(
-        "--persons", type=cli.positive, metavar="P", help="persons of a soak, each one's frame counting (1)"
-    )
-    parser.add_argument("--seed", type=cli.seed, metavar="S", help="of everything that is drawn (0)")
-    parser.add_argument(
-        "--output",
-        type=cli.out_folder,
-        default=Path("stress"),
-        metavar="DIR",
-        help="where the worst trials go (stress)",
-    )
+    cli.add_options(parser, StressOptions)
     parser.add_argument("--replay", type=cli.in_path, metavar="FILE", help="try one of them again, and nothing else")
-    cli.add_collider(parser)
     cli.add_common(parser)
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    from refu_lab.stress import StressOptions, StressResult, replay_trial, run_stress, stress_table
+    from refu_lab.stress import StressResult, replay_trial, run_stress, stress_table
 
-    options = StressOptions(**cli.given(args, StressOptions))
+    options = StressOptions(**{"output": Path("stress")} | cli.given(args, StressOptions))
     if args.replay is not None:
         result = StressResult(tallies=[replay_trial(args.replay, weights=options.weights, collider=options.collider)])
     else:

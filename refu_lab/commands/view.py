@@ -3,10 +3,30 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from refu_core.options import setting
 from refu_lab.commands import _common as cli
+from refu_lab.commands.replay import RecordingOptions
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewOptions:
+    """What is shown, and where."""
+
+    inputs: tuple[Path, ...] = ()
+    live: tuple[str, ...] | None = None
+    """Topics of markers to look at, in place of inputs: none for the node's own; None: no topics, the inputs."""
+    dressing: RecordingOptions
+    """How motion is dressed; its input is left out of account."""
+    dress: bool = setting(False, "dress the motion anew, though the bag has garments")
+    host: str = setting("localhost", "who may look; 0.0.0.0: all", metavar="NAME")
+    port: int | None = setting(
+        None, "where to listen: the first one free from 8080 on, if not given", parse=cli.port, metavar="N"
+    )
+    browser: bool = setting(True, "open the address in a browser; without, it is printed alone")
 
 
 def add(commands: Any) -> None:
@@ -27,21 +47,16 @@ def add(commands: Any) -> None:
         metavar="TOPIC",
         help="what a running node publishes on topics of markers (garments, body), in place of INPUT; needs rclpy",
     )
-    parser.add_argument("--dress", action="store_true", help="dress the motion anew, though the bag has garments")
-    parser.add_argument("--port", type=cli.port, metavar="N", help="where to listen (the first one free from 8080 on)")
-    parser.add_argument("--host", type=cli.word, metavar="NAME", help="who may look: localhost (default); 0.0.0.0: all")
-    parser.add_argument("--no-browser", dest="browser", action="store_false", help="print the address alone")
-    cli.add_pipeline(parser)
-    cli.add_recording(parser)
+    cli.add_options(parser, ViewOptions)
+    cli.add_options(parser, RecordingOptions)
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    from refu_lab.replay import ReplayOptions
-    from refu_lab.view import ViewOptions, view
+    from refu_lab.view import view
 
-    replay = ReplayOptions(**cli.given(args, ReplayOptions) | {"input": Path(), "output": None})
-    options = ViewOptions(**cli.given(args, ViewOptions) | {"inputs": tuple(args.input), "replay": replay})
+    dressing = RecordingOptions(**cli.given(args, RecordingOptions) | {"input": Path()})
+    options = ViewOptions(**cli.given(args, ViewOptions) | {"inputs": tuple(args.input), "dressing": dressing})
     view(options, progress=not args.quiet)
     return 0

@@ -16,11 +16,12 @@ from refu_core import GarmentPipeline, RefuError, __version__
 from refu_core._cache import code_hash
 from refu_core._engine import Engine, Lost
 from refu_core.errors import printable
+from refu_lab.commands.replay import ReplayOptions
 from refu_lab.fleet._engine import run_function
 from refu_lab.fleet._inputs import Input
 from refu_lab.fleet._storage import Folder, fetched, filesystem, is_url
 from refu_lab.fleet._summary import FleetResult
-from refu_lab.replay import ReplayOptions, ReplayResult, replay
+from refu_lab.replay import ReplayResult, replay
 
 WORST = 5
 """Frames of a recording that its record names, the worst first."""

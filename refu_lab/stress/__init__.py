@@ -5,7 +5,6 @@ from refu_lab.stress._frames import FRAMES as FRAMES
 from refu_lab.stress._frames import everyday as everyday
 from refu_lab.stress._frames import promised as promised
 from refu_lab.stress._invariance import mirror_image as mirror_image
-from refu_lab.stress._rounds import StressOptions as StressOptions
 from refu_lab.stress._rounds import StressResult as StressResult
 from refu_lab.stress._rounds import replay_trial as replay_trial
 from refu_lab.stress._rounds import run_stress as run_stress

@@ -131,4 +131,3 @@ CHECKS: dict[str, Check] = {
     )
 }
 """By name; each round has all of them in this order."""
-PARTS = (*dict.fromkeys(check.part for check in CHECKS.values()), "soak")

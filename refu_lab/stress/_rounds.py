@@ -15,63 +15,16 @@ import numpy as np
 from tqdm import tqdm
 
 from refu_core._device import one_thread
-from refu_core.garments import PAPER_GARMENTS, load_garment
+from refu_core.garments import load_garment
 from refu_core.weights import weights_folder
-from refu_lab.stress._checks import CHECKS, PARTS
+from refu_lab.commands.stress import StressOptions
+from refu_lab.stress._checks import CHECKS
 from refu_lab.stress._soak import SoakResult, soak
 from refu_lab.stress._subject import Subject, Wardrobe
 from refu_lab.stress._trial import Check, StressError, Tally, load_trial, save_trial
 
-MODES: tuple[tuple[str, str], ...] = (("skinned", "accurate"), ("tailornet", "accurate"), ("tailornet", "hybrid"))
-"""Backbone and signed distance of the modes that are tried if none is named."""
 _SOAK_SHARE = 0.3
 """Of the time of a long run."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class StressOptions:
-    """What to try; the fields are options of `refu stress`."""
-
-    parts: tuple[str, ...] = PARTS
-    garments: tuple[str, ...] = PAPER_GARMENTS
-    backbone: str | None = None
-    sdf: str | None = None
-    weights: Path | None = None
-    frames: int | None = None
-    persons: int = 1
-    rounds: int | None = None
-    hours: float | None = None
-    quick: bool = False
-    seed: int = 0
-    output: Path | None = None
-    collider: bool = True
-
-    def __post_init__(self) -> None:
-        unknown = [part for part in self.parts if part not in PARTS]
-        if unknown:
-            msg = f"no part {unknown[0]!r}: wanted {', '.join(PARTS)}"
-            raise StressError(msg)
-        if self.hours is not None and not 0 < self.hours < math.inf:
-            msg = f"hours must be above zero, got {self.hours:g}"
-            raise StressError(msg)
-
-    @property
-    def modes(self) -> Sequence[tuple[str, str]]:
-        """Backbone and signed distance of each mode."""
-        if self.backbone is None and self.sdf is None:
-            return MODES
-        backbone = self.backbone or "skinned"
-        return [(backbone, self.sdf or ("accurate" if backbone == "skinned" else "hybrid"))]
-
-    @property
-    def n_rounds(self) -> int:
-        """How often each check has its turn, at least."""
-        return self.rounds or (1 if self.quick or self.hours is not None else 3)
-
-    @property
-    def n_frames(self) -> int:
-        """Of each soak, at most."""
-        return self.frames or (10_000_000 if self.hours is not None else 200 if self.quick else 3_000)
 
 
 @dataclass(frozen=True, kw_only=True)

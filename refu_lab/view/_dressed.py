@@ -14,7 +14,6 @@ import msg_adapters as adapters
 from refu_core import RefuError
 from refu_core.garments import BUILTIN_GARMENTS, load_garment
 from refu_core.recordings import SUFFIXES, upright_turn
-from refu_lab.bodies import betas_warnings, body_warnings
 from refu_lab.render import SKIN as SKIN_COLOUR
 from refu_lab.sources import open_source
 from refu_lab.view._film import BODY, SKIN, Cache, Shape
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
 
     from refu_core import SmplFrame
     from refu_core.realtime import PipelineOutput
-    from refu_lab.replay import ReplayOptions
+    from refu_lab.commands.replay import RecordingOptions
     from refu_lab.sources import Source
 
 _AWAY_S = 0.25
@@ -58,7 +57,7 @@ class DressedFilm:
     Raises `RefuError` for inputs that can't be read, and options that make no pipeline.
     """
 
-    def __init__(self, inputs: Sequence[Path], options: ReplayOptions) -> None:
+    def __init__(self, inputs: Sequence[Path], options: RecordingOptions) -> None:
         self._options = options
         self._pipeline = options.load_pipeline()
         self._body_faces = self._pipeline.body.faces.cpu().numpy()  # one array: who draws it compares identities
@@ -99,7 +98,7 @@ class DressedFilm:
     @property
     def wardrobe(self) -> tuple[str, ...]:
         """Garments that can be worn: those of this body and, where one was named, all."""
-        if self._options.body is not None:
+        if self._options.body:
             return BUILTIN_GARMENTS
         fitting = [name for name in BUILTIN_GARMENTS if load_garment(name).body == self._pipeline.body.name]
         return tuple(dict.fromkeys((*fitting, *self.garments)))
@@ -170,16 +169,13 @@ class DressedFilm:
             tracks.append(Track(person, frames, times, _turn(options, frames)))
         return tracks
 
-    def _frames(self, options: ReplayOptions) -> list[SmplFrame]:
+    def _frames(self, options: RecordingOptions) -> list[SmplFrame]:
         """In the order of their stamps, one at least."""
-        with open_source(options, lambda: self._pipeline.body) as source:
-            found = [_frame_of(source, record, options) for record in source.records]
-            frames = [frame for frame in found if frame is not None]
-            n_bad = len(found) - len(frames)
-            is_told = options.betas is not None or source.betas_are_known
-            if not is_told and any(frame.betas.any() for frame in frames):
-                self.notes += betas_warnings(self._pipeline, source=options.betas_source)
-            self.notes += source.warnings + body_warnings(self._pipeline, gender=source.gender)
+        source = open_source(options, lambda: self._pipeline.body)
+        found = [_frame_of(source, record) for record in source.records]
+        frames = [frame for frame in found if frame is not None]
+        n_bad = len(found) - len(frames)
+        self.notes += source.warnings(self._pipeline)
         if n_bad:
             self.notes.append(f"{options.input}: {n_bad} messages are no frame and are left out")
         if not frames:
@@ -188,9 +184,9 @@ class DressedFilm:
         return sorted(frames, key=lambda frame: frame.stamp_ns)
 
 
-def _frame_of(source: Source, record: adapters.FrameRecord, options: ReplayOptions) -> SmplFrame | None:
+def _frame_of(source: Source, record: adapters.FrameRecord) -> SmplFrame | None:
     try:
-        return source.frame_of(record, options.betas)
+        return source.frame_of(record)
     except adapters.DecodeError:
         return None
 
@@ -214,7 +210,7 @@ def _topics_of_people(path: Path) -> list[str]:
         ]
 
 
-def _turn(options: ReplayOptions, frames: Sequence[SmplFrame]) -> NDArray[np.float64]:
+def _turn(options: RecordingOptions, frames: Sequence[SmplFrame]) -> NDArray[np.float64]:
     """From the axes of frames to z up: the permutation of markers, of people who stand."""
     to_ros = np.roll(np.eye(3), 1, axis=0)
     if options.axes != "frame":

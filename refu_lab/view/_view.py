@@ -8,7 +8,6 @@ import os
 import socket
 import sys
 import webbrowser
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from refu_core import RefuError
@@ -18,34 +17,16 @@ from refu_lab.view._live import TOPICS, LiveFilm
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
     import viser
 
-    from refu_lab.replay import ReplayOptions
+    from refu_lab.commands.view import ViewOptions
     from refu_lab.view._dressed import DressedFilm
     from refu_lab.view._recorded import RecordedFilm
 
 DEFAULT_PORT = 8080
 _PORTS = 20
 """Ports that are tried from the default one on."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ViewOptions:
-    """What is shown, and where; the fields are the options of `refu view`."""
-
-    inputs: tuple[Path, ...] = ()
-    live: tuple[str, ...] | None = None
-    """Topics of markers to look at, in place of inputs: none for the node's own; None: no topics, the inputs."""
-    replay: ReplayOptions
-    """How motion is dressed; its input is left out of account."""
-    dress: bool = False
-    """Dress motion anew, even where the bag has garments."""
-    host: str = "localhost"
-    port: int | None = None
-    """None: the first one free from 8080 on."""
-    browser: bool = True
 
 
 @one_thread()
@@ -109,7 +90,7 @@ def open_film(options: ViewOptions, *, progress: bool = False) -> DressedFilm | 
             msg = f"{first}: has garments, and is shown alone; --dress dresses the motion of several"
             raise RefuError(msg)
         return RecordedFilm(first, progress=progress)
-    return DressedFilm(options.inputs, options.replay)
+    return DressedFilm(options.inputs, options.dressing)
 
 
 def _require_viser() -> None:

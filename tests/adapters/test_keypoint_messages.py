@@ -142,7 +142,6 @@ def test_streams_and_bags(tmp_path: Path) -> None:
         for i in range(3):
             stamp = 10**9 + i * 33_000_000
             writer.write("/skeletons", pose_array(standing("coco17"), stamp), log_time_ns=stamp)
-    with open_smpl_bag(tmp_path / "a.mcap") as bag:
-        records = list(bag.undecoded())
+    records = list(open_smpl_bag(tmp_path / "a.mcap", input_type="keypoint_poses"))
     assert [record.stamp_ns for record in records] == [10**9, 1_033_000_000, 1_066_000_000]
     assert all(record.frame is None and record.error is None for record in records)

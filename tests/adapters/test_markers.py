@@ -78,25 +78,23 @@ def reference_marker(
 
 @st.composite
 def scenes(draw: st.DrawFn) -> dict[str, Any]:
-    """Random meshes with a frame of vertices, colours and translations."""
+    """Random meshes with a frame of vertices and translations."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
-    meshes, vertices, colors = [], [], []
+    meshes, vertices = [], []
     for i in range(draw(st.integers(1, 3))):
         n = draw(st.integers(1, 30))
         faces = rng.integers(0, n, (draw(st.integers(1, 40)), 3)).astype(
             draw(st.sampled_from([np.int32, np.int64, np.uint16]))
         )
         color = tuple(rng.random(4).astype(np.float32).tolist())
-        mesh = MarkerMesh(draw(texts), faces, n, color=color, id=i, vertex_colors=draw(st.booleans()))
+        mesh = MarkerMesh(draw(texts), faces, n, color=color, id=i)
         meshes.append(mesh)
         vertices.append(rng.normal(size=(n, 3)).astype(draw(st.sampled_from([np.float32, np.float64]))))
-        colors.append(rng.random((n, 4)).astype(np.float32) if mesh.vertex_colors else None)
     transl = draw(st.sampled_from([None, "one", "each"]))
     offsets = {"one": rng.normal(size=3) * 1e5, "each": rng.normal(size=(len(meshes), 3))}
     return {
         "meshes": meshes,
         "vertices": vertices,
-        "colors": colors,
         "transl": offsets.get(transl) if transl else None,
         "axes": draw(st.sampled_from(["smpl", "frame"])),
         "frame_id": draw(texts),
@@ -109,15 +107,13 @@ def scenes(draw: st.DrawFn) -> dict[str, Any]:
 def test_bytes_are_the_reference_serialisers(scene: dict[str, Any]) -> None:
     encoder = MarkerArrayEncoder(scene["meshes"], frame_id=scene["frame_id"], axes=scene["axes"])
     # A frame before leaves no trace.
-    encoder.encode([np.full_like(v, 7) for v in scene["vertices"]], stamp_ns=1, colors=scene["colors"])
-    frame = {key: scene[key] for key in ("stamp_ns", "transl", "colors")}
+    encoder.encode([np.full_like(v, 7) for v in scene["vertices"]], stamp_ns=1)
+    frame = {key: scene[key] for key in ("stamp_ns", "transl")}
     data = encoder.encode(scene["vertices"], **frame)
     offsets = np.zeros(3) if scene["transl"] is None else scene["transl"]
     offsets = np.broadcast_to(offsets, (len(scene["meshes"]), 3))
     markers = []
-    for mesh, vertices, colors, offset in zip(
-        scene["meshes"], scene["vertices"], scene["colors"], offsets, strict=True
-    ):
+    for mesh, vertices, offset in zip(scene["meshes"], scene["vertices"], offsets, strict=True):
         placed = vertices.astype(np.float64) + offset
         placed = placed[:, [2, 0, 1]] if scene["axes"] == "smpl" else placed
         corners = mesh.faces.ravel()
@@ -130,7 +126,7 @@ def test_bytes_are_the_reference_serialisers(scene: dict[str, Any]) -> None:
                 frame_id=scene["frame_id"],
                 color=mesh.color,
                 points=placed[corners],
-                colors=[] if colors is None else colors[corners],
+                colors=[],
             )
         )
     assert data == serialise(make(MARKER_ARRAY, markers), MARKER_ARRAY)
@@ -139,7 +135,17 @@ def test_bytes_are_the_reference_serialisers(scene: dict[str, Any]) -> None:
         assert (decoded.stamp_ns, decoded.frame_id) == (scene["stamp_ns"], scene["frame_id"])
         assert (decoded.pose, decoded.scale, decoded.color) == ((0, 0, 0, 0, 0, 0, 1), (1, 1, 1), mesh.color)
         np.testing.assert_array_equal(decoded.points, [(p.x, p.y, p.z) for p in marker.points])
-        assert decoded.colors.shape == ((3 * len(mesh.faces), 4) if mesh.vertex_colors else (0, 4))
+        assert decoded.colors.shape == (0, 4)
+
+
+def test_colours_of_points_are_read() -> None:
+    """As trackers of keypoints send them: alpha is the confidence."""
+    colors = np.linspace(0, 1, 12, dtype=np.float32).reshape(3, 4)
+    rest: dict[str, Any] = {"ns": "a", "marker_id": 1, "action": 0, "stamp_ns": 5, "frame_id": "map", "kind": 7}
+    marker = reference_marker(color=(0.0,) * 4, points=np.eye(3), colors=colors, **rest)
+    (decoded,) = decode_marker_array(serialise(make(MARKER_ARRAY, [marker]), MARKER_ARRAY))
+    np.testing.assert_array_equal(decoded.colors, colors)
+    np.testing.assert_array_equal(decoded.points, np.eye(3))
 
 
 @given(texts, texts, stamps, st.integers(1, 9))
@@ -239,8 +245,6 @@ def test_vertices_that_are_not_finite_are_refused(value: float, dtype: type) -> 
         ({"vertices": [np.zeros((3, 3), int)]}, "of int64"),
         ({"vertices": []}, "of 1 meshes, got 0"),
         ({"transl": np.zeros((2, 3))}, r"translation of shape \(3,\) or \(1, 3\), got \(2, 3\)"),
-        ({"colors": [np.zeros((3, 4))]}, "wanted no vertex colours"),
-        ({"colors": []}, "of 1 meshes"),
         ({"stamp_ns": 2**63}, "32 bits of seconds"),
     ],
 )
@@ -248,13 +252,6 @@ def test_frames_that_are_refused(arguments: dict[str, Any], message: str) -> Non
     encoder = MarkerArrayEncoder([MarkerMesh("m", TRIANGLE, 3)])
     with pytest.raises(EncodeError, match=message):
         encoder.encode(**({"vertices": [np.zeros((3, 3))], "stamp_ns": 0} | arguments))
-
-
-@pytest.mark.parametrize("colors", [None, np.zeros((2, 4)), np.full((3, 4), np.nan)])
-def test_vertex_colours_must_fit(colors: Any) -> None:
-    encoder = MarkerArrayEncoder([MarkerMesh("m", TRIANGLE, 3, vertex_colors=True)])
-    with pytest.raises(EncodeError, match=r"vertex colours \(3, 4\)"):
-        encoder.encode([np.zeros((3, 3))], stamp_ns=0, colors=[colors])
 
 
 @pytest.mark.parametrize(
@@ -286,9 +283,7 @@ def test_encoders_that_are_refused() -> None:
 @settings(max_examples=600)
 @given(st.integers(0, 600), st.binary(max_size=8), st.booleans())
 def test_damaged_markers(at: int, new: bytes, cut: bool) -> None:
-    data = bytearray(MarkerArrayEncoder([MarkerMesh("m", TRIANGLE, 3, vertex_colors=True)]).encode(
-        [np.zeros((3, 3))], stamp_ns=0, colors=[np.zeros((3, 4))]
-    ))  # fmt: skip
+    data = bytearray(MarkerArrayEncoder([MarkerMesh("m", TRIANGLE, 3)]).encode([np.zeros((3, 3))], stamp_ns=0))
     at %= len(data)
     data[at : at + len(new)] = new
     if cut:

@@ -54,11 +54,9 @@ def test_markers(ns: str, frame_id: str, stamp_ns: int) -> None:
     rng = np.random.default_rng(stamp_ns)
     faces = rng.integers(0, 20, (30, 3))
     color = tuple(rng.random(4).astype(np.float32).tolist())
-    mesh = MarkerMesh(ns, faces, 20, color=color, vertex_colors=True)
-    vertices, colors = rng.normal(size=(20, 3)), rng.random((20, 4)).astype(np.float32)
-    data = MarkerArrayEncoder([mesh], frame_id=frame_id, axes="frame").encode(
-        [vertices], stamp_ns=stamp_ns, colors=[colors]
-    )
+    mesh = MarkerMesh(ns, faces, 20, color=color)
+    vertices = rng.normal(size=(20, 3))
+    data = MarkerArrayEncoder([mesh], frame_id=frame_id, axes="frame").encode([vertices], stamp_ns=stamp_ns)
     message = serialization.deserialize_message(data, message_class(MARKER_ARRAY))
     (marker,) = message.markers
     assert (marker.ns, marker.id, marker.type, marker.action) == (ns, 0, marker.TRIANGLE_LIST, marker.ADD)
@@ -66,7 +64,6 @@ def test_markers(ns: str, frame_id: str, stamp_ns: int) -> None:
     assert marker.header.stamp.sec * 10**9 + marker.header.stamp.nanosec == stamp_ns
     assert (marker.color.r, marker.color.a, marker.scale.x, marker.pose.orientation.w) == (color[0], color[3], 1.0, 1.0)
     np.testing.assert_array_equal([(p.x, p.y, p.z) for p in marker.points], vertices[faces.ravel()])
-    np.testing.assert_array_equal([(c.r, c.g, c.b, c.a) for c in marker.colors], colors[faces.ravel()])
     (back,) = decode_marker_array(serialization.serialize_message(message))
     np.testing.assert_array_equal(back.points, vertices[faces.ravel()])
     assert (back.ns, back.frame_id, back.stamp_ns) == (ns, frame_id, stamp_ns)

@@ -17,8 +17,9 @@ from hypothesis import strategies as st
 
 import msg_adapters as adapters
 from refu_core import SmplFrame
+from refu_core.options import specs_of
 from refu_lab.cli import _parser, main
-from refu_ros._settings import NodeSettings, defaults
+from refu_ros._settings import NodeSettings
 from tests.fuzz.contract import check_line
 from tests.fuzz.corpus import some_frame
 from tests.fuzz.strategies import FLOATS, INTEGERS, ODD_VALUES, Special, near, near_file, odd_value, place
@@ -82,8 +83,8 @@ def definition(_: Path) -> Reader:
 def markers(_: Path) -> Reader:
     """A MarkerArray, which Foxglove and our own evaluation read."""
     faces = np.array([[0, 1, 2], [2, 1, 3]])
-    meshes = adapters.MarkerArrayEncoder([adapters.MarkerMesh("a/b", faces, 4, vertex_colors=True)])
-    good = meshes.encode([np.eye(4, 3)], stamp_ns=5, colors=[np.ones((4, 4))])
+    meshes = adapters.MarkerArrayEncoder([adapters.MarkerMesh("a/b", faces, 4)])
+    good = meshes.encode([np.eye(4, 3)], stamp_ns=5)
     others = [adapters.encode_delete([("a", 0), ("b", 1)], stamp_ns=1)]
 
     def read(data: bytes) -> None:
@@ -181,16 +182,13 @@ def encoder(_: Path) -> Reader:
         faces = numbers.integers(draw(rarely(0, -1)), max(n, 1) + draw(rarely(0, 1)), (f, 3))
         vertices = numbers.normal(size=(n, 3)).astype(draw(st.sampled_from(("f4", "f8"))))
         integers = (0, 10**9, -(2**31), *INTEGERS, *(-number for number in INTEGERS))
-        with_colors = draw(st.booleans())
         return {
             "name": draw(rarely("a/b", "", "\0", "é", "\ud800", "x" * 3000)),
             "faces": draw(_odd_array(faces)),
             "n": n,
             "color": draw(st.lists(rarely(0.5, *FLOATS), min_size=3, max_size=4)),
             "id": draw(rarely(0, *integers)),
-            "with_colors": with_colors,
             "vertices": draw(_odd_array(vertices)),
-            "colors": [draw(_odd_array(np.ones((n, 4))))] if with_colors != draw(rarely(False, True)) else None,
             "stamp_ns": draw(rarely(5, *integers)),
             "transl": draw(rarely(None, np.ones(3), np.ones((1, 3)), [np.nan] * 3, "x", np.ones(2))),
             "frame_id": draw(rarely("map", "", "\ud800")),
@@ -198,11 +196,9 @@ def encoder(_: Path) -> Reader:
         }
 
     def read(v: dict[str, Any]) -> None:
-        mesh = adapters.MarkerMesh(
-            v["name"], v["faces"], v["n"], color=tuple(v["color"]), id=v["id"], vertex_colors=v["with_colors"]
-        )
+        mesh = adapters.MarkerMesh(v["name"], v["faces"], v["n"], color=tuple(v["color"]), id=v["id"])
         meshes = adapters.MarkerArrayEncoder([mesh], frame_id=v["frame_id"], axes=v["axes"])
-        message = meshes.encode([v["vertices"]], stamp_ns=v["stamp_ns"], transl=v["transl"], colors=v["colors"])
+        message = meshes.encode([v["vertices"]], stamp_ns=v["stamp_ns"], transl=v["transl"])
         (marker,) = adapters.decode_marker_array(message)
         assert (marker.ns, marker.stamp_ns) == (v["name"], v["stamp_ns"]), "another marker"
         assert marker.points.shape == (3 * len(v["faces"]), 3), "other points"
@@ -214,7 +210,7 @@ def encoder(_: Path) -> Reader:
 def parameters(_: Path) -> Reader:
     """The parameters of the node."""
     settings = NodeSettings()
-    usual = json.loads(json.dumps(defaults()))
+    usual = json.loads(json.dumps({name: one.default for name, one in specs_of(NodeSettings).items()}))
     others = usual | {"garments": ["shirt-male"], "max_rate": 30, "style": [1, 0, 0, 0], "persons": ["a", "b"]}
 
     def read(values: Any) -> None:

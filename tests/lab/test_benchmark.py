@@ -15,7 +15,6 @@ import torch
 from refu_core import GarmentPipeline, RefuError, SmplFrame, load_body, load_garment
 from refu_lab.benchmark import (
     PLAIN_QUERY,
-    BenchmarkOptions,
     BenchmarkResult,
     PaperSettings,
     PaperStructure,
@@ -28,6 +27,7 @@ from refu_lab.benchmark import (
 from refu_lab.benchmark._inputs import read_stretches, sdf_frame
 from refu_lab.benchmark._sections import GRAPH, LAUNCHES, Section, frame_runners
 from refu_lab.cli import main
+from refu_lab.commands.benchmark import BenchmarkOptions
 from refu_lab.reproduction import published_modes
 
 BAGS = Path(__file__).parents[2] / "bags"

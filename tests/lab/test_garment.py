@@ -19,8 +19,9 @@ from refu_core.garments import garment_files, save_garment
 from refu_core.simulation import open_dataset, simulate_dataset
 from refu_core.training import PretrainSettings, pretrain
 from refu_lab.cli import main
+from refu_lab.commands.garment import AddOptions
 from refu_lab.export import ExportMesh, meshes_of, write_meshes
-from refu_lab.garment import AddOptions, add_garment, list_garments
+from refu_lab.garment import add_garment, list_garments
 from refu_ros._settings import NodeSettings
 
 ROOT = Path(__file__).parents[2]
@@ -131,10 +132,10 @@ def test_a_file_of_any_name_makes_a_garment_that_can_be_worn(folder: Path, kilt:
 def test_a_node_takes_a_garment_by_its_path(kilt: Path, tmp_path: Path) -> None:
     result = add_garment(AddOptions(mesh=kilt, body="female", longest_edge=0.1, output=tmp_path / "kilt.npz"))
     settings = NodeSettings(garments=(result["file"],))
-    settings.pipeline.check()
+    settings.check_files()
     assert settings.pipeline.load().untrained == ("kilt",)
     with pytest.raises(RefuError, match="no weights of tailornet hybrid"):
-        replace(settings, backbone="tailornet").pipeline.check()
+        replace(settings, backbone="tailornet").check_files()
 
 
 @pytest.mark.usefixtures("no_curves")

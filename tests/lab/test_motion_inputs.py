@@ -14,7 +14,8 @@ from msg_adapters.cdr import CdrWriter
 from refu_core.keypoints import Proportions, Skeleton, keypoint_layout
 from refu_core.keypoints._pose import Pose, exp_so3
 from refu_lab.cli import main
-from refu_lab.replay import ReplayOptions, ReplayResult, replay
+from refu_lab.commands.replay import ReplayOptions
+from refu_lab.replay import ReplayResult, replay
 from refu_lab.report import write_report
 
 ROOT = Path(__file__).parents[2]

@@ -16,7 +16,8 @@ from refu_core.modes import FOREIGN_BETAS
 from refu_core.simulation import DrapeSettings, GarmentDataset, SelectionSettings, SimulationSettings, simulate_dataset
 from refu_lab.bodies import body_warnings
 from refu_lab.cli import main
-from refu_lab.replay import ReplayOptions, replay
+from refu_lab.commands.replay import ReplayOptions
+from refu_lab.replay import replay
 
 BAGS = Path(__file__).parents[2] / "bags"
 GARMENT = "short-pant-male"
@@ -98,7 +99,7 @@ def test_betas_of_unknown_meaning_are_warned_of_once(tmp_path: Path) -> None:
     plain = bare()
     assert warnings_of(path, plain) == [FOREIGN_BETAS]
     assert not warnings_of(path, plain, betas_source="builtin")
-    assert not warnings_of(path, plain, betas=(0.0,) * 10)
+    assert not warnings_of(path, plain, betas=(0.0,) * 10, betas_source="fixed")
     assert not warnings_of(path, bare("male"))
     assert not warnings_of(write_motion(tmp_path / "mean.npz", betas=np.zeros(16)), plain)
     assert not warnings_of(BAGS / "reach_squat", plain, max_frames=1, output=tmp_path / "out.mcap")  # it says whose

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
-import signal
 import socket
-import subprocess
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,8 +24,9 @@ import msg_adapters as adapters
 from refu_core import GarmentPipeline, RefuError, SmplFrame
 from refu_core.metrics import CollisionChecker
 from refu_lab.cli import main
-from refu_lab.replay import ReplayOptions
-from refu_lab.view import ViewOptions, view
+from refu_lab.commands.replay import RecordingOptions
+from refu_lab.commands.view import ViewOptions
+from refu_lab.view import view
 from refu_lab.view._dressed import DressedFilm, Track
 from refu_lab.view._film import BODY, SKIN, Cache, Shape
 from refu_lab.view._markers import Topology
@@ -64,7 +66,7 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def film(bag: Path) -> DressedFilm:
-    return DressedFilm([bag], ReplayOptions(input=Path(), garments=SHORTS))
+    return DressedFilm([bag], RecordingOptions(input=Path(), garments=SHORTS))
 
 
 def by_name(shapes: Any, person: str = "") -> dict[str, Shape]:
@@ -89,7 +91,7 @@ def test_a_dressed_film_shows_what_the_pipeline_says(film: DressedFilm) -> None:
 def test_a_recorded_film_shows_the_same_as_the_dressed_one(film: DressedFilm, bag: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     assert main(["replay", str(bag), "--output", str(out), "--garments", SHORTS[0], "--no-evaluate", "--quiet"]) == 0
-    recorded = open_film(ViewOptions(inputs=(out,), replay=ReplayOptions(input=Path())))
+    recorded = open_film(ViewOptions(inputs=(out,), dressing=RecordingOptions(input=Path())))
     assert isinstance(recorded, RecordedFilm)
     np.testing.assert_allclose(recorded.times, film.times, atol=1e-9)
     shift = None
@@ -103,7 +105,7 @@ def test_a_recorded_film_shows_the_same_as_the_dressed_one(film: DressedFilm, ba
             assert len(shape.vertices) == len(dressed[name].vertices)
             assert shape.color == pytest.approx(dressed[name].color, abs=0.1)
     recorded.close()
-    again = open_film(ViewOptions(inputs=(out,), replay=ReplayOptions(input=Path(), garments=SHORTS), dress=True))
+    again = open_film(ViewOptions(inputs=(out,), dressing=RecordingOptions(input=Path(), garments=SHORTS), dress=True))
     assert isinstance(again, DressedFilm)
 
 
@@ -112,7 +114,7 @@ def test_people_of_a_bag_are_shown_together_while_they_are_there(tmp_path: Path)
     both = write_bag(
         tmp_path / "two.mcap", {"/anna/smpl_params": motion(14), "/ben/smpl_params": late, "/robot": motion(1)}
     )
-    film = DressedFilm([both], ReplayOptions(input=Path(), garments=SHORTS))
+    film = DressedFilm([both], RecordingOptions(input=Path(), garments=SHORTS))
     assert {shape.person for shape in film.shapes(0)} == {"anna"}
     shapes = film.shapes(10)
     middles = [by_name(shapes, person)[BODY].vertices[:, 1].mean() for person in ("anna", "ben")]
@@ -128,7 +130,7 @@ def test_what_stays_from_frame_to_frame_is_one_array(film: DressedFilm) -> None:
 def test_files_are_a_person_each_and_garments_can_be_changed(bag: Path, tmp_path: Path) -> None:
     clip = tmp_path / "clip.npz"
     np.savez(clip, poses=np.zeros((3, 72)), trans=np.tile([0.0, 1.0, 0.0], (3, 1)), mocap_framerate=10.0)
-    film = DressedFilm([bag, clip, bag], ReplayOptions(input=Path(), garments=SHORTS))
+    film = DressedFilm([bag, clip, bag], RecordingOptions(input=Path(), garments=SHORTS))
     assert {shape.person for shape in film.shapes(0)} == {"knee", "clip", "knee-2"}
     assert {*SHORTS, "tshirt-male"} <= set(film.wardrobe)
     assert "skirt-female" not in film.wardrobe
@@ -264,15 +266,12 @@ def test_the_player_plays_seeks_and_dresses_anew(film: DressedFilm, server: Any)
 # ---- the command -----------------------------------------------------------------------------------------------------
 
 
-def test_without_viser_one_line_says_how_to_get_it(bag: Path, tmp_path: Path) -> None:
-    (tmp_path / "viser.py").write_text("raise ModuleNotFoundError(name='viser')")
-    code = f"import sys; sys.path[:0] = [{str(tmp_path)!r}, {str(ROOT)!r}]; from refu_lab.cli import main; "
-    code += "sys.exit(main())"
-    done = subprocess.run(
-        [sys.executable, "-c", code, "view", str(bag)], capture_output=True, text=True, check=False, cwd=tmp_path
-    )
-    assert done.returncode == 2
-    assert done.stderr.splitlines() == ['refu: error: the viewer needs viser: pip install "refu-ros[view]"']
+def test_without_viser_one_line_says_how_to_get_it(
+    bag: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert main(["view", str(bag)]) == 2
+    assert capsys.readouterr().err == 'refu: error: the viewer needs viser: pip install "refu-ros[view]"\n'
 
 
 def test_a_port_that_is_taken_is_said(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -298,14 +297,12 @@ def test_what_cannot_be_shown_is_said(where: str, tmp_path: Path, capsys: pytest
 # ---- what a browser shows --------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[browser.Browser]:
+def chromium(profile: Path) -> closing[browser.Browser]:
+    """A browser that leaves before the server ends: that would wait six seconds for it."""
     pytest.importorskip("viser", reason="viser isn't installed (extra view)")
     if browser.PROGRAM is None:
         pytest.skip("no Chromium: apt-get install chromium")
-    found = browser.Browser(tmp_path_factory.mktemp("chromium"), size=(640, 420))
-    yield found
-    found.close()
+    return closing(browser.Browser(profile, size=(640, 420)))
 
 
 def coloured(picture: np.ndarray, hue: tuple[float, float]) -> np.ndarray:
@@ -330,40 +327,63 @@ def dressed_in_the_middle(picture: np.ndarray) -> bool:
     return bool(0.15 < row / height < 0.6 and 0.33 < column / width < 0.67)
 
 
-def test_a_browser_shows_somebody_in_a_green_t_shirt(chromium: browser.Browser, tmp_path: Path) -> None:
+def test_a_browser_shows_somebody_in_a_green_t_shirt(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "still.mcap", {"/smpl_params": motion(1)})  # who draws in software is slow enough
-    chromium.open("about:blank")
-    assert not coloured(chromium.picture(), GREEN).any()
-    code = "import sys; from refu_lab.cli import main; sys.exit(main())"
-    command = [sys.executable, "-u", "-c", code, "view", str(bag), "--no-browser", "--garments", "tshirt-male"]
-    viewer = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    try:
-        assert viewer.stdout is not None
-        said = re.search(r"still.mcap: 1 frames at (http://localhost:\d+) ", viewer.stdout.readline())
+    with running(bag, "tshirt-male") as lines, chromium(tmp_path / "profile") as page:
+        assert not coloured(page.picture(), GREEN).any()
+        said = re.search(r"still.mcap: 1 frames at (http://localhost:\d+) ", lines[0])
         assert said is not None
-        chromium.open(said[1])
-        seen = chromium.picture_when(dressed_in_the_middle)  # a mesh may come before the camera has its place
+        page.open(said[1])
+        seen = page.picture_when(dressed_in_the_middle)  # a mesh may come before the camera has its place
         assert dressed_in_the_middle(seen)
-        assert chromium.errors == []
-    finally:
-        viewer.send_signal(signal.SIGINT)
-        out, err = viewer.communicate(timeout=60)
-    assert (viewer.returncode, out, err) == (0, "viewer closed\n", "")
+        assert page.errors == []
 
 
-def test_an_empty_stage_has_no_colour(chromium: browser.Browser, film: DressedFilm, server: Any) -> None:
+def test_an_empty_stage_has_no_colour(film: DressedFilm, server: Any, tmp_path: Path) -> None:
     player = Player(server, film, playing=False)
     player._body.value = "hidden"
     player._stage.draw([], wireframe=False)
-    chromium.open(f"http://localhost:{server.get_port()}")
-    seen = chromium.picture_when(lambda picture: coloured(picture, (200, 220)).sum() > 800)  # the panel's button
+    with chromium(tmp_path / "profile") as page:
+        page.open(f"http://localhost:{server.get_port()}")
+        seen = page.picture_when(lambda picture: coloured(picture, (200, 220)).sum() > 800)  # the panel's button
     assert coloured(seen, (200, 220)).sum() > 800
     assert coloured(seen, GREEN).sum() < 100
+
+
+@contextmanager
+def running(bag: Path, *garments: str) -> Iterator[list[str]]:
+    """A viewer in a thread, from its first line on; what it says."""
+    lines: list[str] = []
+    end = threading.Event()
+    options = ViewOptions(inputs=(bag,), dressing=RecordingOptions(input=Path(), garments=garments), browser=False)
+    how: dict[str, Any] = {"say": lines.append, "until": end.is_set}
+    thread = threading.Thread(target=view, args=(options,), kwargs=how)
+    thread.start()
+    try:
+        while not lines:
+            assert thread.is_alive()
+            time.sleep(0.01)
+        yield lines
+    finally:
+        end.set()
+        thread.join()
+
+
+def test_an_interrupt_closes_the_viewer(bag: Path) -> None:
+    pytest.importorskip("viser", reason="viser isn't installed (extra view)")
+    lines: list[str] = []
+    options = ViewOptions(inputs=(bag,), dressing=RecordingOptions(input=Path(), garments=SHORTS), browser=False)
+
+    def interrupt() -> bool:
+        raise KeyboardInterrupt
+
+    view(options, say=lines.append, until=interrupt)
+    assert lines[1:] == ["viewer closed"]
 
 
 def test_view_ends_when_it_is_told_to(bag: Path) -> None:
     pytest.importorskip("viser", reason="viser isn't installed (extra view)")
     lines: list[str] = []
-    options = ViewOptions(inputs=(bag,), replay=ReplayOptions(input=Path(), garments=SHORTS), browser=False)
+    options = ViewOptions(inputs=(bag,), dressing=RecordingOptions(input=Path(), garments=SHORTS), browser=False)
     view(options, say=lines.append, until=until(2))
     assert any(re.search(r"http://localhost:\d+", line) for line in lines)

@@ -27,6 +27,7 @@ from visualization_msgs.msg import MarkerArray
 
 from msg_adapters import Marker, decode_marker_array, encoder_for
 from refu_core import SmplFrame
+from tests.ros.ready import Forked, run_node
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -58,14 +59,20 @@ class NodeProcess:
         **parameters: Any,
     ) -> None:
         self._log = log
+        given = [*ros_arguments(parameters), "-r", f"__ns:=/{namespace}"]
+        path = [str(folder) for folder in (ROOT, packages) if folder is not None]
+        cwd = log.parent  # of relative paths that a test or a hostile peer names
+        self.process: Forked | subprocess.Popen[bytes]
+        if not program and prepare is None:
+            self.process = run_node(given, log=log, cwd=cwd, environment=dict(os.environ), path=path)
+            return
         start = ["-c", program] if program else ["-m", "refu_ros.garment_node"]
-        command = [sys.executable, *start, *ros_arguments(parameters), "-r", f"__ns:=/{namespace}"]
-        path = [ROOT, *([] if packages is None else [packages]), os.environ.get("PYTHONPATH", "")]
+        environment = {**os.environ, "PYTHONPATH": ":".join([*path, os.environ.get("PYTHONPATH", "")])}
         with log.open("wb") as file:
             self.process = subprocess.Popen(
-                command,
-                cwd=log.parent,  # relative paths that a test or a hostile peer names
-                env={**os.environ, "PYTHONPATH": ":".join(map(str, path))},
+                [sys.executable, *start, *given],
+                cwd=cwd,
+                env=environment,
                 stdout=file,
                 stderr=file,
                 preexec_fn=prepare,

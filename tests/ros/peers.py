@@ -40,13 +40,15 @@ from visualization_msgs.msg import MarkerArray
 
 from msg_adapters import decode_marker_array, encoder_for
 from refu_core import SmplFrame
-from refu_ros._settings import defaults, specs
+from refu_core.options import specs_of
+from refu_ros._settings import NodeSettings
 from tests.ros.harness import CHEAP, PATIENCE_S, NodeProcess, start
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
+SPECS = specs_of(NodeSettings)
 _PENDING, _ENTITIES = 40, 12
 """Requests without an answer, and peers at once, at most."""
 _QUEUED = 8
@@ -232,17 +234,17 @@ class HostilePeers:
             "%s%n",
             ".",
         )
-        own = tuple(str(value) for value in defaults().values() if isinstance(value, str))
+        own = tuple(one.default for one in SPECS.values() if isinstance(one.default, str))
         return self._random.choice((*texts, *own, str(self._folder / "bag"), str(self._folder / "other" / "bag")))
 
     def _names(self) -> list[str]:
-        names = (*specs(), *_FOREIGN, "x" * 5000, "a.b.c", "\n")
+        names = (*SPECS, *_FOREIGN, "x" * 5000, "a.b.c", "\n")
         if self._random.random() < 0.02:
             return [self._random.choice(names)] * 100_000
         return self._random.choices(names, k=self._random.randrange(5))
 
     def _parameters(self) -> list[Any]:
-        names = (*specs(), *_FOREIGN)
+        names = (*SPECS, *_FOREIGN)
         n = self._random.choice((1, 1, 1, 2, 5)) if self._random.random() < 0.99 else 5000
         return [Parameter(name=self._random.choice(names), value=self._value()) for _ in range(n)]
 
@@ -251,7 +253,7 @@ class HostilePeers:
             self._count(),
             self._random.choice((0.0, 0.03, 1.0, 30.0, -1.0, 1e308, 5e-324, float("nan"), float("inf"))),
         )
-        known = self._random.choice([*defaults().values()])
+        known = self._random.choice([one.default for one in SPECS.values()])
         known = [*known] if isinstance(known, tuple) else known
         if isinstance(known, str) and "/" in known:
             known = ""
@@ -317,9 +319,9 @@ class HostilePeers:
 
 
 _SAFE: dict[str, Any] = {
-    name: [*value] if isinstance(value, tuple) else value
-    for name, value in defaults().items()
-    if specs()[name].live and name not in ("garments", "backbone", "sdf")
+    name: [*one.default] if isinstance(one.default, tuple) else one.default
+    for name, one in SPECS.items()
+    if one.live and name not in ("garments", "backbone", "sdf")
 }
 _SAFE |= {name: value for name, value in CHEAP.items() if name != "input_type"}
 """Parameters with which a frame is dressed soon."""

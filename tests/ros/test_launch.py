@@ -21,7 +21,8 @@ from launch.launch_description_sources import get_launch_description_from_python
 from launch.utilities import perform_substitutions
 
 from launch import LaunchContext
-from refu_ros._settings import specs
+from refu_core.options import specs_of
+from refu_ros._settings import NodeSettings
 
 ROOT = Path(__file__).parents[2]
 ROS2 = "import sys; sys.argv[0] = 'ros2'; from ros2cli.cli import main; sys.exit(main())"
@@ -59,7 +60,7 @@ def arguments(name: str) -> dict[str, tuple[str, str]]:
 def test_every_parameter_is_a_described_argument() -> None:
     of_node = arguments("garments.launch.py")
     others = {"params_file", "namespace", "log_level", "use_sim_time", "input_topic", "output_topic", "body_topic"}
-    assert set(of_node) == set(specs()) | others
+    assert set(of_node) == set(specs_of(NodeSettings)) | others
     of_demo = arguments("demo.launch.py")
     assert set(of_demo) == set(of_node) | {"motion", "bag", "in_place", "rviz"}
     assert all(len(description) > 10 for _, description in [*of_node.values(), *of_demo.values()])

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import re
-import signal
-import subprocess
-import sys
-from typing import TYPE_CHECKING
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -16,18 +14,19 @@ pytest.importorskip("rclpy", reason="rclpy isn't installed (extra ros): no node 
 
 import browser
 import rclpy
-from harness import ROOT
 from rclpy.qos import QoSProfile
 from visualization_msgs.msg import MarkerArray
 
 import msg_adapters as adapters
 from refu_core import RefuError, load_garment
 from refu_lab.cli import main
+from refu_lab.commands.replay import RecordingOptions
+from refu_lab.commands.view import ViewOptions
+from refu_lab.view import view
 from refu_lab.view._live import LiveFilm
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
-    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -115,17 +114,17 @@ def green(picture: NDArray[np.uint8]) -> NDArray[np.bool_]:
 @pytest.mark.skipif(browser.PROGRAM is None, reason="no Chromium: apt-get install chromium")
 def test_a_browser_shows_it(node: Node, tmp_path: Path) -> None:
     pytest.importorskip("viser", reason="viser isn't installed (extra view)")
-    code = "import sys; from refu_lab.cli import main; sys.exit(main())"
-    command = [sys.executable, "-u", "-c", code, "view", "--no-browser", "--live", "garments"]
-    viewer = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, env=os.environ)
+    said: list[str] = []
+    end = threading.Event()
+    options = ViewOptions(live=("garments",), dressing=RecordingOptions(input=Path()), browser=False)
+    how: dict[str, Any] = {"say": said.append, "until": end.is_set}
+    viewer = threading.Thread(target=view, args=(options,), kwargs=how)
+    viewer.start()
     chromium = browser.Browser(tmp_path / "profile", size=(640, 420))
     try:
-        assert viewer.stdout is not None
-        assert viewer.stdout.readline() == "live: garments: waiting for garments\n"
-        os.set_blocking(viewer.stdout.fileno(), False)
-        said: list[str] = []
-        node.until(lambda: bool(said), lambda: [node.send(0.0, 10**9), said.extend(viewer.stdout or [])])
-        address = re.search(r"(http://localhost:\d+) ", said[0])
+        node.until(lambda: len(said) > 1, lambda: node.send(0.0, 10**9))
+        assert said[0] == "live: garments: waiting for garments"
+        address = re.search(r"(http://localhost:\d+) ", said[1])
         assert address is not None
         chromium.open(address[1])
         seen = chromium.picture_when(lambda picture: int(green(picture).sum()) > 1500)
@@ -133,7 +132,6 @@ def test_a_browser_shows_it(node: Node, tmp_path: Path) -> None:
         node.until(lambda: int(green(chromium.picture()).sum()) < 100, node.leave)
         assert chromium.errors == []
     finally:
-        chromium.close()
-        viewer.send_signal(signal.SIGINT)
-        viewer.communicate(timeout=60)
-    assert viewer.returncode == 0
+        chromium.close()  # before the server ends, which would wait six seconds for it
+        end.set()
+        viewer.join()

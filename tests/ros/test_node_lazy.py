@@ -200,6 +200,9 @@ def test_so_are_recordings(stage: Callable[..., Stage], tmp_path: Path) -> None:
         scene.peer.send(frame(1))
         return int(scene.peer.status("recording")[2].get("messages", 0)) > 3
 
+    def is_closed() -> bool:
+        return all(one.finished for one in scene.node.recording._closing)
+
     scene.until(client.service_is_ready, "the service is there")
     (result,) = scene.node.set_parameters([Parameter("record", value=str(tmp_path / "bag"))])
     assert result.successful, result.reason
@@ -209,7 +212,7 @@ def test_so_are_recordings(stage: Callable[..., Stage], tmp_path: Path) -> None:
         scene.until(recorded, "messages are recorded")
         switch(False)
         scene.rests()
-        scene.until(lambda: scene.reports(1) and not scene.node.recording._closing, "the bag is closed")
+        scene.until(lambda: scene.reports(1) and is_closed(), "the bag is closed")
         with BagReader(tmp_path / bag) as reader:
             assert {"/smpl_params", "/garments"} <= {message.topic for message in reader.messages()}
         if bag == "bag":

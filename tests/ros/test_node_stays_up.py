@@ -173,4 +173,4 @@ def test_what_cannot_be_used_is_refused(values: dict[str, Any], reason: str) -> 
     from refu_ros._settings import NodeSettings
 
     with pytest.raises(RefuError, match=reason):
-        NodeSettings().changed(values).pipeline.check()
+        NodeSettings().changed(values).check_files()

@@ -19,9 +19,11 @@ import pytest
 import yaml
 
 from refu_core import __version__
-from refu_ros._settings import defaults, specs
+from refu_core.options import specs_of
+from refu_ros._settings import NodeSettings
 
 ROOT = Path(__file__).parents[2]
+SPECS = specs_of(NodeSettings)
 INSTALLED_FOLDERS = ("launch", "config", "rviz", "foxglove", "resource")
 LAUNCH_FILES = sorted((ROOT / "launch").glob("*.launch.py"))
 TOPICS = {"/garments", "/body"}
@@ -116,7 +118,8 @@ def test_package_xml_depends_on_what_is_imported(package_xml: ET.Element) -> Non
 def test_config_holds_every_parameter_with_its_default() -> None:
     config = yaml.safe_load((ROOT / "config" / "garment_node.yaml").read_text(encoding="utf-8"))
     given = config["/**/garment_node"]["ros__parameters"]
-    wanted = {name: list(value) if isinstance(value, tuple) else value for name, value in defaults().items()}
+    defaults = {name: spec.default for name, spec in SPECS.items()}
+    wanted = {name: list(value) if isinstance(value, tuple) else value for name, value in defaults.items()}
     assert given == wanted
     assert {name: type(value) for name, value in given.items()} == {name: type(v) for name, v in wanted.items()}
 
@@ -125,15 +128,15 @@ def test_config_says_what_is_what_and_what_is_live() -> None:
     """The comments are the launch arguments' descriptions, too."""
     lines = (ROOT / "config" / "garment_node.yaml").read_text(encoding="utf-8").splitlines()
     live = {line.split(":")[0].strip() for line in lines if re.search(r"[;#] live$", line)}
-    assert live == {name for name, spec in specs().items() if spec.live}
+    assert live == {name for name, spec in SPECS.items() if spec.live}
     described = {line.split(":")[0].strip() for line in lines if re.search(r":.*  # ..........", line)}
-    assert described == set(specs())
+    assert described == set(SPECS)
 
 
 def test_documented_parameters() -> None:
     text = (ROOT / "docs" / "guide" / "ros.md").read_text(encoding="utf-8")
     rows = set(re.findall(r"^\| `(\w+)` \|", text, flags=re.MULTILINE))
-    assert set(specs()) <= rows
+    assert set(SPECS) <= rows
 
 
 @pytest.mark.parametrize("path", LAUNCH_FILES, ids=lambda path: path.name)
@@ -148,7 +151,7 @@ def test_rviz_shows_the_topics() -> None:
     assert {topic for topic, display in displays.items() if display["Enabled"]} == TOPICS
     assert set(displays) == TOPICS | ON_REQUEST
     assert {display["Topic"]["Depth"] for display in displays.values()} == {1}  # a deeper queue only holds old garments
-    assert manager["Global Options"]["Fixed Frame"] == defaults()["frame_id"]
+    assert manager["Global Options"]["Fixed Frame"] == SPECS["frame_id"].default
 
 
 def test_foxglove_shows_the_topics() -> None:
@@ -156,7 +159,7 @@ def test_foxglove_shows_the_topics() -> None:
     topics = layout["configById"]["3D!refu"]["topics"]
     assert {name for name, topic in topics.items() if topic["visible"]} == TOPICS
     assert set(topics) == TOPICS | ON_REQUEST | {"/scene"}
-    assert layout["configById"]["3D!refu"]["followTf"] == defaults()["frame_id"]
+    assert layout["configById"]["3D!refu"]["followTf"] == SPECS["frame_id"].default
 
     def panels(node: Any) -> list[str]:
         return [node] if isinstance(node, str) else panels(node["first"]) + panels(node["second"])

@@ -28,9 +28,11 @@ from rclpy.node import Node  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
 from rclpy.qos import QoSProfile  # noqa: E402
 
+from msg_adapters import load_motion  # noqa: E402
+from msg_adapters.motion import march  # noqa: E402
 from refu_ros._interfaces import interface  # noqa: E402
 from refu_ros._parameters import declare  # noqa: E402
-from refu_ros.smpl_publisher import PublisherOptions, SmplPublisher, in_place, load_motion, march  # noqa: E402
+from refu_ros.smpl_publisher import PublisherOptions, SmplPublisher  # noqa: E402
 
 # rclpy's parser of message definitions uses a module that Python 3.11 deprecates.
 pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")
@@ -211,7 +213,7 @@ def publisher(context: Context, **parameters: Any) -> SmplPublisher:
 
 def test_in_place_holds_the_ground_and_not_the_height() -> None:
     walk = load_motion(str(BAGS / "walk"))
-    held = in_place(walk, up=1)
+    held = walk.in_place(up=1)
     np.testing.assert_array_equal(held.transl[:, 1], walk.transl[:, 1])
     np.testing.assert_array_equal(held.transl[:, [0, 2]], np.tile(walk.transl[0, [0, 2]], (len(walk), 1)))
     np.testing.assert_array_equal(held.poses, walk.poses)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import Counter, deque
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections import Counter, defaultdict, deque
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,7 +15,7 @@ _WINDOW = 1000
 """Latencies that percentiles are taken of."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Report:
     """Counts since the node started, what they grew by since the last report, and latencies."""
 
@@ -31,8 +30,8 @@ class Report:
     last_error: str
     silent_for: float | None
     """Since the last input of anybody [s]; None if there was none."""
-    reasons: dict[str, str] = field(default_factory=dict)
-    """The newest reason for each kind of drop, and for a fault."""
+    reasons: defaultdict[str, str]
+    """The newest reason for each kind of drop, and for a fault; empty where there is none."""
 
     def rate(self, key: str) -> float:
         """Events a second since the last report [Hz]."""
@@ -51,37 +50,39 @@ class Statistics:
     placed by a transform older than itself), beyond_promise (a frame that "nothing inside" isn't promised for).
     """
 
-    def __init__(self, *, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
+    def __init__(self) -> None:
         self._lock = threading.Lock()
         self._total: Counter[str] = Counter()
         self._reported: Counter[str] = Counter()
-        self._reported_at = clock()
+        self._reported_at = time.monotonic()
         self._received_at: float | None = None
         self._largest_shift = 0.0
         self._latencies: deque[float] = deque(maxlen=_WINDOW)
-        self._reasons: dict[str, str] = {}
+        self._reasons: defaultdict[str, str] = defaultdict(str)
         self._error = ""
+
+    def count(self, key: str) -> None:
+        """One more of what a key stands for."""
+        with self._lock:
+            self._total[key] += 1
 
     def receive(self) -> None:
         """A message came, whatever it holds."""
-        with self._lock:
-            self._total["received"] += 1
-            self._received_at = self._clock()
+        self._received_at = time.monotonic()
+        self.count("received")
 
     def drop(self, cause: str, reason: str = "") -> None:
         """A frame was lost to something that isn't wanted."""
-        self.count(f"drop.{cause}", {cause: reason})
+        self._because(f"drop.{cause}", cause, reason)
 
     def fault(self, where: str, reason: str) -> None:
         """A callback failed, or a request made no sense."""
-        self.count(f"fault.{where}", {"fault": reason})
+        self._because(f"fault.{where}", "fault", reason)
 
-    def count(self, key: str, reasons: Mapping[str, str] | None = None) -> None:
-        """One more of what one of the keys stands for, and why."""
+    def _because(self, key: str, kind: str, reason: str) -> None:
         with self._lock:
             self._total[key] += 1
-            self._reasons |= {cause: printable(reason) for cause, reason in (reasons or {}).items() if reason}
+            self._reasons[kind] = printable(reason) or self._reasons[kind]
 
     def shift(self, largest: float) -> None:
         """In a frame the collider left the skin by so much [m]."""
@@ -90,34 +91,30 @@ class Statistics:
 
     def publish(self, latencies_ms: list[float], *, found: int, unresolved: int) -> None:
         """A message went out with the frames of so many persons."""
+        counts = {"ticks": 1, "frames": len(latencies_ms)}
+        counts |= {"penetration.found": found, "penetration.unresolved": unresolved}
         with self._lock:
-            self._total["ticks"] += 1
-            self._total["frames"] += len(latencies_ms)
-            self._total["penetration.found"] += found
-            self._total["penetration.unresolved"] += unresolved
+            self._total.update(counts)
             self._latencies.extend(latencies_ms)
 
     def set_error(self, text: str) -> None:
         """What keeps the node from doing as it was asked, or empty."""
-        with self._lock:
-            self._error = printable(text)
+        self._error = printable(text)
 
     def report(self) -> Report:
         """What there is to say, once a second."""
         with self._lock:
-            now = self._clock()
-            recent = self._total - self._reported
-            seconds, self._reported_at = now - self._reported_at, now
-            self._reported = self._total.copy()
-            largest_shift, self._largest_shift = self._largest_shift, 0.0
-            p50, p95, p99 = np.percentile(self._latencies, (50, 95, 99)) if self._latencies else (0.0, 0.0, 0.0)
-            return Report(
-                total=self._total.copy(),
-                recent=recent,
-                seconds=seconds,
-                latency_ms=(float(p50), float(p95), float(p99)),
-                largest_shift=largest_shift,
+            now, total = time.monotonic(), self._total.copy()
+            p50, p95, p99 = np.percentile(self._latencies or (0.0,), (50, 95, 99)).tolist()
+            report = Report(
+                total=total,
+                recent=total - self._reported,
+                seconds=now - self._reported_at,
+                latency_ms=(p50, p95, p99),
+                largest_shift=self._largest_shift,
                 last_error=self._error,
                 silent_for=None if self._received_at is None else now - self._received_at,
-                reasons=dict(self._reasons),
+                reasons=self._reasons.copy(),
             )
+            self._reported, self._reported_at, self._largest_shift = total, now, 0.0
+            return report

@@ -7,21 +7,16 @@ import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from msg_adapters import Placement
-from refu_core import FrameError
-from refu_core.frames import PLAUSIBLE_ANGLE, PLAUSIBLE_COEFFICIENT, PLAUSIBLE_TRANSL
+from msg_adapters.transforms import Placement
 from refu_core.keypoints import MOST_PEOPLE
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from msg_adapters.statistics import Statistics
     from refu_core import SmplFrame
     from refu_core.outputs import PinholeCamera
-    from refu_ros._statistics import Statistics
 
-_MAX_STAMP_NS = 2**31 * 10**9
 _MOST_WAITING = 2
 """Frames of a person. With one, 171 of 900 frames at 30 Hz were lost where one takes 30 ms, with two none."""
 
@@ -37,31 +32,6 @@ class Arrival:
     """From the sender's frame to that of the messages."""
     camera: PinholeCamera | None = None
     """Who looks, in the frame of the messages."""
-
-
-def check_plausible(frame: SmplFrame) -> None:
-    """Finite is not enough: numbers no body has would overflow further on, where they are hard to tell apart.
-
-    Raises `FrameError`.
-    """
-    for name, value, limit in (
-        ("pose", frame.pose, PLAUSIBLE_ANGLE),
-        ("betas", frame.betas, PLAUSIBLE_COEFFICIENT),
-        ("style", 0.0 if frame.style is None else frame.style, PLAUSIBLE_COEFFICIENT),
-        ("transl", frame.transl, PLAUSIBLE_TRANSL),
-    ):
-        largest = float(np.abs(value).max())
-        if largest > limit:
-            msg = f"{name}: wanted magnitudes up to {limit:g}, got {largest:g}"
-            raise FrameError(msg)
-    check_stamp(frame.stamp_ns)
-
-
-def check_stamp(stamp_ns: int) -> None:
-    """Raises `FrameError` for a time [ns] that no message holds, or before the clock's beginning."""
-    if not 0 <= stamp_ns < _MAX_STAMP_NS:
-        msg = f"wanted a stamp that fits a ROS time, got {stamp_ns} ns"
-        raise FrameError(msg)
 
 
 class Scene:

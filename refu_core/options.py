@@ -1,0 +1,228 @@
+"""Settings that say what they are for: fields of a dataclass, which nodes take as parameters and commands as options.
+
+What loads torch is imported where it is needed: a mistyped setting is answered before that.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields, replace
+from functools import cache, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from refu_core.errors import RefuError
+from refu_core.frames import N_BETAS, N_STYLES, SmplFrame
+from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN, MAX_MARGIN, BackboneName, BetasSource, SdfMode
+
+if TYPE_CHECKING:
+    from refu_core.garments import GarmentTemplate
+    from refu_core.realtime import GarmentPipeline
+
+
+class SettingsError(RefuError, ValueError):
+    """A setting that has no meaning, or settings that can't go together."""
+
+
+@dataclass(frozen=True)
+class Spec:
+    """What there is to know of a setting."""
+
+    default: Any
+    description: str
+    within: tuple[float, float] | None = None
+    choices: tuple[str, ...] = ()
+    live: bool = True
+    """Whether it may change while a node runs."""
+    metavar: str = ""
+    """What stands for the value in the help of a command: FILE and DIR for paths."""
+    parse: Callable[[str], Any] | None = None
+    """Reads what a command was given, where the default doesn't say what that is."""
+
+    @property
+    def kind(self) -> type:
+        """Of the value, or of a list's items."""
+        return type(self.default[0] if isinstance(self.default, tuple) and self.default else self.default)
+
+
+def setting(default: Any, description: str, **limits: Any) -> Any:
+    """A field that is a setting; `limits` are those of `Spec`."""
+    return field(default=default, metadata={"spec": Spec(default, description, **limits)})
+
+
+fixed = partial(setting, live=False)
+"""A field that is a setting, and doesn't change while a node runs."""
+
+
+def specs_of(kind: Any) -> dict[str, Spec]:
+    """The settings of a dataclass by name."""
+    return {item.name: item.metadata["spec"] for item in fields(kind) if "spec" in item.metadata}
+
+
+def check(settings: Any) -> None:
+    """Raises `SettingsError` for a value out of its range, or that isn't among its choices."""
+    for name, spec in specs_of(type(settings)).items():
+        value = getattr(settings, name)
+        if spec.choices and value not in spec.choices:
+            msg = f"{name}: wanted {' or '.join(spec.choices)}, got {value!r}"
+            raise SettingsError(msg)
+        low, high = spec.within or (-math.inf, math.inf)
+        for number in (value if isinstance(value, tuple) else (value,)) if spec.within else ():
+            if not low <= number <= high:  # NaN isn't, either
+                msg = f"{name}: wanted {low:g} to {high:g}, got {number:g}"
+                raise SettingsError(msg)
+
+
+def arguments(settings: Any, *names: str) -> list[str]:
+    """Settings as a command takes them, by name; without those that have their defaults, or were left empty."""
+    found = []
+    for name in names:
+        value, flag = getattr(settings, name), name.replace("_", "-")
+        if isinstance(value, bool):
+            found += [] if value == specs_of(type(settings))[name].default else [f"--{'' if value else 'no-'}{flag}"]
+        elif value not in (None, "", ()):
+            found.append(f"--{flag}={','.join(map(str, value)) if isinstance(value, tuple) else value}")
+    return found
+
+
+@dataclass(frozen=True, kw_only=True)
+class PipelineOptions:
+    """What is worn by whom, and by what it is computed: where one of these changes, another pipeline is needed."""
+
+    garments: tuple[str, ...] = setting(DEFAULT_GARMENTS, "Garments that every person wears.", metavar="A,B")
+    body: str = setting(
+        "", "Who wears them: an SMPL file, or a built-in name; empty for the garments' own.", metavar="FILE"
+    )
+    betas_from: str = setting(
+        "", "An SMPL file whose betas arrive: the built-in mesh follows them; empty for none.", metavar="FILE"
+    )
+    backbone: str = setting(
+        "auto", "What predicts the garment before collisions are handled.", choices=tuple(BackboneName)
+    )
+    weights: str = setting(
+        "",
+        "Folder with a folder a garment of weights of one's own (refu train); empty for those that ship.",
+        metavar="DIR",
+    )
+    sdf: str = setting("hybrid", "How collisions are found.", choices=tuple(SdfMode))
+    collider: bool = setting(
+        True, "Bring garments off a body whose overlaps are pulled apart, or off the body as it is posed."
+    )
+    device: str = setting("cpu", "Torch device: cpu or cuda.")
+
+    def __str__(self) -> str:
+        weights = f", weights {self.weights}" if self.weights else ""
+        raw = "" if self.collider else ", no collider"
+        wearer = f" on {self.body or self.betas_from}" if self.body or self.betas_from else ""
+        return f"{', '.join(self.garments)}{wearer} ({self.backbone}, {self.sdf}, {self.device}{weights}{raw})"
+
+    @property
+    def pipeline(self) -> PipelineOptions:
+        """These alone, of settings that are more."""
+        return PipelineOptions(**{name: getattr(self, name) for name in PIPELINE_OPTIONS})
+
+    @property
+    def of_one_style(self) -> list[str]:
+        """The garments that hear of no style."""
+        return [name for name in self.garments if _template(name).styledirs is None]
+
+    def check_garments(self) -> None:
+        """Raises `SettingsError` for garments that there aren't, or that nobody wears together."""
+        if not self.garments or len(set(self.garments)) < len(self.garments):
+            msg = f"garments: wanted distinct names, at least one, got {list(self.garments)}"
+            raise SettingsError(msg)
+        try:
+            bodies = {name: _template(name).body for name in self.garments}
+        except RefuError as error:
+            msg = f"garments: {error}"
+            raise SettingsError(msg) from error
+        if not (self.body or self.betas_from) and len(set(bodies.values())) > 1:
+            cut_for = ", ".join(f"{name} ({body})" for name, body in bodies.items())
+            msg = f"garments: one person wears garments of one body, got {cut_for}"
+            raise SettingsError(msg)
+
+    def check_files(self) -> None:
+        """Raises `RefuError` for a device, a body or weights that there aren't, as far as that shows at once."""
+        from refu_core._device import checked_device
+        from refu_core.body import BUILTIN_BODIES
+        from refu_core.weights import weights_folder
+
+        checked_device(self.device)
+        for body in (self.body, self.betas_from):
+            if body not in ("", *BUILTIN_BODIES) and not Path(body).is_file():
+                msg = f"no body {body!r}: wanted one of {', '.join(BUILTIN_BODIES)}, or an .npz or .pkl file"
+                raise SettingsError(msg)
+        is_auto = self.backbone == BackboneName.AUTO
+        for name in self.garments if self.backbone != BackboneName.SKINNED else ():
+            folder = weights_folder(_template(name).name, self.weights or None)
+            if is_auto and not self.weights and not folder.exists():
+                continue  # it is worn by skinning
+            path = folder / f"{BackboneName.TAILORNET if is_auto else self.backbone}-{self.sdf}.safetensors"
+            if not path.is_file():
+                msg = f"no weights of {path.stem.replace('-', ' ')} for {name}: {path} is missing; "
+                msg += "train them (refu train)"
+                raise SettingsError(msg)
+
+    def load(self, **more: Any) -> GarmentPipeline:
+        """The pipeline; `more` are other arguments of `GarmentPipeline.load`. Raises `RefuError` as that does."""
+        from refu_core.realtime import GarmentPipeline
+
+        asked: dict[str, Any] = {name: getattr(self, name) for name in PIPELINE_OPTIONS}
+        return GarmentPipeline.load(**{name: value for name, value in asked.items() if value != ""}, **more)
+
+
+PIPELINE_OPTIONS = tuple(specs_of(PipelineOptions))
+
+
+@dataclass(frozen=True, kw_only=True)
+class DressOptions(PipelineOptions):
+    """The same, and how it is worn."""
+
+    margin: float = setting(
+        DEFAULT_MARGIN, "Clearance that is kept from the skin [m].", within=(0.0, MAX_MARGIN), metavar="M"
+    )
+    style: tuple[float, ...] = setting(
+        (0.0,) * N_STYLES,
+        "Garment style γ in standard deviations; zeros are the mean style.",
+        within=(-10.0, 10.0),
+        metavar="G0,…",
+    )
+    betas: tuple[float, ...] = setting(
+        (0.0,) * N_BETAS,
+        "Shape of everybody in standard deviations, where betas_source is fixed.",
+        within=(-20.0, 20.0),
+        metavar="B0,…",
+    )
+    betas_source: str = setting(
+        "message",
+        "message: betas that arrive are of body or betas_from; builtin: of the built-in body; fixed: parameter betas.",
+        choices=tuple(BetasSource),
+    )
+
+    @property
+    def betas_are_told(self) -> bool:
+        """Whether it is known what betas that arrive are of."""
+        return bool(self.body or self.betas_from) or self.betas_source != BetasSource.MESSAGE
+
+    @property
+    def known_betas(self) -> tuple[float, ...] | None:
+        """The shape of everybody, whatever arrives; None where what arrives counts."""
+        return self.betas if self.betas_source == BetasSource.FIXED else None
+
+    def applied(self, frame: SmplFrame) -> SmplFrame:
+        """The frame with the shape and style that are asked for; a style that it has stays."""
+        if self.known_betas is not None:
+            frame = replace(frame, betas=np.array(self.known_betas, np.float32))
+        if frame.style is None and any(self.style):
+            frame = replace(frame, style=np.array(self.style, np.float32))
+        return frame
+
+
+@cache
+def _template(name: str) -> GarmentTemplate:
+    from refu_core.garments import load_garment
+
+    return load_garment(name)

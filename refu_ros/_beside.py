@@ -1,0 +1,190 @@
+"""Beside the stream, in threads of their own: pipelines are loaded, and single frames dressed, as somebody asks."""
+
+from __future__ import annotations
+
+import os
+import re
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from msg_adapters import check_plausible
+from msg_adapters.axes import SMPL_COLUMNS
+from refu_core import RefuError, SmplFrame
+from refu_core.frames import N_BETAS, N_JOINTS
+from refu_core.modes import BUILTIN_GARMENTS
+from refu_core.options import PipelineOptions
+from refu_ros._settings import NodeSettings
+
+if TYPE_CHECKING:
+    from refu_core import GarmentPipeline
+    from refu_core.realtime import PipelineOutput
+
+Then = Callable[["PipelineOutput", dict[str, NDArray[np.float64]]], object]
+
+_PART = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
+"""A folder or file: nothing hidden, no `..`, no option of a command."""
+_MOST_PARTS = 8
+_MOST_GARMENTS = 16
+_MOST_WAITING = 8
+"""Requests that may wait: who asks more often than frames can be dressed is told so."""
+_MOST_PIPELINES = 2
+NICE = 10
+"""Who asks for a frame waits for those whose garments are to be there 30 times a second."""
+
+
+def load(options: PipelineOptions, *, threads: int = 1) -> GarmentPipeline:
+    """Loads a pipeline, which takes some tenths of a second, and asks it once for all that a subscriber may want.
+
+    Kernels are loaded when they first run, and the frames that come meanwhile would be lost. Raises `RefuError`.
+    """
+    from refu_core.outputs import Dressed, Fittings  # loads torch
+
+    pipeline = options.load(threads=threads)
+    frame, fittings = (
+        SmplFrame(np.zeros((N_JOINTS, 3), np.float32)),
+        Fittings(pipeline, weights=options.weights or None),
+    )
+    worn = Dressed("", frame, pipeline(frame), fittings, np.eye(3), np.zeros(3))
+    for ask in (worn.normals, worn.clearance, worn.sigma, worn.contacts):
+        ask()
+    return pipeline
+
+
+class PipelineLoader:
+    """A thread that loads the pipeline asked for last; requests it has been too slow for are forgotten."""
+
+    def __init__(
+        self,
+        use: Callable[[GarmentPipeline, PipelineOptions], None],
+        fail: Callable[[Exception, PipelineOptions], None],
+        *,
+        threads: int,
+    ) -> None:
+        self._use, self._fail, self._threads = use, fail, threads
+        self._wanted: PipelineOptions | None = None
+        self._pool = ThreadPoolExecutor(1, "loader")
+
+    def request(self, options: PipelineOptions) -> None:
+        """Asks for a pipeline; returns at once."""
+        self._wanted = options
+        self._pool.submit(self._load, options)
+
+    def close(self) -> None:
+        """Ends the thread, after the load under way."""
+        self._wanted = None
+        self._pool.shutdown()
+
+    def _load(self, options: PipelineOptions) -> None:
+        if options is not self._wanted:
+            return
+        try:
+            pipeline = load(options, threads=self._threads)
+        except Exception as error:  # missing weights, no CUDA: the running pipeline stays
+            self._fail(error, options)
+            return
+        if options is self._wanted:
+            self._use(pipeline, options)
+
+
+class Dresser:
+    """`ask` belongs to one thread. What it makes doesn't depend on who is on the node's topics, or was."""
+
+    def __init__(self) -> None:
+        self._pool: ThreadPoolExecutor | None = None
+        self._waiting = threading.BoundedSemaphore(_MOST_WAITING)
+        self._load = lru_cache(_MOST_PIPELINES)(load)
+
+    def ask(self, frame: SmplFrame, settings: NodeSettings, then: Then) -> Future[object]:
+        """What `then` makes of the output, and of each garment's vertices in the frame of the messages [m], (V, 3).
+
+        Raises `RefuError` where too many wait.
+        """
+        if not self._waiting.acquire(blocking=False):
+            msg = f"{_MOST_WAITING} requests wait already: ask again when one has been answered"
+            raise RefuError(msg)
+        if self._pool is None:
+            self._pool = ThreadPoolExecutor(1, "dresser", initializer=_give_way)
+        asked = self._pool.submit(self._dress, frame, settings, then)
+        asked.add_done_callback(lambda _: self._waiting.release())
+        return asked
+
+    def close(self) -> None:
+        """Waits for the frame that is being dressed."""
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+        self._pool = None
+        self._load.cache_clear()
+
+    def _dress(self, frame: SmplFrame, settings: NodeSettings, then: Then) -> object:
+        pipeline = self._load(settings.pipeline)
+        pipeline.margin = settings.margin
+        frame = settings.applied(frame)
+        output = pipeline(frame)
+        rotation = np.eye(3)[list(SMPL_COLUMNS[settings.axes])]
+        placed = {name: (mesh.local + frame.transl) @ rotation.T for name, mesh in output.items()}
+        if not all(np.isfinite(points).all() for points in placed.values()):
+            msg = "a garment isn't finite in this pose"
+            raise RefuError(msg)
+        return then(output, placed)
+
+
+def _give_way() -> None:
+    import torch
+
+    torch.set_num_threads(1)
+    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)  # to Linux a thread is a process
+
+
+def asked_frame(request: Any) -> SmplFrame:
+    """Of a `refu_msgs/srv/Dress` request. Raises `FrameError` for what no body has."""
+    betas = np.asarray(request.betas, np.float32)
+    stamp = request.header.stamp
+    frame = SmplFrame(
+        pose=np.asarray(request.pose),
+        betas=np.pad(betas, (0, max(0, N_BETAS - len(betas)))),
+        transl=np.asarray(request.transl),
+        style=np.asarray(request.style) if len(request.style) else None,
+        stamp_ns=stamp.sec * 10**9 + stamp.nanosec,
+    )
+    check_plausible(frame)
+    return frame
+
+
+def asked_settings(request: Any, settings: NodeSettings) -> NodeSettings:
+    """The settings with a request's garments and mode of collisions. Raises `RefuError` for some that make no sense.
+
+    Garments are files: those that ship may be named, and what the operator has chosen, but no path.
+    """
+    names, sdf = tuple(request.garments[:_MOST_GARMENTS]), request.sdf or settings.sdf
+    known = list(dict.fromkeys([*settings.garments, *BUILTIN_GARMENTS]))
+    if unknown := [name for name in names if name not in known] or request.garments[_MOST_GARMENTS:]:
+        msg = f"garments: wanted up to {_MOST_GARMENTS} of {', '.join(known)}, got {unknown[0]!r}"
+        raise RefuError(msg)
+    # A style is of the garments that the parameters name: others may have none.
+    style = settings.style if names in ((), settings.garments) else (0.0,) * len(settings.style)
+    asked = replace(settings, garments=names or settings.garments, sdf=sdf, style=style)
+    asked.check_files()
+    return asked
+
+
+def asked_path(settings: NodeSettings, name: str) -> Path:
+    """A path below the parameter `bags`. Raises `RefuError` for any other, links out of that folder included."""
+    if not settings.bags:
+        msg = "a request may name no file: start the node with the parameter bags, a folder for them"
+        raise RefuError(msg)
+    parts = name.split("/")
+    folder = Path(settings.bags).expanduser().resolve()
+    if len(parts) <= _MOST_PARTS and all(map(_PART.fullmatch, parts)):
+        path = (folder / name).resolve()
+        if folder in path.parents:
+            return path
+    msg = f"wanted a path below the parameter bags, as today/walk.mcap, got {name!r}"
+    raise RefuError(msg)
