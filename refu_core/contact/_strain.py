@@ -14,7 +14,7 @@ from refu_core.mesh import Connectivity
 
 
 class StrainLimit:
-    """Draws the ends of edges together that are longer than a multiple of their rest length.
+    """Draws the ends of edges together that contact has made longer than a multiple of their rest length.
 
     Vertices that are deep in a limb may leave it on another side than their neighbours do, which tears the cloth. Drawn
     together, they are pushed off the skin anew, on the side where most of them are.
@@ -30,10 +30,12 @@ class StrainLimit:
         self._settings, self._device = settings, device
         self._is_serial = device.type == "cpu"
         n, name = mesh.n_vertices, str(device)
-        self._rest, self._points, self._other = torch.zeros(3, n, 3, device=device)
+        self._rest, self._before, self._points, self._other = torch.zeros(4, n, 3, device=device)
         self._count = torch.zeros(1, dtype=torch.int32, device=device)
         net = kernels.Net()
-        net.rest, net.points, net.other = (as_warp(one, wp.vec3) for one in (self._rest, self._points, self._other))
+        net.rest, net.before, net.points, net.other = (
+            as_warp(one, wp.vec3) for one in (self._rest, self._before, self._points, self._other)
+        )
         lower, higher = mesh.edges.T
         lists = (*mesh.ring, np.searchsorted(lower, np.arange(n + 1)), higher)
         net.ring_start, net.ring, net.edge_start, net.edge_end = (
@@ -48,13 +50,14 @@ class StrainLimit:
         ]
 
     @torch.no_grad()
-    def __call__(self, points: Tensor, rest: Tensor) -> Tensor:
+    def __call__(self, points: Tensor, before: Tensor, rest: Tensor) -> Tensor:
         """The garment (N, 3) [m] with no tear in it; on a CPU the very points where there was none.
 
-        `rest` are the vertices of the wearer's garment in the rest pose (N, 3) [m]. Not differentiable; a GPU isn't
-        waited for.
+        `before` (N, 3) [m] are its vertices before contact, and `rest` (N, 3) [m] those of the wearer's garment in the
+        rest pose. Not differentiable; a GPU isn't waited for.
         """
         self._points.copy_(points)
+        self._before.copy_(before)
         self._rest.copy_(rest)
         with torch_stream(self._device):
             if self._is_serial:

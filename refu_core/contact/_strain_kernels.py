@@ -11,6 +11,8 @@ class Net:
 
     rest: wp.array[wp.vec3]
     """Vertices in the rest pose [m]."""
+    before: wp.array[wp.vec3]
+    """Vertices before contact [m]."""
     points: wp.array[wp.vec3]
     other: wp.array[wp.vec3]
     """Vertices [m], and the same a sweep later."""
@@ -20,7 +22,7 @@ class Net:
     edge_end: wp.array[int]
     """The edges of vertex v to those of higher number are to `edge_end[edge_start[v]:edge_start[v + 1]]`."""
     limit: float
-    """How many times their rest length edges may be."""
+    """How many times their rest length edges may be, unless they were longer before contact."""
     rows: wp.array[int]
     """On a CPU the ends of edges that are too long, in the order in which they were found."""
     is_listed: wp.array[int]
@@ -28,8 +30,15 @@ class Net:
 
 
 @wp.func
+def longest_squared(v: int, w: int, net: Net) -> float:
+    """The square of how long an edge may be [m²]."""
+    at_rest = net.limit * net.limit * wp.length_sq(net.rest[v] - net.rest[w])
+    return wp.max(at_rest, wp.length_sq(net.before[v] - net.before[w]))
+
+
+@wp.func
 def is_long(v: int, w: int, points: wp.array[wp.vec3], net: Net) -> bool:
-    return wp.length_sq(points[v] - points[w]) > net.limit * net.limit * wp.length_sq(net.rest[v] - net.rest[w])
+    return wp.length_sq(points[v] - points[w]) > longest_squared(v, w, net)
 
 
 @wp.func
@@ -41,9 +50,10 @@ def drawn(v: int, points: wp.array[wp.vec3], net: Net) -> wp.vec3:
     total = wp.vec3()
     for r in range(net.ring_start[v], net.ring_start[v + 1]):
         w = net.ring[r]
-        if is_long(v, w, points, net):
-            way = points[w] - points[v]
-            total += (0.5 - 0.5 * net.limit * wp.length(net.rest[v] - net.rest[w]) / wp.length(way)) * way
+        way = points[w] - points[v]
+        ratio = longest_squared(v, w, net) / wp.max(wp.length_sq(way), 1.0e-18)
+        if ratio < 1.0:
+            total += (0.5 - 0.5 * wp.sqrt(ratio)) * way
     return points[v] + total / float(wp.max(net.ring_start[v + 1] - net.ring_start[v], 1))
 
 
@@ -65,15 +75,11 @@ def sweep_kernel(net: Net, points: wp.array[wp.vec3], other: wp.array[wp.vec3]) 
 @wp.kernel
 def limit_kernel(net: Net, sweeps: int) -> None:
     """All sweeps, by one thread: over the ends of edges that are too long, and of those that become it."""
-    squared = net.limit * net.limit
     for v in range(net.points.shape[0]):
-        here = net.points[v]
-        rest = net.rest[v]
         for e in range(net.edge_start[v], net.edge_start[v + 1]):
-            w = net.edge_end[e]
-            if wp.length_sq(here - net.points[w]) > squared * wp.length_sq(rest - net.rest[w]):
+            if is_long(v, net.edge_end[e], net.points, net):
                 enlist(v, net)
-                enlist(w, net)
+                enlist(net.edge_end[e], net)
     for _ in range(sweeps):
         i = int(0)
         while i < net.count[0]:

@@ -85,12 +85,14 @@ class WayOut:
         return points, torch.count_nonzero(is_inside)
 
     @torch.no_grad()
-    def ways(self, points: Tensor) -> Tensor:
-        """How far those of the points (N, 3) [m] that are inside are from open skin [m], (N,); zero for the others."""
+    def open_skin(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """The closest places on open skin (N, 3) [m] of those of the points (N, 3) [m] that are inside, and which are.
+
+        Who has none within `max_displacement` isn't among them.
+        """
         is_inside = self._winding(points) != 0
         foot, normal = self._nearest_skin(points, is_inside, self._winding_above(), of_samples=False)
-        way = torch.linalg.vector_norm(foot - points, dim=1)
-        return torch.where(is_inside & (normal != 0).any(1), way, 0.0)
+        return foot, is_inside & (normal != 0).any(1)
 
     def _winding_above(self) -> Tensor:
         """The winding numbers above the samples of the skin: its vertices, and the middles of its faces."""

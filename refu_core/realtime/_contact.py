@@ -166,6 +166,7 @@ class ContactStage:
         vertices: Tensor,
         worn: Mapping[str, Worn],
         *,
+        raw: Tensor,
         pressed: Tensor,
         on_mean: Tensor,
         rest: Tensor,
@@ -175,7 +176,8 @@ class ContactStage:
     ) -> Resolved:
         """Vertices (V, 3) [m] off the body, which has the last word, and within reach of where limbs `pressed` them.
 
-        `on_mean` is as in `Drape`, and `rest` (V, 3) [m] the wearer's garment in the rest pose.
+        `raw` (V, 3) [m] are the vertices as they were predicted, `rest` (V, 3) [m] those of the wearer's garment in the
+        rest pose, and `on_mean` is as in `Drape`.
         """
         start = self._asked[name](vertices, on_mean=on_mean, reach=margin + ASKED_FROM)
         assert start.face is not None  # these distances are to faces
@@ -187,7 +189,7 @@ class ContactStage:
             vertices, _ = self.lift(name, done.vertices, worn, goes_on=True)
             kept = self._kept * margin
             done = resolver(vertices, self.sdf, None, margin=kept)
-        vertices = self._strain[name](done.vertices, rest)
+        vertices = self._strain[name](done.vertices, raw, rest)
         was_torn = vertices is not done.vertices
         if was_torn:
             done = resolver(vertices, self.sdf, None, margin=kept)

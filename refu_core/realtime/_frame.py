@@ -126,6 +126,7 @@ class FrameStep:
                         name,
                         vertices,
                         garments,
+                        raw=raw,
                         pressed=pressed,
                         on_mean=drape.on_mean[person],
                         rest=wearer.garments[name].rest[person],

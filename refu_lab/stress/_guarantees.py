@@ -14,7 +14,7 @@ from refu_core.backbones import Skinned
 from refu_core.contact import DEFAULT_CONTACT
 from refu_core.frames import SmplFrame
 from refu_core.garments import inner_first
-from refu_core.modes import DEFAULT_MARGIN, SdfMode
+from refu_core.modes import DEFAULT_MARGIN
 from refu_core.realtime import GarmentMesh, GarmentPipeline, PipelineOutput, Wearer, dress
 from refu_core.refu import MAX_DISPLACEMENT
 from refu_lab.stress._closest_kernels import closest_on_sheet
@@ -87,6 +87,7 @@ def buried(subject: Subject, trial: Trial) -> Iterator[Measurement]:
                 name,
                 points,
                 {},
+                raw=points,
                 pressed=points,
                 on_mean=drape.on_mean[0],
                 rest=skinned[name].template.rest(betas)[0],
@@ -103,17 +104,8 @@ def not_thrown(subject: Subject, trial: Trial) -> Iterator[Measurement]:
     for name, pipeline in subject.one_by_one.items():
         (out,) = pipeline(trial.frames)
         mesh = out[name]
-        sdf = subject.distances["exact"]
-        sdf.update(torch.from_numpy(out.body))
+        _, lack = _closest_skin(subject, out, mesh)
         moved = np.linalg.norm(mesh.local - mesh.raw, axis=1)
-        raw = torch.from_numpy(mesh.raw)
-        lack = np.maximum(DEFAULT_MARGIN - sdf.query(raw).distance.numpy(), 0)
-        if subject.wardrobe.sdf != SdfMode.NONE:  # where limbs overlap, the closest skin may be inside
-            stage = subject.contact_stage
-            stage.update(torch.from_numpy(out.body))
-            assert stage.way_out is not None  # it certifies
-            way = stage.way_out.ways(raw).numpy()
-            lack = np.where(way > 0, way + DEFAULT_MARGIN, lack)
         near = _largest_near(lack, pipeline.garments[name].edges.numpy())
         limit = (
             np.minimum(MAX_DISPLACEMENT, MULTIPLE * (near + DEFAULT_MARGIN)) + _pressed(subject, trial.frames[0])[name]
@@ -224,16 +216,32 @@ class _Aims:
     """Whether a vertex is nearer to that surface than it may be, (N,)."""
 
 
+def _closest_skin(
+    subject: Subject, out: PipelineOutput, mesh: GarmentMesh
+) -> tuple[NDArray[np.float32], NDArray[np.floating]]:
+    """The skin closest to each vertex before collision handling [m], (N, 3), and what it lacks to the margin [m], (N,).
+
+    Where limbs overlap the closest skin may be inside: it is the closest that isn't.
+    """
+    raw, body = torch.from_numpy(mesh.raw), torch.from_numpy(out.body)
+    sdf, stage = subject.distances["exact"], subject.contact_stage
+    sdf.update(body)
+    stage.update(body)
+    sample = sdf.query(raw)
+    assert stage.way_out is not None  # it certifies
+    foot, is_inside = stage.way_out.open_skin(raw)
+    place = torch.where(is_inside[:, None], foot, raw - sample.distance[:, None] * sample.gradient)
+    depth = torch.where(is_inside, -(foot - raw).norm(dim=1), sample.distance)
+    return place.numpy(), (DEFAULT_MARGIN - depth).clamp_min(0).numpy()
+
+
 def _aims(subject: Subject, pipeline: GarmentPipeline, out: PipelineOutput) -> dict[str, _Aims]:
-    skin = subject.distances["exact"]
-    skin.update(torch.from_numpy(out.body))
     aims: dict[str, _Aims] = {}
     worn: list[GarmentMesh] = []
     for name in inner_first(pipeline.garments):
         mesh = out[name]
-        sample = skin.query(torch.from_numpy(mesh.raw))
-        places = [mesh.raw - (sample.distance[:, None] * sample.gradient).numpy()]
-        is_pushed = [(sample.distance < DEFAULT_MARGIN).numpy()]
+        place, lack = _closest_skin(subject, out, mesh)
+        places, is_pushed = [place], [lack > 0]
         for below in worn:
             closest, height = closest_on_sheet(mesh.raw, below.local, below.faces)
             places.append(closest)

@@ -63,7 +63,7 @@ def torn(seed: int) -> Tensor:
 @settings(max_examples=8)
 def test_does_what_edges_say_one_by_one(seed: int) -> None:
     points = torn(seed)
-    limited = StrainLimit(SHORTS.mesh, CPU)(points, REST)
+    limited = StrainLimit(SHORTS.mesh, CPU)(points, REST, REST)
     expected = slow(points, REST, SHORTS.mesh, DEFAULT_CONTACT.strain_sweeps)
     torch.testing.assert_close(limited.double(), expected, rtol=0, atol=1e-6)
 
@@ -73,7 +73,7 @@ def test_a_thrown_vertex_comes_back_to_its_neighbours() -> None:
     thrown = 1000
     points[thrown] += torch.tensor([0.0, 0.0, 0.08])
     before = strains(points, REST, SHORTS.mesh.edges)
-    after = strains(StrainLimit(SHORTS.mesh, CPU)(points, REST), REST, SHORTS.mesh.edges)
+    after = strains(StrainLimit(SHORTS.mesh, CPU)(points, REST, REST), REST, SHORTS.mesh.edges)
     assert before.max() > 6
     assert after.max() < 1.05 * LIMIT
 
@@ -81,14 +81,22 @@ def test_a_thrown_vertex_comes_back_to_its_neighbours() -> None:
 def test_what_is_not_torn_stays_as_it_is() -> None:
     points = REST * torch.tensor([1.2, 1.3, 0.8])
     assert strains(points, REST, SHORTS.mesh.edges).max() < LIMIT
-    assert StrainLimit(SHORTS.mesh, CPU)(points, REST) is points
+    assert StrainLimit(SHORTS.mesh, CPU)(points, REST, REST) is points
 
 
 def test_how_long_cloth_may_be_is_the_wearers() -> None:
     """Who is larger has longer edges at rest."""
     points = 1.7 * REST
-    assert StrainLimit(SHORTS.mesh, CPU)(points, 1.2 * REST) is points
-    assert StrainLimit(SHORTS.mesh, CPU)(points, REST) is not points
+    assert StrainLimit(SHORTS.mesh, CPU)(points, REST, 1.2 * REST) is points
+    assert StrainLimit(SHORTS.mesh, CPU)(points, REST, REST) is not points
+
+
+def test_what_was_as_long_before_contact_stays() -> None:
+    """A network may stretch cloth as it likes: what this mends is what contact has done."""
+    points = torn(2)
+    limit = StrainLimit(SHORTS.mesh, CPU)
+    assert limit(points, points, REST) is points
+    assert limit(points, REST, REST) is not points
 
 
 @given(st.floats(0.0, 0.05), st.floats(-1e-4, 1e-4))
@@ -100,7 +108,7 @@ def test_it_is_continuous(away: float, further: float) -> None:
     for height in (away, away + further):
         points = rest.clone()
         points[10, 2] += height
-        results.append(limit(points, rest))
+        results.append(limit(points, rest, rest))
     assert (results[0] - results[1]).norm(dim=1).max() <= 2 * abs(further) + 1e-6
 
 
@@ -108,11 +116,11 @@ def test_one_list_does_what_the_same_launches_in_every_frame_do() -> None:
     points = torn(3)
     on_a_gpu = StrainLimit(SHORTS.mesh, CPU)
     on_a_gpu._is_serial = False
-    on_a_gpu(torn(4), REST)  # leaves nothing behind
-    assert torch.equal(on_a_gpu(points, REST), StrainLimit(SHORTS.mesh, CPU)(points, REST))
+    on_a_gpu(torn(4), REST, REST)  # leaves nothing behind
+    assert torch.equal(on_a_gpu(points, REST, REST), StrainLimit(SHORTS.mesh, CPU)(points, REST, REST))
 
 
 def test_no_sweeps_change_nothing() -> None:
     points = torn(1)
     still = StrainLimit(SHORTS.mesh, CPU, settings=replace(DEFAULT_CONTACT, strain_sweeps=0))
-    assert torch.equal(still(points, REST), points)
+    assert torch.equal(still(points, REST, REST), points)
