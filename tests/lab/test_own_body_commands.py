@@ -49,6 +49,7 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     return capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("no_curves")
 def test_from_simulation_to_weights_that_are_worn(
     body: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
