@@ -183,24 +183,25 @@ def _over_all(result: ReplayResult) -> dict[str, Any]:
     """A recording's figures over all garments, and its worst frames."""
     if not result.frames:
         return {"free_percent": None, "vfcp_percent": None, "max_depth_mm": None, "worst": []}
-    free = [all(not (g.n_inside or g.n_pairs) for g in one.garments.values()) for one in result.frames]
+    left = [frame.total("after") for frame in result.frames]
+    n_free = sum(not (one.n_inside or one.n_pairs) for one in left)
     shares = [one.vfcp_percent for one in result.after.values() if one.vfcp_percent is not None]
     start = result.frames[0].frame.stamp_ns
-    order = sorted(range(len(free)), key=lambda i: result.frames[i].badness, reverse=True)[:WORST]
+    order = sorted(range(len(left)), key=lambda i: result.frames[i].badness, reverse=True)[:WORST]
     worst = [
         {
             "frame": i,
             "time_s": 1e-9 * (result.frames[i].frame.stamp_ns - start),
             "stamp_ns": result.frames[i].frame.stamp_ns,
-            "n_inside": sum(g.n_inside for g in result.frames[i].garments.values()),
-            "n_pairs": sum(g.n_pairs for g in result.frames[i].garments.values()),
-            "max_depth_mm": 1e3 * max(g.max_depth for g in result.frames[i].garments.values()),
+            "n_inside": left[i].n_inside,
+            "n_pairs": left[i].n_pairs,
+            "max_depth_mm": 1e3 * left[i].max_depth,
             "badness": [float(x) for x in result.frames[i].badness],
         }
         for i in order
     ]
     return {
-        "free_percent": 100 * sum(free) / len(free),
+        "free_percent": 100 * n_free / len(left),
         "vfcp_percent": sum(shares) / len(shares) if shares else None,
         "max_depth_mm": max((one.max_depth_mm or 0.0) for one in result.after.values()),
         "worst": worst,
