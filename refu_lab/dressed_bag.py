@@ -110,18 +110,18 @@ class DressedBag:
     def _garment(self, name: str, output: PipelineOutput, exact: GarmentRecord | None) -> adapters.DiagnosticStatus:
         """By exact checks of this frame where it was evaluated, otherwise by what collision handling says of itself."""
         stats = output.stats.garments[name]
-        n_inside, n_pairs = (stats.n_unresolved, 0) if exact is None else (exact.n_inside, exact.n_pairs)
+        n_inside, n_pairs = (stats.n_unresolved, 0) if exact is None else exact.after[:2]
         values = {
-            "vertices inside before": str(stats.n_inside if exact is None else exact.n_inside_before),
+            "vertices inside before": str(stats.n_inside if exact is None else exact.before.n_inside),
             "vertices inside": str(n_inside),
             "vertices that were moved": str(stats.n_pushed),
         }
         if exact is not None:
             values |= {
-                "intersecting pairs of triangles before": str(exact.n_pairs_before),
+                "intersecting pairs of triangles before": str(exact.before.n_pairs),
                 "intersecting pairs of triangles": str(n_pairs),
-                "deepest before [mm]": f"{1e3 * exact.max_depth_before:.1f}",
-                "deepest [mm]": f"{1e3 * exact.max_depth:.1f}",
+                "deepest before [mm]": f"{1e3 * exact.before.max_depth:.1f}",
+                "deepest [mm]": f"{1e3 * exact.after.max_depth:.1f}",
             }
         values |= {
             "skin moved by the collider, at most [mm]": f"{1e3 * output.stats.shift.largest:.1f}",

@@ -16,7 +16,7 @@ from refu_core._files import read_json
 from refu_core.metrics import Figures
 from refu_core.modes import DEFAULT_GARMENTS
 from refu_lab.commands.replay import ReplayOptions
-from refu_lab.fleet import fetched, find_recordings, run_function
+from refu_lab.fleet import fetched, find_recordings, pipeline_for, run_function
 from refu_lab.replay import replay
 from refu_lab.reproduction import METRICS, format_value, label_of
 from refu_lab.tables import format_table, write_json
@@ -156,7 +156,7 @@ def _figures(bag: Path) -> Iterator[tuple[FigureKey, float]]:
             input=bag, garments=true or DEFAULT_GARMENTS, backbone=backbone, sdf=sdf, max_frames=_FRAMES
         )
         try:
-            pipeline = options.load_pipeline()
+            pipeline = pipeline_for(options)
         except RefuError:  # no weights for one of the garments
             continue
         result = replay(options, pipeline=pipeline)

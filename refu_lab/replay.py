@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from tqdm import tqdm
@@ -31,25 +31,32 @@ from refu_lab.dressed_bag import DressedBag, garment_encoder
 from refu_lab.sources import Source, open_source
 from refu_lab.truth import GroundTruth
 
+When = Literal["before", "after"]
+"""Collision handling."""
 _MAX_REASONS = 20
 """Reasons of skips that are counted apart."""
 _LONGEST_PAUSE_S = 60.0
 _TOLD_S = 0.2
 
 
-@dataclass(frozen=True)
-class GarmentRecord:
-    """One garment in one frame, before (`raw`) and after collision handling."""
+class Found(NamedTuple):
+    """What exact checks find in a frame: of one garment, or of all."""
 
-    latency_ms: float
-    n_inside_before: int
     n_inside: int
-    n_pairs_before: int
+    """Vertices in the body."""
     n_pairs: int
-    max_depth_before: float
-    """[m]."""
+    """Triangles that cut it."""
     max_depth: float
     """[m]."""
+
+
+@dataclass(frozen=True)
+class GarmentRecord:
+    """One garment in one frame, before and after collision handling."""
+
+    latency_ms: float
+    before: Found
+    after: Found
 
 
 @dataclass(frozen=True)
@@ -63,16 +70,17 @@ class FrameResult:
     shift: SkinShift
     garments: Mapping[str, GarmentRecord]
 
+    def total(self, when: When) -> Found:
+        """Of all garments."""
+        found: list[Found] = [getattr(one, when) for one in self.garments.values()]
+        deepest = max((one.max_depth for one in found), default=0.0)
+        return Found(sum(one.n_inside for one in found), sum(one.n_pairs for one in found), deepest)
+
     @property
     def badness(self) -> tuple[int, float, int, float]:
         """Orders frames from best to worst: what is left first, what there was to do second."""
-        g = self.garments.values()
-        return (
-            sum(r.n_pairs + r.n_inside for r in g),
-            max((r.max_depth for r in g), default=0.0),
-            sum(r.n_pairs_before for r in g),
-            max((r.max_depth_before for r in g), default=0.0),
-        )
+        before, after = self.total("before"), self.total("after")
+        return after.n_inside + after.n_pairs, after.max_depth, before.n_pairs, before.max_depth
 
 
 @dataclass(eq=False)
@@ -169,12 +177,8 @@ class Evaluator:
             self.on_skin[name].add(mesh.local, self._skin.check(mesh.local, self._faces[name]))
             records[name] = GarmentRecord(
                 latency_ms=latency_ms - sum(own_ms.values()) + own_ms[name],
-                n_inside_before=raw.n_inside,
-                n_inside=done.n_inside,
-                n_pairs_before=raw.n_pairs,
-                n_pairs=done.n_pairs,
-                max_depth_before=raw.max_depth,
-                max_depth=done.max_depth,
+                before=Found(raw.n_inside, raw.n_pairs, raw.max_depth),
+                after=Found(done.n_inside, done.n_pairs, done.max_depth),
             )
         return records
 

@@ -15,7 +15,7 @@ from refu_core.metrics import CollisionChecker
 from refu_core.recordings import upright_turn
 from refu_lab.plots import new_axes, save_svg
 from refu_lab.render import SKIN, Camera, RenderMesh, colliding_vertices, collision_mesh, render, save_png
-from refu_lab.replay import FrameResult, ReplayResult
+from refu_lab.replay import Found, FrameResult, ReplayResult, When
 from refu_lab.tables import REPLAY_HEADER, html_page, html_table, replay_rows
 from refu_lab.turntable import STYLE as TURNTABLE_STYLE
 from refu_lab.turntable import Frame, Mesh, Pose, turntable
@@ -78,13 +78,10 @@ def _plot(result: ReplayResult, pipeline: GarmentPipeline, folder: Path) -> None
     for name in result.after:
         records = [f.garments[name] for f in result.frames]
         colour = pipeline.garments[name].card.color
-        for ax, before, after in (
-            (inside, [r.n_inside_before for r in records], [r.n_inside for r in records]),
-            (pairs, [r.n_pairs_before for r in records], [r.n_pairs for r in records]),
-            (depth, [1e3 * r.max_depth_before for r in records], [1e3 * r.max_depth for r in records]),
-        ):
-            ax.plot(times, before, color=colour, alpha=0.45, lw=1.2, label=f"{name}, before")
-            ax.plot(times, after, color=colour, lw=1.8, label=f"{name}, after")
+        for when, alpha, width in (("before", 0.45, 1.2), ("after", 1.0, 1.8)):
+            found = np.array([getattr(record, when) for record in records]) * (1, 1, 1e3)
+            for ax, values in zip((inside, pairs, depth), found.T, strict=True):
+                ax.plot(times, values, color=colour, alpha=alpha, lw=width, label=f"{name}, {when}")
     inside.set_ylabel("vertices inside")
     pairs.set_ylabel("intersecting pairs")
     depth.set_ylabel("deepest [mm]")
@@ -96,9 +93,9 @@ def _plot(result: ReplayResult, pipeline: GarmentPipeline, folder: Path) -> None
 
     drawn, (latency,) = new_axes(size=(10.8, 2.5))
     stages = list(result.frames[0].stage_ms)
-    values = [[f.stage_ms[stage] for f in result.frames] for stage in stages]
+    spent = [[f.stage_ms[stage] for f in result.frames] for stage in stages]
     rest = [f.latency_ms - sum(f.stage_ms.values()) for f in result.frames]
-    latency.stackplot(times, [*values, rest], labels=[*stages, "decode and encode"], alpha=0.75, lw=0)
+    latency.stackplot(times, [*spent, rest], labels=[*stages, "decode and encode"], alpha=0.75, lw=0)
     latency.set(xlabel="time [s]", ylabel="latency [ms]")
     latency.set_ylim(0, 1.3 * float(np.percentile([f.latency_ms for f in result.frames], 99)))
     _legend(latency, columns=len(stages) + 1)
@@ -158,12 +155,11 @@ def _front(frame: FrameResult, turn: NDArray[np.float32]) -> float:
     return float(np.degrees(np.arctan2(forward[0], forward[2]))) + 25.0
 
 
-def _caption(frame: FrameResult, when: str) -> str:
-    parts = []
-    for name, r in frame.garments.items():
-        n_inside, n_pairs = (r.n_inside_before, r.n_pairs_before) if when == "before" else (r.n_inside, r.n_pairs)
-        parts.append(f"{name}: {n_inside} vertices inside, {n_pairs} intersecting pairs")
-    return "; ".join(parts)
+def _caption(frame: FrameResult, when: When) -> str:
+    found: dict[str, Found] = {name: getattr(record, when) for name, record in frame.garments.items()}
+    return "; ".join(
+        f"{name}: {one.n_inside} vertices inside, {one.n_pairs} intersecting pairs" for name, one in found.items()
+    )
 
 
 def _page(result: ReplayResult, frames: Sequence[Frame], turned: str) -> str:

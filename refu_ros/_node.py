@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 
 NODE_NAME = "garment_node"
 DIAGNOSTICS_TOPIC = "/diagnostics"
+_BEAT_S = 1.0
+"""How often the node says how it is, and looks for whoever came or left unheard."""
 _LOG_PERIOD_S = 5.0
 _LAST_WORDS_S = 0.3
 """Time for the answer to a shutdown request to leave."""
@@ -74,7 +76,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         self.add_on_set_parameters_callback(self._on_parameters)
         # Steady time: a simulation that stands still must not stop the diagnostics.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(1.0, self.guarded("each second", self._on_second), clock=steady)
+        self.create_timer(_BEAT_S, self.guarded("each second", self._on_second), clock=steady)
         if self._listener.is_steady:
             predict = self.guarded("predict", self._listener.predict)
             self.create_timer(1 / self.settings.keypoint_rate, predict, clock=steady)

@@ -13,7 +13,6 @@ from pathlib import Path
 
 from refu_core import RefuError, WeightsError
 from refu_core.modes import DEFAULT_GARMENTS
-from refu_core.options import arguments
 from refu_core.weights import load_weights, weights_folder
 from refu_lab.benchmark._rows import BenchmarkRow
 from refu_lab.commands.benchmark import BenchmarkOptions
@@ -35,16 +34,14 @@ def start_row(
     """
     sizes = _weights_mb(options, backbone, mode)
     backbone = backbone if len(sizes) == len(TWO) else "skinned"
-    command = [sys.executable, str(Path(__file__).with_name("start.py"))]
-    command += ["--garments", ",".join(TWO), "--sdf", mode, "--backbone", backbone]
-    command += arguments(options, "weights", "body", "collider")
+    asked = {"garments": TWO, "sdf": mode, "backbone": backbone, "body": options.body, "collider": options.collider}
+    asked["weights"] = None if options.weights is None else str(options.weights)
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     with tempfile.TemporaryDirectory() as empty:
         if first_ever:
             environment["WARP_CACHE_PATH"] = empty
-        run = subprocess.run(
-            [*command, "--started", repr(time.time())], env=environment, capture_output=True, text=True, check=False
-        )
+        command = [sys.executable, str(Path(__file__).with_name("start.py")), repr(time.time()), json.dumps(asked)]
+        run = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if run.returncode:
         last = (run.stderr.strip().splitlines() or ["no word about it"])[-1]
         msg = f"a process that was to dress one person failed: {last}"

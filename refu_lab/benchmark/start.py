@@ -1,13 +1,13 @@
 """What a process of its own needs: time until its first garments, and memory.
 
-`refu benchmark` runs this file as a script, so that nothing is counted but what a user imports. It prints a line of
-JSON.
+`refu benchmark` runs this file as a script, so that nothing is counted but what a user imports. It is given when it was
+started (Unix time) and, as JSON, what `GarmentPipeline.load` is; it prints a line of JSON.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
+import sys
 import time
 from pathlib import Path
 
@@ -27,15 +27,7 @@ def memory_mb() -> tuple[float, float] | tuple[None, None]:
 
 def main() -> None:
     """Loads, dresses one body, and goes on for a while."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--garments", required=True)
-    parser.add_argument("--sdf", required=True)
-    parser.add_argument("--backbone", required=True)
-    parser.add_argument("--weights")
-    parser.add_argument("--body")
-    parser.add_argument("--no-collider", dest="collider", action="store_false")
-    parser.add_argument("--started", type=float, required=True, help="when the process was started (Unix time)")
-    args = parser.parse_args()
+    started, asked = float(sys.argv[1]), json.loads(sys.argv[2])
 
     import numpy as np
     import torch
@@ -44,14 +36,7 @@ def main() -> None:
 
     torch.set_num_threads(1)
     imported = time.time()
-    pipeline = GarmentPipeline.load(
-        args.garments.split(","),
-        sdf=args.sdf,
-        backbone=args.backbone,
-        weights=args.weights,
-        body=args.body,
-        collider=args.collider,
-    )
+    pipeline = GarmentPipeline.load(**asked)
     loaded = time.time()
     pose = np.zeros((24, 3), np.float32)
     pipeline(SmplFrame(pose=pose))
@@ -61,7 +46,7 @@ def main() -> None:
         pose[16:18, 2] = -0.03 * i, 0.03 * i
         pipeline(SmplFrame(pose=pose))
     resident, peak = memory_mb()
-    seconds = {"import_s": imported - args.started, "load_s": loaded - imported, "first_mesh_s": first - args.started}
+    seconds = {"import_s": imported - started, "load_s": loaded - imported, "first_mesh_s": first - started}
     print(json.dumps({**seconds, "first_mesh_cpu_s": cpu, "resident_mb": resident, "peak_mb": peak}))
 
 

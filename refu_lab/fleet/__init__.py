@@ -14,7 +14,7 @@ from refu_lab.fleet._storage import Folder, fetched, is_url
 from refu_lab.fleet._summary import FleetResult, fleet_table
 
 if TYPE_CHECKING:
-    from refu_lab.fleet._replay import FleetOptions, replay_fleet
+    from refu_lab.fleet._replay import FleetOptions, pipeline_for, replay_fleet
 
 __all__ = [
     "FleetError",
@@ -29,13 +29,14 @@ __all__ = [
     "is_plain",
     "is_url",
     "open_engine",
+    "pipeline_for",
     "replay_fleet",
     "run_function",
 ]
 
 
 def __getattr__(name: str) -> Any:
-    if name not in ("FleetOptions", "replay_fleet"):
+    if name not in ("FleetOptions", "pipeline_for", "replay_fleet"):
         msg = f"module {__name__!r} has no attribute {name!r}"
         raise AttributeError(msg)
     return getattr(import_module(f"{__name__}._replay"), name)

@@ -73,7 +73,7 @@ def replay_fleet(
         RefuError: options that make no pipeline, a folder that can't be written or that another run writes to, or an
             engine that is out of reach.
     """
-    options.replay.load_pipeline()  # what no recording could be replayed with is said once, and now
+    pipeline_for(options.replay)  # what no recording could be replayed with is said once, and now
     result = FleetResult(with_report=options.report is not None)
     rows: dict[int, dict[str, Any]] = {}
     folders = {place: Folder(place) for place in (options.output, options.report) if place is not None}
@@ -135,7 +135,7 @@ def _is_there(record: dict[str, Any], job: _Job) -> bool:
 
 def _make(job: _Job, path: Path) -> dict[str, Any]:
     options, name = job.options, job.recording.name
-    pipeline = _pipeline(replace(options.replay, input=Path(), output=None))
+    pipeline = pipeline_for(options.replay)
     if options.output is None:
         result, size = _replayed(replace(options.replay, input=path, output=None), pipeline), None
     else:
@@ -165,39 +165,43 @@ def _replayed(options: ReplayOptions, pipeline: GarmentPipeline) -> ReplayResult
     return result
 
 
-_loaded: dict[ReplayOptions, GarmentPipeline] = {}
+_loaded: dict[str, GarmentPipeline] = {}
+"""This process's pipelines by what is in their options; two, as a few modes may take turns."""
 
 
-def _pipeline(options: ReplayOptions) -> GarmentPipeline:
-    """This process's pipeline; loading takes as long as many frames."""
-    if options not in _loaded:
-        _loaded.clear()
-        _loaded[options] = options.load_pipeline()
-    return _loaded[options]
+def pipeline_for(options: ReplayOptions) -> GarmentPipeline:
+    """This process's pipeline for recordings: loading one takes as long as many frames. Raises as `load_pipeline`."""
+    content = _content(options)
+    if content not in _loaded:
+        for oldest in [*_loaded][:-1]:
+            del _loaded[oldest]
+        _loaded[content] = options.load_pipeline()
+    return _loaded[content]
 
 
 def _over_all(result: ReplayResult) -> dict[str, Any]:
     """A recording's figures over all garments, and its worst frames."""
     if not result.frames:
         return {"free_percent": None, "vfcp_percent": None, "max_depth_mm": None, "worst": []}
-    free = [all(not (g.n_inside or g.n_pairs) for g in one.garments.values()) for one in result.frames]
+    left = [frame.total("after") for frame in result.frames]
+    n_free = sum(not (one.n_inside or one.n_pairs) for one in left)
     shares = [one.vfcp_percent for one in result.after.values() if one.vfcp_percent is not None]
     start = result.frames[0].frame.stamp_ns
-    order = sorted(range(len(free)), key=lambda i: result.frames[i].badness, reverse=True)[:WORST]
+    order = sorted(range(len(left)), key=lambda i: result.frames[i].badness, reverse=True)[:WORST]
     worst = [
         {
             "frame": i,
             "time_s": 1e-9 * (result.frames[i].frame.stamp_ns - start),
             "stamp_ns": result.frames[i].frame.stamp_ns,
-            "n_inside": sum(g.n_inside for g in result.frames[i].garments.values()),
-            "n_pairs": sum(g.n_pairs for g in result.frames[i].garments.values()),
-            "max_depth_mm": 1e3 * max(g.max_depth for g in result.frames[i].garments.values()),
+            "n_inside": left[i].n_inside,
+            "n_pairs": left[i].n_pairs,
+            "max_depth_mm": 1e3 * left[i].max_depth,
             "badness": [float(x) for x in result.frames[i].badness],
         }
         for i in order
     ]
     return {
-        "free_percent": 100 * sum(free) / len(free),
+        "free_percent": 100 * n_free / len(left),
         "vfcp_percent": sum(shares) / len(shares) if shares else None,
         "max_depth_mm": max((one.max_depth_mm or 0.0) for one in result.after.values()),
         "worst": worst,
@@ -206,10 +210,15 @@ def _over_all(result: ReplayResult) -> dict[str, Any]:
 
 def _key(job: _Job, path: Path) -> str:
     """Of what is read, how it is replayed, and with what code and weights."""
-    told: list[Any] = [__version__, code_hash(*_CODE), job.recording.name, _recording_hash(job.recording.source, path)]
-    names = [option.name for option in fields(ReplayOptions) if option.name not in _NOT_CONTENT]
-    told += [[name, _told(getattr(job.options.replay, name))] for name in names]
-    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+    read = (job.recording.name, _recording_hash(job.recording.source, path))
+    told = (__version__, code_hash(*_CODE), *read, _content(job.options.replay))
+    return hashlib.sha256(json.dumps(told).encode()).hexdigest()
+
+
+def _content(options: ReplayOptions) -> str:
+    """What results depend on."""
+    names = [option.name for option in fields(options) if option.name not in _NOT_CONTENT]
+    return json.dumps({name: _told(getattr(options, name)) for name in names})
 
 
 def _told(value: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from pathlib import Path
 from typing import Any
@@ -372,9 +373,17 @@ def walk() -> Motion:
 
 
 @pytest.fixture(scope="module")
-def motion_table(walk: Motion) -> rp.ResultTable:
+def library() -> rp.Library:
+    """The weights that ship; a pipeline is loaded once."""
+    library = rp.Library()
+    library.pipeline = functools.cache(library.pipeline)  # type: ignore[method-assign]
+    return library
+
+
+@pytest.fixture(scope="module")
+def motion_table(walk: Motion, library: rp.Library) -> rp.ResultTable:
     short = Motion(walk.poses[3:6], walk.transl[3:6], walk.betas, walk.fps)
-    return rp.motion_table({"long": walk, "short": short}, library=rp.Library(), every=4)
+    return rp.motion_table({"long": walk, "short": short}, library=library, every=4)
 
 
 def test_motion_table_weighs_clips_by_their_frames(motion_table: rp.ResultTable) -> None:
@@ -437,9 +446,9 @@ def test_motion_table_against_a_loop(walk: Motion, motion_table: rp.ResultTable,
     assert max(ways) > 0.002  # the arms do press
 
 
-def test_motion_of_one_frame_has_no_pair(walk: Motion) -> None:
+def test_motion_of_one_frame_has_no_pair(walk: Motion, library: rp.Library) -> None:
     one = Motion(walk.poses[:1], walk.transl[:1], walk.betas, walk.fps)
-    assert rp.motion_table({"still": one}, library=rp.Library(), every=1).rows == []
+    assert rp.motion_table({"still": one}, library=library, every=1).rows == []
 
 
 def test_shipped_weights_are_found_by_name(tmp_path: Path) -> None:

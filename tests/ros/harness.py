@@ -27,7 +27,7 @@ from visualization_msgs.msg import MarkerArray
 
 from msg_adapters import Marker, decode_marker_array, encoder_for
 from refu_core import SmplFrame
-from tests.ros.ready import Forked, run_node
+from tests.ros.ready import Forked, run_program
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -51,7 +51,6 @@ class NodeProcess:
     def __init__(
         self,
         log: Path,
-        prepare: Callable[[], None] | None = None,
         *,
         program: str = "",
         packages: Path | None = None,
@@ -63,19 +62,13 @@ class NodeProcess:
         path = [str(folder) for folder in (ROOT, packages) if folder is not None]
         cwd = log.parent  # of relative paths that a test or a hostile peer names
         self.process: Forked | subprocess.Popen[bytes]
-        if not program and prepare is None:
-            self.process = run_node(given, log=log, cwd=cwd, environment=dict(os.environ), path=path)
+        if not program:
+            self.process = run_program("garment_node", given, log=log, cwd=cwd, path=path)
             return
-        start = ["-c", program] if program else ["-m", "refu_ros.garment_node"]
         environment = {**os.environ, "PYTHONPATH": ":".join([*path, os.environ.get("PYTHONPATH", "")])}
         with log.open("wb") as file:
             self.process = subprocess.Popen(
-                [sys.executable, *start, *given],
-                cwd=cwd,
-                env=environment,
-                stdout=file,
-                stderr=file,
-                preexec_fn=prepare,
+                [sys.executable, "-c", program, *given], cwd=cwd, env=environment, stdout=file, stderr=file
             )
 
     def __enter__(self) -> NodeProcess:

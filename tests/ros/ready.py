@@ -1,6 +1,6 @@
-"""Programs that begin at once: a process that has imported what the node imports, and forks one for each that asks.
+"""Programs that begin at once: a process that has imported what they import, and forks one for each that asks.
 
-To import torch takes seconds, and some thirty nodes are started by the tests. Nothing but modules is shared: rclpy is
+To import torch takes seconds, and some forty programs are started by the tests. Nothing but modules is shared: rclpy is
 started, and warp, by each for itself.
 """
 
@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from types import FrameType
 
 
@@ -69,22 +70,24 @@ def _parent() -> subprocess.Popen[str]:
     return parent
 
 
-def run_node(arguments: list[str], *, log: Path, cwd: Path, environment: dict[str, str], path: list[str]) -> Forked:
-    """`garment_node` with these arguments, which writes to `log`, and finds modules in `path` first."""
+def run_program(
+    name: str, arguments: list[str], *, log: Path, cwd: Path | None = None, path: Sequence[str] = ()
+) -> Forked:
+    """`garment_node` or `smpl_publisher` in this environment; writes to `log`, and finds modules in `path` first."""
     log.write_bytes(b"")
     status = log.with_name(f"{log.name}.status-{time.monotonic_ns()}")
-    order = {"arguments": arguments, "log": str(log), "cwd": str(cwd), "environment": environment, "path": path}
+    order = {"program": [name, *arguments], "log": str(log), "cwd": str(cwd or Path.cwd()), "path": [*path]}
     parent = _parent()
     assert parent.stdin is not None
     assert parent.stdout is not None
-    parent.stdin.write(json.dumps({**order, "status": str(status)}) + "\n")
+    parent.stdin.write(json.dumps({**order, "environment": dict(os.environ), "status": str(status)}) + "\n")
     parent.stdin.flush()
     return Forked(int(parent.stdout.readline()), status)
 
 
 def _serve() -> None:
     """Forks until there is nobody to ask any more."""
-    from refu_ros import _node, _worker, garment_node  # noqa: F401  (and all that they import)
+    from refu_ros import _node, _worker, garment_node, smpl_publisher  # noqa: F401  (and all that they import)
 
     gc.freeze()  # a collector that goes through all of it would copy it, too
     running: dict[int, Path] = {}
@@ -115,8 +118,8 @@ def _serve() -> None:
             os.chdir(order["cwd"])
             os.environ.update(order["environment"])
             sys.path[:0] = order["path"]
-            sys.argv = ["garment_node", *order["arguments"]]
-            code = garment_node.main()
+            sys.argv = order["program"]
+            code = sys.modules[f"refu_ros.{sys.argv[0]}"].main()
             atexit._run_exitfuncs()
             gc.collect()  # what leaves the graph with its end
             os._exit(code)  # to take its modules apart would copy the memory that it shares

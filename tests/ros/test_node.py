@@ -188,8 +188,12 @@ def test_work_nobody_needs_is_skipped_and_counted(scene: Peer) -> None:
 
 def test_who_leaves_is_taken_out_of_the_scene(scene: Peer) -> None:
     of_ann = {f"ann/{name}" for name in GARMENTS}
-    scene.dress(frame(40), "ann")
-    assert any(of_ann <= {marker.ns for marker in markers} for markers in scene.garments)
+
+    def is_dressed() -> bool:
+        scene.send(frame(40), "ann")
+        return of_ann <= scene.shown()
+
+    scene.spin_until(is_dressed, "she wears what she should")
     scene.spin_until(lambda: not of_ann & scene.shown(), "the garments of who has left are deleted")
     scene.spin_until(lambda: "ann" in scene.status("input")[1], "silence is reported")
     assert scene.status("input")[0] == 1

@@ -88,6 +88,7 @@ class Stage:
 def stage(ros: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Stage]]:  # noqa: ARG001
     """Makes stages."""
     monkeypatch.setattr("refu_ros._listener._GRACE_S", 0.0)
+    monkeypatch.setattr("refu_ros._node._BEAT_S", 0.2)
     made: list[Stage] = []
 
     def make(make_executor: Callable[[], Any] = make_executor, **parameters: Any) -> Stage:

@@ -287,12 +287,11 @@ def test_obstacles_are_added_moved_and_removed(robot: Callable[..., Robot], fore
         return any(one.operation == one.MOVE and not one.meshes and one.pose.position.y > 0.05 for one in heard())
 
     scene.until(moved, "who has only moved is moved")
+    scene.heard["collision_object"].clear()
     another = scene.hear("collision_object", kind, raw=True)
 
     def added_anew() -> bool:
-        scene.heard["collision_object"].clear()
         scene.peer.send(frame(1, stamp_ns=next(stamps)))
-        scene.peer.spin(0.05)
         return any(one.operation == one.ADD for one in heard())
 
     scene.until(added_anew, "who subscribes later is told all")
@@ -444,8 +443,12 @@ def test_who_is_tracked_is_followed(robot: Callable[..., Robot], foreign: Callab
         return any(abs(marker.points.mean(0) - [4.0, 5.0, 1.25]).max() < 0.15 for marker in came if len(marker.points))
 
     scene.until(stands_there, "she is dressed where tf has her body")
-    says()
-    scene.until(lambda: not people.listeners("ann"), "nobody is tracked")
+
+    def nobody() -> bool:
+        says()
+        return not people.listeners("ann")
+
+    scene.until(nobody, "nobody is tracked")
     people.close()
 
 

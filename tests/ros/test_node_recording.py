@@ -137,13 +137,9 @@ def test_the_service_starts_and_stops(peer: Peer, tmp_path: Path) -> None:
 
 def test_a_full_disk_stops_the_recording_and_not_the_node(peer: Peer, tmp_path: Path) -> None:
     limit = 3_000_000
-
-    def small_disk() -> None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
-
     bag = tmp_path / "bag"
-    log = tmp_path / "log.txt"
-    with NodeProcess(log, small_disk, **CHEAP, record=bag) as node:
+    with NodeProcess(tmp_path / "log.txt", **CHEAP, record=bag) as node:
+        resource.prlimit(node.process.pid, resource.RLIMIT_FSIZE, (limit, limit))  # a small disk
         peer.wait_for_node()
 
         def failed() -> bool:

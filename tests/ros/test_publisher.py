@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import re
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -33,6 +31,7 @@ from msg_adapters.motion import march  # noqa: E402
 from refu_ros._interfaces import interface  # noqa: E402
 from refu_ros._parameters import declare  # noqa: E402
 from refu_ros.smpl_publisher import PublisherOptions, SmplPublisher  # noqa: E402
+from tests.ros.ready import Forked, run_program  # noqa: E402
 
 # rclpy's parser of message definitions uses a module that Python 3.11 deprecates.
 pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")
@@ -82,9 +81,8 @@ def ros_arguments(parameters: dict[str, Any]) -> list[str]:
     return ["--ros-args", *(word for name, value in parameters.items() for word in ("-p", f"{name}:={value}"))]
 
 
-def start(**parameters: Any) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "refu_ros.smpl_publisher", *ros_arguments(parameters)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+def start(log: Path, **parameters: Any) -> Forked:
+    return run_program("smpl_publisher", ros_arguments(parameters), log=log)
 
 
 @pytest.mark.parametrize(
@@ -95,18 +93,21 @@ def start(**parameters: Any) -> subprocess.Popen[str]:
         ("pose_array", "walk", signal.SIGINT),
     ],
 )
-def test_plays_a_bag(context: Context, input_type: adapters.InputType, bag: str, stop: signal.Signals) -> None:
+def test_plays_a_bag(
+    context: Context, tmp_path: Path, input_type: adapters.InputType, bag: str, stop: signal.Signals
+) -> None:
     """The bag's frames in order, in another type, stamped anew; then a clean end."""
     listener, before = Listener(context, input_type, ("smpl_params",)), time.time_ns()
-    process = start(motion=BAGS / bag, input_type=input_type, frame_id="camera")
+    log = tmp_path / "log.txt"
+    process = start(log, motion=BAGS / bag, input_type=input_type, frame_id="camera")
     try:
         listener.collect(20)
     finally:
         process.send_signal(stop)
-        _, errors = process.communicate(timeout=PATIENCE_S)
+        status = process.wait(PATIENCE_S)
         listener.close()
-    assert process.returncode == 0, errors
-    assert "Traceback" not in errors
+    assert status == 0, log.read_text()
+    assert "Traceback" not in log.read_text()
     recorded = load_motion(str(BAGS / bag))
     frames = [adapters.decoder_for(input_type)(data) for data in listener.received["smpl_params"]]
     indices = [int(np.abs(recorded.poses - frame.pose).max(axis=(1, 2)).argmin()) for frame in frames]
@@ -123,16 +124,17 @@ def test_plays_a_bag(context: Context, input_type: adapters.InputType, bag: str,
         assert before < stamps[0] < stamps[-1] < time.time_ns()
 
 
-def test_persons_stand_apart_and_move_apart(context: Context) -> None:
+def test_persons_stand_apart_and_move_apart(context: Context, tmp_path: Path) -> None:
     listener = Listener(context, "joint_state", ("ann/smpl_params", "bob/smpl_params"))
-    process = start(input_type="joint_state", persons="[ann, bob]", spacing=1.5, rate=60)
+    log = tmp_path / "log.txt"
+    process = start(log, input_type="joint_state", persons="[ann, bob]", spacing=1.5, rate=60)
     try:
         listener.collect(5)
     finally:
         process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=PATIENCE_S)
+        status = process.wait(PATIENCE_S)
         listener.close()
-    assert process.returncode == 0, errors
+    assert status == 0, log.read_text()
     decode = adapters.decoder_for("joint_state")
     ann, bob = ({f.stamp_ns: f for f in map(decode, messages)} for messages in listener.received.values())
     common = sorted(ann.keys() & bob.keys())
@@ -199,11 +201,9 @@ def test_a_parameter_that_there_is_not_is_warned_of(context: Context) -> None:
     assert said == ["there is no parameter rat: is rate meant?", "there is no parameter use_sim_tine"]
 
 
-def test_bad_parameters_are_one_line() -> None:
-    process = start(motion="nowhere")
-    _, errors = process.communicate(timeout=PATIENCE_S)
-    assert process.returncode == 2
-    (line,) = errors.splitlines()
+def test_bad_parameters_are_one_line(tmp_path: Path) -> None:
+    assert start(tmp_path / "log.txt", motion="nowhere").wait(PATIENCE_S) == 2
+    (line,) = (tmp_path / "log.txt").read_text().splitlines()
     assert line.startswith("smpl_publisher: error: nowhere: can't be read: No such file or directory; wanted")
 
 
