@@ -17,8 +17,8 @@ STUCK = wp.constant(5)  # inside after all
 RAISED = wp.constant(6)  # ends of edges that cut the skin
 CHANGED = wp.constant(7)  # distances that were replaced
 CUTTING = wp.constant(8)  # such edges; a number for each round follows
-N_COUNTS = 16
 SHIFTED = wp.constant(15)  # vertices that were moved since the last call
+N_COUNTS = 16
 
 # A vertex reached by pushes, or pushed itself.
 BESIDE = wp.constant(1)

@@ -22,6 +22,10 @@ from refu_core.training._taken_along import TakenAlong
 
 _FEWEST = 2
 """Samples that anything can be learnt from; hundreds are needed to learn it well."""
+_SPARE = 32
+"""Components that a randomised decomposition finds besides, so that those that are wanted are exact."""
+_SWEEPS = 4
+"""Its power iterations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,10 +182,10 @@ def principal_components(values: Tensor, *, rank: int) -> tuple[Tensor, Tensor]:
     rank = min(rank, n - 1)
     mean = values.mean(0)
     centred = (values - mean).flatten(1)
-    # The samples' products instead of the vertices': N is smaller than 3 V.
-    found, vectors = torch.linalg.eigh((centred @ centred.T).double())
-    found, vectors = found[-rank:].flip(0), vectors[:, -rank:].flip(1)
-    return mean, (vectors / found.clamp_min(1e-12).sqrt()).float().T @ centred
+    with torch.random.fork_rng(devices=[]):  # a randomised decomposition: thousands of samples would take an exact hours
+        torch.manual_seed(0)
+        _, _, components = torch.svd_lowrank(centred, q=min(rank + _SPARE, n), niter=_SWEEPS)
+    return mean, components[:, :rank].T.contiguous()
 
 
 def check_dataset(dataset: GarmentDataset | GarmentSequences, body: SmplBody, garment: GarmentTemplate) -> None:
