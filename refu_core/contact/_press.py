@@ -76,10 +76,19 @@ class Press:
     """
 
     def __init__(
-        self, garment: GarmentTemplate, limbs: LimbMeshes, *, settings: ContactSettings = DEFAULT_CONTACT
+        self,
+        garment: GarmentTemplate,
+        limbs: LimbMeshes,
+        *,
+        knows_limbs: bool = False,
+        settings: ContactSettings = DEFAULT_CONTACT,
     ) -> None:
-        """For a garment and the limbs of the body that it is worn on, on one device."""
+        """For a garment and the limbs of the body that it is worn on, on one device.
+
+        Whether what predicts it `knows_limbs` is as in `Wearable`.
+        """
         self._settings = settings
+        self._beside = settings.press_near if knows_limbs else settings.press_beside
         self._limbs = limbs  # their memory is read
         n, self.device = garment.n_vertices, garment.v_template.device
         self._is_serial = self.device.type == "cpu"
@@ -169,7 +178,7 @@ class Press:
 
     def _feel(self) -> Any:
         how, feel = self._settings, kernels.Feel()
-        feel.room, feel.beside, feel.flat = how.press_room, how.press_beside, how.press_flat
+        feel.room, feel.beside, feel.flat = how.press_room, self._beside, how.press_flat
         feel.lies, feel.looks, feel.step = wp.vec2(*how.press_lies), how.press_looks, how.press_step
         return feel
 

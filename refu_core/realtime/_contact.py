@@ -92,7 +92,10 @@ class ContactStage:
             self._shins = shins = Shins(body)
             self._tents = {name: Tent(one, shins, settings=settings) for name, one in garments.items()}
             self._limbs = limbs = LimbMeshes(body)
-            self._press = {name: Press(one, limbs, settings=settings) for name, one in garments.items()}
+            self._press = {
+                name: Press(one.template, limbs, knows_limbs=one.knows_limbs, settings=settings)
+                for name, one in outfit.wearables.items()
+            }
             self._skin = skin = Sheet(outfit.collider.anatomy.mesh, body.v_template)
             self._off_skin = {
                 name: Parting(one.mesh, one.v_template, skin, settings=settings) for name, one in garments.items()

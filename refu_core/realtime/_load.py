@@ -118,4 +118,5 @@ def wearable_of(
             f"{hint}train some with `refu train {template.name} --body`"
         )
         raise WeightsError(msg)
-    return Wearable(worn, network, refu, DEFAULT_MARGIN if refu is None else float(refu.margin), betas)
+    margin = DEFAULT_MARGIN if refu is None else float(refu.margin)
+    return Wearable(worn, network, refu, margin, betas, stored.card.get("knows_limbs") is True)

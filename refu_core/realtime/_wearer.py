@@ -31,6 +31,8 @@ class Wearable:
     """ε that the networks were trained with [m]."""
     betas: ShapeMap | None = None
     """The body's betas to those of the body that the networks were trained on; None where that is this one."""
+    knows_limbs: bool = False
+    """Whether the networks have learnt where cloth lies between limbs, of many samples in which limbs touched it."""
 
     def known_as(self, betas: Tensor) -> Tensor:
         """The networks' betas for those of the body, (B, 10) both."""

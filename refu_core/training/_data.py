@@ -94,6 +94,11 @@ class TrainingSet:
         """What the card of the weights says of the set."""
         return {key: self.rows.card.get(key) for key in ("garment_fingerprint", "motions_fingerprint", "plan")}
 
+    @property
+    def knows_limbs(self) -> bool:
+        """Whether limbs were where they were recorded, beside cloth: sets of old, not on colliders, held them back."""
+        return "gap" in self.rows.card.get("settings", {}).get("drape", {})
+
 
 def in_chunks(of: Callable[..., Tensor], *values: Any, size: int = 64) -> Tensor:
     """`of` these arrays, some rows at a time, which bounds the memory; all have N rows, the result too."""
@@ -182,7 +187,9 @@ def principal_components(values: Tensor, *, rank: int) -> tuple[Tensor, Tensor]:
     rank = min(rank, n - 1)
     mean = values.mean(0)
     centred = (values - mean).flatten(1)
-    with torch.random.fork_rng(devices=[]):  # a randomised decomposition: thousands of samples would take an exact hours
+    with torch.random.fork_rng(
+        devices=[]
+    ):  # a randomised decomposition: thousands of samples would take an exact hours
         torch.manual_seed(0)
         _, _, components = torch.svd_lowrank(centred, q=min(rank + _SPARE, n), niter=_SWEEPS)
     return mean, components[:, :rank].T.contiguous()

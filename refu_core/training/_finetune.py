@@ -209,6 +209,7 @@ def finetune(
         **described,
         "refu": None if refu is None else refu.config,
         "dataset": opened.card,
+        "knows_limbs": opened.knows_limbs,
     }
     if is_writer:
         others = None if refu is None else refu_tensors(refu, half=preset != "paper")

@@ -54,8 +54,8 @@ class PretrainSettings:
     rank: int = 128
     """R, components of the output basis."""
     style_shape_steps: int = 800
-    low_steps: int = 2500
-    steps: int = 1500
+    low_steps: int = 5000
+    steps: int = 3000
     """Of the last stage; of the only one for backbones other than the tailornet."""
     pivots: str = "joint"
     """`joint`: the high-frequency nets are trained through the mixture, on all samples and together with the
@@ -165,6 +165,7 @@ def pretrain(
         **described,
         "mode": "none",
         "dataset": opened.card,
+        "knows_limbs": opened.knows_limbs,
         "figures": backbone_figures(model, test, body, template, mean=mean),
     }
     if is_writer:
