@@ -19,6 +19,7 @@ from refu_core.contact import Blend
 from refu_core.errors import RefuError, WeightsError
 from refu_core.garments import GarmentTemplate, SkinBelow
 from refu_core.realtime import RootTurn
+from refu_core.realtime._load import wearable_of
 from refu_core.refu import Refu, trained_from_weights
 from refu_core.sdf import ApproxSdf, ExactSdf, RestFaces, SdfSample
 from refu_core.training import (
@@ -33,6 +34,7 @@ from refu_core.training import (
     refu_loss,
 )
 from refu_core.training import _loop as loop_module
+from refu_core.training._data import TrainingSet
 from refu_core.training._dresser import Dresser
 from refu_core.weights import load_weights
 
@@ -274,3 +276,22 @@ def test_says_what_it_knows(tmp_path: Path, dataset: Path, pretrained: Path) -> 
         finetune(GARMENT, dataset, pretrained, tmp_path, backbone="mlp", settings=replace(QUICK, scale="huge"))
     with pytest.raises(WeightsError, match="tailornet-none"):
         finetune(GARMENT, dataset, pretrained, tmp_path, settings=QUICK)
+
+
+def test_weights_say_whether_limbs_were_beside_the_cloth(pretrained: Path) -> None:
+    """Sets of old held limbs back; what was trained on those doesn't know where cloth lies between limbs."""
+    stored, template = load_weights(pretrained / "mlp-none"), load_garment(GARMENT)
+    for said, knows in ((True, True), (False, False), (None, False), ("yes", False)):
+        card = {**stored.card, "knows_limbs": said}
+        assert wearable_of(replace(stored, card=card), template, None).knows_limbs is knows
+    card = {key: value for key, value in stored.card.items() if key != "knows_limbs"}
+    assert not wearable_of(replace(stored, card=card), template, None).knows_limbs
+
+
+def test_a_set_says_whether_limbs_were_beside_the_cloth(dataset: Path) -> None:
+    opened = TrainingSet.of(GARMENT, dataset, None)
+    for drape, knows in (({"gap": 0.012}, True), ({}, False)):
+        opened.rows.card["settings"] = {"drape": drape}
+        assert opened.knows_limbs is knows
+    opened.rows.card.pop("settings")
+    assert not opened.knows_limbs
