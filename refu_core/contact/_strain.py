@@ -43,14 +43,11 @@ class StrainLimit:
         )
         net.limit, net.count = settings.strain_limit, as_warp(self._count, wp.int32)
         net.rows, net.is_listed = (wp.zeros(n, dtype=wp.int32, device=name) for _ in range(2))
-        if self._is_serial:
-            inputs = [net, settings.strain_sweeps]
-            self._limit = wp.launch(kernels.limit_kernel, 1, inputs, device=name, record_cmd=True)
-        else:
-            self._sweeps = [
-                wp.launch(kernels.sweep_kernel, n, [net, *places], device=name, record_cmd=True)
-                for places in ((net.points, net.other), (net.other, net.points))
-            ]
+        self._limit = wp.launch(kernels.limit_kernel, 1, [net, settings.strain_sweeps], device=name, record_cmd=True)
+        self._sweeps = [
+            wp.launch(kernels.sweep_kernel, n, [net, *places], device=name, record_cmd=True)
+            for places in ((net.points, net.other), (net.other, net.points))
+        ]
 
     @torch.no_grad()
     def __call__(self, points: Tensor, before: Tensor, rest: Tensor) -> Tensor:
