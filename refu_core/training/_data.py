@@ -187,10 +187,9 @@ def principal_components(values: Tensor, *, rank: int) -> tuple[Tensor, Tensor]:
     rank = min(rank, n - 1)
     mean = values.mean(0)
     centred = (values - mean).flatten(1)
-    with torch.random.fork_rng(
-        devices=[]
-    ):  # a randomised decomposition: thousands of samples would take an exact hours
+    with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
+        # Randomised: an exact decomposition of thousands of samples takes hours.
         _, _, components = torch.svd_lowrank(centred, q=min(rank + _SPARE, n), niter=_SWEEPS)
     return mean, components[:, :rank].T.contiguous()
 
