@@ -23,7 +23,7 @@ from refu_core.training._taken_along import TakenAlong
 _FEWEST = 2
 """Samples that anything can be learnt from; hundreds are needed to learn it well."""
 _SPARE = 32
-"""Components that a randomised decomposition finds besides, so that those that are wanted are exact."""
+"""Components that a randomised decomposition finds besides: the last ones that it finds are the least accurate."""
 _SWEEPS = 4
 """Its power iterations."""
 
@@ -189,7 +189,7 @@ def principal_components(values: Tensor, *, rank: int) -> tuple[Tensor, Tensor]:
     centred = (values - mean).flatten(1)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        # Randomised: an exact decomposition of thousands of samples takes hours.
+        # Randomised: an exact decomposition takes 7 s of 3,000 samples, and with their cube, minutes of 12,000.
         _, _, components = torch.svd_lowrank(centred, q=min(rank + _SPARE, n), niter=_SWEEPS)
     return mean, components[:, :rank].T.contiguous()
 

@@ -56,7 +56,8 @@ class PretrainSettings:
     style_shape_steps: int = 800
     low_steps: int = 5000
     steps: int = 3000
-    """Of the last stage; of the only one for backbones other than the tailornet."""
+    """Of the last stage; of the only one for backbones other than the tailornet. On test samples half of these and of
+    the low-frequency net's steps leave 11.3 mm, all 11.1 (a T-shirt's 980 samples)."""
     pivots: str = "joint"
     """`joint`: the high-frequency nets are trained through the mixture, on all samples and together with the
     low-frequency net. `separate`: each on its own pivot's samples, as in the original."""
