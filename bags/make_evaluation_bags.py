@@ -2,17 +2,17 @@
 
     python bags/make_evaluation_bags.py data/tshirt-male data/skirt-female       # 96 unseen test samples of each
     python bags/make_evaluation_bags.py data/tshirt-male-sequences-5             # one unseen test sequence
+    python bags/make_evaluation_bags.py data/outfit                              # eval_<outer>_over_<inner>
 
-A bag carries SMPL parameters with the style on /smpl_params and the simulated garment on /ground_truth, so
-`refu replay BAG --garments GARMENT` says how far (MPVE) a prediction is off. The garment is a marker of points: its
+A bag carries SMPL parameters with the style on /smpl_params and the simulated garments on /ground_truth, so
+`refu replay BAG --garments GARMENT ...` says how far (MPVE) a prediction is off. A garment is a marker of points: its
 triangles would take more than three times the room.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from msg_adapters import INPUT_TYPES, MARKER_ARRAY, BagWriter, encode_points, encoder_for, vertices_ros_from_smpl
 from refu_core import SmplFrame, load_body, load_garment
-from refu_core.simulation import GarmentDataset, GarmentSequences, SequencePlan
+from refu_core.simulation import GarmentDataset, GarmentSequences, SequencePlan, open_dataset
 from refu_core.simulation._plan import TEST
 from refu_lab.truth import TOPIC as TRUTH_TOPIC
 
@@ -32,7 +32,7 @@ TRUTH_EVERY = 3
 """A sequence's ground truth is in each third frame: 10 a second."""
 MOST_BYTES = 8_000_000
 Moment = tuple[SmplFrame, NDArray[np.float32] | None]
-"""A frame, and its garment at zero translation [m], shape (N, 3), where there is one."""
+"""A frame, and a row of the set, its garments at zero translation [m], shape (N, 3), where there is one."""
 
 
 def spread_samples(dataset: GarmentDataset, count: int, seed: int) -> NDArray[np.intp]:
@@ -50,7 +50,7 @@ def spread_samples(dataset: GarmentDataset, count: int, seed: int) -> NDArray[np
 
 def sample_moments(dataset: GarmentDataset, count: int, seed: int) -> Iterator[Moment]:
     """Unrelated frames, each standing on the floor."""
-    body = load_body(load_garment(dataset.card["garment"]).body)
+    body = load_body(load_garment(next(iter(dataset.parts))).body)
     quantum = dataset.card["quantum_m"]
     for k, index in enumerate(spread_samples(dataset, count, seed)):
         sample = dataset.sample(int(index))
@@ -76,10 +76,10 @@ def sequence_moments(sequences: GarmentSequences) -> Iterator[Moment]:
         yield frame, sequence.vertices(t) if t % TRUTH_EVERY == 0 and sequence.kept[t] else None
 
 
-def write_bag(path: Path, garment: str, moments: Iterator[Moment]) -> tuple[int, int]:
+def write_bag(path: Path, parts: Mapping[str, slice], moments: Iterator[Moment]) -> tuple[int, int]:
     """One bag as a rosbag2 directory; returns the number of frames and of those with ground truth."""
     encode = encoder_for("multiarray")
-    color = (*load_garment(garment).card.color, 1.0)
+    colors = {garment: (*load_garment(garment).card.color, 1.0) for garment in parts}
     frames = truths = 0
     with BagWriter(path, overwrite=True) as bag:
         bag.add_topic(TOPIC, INPUT_TYPES["multiarray"])
@@ -90,8 +90,9 @@ def write_bag(path: Path, garment: str, moments: Iterator[Moment]) -> tuple[int,
             if vertices is not None:
                 truths += 1
                 points = vertices_ros_from_smpl(vertices.astype(np.float64) + frame.transl)
-                data = encode_points(points, ns=garment, stamp_ns=frame.stamp_ns, color=color)
-                bag.write(TRUTH_TOPIC, data, log_time_ns=frame.stamp_ns)
+                for garment, part in parts.items():
+                    data = encode_points(points[part], ns=garment, stamp_ns=frame.stamp_ns, color=colors[garment])
+                    bag.write(TRUTH_TOPIC, data, log_time_ns=frame.stamp_ns)
     return frames, truths
 
 
@@ -106,15 +107,14 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of their choice (0)")
     arguments = parser.parse_args()
     for directory in arguments.sets:
-        card = json.loads((directory / "card.json").read_text())
-        garment = card["garment"]
-        path = arguments.output / f"eval_{garment.replace('-', '_')}"
-        if card["format"] == "refu-sequences-2":
+        rows = open_dataset(directory)
+        path = arguments.output / f"eval_{'_over_'.join(reversed(rows.parts)).replace('-', '_')}"
+        if isinstance(rows, GarmentSequences):
             path = path.with_name(path.name + "_sequence")
-            moments = sequence_moments(GarmentSequences(directory))
+            moments = sequence_moments(rows)
         else:
-            moments = sample_moments(GarmentDataset(directory), arguments.count, arguments.seed)
-        frames, truths = write_bag(path, garment, moments)
+            moments = sample_moments(rows, arguments.count, arguments.seed)
+        frames, truths = write_bag(path, rows.parts, moments)
         size = sum(file.stat().st_size for file in path.iterdir())
         print(f"{path}: {frames} frames, {truths} with ground truth, {size / 1e6:.1f} MB")
         if size > MOST_BYTES:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,7 @@ def contact_sheet(
     columns: int = 6,
     seed: int = 0,
     body: str | Path | None = None,
-    garment: str | Path | None = None,
+    garments: Sequence[str | Path] | None = None,
 ) -> NDArray[np.uint8]:
     """Draws random samples of a set side by side, each from the front and from behind.
 
@@ -34,7 +35,7 @@ def contact_sheet(
         columns: samples in a row.
         seed: of their choice.
         body: name or file of the body that the set was made for; None for the one that the garment was cut for.
-        garment: name or file of the set's garment; None for the one that has the name which the set says.
+        garments: names or files of the set's garments; None for those that have the names which the set says.
 
     Returns:
         sRGB, shape (height, width, 3).
@@ -45,8 +46,8 @@ def contact_sheet(
     if not len(dataset) or count < 1 or columns < 1:
         msg = f"wanted a sample, a count and columns of 1 at least, got {len(dataset)}, {count} and {columns}"
         raise SimulationError(msg)
-    template = load_garment(dataset.card["garment"] if garment is None else garment)
-    model = load_body(template.body if body is None else body)
+    templates = {one.name: one for one in map(load_garment, dataset.parts if garments is None else garments)}
+    model = load_body(next(iter(templates.values())).body if body is None else body)
     if model.fingerprint != dataset.card["body_fingerprint"]:
         msg = f"the set was made for the body {dataset.card['body']!r}, got {model.name!r}: name its file as `body`"
         raise SimulationError(msg)
@@ -59,9 +60,9 @@ def contact_sheet(
     for k, index in enumerate(chosen):
         sample = dataset.sample(int(index))
         (posed,) = colliders(model, collider, sample.pose[None], sample.betas)
-        meshes = [
-            RenderMesh(posed, model.faces),
-            RenderMesh(sample.vertices, template.faces, colour=_CLOTH[sample.pair % len(_CLOTH)]),
+        meshes = [RenderMesh(posed, model.faces)] + [
+            RenderMesh(sample.vertices[part], templates[name].faces, colour=_CLOTH[(sample.pair + n) % len(_CLOTH)])
+            for n, (name, part) in enumerate(dataset.parts.items())
         ]
         top, left = k // columns * height, k % columns * 2 * width
         for side, yaw in enumerate((20.0, 200.0)):

@@ -32,7 +32,7 @@ def simulate(options: SimulateOptions, *, engine: Engine | None = None, progress
         clips = load_clips(options.motions, axes=options.input_axes, fps=options.fps)
     for note, count in Counter(note for clip in clips or () for note in clip.notes).most_common():
         print(f"motions: {note} ({count} of {len(clips or ())} files)", file=sys.stderr)
-    what = options.garment, options.count, options.output
+    what = options.garments, options.count, options.output
     unit = "sequence" if options.sequences else "sample"
     with tqdm(total=None, unit=unit, disable=None if progress else True) as bar:
 
@@ -47,7 +47,7 @@ def simulate(options: SimulateOptions, *, engine: Engine | None = None, progress
             return simulate_sequences(*what, shapes=options.shapes, seconds=options.seconds, **how)
         card = simulate_dataset(*what, **how)
     if not card["counts"]["to_do"]:
-        sheet = contact_sheet(GarmentDataset(options.output), body=options.body, garment=options.garment)
+        sheet = contact_sheet(GarmentDataset(options.output), body=options.body, garments=options.garments)
         save_png(sheet, options.output / SHEET)
     return card
 

@@ -35,6 +35,7 @@ from refu_core.body import Collider, load_body
 from refu_core.garments import load_garment
 from refu_core.simulation import colliders
 from refu_core.simulation._drape import comfort_poses
+from refu_core.simulation._outfit import Outfit
 
 F64 = NDArray[np.float64]
 MOST_EASE = 1.15
@@ -74,10 +75,10 @@ class Verdict:
 
 
 class Judge:
-    """Judges garments of one kind on one body."""
+    """Judges garments of one kind, or of several worn together, on one body."""
 
     def __init__(self, garment: str, body: str, gap: float, most_stretch: float) -> None:
-        self._garment = load_garment(garment)
+        self._garment = Outfit([load_garment(name) for name in garment.split("+")]).joined
         self._body = load_body(body)
         self._collider = Collider(self._body, gap=gap)
         self._faces = self._garment.faces.numpy().astype(np.int64)
@@ -211,7 +212,7 @@ def _verdict(task: tuple[Place, tuple[str, str, float, float], float]) -> Verdic
 def verdicts(directory: Path, *, body: str | None = None, processes: int = 1, every: int = 1) -> Iterator[Verdict]:
     """Judges every `every`-th garment of a set."""
     card = json.loads((directory / "card.json").read_text())
-    body = body or load_garment(card["garment"]).body
+    body = body or load_garment(card["garment"].split("+")[0]).body
     if load_body(body).fingerprint != card["body_fingerprint"]:
         sys.exit(f"{directory}: made for another body than {body!r}: name its file as --body")
     settings = card["settings"]

@@ -58,6 +58,7 @@ _SLIDE = 0.003  # [m]: a contact's tangent plane holds for this far
 _PAIR_REACH = 0.007  # [m]: a vertex this close to another piece of the cloth is watched
 _PAIR_SLACK = 0.003  # [m]: pieces are looked for farther away by this, and then not until a vertex has moved half of it
 _MAX_SPEED = 6.0  # [m/s]
+_APART = 10.0  # [m]: pieces of cloth that are this far from each other at rest are no neighbours
 
 
 class _Skin:
@@ -74,8 +75,17 @@ class _Skin:
 class SimulatedCloth:
     """The simulated garment. Positions are relative to the body's root, in SMPL axes [m]; one thread, deterministic."""
 
-    def __init__(self, topology: ClothTopology, sdf: ExactSdf, *, settings: ClothSettings | None = None) -> None:
+    def __init__(
+        self,
+        topology: ClothTopology,
+        sdf: ExactSdf,
+        *,
+        settings: ClothSettings | None = None,
+        piece: NDArray[np.intp] | None = None,
+    ) -> None:
         """A garment of this topology against the body behind `sdf`.
+
+        `piece` (N,) numbers the pieces that it is made of: those keep apart however near they are at rest.
 
         `sdf` must have its BVH built on the same vertices whenever the same drape is simulated, and must not rebuild it
         by itself: the tree decides which of two equally close faces is found, and with it the last bit of the result.
@@ -95,6 +105,7 @@ class SimulatedCloth:
                 np.full(len(topology.mesh.edges), self.settings.stretch_compliance / h2, np.float32),
             )
         )
+        self._piece = piece
         self.positions: F32 = np.zeros((n, 3), np.float32)
         self.velocities: F32 = np.zeros((n, 3), np.float32)
         self._previous: F32 = np.zeros((n, 3), np.float32)
@@ -103,7 +114,9 @@ class SimulatedCloth:
 
     def _dress(self, rest: F32) -> None:
         n = self.topology.n_vertices
-        self._rest = rest
+        self._rest = self._told_apart = rest
+        if self._piece is not None:
+            self._told_apart = rest + np.float32(_APART) * self._piece[:, None].astype(np.float32)
         self._skin = _Skin(n)
         self._middles = _Skin(len(self.topology.mesh.edges))
         self._searched_at: F32 = np.full((n, 3), 1e6, np.float32)  # far away: nothing that was found holds
@@ -219,7 +232,11 @@ class SimulatedCloth:
         faces, reach = self.topology.mesh.faces, np.float32(_PAIR_REACH + 0.85 * self._edge_length)
         if farthest_move(self.positions, self._searched_at) > _PAIR_SLACK / 2:
             self._candidates = find_candidates(
-                self.positions, faces, self._rest, np.float32(2.2 * self._edge_length), reach + np.float32(_PAIR_SLACK)
+                self.positions,
+                faces,
+                self._told_apart,
+                np.float32(2.2 * self._edge_length),
+                reach + np.float32(_PAIR_SLACK),
             )
             self._searched_at[:] = self.positions
         return near_pairs(self.positions, faces, *self._candidates, np.float32(_PAIR_REACH))

@@ -24,6 +24,7 @@ from refu_core.simulation._store import (
     clip_names,
     dequantise,
     gather,
+    parts_of,
     read_by_slot,
     read_card,
     rows_of,
@@ -36,7 +37,7 @@ class GarmentSample:
     """One simulated garment and what it was simulated for."""
 
     vertices: NDArray[np.float32]
-    """Garment on the body at zero translation, SMPL axes [m], shape (N, 3)."""
+    """Garment on the body at zero translation, SMPL axes [m], shape (N, 3); several one after the other (`parts`)."""
     pose: NDArray[np.float32]
     """θ that was simulated, rotation vectors [rad], shape (24, 3)."""
     betas: NDArray[np.float32]
@@ -115,6 +116,8 @@ class _Rows:
         if len(shapes) > 1:
             msg = f"{path}: wanted shards of one garment, got rows of the shapes {sorted(shapes)}"
             raise SimulationError(msg)
+        self.parts = parts_of(path, self.card, shapes.pop()[-2])
+        """Which of a row's vertices are each garment's: several where garments were simulated together."""
         self._where, self._rows = rows_of(self._shards, (DONE,))
         self._clips = clip_names(self.card)
         self._check(split=(0, 2))

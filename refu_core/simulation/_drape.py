@@ -22,6 +22,7 @@ from refu_core.realtime._turn import RootTurn
 from refu_core.sdf import ExactSdf
 from refu_core.simulation._cloth import F32, ClothSettings, SimulatedCloth
 from refu_core.simulation._mesh import ClothTopology
+from refu_core.simulation._outfit import Outfit
 
 GRAVITY = 9.81
 """[m/s²], along -y of the world."""
@@ -124,12 +125,15 @@ class SettledDrape:
 class Draper:
     """Drapes one garment on one body; keeps the canonical drape of the last shape and style."""
 
-    def __init__(self, garment: GarmentTemplate, body: SmplBody, *, settings: DrapeSettings | None = None) -> None:
-        """Prepares for `garment` on `body`, both on the CPU.
+    def __init__(
+        self, garment: GarmentTemplate | Outfit, body: SmplBody, *, settings: DrapeSettings | None = None
+    ) -> None:
+        """Prepares for `garment`, or several that are worn together, on `body`, all on the CPU.
 
-        Raises `MeshError` when the body isn't watertight or the garment's mesh isn't one of edges of one or two faces.
+        Raises `MeshError` when the body isn't watertight or a garment's mesh isn't one of edges of one or two faces.
         """
-        self.garment = garment
+        self.outfit = garment if isinstance(garment, Outfit) else Outfit([garment])
+        self.garment = garment = self.outfit.joined
         self.body = body
         self.settings = settings or DrapeSettings()
         self.topology = ClothTopology.of(garment.mesh)
@@ -138,14 +142,23 @@ class Draper:
         sdf = ExactSdf(body.faces, rebuild_distance=math.inf)
         self._sdf = sdf
         self._collider = Collider(body, gap=self.settings.gap)
-        self.cloth = SimulatedCloth(self.topology, sdf, settings=self.settings.cloth)
-        self.waist: NDArray[np.intp] | None = None
-        if garment.card.held_at_waist:
-            vertices = garment.v_template.numpy()
-            loop = max(self.topology.boundary_loops(), key=lambda rim: float(vertices[rim, 1].mean()))
-            self.waist = np.flatnonzero(self.topology.distance_from(vertices, loop) < self.settings.waistband)
+        piece = self.outfit.number_of_vertex if len(self.outfit.garments) > 1 else None
+        self.cloth = SimulatedCloth(self.topology, sdf, settings=self.settings.cloth, piece=piece)
+        self.waist = self._waists()
         self._comfort = comfort_poses()
         self._canonical: tuple[bytes, F32, F32, float] | None = None
+
+    def _waists(self) -> NDArray[np.intp] | None:
+        """Vertices of the bands that hold garments at the waist; None where all hang from the shoulders."""
+        vertices = self.garment.v_template.numpy()
+        found = []
+        for garment in self.outfit.garments:
+            if garment.card.held_at_waist:
+                part = self.outfit.parts[garment.name]
+                rims = [rim for rim in self.topology.boundary_loops() if part.start <= rim[0] < part.stop]
+                loop = max(rims, key=lambda rim: float(vertices[rim, 1].mean()))
+                found.append(np.flatnonzero(self.topology.distance_from(vertices, loop) < self.settings.waistband))
+        return np.concatenate(found) if found else None
 
     def rest(self, betas: NDArray[np.floating], style: NDArray[np.floating]) -> F32:
         """The garment cut for this shape and style [m], shape (N, 3): its edges are the cloth's rest lengths."""
@@ -173,6 +186,7 @@ class Draper:
         rest = self.rest(betas, style)
         body = self.bodies(np.zeros((1, N_JOINTS, 3)), betas)[0]
         self.begin(rest, betas, style, body)
+        self.cloth.positions[:] = self.outfit.layered(rest, body, self._sdf)
         gravity = np.array([0, -GRAVITY, 0], np.float32)
         for _ in range(s.dress_frames):
             self.cloth.frame(body, body, gravity=gravity, drag=s.drag[0])

@@ -23,6 +23,16 @@ TRAIN, TEST = 0, 1
 MAX_PIVOTS_SHARE = 0.5
 
 
+def garments_of(garment: str | Sequence[str]) -> list[str]:
+    """The garments of a plan, as they were asked for."""
+    return [garment] if isinstance(garment, str) else list(garment)
+
+
+def names_of(garment: str | Sequence[str]) -> str:
+    """Their names, however their files are called, in one text whatever their order."""
+    return "+".join(sorted(garment_name(one) for one in garments_of(garment)))
+
+
 def truncated_normal(u: NDArray[np.float64], spread: float) -> NDArray[np.float32]:
     """Normal numbers of this standard deviation, cut off at ±2, of evenly distributed `u` in [0, 1)."""
     edge = ndtr(2 / spread)
@@ -39,7 +49,8 @@ class SamplePlan:
     networks learn from them). Test samples have pairs of their own and poses of clips kept for the test.
     """
 
-    garment: str
+    garment: str | Sequence[str]
+    """One, or several that are simulated together."""
     count: int
     """Samples in the set, training and test together."""
     seed: int = 0
@@ -101,7 +112,7 @@ class SamplePlan:
         return [runs[k] for k in order]
 
     def _key(self, *numbers: int) -> list[int]:
-        return [self.seed, zlib.crc32(garment_name(self.garment).encode()), *numbers]
+        return [self.seed, zlib.crc32(names_of(self.garment).encode()), *numbers]
 
     def style_shape(self, pair: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """β (10,) and γ (4,) of a pair, normal, cut off at ±2; the pivots are spread evenly over each coordinate."""

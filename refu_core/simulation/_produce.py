@@ -134,6 +134,7 @@ def _card_of(simulator: Simulator) -> dict[str, Any]:
     return {
         "format": simulator.kind,
         "garment": garment.name,
+        "parts": {name: part.stop - part.start for name, part in simulator.parts.items()},
         "body": body.name,
         "body_fingerprint": body.fingerprint,
         "garment_fingerprint": digest.hexdigest()[:16],
@@ -183,7 +184,7 @@ def _plain(value: Any) -> Any:
 
 
 def simulate_dataset(
-    garment: str,
+    garment: str | Sequence[str],
     count: int,
     output: str | Path,
     *,
@@ -203,7 +204,7 @@ def simulate_dataset(
     samples are on disk at any time and can be read while others are made.
 
     Args:
-        garment: `tshirt-male` or another built-in garment.
+        garment: `tshirt-male` or another garment, or several that are worn together: their layers never cross.
         count: samples in the set, training and test together.
         output: directory of the set; it is made, or must hold the beginning of the same set.
         motions: a folder of motion files, or what `load_clips` has read, two at least; None for drawn poses alone.

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from refu_core._engine import Engine
 from refu_core.errors import SimulationError
 from refu_core.frames import N_BETAS
-from refu_core.garments import N_STYLES, garment_name
+from refu_core.garments import N_STYLES
 from refu_core.simulation._cloth import F32
 from refu_core.simulation._drape import GRAVITY, SettledDrape
 from refu_core.simulation._motion import FPS, STEPS, DrawnMotion, draw_motion
-from refu_core.simulation._plan import TEST, TRAIN, truncated_normal
+from refu_core.simulation._plan import TEST, TRAIN, names_of, truncated_normal
 from refu_core.simulation._poses import Clip, as_clips, split_clips
 from refu_core.simulation._produce import Progress, produce
 from refu_core.simulation._selection import CAUSES
@@ -37,7 +37,8 @@ class SequencePlan:
     Shapes are drawn one by one: those of a set of 5 are the first of a set of 17.
     """
 
-    garment: str
+    garment: str | Sequence[str]
+    """One, or several that are simulated together."""
     count: int
     """Sequences in the set, training and test together."""
     shapes: int = 5
@@ -75,7 +76,7 @@ class SequencePlan:
         return [[int(slot)] for slot in order]
 
     def _key(self, *numbers: int) -> list[int]:
-        return [self.seed, zlib.crc32(f"{garment_name(self.garment)} sequences".encode()), *numbers]
+        return [self.seed, zlib.crc32(f"{names_of(self.garment)} sequences".encode()), *numbers]
 
     def style_shape(self, slot: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """β (10,), normal, cut off at ±2, and γ (4,), zero."""
@@ -179,7 +180,7 @@ class SequenceSimulator(Simulator):
 
 
 def simulate_sequences(
-    garment: str,
+    garment: str | Sequence[str],
     count: int,
     output: str | Path,
     *,
@@ -197,7 +198,7 @@ def simulate_sequences(
     What holds for `simulate_dataset` holds here; the unit that is finished or not is a whole sequence.
 
     Args:
-        garment: `tshirt-male` or another built-in garment.
+        garment: `tshirt-male` or another garment, or several that are worn together.
         count: sequences in the set, training and test together; best a multiple of `shapes`.
         output: directory of the set; it is made, or must hold the beginning of the same set.
         motions: a folder of motion files, or what `load_clips` has read, two at least, of `seconds` or more.

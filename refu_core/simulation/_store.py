@@ -25,6 +25,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -244,6 +245,22 @@ def clip_names(card: dict[str, Any]) -> dict[str, list[str]]:
         msg = f"wanted a card with the names of the motions in clips.train and clips.test, got {str(clips)[:80]}"
         raise SimulationError(msg)
     return {split: [str(name) for name in value or ()] for split, value in names.items()}
+
+
+def parts_of(path: Path, card: dict[str, Any], n_vertices: int) -> dict[str, slice]:
+    """Which of a row's vertices are each garment's, by the card of the set at `path`.
+
+    Raises `SimulationError` for a card whose garments don't have that many vertices.
+    """
+    garment = str(card.get("garment"))
+    parts = card.get("parts", {garment: n_vertices})
+    is_whole = isinstance(parts, dict) and all(type(count) is int and count > 0 for count in parts.values())
+    if not is_whole or sum(parts.values()) != n_vertices or list(parts) != garment.split("+"):
+        msg = f"{path}: wanted a card whose parts are the {n_vertices} vertices of {garment[:80]} by garment, "
+        msg += f"got {str(parts)[:80]}"
+        raise SimulationError(msg)
+    ends = list(accumulate(parts.values()))
+    return {name: slice(end - count, end) for (name, count), end in zip(parts.items(), ends, strict=True)}
 
 
 def gather(shards: Sequence[Shard], where: NDArray[np.intp], row: NDArray[np.intp], name: str) -> NDArray[Any]:

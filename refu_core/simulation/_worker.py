@@ -13,7 +13,8 @@ import numpy as np
 from refu_core.body import load_body, load_fit
 from refu_core.garments import load_garment, worn_on
 from refu_core.simulation._drape import Draper, DrapeSettings, SettledDrape
-from refu_core.simulation._plan import TEST, SamplePlan
+from refu_core.simulation._outfit import Outfit
+from refu_core.simulation._plan import TEST, SamplePlan, garments_of
 from refu_core.simulation._poses import Clip
 from refu_core.simulation._selection import CAUSES, SelectionSettings, Selector
 from refu_core.simulation._store import DONE, FORMAT, GIVEN_UP, Shard, dequantise, quantise
@@ -46,17 +47,19 @@ class Simulator(ABC):
     ) -> None:
         """For the clips of the training and of the test set, on a body or (None) the one the garment is cut for.
 
-        On another one the garment is transferred to it (`refu_core.garments.worn_on`).
+        On another one the garments are transferred to it (`refu_core.garments.worn_on`).
 
-        Raises `BodyError` or `GarmentError` where there is no such body or garment; `MeshError` as `Draper`.
+        Raises `SimulationError` for garments of different bodies; `BodyError` or `GarmentError` where there is no such
+        body or garment; `MeshError` as `Draper`.
         """
         self.plan = plan
         self.settings = settings
         self.clips = clips
         own = None if body is None else load_fit(body)
-        self.garment = worn_on(load_garment(plan.garment), own)
+        outfit = Outfit([worn_on(load_garment(garment), own) for garment in garments_of(plan.garment)])
+        self.garment, self.parts = outfit.joined, outfit.parts
         self.body = load_body(self.garment.body) if own is None else own.body
-        self._draper = Draper(self.garment, self.body, settings=settings.drape)
+        self._draper = Draper(outfit, self.body, settings=settings.drape)
         self._selector = Selector(self.body.faces, self.garment.faces, settings=settings.selection)
 
     @property

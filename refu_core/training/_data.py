@@ -120,7 +120,7 @@ def read_samples(
         msg = f"the set of {garment.name} has no finished sample to {split} on: let `refu simulate` run longer"
         raise RefuError(msg)
     stored = _frames(dataset, rows) if isinstance(dataset, GarmentSequences) else _columns(dataset, rows)
-    vertices = stored.pop("vertices")
+    vertices = stored.pop("vertices")[:, dataset.parts[garment.name]]
     column = {name: torch.as_tensor(values) for name, values in stored.items()}
 
     along = TakenAlong(body, garment)
@@ -200,8 +200,10 @@ def check_dataset(dataset: GarmentDataset | GarmentSequences, body: SmplBody, ga
     Raises:
         RefuError: it wasn't.
     """
-    for what, wanted in (("garment", garment.name), ("body_fingerprint", body.fingerprint)):
-        got = dataset.card.get(what)
-        if got != wanted:
-            msg = f"wanted a set whose {what} is {wanted}, got {got}: simulate one with `refu simulate {garment.name}`"
-            raise RefuError(msg)
+    got, fingerprint = dataset.card.get("garment"), dataset.card.get("body_fingerprint")
+    differs = "" if garment.name in dataset.parts else f"garment is {garment.name}, got {got}"
+    if not differs and fingerprint != body.fingerprint:
+        differs = f"body_fingerprint is {body.fingerprint}, got {fingerprint}"
+    if differs:
+        msg = f"wanted a set whose {differs}: simulate one with `refu simulate {garment.name}`"
+        raise RefuError(msg)

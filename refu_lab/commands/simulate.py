@@ -16,7 +16,7 @@ from refu_lab.commands import _common as cli
 class SimulateOptions:
     """What is simulated."""
 
-    garment: str
+    garments: list[str]
     count: int
     output: Path
     motions: Path | None = setting(
@@ -38,7 +38,12 @@ def add(commands: Any) -> None:
         description="Simulate collision-free garments on bodies of many poses, shapes and styles. An interrupted run "
         "goes on when the same command is given again.",
     )
-    parser.add_argument("garment", metavar="GARMENT", help="a garment's name (refu garment list), or its .npz")
+    parser.add_argument(
+        "garments",
+        nargs="+",
+        metavar="GARMENT",
+        help="a garment's name (refu garment list), or its .npz; several are worn together",
+    )
     parser.add_argument(
         "--count",
         type=cli.positive,

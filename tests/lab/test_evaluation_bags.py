@@ -6,6 +6,7 @@ import importlib.util
 import json
 import sys
 from dataclasses import asdict
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from rosbags.rosbag2 import Reader as RosbagsReader
 import msg_adapters as adapters
 from refu_core import load_body, load_garment
 from refu_core.body import Collider
-from refu_core.metrics import CollisionChecker
+from refu_core.metrics import CollisionChecker, SheetChecker
 from refu_core.simulation import GarmentDataset, GarmentSequences, SequencePlan
 from refu_core.simulation._drape import colliders
 from refu_core.simulation._store import DONE, FORMAT, QUANTUM, SEQUENCES, SequenceShard, Shard, quantise, write_card
@@ -28,13 +29,14 @@ SHIPPED = sorted(BAGS.glob("eval_*"))
 GARMENT = "short-pant-male"
 
 
-def garment_of(bag: Path) -> str:
-    return bag.name.removeprefix("eval_").removesuffix("_sequence").replace("_", "-")
+def garments_of(bag: Path) -> list[str]:
+    """From the skin outwards."""
+    worn = bag.name.removeprefix("eval_").removesuffix("_sequence").replace("_", "-")
+    return worn.split("-over-")[::-1]
 
 
 def moments(bag: Path) -> tuple[list[Any], GroundTruth]:
-    garment = garment_of(bag)
-    truth = GroundTruth.of_bag(bag, {garment: load_garment(garment).faces.numpy()})
+    truth = GroundTruth.of_bag(bag, {garment: load_garment(garment).faces.numpy() for garment in garments_of(bag)})
     return [record.frame for record in adapters.open_smpl_bag(bag)], truth
 
 
@@ -44,23 +46,28 @@ def test_a_bag_ships() -> None:
 
 @pytest.mark.parametrize("bag", SHIPPED, ids=lambda path: path.name)
 def test_shipped_truth_is_that_of_its_frames(bag: Path) -> None:
-    """Small, rosbag2, standing on the floor, and free of the collider, which it was simulated on."""
+    """Small, rosbag2, standing on the floor, and free of the collider and of the garments below."""
     assert sum(file.stat().st_size for file in bag.iterdir()) < 8e6
     with RosbagsReader(bag) as reader:
         counts = {connection.topic: connection.msgcount for connection in reader.connections}
-    assert counts["/smpl_params"] >= counts["/ground_truth"] > 50
-    garment = load_garment(garment_of(bag))
+    garments = [load_garment(name) for name in garments_of(bag)]
+    n_truths = counts["/ground_truth"] // len(garments)
+    assert counts["/smpl_params"] >= n_truths > 50
     frames, truth = moments(bag)
-    assert len(truth.garments[garment.name]) == counts["/ground_truth"]
-    body = load_body(garment.body)
+    assert [len(truth.garments[garment.name]) for garment in garments] == [n_truths] * len(garments)
+    body = load_body(garments[0].body)
     checker, collider = CollisionChecker(body.faces), Collider(body)
-    with_truth = [frame for frame in frames if truth.of(garment.name, frame) is not None]
+    with_truth = [frame for frame in frames if truth.of(garments[0].name, frame) is not None]
     for frame in with_truth[:: len(with_truth) // 3]:
         posed = body(frame.pose[None], betas=frame.betas[None]).vertices[0].numpy()
         checker.update(colliders(body, collider, frame.pose[None].copy(), frame.betas.copy())[0])
-        true = truth.of(garment.name, frame)
-        assert true is not None
-        assert checker.check(true.astype(np.float32), garment.faces).is_free
+        worn = [np.asarray(truth.of(garment.name, frame), np.float32) for garment in garments]
+        for garment, vertices in zip(garments, worn, strict=True):
+            assert checker.check(vertices, garment.faces).is_free
+        for (inner, below), (outer, above) in pairwise(zip(garments, worn, strict=True)):
+            sheet = SheetChecker(inner.faces)
+            sheet.update(below)
+            assert not len(sheet.with_other(above, outer.faces))
         if not bag.name.endswith("_sequence"):
             assert posed[:, 1].min() + frame.transl[1] == pytest.approx(0, abs=1e-4)
             assert np.abs(frame.style).max() > 0.1
@@ -68,10 +75,11 @@ def test_shipped_truth_is_that_of_its_frames(bag: Path) -> None:
 
 @pytest.mark.parametrize("bag", SHIPPED, ids=lambda path: path.name)
 def test_replay_of_shipped_truth_gives_mpve(bag: Path, tmp_path: Path) -> None:
-    garment, report = garment_of(bag), tmp_path / "report.json"
-    options = ["--garments", garment, "--backbone", "skinned", "--sdf", "accurate", "--max-frames", "4", "--quiet"]
+    garments, report = garments_of(bag), tmp_path / "report.json"
+    options = ["--garments", *garments, "--backbone", "skinned", "--sdf", "accurate", "--max-frames", "4", "--quiet"]
     assert main(["replay", str(bag), *options, "--json", str(report)]) == 0
-    assert 2 < json.loads(report.read_text())["garments"][garment]["mpve_mm"] < 150
+    for garment in garments:
+        assert 2 < json.loads(report.read_text())["garments"][garment]["mpve_mm"] < 150
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +128,7 @@ def test_samples_are_spread_over_the_test_split(script: Any, tmp_path: Path) -> 
         assert 1 <= (dataset.column("clip")[chosen] >= 0).sum() <= 3
     assert sorted(script.spread_samples(dataset, 100, 0)) == list(range(6, 12))
     bag = tmp_path / "eval_short_pant_male"
-    assert script.write_bag(bag, GARMENT, script.sample_moments(dataset, 100, 0)) == (6, 6)
+    assert script.write_bag(bag, dataset.parts, script.sample_moments(dataset, 100, 0)) == (6, 6)
     frames, truth = moments(bag)
     for frame in frames:
         (index,) = np.flatnonzero((dataset.column("betas") == frame.betas).all(1))
@@ -140,7 +148,7 @@ def test_sequence_has_truth_in_each_third_frame_of_the_set(script: Any, tmp_path
     rows(directory, SequenceShard, (7, load_garment(GARMENT).n_vertices, 3), cause=cause, transl=transl)
     sequences = GarmentSequences(directory)
     bag = tmp_path / "eval_short_pant_male_sequence"
-    assert script.write_bag(bag, GARMENT, script.sequence_moments(sequences)) == (7, 2)
+    assert script.write_bag(bag, sequences.parts, script.sequence_moments(sequences)) == (7, 2)
     frames, truth = moments(bag)
     np.testing.assert_allclose([frame.transl[1] for frame in frames], np.linspace(0, 1, 7), atol=QUANTUM)
     assert [truth.of(GARMENT, frame) is not None for frame in frames] == [True, *[False] * 5, True]

@@ -1,0 +1,100 @@
+"""Garments simulated together: one cloth whose parts hang together nowhere, from the skin outwards."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from refu_core.errors import SimulationError
+from refu_core.frames import N_STYLES
+from refu_core.garments import GarmentTemplate, inner_first
+from refu_core.sdf import ExactSdf
+from refu_core.simulation._cloth import F32
+
+_OVER = 0.006
+"""How far over the garments below it a garment starts [m]: twice the cloth's thickness."""
+_BESIDE = 0.025
+"""How far around a vertex what is below it counts [m]: two of a garment's edges."""
+
+
+class Outfit:
+    """Garments worn together, as the one that a cloth is made of: it lies on the skin and on itself, like any cloth.
+
+    An outfit of one garment is that garment.
+    """
+
+    def __init__(self, garments: Sequence[GarmentTemplate]) -> None:
+        """Of garments for one body, in any order.
+
+        Raises `SimulationError` for none, for one twice, and for garments of different bodies.
+        """
+        by_name = {garment.name: garment for garment in garments}
+        if not garments or len(by_name) < len(garments) or len({garment.body for garment in garments}) > 1:
+            named = ", ".join(f"{garment.name} for {garment.body}" for garment in garments) or "none"
+            msg = f"wanted different garments of one body, got {named}"
+            raise SimulationError(msg)
+        self.garments = tuple(by_name[name] for name in inner_first(by_name))
+        """From the skin outwards."""
+        ends = np.cumsum([0, *(garment.n_vertices for garment in self.garments)]).tolist()
+        self.parts = {
+            garment.name: slice(first, last)
+            for garment, first, last in zip(self.garments, ends[:-1], ends[1:], strict=True)
+        }
+        """Which of the joined garment's vertices are each garment's."""
+        self.joined = _joined(self.garments, ends)
+        """All of it as one template; its name has all names in it, its card is that of the outermost."""
+
+    @property
+    def number_of_vertex(self) -> NDArray[np.intp]:
+        """Which garment a vertex is of, from the skin outwards, shape (N,)."""
+        return np.repeat(np.arange(len(self.garments)), [garment.n_vertices for garment in self.garments])
+
+    def layered(self, positions: F32, body: F32, sdf: ExactSdf) -> F32:
+        """`positions` (N, 3) [m] with each garment lifted off the skin until it is over all that is below it.
+
+        `sdf` is that of the body's vertices `body` (V, 3). Where one garment is far from another nothing moves.
+        """
+        out: F32 = positions.copy()
+        for garment in self.garments[1:]:
+            own = self.parts[garment.name]
+            height, outwards = _over_skin(sdf, body, out[: own.stop])
+            below, mine = out[: own.start], out[own]
+            beside = cKDTree(below).query_ball_point(mine, _BESIDE)
+            highest = np.array([height[near].max() + _OVER if near else -np.inf for near in beside], np.float32)
+            lift = np.maximum(highest - height[own], 0)
+            out[own] = mine + lift[:, None] * outwards[own]
+        return out
+
+
+def _over_skin(sdf: ExactSdf, body: F32, points: F32) -> tuple[F32, F32]:
+    """Signed distances of points (P, 3) to the skin [m], (P,), and the normals of the skin below them, (P, 3)."""
+    found = sdf.closest(torch.from_numpy(np.ascontiguousarray(points)))
+    height = (found.distance * found.sign).numpy()
+    a, b, c = body[sdf.faces.numpy()[found.face.numpy()]].transpose(1, 0, 2)
+    normals: F32 = np.cross(b - a, c - a)
+    return height, normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+def _joined(garments: tuple[GarmentTemplate, ...], starts: list[int]) -> GarmentTemplate:
+    if len(garments) == 1:
+        return garments[0]
+    no_style = [garment.shapedirs.new_zeros(3 * garment.n_vertices, N_STYLES) for garment in garments]
+    styledirs = [
+        none if garment.styledirs is None else garment.styledirs
+        for garment, none in zip(garments, no_style, strict=True)
+    ]
+    return replace(
+        garments[-1],
+        name="+".join(garment.name for garment in garments),
+        faces=torch.cat([garment.faces + start for garment, start in zip(garments, starts, strict=False)]),
+        weights=torch.cat([garment.weights for garment in garments]),
+        v_template=torch.cat([garment.v_template for garment in garments]),
+        shapedirs=torch.cat([garment.shapedirs for garment in garments]),
+        styledirs=torch.cat(styledirs),
+        uv=None,
+    )
