@@ -29,7 +29,7 @@ JOINED = "short-pant-male+tshirt-male"
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     output = tmp_path_factory.mktemp("sets") / "outfit"
-    simulate_dataset(NAMES, 3, output, test_share=1 / 3)
+    simulate_dataset(NAMES, 2, output, test_share=1 / 2)
     return output
 
 
@@ -48,7 +48,7 @@ def test_layers_never_cross(dataset: GarmentDataset) -> None:
     body = load_body("male")
     collider, checker, below = Collider(body), CollisionChecker(body.faces), SheetChecker(shorts.faces)
     assert list(dataset.parts) == [shorts.name, shirt.name]
-    assert len(dataset) == 3
+    assert len(dataset) == 2
     sdf = ExactSdf(body.faces)
     for index in range(len(dataset)):
         sample = dataset.sample(index)
