@@ -88,7 +88,7 @@ class Press:
         Whether what predicts it `knows_limbs` is as in `Wearable`.
         """
         self._settings = settings
-        self._beside = settings.press_near if knows_limbs else settings.press_beside
+        self._beside = garment.edge_length if knows_limbs else settings.press_beside
         self._limbs = limbs  # their memory is read
         n, self.device = garment.n_vertices, garment.v_template.device
         self._is_serial = self.device.type == "cpu"

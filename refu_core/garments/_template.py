@@ -76,6 +76,12 @@ class GarmentTemplate:
         """Each edge once, lower vertex first, shape (E, 2), int64."""
         return torch.as_tensor(self.mesh.edges.astype(np.int64), device=self.faces.device)
 
+    @cached_property
+    def edge_length(self) -> float:
+        """Median length of the mean garment's edges at rest [m]."""
+        first, second = self.v_template[self.edges].unbind(1)
+        return float((first - second).norm(dim=1).median())
+
     def to(self, *, device: str | torch.device | None = None, dtype: torch.dtype | None = None) -> GarmentTemplate:
         """The same garment on another device or in another precision."""
         styledirs = None if self.styledirs is None else self.styledirs.to(device=device, dtype=dtype)

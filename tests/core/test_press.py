@@ -78,7 +78,7 @@ def test_is_what_a_look_from_the_skin_says(knows_limbs: bool) -> None:
     to_skin = np.linalg.norm(rest[:, None] - outfit().body.v_template.numpy()[None], axis=2).min(1)
     is_asked = outfit().wearables[SKIRT].template.mesh.independent() | (to_skin > DEFAULT_CONTACT.press_lies[0])
     how, moved = DEFAULT_CONTACT, np.linalg.norm(pressed - x, axis=1)
-    farthest = how.press_near if knows_limbs else how.press_beside
+    farthest = outfit().wearables[SKIRT].template.edge_length if knows_limbs else how.press_beside
     near = np.flatnonzero((moved > 0) | (np.arange(len(x)) % 40 == 0))
     height = np.linalg.norm(x - at, axis=1)
     arms = [body.double().numpy()[outfit().body.faces.numpy()[of_face == arm]] for arm in (1, 2)]
