@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -89,11 +88,7 @@ class Press:
         Whether what predicts it `knows_limbs` is as in `Wearable`.
         """
         self._settings = settings
-        # A finger fits between vertices. What goes through a triangle is within the radius of its circumcircle of a
-        # corner: it counts in full there, and not at all twice as far away.
-        self._beside, self._full = settings.press_beside, 0.0
-        if knows_limbs:
-            self._beside, self._full = 2 / math.sqrt(3) * garment.edge_length, 0.5
+        self._beside = garment.edge_length if knows_limbs else settings.press_beside
         self._limbs = limbs  # their memory is read
         n, self.device = garment.n_vertices, garment.v_template.device
         self._is_serial = self.device.type == "cpu"
@@ -103,11 +98,10 @@ class Press:
         self._commands: dict[str, Any] = {}
         own = weight_of_parts(garment.weights, _LIMBS) > settings.own_weight
         foreign = (~own).cpu().numpy() @ (1 << np.arange(len(_LIMBS)))
-        # Cloth that lies on the skin gives way as one piece: where limbs are felt from afar a few of its vertices are
-        # asked, and others follow those.
+        # Cloth that lies on the skin gives way as one piece: of its vertices a few are asked, and others follow those.
         rest = garment.v_template.cpu().numpy()
         is_loose = cKDTree(limbs.rest).query(rest)[0] > settings.press_lies[0]
-        is_asked = is_loose | garment.mesh.independent() | knows_limbs
+        is_asked = is_loose | garment.mesh.independent()
         order, ring = grouped(rest), garment.mesh.ring
         order = order[is_asked[order]]
         self._fabric = fabric = kernels.Fabric()
@@ -184,8 +178,7 @@ class Press:
 
     def _feel(self) -> Any:
         how, feel = self._settings, kernels.Feel()
-        feel.room, feel.flat = how.press_room, how.press_flat
-        feel.beside, feel.full = self._beside, self._full
+        feel.room, feel.beside, feel.flat = how.press_room, self._beside, how.press_flat
         feel.lies, feel.looks, feel.step = wp.vec2(*how.press_lies), how.press_looks, how.press_step
         return feel
 

@@ -18,7 +18,6 @@ class Feel:
 
     room: wp.float32
     beside: wp.float32
-    full: wp.float32
     flat: wp.float32
     lies: wp.vec2
     looks: wp.int32
@@ -104,25 +103,24 @@ def find_near(i: int, fabric: Fabric, bundles: Bundles, feel: Feel) -> None:
 def press(v: int, fabric: Fabric, limbs: wp.array[wp.uint64], feel: Feel) -> None:
     """How far a vertex is drawn back to the skin that it lies on: before a limb that comes in between.
 
-    Whatever is within `beside` of the way is in between the less the farther beside it is, and all of it within the
-    share `full` of that. The way is looked along as a ray is marched along: by as much as nothing is near.
+    Whatever is on the way within `beside` is in between the less the farther beside it is. The way is looked along as
+    a ray is marched along: by as much as nothing is near.
     """
     way = fabric.points[v] - fabric.skin[v]
     height = wp.length(way)
     whole = height + feel.room
     aside = beside(height, feel)
-    full = feel.full * aside
     least = float(whole)
     for k in range(limbs.shape[0]):
         if (fabric.boxed[v] >> k) & 1 == 1:
             at = float(0.0)
             for _ in range(feel.looks):
                 here = fabric.skin[v] + (at / height) * way
-                off = full + (aside - full) * (least - at) / (whole - at)  # what is farther off says nothing new
+                off = aside * (least - at) / (whole - at)  # what is farther off than that says nothing new
                 hit = wp.mesh_query_point_no_sign(limbs[k], here, off)
                 if hit.result:
                     off = wp.min(off, wp.length(wp.mesh_eval_position(limbs[k], hit.face, hit.u, hit.v) - here))
-                    least = wp.min(least, at + (whole - at) * wp.max(off - full, 0.0) / (aside - full))
+                    least = wp.min(least, at + (whole - at) * off / aside)
                 at += wp.max(off, feel.step)
                 if at >= least:
                     break

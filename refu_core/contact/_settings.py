@@ -43,8 +43,8 @@ class ContactSettings:
     press_beside: float = 0.07
     """How far beside a limb cloth still feels it, less and less [m]: a hand that swings goes 30 mm in a frame. With
     50 mm the skirt jumps in 13.1 % of frame pairs, with 70 mm in 12.0 % (before `press_lies`). Networks that have seen
-    limbs beside cloth (`Wearable.knows_limbs`) need as much as keeps a finger out from between vertices: what they
-    predict is nearer to the truth than where a limb from afar draws it."""
+    limbs beside cloth (`Wearable.knows_limbs`) need as much as one of the cloth's edges: a finger fits between its
+    vertices. What they predict there is nearer to the truth than where a limb from afar draws it."""
     press_flat: float = 0.025
     """Cloth at a height feels limbs beside it as far as the height squared is of this [m]: at 40 mm all that far."""
     press_lies: tuple[float, float] = (0.06, 0.16)

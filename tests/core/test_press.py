@@ -76,12 +76,9 @@ def test_is_what_a_look_from_the_skin_says(knows_limbs: bool) -> None:
     of_face = part_of_faces(outfit().body.weights, outfit().body.faces, parts).numpy()
     rest = outfit().wearables[SKIRT].template.v_template.numpy()
     to_skin = np.linalg.norm(rest[:, None] - outfit().body.v_template.numpy()[None], axis=2).min(1)
-    is_asked = (
-        knows_limbs | outfit().wearables[SKIRT].template.mesh.independent() | (to_skin > DEFAULT_CONTACT.press_lies[0])
-    )
+    is_asked = outfit().wearables[SKIRT].template.mesh.independent() | (to_skin > DEFAULT_CONTACT.press_lies[0])
     how, moved = DEFAULT_CONTACT, np.linalg.norm(pressed - x, axis=1)
-    edge = outfit().wearables[SKIRT].template.edge_length
-    farthest, share = (2 / 3**0.5 * edge, 0.5) if knows_limbs else (how.press_beside, 0.0)
+    farthest = outfit().wearables[SKIRT].template.edge_length if knows_limbs else how.press_beside
     near = np.flatnonzero((moved > 0) | (np.arange(len(x)) % 40 == 0))
     height = np.linalg.norm(x - at, axis=1)
     arms = [body.double().numpy()[outfit().body.faces.numpy()[of_face == arm]] for arm in (1, 2)]
@@ -91,14 +88,13 @@ def test_is_what_a_look_from_the_skin_says(knows_limbs: bool) -> None:
         if not (is_asked[v] and how.press_room < h < how.press_lies[1]):
             continue
         aside = min(farthest, h * h / how.press_flat)
-        full = share * aside
         least = whole
         for triangles in arms:
             go = 0.0
             for _ in range(how.press_looks):
                 off = distances((at[v] + go / h * (x[v] - at[v]))[None], triangles)[0]
-                off = min(off, full + (aside - full) * (least - go) / (whole - go))
-                least = min(least, go + (whole - go) * max(off - full, 0) / (aside - full))
+                off = min(off, aside * (least - go) / (whole - go))
+                least = min(least, go + (whole - go) * off / aside)
                 go += max(off, how.press_step)
                 if go >= least:
                     break
