@@ -80,15 +80,15 @@ class Press:
         garment: GarmentTemplate,
         limbs: LimbMeshes,
         *,
-        knows_limbs: bool = False,
+        knows_arms: bool = False,
         settings: ContactSettings = DEFAULT_CONTACT,
     ) -> None:
         """For a garment and the limbs of the body that it is worn on, on one device.
 
-        Whether what predicts it `knows_limbs` is as in `Wearable`.
+        Whether what predicts it `knows_arms` is as in `Wearable`.
         """
         self._settings = settings
-        self._beside = garment.edge_length if knows_limbs else settings.press_beside
+        self._beside = garment.edge_length if knows_arms else settings.press_beside
         self._limbs = limbs  # their memory is read
         n, self.device = garment.n_vertices, garment.v_template.device
         self._is_serial = self.device.type == "cpu"

@@ -42,9 +42,9 @@ class ContactSettings:
     Cloth nearer to the skin than this isn't pressed, and cloth from twice as far on in full."""
     press_beside: float = 0.07
     """How far beside a limb cloth still feels it, less and less [m]: a hand that swings goes 30 mm in a frame. With
-    50 mm the skirt jumps in 13.1 % of frame pairs, with 70 mm in 12.0 % (before `press_lies`). Networks that have seen
-    limbs beside cloth (`Wearable.knows_limbs`) need as much as one of the cloth's edges: a finger fits between its
-    vertices. What they predict there is nearer to the truth than where a limb from afar draws it."""
+    50 mm the skirt jumps in 13.1 % of frame pairs, with 70 mm in 12.0 % (before `press_lies`). Cloth whose networks
+    know where arms are (`Wearable.knows_arms`) feels limbs as far as one of its edges is long: what those predict is
+    nearer to the truth than where a limb from afar draws it."""
     press_flat: float = 0.025
     """Cloth at a height feels limbs beside it as far as the height squared is of this [m]: at 40 mm all that far."""
     press_lies: tuple[float, float] = (0.06, 0.16)

@@ -93,7 +93,7 @@ class ContactStage:
             self._tents = {name: Tent(one, shins, settings=settings) for name, one in garments.items()}
             self._limbs = limbs = LimbMeshes(body)
             self._press = {
-                name: Press(one.template, limbs, knows_limbs=one.knows_limbs, settings=settings)
+                name: Press(one.template, limbs, knows_arms=one.knows_arms, settings=settings)
                 for name, one in outfit.wearables.items()
             }
             self._skin = skin = Sheet(outfit.collider.anatomy.mesh, body.v_template)

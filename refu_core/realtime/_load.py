@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from refu_core.backbones import Skinned, backbone_weights
-from refu_core.body import BodyFit, Collider, load_body, load_fit
+from refu_core.body import ARMS, BodyFit, Collider, load_body, load_fit
 from refu_core.errors import BodyError, GarmentError, WeightsError, require_type
 from refu_core.garments import GarmentTemplate, load_garment, worn_on
 from refu_core.modes import DEFAULT_MARGIN
@@ -119,4 +119,5 @@ def wearable_of(
         )
         raise WeightsError(msg)
     margin = DEFAULT_MARGIN if refu is None else float(refu.margin)
-    return Wearable(worn, network, refu, margin, betas, stored.card.get("knows_limbs") is True)
+    feels_arms = all(joint in template.card.joints for arm in ARMS for joint in arm[:2])  # shoulders and elbows
+    return Wearable(worn, network, refu, margin, betas, feels_arms and stored.card.get("knows_limbs") is True)

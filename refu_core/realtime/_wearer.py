@@ -31,8 +31,9 @@ class Wearable:
     """ε that the networks were trained with [m]."""
     betas: ShapeMap | None = None
     """The body's betas to those of the body that the networks were trained on; None where that is this one."""
-    knows_limbs: bool = False
-    """Whether the networks have learnt where cloth lies between limbs, of many samples in which limbs touched it."""
+    knows_arms: bool = False
+    """Whether the networks have learnt where cloth lies beside arms: they are told where those are, and in their
+    samples arms were where people have them."""
 
     def known_as(self, betas: Tensor) -> Tensor:
         """The networks' betas for those of the body, (B, 10) both."""

@@ -36,11 +36,11 @@ def beside(lower: float) -> tuple[Tensor, Tensor, Tensor]:
     return dressed.drapes[SKIRT].vertices[0], outfit().below[SKIRT](dressed.body)[0], dressed.body[0]
 
 
-def made(body: Tensor, sweeps: int = DEFAULT_CONTACT.press_sweeps, *, knows_limbs: bool = False) -> Press:
+def made(body: Tensor, sweeps: int = DEFAULT_CONTACT.press_sweeps, *, knows_arms: bool = False) -> Press:
     limbs = LimbMeshes(outfit().body)
     limbs.update(body)
     how = replace(DEFAULT_CONTACT, press_sweeps=sweeps)
-    return Press(outfit().wearables[SKIRT].template, limbs, knows_limbs=knows_limbs, settings=how)
+    return Press(outfit().wearables[SKIRT].template, limbs, knows_arms=knows_arms, settings=how)
 
 
 def distances(points: NDArray[np.float64], triangles: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -67,10 +67,10 @@ def distances(points: NDArray[np.float64], triangles: NDArray[np.float64]) -> ND
     return found
 
 
-@pytest.mark.parametrize("knows_limbs", [False, True])
-def test_is_what_a_look_from_the_skin_says(knows_limbs: bool) -> None:
+@pytest.mark.parametrize("knows_arms", [False, True])
+def test_is_what_a_look_from_the_skin_says(knows_arms: bool) -> None:
     points, skin, body = beside(1.45)
-    pressed = made(body, sweeps=0, knows_limbs=knows_limbs)(points, skin).double().numpy()
+    pressed = made(body, sweeps=0, knows_arms=knows_arms)(points, skin).double().numpy()
     x, at = points.double().numpy(), skin.double().numpy()
     parts = (joints_of("trunk", "head", "left_thigh"), *ARMS)
     of_face = part_of_faces(outfit().body.weights, outfit().body.faces, parts).numpy()
@@ -78,7 +78,7 @@ def test_is_what_a_look_from_the_skin_says(knows_limbs: bool) -> None:
     to_skin = np.linalg.norm(rest[:, None] - outfit().body.v_template.numpy()[None], axis=2).min(1)
     is_asked = outfit().wearables[SKIRT].template.mesh.independent() | (to_skin > DEFAULT_CONTACT.press_lies[0])
     how, moved = DEFAULT_CONTACT, np.linalg.norm(pressed - x, axis=1)
-    farthest = outfit().wearables[SKIRT].template.edge_length if knows_limbs else how.press_beside
+    farthest = outfit().wearables[SKIRT].template.edge_length if knows_arms else how.press_beside
     near = np.flatnonzero((moved > 0) | (np.arange(len(x)) % 40 == 0))
     height = np.linalg.norm(x - at, axis=1)
     arms = [body.double().numpy()[outfit().body.faces.numpy()[of_face == arm]] for arm in (1, 2)]

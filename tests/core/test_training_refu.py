@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from refu_core import load_body, load_garment
 from refu_core.backbones import MlpConfig, Prediction, WithoutWearerCode, backbone_from_weights
-from refu_core.body import Collider, SmplBody
+from refu_core.body import ARMS, Collider, SmplBody
 from refu_core.contact import Blend
 from refu_core.errors import RefuError, WeightsError
 from refu_core.garments import GarmentTemplate, SkinBelow
@@ -278,14 +278,17 @@ def test_says_what_it_knows(tmp_path: Path, dataset: Path, pretrained: Path) -> 
         finetune(GARMENT, dataset, pretrained, tmp_path, settings=QUICK)
 
 
-def test_weights_say_whether_limbs_were_beside_the_cloth(pretrained: Path) -> None:
-    """Sets of old held limbs back; what was trained on those doesn't know where cloth lies between limbs."""
+def test_networks_know_arms_that_they_are_told_of_and_that_were_beside_the_cloth(pretrained: Path) -> None:
+    """Sets of old held limbs back, and shorts' networks aren't told where arms are."""
     stored, template = load_weights(pretrained / "mlp-none"), load_garment(GARMENT)
-    for said, knows in ((True, True), (False, False), (None, False), ("yes", False)):
-        card = {**stored.card, "knows_limbs": said}
-        assert wearable_of(replace(stored, card=card), template, None).knows_limbs is knows
-    card = {key: value for key, value in stored.card.items() if key != "knows_limbs"}
-    assert not wearable_of(replace(stored, card=card), template, None).knows_limbs
+    arms = tuple(joint for arm in ARMS for joint in arm[:2])
+    for joints, told in ((template.card.joints, False), ((0, *arms), True), ((0, *arms[:-1]), False)):
+        garment = replace(template, card=replace(template.card, joints=joints))
+        for said, knows in ((True, told), (False, False), (None, False), ("yes", False)):
+            card = {**stored.card, "knows_limbs": said}
+            assert wearable_of(replace(stored, card=card), garment, None).knows_arms is knows
+        card = {key: value for key, value in stored.card.items() if key != "knows_limbs"}
+        assert not wearable_of(replace(stored, card=card), garment, None).knows_arms
 
 
 def test_a_set_says_whether_limbs_were_beside_the_cloth(dataset: Path) -> None:
