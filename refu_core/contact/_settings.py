@@ -32,7 +32,8 @@ class ContactSettings:
     tent_share: float = 0.75
     """What share of its way out from before a shin cloth goes: folds keep their order, and the gradient leads backwards
     from where it ends. With half the way the skirt jumps by more than 40 mm in 2.0 % of recorded frame pairs (0.8), and
-    with all of it a fifth more of its triangles cut each other."""
+    with all of it a fifth more of its triangles cut each other. On recorded motion the present skirt hardly needs it;
+    of 160 poses with raised heels, without it 9 % aren't free of collisions and 4 % jump by more than 40 mm (none)."""
 
     # Other limbs beside loose cloth
     own_weight: float = 0.02
