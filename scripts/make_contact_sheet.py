@@ -25,7 +25,7 @@ def main() -> None:
     arguments = parser.parse_args()
     for directory in arguments.sets:
         dataset = GarmentDataset(directory)
-        path = arguments.output / f"dataset-{dataset.card['garment']}.png"
+        path = arguments.output / f"dataset-{'-over-'.join(reversed(dataset.parts))}.png"
         sheet = Image.fromarray(contact_sheet(dataset, seed=arguments.seed))
         sheet.quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)
         print(path)
