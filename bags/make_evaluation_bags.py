@@ -5,8 +5,8 @@
     python bags/make_evaluation_bags.py data/outfit                              # eval_<outer>_over_<inner>
 
 A bag carries SMPL parameters with the style on /smpl_params and the simulated garments on /ground_truth, so
-`refu replay BAG --garments GARMENT ...` says how far (MPVE) a prediction is off. A garment is a marker of points: its
-triangles would take more than three times the room.
+`refu replay BAG --garments GARMENT,GARMENT` says how far (MPVE) a prediction is off. A garment is a marker of points:
+its triangles would take more than three times the room.
 """
 
 from __future__ import annotations

@@ -19,8 +19,8 @@ def main() -> None:
     clearance, contacts, sigma = Clearance.of(pipeline), LimbContacts.of(pipeline), Sigma(pipeline)  # once
 
     pose = np.zeros((24, 3))
-    pose[1, 0] = pose[2, 0] = -1.7  # a deep squat
-    pose[4, 0] = pose[5, 0] = 1.9
+    pose[1, 0] = pose[2, 0] = -2.0  # a deep squat
+    pose[4, 0] = pose[5, 0] = 2.2
     frame = SmplFrame(pose=pose, transl=[0.0, 0.7, 0.0])
     out = pipeline(frame)
     worn = out[garment.name]

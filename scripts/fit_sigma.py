@@ -17,18 +17,7 @@ import numpy as np
 
 from refu_core import RefuError
 from refu_core.outputs import fit_sigma, save_sigma
-from refu_lab.held_out import HeldOut, coverage, held_out
-
-
-def cross_checked(samples: HeldOut) -> float:
-    """Share of the true vertices that are within the 90 % interval, of samples that it wasn't fitted to."""
-    shares: list[float] = []
-    for pair in np.unique(samples.pairs):
-        is_out = samples.pairs == pair
-        found = fit_sigma(samples.garment, samples.errors[~is_out], samples.poses[~is_out])
-        out = HeldOut(samples.garment, samples.errors[is_out], samples.poses[is_out], samples.pairs[is_out])
-        shares += [coverage(found, out)] * int(is_out.sum())
-    return float(np.mean(shares))
+from refu_lab.held_out import cross_checked, held_out
 
 
 def main() -> None:

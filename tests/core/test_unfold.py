@@ -133,5 +133,5 @@ def test_shorts_in_a_squat_run_through_themselves_less_and_the_shirt_is_clear_of
             checker.update(person.garments[SHORTS].vertices)
             own[-1] += len(checker.with_itself())
             between += len(checker.with_other(person.garments[SHIRT].vertices.numpy(), faces[SHIRT]))
-    assert own[1] < 0.7 * own[0]
+    assert own[1] < 0.8 * own[0]
     assert between == 0, "of the last, with what has folded over levelled"
