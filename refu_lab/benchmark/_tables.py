@@ -9,7 +9,7 @@ from refu_lab.benchmark._rows import BenchmarkResult, BenchmarkRow
 from refu_lab.reproduction import published_modes
 from refu_lab.tables import TextTable, picture_markdown, write_json, write_page
 
-STAGES = ("decode", "body", "backbone", "sdf", "refu", "encode")
+STAGES = ("decode", "body", "collider", "backbone", "sdf", "refu", "encode")
 _MODES = ("hybrid", "accurate")
 
 
