@@ -35,7 +35,7 @@ from refu_core.body import Collider, load_body
 from refu_core.garments import load_garment
 from refu_core.simulation import colliders
 from refu_core.simulation._drape import comfort_poses
-from refu_core.simulation._outfit import Outfit
+from refu_core.simulation._joined import JoinedGarments
 
 F64 = NDArray[np.float64]
 MOST_EASE = 1.15
@@ -78,7 +78,7 @@ class Judge:
     """Judges garments of one kind, or of several worn together, on one body."""
 
     def __init__(self, garment: str, body: str, gap: float, most_stretch: float) -> None:
-        self._garment = Outfit([load_garment(name) for name in garment.split("+")]).joined
+        self._garment = JoinedGarments([load_garment(name) for name in garment.split("+")]).joined
         self._body = load_body(body)
         self._collider = Collider(self._body, gap=gap)
         self._faces = self._garment.faces.numpy().astype(np.int64)

@@ -80,8 +80,8 @@ class SimulatedCloth:
         topology: ClothTopology,
         sdf: ExactSdf,
         *,
+        piece: NDArray[np.intp],
         settings: ClothSettings | None = None,
-        piece: NDArray[np.intp] | None = None,
     ) -> None:
         """A garment of this topology against the body behind `sdf`.
 
@@ -114,9 +114,8 @@ class SimulatedCloth:
 
     def _dress(self, rest: F32) -> None:
         n = self.topology.n_vertices
-        self._rest = self._told_apart = rest
-        if self._piece is not None:
-            self._told_apart = rest + np.float32(_APART) * self._piece[:, None].astype(np.float32)
+        self._rest = rest
+        self._told_apart: F32 = rest + np.float32(_APART) * self._piece[:, None].astype(np.float32)
         self._skin = _Skin(n)
         self._middles = _Skin(len(self.topology.mesh.edges))
         self._searched_at: F32 = np.full((n, 3), 1e6, np.float32)  # far away: nothing that was found holds

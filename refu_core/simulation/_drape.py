@@ -21,8 +21,8 @@ from refu_core.garments import N_STYLES, GarmentTemplate
 from refu_core.realtime._turn import RootTurn
 from refu_core.sdf import ExactSdf
 from refu_core.simulation._cloth import F32, ClothSettings, SimulatedCloth
+from refu_core.simulation._joined import JoinedGarments
 from refu_core.simulation._mesh import ClothTopology
-from refu_core.simulation._outfit import Outfit
 
 GRAVITY = 9.81
 """[m/s²], along -y of the world."""
@@ -126,13 +126,13 @@ class Draper:
     """Drapes one garment on one body; keeps the canonical drape of the last shape and style."""
 
     def __init__(
-        self, garment: GarmentTemplate | Outfit, body: SmplBody, *, settings: DrapeSettings | None = None
+        self, garment: GarmentTemplate | JoinedGarments, body: SmplBody, *, settings: DrapeSettings | None = None
     ) -> None:
         """Prepares for `garment`, or several that are worn together, on `body`, all on the CPU.
 
         Raises `MeshError` when the body isn't watertight or a garment's mesh isn't one of edges of one or two faces.
         """
-        self.outfit = garment if isinstance(garment, Outfit) else Outfit([garment])
+        self.outfit = garment if isinstance(garment, JoinedGarments) else JoinedGarments([garment])
         self.garment = garment = self.outfit.joined
         self.body = body
         self.settings = settings or DrapeSettings()
@@ -142,20 +142,21 @@ class Draper:
         sdf = ExactSdf(body.faces, rebuild_distance=math.inf)
         self._sdf = sdf
         self._collider = Collider(body, gap=self.settings.gap)
-        piece = self.outfit.number_of_vertex if len(self.outfit.garments) > 1 else None
-        self.cloth = SimulatedCloth(self.topology, sdf, settings=self.settings.cloth, piece=piece)
+        self.cloth = SimulatedCloth(
+            self.topology, sdf, piece=self.outfit.number_of_vertex, settings=self.settings.cloth
+        )
         self.waist = self._waists()
         self._comfort = comfort_poses()
         self._canonical: tuple[bytes, F32, F32, float] | None = None
 
     def _waists(self) -> NDArray[np.intp] | None:
         """Vertices of the bands that hold garments at the waist; None where all hang from the shoulders."""
-        vertices = self.garment.v_template.numpy()
+        vertices, loops = self.garment.v_template.numpy(), self.topology.boundary_loops()
         found = []
         for garment in self.outfit.garments:
             if garment.card.held_at_waist:
                 part = self.outfit.parts[garment.name]
-                rims = [rim for rim in self.topology.boundary_loops() if part.start <= rim[0] < part.stop]
+                rims = [rim for rim in loops if part.start <= rim[0] < part.stop]
                 loop = max(rims, key=lambda rim: float(vertices[rim, 1].mean()))
                 found.append(np.flatnonzero(self.topology.distance_from(vertices, loop) < self.settings.waistband))
         return np.concatenate(found) if found else None

@@ -29,8 +29,8 @@ def garments_of(garment: str | Sequence[str]) -> list[str]:
 
 
 def names_of(garment: str | Sequence[str]) -> str:
-    """Their names, however their files are called, in one text whatever their order."""
-    return "+".join(sorted(garment_name(one) for one in garments_of(garment)))
+    """Their names, however their files are called, in one text whatever their order; a set's card has such a text."""
+    return "+".join(sorted(name for one in garments_of(garment) for name in garment_name(one).split("+")))
 
 
 def truncated_normal(u: NDArray[np.float64], spread: float) -> NDArray[np.float32]:

@@ -25,7 +25,6 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
-from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +34,7 @@ from numpy.typing import NDArray
 from refu_core._files import open_file, read_json, replacing
 from refu_core._npz import DAMAGE, check_npy
 from refu_core.errors import SimulationError
+from refu_core.simulation._joined import slices_of
 from refu_core.simulation._selection import CAUSES
 
 FORMAT = "refu-garments-2"
@@ -259,8 +259,7 @@ def parts_of(path: Path, card: dict[str, Any], n_vertices: int) -> dict[str, sli
         msg = f"{path}: wanted a card whose parts are the {n_vertices} vertices of {garment[:80]} by garment, "
         msg += f"got {str(parts)[:80]}"
         raise SimulationError(msg)
-    ends = list(accumulate(parts.values()))
-    return {name: slice(end - count, end) for (name, count), end in zip(parts.items(), ends, strict=True)}
+    return slices_of(parts)
 
 
 def gather(shards: Sequence[Shard], where: NDArray[np.intp], row: NDArray[np.intp], name: str) -> NDArray[Any]:

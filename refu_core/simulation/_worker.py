@@ -13,7 +13,7 @@ import numpy as np
 from refu_core.body import load_body, load_fit
 from refu_core.garments import load_garment, worn_on
 from refu_core.simulation._drape import Draper, DrapeSettings, SettledDrape
-from refu_core.simulation._outfit import Outfit
+from refu_core.simulation._joined import JoinedGarments
 from refu_core.simulation._plan import TEST, SamplePlan, garments_of
 from refu_core.simulation._poses import Clip
 from refu_core.simulation._selection import CAUSES, SelectionSettings, Selector
@@ -56,7 +56,7 @@ class Simulator(ABC):
         self.settings = settings
         self.clips = clips
         own = None if body is None else load_fit(body)
-        outfit = Outfit([worn_on(load_garment(garment), own) for garment in garments_of(plan.garment)])
+        outfit = JoinedGarments([worn_on(load_garment(garment), own) for garment in garments_of(plan.garment)])
         self.garment, self.parts = outfit.joined, outfit.parts
         self.body = load_body(self.garment.body) if own is None else own.body
         self._draper = Draper(outfit, self.body, settings=settings.drape)

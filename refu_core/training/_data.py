@@ -200,10 +200,11 @@ def check_dataset(dataset: GarmentDataset | GarmentSequences, body: SmplBody, ga
     Raises:
         RefuError: it wasn't.
     """
-    got, fingerprint = dataset.card.get("garment"), dataset.card.get("body_fingerprint")
-    differs = "" if garment.name in dataset.parts else f"garment is {garment.name}, got {got}"
-    if not differs and fingerprint != body.fingerprint:
-        differs = f"body_fingerprint is {body.fingerprint}, got {fingerprint}"
-    if differs:
-        msg = f"wanted a set whose {differs}: simulate one with `refu simulate {garment.name}`"
-        raise RefuError(msg)
+    for what, wanted, of_set in (
+        ("garment", garment.name, dataset.parts),
+        ("body_fingerprint", body.fingerprint, [dataset.card.get("body_fingerprint")]),
+    ):
+        if wanted not in of_set:
+            got = dataset.card.get(what)
+            msg = f"wanted a set whose {what} is {wanted}, got {got}: simulate one with `refu simulate {garment.name}`"
+            raise RefuError(msg)

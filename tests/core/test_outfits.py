@@ -17,7 +17,7 @@ from refu_core.garments import load_garment
 from refu_core.metrics import CollisionChecker, SheetChecker
 from refu_core.sdf import ExactSdf
 from refu_core.simulation import GarmentDataset, SimulationError, colliders, simulate_dataset
-from refu_core.simulation._outfit import Outfit
+from refu_core.simulation._joined import JoinedGarments
 from refu_core.simulation._plan import names_of
 from refu_core.simulation._store import read_card, write_card
 from refu_core.training._data import TrainingSet
@@ -39,8 +39,8 @@ def dataset(simulated: Path) -> GarmentDataset:
 
 
 @pytest.fixture(scope="module")
-def outfit() -> Outfit:
-    return Outfit([load_garment(name) for name in NAMES])
+def outfit() -> JoinedGarments:
+    return JoinedGarments([load_garment(name) for name in NAMES])
 
 
 def test_layers_never_cross(dataset: GarmentDataset) -> None:
@@ -68,7 +68,7 @@ def test_layers_never_cross(dataset: GarmentDataset) -> None:
         assert np.median(heights[0]) > np.median(heights[1]) + 0.002
 
 
-def test_start_is_over_what_is_below_and_moves_nothing_else(outfit: Outfit) -> None:
+def test_start_is_over_what_is_below_and_moves_nothing_else(outfit: JoinedGarments) -> None:
     body = load_body("male")
     skin = body.rest_vertices(torch.zeros(1, 10))[0]
     sdf = ExactSdf(body.faces)
@@ -89,21 +89,22 @@ def test_start_is_over_what_is_below_and_moves_nothing_else(outfit: Outfit) -> N
 
 def test_one_garment_is_its_own_outfit() -> None:
     garment = load_garment("tshirt-male")
-    assert Outfit([garment]).joined is garment
-    assert Outfit([garment]).parts == {"tshirt-male": slice(0, garment.n_vertices)}
+    assert JoinedGarments([garment]).joined is garment
+    assert JoinedGarments([garment]).parts == {"tshirt-male": slice(0, garment.n_vertices)}
 
 
-def test_an_outfit_depends_on_no_order(outfit: Outfit) -> None:
-    other = Outfit([load_garment(name) for name in reversed(NAMES)])
+def test_an_outfit_depends_on_no_order(outfit: JoinedGarments) -> None:
+    other = JoinedGarments([load_garment(name) for name in reversed(NAMES)])
     assert other.joined.name == outfit.joined.name == JOINED
     torch.testing.assert_close(other.joined.v_template, outfit.joined.v_template, rtol=0, atol=0)
     assert names_of(NAMES) == names_of(NAMES[::-1]) == JOINED
     assert names_of("here/garment_kilt.npz") == "kilt"
+    assert names_of("trousers-male+shirt-male") == names_of(["shirt-male", "trousers-male"]), "as a card has it"
 
 
-def test_a_garment_without_styles_joins_in(outfit: Outfit) -> None:
+def test_a_garment_without_styles_joins_in(outfit: JoinedGarments) -> None:
     plain = replace(load_garment("short-pant-male"), styledirs=None)
-    joined = Outfit([plain, load_garment("tshirt-male")]).joined
+    joined = JoinedGarments([plain, load_garment("tshirt-male")]).joined
     style, betas = torch.ones(1, 4), torch.zeros(1, 10)
     part = outfit.parts["short-pant-male"]
     torch.testing.assert_close(joined.rest(betas, style)[:, part], plain.rest(betas))
@@ -113,7 +114,7 @@ def test_a_garment_without_styles_joins_in(outfit: Outfit) -> None:
 @pytest.mark.parametrize("names", [(), ("tshirt-male", "tshirt-male"), ("tshirt-male", "skirt-female")])
 def test_what_makes_no_outfit_is_refused(names: tuple[str, ...]) -> None:
     with pytest.raises(SimulationError, match="wanted different garments of one body, got"):
-        Outfit([load_garment(name) for name in names])
+        JoinedGarments([load_garment(name) for name in names])
 
 
 def test_one_garment_of_the_set_is_trained_on(dataset: GarmentDataset) -> None:

@@ -11,6 +11,7 @@ import signal
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -180,13 +181,12 @@ def test_a_number_of_threads_that_is_none_is_refused(threads: object) -> None:
 def test_a_batch_is_shared_out_among_threads(pipeline: GarmentPipeline, n: int) -> None:
     shared = GarmentPipeline.load(_GARMENTS, threads=3)
     frames = _frames(n, seed=n)
-    for out, alone in zip(shared(frames), pipeline(frames), strict=True):
+    # A batch of another size rounds otherwise, and deep in a limb that decides between two ways out: the same parts.
+    ends = [n * i // min(n, 3) for i in range(min(n, 3) + 1)]
+    parts = [out for start, end in pairwise(ends) for out in pipeline(frames[start:end])]
+    for out, alone in zip(shared(frames), parts, strict=True):
         assert np.abs(out.body - alone.body).max() < 1e-5
-        for name, mesh in out.items():
-            off = np.abs(mesh.local - alone[name].local).max(1)
-            # A batch of another size rounds otherwise, and deep in a limb that decides between two ways out.
-            assert np.median(off) < 1e-5
-            assert off.max() < 0.025
+        assert all(np.abs(mesh.local - alone[name].local).max() < 1e-3 for name, mesh in out.items())
     assert len({id(step) for step in _all_steps(shared)}) == 3, "all have come back"
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import accumulate
 
 import numpy as np
 import torch
@@ -22,10 +23,16 @@ _BESIDE = 0.025
 """How far around a vertex what is below it counts [m]: two of a garment's edges."""
 
 
-class Outfit:
+def slices_of(counts: Mapping[str, int]) -> dict[str, slice]:
+    """Which of the vertices of garments that follow each other are each garment's, by their numbers of vertices."""
+    ends = accumulate(counts.values())
+    return {name: slice(end - count, end) for (name, count), end in zip(counts.items(), ends, strict=True)}
+
+
+class JoinedGarments:
     """Garments worn together, as the one that a cloth is made of: it lies on the skin and on itself, like any cloth.
 
-    An outfit of one garment is that garment.
+    One garment alone is itself.
     """
 
     def __init__(self, garments: Sequence[GarmentTemplate]) -> None:
@@ -40,13 +47,9 @@ class Outfit:
             raise SimulationError(msg)
         self.garments = tuple(by_name[name] for name in inner_first(by_name))
         """From the skin outwards."""
-        ends = np.cumsum([0, *(garment.n_vertices for garment in self.garments)]).tolist()
-        self.parts = {
-            garment.name: slice(first, last)
-            for garment, first, last in zip(self.garments, ends[:-1], ends[1:], strict=True)
-        }
+        self.parts = slices_of({garment.name: garment.n_vertices for garment in self.garments})
         """Which of the joined garment's vertices are each garment's."""
-        self.joined = _joined(self.garments, ends)
+        self.joined = _joined(self.garments, self.parts)
         """All of it as one template; its name has all names in it, its card is that of the outermost."""
 
     @property
@@ -80,18 +83,17 @@ def _over_skin(sdf: ExactSdf, body: F32, points: F32) -> tuple[F32, F32]:
     return height, normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
 
-def _joined(garments: tuple[GarmentTemplate, ...], starts: list[int]) -> GarmentTemplate:
+def _joined(garments: tuple[GarmentTemplate, ...], parts: Mapping[str, slice]) -> GarmentTemplate:
     if len(garments) == 1:
         return garments[0]
-    no_style = [garment.shapedirs.new_zeros(3 * garment.n_vertices, N_STYLES) for garment in garments]
     styledirs = [
-        none if garment.styledirs is None else garment.styledirs
-        for garment, none in zip(garments, no_style, strict=True)
+        torch.zeros_like(garment.shapedirs[:, :N_STYLES]) if garment.styledirs is None else garment.styledirs
+        for garment in garments
     ]
     return replace(
         garments[-1],
         name="+".join(garment.name for garment in garments),
-        faces=torch.cat([garment.faces + start for garment, start in zip(garments, starts, strict=False)]),
+        faces=torch.cat([garment.faces + parts[garment.name].start for garment in garments]),
         weights=torch.cat([garment.weights for garment in garments]),
         v_template=torch.cat([garment.v_template for garment in garments]),
         shapedirs=torch.cat([garment.shapedirs for garment in garments]),
