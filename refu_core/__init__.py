@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from refu_core.body import SmplBody, load_body
     from refu_core.contact import Resolver
     from refu_core.garments import GarmentTemplate, load_garment
+    from refu_core.history import PoseHistory
     from refu_core.realtime import GarmentPipeline, PipelineOutput, Wearer, dress
     from refu_core.refu import Refu
     from refu_core.sdf import ApproxSdf, BandSdf, BodySdf, ExactSdf, SdfSample
@@ -40,6 +41,7 @@ __all__ = [
     "GarmentTemplate",
     "MeshError",
     "PipelineOutput",
+    "PoseHistory",
     "Refu",
     "RefuError",
     "Resolver",
@@ -62,6 +64,7 @@ _LAZY = {
     "GarmentPipeline": "realtime",
     "GarmentTemplate": "garments",
     "PipelineOutput": "realtime",
+    "PoseHistory": "history",
     "Refu": "refu",
     "Resolver": "contact",
     "SdfSample": "sdf",

@@ -14,6 +14,11 @@ from refu_core.errors import FrameError
 N_JOINTS = 24
 N_BETAS = 10
 N_STYLES = 4
+LAGS = (1 / 15, 2 / 15, 4 / 15, 8 / 15)
+"""How long ago what `SmplFrame.past` tells of was [s]: cloth comes to rest within half a second, and what was last
+counts most."""
+N_PAST = 9 * N_JOINTS + 3
+"""Numbers a lag: of each joint's rotation, and of the root's place."""
 # Limits of two levels. A frame holds whatever can be computed with: a study may go beyond all bodies. A stream of
 # messages has no such wish, so a node refuses (`msg_adapters.check_plausible`) what is beyond the plausible: no
 # sender means it.
@@ -81,6 +86,8 @@ class SmplFrame:
     """Garment style γ in standard deviations, shape (4,); None for the wearer's usual one."""
     stamp_ns: int = 0
     """Time of the measurement [ns since the epoch of the sender's clock]."""
+    past: NDArray[np.float32] | None = None
+    """How the person moved until now, as `PoseHistory` says it, shape (4, 219): see there; None for not at all."""
 
     def __post_init__(self) -> None:
         # A frozen dataclass is normalised through object.__setattr__, once, here.
@@ -91,6 +98,9 @@ class SmplFrame:
             object.__setattr__(
                 self, "style", checked_numbers("style", self.style, (N_STYLES,), np.float32, MAX_COEFFICIENT)
             )
+        if self.past is not None:
+            past = checked_numbers("past", self.past, (len(LAGS), N_PAST), np.float32, MAX_COEFFICIENT)
+            object.__setattr__(self, "past", past)
         try:
             object.__setattr__(self, "stamp_ns", int(self.stamp_ns))
         except (TypeError, ValueError, OverflowError) as error:

@@ -67,10 +67,12 @@ class BackboneName(Choice):
     """What predicts a garment."""
 
     AUTO = "auto"
-    """`tailornet` for a garment whose weights of it ship, `skinned` for one that has none yet."""
+    """The best that there is for a garment: `dynamic`, `tailornet`, or `skinned` for one without weights that ship."""
     SKINNED = "skinned"
     """No network: the template follows the skin."""
     TAILORNET = "tailornet"
+    DYNAMIC = "dynamic"
+    """The same, and what cloth owes to how a person has moved in the last half second."""
     MLP = "mlp"
     GCNN = "gcnn"
 

@@ -160,11 +160,14 @@ class PipelineOptions:
             folder = weights_folder(_template(name).name, self.weights or None)
             if is_auto and not self.weights and not folder.exists():
                 continue  # it is worn by skinning
-            path = folder / f"{BackboneName.TAILORNET if is_auto else self.backbone}-{self.sdf}.safetensors"
-            if not path.is_file():
-                msg = f"no weights of {path.stem.replace('-', ' ')} for {name}: {path} is missing; "
-                msg += "train them (refu train)"
-                raise SettingsError(msg)
+            is_dynamic = self.backbone == BackboneName.DYNAMIC
+            kind = BackboneName.TAILORNET if is_auto or is_dynamic else self.backbone
+            for stem in (f"{kind}-{self.sdf}", *(["dynamics"] if is_dynamic else [])):
+                path = folder / f"{stem}.safetensors"
+                if not path.is_file():
+                    msg = f"no weights of {stem.replace('-', ' ')} for {name}: {path} is missing; "
+                    msg += "train them (refu train)"
+                    raise SettingsError(msg)
 
     def load(self, **more: Any) -> GarmentPipeline:
         """The pipeline; `more` are other arguments of `GarmentPipeline.load`. Raises `RefuError` as that does."""

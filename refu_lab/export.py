@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from refu_core.errors import RefuError
+from refu_core.history import PoseHistory
 from refu_lab.render import SKIN
 
 if TYPE_CHECKING:
@@ -112,6 +113,7 @@ def export(
     load = cache(options.load_pipeline)
     source = open_source(options, lambda: load().body)
     pipeline = load()
+    source.history = PoseHistory() if pipeline.heeds_past else None
     frames, outputs, left_out = [], [], list[str]()
     for number, record in enumerate(islice(source.records, first, first + count), first):
         with _left_out(number, left_out):

@@ -21,6 +21,7 @@ import msg_adapters as adapters
 from msg_adapters import FrameRecord
 from refu_core import GarmentPipeline, RefuError, SmplFrame
 from refu_core._device import one_thread
+from refu_core.history import PoseHistory
 from refu_core.metrics import CollisionChecker, Figures, GarmentMetrics
 from refu_core.modes import BackboneName
 from refu_core.realtime import PipelineOutput, SkinShift
@@ -190,6 +191,7 @@ class _Replayer:
         self._options = options
         self._pipeline = pipeline
         self._source = source
+        source.history = PoseHistory() if pipeline.heeds_past else None
         self._result = result
         faces = {name: garment.faces.cpu().numpy() for name, garment in pipeline.garments.items()}
         self._evaluator: Evaluator | None = None

@@ -9,6 +9,7 @@ import numpy as np
 
 import msg_adapters as adapters
 from refu_core import FrameError, RefuError
+from refu_core.history import PoseHistory
 from refu_core.keypoints import Proportions
 from refu_core.modes import FOREIGN_BETAS, ONE_STYLE, BetasSource
 from refu_core.recordings import SUFFIXES
@@ -44,6 +45,8 @@ class Source:
     gender: str = "neutral"
     """Whose motion it is, where the file says it."""
 
+    history: PoseHistory | None = None
+    """Tells frames their past, for garments that heed it (`GarmentPipeline.heeds_past`)."""
     has_betas: bool = False
     """Whether there were shapes, and a style, in its frames."""
     has_style: bool = False
@@ -55,6 +58,8 @@ class Source:
         frame = replace(self.decode(record.raw), stamp_ns=record.stamp_ns)
         self.has_betas = self.has_betas or bool(frame.betas.any())
         self.has_style = self.has_style or frame.style is not None
+        if self.history is not None:
+            frame = self.history(frame)
         betas = self.options.known_betas
         return frame if betas is None else replace(frame, betas=np.asarray(betas, np.float32))
 

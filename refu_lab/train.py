@@ -17,12 +17,14 @@ from refu_core.sdf import SDF_PRESETS
 from refu_core.simulation import GarmentDataset, open_dataset
 from refu_core.training import (
     CarrySettings,
+    DynamicsSettings,
     FinetuneSettings,
     PretrainSettings,
     SdfSettings,
     carry_over,
     finetune,
     pretrain,
+    train_dynamics,
     train_sdf,
 )
 from refu_lab.commands.train import TrainOptions
@@ -47,6 +49,16 @@ def train(options: TrainOptions, *, progress: bool) -> dict[str, Any]:
             GarmentDataset(options.data), body, template, options.folder, settings=_sdf_training(options), **common
         )
     dataset = open_dataset(options.data)
+    if options.network == "dynamics":
+        return train_dynamics(
+            template,
+            dataset,
+            options.folder,
+            mode=options.mode,
+            settings=_dynamics_training(options),
+            body=body,
+            **common,
+        )
     if options.like is not None:
         few = _carrying(options)
         return carry_over(
@@ -87,6 +99,12 @@ def _check(options: TrainOptions) -> None:
 
 def _sdf_training(options: TrainOptions) -> SdfSettings:
     settings = replace(SdfSettings.of(options.preset), seed=options.seed)
+    return settings if options.steps is None else replace(settings, steps=options.steps)
+
+
+def _dynamics_training(options: TrainOptions) -> DynamicsSettings:
+    settings = DynamicsSettings()
+    settings = replace(settings, loop=replace(settings.loop, seed=options.seed))
     return settings if options.steps is None else replace(settings, steps=options.steps)
 
 

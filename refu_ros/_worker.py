@@ -18,6 +18,7 @@ from msg_adapters.scene import Arrival, Scene
 from msg_adapters.statistics import Statistics
 from refu_core import GarmentPipeline, RefuError, SmplFrame
 from refu_core._device import is_device_loss
+from refu_core.history import PoseHistory
 from refu_core.outputs import Dressed, Fittings
 from refu_core.realtime import PipelineOutput
 from refu_ros._settings import NodeSettings
@@ -72,7 +73,8 @@ class _Job:
     def inputs(self, frame: SmplFrame) -> tuple[object, ...]:
         """All that a garment relative to the root depends on."""
         style = b"" if frame.style is None else frame.style.tobytes()
-        return self.pipeline, self.settings.margin, frame.pose.tobytes() + frame.betas.tobytes() + style
+        past = b"" if frame.past is None else frame.past.tobytes()
+        return self.pipeline, self.settings.margin, frame.pose.tobytes() + frame.betas.tobytes() + style, past
 
 
 class Worker:
@@ -98,6 +100,7 @@ class Worker:
         self._outlet = outlet
         self._next = self._fitted(pipeline)
         self._dressed: dict[str, _Known] = {}
+        self._history = PoseHistory()
         self._outputs = make_outputs(tf=settings.publish_tf)  # they remember what was worn
         self._pipeline, self._sent_with = self._next
         self._here: set[str] = set()
@@ -184,11 +187,15 @@ class Worker:
         gone = self._scene.leave(settings.person_timeout)
         near = self._near(arrivals, settings)
         gone += [person for person in arrivals if person not in near]
+        for person in gone:
+            self._history.forget(person)
         if near and not self._outlet.is_watched():
             for _ in near:
                 self._statistics.count("skip.unwatched")
             near = {}
         frames = {person: settings.applied(arrival.frame) for person, arrival in near.items()}
+        if pipeline.heeds_past:
+            frames = {person: self._history(frame, person) for person, frame in frames.items()}
         known: dict[str, _Known] = {}
         job = _Job(self._n_taken, settings, pipeline, fittings, near, frames, known, gone)
         for person, frame in frames.items():

@@ -9,6 +9,7 @@ import tempfile
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -391,6 +392,21 @@ def test_unchanged_frames_cost_no_inference_but_move(pipeline: GarmentPipeline) 
     (first,), (second,) = setup.viewer.messages
     assert (second.stamp_ns, setup.total("skip.unchanged")) == (2, 1)
     np.testing.assert_allclose(second.points, first.points + np.array([0.0, 1.0, 0.0]), atol=1e-12)
+
+
+def test_cloth_comes_to_rest_after_the_pose_has() -> None:
+    skirt, still = (GarmentPipeline.load(["skirt-female"], backbone=name) for name in ("auto", "tailornet"))
+    setup, at_rest = (Setup(one, garments=["skirt-female"]) for one in (skirt, still))
+    angles = [*np.linspace(0, 0.6, 8), *[0.6] * 20]  # a leg is lifted in a quarter of a second, and held
+    for i, angle in enumerate(angles):
+        setup.tick(ann=frame(angle, stamp_ns=1 + i * 10**9 // 30))
+    points = [markers[0].points for markers in setup.viewer.messages]
+    assert len(points) == len(angles)
+    assert 1 <= setup.total("skip.unchanged") <= 3  # after 16 frames nothing of the past is left
+    moved = [np.linalg.norm(after - before, axis=1).max() for before, after in pairwise(points)]
+    assert moved[8] > 1e-3  # the pose was the same
+    at_rest.tick(ann=frame(0.6))
+    np.testing.assert_allclose(points[-1], at_rest.viewer.messages[0][0].points, atol=1e-5)
 
 
 def test_nothing_is_done_for_nobody(pipeline: GarmentPipeline) -> None:

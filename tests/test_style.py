@@ -20,7 +20,7 @@ PACKAGES = ("refu_core", "msg_adapters", "refu_ros", "refu_lab")
 CORE = (
     {"errors"},
     {"_engine", "_files", "_npz", "_cache", "_device", "_kernel_cache", "_warp", "frames", "modes", "mesh", "weights"},
-    {"skeleton", "_pickle_machine"},
+    {"skeleton", "_pickle_machine", "history"},
     {"_torch_stream", "keypoints"},
     {"_pickle"},
     {"recordings"},

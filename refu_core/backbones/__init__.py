@@ -4,6 +4,9 @@ from refu_core.backbones._controls import Controls as Controls
 from refu_core.backbones._decoder import BasisDecoder as BasisDecoder
 from refu_core.backbones._decoder import Decoder as Decoder
 from refu_core.backbones._decoder import DenseDecoder as DenseDecoder
+from refu_core.backbones._dynamics import Dynamic as Dynamic
+from refu_core.backbones._dynamics import Dynamics as Dynamics
+from refu_core.backbones._dynamics import DynamicsConfig as DynamicsConfig
 from refu_core.backbones._features import ENCODINGS as ENCODINGS
 from refu_core.backbones._features import N_STYLE_SHAPE as N_STYLE_SHAPE
 from refu_core.backbones._features import PoseFeatures as PoseFeatures
@@ -16,6 +19,9 @@ from refu_core.backbones._files import load_backbone as load_backbone
 from refu_core.backbones._files import load_basis as load_basis
 from refu_core.backbones._files import save_backbone as save_backbone
 from refu_core.backbones._files import save_basis as save_basis
+from refu_core.backbones._files import save_dynamics as save_dynamics
+from refu_core.backbones._files import wants_dynamics as wants_dynamics
+from refu_core.backbones._files import with_dynamics as with_dynamics
 from refu_core.backbones._frequency import LaplacianSmoothing as LaplacianSmoothing
 from refu_core.backbones._gcnn import Gcnn as Gcnn
 from refu_core.backbones._gcnn import GcnnConfig as GcnnConfig

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +11,15 @@ import torch
 from torch import Tensor, nn
 
 from refu_core.backbones._decoder import BasisDecoder
+from refu_core.backbones._dynamics import Dynamic, Dynamics, DynamicsConfig
 from refu_core.backbones._presets import Network, backbone_name, build_backbone, config_from_card, config_to_card
 from refu_core.backbones._protocol import MAX_OFFSET, Backbone, Skinned
+from refu_core.backbones._tailornet import TailorNet
 from refu_core.errors import WeightsError
 from refu_core.frames import N_BETAS, N_JOINTS
 from refu_core.garments import GarmentTemplate, load_garment
 from refu_core.modes import BackboneName, SdfMode
-from refu_core.weights import Weights, build_for, load_weights, save_weights, weights_folder
+from refu_core.weights import Weights, build_for, config_of_card, load_weights, save_weights, weights_folder
 
 _PREFIX = "backbone."
 
@@ -118,6 +121,49 @@ def backbone_from_weights(weights: Weights, garment: GarmentTemplate, *, device:
     return module
 
 
+def save_dynamics(folder: Path, dynamics: Dynamics, card: Mapping[str, Any]) -> Path:
+    """Writes what a garment owes to motion, `folder`/dynamics, for the basis that is there.
+
+    Raises:
+        WeightsError: it isn't finite, can't be written, or there is no basis.
+    """
+    basis = load_weights(folder / "basis", expect={"garment": card["garment"]})
+    described = {"config": asdict(dynamics.config), "basis_sha256": str(basis.card["sha256"])}
+    parameters = dict(dynamics.named_parameters())
+    tensors = {k: v.half() if k in parameters else v for k, v in dynamics.state_dict().items()}
+    return save_weights(folder / "dynamics", tensors, {**described, **card})
+
+
+def wants_dynamics(name: str, weights: Weights) -> bool:
+    """Whether the backbone `name` is these weights of a tailornet with the dynamics beside them."""
+    there = weights.path.with_name("dynamics.json").exists()
+    return name == BackboneName.DYNAMIC or (name == BackboneName.AUTO and there)
+
+
+def with_dynamics(still: Backbone, weights: Weights) -> Dynamic:
+    """A TailorNet that was made of `weights`, and the dynamics beside them.
+
+    Raises:
+        WeightsError: it isn't one, or there are no dynamics, damaged ones, or some for another basis.
+    """
+    if not isinstance(still, TailorNet):
+        msg = f"{weights.path}: dynamics go with a tailornet, got {weights.card.get('backbone')}"
+        raise WeightsError(msg)
+    expect = {key: weights.card.get(key) for key in ("garment", "body_fingerprint", "basis_sha256")}
+    stored = load_weights(weights.path.with_name("dynamics"), expect=expect)
+    config = config_of_card(DynamicsConfig, stored.card.get("config"))
+    if not all(joint < N_JOINTS for joint in config.joints):
+        msg = f"{stored.path}: wanted joints below {N_JOINTS}, got {config.joints}; train it again"
+        raise WeightsError(msg)
+    try:
+        dynamics = build_for(stored.tensors, lambda: Dynamics(config, still))
+    except WeightsError as error:
+        msg = f"{stored.path}: doesn't fit {weights.path.name}: {error}"
+        raise WeightsError(msg) from error
+    dynamics = dynamics.float().to(next(still.parameters()).device)
+    return Dynamic(still, dynamics).eval().requires_grad_(False)
+
+
 def load_backbone(
     name: str,
     garment: str | GarmentTemplate,
@@ -130,7 +176,8 @@ def load_backbone(
     """The trained backbone `name` of a garment.
 
     Args:
-        name: `skinned`, `tailornet`, `mlp`, `gcnn`, or `auto`: `tailornet` where it ships, else `skinned`.
+        name: `skinned`, `tailornet`, `dynamic`, `mlp`, `gcnn`, or `auto`: `dynamic` or `tailornet` where it ships, else
+            `skinned`.
         garment: name of a garment, or a template.
         mode: what it was trained with: `none`, `approx`, `accurate` or `hybrid`.
         body_fingerprint: `SmplBody.fingerprint` of the body that wears it; weights for another body are refused.
@@ -145,7 +192,8 @@ def load_backbone(
     weights = backbone_weights(name, template.name, mode=mode, body_fingerprint=body_fingerprint, folder=folder)
     if weights is None:
         return Skinned()
-    return backbone_from_weights(weights, template, device=device).requires_grad_(False)
+    network = backbone_from_weights(weights, template, device=device).requires_grad_(False)
+    return with_dynamics(network, weights) if wants_dynamics(name, weights) else network
 
 
 def backbone_weights(
@@ -161,6 +209,8 @@ def backbone_weights(
     if kind is BackboneName.AUTO:
         if folder == shipped and not shipped.exists():  # weights that were named have to be there
             return None
+        kind = BackboneName.TAILORNET
+    if kind is BackboneName.DYNAMIC:  # which is one, and more
         kind = BackboneName.TAILORNET
     expect = {"garment": garment}
     if body_fingerprint is not None:

@@ -23,6 +23,11 @@ MAX_OFFSET = 2.0
 class Backbone(Protocol):
     """Predicts one garment."""
 
+    @property
+    def heeds_past(self) -> bool:
+        """Whether it wants to know how a person has moved (`SmplFrame.past`), too."""
+        ...
+
     def wearer_code(self, betas: Tensor, style: Tensor | None) -> Tensor | None:
         """What depends on betas (B, 10) and style (B, 4) only, shape (B, K): to be computed once a person.
 
@@ -31,9 +36,15 @@ class Backbone(Protocol):
         ...
 
     def __call__(
-        self, betas: Tensor, pose: Tensor, style: Tensor | None, *, wearer_code: Tensor | None = None
+        self,
+        betas: Tensor,
+        pose: Tensor,
+        style: Tensor | None,
+        *,
+        wearer_code: Tensor | None = None,
+        past: Tensor | None = None,
     ) -> Prediction:
-        """Predicts for betas (B, 10), pose (B, 24, 3) [rad] and style (B, 4).
+        """Predicts for betas (B, 10), pose (B, 24, 3) [rad], style (B, 4) and, for some, past (B, 4, 219).
 
         Given the `wearer_code` of (β, γ), that isn't computed again.
         """
@@ -41,7 +52,9 @@ class Backbone(Protocol):
 
 
 class WithoutWearerCode:
-    """A backbone that computes all of a frame anew."""
+    """A backbone that computes all of a frame anew, of that frame alone."""
+
+    heeds_past = False
 
     def wearer_code(self, betas: Tensor, style: Tensor | None) -> None:
         """None: there is nothing to keep."""
@@ -57,6 +70,7 @@ class Skinned(WithoutWearerCode):
         style: Tensor | None,  # noqa: ARG002
         *,
         wearer_code: Tensor | None = None,  # noqa: ARG002
+        past: Tensor | None = None,  # noqa: ARG002
     ) -> Prediction:
         """Predicts no displacement."""
         return Prediction(None, None)

@@ -47,6 +47,8 @@ class TailorNet(nn.Module):
     mean drapes G of a style and shape, which the style-shape net predicts.
     """
 
+    heeds_past = False
+
     def __init__(self, config: TailorNetConfig, garment: GarmentTemplate, decoder: Decoder, pivots: Tensor) -> None:
         """`pivots` are the (β, γ) of the pivots, shape (K, 14)."""
         super().__init__()
@@ -76,12 +78,22 @@ class TailorNet(nn.Module):
         return self.mixture(style_shape(betas, style))
 
     def forward(
-        self, betas: Tensor, pose: Tensor, style: Tensor | None, *, wearer_code: Tensor | None = None
+        self,
+        betas: Tensor,
+        pose: Tensor,
+        style: Tensor | None,
+        *,
+        wearer_code: Tensor | None = None,
+        past: Tensor | None = None,  # noqa: ARG002
     ) -> Prediction:
         """Predicts for betas (B, 10), pose (B, 24, 3) [rad], style (B, 4) and, where it is known, their code (B, K)."""
-        x, s = self.features(pose), style_shape(betas, style)
-        mixture = self.mixture(s) if wearer_code is None else wearer_code
-        return Prediction(self.decoder(self.low_code(x, s) + self.high(x, mixture)), None)
+        code = self.code(self.features(pose), style_shape(betas, style), wearer_code)
+        return Prediction(self.decoder(code), None)
+
+    def code(self, x: Tensor, s: Tensor, mixture: Tensor | None = None) -> Tensor:
+        """Code, shape (B, C), of pose features (B, I), (β, γ) (B, 14) and, where it is known, their mixture (B, K)."""
+        code: Tensor = self.low_code(x, s) + self.high(x, self.mixture(s) if mixture is None else mixture)
+        return code
 
     def low_code(self, x: Tensor, s: Tensor) -> Tensor:
         """Code of D_LF, shape (B, C), of pose features (B, I) and (β, γ) (B, 14)."""

@@ -10,7 +10,7 @@ from torch import Tensor
 from refu_core.backbones import MAX_OFFSET
 from refu_core.body import RigidTransforms
 from refu_core.errors import FrameError, require_type
-from refu_core.frames import N_JOINTS
+from refu_core.frames import LAGS, N_JOINTS, N_PAST
 from refu_core.realtime._turn import RootTurn
 from refu_core.realtime._wearer import UnposedGarment, Wearable, Wearer, require_batch
 from refu_core.refu import VertexScale
@@ -52,15 +52,18 @@ class Dressed(NamedTuple):
     """Of the bodies' joints, that skin and garments were posed with, leading shape (B, 24)."""
 
 
-def dress(pose: Tensor, wearer: Wearer, *, lap: Lap = _no_lap) -> Dressed:
+def dress(pose: Tensor, wearer: Wearer, *, past: Tensor | None = None, lap: Lap = _no_lap) -> Dressed:
     """Bodies in poses (B, 24, 3) [rad], dressed by the backbones: posed as g = T(θ, β)(t(β, γ) + D(θ, β, γ)).
 
+    A backbone that heeds the past takes it from `past` (B, 4, 219), which `PoseHistory` explains, rest if not given.
     Where a collider pulls the skin apart, the cloth that lies on it goes along (`SkinBelow`).
     Pipeline, CUDA graph, training, evaluation and benchmark all call this. It is a pure function of tensors and
     differentiable: nothing is remembered, and no device is waited for. `lap` is called at the end of each stage.
     """
     require_type(wearer, Wearer, "a Wearer, such as Wearer.of(outfit, betas) gives", error=FrameError)
     require_batch("pose", pose, (N_JOINTS, 3), wearer.outfit, sizes=(len(wearer.betas),))
+    if past is not None:
+        require_batch("past", past, (len(LAGS), N_PAST), wearer.outfit, sizes=(len(pose),))
     turns, at_root = RootTurn.taken_off(pose, wearer.shape.joints)
     posed = wearer.outfit.body.posed(at_root, wearer.shape)
     lap("body", None)
@@ -71,7 +74,7 @@ def dress(pose: Tensor, wearer: Wearer, *, lap: Lap = _no_lap) -> Dressed:
         lap("collider", None)
     drapes = {}
     for name, garment in wearer.garments.items():
-        drape = _drape(pose, wearer, outfit.wearables[name], garment, posed.transforms)
+        drape = _drape(pose, past, wearer, outfit.wearables[name], garment, posed.transforms)
         if outfit.collider is not None:
             drape = drape._replace(vertices=drape.vertices + outfit.below[name](body - posed.vertices))
         drapes[name] = drape
@@ -87,10 +90,15 @@ def scale_of(wearable: Wearable, drape: Drape, person: int) -> float | VertexSca
 
 
 def _drape(
-    pose: Tensor, wearer: Wearer, wearable: Wearable, garment: UnposedGarment, transforms: RigidTransforms
+    pose: Tensor,
+    past: Tensor | None,
+    wearer: Wearer,
+    wearable: Wearable,
+    garment: UnposedGarment,
+    transforms: RigidTransforms,
 ) -> Drape:
     style = wearable.template.own(wearer.style)
-    predicted = wearable.backbone(garment.betas, pose, style, wearer_code=garment.code)
+    predicted = wearable.backbone(garment.betas, pose, style, wearer_code=garment.code, past=past)
     unposed, on_mean = garment.rest, garment.on_mean
     if predicted.displacement is not None:
         displacement = predicted.displacement.clamp(-MAX_OFFSET, MAX_OFFSET).to(unposed)

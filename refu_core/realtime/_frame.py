@@ -91,14 +91,16 @@ class FrameStep:
         margins: Sequence[float],
         clocks: Sequence[StageClock] = (),
         adjust: Adjust | None = None,
+        *,
+        past: Tensor | None = None,
     ) -> list[Person]:
-        """Persons in poses (B, 24, 3) [rad]; `margins` [m] of the garments in the outfit's order.
+        """Persons in poses (B, 24, 3) [rad]; `past` as for `dress`, `margins` [m] of the garments as in the outfit.
 
         `clocks`, one a person, are told how long the stages took; what is done for all at once is shared out. What was
         predicted may be changed by `adjust` before anything is done about collisions.
         """
         shared = StageClock()
-        dressed = dress(pose, replace(wearer, outfit=self.outfit), lap=shared.lap)
+        dressed = dress(pose, replace(wearer, outfit=self.outfit), past=past, lap=shared.lap)
         if adjust is not None:
             dressed = adjust(dressed)
             shared.lap("adjust")
@@ -140,9 +142,10 @@ class FrameStep:
         return persons
 
     def packed(self, inputs: Mapping[str, Tensor], margins: tuple[float, ...]) -> Tensor:
-        """The same of `pose` and a wearer's tensors: all results in one tensor (B, …), which `unpacked` reads."""
+        """The same of `pose`, `past` and a wearer's tensors: all in one tensor (B, …), which `unpacked` reads."""
         rows = []
-        for person in self(inputs["pose"], Wearer.of_tensors(self.outfit, inputs), margins):
+        wearer = Wearer.of_tensors(self.outfit, inputs)
+        for person in self(inputs["pose"], wearer, margins, past=inputs.get("past")):
             parts = [person.turn(person.body), person.turn(person.skin), person.shift]
             for name in self.outfit.wearables:
                 worn = person.garments[name]

@@ -19,7 +19,7 @@ from refu_core._device import checked_device
 from refu_core.backbones import Skinned
 from refu_core.body import BodyFit, SmplBody
 from refu_core.errors import FrameError, GarmentError, RefuError, require_type
-from refu_core.frames import MAX_COEFFICIENT, N_STYLES, SmplFrame, checked_numbers
+from refu_core.frames import LAGS, MAX_COEFFICIENT, N_PAST, N_STYLES, SmplFrame, checked_numbers
 from refu_core.garments import GarmentTemplate
 from refu_core.modes import MAX_MARGIN, BackboneName, SdfMode
 from refu_core.realtime._contact import ContactStage
@@ -92,6 +92,11 @@ class GarmentPipeline:
         return self.outfit.body
 
     @property
+    def heeds_past(self) -> bool:
+        """Whether frames should tell their past (`PoseHistory`): with the backbone `dynamic`."""
+        return self.outfit.heeds_past
+
+    @property
     def fit(self) -> BodyFit | None:
         """How well the built-in mesh lies on a body that was named; None where none was."""
         return self.outfit.fit
@@ -153,8 +158,8 @@ class GarmentPipeline:
             betas_from: the path of an SMPL file whose betas frames have, in place of `body`: the built-in mesh follows
                 them, and the file's own mesh isn't used.
             sdf: `hybrid`, `approx`, `accurate` or `none`.
-            backbone: `tailornet`, `mlp`, `gcnn`, or `skinned`, which needs no weights; by default (`auto`) `tailornet`
-                for garments whose weights ship, `skinned` for others.
+            backbone: `tailornet`, `dynamic` (which heeds `SmplFrame.past`), `mlp`, `gcnn`, or `skinned`, which needs no
+                weights; by default (`auto`) the first of `dynamic` and `tailornet` that ships, `skinned` for others.
             style: γ of all garments, shape (4,); the mean style if not given.
             margin: clearance ε that is kept from the skin [m]; by default what the weights were trained with.
             weights: folder with a folder a garment of weights of one's own (`refu train`); those that ship by default.
@@ -287,13 +292,17 @@ class GarmentPipeline:
             wearer = self._together(tuple(wearer for wearer, _ in found))
         pose = torch.as_tensor(np.stack([f.pose for f in frames]))
         margins = tuple(one.margin if margin is None else margin for one in self.outfit.wearables.values())
+        told = {}
+        if self.heeds_past and any(frame.past is not None for frame in frames):
+            told["past"] = _past(frames)
         if self._graphs is not None and adjust is None:
-            packed = self._graphs({"pose": pose, **wearer.tensors()}, margins)
+            packed = self._graphs({"pose": pose, **told, **wearer.tensors()}, margins)
             outputs = [self._unpacked(frame, parts) for frame, parts in zip(frames, step.unpacked(packed), strict=True)]
             clocks[0].lap("step")
             took = {"step": clocks[0].stages["step"] / len(frames)}
             return [replace(one, stats=replace(one.stats, stage_ms=took)) for one in outputs]
-        persons = step(pose.to(self.body.device), wearer, margins, clocks, adjust)
+        told = {name: tensor.to(self.body.device) for name, tensor in told.items()}
+        persons = step(pose.to(self.body.device), wearer, margins, clocks, adjust, **told)
         return [
             self._output(frame, person, clock, skipped)
             for frame, person, clock, (_, skipped) in zip(frames, persons, clocks, found, strict=True)
@@ -359,10 +368,17 @@ class GarmentPipeline:
         return FrameStats(stage_ms, garments, self._is_certified, promised, skipped, moved)
 
 
+def _past(frames: Sequence[SmplFrame]) -> Tensor:
+    """Of frames that weren't told theirs: rest."""
+    rest = np.zeros((len(LAGS), N_PAST), np.float32)
+    return torch.as_tensor(np.stack([rest if frame.past is None else frame.past for frame in frames]))
+
+
 def _key(frame: SmplFrame, *, of_pose: bool = True) -> bytes:
     """Equal for two persons who differ in their place alone."""
     style = b"" if frame.style is None else b"s" + frame.style.tobytes()
-    return frame.betas.tobytes() + (frame.pose.tobytes() if of_pose else b"") + style
+    past = b"" if frame.past is None else b"p" + frame.past.tobytes()
+    return frame.betas.tobytes() + (frame.pose.tobytes() + past if of_pose else b"") + style
 
 
 def _check_margin(margin: float | None) -> None:

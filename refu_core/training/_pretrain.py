@@ -232,12 +232,7 @@ def stages(
         TrainingStage("low", Objective([model.low], model.low_code, loss), settings.low_steps, *low),
     ]
     if settings.pivots == "joint":
-
-        def whole(x: Tensor, s: Tensor) -> Tensor:
-            code: Tensor = model.low_code(x, s) + model.high(x, model.mixture(s))
-            return code
-
-        joint = Objective([model.low, model.high], whole, loss)
+        joint = Objective([model.low, model.high], model.code, loss)
         return [*found, TrainingStage("joint", joint, settings.steps, *both, rate=settings.joint_rate)]
     fine = []
     for (x, s, code), low_code in zip(both, coarse, strict=True):

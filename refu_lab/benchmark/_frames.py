@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 import msg_adapters as adapters
 from refu_core import GarmentPipeline, SmplFrame, WeightsError
 from refu_core.garments import GarmentTemplate
+from refu_core.history import PoseHistory
 from refu_core.realtime import PipelineOutput
 from refu_lab.benchmark._inputs import Moment
 from refu_lab.commands.benchmark import BenchmarkOptions
@@ -30,11 +32,12 @@ class FrameRunner:
         garments: Mapping[str, GarmentTemplate],
         *,
         persons: int = 1,
+        history: PoseHistory | None = None,
     ) -> None:
-        """`dress` gives a pipeline's output for each frame; `garments` are those that it holds."""
+        """`dress` gives a pipeline's output for each frame, which `history` tells its past; `garments` are its own."""
         self._dress = dress
         self._decode = adapters.decoder_for("multiarray").from_bytes
-        self._persons = range(persons)
+        self._persons, self._history = range(persons), history
         meshes = [
             adapters.MarkerMesh(
                 ns=adapters.garment_namespace(name, f"p{person}" if persons > 1 else ""),
@@ -51,13 +54,17 @@ class FrameRunner:
     @classmethod
     def of(cls, pipeline: GarmentPipeline, *, persons: int = 1) -> FrameRunner:
         """Of a pipeline."""
-        return cls(lambda frames: pipeline(frames), pipeline.garments, persons=persons)
+        history = PoseHistory() if pipeline.heeds_past else None
+        return cls(lambda frames: pipeline(frames), pipeline.garments, persons=persons, history=history)
 
     def __call__(self, moments: Moment | Sequence[Moment]) -> bytes:
         """The message that goes out."""
         given = [moments] if isinstance(moments, Moment) else moments
         laps = [time.perf_counter()]
         frames = [self._decode(given[i].raw) for i in self._persons]
+        if self._history is not None:
+            stamped = [replace(frame, stamp_ns=given[i].frame.stamp_ns) for i, frame in enumerate(frames)]
+            frames = [self._history(frame, str(i)) for i, frame in enumerate(stamped)]
         laps.append(time.perf_counter())
         outputs = self._dress(frames)
         laps.append(time.perf_counter())

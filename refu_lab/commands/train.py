@@ -22,8 +22,9 @@ class TrainOptions:
     data: Path
     network: str = setting(
         "garment",
-        "sdf: the paper's network for the body's distance (preset paper or small)",
-        choices=("garment", "sdf"),
+        "sdf: the paper's network for the body's distance (preset paper or small); dynamics: what moving cloth does "
+        "beyond the tailornet of --mode in --output, from sequences",
+        choices=("garment", "sdf", "dynamics"),
     )
     mode: str = setting(
         "hybrid",

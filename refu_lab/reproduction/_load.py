@@ -11,6 +11,7 @@ from refu_core._files import read_json
 from refu_core.body import SmplBody, load_fit
 from refu_core.errors import WeightsError
 from refu_core.garments import load_garment
+from refu_core.modes import BackboneName
 from refu_core.realtime import GarmentPipeline, Wearable, wearable_of
 from refu_core.sdf import BodySdf, NeuralSdf, load_sdf_network
 from refu_core.weights import load_weights, weights_folder
@@ -62,17 +63,17 @@ class Library:
         return wearable_of(stored, load_garment(garment), self.fit)
 
     def pipeline(self, method: Method, *garments: str) -> GarmentPipeline:
-        """What the node runs, in the method's mode; `none` without handling of collisions.
+        """What the node runs in the method's mode, or the method's own backbone, with nothing handled.
 
         Raises `RefuError` where garments worn together have no weights in one folder.
         """
         weights = None if method.weights is None else self.find(method, garments[0]).parent.parent
-        sdf = method.mode if method.handling == "node" else "none"
+        is_node = method.handling == "node"
         return GarmentPipeline.load(
             garments,
             body=None if self.fit is None else self.fit.body,
-            sdf=sdf,
-            backbone=method.backbone,
+            sdf=method.mode if is_node else "none",
+            backbone=BackboneName.AUTO if is_node else method.backbone,
             weights=weights,
             collider=self.collider,
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -12,7 +13,8 @@ from numpy.typing import NDArray
 
 from msg_adapters import Motion
 from refu_core.errors import RefuError
-from refu_core.frames import SmplFrame
+from refu_core.frames import LAGS, SmplFrame
+from refu_core.history import PoseHistory
 from refu_core.metrics import (
     CollisionChecker,
     Figures,
@@ -92,7 +94,7 @@ def motion_table(
         for name, clip in clips.items():
             shift = SkinShifts()
             for index in indices[name]:
-                judged, way = worn.judge([clip.frame(index), clip.frame(index + _step(clip))])
+                judged, way = worn.judge(_pair(clip, index))
                 for (garment, method), one in judged.items():
                     found.setdefault(garment, {}).setdefault((name, method), []).append(one)
                 shift.add(way)
@@ -259,6 +261,13 @@ class _Worn:
             len(sheet.with_itself()),
             any(len(sheet.with_other(one.local, one.faces)) for one in others) if others else None,
         )
+
+
+def _pair(clip: Motion, index: int) -> list[SmplFrame]:
+    """A frame and the next one, with what was before them."""
+    first = max(0, index - math.ceil(LAGS[-1] * clip.fps) - 1)
+    frames = PoseHistory.told(map(clip.frame, range(first, index + _step(clip) + 1)))
+    return [frames[index - first], frames[-1]]
 
 
 def _step(clip: Motion) -> int:

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 import msg_adapters as adapters
 from refu_core import RefuError
 from refu_core.garments import BUILTIN_GARMENTS, load_garment
+from refu_core.history import PoseHistory
 from refu_core.recordings import SUFFIXES, upright_turn
 from refu_lab.render import SKIN as SKIN_COLOUR
 from refu_lab.sources import open_source
@@ -172,6 +173,7 @@ class DressedFilm:
     def _frames(self, options: RecordingOptions) -> list[SmplFrame]:
         """In the order of their stamps, one at least."""
         source = open_source(options, lambda: self._pipeline.body)
+        source.history = PoseHistory()  # other garments may heed it
         found = [_frame_of(source, record) for record in source.records]
         frames = [frame for frame in found if frame is not None]
         n_bad = len(found) - len(frames)

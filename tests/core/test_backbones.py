@@ -562,7 +562,7 @@ def test_unknown_names_are_refused(garment: GarmentTemplate) -> None:
         backbone_config("mlp", garment, preset="tiny")
     with pytest.raises(WeightsError, match="needs pivots"):
         build_backbone(backbone_config("tailornet", garment), garment)
-    assert set(TRAINABLE) | {"skinned", "auto"} == set(BackboneName)
+    assert set(TRAINABLE) | {"skinned", "auto", "dynamic"} == set(BackboneName)
 
 
 def _rotvec(rotation: Tensor) -> Tensor:

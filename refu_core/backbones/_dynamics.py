@@ -1,0 +1,111 @@
+"""A backbone that knows how a person moves: what cloth owes to its inertia, added to what it does at rest."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from refu_core.backbones._features import N_STYLE_SHAPE, style_shape
+from refu_core.backbones._perceptron import Perceptron
+from refu_core.backbones._protocol import Prediction
+from refu_core.backbones._tailornet import TailorNet
+from refu_core.frames import LAGS, N_JOINTS, N_PAST
+
+
+@dataclass(frozen=True)
+class DynamicsConfig:
+    """Sizes of the perceptron."""
+
+    joints: tuple[int, ...]
+    """Those whose motion it sees, the root's among them."""
+    hidden: tuple[int, ...] = (256, 256)
+    activation: str = "silu"
+    dropout: float = 0.2
+
+
+class Dynamics(nn.Module):
+    """f(θ, β, γ, past) - f(θ, β, γ, 0): zero for whoever stands still, whatever was learnt.
+
+    It has no state, so it can't drift, and is told nothing beyond what it has learnt from: each number of the past is
+    clamped to the largest one in its training (`reach`).
+    """
+
+    def __init__(self, config: DynamicsConfig, still: TailorNet) -> None:
+        """`still` is what it is added to."""
+        super().__init__()
+        self.config = config
+        joints = (0, *(j for j in config.joints if j))
+        of_joints = np.arange(9 * N_JOINTS).reshape(N_JOINTS, 9)[list(joints)].ravel()
+        columns = np.concatenate((of_joints, np.arange(9 * N_JOINTS, N_PAST)))
+        self.register_buffer("_columns", torch.from_numpy(columns), persistent=False)
+        self._columns: Tensor
+        now = still.features.groups.numpy()
+        self.groups = torch.from_numpy(np.concatenate((now, np.tile(now.max() + 1 + columns // 9, len(LAGS)))))
+        """Which inputs belong together, as `PoseFeatures.groups`: of all lags those of a joint."""
+        n_past = len(LAGS) * len(columns)
+        self.net = Perceptron(
+            still.features.size + N_STYLE_SHAPE + n_past,
+            config.hidden,
+            still.decoder.size,
+            activation=config.activation,
+            dropout=config.dropout,
+        )
+        self.register_buffer("reach", torch.zeros(n_past))
+        self.reach: Tensor
+
+    def forward(self, x: Tensor, s: Tensor, past: Tensor) -> Tensor:
+        """Code, shape (B, C), of pose features (B, I), (β, γ) (B, 14) and the past (B, 4, 219)."""
+        moved = self.seen(past).clamp(-self.reach, self.reach)
+        now = torch.cat((x, s), 1)
+        both = torch.cat((torch.cat((now, moved), 1), torch.cat((now, torch.zeros_like(moved)), 1)))
+        with_past, without = self.net(both).chunk(2)
+        code: Tensor = with_past - without
+        return code
+
+    def seen(self, past: Tensor) -> Tensor:
+        """What it sees of the past (B, 4, 219), shape (B, P)."""
+        return past[..., self._columns].flatten(1)
+
+    def standardise(self, x: Tensor, s: Tensor, past: Tensor) -> None:
+        """Takes the inputs' sizes, and how far they reach, from the training set."""
+        moved = self.seen(past)
+        self.reach.copy_(moved.abs().amax(0))
+        self.net.standardise(torch.cat((x, s, moved), 1), self.groups)
+
+
+class Dynamic(nn.Module):
+    """A TailorNet, and `Dynamics` on top: one output basis for both, so hardly more than the one alone."""
+
+    heeds_past = True
+
+    def __init__(self, still: TailorNet, dynamics: Dynamics) -> None:
+        super().__init__()
+        self.still, self.dynamics = still, dynamics
+
+    @property
+    def decoder(self) -> nn.Module:
+        """Of both."""
+        return self.still.decoder
+
+    def wearer_code(self, betas: Tensor, style: Tensor | None) -> Tensor:
+        """`TailorNet.wearer_code`."""
+        return self.still.wearer_code(betas, style)
+
+    def forward(
+        self,
+        betas: Tensor,
+        pose: Tensor,
+        style: Tensor | None,
+        *,
+        wearer_code: Tensor | None = None,
+        past: Tensor | None = None,
+    ) -> Prediction:
+        """Predicts as the TailorNet does and, where it is told the past (B, 4, 219), for moving cloth."""
+        x, s = self.still.features(pose), style_shape(betas, style)
+        code = self.still.code(x, s, wearer_code)
+        if past is not None:
+            code = code + self.dynamics(x, s, past)
+        return Prediction(self.still.decoder(code), None)

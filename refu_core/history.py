@@ -1,0 +1,108 @@
+"""How people have moved until now: a swinging skirt can't be told from a pose alone."""
+
+from __future__ import annotations
+
+from collections import OrderedDict, deque
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from refu_core.frames import LAGS, N_JOINTS, SmplFrame
+
+_MOST_PEOPLE = 64
+"""Those who were seen last are remembered; each takes half a megabyte at most."""
+_CLOSEST_NS = 1_000_000_000 // 240
+"""Frames nearer to each other than this replace one another, so that no rate fills the memory."""
+_FASTEST = 15.0
+"""Who moves faster is somebody else, or was lost and found [m/s]; sprinters reach 12."""
+_LONGEST_PAUSE = 0.25
+"""Between frames farther apart nobody knows the motion [s]."""
+_LAGS = np.array(LAGS)
+
+
+class _Moment(NamedTuple):
+    """A person in a frame."""
+
+    stamp_ns: int
+    rotations: NDArray[np.float64]
+    """Of the joints relative to their parents, shape (24, 3, 3)."""
+    transl: NDArray[np.float64]
+    """[m], shape (3,)."""
+
+
+class PoseHistory:
+    """Tells frames of the half second before them: `SmplFrame.past`, for pipelines with the backbone `dynamic`.
+
+    Nothing is kept but the frames of that half second, so nothing can drift. Before somebody's first frame they are
+    taken to have stood still, as after a pause of a quarter of a second, a clock that went back, and a leap. Frames may
+    come at any rate from 4 Hz on. Not thread-safe.
+
+    `past` is what was `LAGS` ago, less what is now, of the shape (4, 219): nine numbers of each joint's rotation
+    relative to its parent, row by row, those of the root as it sees itself; then where the root was [m], in its axes,
+    beside where it would have been at the mean speed of the longest lag. It is zero for whoever stands, and for whoever
+    glides: the air is taken to move along, as in the simulation.
+
+    Example:
+        >>> history = PoseHistory()
+        >>> history(SmplFrame(pose=np.zeros((24, 3)))).past.any()
+        np.False_
+    """
+
+    def __init__(self) -> None:
+        self._people: OrderedDict[str, deque[_Moment]] = OrderedDict()
+
+    def __call__(self, frame: SmplFrame, person: str = "") -> SmplFrame:
+        """A person's next frame, with its past."""
+        now = _Moment(frame.stamp_ns, Rotation.from_rotvec(frame.pose.astype(np.float64)).as_matrix(), frame.transl)
+        known = self._people.pop(person, None)
+        if known is None or not _goes_on(known[-1], now):
+            known = deque()
+        elif len(known) > 1 and now.stamp_ns - known[-2].stamp_ns < _CLOSEST_NS:
+            known.pop()
+        known.append(now)
+        while len(known) > 2 and known[1].stamp_ns <= now.stamp_ns - 1e9 * LAGS[-1]:
+            known.popleft()
+        self._people[person] = known
+        while len(self._people) > _MOST_PEOPLE:
+            self._people.popitem(last=False)
+        return replace(frame, past=_past(known))
+
+    @classmethod
+    def told(cls, frames: Iterable[SmplFrame]) -> list[SmplFrame]:
+        """The frames of one person's motion, each with its past."""
+        return [*map(cls(), frames)]
+
+    def forget(self, person: str = "") -> None:
+        """Somebody has left."""
+        self._people.pop(person, None)
+
+
+def _goes_on(last: _Moment, now: _Moment) -> bool:
+    """Whether it is the same motion."""
+    seconds = 1e-9 * (now.stamp_ns - last.stamp_ns)
+    return 0 < seconds <= _LONGEST_PAUSE and float(np.linalg.norm(now.transl - last.transl)) <= _FASTEST * seconds
+
+
+def _past(moments: Sequence[_Moment]) -> NDArray[np.float32]:
+    """Of the last of these, shape (4, 219)."""
+    now = moments[-1]
+    ages = [1e-9 * (moment.stamp_ns - now.stamp_ns) for moment in moments]
+    place = np.interp(-_LAGS, ages, np.arange(len(ages)))  # the first one's before it
+    before = place.astype(int)
+    after = np.minimum(before + 1, len(ages) - 1)
+    share = place - before
+    rotations = np.empty((len(_LAGS), N_JOINTS, 3, 3))
+    way = np.empty((len(_LAGS), 3))
+    for i, (a, b, w) in enumerate(zip(before, after, share, strict=True)):
+        rotations[i] = (1 - w) * moments[a].rotations + w * moments[b].rotations
+        way[i] = (1 - w) * moments[a].transl + w * moments[b].transl - now.transl
+    root = now.rotations[0]
+    turned = rotations - now.rotations
+    turned[:, 0] = root.T @ turned[:, 0]
+    beside = (way - _LAGS[:, None] / _LAGS[-1] * way[-1]) @ root
+    past = np.concatenate((turned.reshape(len(_LAGS), -1), beside), 1)
+    return past.astype(np.float32)
