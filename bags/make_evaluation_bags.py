@@ -1,7 +1,7 @@
 """Write bags with ground truth from simulated sets: `eval_<garment>` and `eval_<garment>_sequence`.
 
     python bags/make_evaluation_bags.py data/tshirt-male data/skirt-female       # 96 unseen test samples of each
-    python bags/make_evaluation_bags.py data/tshirt-male-sequences-5             # one unseen test sequence
+    python bags/make_evaluation_bags.py data/tshirt-male-sequences-5             # ten seconds of unseen sequences
     python bags/make_evaluation_bags.py data/outfit                              # eval_<outer>_over_<inner>
 
 A bag carries SMPL parameters with the style on /smpl_params and the simulated garments on /ground_truth, so
@@ -30,6 +30,9 @@ TOPIC = "/smpl_params"
 SAMPLES_A_SECOND = 2
 TRUTH_EVERY = 3
 """A sequence's ground truth is in each third frame: 10 a second."""
+SEQUENCE_SECONDS = 10.0
+PAUSE_NS = 2 * 10**9
+"""Between sequences."""
 MOST_BYTES = 8_000_000
 Moment = tuple[SmplFrame, NDArray[np.float32] | None]
 """A frame, and a row of the set, its garments at zero translation [m], shape (N, 3), where there is one."""
@@ -62,18 +65,23 @@ def sample_moments(dataset: GarmentDataset, count: int, seed: int) -> Iterator[M
         yield frame, sample.vertices
 
 
-def sequence_moments(sequences: GarmentSequences) -> Iterator[Moment]:
-    """The test sequence that is simulated first; ground truth in each third frame, as far as those are in the set."""
+def sequence_moments(sequences: GarmentSequences, *, seconds: float = SEQUENCE_SECONDS) -> Iterator[Moment]:
+    """The test sequences that are simulated first, one at least, so many seconds of them with pauses in between.
+
+    Ground truth is in each third frame, as far as those are in the set.
+    """
     plan = SequencePlan(**sequences.card["plan"])
-    first = next(number for block in plan.blocks() for number in block if plan.split_of(number) == TEST)
-    (index,) = np.flatnonzero(sequences.column("slot") == first)
-    sequence = sequences.sequence(int(index))
-    quantum = sequences.card["quantum_m"]
-    for t in range(len(sequence)):
-        transl = np.round(sequence.transl[t].astype(np.float64) / quantum) * quantum
-        stamp = START_NS + round(t * 1e9 / sequence.fps)
-        frame = SmplFrame(sequence.pose[t], sequence.betas, transl, style=sequence.style, stamp_ns=stamp)
-        yield frame, sequence.vertices(t) if t % TRUTH_EVERY == 0 and sequence.kept[t] else None
+    numbers = [number for block in plan.blocks() for number in block if plan.split_of(number) == TEST]
+    quantum, stamp = sequences.card["quantum_m"], START_NS
+    for number in numbers[: max(1, round(seconds / plan.seconds))]:
+        (index,) = np.flatnonzero(sequences.column("slot") == number)
+        sequence = sequences.sequence(int(index))
+        for t in range(len(sequence)):
+            transl = np.round(sequence.transl[t].astype(np.float64) / quantum) * quantum
+            now = stamp + round(t * 1e9 / sequence.fps)
+            frame = SmplFrame(sequence.pose[t], sequence.betas, transl, style=sequence.style, stamp_ns=now)
+            yield frame, sequence.vertices(t) if t % TRUTH_EVERY == 0 and sequence.kept[t] else None
+        stamp = now + PAUSE_NS
 
 
 def write_bag(path: Path, parts: Mapping[str, slice], moments: Iterator[Moment]) -> tuple[int, int]:

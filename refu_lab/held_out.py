@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 import msg_adapters as adapters
 from refu_core import GarmentPipeline, GarmentTemplate, SmplFrame
 from refu_core.errors import GarmentError
+from refu_core.history import PoseHistory
 from refu_core.outputs import RADIUS_90, SigmaMap, bend_of, fit_sigma
 from refu_lab.truth import GroundTruth
 
@@ -32,12 +33,14 @@ def moments_of(bag: Path, garment: GarmentTemplate) -> list[Moment]:
         RefuError: the bag can't be read, or there is none of this garment.
     """
     truth = GroundTruth.of_bag(bag, {garment.name: garment.faces.cpu().numpy()})
-    found = []
+    found, history = [], PoseHistory()
     with adapters.open_smpl_bag(bag) as opened:
         for record in opened:
-            true = None if record.frame is None else truth.of(garment.name, record.frame)
-            if record.frame is not None and true is not None:
-                found.append((record.frame, true))
+            if record.frame is None:
+                continue
+            frame, true = history(record.frame), truth.of(garment.name, record.frame)
+            if true is not None:
+                found.append((frame, true))
     if not found:
         msg = f"{bag}: no ground truth of {garment.name} in it"
         raise GarmentError(msg)

@@ -29,8 +29,8 @@ TOLERANCES: dict[str, float] = {"mpve_mm": 0.3, "vfcp_percent": 0.02, "cfmp_perc
 weights, far less than what a worse method does. Those of a reference file are in the file."""
 _FRAMES = 15
 """Frames of a bag, at most."""
-_MODES = (("skinned", "accurate"), ("tailornet", "hybrid"))
-"""(backbone, sdf) of the pipelines that are measured; what isn't trained is left out."""
+_MODES = (("skinned", "accurate"), ("auto", "hybrid"))
+"""(backbone, sdf) of the pipelines that are measured."""
 
 
 class FigureKey(NamedTuple):
@@ -155,11 +155,7 @@ def _figures(bag: Path) -> Iterator[tuple[FigureKey, float]]:
         options = ReplayOptions(
             input=bag, garments=true or DEFAULT_GARMENTS, backbone=backbone, sdf=sdf, max_frames=_FRAMES
         )
-        try:
-            pipeline = pipeline_for(options)
-        except RefuError:  # no weights for one of the garments
-            continue
-        result = replay(options, pipeline=pipeline)
+        result = replay(options, pipeline=pipeline_for(options))
         for garment in options.garments:
             yield from _rows(bag.stem, garment, backbone, result.before[garment])
             yield from _rows(bag.stem, garment, f"node, {backbone}, {sdf}", result.after[garment])

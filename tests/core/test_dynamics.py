@@ -31,6 +31,7 @@ from refu_core.backbones import (
 )
 from refu_core.errors import FrameError, WeightsError
 from refu_core.frames import LAGS, N_PAST
+from refu_core.metrics import CollisionChecker
 from refu_core.simulation import open_dataset
 from refu_core.training import (
     DynamicsSettings,
@@ -40,6 +41,7 @@ from refu_core.training import (
     train_dynamics,
 )
 from refu_core.weights import load_weights
+from refu_lab.stress._frames import promised
 
 pytestmark = pytest.mark.usefixtures("no_curves_in_module")
 GARMENT = "short-pant-male"
@@ -308,6 +310,22 @@ def test_a_pipeline_tells_its_garments(folder: Path) -> None:
     together = moving([frames[3], standing, last])
     np.testing.assert_allclose(together[2][GARMENT].local, alone, atol=1e-5)
     np.testing.assert_allclose(together[1][GARMENT].local, still(standing)[GARMENT].local, atol=1e-5)
+
+
+def test_whatever_the_past_nothing_is_inside() -> None:
+    skirt, rng = GarmentPipeline.load(["skirt-female"], threads=2), np.random.default_rng(0)
+    assert skirt.heeds_past
+    checker = CollisionChecker(skirt.body.faces.numpy())
+    n_promised = 0
+    for size in (0.1, 0.5, 2.0, 100.0):
+        pasts = size * rng.uniform(-1, 1, (6, len(LAGS), N_PAST))
+        for out in skirt([replace(promised(rng), past=past) for past in pasts]):
+            assert np.isfinite(out["skirt-female"].local).all()
+            if out.stats.within_promise:
+                n_promised += 1
+                checker.update(out.body)
+                assert checker.check(out["skirt-female"].local, out["skirt-female"].faces).n_inside == 0
+    assert n_promised > 10
 
 
 def test_all_precisions_are_told(folder: Path) -> None:

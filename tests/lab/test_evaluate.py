@@ -198,7 +198,7 @@ def test_no_figure_of_the_shipped_bags_and_weights_has_fallen(capsys: pytest.Cap
     assert passed, capsys.readouterr().out
     rows = json.loads(reference.read_text(encoding="utf-8"))["rows"]
     assert {row["bag"] for row in rows} == {path.parent.name for path in BAGS.glob("*/metadata.yaml")}
-    assert {row["method"] for row in rows} >= {"tailornet", "node, tailornet, hybrid", "node, skinned, accurate"}
+    assert {row["method"] for row in rows} >= {"auto", "node, auto, hybrid", "node, skinned, accurate"}
 
 
 def test_tolerances_are_one_sided() -> None:

@@ -148,10 +148,13 @@ def test_sequence_has_truth_in_each_third_frame_of_the_set(script: Any, tmp_path
     rows(directory, SequenceShard, (7, load_garment(GARMENT).n_vertices, 3), cause=cause, transl=transl)
     sequences = GarmentSequences(directory)
     bag = tmp_path / "eval_short_pant_male_sequence"
-    assert script.write_bag(bag, sequences.parts, script.sequence_moments(sequences)) == (7, 2)
+    assert script.write_bag(bag, sequences.parts, script.sequence_moments(sequences, seconds=0.1)) == (7, 2)
     frames, truth = moments(bag)
     np.testing.assert_allclose([frame.transl[1] for frame in frames], np.linspace(0, 1, 7), atol=QUANTUM)
     assert [truth.of(GARMENT, frame) is not None for frame in frames] == [True, *[False] * 5, True]
     (shown,) = np.flatnonzero((sequences.column("betas") == frames[0].betas).all(1))
     assert sequences.test[shown]
     np.testing.assert_array_equal(truth.of(GARMENT, frames[6]), sequences.sequence(int(shown)).vertices(6))
+    several = [frame for frame, _ in script.sequence_moments(sequences, seconds=2 * sequences.card["plan"]["seconds"])]
+    assert len(several) == 14
+    assert several[7].stamp_ns == several[6].stamp_ns + script.PAUSE_NS
