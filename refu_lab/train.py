@@ -14,7 +14,7 @@ from refu_core.garments import worn_on
 from refu_core.options import check
 from refu_core.refu import ScaleKind
 from refu_core.sdf import SDF_PRESETS
-from refu_core.simulation import GarmentDataset, open_dataset
+from refu_core.simulation import GarmentDataset, GarmentSequences, open_dataset
 from refu_core.training import (
     CarrySettings,
     DynamicsSettings,
@@ -66,14 +66,14 @@ def train(options: TrainOptions, *, progress: bool) -> dict[str, Any]:
         )
     common |= {"backbone": options.backbone, "preset": options.preset, "body": body}
     if options.mode == "none":
-        return pretrain(template, dataset, options.folder, settings=_pretraining(options), **common)
+        return pretrain(template, dataset, options.folder, settings=_pretraining(options, dataset), **common)
     source: Path | None = options.folder
     if options.start is not None:
         source = options.start
     elif options.backbone == "gcnn":
         source = None
     elif not (options.folder / f"{options.backbone}-none.json").exists():
-        pretrain(template, dataset, options.folder, settings=_pretraining(options), **common)
+        pretrain(template, dataset, options.folder, settings=_pretraining(options, dataset), **common)
     common |= {"settings": _finetuning(options), "goes_on": options.start is not None}
     return finetune(template, dataset, source, options.folder, mode=options.mode, **common)
 
@@ -108,8 +108,8 @@ def _dynamics_training(options: TrainOptions) -> DynamicsSettings:
     return settings if options.steps is None else replace(settings, steps=options.steps)
 
 
-def _pretraining(options: TrainOptions) -> PretrainSettings:
-    settings = PretrainSettings.of(options.backbone, options.preset)
+def _pretraining(options: TrainOptions, dataset: GarmentDataset | GarmentSequences) -> PretrainSettings:
+    settings = PretrainSettings.of(options.backbone, options.preset, samples=int(dataset.train.sum()))
     settings = replace(settings, loop=replace(settings.loop, seed=options.seed))
     if options.steps is None:
         return settings

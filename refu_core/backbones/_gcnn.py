@@ -129,7 +129,6 @@ class Gcnn(WithoutWearerCode, nn.Module):
         style: Tensor | None,
         *,
         wearer_code: Tensor | None = None,  # noqa: ARG002
-        past: Tensor | None = None,  # noqa: ARG002
     ) -> Prediction:
         """Predicts for betas (B, 10), pose (B, 24, 3) [rad] and style (B, 4)."""
         z = self.head(torch.cat((self.features(pose), style_shape(betas, style)), 1))

@@ -52,7 +52,6 @@ class Mlp(WithoutWearerCode, nn.Module):
         style: Tensor | None,
         *,
         wearer_code: Tensor | None = None,  # noqa: ARG002
-        past: Tensor | None = None,  # noqa: ARG002
     ) -> Prediction:
         """Predicts for betas (B, 10), pose (B, 24, 3) [rad] and style (B, 4)."""
         return Prediction(self.decoder(self.code(self.features(pose), style_shape(betas, style))), None)

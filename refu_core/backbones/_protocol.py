@@ -36,17 +36,12 @@ class Backbone(Protocol):
         ...
 
     def __call__(
-        self,
-        betas: Tensor,
-        pose: Tensor,
-        style: Tensor | None,
-        *,
-        wearer_code: Tensor | None = None,
-        past: Tensor | None = None,
+        self, betas: Tensor, pose: Tensor, style: Tensor | None, *, wearer_code: Tensor | None = None
     ) -> Prediction:
-        """Predicts for betas (B, 10), pose (B, 24, 3) [rad], style (B, 4) and, for some, past (B, 4, 219).
+        """Predicts for betas (B, 10), pose (B, 24, 3) [rad] and style (B, 4).
 
-        Given the `wearer_code` of (β, γ), that isn't computed again.
+        Given the `wearer_code` of (β, γ), that isn't computed again. One that heeds the past takes it as `past`, too,
+        of the shape (B, 4, 219).
         """
         ...
 
@@ -70,7 +65,6 @@ class Skinned(WithoutWearerCode):
         style: Tensor | None,  # noqa: ARG002
         *,
         wearer_code: Tensor | None = None,  # noqa: ARG002
-        past: Tensor | None = None,  # noqa: ARG002
     ) -> Prediction:
         """Predicts no displacement."""
         return Prediction(None, None)

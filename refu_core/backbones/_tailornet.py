@@ -78,13 +78,7 @@ class TailorNet(nn.Module):
         return self.mixture(style_shape(betas, style))
 
     def forward(
-        self,
-        betas: Tensor,
-        pose: Tensor,
-        style: Tensor | None,
-        *,
-        wearer_code: Tensor | None = None,
-        past: Tensor | None = None,  # noqa: ARG002
+        self, betas: Tensor, pose: Tensor, style: Tensor | None, *, wearer_code: Tensor | None = None
     ) -> Prediction:
         """Predicts for betas (B, 10), pose (B, 24, 3) [rad], style (B, 4) and, where it is known, their code (B, K)."""
         code = self.code(self.features(pose), style_shape(betas, style), wearer_code)

@@ -98,7 +98,8 @@ def _drape(
     transforms: RigidTransforms,
 ) -> Drape:
     style = wearable.template.own(wearer.style)
-    predicted = wearable.backbone(garment.betas, pose, style, wearer_code=garment.code, past=past)
+    told = {"past": past} if past is not None and wearable.backbone.heeds_past else {}
+    predicted = wearable.backbone(garment.betas, pose, style, wearer_code=garment.code, **told)
     unposed, on_mean = garment.rest, garment.on_mean
     if predicted.displacement is not None:
         displacement = predicted.displacement.clamp(-MAX_OFFSET, MAX_OFFSET).to(unposed)

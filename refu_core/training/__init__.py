@@ -23,6 +23,7 @@ from refu_core.training._losses import reconstruction_loss as reconstruction_los
 from refu_core.training._losses import refu_loss as refu_loss
 from refu_core.training._mirror import Mirror as Mirror
 from refu_core.training._mirror import mirror_pose as mirror_pose
+from refu_core.training._pretrain import MANY as MANY
 from refu_core.training._pretrain import PretrainSettings as PretrainSettings
 from refu_core.training._pretrain import pretrain as pretrain
 from refu_core.training._progress import TrainingLog as TrainingLog

@@ -89,31 +89,21 @@ class Dresser(nn.Module):
 class _InPrecision:
     """A backbone in the precision that the training loop asks for, in the midst of what needs float32."""
 
+    heeds_past = False
     backbone: Backbone
     is_low: bool = False
     dtype: torch.dtype = torch.float32
-
-    @property
-    def heeds_past(self) -> bool:
-        """As `Backbone`."""
-        return self.backbone.heeds_past
 
     def wearer_code(self, betas: Tensor, style: Tensor | None) -> Tensor | None:
         """As `Backbone.wearer_code`, in full precision."""
         return self.backbone.wearer_code(betas, style)
 
     def __call__(
-        self,
-        betas: Tensor,
-        pose: Tensor,
-        style: Tensor | None,
-        *,
-        wearer_code: Tensor | None = None,
-        past: Tensor | None = None,
+        self, betas: Tensor, pose: Tensor, style: Tensor | None, *, wearer_code: Tensor | None = None
     ) -> Prediction:
         """As `Backbone`."""
         with torch.autocast(betas.device.type, self.dtype, enabled=self.is_low):
-            return self.backbone(betas, pose, style, wearer_code=wearer_code, past=past)
+            return self.backbone(betas, pose, style, wearer_code=wearer_code)
 
 
 class _Distances:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from refu_core.backbones import (
     LaplacianSmoothing,
     Mlp,
     TailorNet,
+    TailorNetConfig,
     backbone_config,
     build_backbone,
     load_basis,
@@ -43,6 +44,10 @@ from refu_core.training._mirror import Mirror
 from refu_core.training._progress import TrainingLog
 
 N_PIVOTS = 20
+MANY = 4000
+"""Samples from which on a tailornet is trained longer and held back less. On validation samples of shorts' 6,000 the
+error is 7.61 mm with weight decay 1 and twice the steps, 7.21 with 0.3, 7.18 with half the dropout, 7.04 with 0.1 (on
+the test split 6.68, 6.43, 6.39 and 6.36); a T-shirt's 2,580 gain nothing (test: 9.5, with 0.3 9.6)."""
 PIVOT_TRAINING: tuple[str, ...] = ("joint", "separate")
 
 
@@ -63,6 +68,8 @@ class PretrainSettings:
     low-frequency net. `separate`: each on its own pivot's samples, as in the original."""
     joint_rate: float = 0.3
     """Learning rate of the last stage with `joint` pivots, relative: the low-frequency net is only tuned there."""
+    dropout: float | None = None
+    """Of a tailornet's low-frequency net, half that of its high-frequency nets; None for the configuration's."""
     is_mirrored: bool = True
     validation_share: float = 0.08
 
@@ -78,10 +85,12 @@ class PretrainSettings:
         return cls(loop, style_shape_steps=100_000, low_steps=300_000, steps=300_000, pivots="separate")
 
     @classmethod
-    def of(cls, backbone: str, preset: str = "realtime") -> PretrainSettings:
-        """A backbone's own in a preset."""
+    def of(cls, backbone: str, preset: str = "realtime", *, samples: int = 0) -> PretrainSettings:
+        """A backbone's own in a preset, for so many samples of a training split."""
         if preset == "paper":
             return cls.paper()
+        if backbone == "tailornet" and samples >= MANY:
+            return cls(LoopSettings(weight_decay=0.1), low_steps=10_000, steps=6000, dropout=0.05)
         # A gcnn's step costs many times one of a network with an output basis, and hardly gains from larger batches.
         return cls(LoopSettings(batch_size=32, learning_rate=5e-3, weight_decay=0.1)) if backbone == "gcnn" else cls()
 
@@ -126,8 +135,10 @@ def pretrain(
     opened = TrainingSet.of(garment, dataset, body)
     template, body, samples, identity = opened.garment, opened.body, opened.samples, opened.identity
     test = read_samples(opened.rows, body, template, split="test")  # what there is none of is said before hours of work
-    settings = PretrainSettings.of(backbone, preset) if settings is None else settings
+    settings = PretrainSettings.of(backbone, preset, samples=len(samples)) if settings is None else settings
     config = backbone_config(backbone, template, preset=preset) if config is None else config
+    if settings.dropout is not None and isinstance(config, TailorNetConfig):
+        config = replace(config, dropout=settings.dropout, high_dropout=2 * settings.dropout)
     is_writer, torch_device = start_parallel(torch.device(device))
     output = Path(output)
 

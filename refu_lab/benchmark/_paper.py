@@ -45,7 +45,6 @@ class _InPrecision(WithoutWearerCode):
         style: Tensor | None,
         *,
         wearer_code: Tensor | None = None,  # noqa: ARG002
-        past: Tensor | None = None,  # noqa: ARG002
     ) -> Prediction:
         """As `Backbone`."""
         style = None if style is None else style.to(self._dtype)

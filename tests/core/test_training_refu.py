@@ -24,6 +24,7 @@ from refu_core.refu import Refu, trained_from_weights
 from refu_core.sdf import ApproxSdf, ExactSdf, RestFaces, SdfSample
 from refu_core.training import (
     FINETUNE_MODES,
+    MANY,
     FinetuneSettings,
     LoopSettings,
     PretrainSettings,
@@ -266,7 +267,9 @@ def test_a_gcnn_has_as_much_training_with_refu_as_alone() -> None:
     assert (together.loop, together.steps) == (alone.loop, alone.steps)
     assert FinetuneSettings.of("gcnn", "paper") == FinetuneSettings.paper()
     assert FinetuneSettings.of("tailornet") == FinetuneSettings()
-    assert PretrainSettings.of("mlp") == PretrainSettings()
+    assert PretrainSettings.of("mlp") == PretrainSettings.of("tailornet", samples=MANY - 1) == PretrainSettings()
+    many = PretrainSettings.of("tailornet", samples=MANY)
+    assert many.loop.weight_decay < PretrainSettings().loop.weight_decay
 
 
 def test_says_what_it_knows(tmp_path: Path, dataset: Path, pretrained: Path) -> None:
