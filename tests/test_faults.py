@@ -247,6 +247,7 @@ class Failing:
         self.body, self.garments, self.margin = pipeline.body, pipeline.garments, pipeline.margin
         self.untrained = pipeline.untrained
         self.threads, self.frames = 1, 0
+        self.heeds_past = pipeline.heeds_past
 
     def __call__(self, frames: list[SmplFrame]) -> list[Any]:
         self.frames += 1

@@ -469,6 +469,7 @@ class Choosy:
         self.body, self.garments, self.margin = pipeline.body, pipeline.garments, pipeline.margin
         self.untrained = pipeline.untrained
         self.threads = pipeline.threads
+        self.heeds_past = pipeline.heeds_past
 
     def __call__(self, frames: list[SmplFrame]) -> list[Any]:
         if any(frame.pose[1, 0] > 1 for frame in frames):

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from msg_adapters import Motion
-from refu_core import GarmentPipeline
+from refu_core import GarmentPipeline, PoseHistory
 from refu_core.backbones import Prediction, WithoutWearerCode
 from refu_core.body import Collider, load_body
 from refu_core.errors import RefuError, WeightsError
@@ -408,7 +408,8 @@ def test_motion_table_against_a_loop(walk: Motion, motion_table: rp.ResultTable,
     ways = []
     found: dict[str, dict[str, list[float]]] = {name: {} for name in garments}
     for index in (0, 4):
-        now, then, start, end = (p(walk.frame(i)) for p in (pipeline, skinned) for i in (index, index + 1))
+        told = PoseHistory.told(walk.frame(i) for i in range(index + 2))[-2:]
+        now, then, start, end = (p(frame) for p in (pipeline, skinned) for frame in told)
         ways += np.linalg.norm(now.body - now.skin, axis=1).tolist()
         for name, garment in pipeline.garments.items():
             faces, edges = garment.faces.numpy(), garment.edges.numpy()
