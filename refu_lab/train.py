@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 from refu_core import RefuError, load_garment
 from refu_core._device import checked_device
@@ -29,6 +29,8 @@ from refu_core.training import (
 )
 from refu_lab.commands.train import TrainOptions
 from refu_lab.tables import format_table
+
+Settings = TypeVar("Settings", CarrySettings, DynamicsSettings)
 
 
 def train(options: TrainOptions, *, progress: bool) -> dict[str, Any]:
@@ -55,12 +57,12 @@ def train(options: TrainOptions, *, progress: bool) -> dict[str, Any]:
             dataset,
             options.folder,
             mode=options.mode,
-            settings=_dynamics_training(options),
+            settings=_asked(DynamicsSettings(), options),
             body=body,
             **common,
         )
     if options.like is not None:
-        few = _carrying(options)
+        few = _asked(CarrySettings(), options)
         return carry_over(
             template, dataset, options.folder, like=options.like, settings=few, body=body, quiet=not progress
         )
@@ -102,12 +104,6 @@ def _sdf_training(options: TrainOptions) -> SdfSettings:
     return settings if options.steps is None else replace(settings, steps=options.steps)
 
 
-def _dynamics_training(options: TrainOptions) -> DynamicsSettings:
-    settings = DynamicsSettings()
-    settings = replace(settings, loop=replace(settings.loop, seed=options.seed))
-    return settings if options.steps is None else replace(settings, steps=options.steps)
-
-
 def _pretraining(options: TrainOptions, dataset: GarmentDataset | GarmentSequences) -> PretrainSettings:
     settings = PretrainSettings.of(options.backbone, options.preset, samples=int(dataset.train.sum()))
     settings = replace(settings, loop=replace(settings.loop, seed=options.seed))
@@ -116,8 +112,8 @@ def _pretraining(options: TrainOptions, dataset: GarmentDataset | GarmentSequenc
     return replace(settings, style_shape_steps=options.steps, low_steps=options.steps, steps=options.steps)
 
 
-def _carrying(options: TrainOptions) -> CarrySettings:
-    settings = CarrySettings()
+def _asked(settings: Settings, options: TrainOptions) -> Settings:
+    """The settings with the seed and the steps that were asked for."""
     settings = replace(settings, loop=replace(settings.loop, seed=options.seed))
     return settings if options.steps is None else replace(settings, steps=options.steps)
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from refu_core.body import SmplBody
@@ -58,10 +60,6 @@ def write_set(
         "dropped": np.zeros((n, 4), "|u1"),
         **{name: np.ones(n, "<f4") for name in ("stretch", "speed", "seconds")},
     }
-    shard = folder / "shard-0-of-1"
-    shard.mkdir(parents=True)
-    for name, array in columns.items():
-        np.save(shard / f"{name}.npy", array)
     card = {
         "format": "refu-garments-2",
         "garment": garment.name,
@@ -71,5 +69,14 @@ def write_set(
         "plan": {"count": n, "pivots": 4},
         "clips": {"train": [], "test": []},
     }
+    return write_shard(folder, columns, card)
+
+
+def write_shard(folder: Path, columns: Mapping[str, NDArray[Any]], card: Mapping[str, Any]) -> Path:
+    """A set of one shard, as these columns and this card."""
+    shard = folder / "shard-0-of-1"
+    shard.mkdir(parents=True)
+    for name, array in columns.items():
+        np.save(shard / f"{name}.npy", array)
     (folder / "card.json").write_text(json.dumps(card))
     return folder

@@ -20,7 +20,6 @@ from refu_core.backbones._files import load_basis as load_basis
 from refu_core.backbones._files import save_backbone as save_backbone
 from refu_core.backbones._files import save_basis as save_basis
 from refu_core.backbones._files import save_dynamics as save_dynamics
-from refu_core.backbones._files import wants_dynamics as wants_dynamics
 from refu_core.backbones._files import with_dynamics as with_dynamics
 from refu_core.backbones._frequency import LaplacianSmoothing as LaplacianSmoothing
 from refu_core.backbones._gcnn import Gcnn as Gcnn

@@ -134,19 +134,16 @@ def save_dynamics(folder: Path, dynamics: Dynamics, card: Mapping[str, Any]) -> 
     return save_weights(folder / "dynamics", tensors, {**described, **card})
 
 
-def wants_dynamics(name: str, weights: Weights) -> bool:
-    """Whether the backbone `name` is these weights of a tailornet with the dynamics beside them."""
-    there = weights.path.with_name("dynamics.json").exists()
-    return name == BackboneName.DYNAMIC or (name == BackboneName.AUTO and there)
-
-
-def with_dynamics(still: Backbone, weights: Weights) -> Dynamic:
-    """A TailorNet that was made of `weights`, and the dynamics beside them.
+def with_dynamics(name: str, network: Backbone, weights: Weights) -> Backbone:
+    """What the backbone `name` is: what was made of `weights`, with the dynamics beside them where it wants those.
 
     Raises:
-        WeightsError: it isn't one, or there are no dynamics, damaged ones, or some for another basis.
+        WeightsError: they aren't of a tailornet, or there are no dynamics, damaged ones, or some for another basis.
     """
-    if not isinstance(still, TailorNet):
+    there = weights.path.with_name("dynamics.json").exists()
+    if name != BackboneName.DYNAMIC and not (name == BackboneName.AUTO and there):
+        return network
+    if not isinstance(network, TailorNet):
         msg = f"{weights.path}: dynamics go with a tailornet, got {weights.card.get('backbone')}"
         raise WeightsError(msg)
     expect = {key: weights.card.get(key) for key in ("garment", "body_fingerprint", "basis_sha256")}
@@ -156,12 +153,12 @@ def with_dynamics(still: Backbone, weights: Weights) -> Dynamic:
         msg = f"{stored.path}: wanted joints below {N_JOINTS}, got {config.joints}; train it again"
         raise WeightsError(msg)
     try:
-        dynamics = build_for(stored.tensors, lambda: Dynamics(config, still))
+        dynamics = build_for(stored.tensors, lambda: Dynamics(config, network))
     except WeightsError as error:
         msg = f"{stored.path}: doesn't fit {weights.path.name}: {error}"
         raise WeightsError(msg) from error
-    dynamics = dynamics.float().to(next(still.parameters()).device)
-    return Dynamic(still, dynamics).eval().requires_grad_(False)
+    dynamics = dynamics.float().to(next(network.parameters()).device)
+    return Dynamic(network, dynamics).eval().requires_grad_(False)
 
 
 def load_backbone(
@@ -193,7 +190,7 @@ def load_backbone(
     if weights is None:
         return Skinned()
     network = backbone_from_weights(weights, template, device=device).requires_grad_(False)
-    return with_dynamics(network, weights) if wants_dynamics(name, weights) else network
+    return with_dynamics(name, network, weights)
 
 
 def backbone_weights(

@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from refu_core.backbones import Skinned, backbone_weights, wants_dynamics, with_dynamics
+from refu_core.backbones import Skinned, backbone_weights, with_dynamics
 from refu_core.body import ARMS, BodyFit, Collider, load_body, load_fit
 from refu_core.errors import BodyError, GarmentError, WeightsError, require_type
 from refu_core.garments import GarmentTemplate, load_garment, worn_on
@@ -92,7 +92,7 @@ def _wearable(
     if stored is None:
         return Wearable(worn_on(template, fit), Skinned(), None, DEFAULT_MARGIN)
     worn = wearable_of(stored, template, fit, device=device)
-    return replace(worn, backbone=with_dynamics(worn.backbone, stored)) if wants_dynamics(backbone, stored) else worn
+    return replace(worn, backbone=with_dynamics(backbone, worn.backbone, stored))
 
 
 def wearable_of(

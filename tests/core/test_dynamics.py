@@ -14,10 +14,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from small_set import QUANTUM
+from small_set import QUANTUM, write_set, write_shard
 
 from refu_core import GarmentPipeline, PoseHistory, RefuError, SmplFrame, load_body, load_garment
 from refu_core.backbones import (
+    BasisDecoder,
     Dynamic,
     Dynamics,
     DynamicsConfig,
@@ -185,11 +186,11 @@ def test_a_past_of_another_kind_is_refused(past: object) -> None:
 # The network --------------------------------------------------------------------------------------
 
 
-def untrained() -> Dynamic:
+def untrained(basis: BasisDecoder | None = None) -> Dynamic:
     """With a tailornet of a basis of few components, none of them trained."""
     torch.manual_seed(0)
     garment = load_garment(GARMENT)
-    basis = output_basis(1e-2 * torch.randn(12, garment.n_vertices, 3), rank=8)
+    basis = basis or output_basis(1e-2 * torch.randn(12, garment.n_vertices, 3), rank=8)
     config = replace(backbone_config("tailornet", garment), low=(16,), high=(8,), style_shape=(8,))  # type: ignore[arg-type]
     still = build_backbone(config, garment, basis=basis, pivots=torch.randn(3, 14))
     assert isinstance(still, TailorNet)
@@ -380,10 +381,6 @@ def write_sequences(folder: Path, *, count: int = 10, n_test: int = 2, seconds: 
         "dropped": np.zeros((count, 4), "<i4"),
         "seconds": np.ones(count, "<f4"),
     }
-    shard = folder / "shard-0-of-1"
-    shard.mkdir(parents=True)
-    for name, array in columns.items():
-        np.save(shard / f"{name}.npy", array)
     card = {
         "format": "refu-sequences-2",
         "garment": GARMENT,
@@ -393,14 +390,13 @@ def write_sequences(folder: Path, *, count: int = 10, n_test: int = 2, seconds: 
         "plan": {"count": count},
         "clips": {"train": ["a"], "test": ["b"]},
     }
-    (folder / "card.json").write_text(json.dumps(card))
-    return folder
+    return write_shard(folder, columns, card)
 
 
 def test_it_learns_what_a_pose_cannot_tell(tmp_path: Path) -> None:
     data = write_sequences(tmp_path / "sequences")
     samples = read_samples(open_dataset(data), load_body("male"), load_garment(GARMENT), split="train")
-    weights = write(tmp_path / GARMENT, fitting(output_basis(samples.displacement, rank=8)))
+    weights = write(tmp_path / GARMENT, untrained(output_basis(samples.displacement, rank=8)))
     settings = DynamicsSettings(LoopSettings(weight_decay=0.01, learning_rate=3e-3), steps=300)
     card = train_dynamics(GARMENT, data, weights, settings=settings, quiet=True)
     figures = card["figures"]
@@ -411,19 +407,7 @@ def test_it_learns_what_a_pose_cannot_tell(tmp_path: Path) -> None:
     assert not (weights / "dynamics.checkpoint").exists()
 
 
-def fitting(basis: object) -> Dynamic:
-    """Untrained networks that say next to nothing, on a basis."""
-    torch.manual_seed(0)
-    garment = load_garment(GARMENT)
-    config = replace(backbone_config("tailornet", garment), low=(16,), high=(8,), style_shape=(8,))  # type: ignore[arg-type]
-    still = build_backbone(config, garment, basis=basis, pivots=torch.randn(3, 14))  # type: ignore[arg-type]
-    assert isinstance(still, TailorNet)
-    return Dynamic(still, Dynamics(DynamicsConfig(garment.card.joints), still))
-
-
 def test_samples_at_rest_teach_no_motion(tmp_path: Path) -> None:
-    from small_set import write_set
-
     data = write_set(tmp_path / "rest", load_garment(GARMENT), load_body("male"))
     with pytest.raises(RefuError, match="--sequences"):
         train_dynamics(GARMENT, data, tmp_path, quiet=True)
