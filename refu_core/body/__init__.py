@@ -13,7 +13,7 @@ from refu_core.body._model import BodyOutput, Shape, SmplBody
 from refu_core.body._parts import ARMS, LEGS, MIRRORED_JOINTS, SEGMENTS, joints_of, part_of_faces, weight_of_parts
 from refu_core.body._register import Registration
 from refu_core.body._rest_pose import require_rest_pose
-from refu_core.body._skinning import Skinning, apply_transforms, blend_transforms, unapply_transforms
+from refu_core.body._skinning import JointWeights, Skinning, apply_transforms, blend_transforms, unapply_transforms
 from refu_core.body._surface import Surface
 from refu_core.skeleton import JOINT_NAMES, PARENTS
 
@@ -32,6 +32,7 @@ __all__ = [
     "Collider",
     "ColliderSettings",
     "Difference",
+    "JointWeights",
     "Registration",
     "RigidTransforms",
     "Shape",

@@ -19,6 +19,7 @@ from refu_core.body._creases import LEVELS, find_creases
 from refu_core.body._kinematics import PARENTS
 from refu_core.body._model import SmplBody
 from refu_core.body._segments import SOFTNESS, cut
+from refu_core.body._skinning import JointWeights
 from refu_core.mesh import Connectivity, vertex_normals
 
 DEFAULT_GAP = 0.012
@@ -114,13 +115,12 @@ class Anatomy:
         return rings
 
     def _bind_bones(self, rest: NDArray[np.float64], mesh: Connectivity, weights: NDArray[np.float64]) -> Any:
-        vertex, joint = np.nonzero(weights)
         bones = kernels.Bones()
         work = self.tensors
         bones.rotation, bones.between = as_warp(work.rotation, wp.mat33), as_warp(work.between, wp.mat33)
         bones.bent = wp.zeros(len(PARENTS), dtype=wp.float32, device=str(self.device))
-        bones.start = self._ints(np.searchsorted(vertex, np.arange(len(rest) + 1)))
-        bones.joint, bones.weight = self._ints(joint), self._floats(weights[vertex, joint])
+        start, joint, weight = JointWeights.of(torch.as_tensor(weights))
+        bones.start, bones.joint, bones.weight = self._ints(start), self._ints(joint), self._floats(weight)
         normals = _smooth_normals(rest, mesh)
         bones.normal = self._vectors(normals)
         self.normals = torch.as_tensor(normals, device=self.device)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 import warp as wp
 from torch import Tensor
@@ -37,16 +39,31 @@ def _stacked(transforms: RigidTransforms) -> Tensor:
     return torch.cat((transforms.rotation.flatten(2), transforms.translation), -1)
 
 
+class JointWeights(NamedTuple):
+    """The joints that have a weight at each of V vertices: of vertex v, rows `start[v]` to `start[v + 1]`."""
+
+    start: Tensor
+    """int32, shape (V + 1,)."""
+    joint: Tensor
+    """int32, shape (R,)."""
+    weight: Tensor
+    """float32, shape (R,)."""
+
+    @classmethod
+    def of(cls, weights: Tensor) -> JointWeights:
+        """Of skinning weights (V, 24)."""
+        has_weight = weights != 0
+        vertex, joint = torch.nonzero(has_weight, as_tuple=True)
+        start = torch.nn.functional.pad(has_weight.sum(1).cumsum(0), (1, 0))
+        return cls(start.int(), joint.int(), weights[vertex, joint].float())
+
+
 class Skinning:
     """Linear blend skinning of one mesh, by those joints only that have a weight at a vertex."""
 
     def __init__(self, weights: Tensor) -> None:
         """For skinning weights whose rows sum to one, shape (V, 24)."""
-        self._weights = weights
-        has_weight = weights != 0
-        vertex, joint = torch.nonzero(has_weight, as_tuple=True)
-        self._start = torch.nn.functional.pad(has_weight.sum(1).cumsum(0), (1, 0)).int()
-        self._joint, self._weight = joint.int(), weights[vertex, joint].float()
+        self._weights, self._by_joint = weights, JointWeights.of(weights)
 
     def __call__(self, points: Tensor, transforms: RigidTransforms) -> Tensor:
         """Posed points [m], shape (B, V, 3), of rest-pose points (B, V, 3), or (1, V, 3) for bodies of one shape.
@@ -60,7 +77,7 @@ class Skinning:
         posed = torch.empty(len(rotation), *points.shape[1:], device=points.device)
         if len(rotation):
             n_strips, each = strips(posed.shape[1], posed.device)
-            _skin((len(posed), n_strips), points, self._start, self._joint, self._weight, stacked, each, posed)
+            _skin((len(posed), n_strips), points, *self._by_joint, stacked, each, posed)
         return posed
 
 

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from refu_core._warp import as_warp, torch_stream
+from refu_core.body import PARENTS, JointWeights
 from refu_core.contact import _layers_kernels as layers
 from refu_core.contact import _unfold_kernels as kernels
 from refu_core.contact._level_kernels import level_kernel
@@ -40,39 +41,50 @@ class Unfold:
     ) -> None:
         """For a garment that is worn with the `others`, on its device."""
         rest = garment.v_template.detach().float().contiguous()
-        self._settings, self._device = settings, rest.device
-        self._is_serial = rest.device.type == "cpu"
-        cut, n = cut_of(garment.mesh, rest.device), garment.n_vertices
-        self._points, self._other, self._turned, normals = torch.zeros(4, n, 3, device=rest.device)
-        self._weight, self._wider, self._share = torch.zeros(3, n, device=rest.device)
-        self._share.copy_(_share(garment, others, *settings.unfold_near))
-        self._count = torch.zeros(1, dtype=torch.int32, device=rest.device)
-        rows = wp.zeros(n, dtype=wp.int32, device=str(rest.device))
-        points, other, turned = (as_warp(one, wp.vec3) for one in (self._points, self._other, self._turned))
-        weight, wider, may = (as_warp(one, wp.float32) for one in (self._weight, self._wider, self._share))
-        wp.launch(
-            layers.normals_kernel, n, [as_warp(rest, wp.vec3), cut, as_warp(normals, wp.vec3)], device=str(rest.device)
+        device, n = rest.device, garment.n_vertices
+        self._settings, self._device = settings, device
+        self._is_serial = device.type == "cpu"
+        self._points, self._other, self._origin, normals = torch.zeros(4, n, 3, device=device)
+        self._weight, self._wider = torch.zeros(2, n, device=device)
+        self._rotation = torch.zeros(len(PARENTS), 3, 3, device=device)
+        self._count = torch.zeros(1, dtype=torch.int32, device=device)
+        points, other, origin, upward = (
+            as_warp(one, wp.vec3) for one in (self._points, self._other, self._origin, normals)
         )
-        # What a rotation of joint j adds to the normal of vertex v, for all j and axes: (V, 24 * 3).
-        self._by_joint = (garment.weights.float()[:, :, None] * normals[:, None]).flatten(1)
-        (flat, folded), fade = settings.unfold_cosines, settings.unfold_fade
-        reach, rounds = settings.unfold_reach, settings.unfold_rounds
-        count = as_warp(self._count, wp.int32)
+        weight, wider = as_warp(self._weight, wp.float32), as_warp(self._wider, wp.float32)
+        share = _share(garment, others, *settings.unfold_near).to(device)
+        may = torch.nonzero(share)[:, 0].int()
+        self._kept = upright, cut = kernels.Upright(), cut_of(garment.mesh, device)  # launches know addresses
+        wp.launch(layers.normals_kernel, n, [as_warp(rest, wp.vec3), cut, upward], device=str(device))
+        upright.normal, upright.share, upright.may = upward, as_warp(share, wp.float32), as_warp(may, wp.int32)
+        start, joint, of_joint = JointWeights.of(garment.weights)
+        upright.start, upright.joint = as_warp(start, wp.int32), as_warp(joint, wp.int32)
+        upright.weight = as_warp(of_joint, wp.float32)
+        rows, is_listed = (wp.zeros(n, dtype=wp.int32, device=str(device)) for _ in range(2))
+        (flat, folded), fade, farthest = settings.unfold_cosines, settings.unfold_fade, settings.max_displacement
+        n_strips, each = (1, len(may)) if self._is_serial else (len(may), 1)
+        told = [points, as_warp(self._rotation, wp.mat33), cut, upright, flat, folded]
+        listed = [rows, as_warp(self._count, wp.int32)]
+        widening = [upright.share, cut, fade]
         self._commands: dict[str, Any] = {}
         for name, kernel, size, arguments in (
-            ("fold", kernels.fold_kernel, n, [points, turned, cut, flat, folded, may, weight, count]),
-            ("widen0", kernels.widen_kernel, n, [weight, may, cut, fade, wider]),
-            ("widen1", kernels.widen_kernel, n, [wider, may, cut, fade, weight]),
+            ("fold", kernels.fold_kernel, n_strips, [each, *told, weight, *listed]),
+            ("widen0", kernels.widen_kernel, n, [weight, *widening, wider]),
+            ("widen1", kernels.widen_kernel, n, [wider, *widening, weight]),
             ("level0", level_kernel, n, [points, weight, cut.ring_start, cut.ring, other]),
             ("level1", level_kernel, n, [other, weight, cut.ring_start, cut.ring, points]),
+            ("bound", kernels.bound_kernel, n, [origin, farthest, points]),
             (
                 "unfold all",
                 kernels.unfold_all_kernel,
                 1,
-                [may, cut, fade, reach, rounds, wider, rows, other, weight, points],
+                [
+                    *(*widening, settings.unfold_reach, settings.unfold_rounds, farthest),
+                    *(*listed, is_listed, wider, origin, other, weight, points),
+                ],
             ),
         ):
-            self._commands[name] = wp.launch(kernel, size, arguments, device=str(rest.device), record_cmd=True)
+            self._commands[name] = wp.launch(kernel, size, arguments, device=str(device), record_cmd=True)
 
     @torch.no_grad()
     def __call__(self, points: Tensor, rotation: Tensor) -> Tensor:
@@ -82,7 +94,7 @@ class Unfold:
         """
         with torch_stream(self._device):
             self._points.copy_(points)
-            torch.mm(self._by_joint, rotation.float().transpose(1, 2).reshape(-1, 3), out=self._turned)
+            self._rotation.copy_(rotation)
             self._count.zero_()
             self._commands["fold"].launch()
             if self._is_serial:
@@ -90,11 +102,14 @@ class Unfold:
                     return points
                 self._commands["unfold all"].launch()
             else:
+                self._origin.copy_(points)
                 for k in range(self._settings.unfold_reach):
                     self._commands[f"widen{k % 2}"].launch()
                 for k in range(self._settings.unfold_rounds):
                     self._commands[f"level{k % 2}"].launch()
-        return points + torch.renorm(self._points - points, 2, 0, self._settings.max_displacement)
+                self._commands["bound"].launch()
+        unfolded: Tensor = self._points.clone()
+        return unfolded
 
 
 def _share(garment: GarmentTemplate, others: Sequence[GarmentTemplate], near: float, far: float) -> Tensor:
