@@ -18,7 +18,7 @@ from refu_core.contact._parting import Parting
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
 from refu_core.contact._sheet import Sheet, ints
 from refu_core.errors import MeshError
-from refu_core.mesh import Adjacency, Connectivity
+from refu_core.mesh import Connectivity
 
 
 class Layer:
@@ -63,28 +63,13 @@ class Layer:
         self._above = above.detach().to(torch.float32, copy=True).contiguous()
         above_mesh = Connectivity.of(above_faces.cpu(), len(above))
         self._below = Sheet(Connectivity.of(below_faces.cpu(), len(below)), below)
-        rest, rest_below = self._above.cpu().numpy(), self._below.vertices.cpu().numpy()
-        is_near = cKDTree(rest_below).query(rest)[0] < settings.layer_meets
-        meets, candidates = np.flatnonzero(is_near), np.argsort(~is_near, kind="stable")  # those that meet first
-        rows, ring_start, ring = _region(above_mesh.ring, candidates, settings.layer_rounds)
-        self._n_candidates, self._n_region = len(candidates), len(rows)
-        self._push = torch.zeros(len(candidates), 3, device=self.device)
-        self._fields = torch.zeros(2, len(rows) + 1, 3, device=self.device)
-        self._rows = torch.from_numpy(rows).to(self.device)
-        self._looks, self._moved = torch.zeros(2, len(rows), dtype=torch.int32, device=self.device)
-        self._count = torch.zeros(1, dtype=torch.int32, device=self.device)
-        self._n_doubtful = torch.zeros(1, dtype=torch.int32, device=self.device)
+        self.parting = Parting(above_mesh, self._above, self._below, settings=settings)
+        """What is done where triangles cut each other after all."""
+        self._given, self._push, *self._fields = torch.zeros(4, *self._above.shape, device=self.device)
+        self._moved = torch.zeros(len(above), dtype=torch.int32, device=self.device)
+        self._count, self._n_doubtful = torch.zeros(2, 1, dtype=torch.int32, device=self.device)
         self._commands: dict[str, Any] = {}
-        if len(candidates):
-            start, places = _starts(rest[meets], rest_below, settings)
-            start = np.append(start, np.full(len(rest) - len(meets), start[-1]))  # strangers know of no place
-            lists = [ints(values, self.device) for values in (start, places, rows, ring_start, ring)]
-            edges = rest_below[self._below.mesh.edges]
-            longest = settings.layer_stretch * float(np.linalg.norm(edges[:, 0] - edges[:, 1], axis=1).max())
-            rules = _rules(settings, longest)
-            self.parting = Parting(above_mesh, self._above, self._below, settings=settings)
-            """What is done where triangles cut each other after all."""
-            self._record(rules, *lists)
+        self._record(self._above.cpu().numpy(), self._below.vertices.cpu().numpy())
 
     @torch.no_grad()
     def __call__(self, above: Tensor, below: Tensor, *, goes_on: bool = False) -> tuple[Tensor, Tensor]:
@@ -99,11 +84,11 @@ class Layer:
         Raises `MeshError` for garments of other sizes than these were made for.
         """
         self._check(above, below)
-        if not self._n_candidates:
-            return above, torch.zeros_like(self._count)
         with torch_stream(self.device):
-            self._take(above, below, goes_on=goes_on)
-            self._look()
+            if not goes_on:
+                self._below.take(below)
+            self._given.copy_(above)
+            self._look("look again" if goes_on else "look")
             n_low = self._count.clone()
             if self._is_serial and not int(n_low):
                 return above, n_low
@@ -115,10 +100,8 @@ class Layer:
 
         An int32 of shape (1,). `parting` goes on from what was found.
         """
-        if self._n_candidates:
-            self.parting.find(above)
-            return self.parting.n_cut.clone()
-        return torch.zeros_like(self._count)
+        self.parting.find(above)
+        return self.parting.n_cut.clone()
 
     def _check(self, above: Tensor, below: Tensor) -> None:
         if above.shape != self._above.shape or below.shape != self._below.vertices.shape:
@@ -128,23 +111,13 @@ class Layer:
             )
             raise MeshError(msg)
 
-    def _take(self, above: Tensor, below: Tensor, *, goes_on: bool) -> None:
-        """Takes over a frame."""
-        if goes_on:
-            self._looks.copy_((above != self._above).any(1)[self._rows] | (self._moved > 0))
-        else:
-            self._looks.fill_(1)
-            self._below.take(below)
-        self._moved.zero_()
-        self._above.copy_(above)
-
-    def _look(self) -> None:
+    def _look(self, search: str) -> None:
         """What has to be pushed, and how many vertices that are; a device that isn't waited for asks about everyone."""
         self._count.zero_()
         self._n_doubtful.zero_()
-        self._commands["search"].launch()
+        self._commands[search].launch()
         self._commands["lift"].launch()
-        n = int(self._n_doubtful) if self._is_serial else self._n_candidates
+        n = int(self._n_doubtful) if self._is_serial else len(self._above)
         if n:
             self._below.fit()
             self._commands["ask"].set_dim(n)
@@ -155,58 +128,40 @@ class Layer:
         if self._is_serial:
             self._commands["move all"].launch()
             return
-        self._fields[0].zero_()
-        self._fields[0, : self._n_candidates] = self._push
+        self._fields[0].copy_(self._push)
         for round_ in range(self._settings.layer_rounds):
             self._commands[f"spread{round_ % 2}"].launch()
         self._commands["move"].launch()
 
-    def _record(
-        self,
-        rules: Any,
-        near_start: Any,
-        near: Any,
-        rows: Any,
-        start: Any,
-        ring: Any,
-    ) -> None:
+    def _record(self, rest: NDArray[np.float32], rest_below: NDArray[np.float32]) -> None:
         """Records the launches of a frame: each of them is shorter than what Python makes of its arguments."""
-        above, push = (as_warp(tensor, wp.vec3) for tensor in (self._above, self._push))
-        sheet = self._below
-        fields = [as_warp(field, wp.vec3) for field in self._fields]
-        found, doubtful = (wp.zeros(self._n_candidates, dtype=wp.int32, device=str(self.device)) for _ in range(2))
-        looks, moved = as_warp(self._looks, wp.int32), as_warp(self._moved, wp.int32)
-        garments = [sheet.places, sheet.normals, sheet.cut, above, self.parting.cut, rows]
-        pushed = [push, as_warp(self._count, wp.int32)]
-        doubts = [doubtful, as_warp(self._n_doubtful, wp.int32)]
-        blend = [push, start, ring]
-        reached = [wp.zeros(self._n_region, dtype=wp.int32, device=str(self.device)) for _ in range(2)]
-        rounds = self._settings.layer_rounds
+        n, device, sheet, rounds = len(rest), str(self.device), self._below, self._settings.layer_rounds
+        n_strips, each = (1, n) if self._is_serial else (n, 1)
+        edges = rest_below[sheet.mesh.edges]
+        longest = float(np.linalg.norm(edges[:, 0] - edges[:, 1], axis=1).max(initial=0.0))
+        rules = _rules(self._settings, self._settings.layer_stretch * longest)
+        starts = [ints(values, self.device) for values in _starts(rest, rest_below, self._settings)]
+        given, above, push, *fields = (
+            as_warp(rows, wp.vec3) for rows in (self._given, self._above, self._push, *self._fields)
+        )
+        moved = as_warp(self._moved, wp.int32)
+        looks, found, doubtful, *reached = (wp.zeros(n, dtype=wp.int32, device=device) for _ in range(5))
+        count, n_doubtful = as_warp(self._count, wp.int32), as_warp(self._n_doubtful, wp.int32)
+        cut, below = self.parting.cut, [sheet.places, sheet.normals, sheet.cut]
+        search = [given, sheet.places, sheet.cut, *starts, above, moved, looks, found]
+        lift = [*below, sheet.extent, above, cut, looks, found, rules, push, count, doubtful, n_doubtful]
+        ask = [sheet.tree, *below, above, cut, found, rules, doubtful, n_doubtful, push, count]
         for name, kernel, size, arguments in (
-            (
-                "search",
-                kernels.search_kernel,
-                self._n_candidates,
-                [sheet.places, sheet.cut, above, rows, near_start, near, looks, found],
-            ),
-            (
-                "lift",
-                kernels.lift_kernel,
-                self._n_candidates,
-                [*garments, start, ring, looks, found, sheet.extent, rules, *pushed, *doubts],
-            ),
-            (
-                "ask",
-                kernels.tree_kernel,
-                self._n_candidates,
-                [sheet.tree, *garments, found, rules, *doubts, *pushed],
-            ),
-            ("spread0", moving.spread_kernel, self._n_region, [*blend, fields[0], fields[1]]),
-            ("spread1", moving.spread_kernel, self._n_region, [*blend, fields[1], fields[0]]),
-            ("move", moving.move_kernel, self._n_region, [rows, fields[0], above, moved]),
-            ("move all", moving.move_all_kernel, 1, [*blend, rows, rounds, *reached, *fields, above, moved]),
+            ("look", kernels.search_kernel, n_strips, [each, False, *search]),
+            ("look again", kernels.search_kernel, n_strips, [each, True, *search]),
+            ("lift", kernels.lift_kernel, n_strips, [each, *lift]),
+            ("ask", kernels.tree_kernel, n, ask),
+            ("spread0", moving.spread_kernel, n, [push, cut, *fields]),
+            ("spread1", moving.spread_kernel, n, [push, cut, *reversed(fields)]),
+            ("move", moving.move_kernel, n, [fields[0], above, moved]),
+            ("move all", moving.move_all_kernel, 1, [push, cut, rounds, *reached, *fields, above, moved]),
         ):
-            self._commands[name] = wp.launch(kernel, size, arguments, device=str(self.device), record_cmd=True)
+            self._commands[name] = wp.launch(kernel, size, arguments, device=device, record_cmd=True)
 
 
 def _rules(settings: ContactSettings, longest: float) -> Any:
@@ -219,35 +174,20 @@ def _rules(settings: ContactSettings, longest: float) -> Any:
 def _starts(
     above: NDArray[np.float32], below: NDArray[np.float32], settings: ContactSettings
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Vertices of the sheet below, (U, 3) [m], that each vertex above, (K, 3), looks from: starts (K + 1,) and them."""
+    """Vertices of the sheet below, (U, 3) [m], that each vertex above, (V, 3), looks from: starts (V + 1,) and them.
+
+    None where it isn't near the sheet at rest.
+    """
     tree, is_free, places = cKDTree(below), np.ones(len(below), np.bool_), []
     for vertex in range(len(below)):
         if is_free[vertex]:
             places.append(vertex)
             is_free[tree.query_ball_point(below[vertex], settings.layer_spacing)] = False
-    closest = np.asarray(tree.query(above)[1])
+    distance, closest = (np.asarray(found) for found in tree.query(above))
     around = cKDTree(below[places]).query_ball_point(above, settings.layer_slides)
-    each = [np.append(first, np.array(places)[others]) for first, others in zip(closest, around, strict=True)]
+    each = [
+        np.append(first, np.array(places)[others]) if near else np.zeros(0, np.int64)
+        for first, others, near in zip(closest, around, distance < settings.layer_meets, strict=True)
+    ]
     found = np.concatenate((*each, np.zeros(0, np.int64))).astype(np.int64)
     return np.append(0, np.cumsum([len(one) for one in each])).astype(np.int64), found
-
-
-def _region(
-    ring: Adjacency, candidates: NDArray[np.int64], reach: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """The vertices that pushes of the candidates reach, those first, (R,), and the ring of each by place in that list.
-
-    Starts (R + 1,) and places; a neighbour outside of the region, which no push reaches, is at place R.
-    """
-    vertex, neighbour = ring.owner, ring.items
-    reached = np.zeros(len(ring.start) - 1, np.bool_)
-    reached[candidates] = True
-    is_beside = ~reached
-    for _ in range(reach):
-        reached[neighbour[reached[vertex]]] = True
-    rows = np.concatenate((candidates, np.flatnonzero(reached & is_beside)))
-    place = np.full(len(reached), len(rows))
-    place[rows] = np.arange(len(rows))
-    n_neighbours = np.bincount(vertex, minlength=len(reached))[rows]
-    of_region = np.argsort(place[vertex], kind="stable")[: n_neighbours.sum()]
-    return rows, np.append(0, np.cumsum(n_neighbours)), place[neighbour[of_region]]

@@ -6,7 +6,7 @@ from refu_core.sdf._closest_kernels import closest_on_face, mean_normal
 
 # Nothing is so far from where it was at rest; it is a limit to what a sheet crumpled into itself may take.
 MOST_STEPS = wp.constant(64)
-# In place of the vertex that a candidate comes to: it isn't near the sheet at rest, as a sleeve isn't near shorts.
+# In place of the vertex that one comes to: it isn't near the sheet at rest, as a sleeve isn't near shorts.
 STRANGER = wp.constant(-2)
 
 
@@ -119,36 +119,47 @@ def normals_kernel(
 
 @wp.kernel(enable_backward=False)
 def search_kernel(
+    each: int,
+    goes_on: bool,
+    given: wp.array[wp.vec3],
     below: wp.array[wp.vec3],
     below_cut: Cut,
-    above: wp.array[wp.vec3],
-    candidates: wp.array[int],
     near_start: wp.array[int],
     near: wp.array[int],
+    # outputs; a call that goes on begins with the last one's
+    above: wp.array[wp.vec3],
+    moved: wp.array[int],
     looks: wp.array[int],
-    # output, by candidate
     found: wp.array[int],
 ) -> None:
-    """Which vertex of the sheet below each candidate that `looks` comes to, downhill.
+    """Takes over what is `given`, and finds the vertex of the sheet below that each vertex comes to, downhill.
 
-    From the nearest of those to look from, which are `near[near_start[k]:near_start[k + 1]]`; `STRANGER` where there
-    are none.
+    From the nearest of those to look from, which are `near[near_start[i]:near_start[i + 1]]`; `STRANGER` where there
+    are none. A call that goes on looks only at what isn't where it was left, or was `moved` there, from what it found.
+    `each` vertices a thread (`strips`).
     """
-    k = wp.tid()
-    if looks[k] == 0:
-        return
-    if near_start[k] == near_start[k + 1]:
-        found[k] = STRANGER
-        return
-    p = above[candidates[k]]
-    v = int(near[near_start[k]])
-    squared = float(wp.inf)
-    for n in range(near_start[k], near_start[k + 1]):
-        other = wp.length_sq(below[near[n]] - p)
-        if other < squared:
-            squared = other
-            v = near[n]
-    found[k] = nearest_vertex(p, v, below, below_cut)
+    first = wp.tid() * each
+    for i in range(first, first + each):
+        p = given[i]
+        looks[i] = wp.where(goes_on and moved[i] == 0 and p == above[i], 0, 1)
+        above[i] = p
+        moved[i] = 0
+        if looks[i] == 0:
+            continue
+        if near_start[i] == near_start[i + 1]:
+            found[i] = STRANGER
+            continue
+        v = int(near[near_start[i]])
+        if goes_on:
+            v = found[i]
+        else:
+            squared = float(wp.inf)
+            for n in range(near_start[i], near_start[i + 1]):
+                other = wp.length_sq(below[near[n]] - p)
+                if other < squared:
+                    squared = other
+                    v = near[n]
+        found[i] = nearest_vertex(p, v, below, below_cut)
 
 
 @wp.func
@@ -162,7 +173,6 @@ def normal_on(face: int, w: wp.vec3, normals: wp.array[wp.vec3], cut: Cut) -> wp
 
 @wp.func
 def lift_off(
-    k: int,
     i: int,
     face: int,
     feature: int,
@@ -173,11 +183,11 @@ def lift_off(
     above_cut: Cut,
     faces_it: bool,
     rules: LayerRules,
-    # outputs, by candidate
+    # outputs
     push: wp.array[wp.vec3],
     count: wp.array[int],
 ) -> None:
-    """What brings candidate k, vertex i, to the gap above the place on the sheet that it is off by `offset`."""
+    """What brings vertex i to the gap above the place on the sheet that it is off by `offset`."""
     height = wp.dot(offset, normal)
     far = wp.length(offset)
     if height >= rules.gap or far > rules.reach:
@@ -192,71 +202,70 @@ def lift_off(
         share *= wp.max(0.0, 1.0 - wp.length(offset - height * normal) / rules.fade)
     lift = share * (rules.gap - height) * normal
     if wp.length_sq(lift) > 0.0:
-        push[k] = lift
+        push[i] = lift
         wp.atomic_add(count, 0, 1)
 
 
 @wp.kernel(enable_backward=False)
 def lift_kernel(
+    each: int,
     # the garment below
     below: wp.array[wp.vec3],
     below_normals: wp.array[wp.vec3],
     below_cut: Cut,
+    extent: wp.array[wp.vec3],
     # the garment above
     above: wp.array[wp.vec3],
     above_cut: Cut,
-    candidates: wp.array[int],
-    ring_start: wp.array[int],
-    ring: wp.array[int],
     looks: wp.array[int],
     found: wp.array[int],
-    extent: wp.array[wp.vec3],
     rules: LayerRules,
-    # outputs, by candidate
+    # outputs
     push: wp.array[wp.vec3],
     count: wp.array[int],
     doubtful: wp.array[int],
     n_doubtful: wp.array[int],
 ) -> None:
-    """What brings each candidate that `looks` to the gap above the sheet, and how many they are that lack something.
+    """What brings each vertex that `looks` to the gap above the sheet, and how many they are that lack something.
 
-    A fold that one candidate's search ended in is seldom in the way of its neighbours': what these `found` is looked
-    at, too. Whoever is far below the sheet is `doubtful`, and only listed.
+    A fold that one vertex's search ended in is seldom in the way of its neighbours': what these `found` is looked at,
+    too. Whoever is far below the sheet is `doubtful`, and only listed. `each` vertices a thread
+    (`strips`).
     """
-    k = wp.tid()
-    i = candidates[k]
-    p = above[i]
-    push[k] = wp.vec3(0.0, 0.0, 0.0)
-    if looks[k] == 0:
-        return
-    v = int(found[k])
-    if v == STRANGER:
-        if is_within(p, extent, rules.gap):
-            doubtful[wp.atomic_add(n_doubtful, 0, 1)] = k
-        return
-    squared = wp.length_sq(below[v] - p)
-    # As near as that, it is the right fold.
-    if 4.0 * squared > rules.longest * rules.longest:
-        for r in range(ring_start[k], ring_start[k + 1]):
-            j = ring[r]
-            if j < found.shape[0] and found[j] != STRANGER and found[j] != v:
-                other = wp.length_sq(below[found[j]] - p)
-                if other < squared:
-                    squared = other
-                    v = found[j]
-        if v != found[k]:
-            v = nearest_vertex(p, v, below, below_cut)
-    # No point of a face is farther from its closest corner than from the middle of three edges of its longest one.
-    if wp.length(below[v] - p) > rules.reach + 0.578 * rules.longest:
-        return
-    face, feature, w, offset = nearest_face(p, v, below, below_cut)
-    normal = normal_on(face, w, below_normals, below_cut)
-    if wp.dot(offset, normal) >= rules.gap:
-        return
-    if wp.length(offset) > rules.doubt:
-        doubtful[wp.atomic_add(n_doubtful, 0, 1)] = k
-        return
-    lift_off(k, i, face, feature, offset, normal, below_cut, above, above_cut, False, rules, push, count)
+    first = wp.tid() * each
+    for i in range(first, first + each):
+        push[i] = wp.vec3(0.0, 0.0, 0.0)
+        if looks[i] == 0:
+            continue
+        p = above[i]
+        v = int(found[i])
+        if v == STRANGER:
+            if is_within(p, extent, rules.gap):
+                doubtful[wp.atomic_add(n_doubtful, 0, 1)] = i
+            continue
+        squared = wp.length_sq(below[v] - p)
+        # As near as that, it is the right fold.
+        if 4.0 * squared > rules.longest * rules.longest:
+            for r in range(above_cut.ring_start[i], above_cut.ring_start[i + 1]):
+                beside = found[above_cut.ring[r]]
+                if beside != STRANGER and beside != v:
+                    other = wp.length_sq(below[beside] - p)
+                    if other < squared:
+                        squared = other
+                        v = beside
+            if v != found[i]:
+                v = nearest_vertex(p, v, below, below_cut)
+        # No point of a face is farther from its closest corner than from the middle of three edges of its longest one.
+        if wp.length(below[v] - p) > rules.reach + 0.578 * rules.longest:
+            continue
+        face, feature, w, offset = nearest_face(p, v, below, below_cut)
+        normal = normal_on(face, w, below_normals, below_cut)
+        if wp.dot(offset, normal) >= rules.gap:
+            continue
+        if wp.length(offset) > rules.doubt:
+            doubtful[wp.atomic_add(n_doubtful, 0, 1)] = i
+            continue
+        lift_off(i, face, feature, offset, normal, below_cut, above, above_cut, False, rules, push, count)
 
 
 @wp.kernel(enable_backward=False)
@@ -269,12 +278,11 @@ def tree_kernel(
     # the garment above
     above: wp.array[wp.vec3],
     above_cut: Cut,
-    candidates: wp.array[int],
     found: wp.array[int],
     rules: LayerRules,
     doubtful: wp.array[int],
     n_doubtful: wp.array[int],
-    # outputs, by candidate
+    # outputs
     push: wp.array[wp.vec3],
     count: wp.array[int],
 ) -> None:
@@ -282,8 +290,7 @@ def tree_kernel(
     n = wp.tid()
     if n >= n_doubtful[0]:
         return
-    k = doubtful[n]
-    i = candidates[k]
+    i = doubtful[n]
     p = above[i]
     hit = wp.mesh_query_point_no_sign(tree, p, rules.reach)
     if not hit.result:
@@ -291,4 +298,4 @@ def tree_kernel(
     face = hit.face
     w, feature, offset = closest_on_face(p, face, below, below_cut.faces)
     normal = normal_on(face, w, below_normals, below_cut)
-    lift_off(k, i, face, feature, offset, normal, below_cut, above, above_cut, found[k] == STRANGER, rules, push, count)
+    lift_off(i, face, feature, offset, normal, below_cut, above, above_cut, found[i] == STRANGER, rules, push, count)

@@ -2,65 +2,63 @@
 
 import warp as wp
 
+from refu_core.contact._layers_kernels import Cut
+
+wp.set_module_options({"enable_backward": False})
+
 
 @wp.func
 def spread(
-    k: int,
+    i: int,
     push: wp.array[wp.vec3],
-    ring_start: wp.array[int],
-    ring: wp.array[int],
+    cut: Cut,
     field: wp.array[wp.vec3],
     # output
     smoother: wp.array[wp.vec3],
 ) -> None:
     """One round of `Blend.spread`."""
-    start = ring_start[k]
-    end = ring_start[k + 1]
+    start = cut.ring_start[i]
+    end = cut.ring_start[i + 1]
     total = wp.vec3(0.0, 0.0, 0.0)
     for r in range(start, end):
-        total += field[ring[r]]
+        total += field[cut.ring[r]]
     mean = total / float(wp.max(end - start, 1))
-    if k < push.shape[0]:
-        length = wp.length(push[k])
-        if length > 0.0:
-            way = push[k] / length
-            mean += wp.max(0.0, length - wp.dot(mean, way)) * way
-    smoother[k] = mean
+    length = wp.length(push[i])
+    if length > 0.0:
+        way = push[i] / length
+        mean += wp.max(0.0, length - wp.dot(mean, way)) * way
+    smoother[i] = mean
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def spread_kernel(
     push: wp.array[wp.vec3],
-    ring_start: wp.array[int],
-    ring: wp.array[int],
+    cut: Cut,
     field: wp.array[wp.vec3],
     # output
     smoother: wp.array[wp.vec3],
 ) -> None:
-    """`spread` of one of the region a thread."""
-    spread(wp.tid(), push, ring_start, ring, field, smoother)
+    """`spread` of one vertex a thread."""
+    spread(wp.tid(), push, cut, field, smoother)
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def move_kernel(
-    rows: wp.array[int],
     field: wp.array[wp.vec3],
     # outputs
     points: wp.array[wp.vec3],
     moved: wp.array[int],
 ) -> None:
-    """Moves the vertices of the region, and says which have `moved`."""
-    k = wp.tid()
-    points[rows[k]] += field[k]
-    moved[k] = wp.where(wp.length_sq(field[k]) > 0.0, 1, 0)
+    """Moves the vertices, and says which have `moved`."""
+    i = wp.tid()
+    points[i] += field[i]
+    moved[i] = wp.where(wp.length_sq(field[i]) > 0.0, 1, 0)
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def move_all_kernel(
     push: wp.array[wp.vec3],
-    ring_start: wp.array[int],
-    ring: wp.array[int],
-    rows: wp.array[int],
+    cut: Cut,
     rounds: int,
     # memory, zero between launches
     is_reached: wp.array[int],
@@ -76,33 +74,33 @@ def move_all_kernel(
     Those have `moved`.
     """
     n = int(0)
-    for k in range(push.shape[0]):
-        if wp.length_sq(push[k]) > 0.0:
-            field[k] = push[k]
-            is_reached[k] = 1
-            reached[n] = k
+    for i in range(push.shape[0]):
+        if wp.length_sq(push[i]) > 0.0:
+            field[i] = push[i]
+            is_reached[i] = 1
+            reached[n] = i
             n += 1
     first = int(0)
     for _ in range(rounds):
         last = int(n)
-        for i in range(first, last):
-            for r in range(ring_start[reached[i]], ring_start[reached[i] + 1]):
-                j = ring[r]
-                if j < rows.shape[0] and is_reached[j] == 0:
+        for k in range(first, last):
+            for r in range(cut.ring_start[reached[k]], cut.ring_start[reached[k] + 1]):
+                j = cut.ring[r]
+                if is_reached[j] == 0:
                     is_reached[j] = 1
                     reached[n] = j
                     n += 1
         first = last
     for sweep in range(rounds):
-        for i in range(n):
+        for k in range(n):
             if sweep % 2 == 0:
-                spread(reached[i], push, ring_start, ring, field, smoother)
+                spread(reached[k], push, cut, field, smoother)
             else:
-                spread(reached[i], push, ring_start, ring, smoother, field)
-    for i in range(n):
-        k = reached[i]
-        points[rows[k]] += field[k]
-        moved[k] = 1
-        is_reached[k] = 0
-        field[k] = wp.vec3()
-        smoother[k] = wp.vec3()
+                spread(reached[k], push, cut, smoother, field)
+    for k in range(n):
+        i = reached[k]
+        points[i] += field[i]
+        moved[i] = 1
+        is_reached[i] = 0
+        field[i] = wp.vec3()
+        smoother[i] = wp.vec3()
