@@ -19,6 +19,8 @@ _CLOSEST_NS = 1_000_000_000 // 240
 """Frames nearer to each other than this replace one another, so that no rate fills the memory."""
 _FASTEST = 15.0
 """Who moves faster is somebody else, or was lost and found [m/s]; sprinters reach 12."""
+_SHORTEST = 1 / 30
+"""A speed is that over at least so long [s]: messages that were queued are stamped as they come, one upon the other."""
 _LONGEST_PAUSE = 0.25
 """Between frames farther apart nobody knows the motion [s]."""
 _LAGS = np.array(LAGS)
@@ -39,7 +41,7 @@ class PoseHistory:
 
     Nothing is kept but the frames of that half second, so nothing can drift. Before somebody's first frame they are
     taken to have stood still, as after a pause of a quarter of a second, a clock that went back, and a leap. Frames may
-    come at any rate from 4 Hz on. Not thread-safe.
+    come at any rate from 4 Hz on, and twice: of two with one stamp the later counts. Not thread-safe.
 
     `past` is what was `LAGS` ago, less what is now, of the shape (4, 219): nine numbers of each joint's rotation
     relative to its parent, row by row, those of the root as it sees itself; then where the root was [m], in its axes,
@@ -61,7 +63,9 @@ class PoseHistory:
         known = self._people.pop(person, None)
         if known is None or not _goes_on(known[-1], now):
             known = deque()
-        elif len(known) > 1 and now.stamp_ns - known[-2].stamp_ns < _CLOSEST_NS:
+        while known and now.stamp_ns <= known[-1].stamp_ns:
+            known.pop()
+        if len(known) > 1 and now.stamp_ns - known[-2].stamp_ns < _CLOSEST_NS:
             known.pop()
         known.append(now)
         while len(known) > 2 and known[1].stamp_ns <= now.stamp_ns - 1e9 * LAGS[-1]:
@@ -83,8 +87,9 @@ class PoseHistory:
 
 def _goes_on(last: _Moment, now: _Moment) -> bool:
     """Whether it is the same motion."""
-    seconds = 1e-9 * (now.stamp_ns - last.stamp_ns)
-    return 0 < seconds <= _LONGEST_PAUSE and float(np.linalg.norm(now.transl - last.transl)) <= _FASTEST * seconds
+    passed = now.stamp_ns - last.stamp_ns
+    way = float(np.linalg.norm(now.transl - last.transl))
+    return -_CLOSEST_NS < passed <= 1e9 * _LONGEST_PAUSE and way <= _FASTEST * max(1e-9 * passed, _SHORTEST)
 
 
 def _past(moments: Sequence[_Moment]) -> NDArray[np.float32]:

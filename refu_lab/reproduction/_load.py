@@ -48,14 +48,20 @@ class Library:
         return self._find(method.weights, garment)
 
     def key(self, method: Method, garment: str) -> str:
-        """What tells these weights from others of the same name; empty where there are none."""
+        """What tells these weights, and what is loaded with them, from others of the same name; empty for none."""
         if method.weights is None:
             return ""
         try:
-            card = read_json(self.find(method, garment).with_suffix(".json"), error=WeightsError, wanted="a card")
-            return str(card.get("sha256", "")) if isinstance(card, dict) else ""
+            stem = self.find(method, garment)
         except WeightsError:
             return ""
+        # Weights that are stored as differences from others may be the same bytes for every garment.
+        cards = [stem.with_name(f"{name}.json") for name in (stem.name, "basis", "dynamics")]
+        found = [read_json(card, error=WeightsError, wanted="a card") for card in cards if card.exists()]
+        hashes = [
+            str(card.get(key, "")) for card in found if isinstance(card, dict) for key in ("sha256", "base_sha256")
+        ]
+        return " ".join(filter(None, hashes))
 
     def load(self, method: Method, garment: str) -> Wearable:
         """A method's networks. Raises `WeightsError` where they are missing, damaged or of another body."""
@@ -63,7 +69,7 @@ class Library:
         return wearable_of(stored, load_garment(garment), self.fit)
 
     def pipeline(self, method: Method, *garments: str) -> GarmentPipeline:
-        """What the node runs in the method's mode, or the method's own backbone, with nothing handled.
+        """What the node runs in the method's mode, where that has networks; or its backbone, with nothing handled.
 
         Raises `RefuError` where garments worn together have no weights in one folder.
         """
@@ -73,7 +79,7 @@ class Library:
             garments,
             body=None if self.fit is None else self.fit.body,
             sdf=method.mode if is_node else "none",
-            backbone=BackboneName.AUTO if is_node else method.backbone,
+            backbone=BackboneName.AUTO if is_node and method.weights is not None else method.backbone,
             weights=weights,
             collider=self.collider,
         )

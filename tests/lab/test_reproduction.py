@@ -19,7 +19,7 @@ from torch import Tensor
 
 from msg_adapters import Motion
 from refu_core import GarmentPipeline, PoseHistory
-from refu_core.backbones import Prediction, WithoutWearerCode
+from refu_core.backbones import Prediction, Skinned, WithoutWearerCode
 from refu_core.body import Collider, load_body
 from refu_core.errors import RefuError, WeightsError
 from refu_core.garments import PAPER_GARMENTS, GarmentTemplate, load_garment
@@ -463,3 +463,20 @@ def test_shipped_weights_are_found_by_name(tmp_path: Path) -> None:
     )
     assert library.key(rp.METHODS["alt1-approx"], "tshirt-male") == "abc"
     assert library.key(rp.METHODS["skinned"], "tshirt-male") == ""
+    for beside in ("basis", "dynamics"):  # what is trained anew makes the figures of before void
+        before = library.key(rp.METHODS["alt1-approx"], "tshirt-male")
+        (tmp_path / "tshirt-male" / "alt1" / f"{beside}.json").write_text(f'{{"sha256": "{beside}"}}', encoding="utf-8")
+        assert library.key(rp.METHODS["alt1-approx"], "tshirt-male") != before
+
+
+def test_shipped_weights_of_each_garment_have_a_key_of_their_own() -> None:
+    keys = [
+        rp.Library().key(rp.METHODS["node-approx"], name) for name in ("dress-female", "trousers-male", "shirt-neutral")
+    ]
+    assert len(set(keys)) == 3
+
+
+def test_the_node_without_networks_has_none() -> None:
+    (wearable,) = rp.Library().pipeline(rp.METHODS["node-skinned"], "tshirt-male").outfit.wearables.values()
+    assert isinstance(wearable.backbone, Skinned)
+    assert wearable.refu is None
