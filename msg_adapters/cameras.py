@@ -26,7 +26,7 @@ class Camera:
     focal: tuple[float, float]
     """fx and fy [pixels]."""
     centre: tuple[float, float]
-    """cx and cy [pixels]."""
+    """cx and cy [pixels] from the picture's corner; a CameraInfo has them from the middle of the first pixel."""
 
     @property
     def numbers(self) -> tuple[int, int, tuple[float, float], tuple[float, float]]:
@@ -42,7 +42,7 @@ def decode_camera_info(data: Buffer) -> Camera:
     k = reader.array("f8", 9 + 9 + 12)  # k, r, p
     reader.fields("IIIIII?")  # binning, region of interest
     reader.finish()
-    focal, centre = (float(k[0]), float(k[4])), (float(k[2]), float(k[5]))
+    focal, centre = (float(k[0]), float(k[4])), (float(k[2]) + 0.5, float(k[5]) + 0.5)
     sizes = 0 < width <= _MOST_PIXELS and 0 < height <= _MOST_PIXELS
     if not (np.isfinite(k[:9]).all() and min(focal) > 0 and sizes):
         msg = f"the camera in {frame_id!r} isn't calibrated: {width} x {height} pixels, focal lengths {focal}"

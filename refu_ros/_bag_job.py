@@ -15,8 +15,10 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+from msg_adapters import KEYPOINT_TYPES
 from refu_core import RefuError
 from refu_core.options import PIPELINE_OPTIONS, arguments
+from refu_core.recordings import SUFFIXES
 from refu_ros._beside import NICE
 from refu_ros._settings import NodeSettings
 
@@ -37,6 +39,8 @@ class BagJob:
         self._result = Path(self._folder.name, "result.json")
         command = [sys.executable, "-m", "refu_lab.cli", "replay", str(bag), f"--output={output}", "--progress=lines"]
         given = ["betas_source", *["betas"] * bool(settings.known_betas), *["style"] * any(settings.style)]
+        if bag.suffix.lower() not in SUFFIXES:  # a file of motion says itself how it is to be read
+            given += ["input_axes", *["input_type", "keypoints"] * (settings.input_type in KEYPOINT_TYPES)]
         command += [f"--json={self._result}", *arguments(settings, *PIPELINE_OPTIONS, "margin", "frame_id", *given)]
         pipes: Any = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
         try:

@@ -143,8 +143,7 @@ class Listener:
         try:
             frames, given = self.stream.frames(data, node.now_ns(), sender=person)
         except (adapters.AdapterError, FrameError) as error:
-            node.statistics.drop("invalid", str(error))
-            node.get_logger().warning(f"{topic}: {printable(error)}", throttle_duration_sec=_LOG_PERIOD_S)
+            self._refuse(topic, error)
             return
         given = printable(given.lstrip("/"))
         # Keypoints' betas are measured on the body that is dressed, and their axes those of `frame_id`.
@@ -155,18 +154,26 @@ class Listener:
         for name, frame in frames.items():
             self._frames[name] = given
             if not self.is_steady:
-                self._put(name, frame)
+                self._put(name, frame, topic)
+
+    def _refuse(self, source: str, error: Exception) -> None:
+        self._node.statistics.drop("invalid", str(error))
+        self._node.get_logger().warning(f"{source}: {printable(error)}", throttle_duration_sec=_LOG_PERIOD_S)
 
     def predict(self) -> None:
         """Everybody whose keypoints are followed, by now."""
         if self.scene is not None and self._node.is_watched():
             for name, frame in self.stream.predicted(self._node.now_ns()).items():
-                self._put(name, frame)
+                self._put(name, frame, f"predicted {name}")
 
-    def _put(self, person: str, frame: Any) -> None:
+    def _put(self, person: str, frame: Any, source: str) -> None:
         assert self.scene is not None
         try:
+            adapters.check_plausible(frame)
             placement = self._placement(self._frames.get(person, ""), frame.stamp_ns)
+        except FrameError as error:
+            self._refuse(source, error)
+            return
         except adapters.TransformError as error:
             self._node.statistics.drop("transform", str(error))
             return

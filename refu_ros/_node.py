@@ -94,6 +94,8 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         try:
             interface(self._listener.stream.message_type)
             self._take(load(self.settings, threads=self.settings.threads), self.settings.pipeline)
+            self._lost = ""  # the device is tried anew
+            self.statistics.set_error("")
         except RefuError as error:
             self.get_logger().error(f"can't be configured: {printable(error)}")
             return TransitionCallbackReturn.FAILURE
@@ -296,6 +298,10 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         self._attend()
         if self._state == "active":
             self._hold_topics()
+        if self._fittings is not None:
+            for name, reason in self._fittings.without_planner.items():
+                text = f"planners aren't sent {name}: {printable(reason)}"
+                self.get_logger().warning(text, throttle_duration_sec=60.0)
         report = self.statistics.report()
         recording, error = self.recording.state()
         scene, since = self._listener.scene, self._listener.since

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 class Obstacles:
     """Garments as MoveIt has obstacles: put in anew when their shape has changed, moved when only their place has.
 
-    Whoever subscribes later is sent everything: to move what isn't there is an error.
+    Whoever subscribes later is sent everything: to move what isn't there is an error. What planners can't have is left
+    out (`Fittings.without_planner`).
     """
 
     message_type = COLLISION_OBJECT
@@ -36,7 +37,7 @@ class Obstacles:
 
     def messages(self, worn: Sequence[Dressed], moment: Moment) -> Messages:
         before, watchers = self._watchers, moment.watchers(self.topic)
-        if watchers and not all(one.fittings.has_planner(name) for one in worn for name in one.fittings.names):
+        if watchers and not all(_is_prepared(one.fittings, name) for one in worn for name in one.fittings.names):
             return  # soon
         self._watchers = watchers
         if watchers > before:
@@ -46,12 +47,13 @@ class Obstacles:
         for one in worn if watchers else ():
             if not is_due(self._due, one.person, moment.wishes):
                 continue
-            names = [garment_namespace(name, one.person) for name in one.fittings.names]
+            garments = [name for name in one.fittings.names if name not in one.fittings.without_planner]
+            names = [garment_namespace(name, one.person) for name in garments]
             sent = self._sent.setdefault(one.person, {})
             for name in [name for name in sent if name not in names]:
                 del sent[name]
                 yield self.topic, self._remove(name, moment)
-            for name, garment in zip(names, one.fittings.names, strict=True):
+            for name, garment in zip(names, garments, strict=True):
                 shape = one.output[garment].local.tobytes() + one.rotation.tobytes()
                 is_moved = sent.get(name) == shape
                 sent[name] = shape
@@ -83,3 +85,8 @@ class Obstacles:
 
     def forget(self) -> None:
         """Nothing: what has gone is seen by its name."""
+
+
+def _is_prepared(fittings: Fittings, garment: str) -> bool:
+    """Whether it is known how planners have a garment, or that they can't."""
+    return fittings.has_planner(garment) or garment in fittings.without_planner

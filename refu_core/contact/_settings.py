@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from refu_core.errors import RefuError
 from refu_core.refu import MAX_DISPLACEMENT
+
+MOST_PUSHES = 16
 
 
 @dataclass(frozen=True, kw_only=True)
 class ContactSettings:
     """How a garment is brought off the body and off the garments below it.
+
+    Raises `RefuError` for more pushes than are counted.
 
     Each number says what it is for. `benchmarks/contact.py` measures what half and twice of it do on recorded motion.
     """
@@ -18,7 +23,7 @@ class ContactSettings:
     max_displacement: float = MAX_DISPLACEMENT
     """No vertex moves farther than this, however wrong its distance is [m]."""
     max_pushes: int = 4
-    """Pushes of a vertex, and rounds of raised edges."""
+    """Pushes of a vertex, and rounds of raised edges; up to 16."""
     tolerance: float = 2e-4
     """What may be missing to the margin [m]."""
 
@@ -150,6 +155,11 @@ class ContactSettings:
     """How often triangles are brought apart, before the body has its word. Eight leave 5 of 116 cut, twelve 3."""
     partings: int = 3
     """How often all of that is done, while any cut. Once leaves 6 of 116 cut, twice 4; four times no fewer."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.max_pushes <= MOST_PUSHES:
+            msg = f"max_pushes: wanted 0 to {MOST_PUSHES}, got {self.max_pushes}"
+            raise RefuError(msg)
 
 
 DEFAULT_CONTACT = ContactSettings()

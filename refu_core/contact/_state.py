@@ -7,6 +7,8 @@ waited for: there a launch is as long as any list can be, and what is beyond its
 
 import warp as wp
 
+from refu_core.contact._settings import MOST_PUSHES
+
 # What a kernel counts.
 NEAR = wp.constant(0)  # vertices nearer than the margin, which are pushed
 REACHED = wp.constant(1)  # vertices that a push reaches by way of its neighbours
@@ -16,9 +18,9 @@ MOVED = wp.constant(4)  # of those nearer than the margin
 STUCK = wp.constant(5)  # inside after all
 RAISED = wp.constant(6)  # ends of edges that cut the skin
 CHANGED = wp.constant(7)  # distances that were replaced
-CUTTING = wp.constant(8)  # such edges; a number for each round follows
-SHIFTED = wp.constant(15)  # vertices that were moved since the last call
-N_COUNTS = 16
+SHIFTED = wp.constant(8)  # vertices that were moved since the last call
+CUTTING = wp.constant(9)  # such edges; a number for each round follows
+N_COUNTS = 10 + MOST_PUSHES
 
 # A vertex reached by pushes, or pushed itself.
 BESIDE = wp.constant(1)

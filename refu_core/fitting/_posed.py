@@ -41,9 +41,8 @@ class PosedBody:
 
     def closest(self, points: F64) -> tuple[NDArray[np.int64], F64]:
         """The closest face of each point (P, 3), and where in it that is, as barycentric coordinates (P, 3)."""
-        face = self._sdf.closest(torch.as_tensor(points, dtype=torch.float32)).face.long().numpy()
-        corners = self.vertices.double().numpy()[self.body.faces.numpy()[face]]
-        return face, _barycentric(points, corners)
+        found = self._sdf.closest(torch.as_tensor(points, dtype=torch.float32))
+        return found.face.long().numpy(), found.barycentrics.double().numpy()
 
 
 def standing_pose(arms: float, legs: float = 0.0) -> F64:
@@ -52,16 +51,3 @@ def standing_pose(arms: float, legs: float = 0.0) -> F64:
     pose[LEFT_SHOULDER, 2], pose[RIGHT_SHOULDER, 2] = -arms, arms
     pose[LEFT_HIP, 2], pose[RIGHT_HIP, 2] = legs, -legs
     return pose
-
-
-def _barycentric(points: F64, corners: F64) -> F64:
-    """Of the projections of points (P, 3) onto triangles (P, 3, 3), clipped to them; shape (P, 3)."""
-    a, b, c = corners.transpose(1, 0, 2)
-    u, v, w = b - a, c - a, points - a
-    uu, uv, vv = (u * u).sum(1), (u * v).sum(1), (v * v).sum(1)
-    wu, wv = (w * u).sum(1), (w * v).sum(1)
-    det = np.maximum(uu * vv - uv * uv, 1e-30)
-    s, t = (vv * wu - uv * wv) / det, (uu * wv - uv * wu) / det
-    found = np.clip(np.stack((1 - s - t, s, t), 1), 0, None)
-    shares: F64 = found / found.sum(1, keepdims=True)
-    return shares

@@ -70,6 +70,11 @@ class KeypointTracker:
 
     # A frame --------------------------------------------------------------------------------------
 
+    @property
+    def stamp_ns(self) -> int:
+        """Of the newest keypoints, 0 without a person [ns]."""
+        return self._stamp
+
     def update(self, points: ArrayLike, stamp_ns: int, *, confidence: ArrayLike | None = None) -> SmplFrame | None:
         """The pose after a frame of keypoints, None while there is no person to be seen.
 
@@ -303,10 +308,13 @@ class People:
         if track is None:
             track = KeypointTracker(self.skeleton, **self._options)  # type: ignore[arg-type]
         self._tracks[person] = track
-        self._newest[person] = stamp_ns, now_ns
+        before = track.stamp_ns
+        frame = track.update(points, stamp_ns, confidence=confidence)
+        if person not in self._newest or track.stamp_ns != before:  # or they were older than those that are known
+            self._newest[person] = stamp_ns, now_ns
         for gone in list(self._tracks)[:-MOST_PEOPLE]:
             del self._tracks[gone], self._newest[gone]
-        return track.update(points, stamp_ns, confidence=confidence)
+        return frame
 
     def at(self, now_ns: int) -> dict[str, SmplFrame]:
         """Everybody's pose by now, as far on from their newest keypoints as these are old.

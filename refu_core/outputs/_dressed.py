@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from refu_core.errors import RefuError
 from refu_core.outputs._clearance import Clearance
 from refu_core.outputs._limbs import LimbContact, LimbContacts
 from refu_core.outputs._normals import VertexNormals
@@ -43,6 +44,8 @@ class Fittings:
         """The body's faces, and how many vertices it has."""
         self._known: dict[tuple[Any, str], Any] = {}
         self._preparing: dict[str, threading.Thread] = {}
+        self.without_planner: dict[str, str] = {}
+        """Garments that planners can't have, and why."""
 
     def prepare(self) -> Fittings:
         """Finds at once what it would be asked for with the first frame, but planners' meshes: they take too long."""
@@ -70,9 +73,15 @@ class Fittings:
     def has_planner(self, name: str) -> bool:
         """Whether `planner` would answer at once. Who asks first starts to make it, in a thread of its own."""
         if name not in self._preparing:
-            self._preparing[name] = threading.Thread(target=self.planner, args=(name,), daemon=True)
+            self._preparing[name] = threading.Thread(target=self._prepare_planner, args=(name,), daemon=True)
             self._preparing[name].start()
-        return (PlannerMesh.of, name) in self._known or not self._preparing[name].is_alive()
+        return (PlannerMesh.of, name) in self._known
+
+    def _prepare_planner(self, name: str) -> None:
+        try:
+            self.planner(name)
+        except RefuError as error:
+            self.without_planner[name] = str(error)
 
     def normals(self, name: str) -> VertexNormals:
         """Of a garment."""

@@ -198,7 +198,7 @@ class ContactStage:
             done = resolver(vertices, self.sdf, None, margin=kept)
         if worn:
             done = self._part(name, done, worn, margin=kept)
-        vertices, numbers[_N_UNRESOLVED] = done.vertices, done.numbers[_N_UNRESOLVED]
+        vertices, numbers[_N_UNRESOLVED] = done.vertices, torch.count_nonzero(done.distance < 0)
         if self._is_tight:
             vertices = self._off_skin[name].parted(vertices)
         if was_torn or worn or self._is_tight:  # Each step goes no farther than that; together they may.

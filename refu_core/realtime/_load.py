@@ -66,6 +66,10 @@ def _templates(
         msg = "no garment was asked for: name at least one"
         raise GarmentError(msg)
     loaded = [one if isinstance(one, GarmentTemplate) else load_garment(one) for one in garments]
+    names = [template.name for template in loaded]
+    if len(set(names)) < len(names):
+        msg = f"wanted garments of different names, got {', '.join(names)}: a person wears each once"
+        raise GarmentError(msg)
     return {template.name: template.to(device=device) for template in loaded}
 
 

@@ -159,14 +159,23 @@ def mirrored(samples: TrainingSamples, mirror: Mirror) -> TrainingSamples:
 def split_validation(samples: TrainingSamples, *, share: float, seed: int) -> tuple[TrainingSamples, TrainingSamples]:
     """TrainingSamples to learn from and samples to choose by; whole style-shape pairs go to one or the other.
 
-    Pairs are drawn until `share` of the samples is reached; 0 gives an empty validation part.
+    With a `share` of 0 the validation part is empty.
     """
-    pairs = torch.unique(samples.pair)
-    order = pairs[torch.randperm(len(pairs), generator=torch.Generator().manual_seed(seed))]
-    counts = torch.stack([(samples.pair == pair).sum() for pair in order])
-    chosen = order[counts.cumsum(0) <= share * len(samples)]
-    held_out = torch.isin(samples.pair, chosen)
+    held_out = drawn_pairs(samples.pair, share=share, seed=seed)
     return samples.take(~held_out), samples.take(held_out)
+
+
+def drawn_pairs(pair: Tensor, *, share: float, seed: int) -> Tensor:
+    """Which of N samples, of the style-shape pairs `pair` (N,), are chosen: bool, shape (N,).
+
+    Whole pairs are drawn until `share` of the samples is reached: at least one where there are two and `share` isn't 0.
+    """
+    known, counts = torch.unique(pair, return_counts=True)
+    order = torch.randperm(len(known), generator=torch.Generator().manual_seed(seed))
+    n_chosen = int((counts[order].cumsum(0) <= share * len(pair)).sum())
+    if share > 0 and len(known) > 1:
+        n_chosen = max(n_chosen, 1)
+    return torch.isin(pair, known[order[:n_chosen]])
 
 
 def output_basis(displacement: Tensor, *, rank: int) -> BasisDecoder:

@@ -19,6 +19,7 @@ from refu_core.garments import GarmentTemplate
 from refu_core.sdf import SDF_PRESETS, ExactSdf, SdfNetwork, body_frame, query_batch, save_sdf_network, with_gradient
 from refu_core.simulation import GarmentDataset
 from refu_core.training._checkpoint import load_checkpoint, save_checkpoint
+from refu_core.training._data import drawn_pairs
 from refu_core.training._loop import cosine, ranks, start_parallel
 from refu_core.training._progress import TrainingLog
 
@@ -280,9 +281,8 @@ def _split(dataset: GarmentDataset, settings: SdfSettings) -> dict[str, Tensor]:
     """Rows to learn from, to choose by (whole style-shape pairs), and to test on."""
     pairs = torch.as_tensor(dataset.column("pair"))
     train, test = torch.from_numpy(dataset.train), torch.from_numpy(dataset.test)
-    known = torch.unique(pairs[train])
-    order = known[torch.randperm(len(known), generator=torch.Generator().manual_seed(settings.seed))]
-    held_out = torch.isin(pairs, order[: max(1, round(settings.validation_share * len(known)))])
+    held_out = torch.zeros_like(train)
+    held_out[train] = drawn_pairs(pairs[train], share=settings.validation_share, seed=settings.seed)
     splits = {"train": train & ~held_out, "validation": train & held_out, "test": test}
     for name, mask in splits.items():
         if not bool(mask.any()):

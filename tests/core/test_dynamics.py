@@ -157,7 +157,7 @@ def test_a_message_that_comes_twice_or_upon_the_last_one_ends_nothing() -> None:
     motion = a_motion(3)
     frames = list(played(motion, until=10.0, fps=60.0))
     np.testing.assert_array_equal(past_of(iter([*frames, frames[-1]])), past_of(iter(frames)))
-    walk = [replace(frame, transl=frame.transl + (0, 0, 1.5 * 1e-9 * frame.stamp_ns)) for frame in frames]
+    walk = [replace(frame, transl=frame.transl + np.array((0, 0, 1.5e-9 * frame.stamp_ns))) for frame in frames]
     queued = [*walk[:-1], replace(walk[-1], stamp_ns=walk[-2].stamp_ns + 1_500_000)]  # stamped as they were read
     np.testing.assert_allclose(past_of(iter(queued)), past_of(iter(walk)), atol=0.05)
 

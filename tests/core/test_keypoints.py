@@ -298,6 +298,14 @@ def test_clocks() -> None:
     assert (back.stamp_ns, round(back.transl[0] - first.transl[0], 1)) == (10**9, 0.5)
 
 
+def test_keypoints_that_come_late_set_no_clock_back() -> None:
+    people, frame = People(skeleton("zed38")), clip("walk").frames[0]
+    points = points_of(frame, "zed38")
+    for late_ns in (0, 99_000_000, 0):
+        people.update("ann", points, confidence=None, stamp_ns=10**10 - late_ns, now_ns=5 * 10**9)
+        assert people.at(5 * 10**9)["ann"].stamp_ns == 10**10
+
+
 def test_predictions_at_a_steady_rate() -> None:
     """Somebody who is seen 15 times a second is where they are 60 times a second."""
     known = clip("cmu_03_01").frames

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 import igl
@@ -13,10 +14,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from msg_adapters.outputs._obstacles import Obstacles
+from msg_adapters.outputs._topics import Moment
 from refu_core import ExactSdf, GarmentPipeline, GarmentTemplate, MeshError, SmplFrame, load_garment
 from refu_core.garments import BUILTIN_GARMENTS
 from refu_core.outputs import (
     Clearance,
+    Dressed,
+    Fittings,
     LimbContacts,
     Openings,
     PinholeCamera,
@@ -26,6 +31,7 @@ from refu_core.outputs import (
     visible,
 )
 from refu_lab.stress._frames import everyday_pose
+from refu_ros._settings import NodeSettings
 
 GARMENTS = ["tshirt-male", "short-pant-male"]
 
@@ -206,6 +212,32 @@ def test_a_planners_mesh_is_recalled_and_moves_with_the_garment() -> None:
     rest = SHORTS.v_template.double().numpy()
     turn = Rotation.from_rotvec([0.3, -1.0, 0.5]).as_matrix()
     assert np.allclose(first.solid(rest @ turn.T + 7.0), again.solid(rest) @ turn.T + 7.0, atol=1e-9)
+
+
+def test_a_garment_that_planners_cannot_have_keeps_no_other_from_them() -> None:
+    """A hundred loose pieces can't be drawn with 2,000 triangles; shorts beside them can."""
+    shorts, shirt = load_garment("short-pant-male"), load_garment("tshirt-male")
+    loose = np.arange(3 * 2400).reshape(-1, 3)
+    rows = shirt.faces[: len(loose)].reshape(-1)
+    torn = replace(
+        shirt,
+        faces=torch.as_tensor(loose),
+        weights=shirt.weights[rows],
+        v_template=shirt.v_template[rows],
+        shapedirs=shirt.shapedirs.view(-1, 3, 10)[rows].reshape(-1, 10),
+        styledirs=None,
+    )
+    worn = GarmentPipeline.load([torn, shorts], backbone="skinned", certify=False)
+    fittings, obstacles = Fittings(worn), Obstacles()
+    frame = SmplFrame(pose=np.zeros((24, 3)))
+    dressed = Dressed("", frame, worn(frame), fittings, np.eye(3), np.zeros(3))
+    moment = Moment(NodeSettings(planner_rate=0.0), lambda _: 1, 0)
+    deadline = time.monotonic() + 120
+    while not (sent := list(obstacles.messages([dressed], moment))) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert list(fittings.without_planner) == ["tshirt-male"]
+    assert "triangles" in fittings.without_planner["tshirt-male"]
+    assert len(sent) == 1
 
 
 def test_a_planners_mesh_of_fewer_triangles() -> None:

@@ -15,9 +15,12 @@ from harness import GARMENTS, ROOT, NodeProcess, Peer, frame
 from rclpy.action import ActionClient
 from std_msgs.msg import Header
 
+import msg_adapters as adapters
 from msg_adapters import BagReader, BagWriter
 from msg_adapters.axes import SMPL_COLUMNS
 from refu_core import GarmentPipeline, SmplFrame
+from refu_ros._bag_job import BagJob
+from refu_ros._settings import NodeSettings
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -213,6 +216,17 @@ def test_a_bag_is_dressed_beside_the_stream(peer: Peer, bags: Path) -> None:
     peer.spin_until(lambda: replayer.feedback[-1] == (N_WALK, N_WALK), "all of it is told")
     with BagReader(bags / "walk-dressed.mcap") as bag:
         assert sum(message.topic == "/garments" for message in bag.messages()) == N_WALK
+
+
+def test_a_bag_is_read_in_the_axes_of_the_node(bags: Path, tmp_path: Path) -> None:
+    garments: dict[str, np.ndarray[Any, Any]] = {}
+    for axes in ("smpl", "frame"):
+        settings = NodeSettings(garments=GARMENTS[:1], backbone="skinned", input_axes=axes)
+        BagJob(bags / "walk.mcap", tmp_path / f"{axes}.mcap", settings, lambda *_: None).done.result()
+        with BagReader(tmp_path / f"{axes}.mcap") as bag:
+            first = next(message for message in bag.messages(["/garments"]))
+        garments[axes] = adapters.decode_marker_array(first.data)[0].points
+    np.testing.assert_allclose(garments["smpl"], garments["frame"][:, SMPL_COLUMNS["smpl"]], atol=1e-5)
 
 
 def test_one_bag_at_a_time_and_it_can_be_cancelled(peer: Peer, bags: Path) -> None:
