@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from refu_core.errors import FrameError, require_type
 from refu_core.frames import LAGS, N_JOINTS, SmplFrame
 
 _MOST_PEOPLE = 64
@@ -58,7 +59,8 @@ class PoseHistory:
         self._people: OrderedDict[str, deque[_Moment]] = OrderedDict()
 
     def __call__(self, frame: SmplFrame, person: str = "") -> SmplFrame:
-        """A person's next frame, with its past."""
+        """A person's next frame, with its past. Raises `FrameError` for what is none."""
+        require_type(frame, SmplFrame, "an SmplFrame", error=FrameError)
         now = _Moment(frame.stamp_ns, Rotation.from_rotvec(frame.pose.astype(np.float64)).as_matrix(), frame.transl)
         known = self._people.pop(person, None)
         if known is None or not _goes_on(known[-1], now):

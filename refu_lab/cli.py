@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import signal
 import sys
@@ -22,6 +23,7 @@ from refu_lab.commands._common import (
     EXIT_INTERRUPTED,
     Parser,
     check_writable,
+    require_apart,
 )
 
 _OF_LAB = ("matplotlib", "PIL", "tqdm")
@@ -48,6 +50,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         args = _parser().parse_args(arguments)
         for path in (getattr(args, name, None) for name in ("json", "output", "cache", "picture")):
             check_writable(path if isinstance(path, Path) else None)
+        for given in _inputs(args) if getattr(args, "json", None) else ():
+            require_apart(given, args.json)
         code: int = args.run(args)
     except RefuError as error:
         return _failed(f"error: {error}", EXIT_BAD_INPUT)
@@ -67,6 +71,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         what = f"{type(error).__name__}: {error}"
         return _failed(f"a bug of refu, please report it; REFU_DEBUG=1 shows where: {what}", EXIT_BUG)
     return code
+
+
+def _inputs(args: argparse.Namespace) -> list[Path]:
+    """What a command reads, of files and folders."""
+    given = getattr(args, "input", None)
+    many = given if isinstance(given, list) else [] if given is None else [given]
+    return [Path(one) for one in many if "://" not in str(one)]
 
 
 def _failed(reason: str, code: int) -> int:

@@ -10,6 +10,7 @@ from typing import Any
 from tqdm import tqdm
 
 from refu_core._engine import Engine
+from refu_core.errors import SimulationError
 from refu_core.simulation import GarmentDataset, Progress, load_clips, simulate_dataset, simulate_sequences
 from refu_lab.commands.simulate import SimulateOptions
 from refu_lab.contact_sheet import contact_sheet
@@ -47,6 +48,11 @@ def simulate(options: SimulateOptions, *, engine: Engine | None = None, progress
             return simulate_sequences(*what, shapes=options.shapes, seconds=options.seconds, **how)
         card = simulate_dataset(*what, **how)
     if not card["counts"]["to_do"]:
+        if card["counts"]["given_up"] == options.count:
+            causes = ", ".join(f"{n} {cause.replace('_', ' ')}" for cause, n in card["yield"]["dropped"].items() if n)
+            msg = f"all {options.count} samples were given up, no attempt passed: {causes}; look at how the garment "
+            msg += "lies on the body (`refu garment add` makes pictures), or simulate more"
+            raise SimulationError(msg)
         sheet = contact_sheet(GarmentDataset(options.output), body=options.body, garments=options.garments)
         save_png(sheet, options.output / SHEET)
     return card

@@ -34,7 +34,8 @@ class Source:
     """A topic and its type, or a motion file."""
     topic: str
     message_type: str
-    decode: Callable[[bytes], SmplFrame]
+    decode: Callable[[bytes, int], SmplFrame]
+    """A message's frame; it is told when the message was received [ns]."""
     records: Iterator[FrameRecord]
     count: int | None
     """Records, where the file says how many there are."""
@@ -52,10 +53,14 @@ class Source:
     has_style: bool = False
 
     def frame_of(self, record: FrameRecord) -> SmplFrame:
-        """A record's frame, in the shape that was asked for. Raises `DecodeError` for a record that has none."""
+        """A record's frame, in the shape that was asked for.
+
+        Raises `DecodeError` for a record that has none, and `FrameError` for a body that nobody has.
+        """
         if record.error is not None:
             raise record.error
-        frame = replace(self.decode(record.raw), stamp_ns=record.stamp_ns)
+        frame = replace(self.decode(record.raw, record.log_time_ns), stamp_ns=record.stamp_ns)
+        adapters.check_plausible(frame)
         self.has_betas = self.has_betas or bool(frame.betas.any())
         self.has_style = self.has_style or frame.style is not None
         if self.history is not None:
@@ -85,19 +90,24 @@ def open_source(options: RecordingOptions, body: Callable[[], SmplBody]) -> Sour
     Raises `RefuError` for an input that can't be read, or with options that it has no use for.
     """
     if options.input.suffix.lower() in SUFFIXES:
+        if options.topic is not None or options.input_type is not None:
+            what = "--topic" if options.topic is not None else "--input-type"
+            msg = f"{options.input}: {what} is for bags, this is a file of motion"
+            raise RefuError(msg)
         motion = adapters.read_motion(options.input, fps=options.fps, axes=options.input_axes, person=options.person)
         description = f"{options.input.name}, {len(motion)} frames at {motion.fps:g} Hz"
-        of_message = adapters.INPUT_TYPES["multiarray"], adapters.decoder_for("multiarray").from_bytes
+        of_message = adapters.INPUT_TYPES["multiarray"], _decoding(adapters.decoder_for("multiarray"))
         records = _motion_records(motion, INPUT_TOPIC)
         source = Source(options, description, INPUT_TOPIC, *of_message, records, len(motion))
         return replace(source, notes=motion.notes, gender=motion.gender)
     if options.fps is not None or options.input_axes in ("z-up", "y-down"):
         what = "--fps" if options.fps is not None else f"--input-axes {options.input_axes}"
-        msg = f"{options.input}: {what} is for files of motion ({', '.join(SUFFIXES)}); bags take smpl or frame"
+        msg = f"{options.input}: {what} is for files of motion ({', '.join(SUFFIXES)})"
+        msg += "" if options.fps is not None else "; the axes of bags are smpl or frame"
         raise RefuError(msg)
     bag = adapters.open_smpl_bag(options.input, topic=options.topic, input_type=options.input_type)
     topic, kind = bag.topic.name, bag.topic.message_type
-    decode = _follower(options, body()) if bag.decoder is None else bag.decoder.from_bytes
+    decode = _follower(options, body()) if bag.decoder is None else _decoding(bag.decoder)
     return Source(options, f"{topic} ({kind})", topic, kind, decode, iter(bag), bag.message_count, bag)
 
 
@@ -116,7 +126,11 @@ def _motion_records(motion: adapters.Motion, topic: str) -> Iterator[FrameRecord
         )
 
 
-def _follower(options: RecordingOptions, body: SmplBody) -> Callable[[bytes], SmplFrame]:
+def _decoding(decoder: adapters.Decoder) -> Callable[[bytes, int], SmplFrame]:
+    return lambda data, _: decoder.from_bytes(data)
+
+
+def _follower(options: RecordingOptions, body: SmplBody) -> Callable[[bytes, int], SmplFrame]:
     """Decodes messages of keypoints to the frames of one person: `options.person`, or who comes first."""
     assert options.input_type is not None
     stream = adapters.KeypointStream(
@@ -124,12 +138,14 @@ def _follower(options: RecordingOptions, body: SmplBody) -> Callable[[bytes], Sm
     )
     followed = options.person
 
-    def decode(data: bytes) -> SmplFrame:
+    def decode(data: bytes, received_ns: int) -> SmplFrame:
         nonlocal followed
-        people, _ = stream.frames(data, 0)
+        people, _ = stream.frames(data, received_ns)
         followed = followed if followed is not None or not people else next(iter(people))
         if followed not in people:
-            msg = f"{followed or 'nobody'} isn't to be seen; who is: {', '.join(people) or 'nobody'}"
+            msg = "nobody is to be seen: of too few keypoints there are finite numbers, with confidence"
+            if people:
+                msg = f"{followed} isn't to be seen; who is: {', '.join(people)}"
             raise adapters.DecodeError(msg)
         return people[followed]
 

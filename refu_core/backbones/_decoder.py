@@ -193,7 +193,7 @@ class _Strips:
         n_strips = len(self._parts[0])
         decoded = torch.empty(len(code), n_strips, WIDTH)
         _decode((n_strips,), code.contiguous(), *self._parts, decoded)
-        return decoded.flatten(1)[:, : self._n].view(len(code), -1, 3)
+        return decoded.view(len(code), n_strips * WIDTH)[:, : self._n].view(len(code), self._n // 3, 3)
 
     def is_of(self, components: Tensor) -> bool:
         """Whether these are the strips of `components`, as they are now."""

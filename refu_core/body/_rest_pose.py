@@ -13,7 +13,7 @@ from refu_core.mesh import Connectivity
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from refu_core.body._model import SmplBody
+    from refu_core.body._model import BodyArrays, SmplBody
 
 _TALL = (0.3, 2.2)
 """From the ankles to the neck [m]: children and giants."""
@@ -22,6 +22,11 @@ _ALONG = 0.8
 """Cosine of the angle to an axis from which on a body stands, or faces, along it."""
 _ARMS = 0.5
 """The same of arms that are stretched out to the sides."""
+_LIMBS = ((1, 4), (2, 5), (4, 7), (5, 8), (16, 18), (17, 19), (18, 20), (19, 21))
+"""Hips, knees, shoulders and elbows, and the joints where their limbs end."""
+_AT_LIMB = 0.08
+"""How far from a limb's middle the skin is, on average, that it moves [of the body's height]. Of the built-in bodies
+0.02 at most; skin of the next limb is 0.17 away."""
 _AXES = ("x", "y", "z")
 _WANTED = "wanted metres, y up, facing +z, the subject's left at +x, in the T-pose"
 
@@ -33,7 +38,8 @@ def require_rest_pose(body: SmplBody, *, closed: bool = True) -> None:
         BodyError: it has other units or axes, is mirrored, not in the T-pose, open or turned inside out, or its joints
             are elsewhere.
     """
-    fault = _fault(body.arrays.v_template, body.arrays.joint_regressor @ body.arrays.v_template)
+    joints = body.arrays.joint_regressor @ body.arrays.v_template
+    fault = _fault(body.arrays.v_template, joints) or _misled(body.arrays, joints)
     if not fault:
         mesh = Connectivity.of(body.faces.cpu().numpy(), body.n_vertices)
         corners = body.arrays.v_template[mesh.faces]
@@ -48,6 +54,19 @@ def require_rest_pose(body: SmplBody, *, closed: bool = True) -> None:
     if fault:
         msg = f"body {body.name}: {fault}"
         raise BodyError(msg)
+
+
+def _misled(arrays: BodyArrays, joints: NDArray[np.float64]) -> str:
+    """Whether a limb's joint moves skin that isn't at the limb; empty if none does."""
+    tall = float(np.ptp(arrays.v_template[:, 1]))
+    for joint, end in _LIMBS:
+        follows = arrays.weights[:, joint] > 0.5
+        if not follows.any():
+            return f"no vertex follows its {JOINT_NAMES[joint]} for the most part: weights are of other joints"
+        off = float(np.linalg.norm(arrays.v_template[follows].mean(0) - (joints[joint] + joints[end]) / 2))
+        if off > _AT_LIMB * tall:
+            return f"what follows its {JOINT_NAMES[joint]} is {off:.2f} m from there: weights are of other joints"
+    return ""
 
 
 def _fault(vertices: NDArray[np.float64], joints: NDArray[np.float64]) -> str:

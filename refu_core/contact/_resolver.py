@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -84,13 +85,16 @@ class Resolver:
             scale: α of the first push: one number, or a function of vertices and their distances.
 
         Raises:
-            MeshError: points of another number or type, or a distance that isn't one to faces.
+            MeshError: points of another number or type, a negative margin, or a distance that isn't one to faces.
         """
         require_tensor("points", points)
         distances = self._floats["distance"] if start is None else start.distance
         if points.shape != (self._n_vertices, 3) or distances.shape != (self._n_vertices,):
             shapes = f"{tuple(points.shape)} and {tuple(distances.shape)}"
             msg = f"wanted {self._n_vertices} points and their distances, got the shapes {shapes}"
+            raise MeshError(msg)
+        if not 0 <= margin < math.inf:
+            msg = f"wanted a margin of 0 m or more, got {margin}"
             raise MeshError(msg)
         if start is not None and start.face is None:
             msg = "start must name the closest faces: ask an ExactSdf, BandSdf or ApproxSdf"

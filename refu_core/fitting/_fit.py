@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from refu_core.body import BUILTIN_BODIES, JOINT_NAMES, SmplBody, blend_transforms, unapply_transforms
-from refu_core.errors import GarmentError
+from refu_core.errors import GarmentError, require_type
 from refu_core.fitting._clean import (
     MAX_VERTICES,
     clean,
@@ -102,6 +102,8 @@ def fit_garment(
     Raises:
         GarmentError: the mesh can't be worn; the message says why, and what to do.
     """
+    require_type(mesh, SurfaceMesh, "a SurfaceMesh, such as read_surface gives", error=GarmentError)
+    require_type(body, SmplBody, "an SmplBody, such as load_body gives", error=GarmentError)
     details = GarmentDetails() if details is None else details
     if details.held_at not in (None, *HOLDS):
         msg = f"a garment is held at {' or '.join(HOLDS)}, got {details.held_at!r}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
@@ -17,6 +18,7 @@ from refu_core.fitting._clean import face_normals
 from refu_core.fitting._mesh_file import SurfaceMesh
 from refu_core.fitting._posed import LEFT_HIP, RIGHT_SHOULDER, PosedBody, standing_pose
 from refu_core.fitting._surround import Fit, Samples, fit_of, sample
+from refu_core.frames import N_JOINTS
 
 F64 = NDArray[np.float64]
 
@@ -60,6 +62,16 @@ class Placing:
     """That the mesh was modelled in: rotation vectors [rad], shape (24, 3); zeros for the T-pose."""
     is_placed: bool = False
     """Whether the mesh's origin is the body's; otherwise it may be moved."""
+
+    def __post_init__(self) -> None:
+        """Raises `GarmentError` for what is no unit, no axis or no pose."""
+        is_unit = self.unit is None or (isinstance(self.unit, (int, float)) and 0 < self.unit < math.inf)
+        if not is_unit or self.up not in (None, "y", "z"):
+            msg = f"wanted a unit in metres (0.01 for cm) and y or z up, got {self.unit!r} and {self.up!r}"
+            raise GarmentError(msg)
+        if self.pose is not None and np.shape(self.pose) != (N_JOINTS, 3):
+            msg = f"wanted a pose of {N_JOINTS} rotation vectors, got {np.shape(self.pose)}"
+            raise GarmentError(msg)
 
 
 @dataclass(frozen=True, eq=False)

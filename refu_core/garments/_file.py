@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from refu_core._files import replacing
 from refu_core._npz import read_npz
 from refu_core.body import BUILTIN_BODIES
-from refu_core.errors import GarmentError, MeshError
+from refu_core.errors import GarmentError, MeshError, require_type
 from refu_core.frames import N_BETAS, N_JOINTS, N_STYLES
 from refu_core.garments._card import GarmentCard, card_to_json, json_to_card
 from refu_core.garments._template import GarmentTemplate, UvMap
@@ -146,6 +146,7 @@ def save_garment(template: GarmentTemplate, path: str | os.PathLike[str]) -> Pat
     Raises:
         GarmentError: the path doesn't end in `.npz`, or can't be written.
     """
+    require_type(template, GarmentTemplate, "a GarmentTemplate, such as load_garment gives", error=GarmentError)
     target = Path(path)
     if target.suffix != ".npz":
         msg = f"{target}: wanted the path of an .npz"

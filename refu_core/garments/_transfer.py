@@ -61,7 +61,8 @@ def worn_on(garment: GarmentTemplate, fit: BodyFit | None) -> GarmentTemplate:
     vertices = rest + carry(differs.template)
     clear = np.minimum(Surface(skin, source.arrays.faces.astype(np.int32)).heights(rest)[0], _CLEARANCE)
     own_side = exact.v_template[:, 0].numpy()
-    vertices = _on_own_side(_lifted(_on_own_side(vertices, own_side), clear, garment, fit), own_side)
+    middle = float((fit.body.joint_template - load_body(garment.body).joint_template)[:, 0].mean())
+    vertices = _on_own_side(_lifted(_on_own_side(vertices, own_side, middle), clear, garment, fit), own_side, middle)
     weights = (exact.weights.numpy() + carry(differs.weights)).clip(0)
     few = np.sort(weights, axis=1)[:, -_INFLUENCES, None]
     weights = np.where(weights >= few, weights, 0)
@@ -94,12 +95,13 @@ class _Carrier:
         return levelled.reshape(-1, *values.shape[1:])
 
 
-def _on_own_side(vertices: Array, own_side: Array) -> Array:
-    """Vertices on the side of the body's middle that they are on as cut, x (N,) [m]: one trouser leg isn't in the
-    other on a body whose legs are nearer together."""
+def _on_own_side(vertices: Array, own_side: Array, middle: float) -> Array:
+    """Vertices on the side of the body's middle, at x = `middle`, that they are on as cut, x (N,) both [m]: one trouser
+    leg isn't in the other on a body whose legs are nearer together."""
     side: Array = np.where(own_side > 0, 1.0, -1.0)
     kept: Array = vertices.copy()
-    kept[:, 0] = side * np.maximum(side * vertices[:, 0], np.minimum(np.abs(own_side), _FROM_MIDDLE))
+    least = np.minimum(np.abs(own_side), _FROM_MIDDLE)
+    kept[:, 0] = middle + side * np.maximum(side * (vertices[:, 0] - middle), least)
     return kept
 
 

@@ -79,7 +79,8 @@ def _parsed(text: str) -> tuple[list[_Joint], Array, float]:
     n_channels, count = sum(len(joint.channels) for joint in joints), int(head[1])
     numbers = np.array(motion[head.end() :].split(), dtype=np.float64)
     if not 0 < count <= MAX_FRAMES or numbers.size != count * n_channels or not np.isfinite(numbers).all():
-        msg = f"wanted {count} frames (1 to {MAX_FRAMES}) of {n_channels} finite numbers, got {numbers.size} in all"
+        finite = int(np.isfinite(numbers).sum())
+        msg = f"wanted {count} frames (1 to {MAX_FRAMES}) of {n_channels} finite numbers, got {finite} in all"
         raise ValueError(msg)
     return joints, numbers.reshape(count, n_channels), float(head[2])
 
@@ -110,6 +111,9 @@ def _joints(words: Iterator[str]) -> list[_Joint]:
     except (StopIteration, IndexError) as cause:
         msg = "its hierarchy is cut short"
         raise ValueError(msg) from cause
+    if open_:
+        msg = f"its hierarchy is cut short: {len(open_)} braces are never closed"
+        raise ValueError(msg)
     unknown = [name for joint in joints for name in joint.channels if name not in _CHANNELS]
     if not joints or unknown:
         msg = f"unknown channel {unknown[0]!r}" if unknown else "no joints"

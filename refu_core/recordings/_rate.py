@@ -9,7 +9,7 @@ FPS_RANGE = (1e-3, 10_000.0)
 """Frames a second that anything is recorded or sampled at: a frame in a quarter of an hour, and ten a millisecond."""
 MAX_FRAMES = 1_000_000
 """Of a clip: nine hours at 30 Hz."""
-_FASTEST, _FARTHEST = 12.0, 50.0
+FASTEST, _FARTHEST = 12.0, 50.0
 """What people run [m/s], and how far from its origin a recording shows them [m]; in centimetres everybody is beyond."""
 
 
@@ -38,7 +38,7 @@ def tell_pace(transl: NDArray[np.float64], rate: float, notes: list[str]) -> Non
     steps, away = steps[np.isfinite(steps)], away[np.isfinite(away)]
     pace = rate * float(np.median(steps)) if len(steps) else 0.0
     far = float(np.median(away)) if len(away) else 0.0
-    if pace > _FASTEST or far > _FARTHEST:
+    if pace > FASTEST or far > _FARTHEST:
         notes.append(
             f"the person moves by {pace:.1f} m/s, {far:.0f} m from the origin: divide the translation by 100 or 1000 "
             "if it is in cm or mm"

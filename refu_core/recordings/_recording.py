@@ -19,7 +19,7 @@ from refu_core.recordings._rate import MAX_FRAMES, check_fps, tell_pace
 from refu_core.recordings._rotations import BODY, WHOLE, rotvecs_of
 from refu_core.recordings._soma import smpl_of_soma
 from refu_core.recordings._tracks import filled, frames_of, tracks_of
-from refu_core.recordings._upright import PELVIS, Axes, to_smpl
+from refu_core.recordings._upright import AXES, PELVIS, Axes, to_smpl
 from refu_core.recordings._values import betas_of, fps_of, gender_of, pelvis_of, transl_of, word_of
 
 _BODY_JOINTS = 22  # what SMPL, SMPL-H and SMPL-X share; SMPL's two hand joints have no counterpart in the others
@@ -86,6 +86,9 @@ def read_recording(
         error: the file can't be read, isn't recognised, has no frame rate, or its arrays have other shapes or meanings.
     """
     path = Path(path)
+    if axes not in AXES or not isinstance(fps, (int, float, type(None))):
+        msg = f"{path}: wanted axes of {', '.join(AXES)} and frames a second as a number, got {axes!r} and {fps!r}"
+        raise error(msg)
     if path.suffix.lower() == ".bvh":
         from refu_core.recordings._bvh import read_bvh
 

@@ -16,7 +16,8 @@ WHOLE = (24, 22, 52, 55)
 BODY = (23, 21, 51, 54)
 """The same without it."""
 _FORMS = {3: "rotation vectors", 9: "matrices", 6: "6D rotations", 4: "quaternions"}
-_LONGEST = 2 * np.pi + 0.1  # [rad] a vector that was unwrapped may be so long, and no median of sound ones is longer
+LONGEST_TURN = 2 * np.pi + 0.1
+"""A vector that was unwrapped may be so long [rad], and no median of sound ones is longer."""
 _MOST_SKEW = 0.05  # of R Rᵀ - I: 16-bit floats have 0.001, networks that don't project 0.01
 _MOST_UNEVEN = 0.3  # mean deviation of raw network output from two orthonormal vectors; anything else has 0.5 at least
 
@@ -91,7 +92,7 @@ def _check_radians(vectors: Array, name: str) -> None:
     with np.errstate(over="ignore", invalid="ignore"):
         longest = np.linalg.norm(vectors, axis=-1).max(axis=1)
     longest = longest[np.isfinite(longest)]
-    if longest.size and float(np.median(longest)) > _LONGEST:
+    if longest.size and float(np.median(longest)) > LONGEST_TURN:
         msg = (
             f"{name} has rotation vectors as long as {np.median(longest):.0f} in most frames, wanted radians, 6.3 at "
             "most; where they are degrees, save np.radians of them"

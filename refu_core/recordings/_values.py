@@ -46,7 +46,7 @@ def betas_of(array: NDArray[Any] | None, n: int, notes: list[str], *, is_smplx: 
     Raises `ValueError` for another shape, and for what isn't finite.
     """
     betas = np.zeros(N_BETAS, np.float32)
-    if array is None:
+    if array is None or not array.size:
         notes.append("no betas: the mean shape")
         return betas
     if array.dtype.kind not in "iuf" or array.ndim > 3 or (array.ndim > 1 and len(array) not in (1, n)):

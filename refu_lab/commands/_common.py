@@ -266,6 +266,14 @@ def check_writable(path: Path | None) -> None:
         raise RefuError(msg)
 
 
+def require_apart(given: Path, written: Path) -> None:
+    """Raises `RefuError` where what is `written` would take the place of what was `given`, or of a part of it."""
+    here, there = given.resolve(), written.resolve()
+    if here == there or there in here.parents or (here in there.parents and there.exists()):
+        msg = f"{written}: would be written over the input {given}; name another place"
+        raise RefuError(msg)
+
+
 def write_json(path: Path | None, content: dict[str, Any]) -> None:
     """Writes it where a path was given."""
     if path is not None:

@@ -255,6 +255,7 @@ def _arms_hanging(arrays: dict[str, Any]) -> dict[str, Any]:
     return {**arrays, "v_template": body(pose).vertices[0].double().numpy()}
 
 
+_ARMS_EXCHANGED = [*range(16), 17, 16, 19, 18, 21, 20, 23, 22]
 WRONG: dict[str, tuple[Any, str]] = {
     "millimetres": (lambda a: _turned(a, 1000 * np.eye(3)), "millimetres\\? Divide by 1000"),
     "centimetres": (lambda a: _turned(a, 100 * np.eye(3)), "centimetres\\? Divide by 100"),
@@ -267,6 +268,8 @@ WRONG: dict[str, tuple[Any, str]] = {
     "inside out": (lambda a: {**a, "f": a["f"][:, ::-1]}, "turned inward"),
     "holes": (lambda a: _without(a, 50), "open edges.*betas_from"),
     "other joints": (lambda a: {**a, "J_regressor": np.roll(a["J_regressor"], 3, axis=0)}, "body mine"),
+    "arms exchanged": (lambda a: {**a, "weights": a["weights"][:, _ARMS_EXCHANGED]}, "left_shoulder is .* from there"),
+    "no limbs": (lambda a: {**a, "weights": np.full_like(a["weights"], 1 / 24)}, "no vertex follows its left_hip"),
     "arms hang": (_arms_hanging, "arm isn't stretched out"),
 }
 
@@ -280,6 +283,17 @@ def test_bodies_that_stand_otherwise_are_refused(what: str) -> None:
         load_fit(body)
     assert str(told.value).startswith("body mine: ")
     assert "\n" not in str(told.value)
+
+
+def test_a_body_may_stand_beside_its_origin() -> None:
+    """On legs of either side of x = 0, which then isn't its middle."""
+    worn = []
+    for beside in (0.001, 0.2):
+        arrays = smpl_arrays("female")
+        arrays["v_template"] = arrays["v_template"] + np.array((beside, 0, 0))
+        body = SmplBody(type(load_body("male").arrays).from_mapping(arrays, source="beside"), name="beside")
+        worn.append(worn_on(load_garment("short-pant-male"), load_fit(body)).v_template - torch.tensor((beside, 0, 0)))
+    assert (worn[1] - worn[0]).norm(dim=1).max() < 2 * MM
 
 
 def test_a_file_with_holes_can_say_what_betas_mean() -> None:

@@ -373,6 +373,12 @@ def test_bvh(tmp_path: Path, names: str, prefix: str, unit: float, said: str) ->
 def test_bvh_that_is_refused(tmp_path: Path) -> None:
     text, _ = bvh(MIXAMO.split(), 100.0, n=2)
     path = tmp_path / "a.bvh"
+    path.write_text(text.replace("}", "", 1))
+    with pytest.raises(MotionFileError, match="cut short"):
+        read_motion(path)
+    path.write_text(text.rstrip().rpartition(" ")[0] + " nan")
+    with pytest.raises(MotionFileError, match=r"of (\d+) finite numbers, got"):
+        read_motion(path)
     for content, said in [
         (text.replace("LeftUpLeg", "Tail"), "no l_hip among Hips"),
         (text.replace("Zrotation", "Wrotation"), "unknown channel 'wrotation'"),

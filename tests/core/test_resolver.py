@@ -12,6 +12,7 @@ from torch import Tensor
 
 from refu_core import GarmentTemplate, SmplBody, load_body, load_garment
 from refu_core.contact import Blend, Resolution, Resolver
+from refu_core.errors import MeshError
 from refu_core.sdf import ApproxSdf, BandSdf, ExactSdf, RestFaces, SdfSample
 
 KINDS = ("exact", "band", "approx")
@@ -154,3 +155,14 @@ def test_going_on_is_as_asking_everyone_again(kind: str) -> None:
     assert (again.vertices - done.vertices).abs().max() > 1e-4
     torch.testing.assert_close(again.vertices, anew.vertices, rtol=0, atol=1e-6)
     torch.testing.assert_close(again.numbers, anew.numbers, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("margin", [-0.01, math.nan, math.inf])
+def test_a_margin_that_is_none_is_refused(margin: float) -> None:
+    """With NaN nothing would be near the skin, and nobody counted who is inside."""
+    body, garment = load_body("male"), load_garment("short-pant-male")
+    sdf = ExactSdf(body.faces)
+    sdf.update(body.v_template.float())
+    points = garment.v_template.float()
+    with pytest.raises(MeshError, match="margin of 0 m or more"):
+        Resolver(garment.faces, len(points))(points, sdf, sdf.query(points), margin=margin)

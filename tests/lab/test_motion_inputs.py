@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import msg_adapters as adapters
 from msg_adapters.cdr import CdrWriter
+from refu_core import SmplFrame
 from refu_core.keypoints import Proportions, Skeleton, keypoint_layout
 from refu_core.keypoints._pose import Pose, exp_so3
 from refu_lab.cli import main
@@ -101,24 +104,48 @@ def test_a_bag_of_people_who_lie_is_said(tmp_path: Path) -> None:
     assert run(tmp_path / "a.mcap", input_axes="frame").warnings == []
 
 
-def test_keypoints_of_a_bag(tmp_path: Path) -> None:
-    bones = Skeleton(keypoint_layout("zed38"), Proportions.builtin("male"))
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda f: replace(f, pose=np.degrees(f.pose)), "wanted radians: degrees?"),
+        (lambda f: replace(f, transl=1000 * f.transl), "translations in cm or mm?"),
+    ],
+)
+def test_a_bag_in_other_units_is_said(tmp_path: Path, change: Callable[[SmplFrame], SmplFrame], said: str) -> None:
+    encode = adapters.encoder_for("joint_state")
     with adapters.BagWriter(tmp_path / "a.mcap") as writer:
+        writer.add_topic("/smpl_params", adapters.INPUT_TYPES["joint_state"])
+        for frame in FRAMES:
+            writer.write("/smpl_params", encode(change(frame)), log_time_ns=10**9 + frame.stamp_ns)
+    assert said in "; ".join(run(tmp_path / "a.mcap", max_frames=None).warnings)
+
+
+def write_keypoints(path: Path, *, stamped: bool) -> None:
+    bones = Skeleton(keypoint_layout("zed38"), Proportions.builtin("male"))
+    with adapters.BagWriter(path) as writer:
         writer.add_topic("/skeleton", adapters.KEYPOINT_TYPES["keypoint_poses"])
         for i, frame in enumerate(FRAMES):
             pose = Pose(frame.transl + np.array([0, -0.22, 0.02]), exp_so3(frame.pose.astype(float)), np.zeros(10))
             points = Z_UP.apply(bones.posed(pose).points)
             stamp = 10**9 + round(i * 1e9 / 30)
             cdr = CdrWriter()
-            cdr.fields("Ts", stamp, "map")
+            cdr.fields("Ts", stamp if stamped else 0, "map")
             cdr.fields("I", len(points))
             cdr.array("f8", np.pad(points, ((0, 0), (0, 4))))
             writer.write("/skeleton", cdr.to_bytes(), log_time_ns=stamp)
+
+
+def test_keypoints_of_a_bag(tmp_path: Path) -> None:
+    write_keypoints(tmp_path / "a.mcap", stamped=True)
     result = run(tmp_path / "a.mcap", input_type="keypoint_poses", keypoints="zed38", max_frames=None)
     assert (len(result.frames), result.options.axes) == (len(FRAMES), "frame")
     for got, known in zip(result.frames, FRAMES, strict=True):
         root = Rotation.from_rotvec(known.pose[0]).inv() * Z_UP.inv() * Rotation.from_rotvec(got.frame.pose[0])
         assert root.magnitude() < 0.2
+    write_keypoints(tmp_path / "b.mcap", stamped=False)
+    unstamped = run(tmp_path / "b.mcap", input_type="keypoint_poses", keypoints="zed38", max_frames=None)
+    for a, b in zip(result.frames, unstamped.frames, strict=True):  # they are of when they were received
+        np.testing.assert_allclose(a.frame.transl, b.frame.transl, atol=1e-4)
     assert main(["replay", str(tmp_path / "a.mcap"), "--input-type", "keypoint_poses", "--keypoints", "coco17"]) == 2
     assert main(["replay", str(tmp_path / "a.mcap")]) == 2
 

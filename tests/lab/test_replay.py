@@ -278,7 +278,7 @@ def test_a_body_that_nobody_has_and_a_time_that_no_message_holds_are_skipped(tmp
     result = json.loads(told.read_text())
     assert result["frames"] == 3
     assert sum(result["skipped"].values()) == 2
-    assert all("negative volume" in reason or "impossible time" in reason for reason in result["skipped"])
+    assert all("magnitudes up to 20" in reason or "impossible time" in reason for reason in result["skipped"])
     assert [topic for topic, _, _ in raw_messages(out)].count("/garments") == 3
     glb, options = tmp_path / "odd.glb", ("--garments", "short-pant-male", "--backbone", "skinned", "--count", "5")
     assert main(["export", str(bag), "--output", str(glb), *options, "--json", str(told)]) == 0
@@ -395,6 +395,36 @@ def test_bad_input_is_one_clear_line(
     except SystemExit as stop:
         code = int(stop.code or 0)
     assert_one_line(code, capsys.readouterr().err, *wanted)
+
+
+@pytest.mark.parametrize("option", ["--output", "--json"])
+def test_a_recording_is_never_written_over(option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given = write_bag(tmp_path / "in.mcap", motion(2))
+    before = given.read_bytes()
+    (tmp_path / "link.mcap").symlink_to(given)
+    for written in ("in.mcap", "link.mcap", "../" + tmp_path.name + "/in.mcap"):
+        code = run(given, "--garments", "short-pant-male", "--overwrite", option, tmp_path / written)
+        assert_one_line(code, capsys.readouterr().err, "written over the input")
+        assert given.read_bytes() == before
+
+
+def test_a_bag_directory_is_not_written_into(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given = write_bag(tmp_path / "given", motion(2))
+    (file,) = given.glob("*.mcap")
+    before = file.read_bytes()
+    for written in (given, file):
+        code = run(given, "--garments", "short-pant-male", "--overwrite", "--output", written)
+        assert_one_line(code, capsys.readouterr().err, "written over the input")
+    assert file.read_bytes() == before
+
+
+def test_a_damaged_bag_is_not_called_empty(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write_bag(tmp_path / "flip.mcap", motion(20))
+    data = bytearray(path.read_bytes())
+    data[len(data) // 3] ^= 255
+    path.write_bytes(data)
+    code = run(path, "--garments", "short-pant-male")
+    assert_one_line(code, capsys.readouterr().err, "damaged")
 
 
 def test_an_output_that_is_there_is_not_overwritten_unasked(
