@@ -108,7 +108,7 @@ def test_no_file_is_longer_than_400_lines() -> None:
     assert {path: n for path, n in lines.items() if n > 400} == {}
 
 
-HEAVY = {"matplotlib", "PIL", "igl", "fcl", "numba", "gpytoolbox", "trimesh", "rosbags", "viser"}
+HEAVY = {"matplotlib", "PIL", "igl", "fcl", "numba", "trimesh", "rosbags", "viser"}
 """Of the extras: nothing that a robot needs may import them. (tqdm is left out: torch imports it where it is.)"""
 
 
