@@ -122,7 +122,7 @@ def fit_garment(
     _require_worn(cleaned)
     fault: GarmentError | None = None
     makeshift: tuple[SurfaceMesh, list[str]] | None = None
-    for place in find_places(cleaned, body, placing or Placing()):
+    for place in find_places(cleaned, body, replace(placing or Placing(), held_at=details.held_at)):
         try:
             mesh, found, moved = _put_on(cleaned, place, body, longest_edge)
         except GarmentError as error:  # a limb goes through it there: is there another place?
@@ -130,7 +130,8 @@ def fit_garment(
             continue
         if moved <= _FARTHEST:
             return _bound(mesh, body, name, details, notes + found)
-        makeshift = makeshift or (mesh, found)
+        doubt = f"it reached {1e3 * moved:.0f} mm into the body: does it lie as it is worn? --up or --pose may help"
+        makeshift = makeshift or (mesh, [*found, doubt])
     if makeshift is not None:
         return _bound(makeshift[0], body, name, details, notes + makeshift[1])
     assert fault is not None  # there is a place, or `find_places` has said that there is none

@@ -16,7 +16,7 @@ from refu_core.body import SmplBody
 from refu_core.errors import GarmentError
 from refu_core.fitting._clean import face_normals
 from refu_core.fitting._mesh_file import SurfaceMesh
-from refu_core.fitting._posed import LEFT_HIP, RIGHT_SHOULDER, PosedBody, standing_pose
+from refu_core.fitting._posed import LEFT_HIP, LEFT_SHOULDER, RIGHT_SHOULDER, PosedBody, standing_pose
 from refu_core.fitting._surround import Fit, Samples, fit_of, sample
 from refu_core.frames import N_JOINTS
 
@@ -62,6 +62,8 @@ class Placing:
     """That the mesh was modelled in: rotation vectors [rad], shape (24, 3); zeros for the T-pose."""
     is_placed: bool = False
     """Whether the mesh's origin is the body's; otherwise it may be moved."""
+    held_at: str | None = None
+    """What is held at the `waist` doesn't reach up between the arms."""
 
     def __post_init__(self) -> None:
         """Raises `GarmentError` for what is no unit, no axis or no pose."""
@@ -86,6 +88,8 @@ class Place:
     pose: F64
     """Rotation vectors [rad], shape (24, 3)."""
     fit: Fit
+    top: float
+    """How high the mesh reaches [m]."""
     notes: list[str] = field(default_factory=list)
 
     def is_like(self, other: Place) -> bool:
@@ -96,6 +100,10 @@ class Place:
         """Vertices (V, 3) on the body [m]."""
         found: F64 = self.unit * vertices @ self.turn.T + self.shift
         return found
+
+
+_UNDER_ARMS = 0.1
+"""How far below the joints of the shoulders a garment that is held at the waist ends [m]."""
 
 
 def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator[Place]:
@@ -125,6 +133,8 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
         for here, turn, unit in itertools.product(bodies, turns, units)
         for kind, shift in _shifts(here, is_placed=placing.is_placed)
     ]
+    if placing.held_at == "waist":
+        found = [one for one in found if not one.is_above_arms]
     good = [one for one in found if one.place.fit.is_plain]
     if good:
         least = min(one.cost(extent) for one in good)
@@ -141,11 +151,10 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
         yield _told(chosen.place, chosen.kind)
     found.sort(key=lambda one: (not one.place.fit.is_good, one.cost(extent)))
     tiers = found[:1]
-    first = tiers[0].place.fit
-    if (
-        first.is_good and max(first.inside, first.distance / 6) < _NOTHING and not tiers[0].is_sideways
-    ):  # of gloves much faces other fingers
-        yield _told(tiers[0].place, tiers[0].kind)
+    for one in tiers:
+        fit = one.place.fit
+        if fit.is_good and max(fit.inside, fit.distance / 6) < _NOTHING and not one.is_sideways:
+            yield _told(one.place, one.kind)  # of gloves much faces other fingers
     for tried in [None] if placing.unit else [None, [size / extent for size in _TRIED_SIZES]]:
         if not placing.is_placed:
             tiers += _searched(mesh, samples, bodies, turns, tried or units, placing, scales=tried is not None)
@@ -185,6 +194,12 @@ class _Candidate(NamedTuple):
     here: PosedBody
 
     @property
+    def is_above_arms(self) -> bool:
+        """Whether the mesh reaches up between the arms."""
+        shoulders = self.here.body.joint_template[[LEFT_SHOULDER, RIGHT_SHOULDER], 1]
+        return self.place.top > float(shoulders.mean()) - _UNDER_ARMS
+
+    @property
     def is_sideways(self) -> bool:
         """Whether the mesh would have been modelled facing x, as nobody does."""
         return _is_sideways(self.place.turn)
@@ -220,6 +235,8 @@ def _searched(
         for here, turn, unit in itertools.product(bodies[::2], turns, units)
         for shift in _heights(unit * mesh.vertices @ turn.T, here)
     ]
+    is_at_waist = placing.held_at == "waist"
+    found = [one for one in found if not (is_at_waist and one.is_above_arms)]
     found.sort(key=lambda one: one.cost(extent))
     refined = [
         one._replace(place=_refined(one, samples, placing, moves=True, scales=scales)) for one in found[:_N_REFINED]
@@ -229,7 +246,8 @@ def _searched(
 
 def _at(samples: Samples, unit: float, turn: F64, shift: F64, body: PosedBody) -> Place:
     turned = samples._replace(normals=samples.normals @ turn.T)
-    return Place(unit, turn, shift, body.pose, fit_of(unit * samples.points @ turn.T + shift, turned, body))
+    points = unit * samples.points @ turn.T + shift
+    return Place(unit, turn, shift, body.pose, fit_of(points, turned, body), float(points[:, 1].max()))
 
 
 def _turns(up: str | None, mesh: SurfaceMesh) -> list[F64]:
@@ -316,7 +334,8 @@ def _refined(start: _Candidate, samples: Samples, placing: Placing, *, moves: bo
     simplex = np.concatenate((np.zeros((1, len(free))), np.eye(len(free))))
 
     def cost(values: F64) -> float:
-        return start._replace(place=at(values)).cost(extent)
+        one = start._replace(place=at(values))
+        return one.cost(extent) + (placing.held_at == "waist" and one.is_above_arms)
 
     options: Any = {"initial_simplex": simplex, "maxfev": 30 * len(free), "xatol": 0.02, "fatol": 1e-5}
     found = minimize(cost, np.zeros(len(free)), method="Nelder-Mead", options=options)

@@ -320,6 +320,20 @@ def test_a_skirt_of_quads_is_worn_saved_and_loaded(tmp_path: Path) -> None:
         save_garment(replace(template, name="x"), tmp_path / "kilt.obj")
 
 
+def test_what_is_held_at_the_waist_is_no_poncho() -> None:
+    """A wide cone fits round the shoulders, too, and nearer there; its origin is elsewhere."""
+    angle, down = (grid.ravel() for grid in np.meshgrid(np.arange(60) * np.pi / 30, np.linspace(0, 1, 30)))
+    radius, away = 0.19 + 0.16 * down, np.array((3.0, 7.0, -2.0))
+    places = np.stack((radius * np.cos(angle), -0.12 - 0.63 * down, 0.85 * radius * np.sin(angle)), 1) + away
+    row, column = (grid.ravel() for grid in np.mgrid[:29, :60])
+    a, b = 60 * row + column, 60 * row + (column + 1) % 60
+    mesh = SurfaceMesh(places, np.concatenate((np.stack((a, b, a + 60), 1), np.stack((b, b + 60, a + 60), 1))))
+    made = fit_garment(
+        mesh, load_body("female"), name="cone", placing=Placing(unit=1.0), details=GarmentDetails(held_at="waist")
+    )
+    np.testing.assert_allclose(made.template.v_template.mean(0), (places - away).mean(0), atol=0.03)
+
+
 def test_a_childs_shirt_is_made_larger_and_not_worn_round_the_ankles() -> None:
     v, f = cloth(Wanted(low=0.80, ease=0.018, sleeve=0.4, step=0.02))
     made = fit_garment(SurfaceMesh(0.7 * v, f), load_body("neutral"), name="shirt")
