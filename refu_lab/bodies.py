@@ -7,8 +7,7 @@ from typing import Any
 
 from refu_core import GarmentPipeline
 from refu_core.body import BodyFit
-
-_GENDERS = {"m": "male", "male": "male", "f": "female", "female": "female", "n": "neutral", "neutral": "neutral"}
+from refu_core.recordings import GENDERS
 
 
 def body_facts(pipeline: GarmentPipeline) -> dict[str, Any]:
@@ -38,5 +37,5 @@ def body_warnings(pipeline: GarmentPipeline, *, gender: str = "") -> list[str]:
 
 def _gender_of(body: str) -> str:
     """Whose body it is by its name, as `SMPL_FEMALE` and `basicModel_f_lbs_10_207_0_v1.0.0` are; empty if unsaid."""
-    words = [word for word in re.split(r"[^a-z]+", body.lower()) if word in _GENDERS]
-    return _GENDERS[words[0]] if words else ""
+    words = [word for word in re.split(r"[^a-z]+", body.lower()) if word in GENDERS]
+    return GENDERS[words[0]] if words else ""

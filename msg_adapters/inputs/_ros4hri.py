@@ -18,6 +18,7 @@ from msg_adapters.errors import DecodeError
 from msg_adapters.joints import SMPL_JOINTS
 from msg_adapters.rotations import quaternion_from_rotvec, quaternion_product, rotvec_from_quaternion
 from refu_core.frames import MAX_ANGLE
+from refu_core.recordings import PELVIS as PELVIS
 
 AXES = {
     "waist": (0, 1, 0), "r_head": (1, 0, 0), "y_head": (0, 0, 1), "p_head": (0, -1, 0),
@@ -27,9 +28,6 @@ AXES = {
     "r_y_hip": (0, 0, -1), "r_p_hip": (-1, 0, 0), "r_r_hip": (0, -1, 0), "r_knee": (0, -1, 0),
 }  # fmt: skip
 """Axis of each joint in ROS axes, as the URDF has it; each limb from the trunk outwards."""
-
-PELVIS = np.array([0.0, -0.22, 0.02])
-"""SMPL's pelvis at rest [m], shape (3,): within 5 mm that of the built-in bodies, whatever the betas."""
 
 
 def _joints(*names: str) -> list[int]:

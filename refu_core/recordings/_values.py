@@ -13,7 +13,7 @@ from refu_core.recordings import _layouts as table
 from refu_core.recordings._containers import Content
 from refu_core.recordings._upright import PELVIS
 
-_GENDERS = {"m": "male", "male": "male", "f": "female", "female": "female", "n": "neutral", "neutral": "neutral"}
+GENDERS = {"m": "male", "male": "male", "f": "female", "female": "female", "n": "neutral", "neutral": "neutral"}
 _STEADY = 1e-3  # betas that differ by less between frames are one shape
 
 
@@ -103,6 +103,6 @@ def word_of(content: Content, value: Any, which: int = 0) -> str:
 
 def gender_of(word: str, notes: list[str]) -> str:
     """`male`, `female` or `neutral`, which an unknown word is, too."""
-    if word and word not in _GENDERS:
+    if word and word not in GENDERS:
         notes.append(f"the gender {word[:20]!r} isn't known: neutral")
-    return _GENDERS.get(word, "neutral")
+    return GENDERS.get(word, "neutral")

@@ -13,12 +13,13 @@ from torch.nn import functional
 
 from refu_core.body import rotvec_to_rotmat
 from refu_core.errors import WeightsError
+from refu_core.frames import N_BETAS, N_JOINTS, N_STYLES
 
 ScaleKind = Literal["vertex", "shared", "distance"]
 VertexScale = Callable[[Tensor, Tensor], Tensor]
 """α of some vertices of one body: (their numbers (R,), their signed distances [m] (R,)) to (R,)."""
 
-N_INPUTS = 10 + 69 + 3 + 4
+N_INPUTS = N_BETAS + 3 * (N_JOINTS - 1) + 3 + N_STYLES
 """β, the pose without the root, the direction of up as the root sees it, γ."""
 _DISTANCE_UNIT = 0.01
 """g reads distances in cm: so they are about as large as the latent vector that it reads beside them."""

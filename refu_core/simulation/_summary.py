@@ -105,7 +105,7 @@ def summarise_sequences(output: str | Path) -> dict[str, Any]:
     column = _finished(output, SequenceShard)
     done = column["state"] == DONE
     good = column["cause"] == 0
-    frames = int(done.sum()) * int(card["plan"]["seconds"] * FPS + 0.5)
+    frames = int(done.sum()) * round(card["plan"]["seconds"] * FPS)
     n_kept = int(good[done].sum())
     _count(card, column, frames=frames, frames_kept=n_kept)
     _note_yield(card, frames, n_kept, column["dropped"][done].sum(0, dtype=np.int64))

@@ -16,7 +16,7 @@ from refu_core.backbones import BasisDecoder, style_shape
 from refu_core.body import SmplBody, load_body
 from refu_core.errors import RefuError
 from refu_core.garments import GarmentTemplate, load_garment
-from refu_core.simulation import GarmentDataset, GarmentSequences, open_dataset
+from refu_core.simulation import GarmentDataset, GarmentSequences, SamplePlan, open_dataset
 from refu_core.training._mirror import Mirror, mirror_pose
 from refu_core.training._taken_along import TakenAlong
 
@@ -93,6 +93,11 @@ class TrainingSet:
     def card(self) -> dict[str, Any]:
         """What the card of the weights says of the set."""
         return {key: self.rows.card.get(key) for key in ("garment_fingerprint", "motions_fingerprint", "plan")}
+
+    @property
+    def n_pivots(self) -> int:
+        """Pairs of the plan that have many poses each."""
+        return int(self.rows.card["plan"].get("pivots", SamplePlan.pivots))
 
     @property
     def knows_limbs(self) -> bool:

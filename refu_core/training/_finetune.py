@@ -153,7 +153,7 @@ def finetune(
             basis = None
             if uses_basis(config, preset):
                 basis = basis_of(output, opened, None, PretrainSettings().rank, is_writer=is_writer)
-            network = fresh = build_backbone(config, template, basis=basis, pivots=pivots_of(samples))
+            network = fresh = build_backbone(config, template, basis=basis, pivots=pivots_of(samples, opened.n_pivots))
             # For the scale of inputs and outputs, which it sets; the stages themselves aren't run.
             stages(fresh, train, validation, template, PretrainSettings())
         else:

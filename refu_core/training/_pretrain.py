@@ -43,7 +43,6 @@ from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStag
 from refu_core.training._mirror import Mirror
 from refu_core.training._progress import TrainingLog
 
-N_PIVOTS = 20
 MANY = 4000
 """Samples from which on a tailornet is trained longer and held back less. On validation samples of shorts' 6,000 the
 error is 7.61 mm with weight decay 1 and twice the steps, 7.21 with 0.3, 7.18 with half the dropout, 7.04 with 0.1 (on
@@ -151,7 +150,7 @@ def pretrain(
         train = train.joined(mirrored(train, mirror))
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.loop.seed)
-        model = build_backbone(config, template, basis=basis, pivots=pivots_of(samples))
+        model = build_backbone(config, template, basis=basis, pivots=pivots_of(samples, opened.n_pivots))
     mean = samples.displacement.mean(0)
     described = {
         **identity,
@@ -199,10 +198,10 @@ def basis_of(folder: Path, opened: TrainingSet, mirror: Mirror | None, rank: int
     return basis
 
 
-def pivots_of(samples: TrainingSamples) -> Tensor:
-    """(β, γ) of a set's pivots, its pairs below 20, shape (K, 14); of all pairs where it has none."""
-    pairs = [k for k in torch.unique(samples.pair).tolist() if k < N_PIVOTS]
-    pairs = pairs or torch.unique(samples.pair)[:N_PIVOTS].tolist()
+def pivots_of(samples: TrainingSamples, n_pivots: int) -> Tensor:
+    """(β, γ) of a set's pivots, its first `n_pivots` pairs, shape (K, 14); of as many others where it has none."""
+    pairs = [k for k in torch.unique(samples.pair).tolist() if k < n_pivots]
+    pairs = pairs or torch.unique(samples.pair)[:n_pivots].tolist()
     return torch.stack([samples.style_shape[samples.pair == k][0] for k in pairs])
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import os
 import re
@@ -274,15 +273,11 @@ def require_apart(given: Path, written: Path) -> None:
         raise RefuError(msg)
 
 
-def write_json(path: Path | None, content: dict[str, Any]) -> None:
-    """Writes it where a path was given."""
-    if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-
-
 def tell(args: argparse.Namespace, text: str, content: dict[str, Any], *, code: int = 0) -> int:
     """Prints the result, writes it as JSON where that was asked for, and gives the exit code back."""
     print(text)
-    write_json(args.json, content)
+    if args.json is not None:
+        from refu_lab.tables import write_json  # loads what tables are of
+
+        write_json(args.json, content)
     return code
