@@ -16,7 +16,7 @@ def listing(kind: type) -> str:
     """The parameters, a line each."""
     specs = specs_of(kind).items()
     return "\n".join(
-        ["parameters:", *(f"  {name:<16}{one.description} Default: {one.default!r}" for name, one in specs)]
+        ["parameters:", *(f"  {name:<20}{one.description} Default: {one.default!r}" for name, one in specs)]
     )
 
 

@@ -13,7 +13,7 @@ PLOT = "time-against-error.png"
 _METRICS = (
     ("mpve_mm", "mean error MPVE [mm]"),
     ("vfcp_percent", "vertices inside the body VFCP [%]"),
-    ("cfmp_percent", "frames without any CFMP [%]"),
+    ("cfmp_percent", "collision-free frames CFMP [%]"),
 )
 _COLOURS = {"none": "#7a7a7a", "approx": "#e0a030", "hybrid": "#4a9a6a", "accurate": "#3b6ea5"}
 _SIZES = {"none": 7, "approx": 12, "hybrid": 8.5, "accurate": 5}

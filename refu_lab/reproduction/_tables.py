@@ -230,6 +230,8 @@ def read_table(folder: Path, name: str) -> ResultTable | None:
 def write_summary(folder: Path) -> Path:
     """Writes `README.md`: all tables that are in the folder, the main one's figures, the pictures.
 
+    What there is to say of the folder as a whole is taken from its `about.txt`.
+
     Raises:
         RefuError: a file that isn't a table, or a folder that can't be written.
     """
@@ -238,11 +240,17 @@ def write_summary(folder: Path) -> Path:
         f"- not made yet: `refu evaluate --table {name}`" if table is None else f"- [{table.title}]({name}.md)"
         for name, table in tables.items()
     ]
-    if (folder / "performance.md").exists():
-        links.append("- [Run time: `refu benchmark`](performance.md)")
+    for file, title in (
+        ("performance.md", "Run time: `refu benchmark`"),
+        ("collider.md", "The collider: what each number does"),
+    ):
+        if (folder / file).exists():
+            links.append(f"- [{title}]({file})")
+    about = folder / "about.txt"
     parts = [
         "# Results",
-        "Every table and figure of the paper, on simulated data of this project. `refu evaluate` writes these pages.",
+        "Every table and figure of the paper, on simulated data of this project; `refu evaluate` writes these pages.",
+        *([about.read_text(encoding="utf-8").strip()] if about.exists() else []),
         "\n".join(links),
         _PAPER_NOTE,
     ]
