@@ -174,15 +174,15 @@ _FEWEST_PAIRS = 5
 """Of fewer none is held out: those that are left would be too alike to learn from."""
 
 
-def drawn_pairs(pair: Tensor, *, share: float, seed: int) -> Tensor:
+def drawn_pairs(pair: Tensor, *, share: float, seed: int, fewest: int = _FEWEST_PAIRS) -> Tensor:
     """Which of N samples, of the style-shape pairs `pair` (N,), are chosen: bool, shape (N,).
 
-    Whole pairs are drawn until `share` of the samples is reached: at least one of five or more, where `share` isn't 0.
+    Whole pairs are drawn until `share` of the samples is reached: at least one of `fewest` or more, where `share` isn't 0.
     """
     known, counts = torch.unique(pair, return_counts=True)
     order = torch.randperm(len(known), generator=torch.Generator().manual_seed(seed))
     n_chosen = int((counts[order].cumsum(0) <= share * len(pair)).sum())
-    if share > 0 and len(known) >= _FEWEST_PAIRS:
+    if share > 0 and len(known) >= fewest:
         n_chosen = max(n_chosen, 1)
     return torch.isin(pair, known[order[:n_chosen]])
 

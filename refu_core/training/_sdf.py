@@ -282,7 +282,7 @@ def _split(dataset: GarmentDataset, settings: SdfSettings) -> dict[str, Tensor]:
     pairs = torch.as_tensor(dataset.column("pair"))
     train, test = torch.from_numpy(dataset.train), torch.from_numpy(dataset.test)
     held_out = torch.zeros_like(train)
-    held_out[train] = drawn_pairs(pairs[train], share=settings.validation_share, seed=settings.seed)
+    held_out[train] = drawn_pairs(pairs[train], share=settings.validation_share, seed=settings.seed, fewest=2)
     splits = {"train": train & ~held_out, "validation": train & held_out, "test": test}
     for name, mask in splits.items():
         if not bool(mask.any()):
