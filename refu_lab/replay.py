@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import itertools
 import math
+import signal
 import sys
+import threading
 import time
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Literal, NamedTuple
@@ -185,6 +187,23 @@ class Evaluator:
         return records
 
 
+@contextmanager
+def _undisturbed() -> Iterator[None]:
+    """An interrupt waits until this ends: a bag that is left in the middle of a message can't be read."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+    before = {kind: signal.signal(kind, lambda kind, _: came.append(kind)) for kind in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for kind, handler in before.items():
+            signal.signal(kind, signal.SIG_DFL if handler is None else handler)
+        for one in dict.fromkeys(came):
+            signal.raise_signal(one)
+
+
 class _Replayer:
     """The loop's parts, so that one frame is one call."""
 
@@ -205,7 +224,8 @@ class _Replayer:
     def run(self, record: FrameRecord, bag: DressedBag | None) -> None:
         """Bytes to bytes (timed), then the metrics and the bag (not timed)."""
         if bag is not None:
-            bag.add_input(record)
+            with _undisturbed():
+                bag.add_input(record)
         start = time.perf_counter()
         try:
             frame = self._source.frame_of(record)
@@ -226,11 +246,13 @@ class _Replayer:
             garments = self._evaluator.add(frame, output, latency_ms)
             result.frames.append(FrameResult(frame, latency_ms, output.stats.stage_ms, shift, garments))
         if bag is not None:
-            bag.add_frame(record, frame, output, data, garments)
+            with _undisturbed():
+                bag.add_frame(record, frame, output, data, garments)
 
     def _skip(self, record: FrameRecord, reason: str, bag: DressedBag | None) -> None:
         if bag is not None:
-            bag.add_skip(record, reason)
+            with _undisturbed():
+                bag.add_skip(record, reason)
         skips = self._result.skips
         skips[reason if reason in skips or len(skips) < _MAX_REASONS else "other reasons"] += 1
 

@@ -177,7 +177,7 @@ _FEWEST_PAIRS = 5
 def drawn_pairs(pair: Tensor, *, share: float, seed: int, fewest: int = _FEWEST_PAIRS) -> Tensor:
     """Which of N samples, of the style-shape pairs `pair` (N,), are chosen: bool, shape (N,).
 
-    Whole pairs are drawn until `share` of the samples is reached: at least one of `fewest` or more, unless `share` is 0.
+    Whole pairs are drawn until that share is reached: one at least of `fewest` or more, unless `share` is 0.
     """
     known, counts = torch.unique(pair, return_counts=True)
     order = torch.randperm(len(known), generator=torch.Generator().manual_seed(seed))
