@@ -19,6 +19,7 @@ from msg_adapters.inputs import _ros4hri
 from msg_adapters.inputs._frame import decoding, reading_fields, smpl_frame, stamp_ns_of
 from msg_adapters.joints import SMPL_JOINTS
 from refu_core.frames import N_BETAS, SmplFrame
+from refu_core.recordings import PELVIS
 
 MESSAGE_TYPE = "sensor_msgs/msg/JointState"
 _POSE_NAMES = tuple(f"{joint}_{axis}" for joint in SMPL_JOINTS for axis in "xyz")
@@ -81,7 +82,7 @@ class _Layout:
         values[self.slots] = position[self.given]
         if self.ros4hri:
             pose = _ros4hri.pose_of(values[: len(_ros4hri.AXES)])
-            return smpl_frame(pose, None, -_ros4hri.PELVIS, stamp_ns=stamp_ns)
+            return smpl_frame(pose, None, -PELVIS, stamp_ns=stamp_ns)
         pose, betas, transl = np.split(values, [_N_POSE, _N_POSE + _N_BETA])
         return smpl_frame(pose, betas, transl, stamp_ns=stamp_ns)
 

@@ -18,7 +18,6 @@ from msg_adapters.errors import DecodeError
 from msg_adapters.joints import SMPL_JOINTS
 from msg_adapters.rotations import quaternion_from_rotvec, quaternion_product, rotvec_from_quaternion
 from refu_core.frames import MAX_ANGLE
-from refu_core.recordings import PELVIS as PELVIS
 
 AXES = {
     "waist": (0, 1, 0), "r_head": (1, 0, 0), "y_head": (0, 0, 1), "p_head": (0, -1, 0),

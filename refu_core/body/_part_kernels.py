@@ -17,6 +17,7 @@ from refu_core.body._collider_kernels import (
     Work,
     within,
 )
+from refu_core.body._pose_kernels import turned
 
 wp.set_module_options({"enable_backward": False})
 
@@ -152,10 +153,7 @@ def deepen(v: int, rounds: int, work: Work, segments: Segments, rings: Rings) ->
 @wp.func
 def normal_at(bones: Bones, v: int) -> wp.vec3:
     """The smoothed normal that the bones give vertex v: a fold doesn't turn it over."""
-    normal = wp.vec3()
-    for k in range(bones.start[v], bones.start[v + 1]):
-        normal += bones.weight[k] * (bones.rotation[bones.joint[k]] @ bones.normal[v])
-    return wp.normalize(normal)
+    return wp.normalize(turned(v, bones.start, bones.joint, bones.weight, bones.rotation, bones.normal))
 
 
 @wp.func

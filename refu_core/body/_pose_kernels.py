@@ -52,6 +52,22 @@ def chain_kernel(
         translation[b, j] = place - turn @ here
 
 
+@wp.func
+def turned(
+    v: int,
+    start: wp.array[int],
+    joint: wp.array[int],
+    weight: wp.array[float],
+    rotation: wp.array[wp.mat33],
+    normal: wp.array[wp.vec3],
+) -> wp.vec3:
+    """A vertex's normal at rest, turned as skinning turns the vertex (`JointWeights`)."""
+    way = wp.vec3()
+    for k in range(start[v], start[v + 1]):
+        way += weight[k] * (rotation[joint[k]] @ normal[v])
+    return way
+
+
 if TYPE_CHECKING:
     Transform = wp.Vector[float]
 else:

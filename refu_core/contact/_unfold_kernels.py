@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from refu_core.body._pose_kernels import turned
 from refu_core.contact._layers_kernels import Cut
 from refu_core.contact._level_kernels import levelled
 from refu_core.contact._state import bounded
@@ -22,15 +23,6 @@ class Upright:
     """The vertices that may give way."""
     share: wp.array[float]
     """How much each vertex may, 0 to 1."""
-
-
-@wp.func
-def turned(i: int, upright: Upright, rotation: wp.array[wp.mat33]) -> wp.vec3:
-    """A vertex's normal at rest, turned as skinning turns the vertex."""
-    way = wp.vec3()
-    for k in range(upright.start[i], upright.start[i + 1]):
-        way += upright.weight[k] * (rotation[upright.joint[k]] @ upright.normal[i])
-    return way
 
 
 @wp.func
@@ -71,7 +63,8 @@ def fold_kernel(
     first = wp.tid() * each
     for k in range(first, first + each):
         i = upright.may[k]
-        cosine = facing(i, points, cut, turned(i, upright, rotation))
+        way = turned(i, upright.start, upright.joint, upright.weight, rotation, upright.normal)
+        cosine = facing(i, points, cut, way)
         fold = upright.share[i] * wp.clamp((flat - cosine) / (flat - folded), 0.0, 1.0)
         weight[i] = fold
         if fold > 0.0:
