@@ -20,6 +20,22 @@ SMPL_COLUMNS: dict[InputAxes, tuple[int, int, int]] = {"smpl": (2, 0, 1), "frame
 """Column of SMPL that becomes the message's x, y and z."""
 
 
+def up_of(frame_id: str) -> NDArray[np.float64]:
+    """Which way is up in a frame, shape (3,), as REP-103 has it: -y in a camera's optical frame, z in any other."""
+    return np.array([0.0, -1.0, 0.0] if "optical" in frame_id.rsplit("/", maxsplit=1)[-1] else [0.0, 0.0, 1.0])
+
+
+def up_of_sender(axes: InputAxes, frame_id: str, turn: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Which way is up in the axes of a sender's roots, shape (3,), where `turn` (3, 3) leads from its frame to another.
+
+    Where `turn` leads nowhere else, SMPL's axes have y up whatever the frame is called.
+    """
+    if axes == "smpl" and (turn == np.eye(3)).all():
+        return np.array([0.0, 1.0, 0.0])
+    up: NDArray[np.float64] = (turn @ np.eye(3)[list(SMPL_COLUMNS[axes])]).T @ up_of(frame_id)
+    return up
+
+
 def vertices_ros_from_smpl(vertices: NDArray[FloatT]) -> NDArray[FloatT]:
     """(x, y, z)_ros = (z, x, y)_smpl of points [m], shape (..., 3)."""
     return np.roll(vertices, 1, axis=-1)

@@ -73,6 +73,8 @@ def checked_numbers(
 class SmplFrame:
     """Parameters of one SMPL body at one time; validated, immutable, in SMPL axes (y up, z forward, left = +x).
 
+    The root and `transl` may be in any other right-handed axes, as long as `up` says which way is up there.
+
     Raises `FrameError` when an array has a wrong number of elements, isn't finite, or is beyond all bodies.
     """
 
@@ -86,6 +88,9 @@ class SmplFrame:
     """Garment style γ in standard deviations, shape (4,); None for the wearer's usual one."""
     stamp_ns: int = 0
     """Time of the measurement [ns since the epoch of the sender's clock]."""
+    up: NDArray[np.floating] = field(default_factory=lambda: np.array([0, 1, 0], np.float32))
+    """Away from the ground, in the axes of the root and `transl`, shape (3,); of any length, kept as a unit vector.
+    Cloth hangs the other way."""
     past: NDArray[np.float32] | None = None
     """How the person moved until now, as `PoseHistory` says it, shape (4, 219): see there; None for not at all."""
 
@@ -98,6 +103,12 @@ class SmplFrame:
             object.__setattr__(
                 self, "style", checked_numbers("style", self.style, (N_STYLES,), np.float32, MAX_COEFFICIENT)
             )
+        up = checked_numbers("up", self.up, (3,), np.float64)
+        length = float(np.linalg.norm(up))
+        if not 1e-6 <= length <= 1e6:
+            msg = f"up must be a direction, got {self.up!r}"
+            raise FrameError(msg)
+        object.__setattr__(self, "up", checked_numbers("up", up / length, (3,), np.float32))
         if self.past is not None:
             past = checked_numbers("past", self.past, (len(LAGS), N_PAST), np.float32, MAX_COEFFICIENT)
             object.__setattr__(self, "past", past)

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 import msg_adapters as adapters
+from msg_adapters.axes import up_of
 from refu_core import FrameError, RefuError
 from refu_core.history import PoseHistory
 from refu_core.keypoints import Proportions
 from refu_core.modes import FOREIGN_BETAS, ONE_STYLE, BetasSource
-from refu_core.recordings import SUFFIXES
+from refu_core.recordings import SUFFIXES, upright_turn
 from refu_lab.bodies import body_warnings
 from refu_lab.commands.replay import RecordingOptions
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
+
+    from numpy.typing import NDArray
 
     from msg_adapters import FrameRecord
     from refu_core import GarmentPipeline, SmplBody, SmplFrame
@@ -96,7 +100,8 @@ def open_source(options: RecordingOptions, body: Callable[[], SmplBody]) -> Sour
             raise RefuError(msg)
         motion = adapters.read_motion(options.input, fps=options.fps, axes=options.input_axes, person=options.person)
         description = f"{options.input.name}, {len(motion)} frames at {motion.fps:g} Hz"
-        of_message = adapters.INPUT_TYPES["multiarray"], _decoding(adapters.decoder_for("multiarray"))
+        up = upright_turn(motion.poses[:, 0].astype(np.float64))[1] if options.axes == "frame" else None
+        of_message = adapters.INPUT_TYPES["multiarray"], _decoding(adapters.decoder_for("multiarray"), lambda _: up)
         records = _motion_records(motion, INPUT_TOPIC)
         source = Source(options, description, INPUT_TOPIC, *of_message, records, len(motion))
         return replace(source, notes=motion.notes, gender=motion.gender)
@@ -107,7 +112,7 @@ def open_source(options: RecordingOptions, body: Callable[[], SmplBody]) -> Sour
         raise RefuError(msg)
     bag = adapters.open_smpl_bag(options.input, topic=options.topic, input_type=options.input_type)
     topic, kind = bag.topic.name, bag.topic.message_type
-    decode = _follower(options, body()) if bag.decoder is None else _decoding(bag.decoder)
+    decode = _follower(options, body()) if bag.decoder is None else _decoding(bag.decoder, _up_of(options, kind))
     return Source(options, f"{topic} ({kind})", topic, kind, decode, iter(bag), bag.message_count, bag)
 
 
@@ -126,8 +131,23 @@ def _motion_records(motion: adapters.Motion, topic: str) -> Iterator[FrameRecord
         )
 
 
-def _decoding(decoder: adapters.Decoder) -> Callable[[bytes, int], SmplFrame]:
-    return lambda data, _: decoder.from_bytes(data)
+_Up = Callable[[bytes], "NDArray[np.float64] | None"]
+"""Which way is up in a message's axes, shape (3,); None for SMPL's."""
+
+
+def _decoding(decoder: adapters.Decoder, up_of_message: _Up) -> Callable[[bytes, int], SmplFrame]:
+    def decode(data: bytes, _: int) -> SmplFrame:
+        frame, up = decoder.from_bytes(data), up_of_message(data)
+        return frame if up is None else replace(frame, up=up)
+
+    return decode
+
+
+def _up_of(options: RecordingOptions, message_type: str) -> _Up:
+    if options.axes == "smpl":
+        return lambda _: None
+    name = next(name for name, kind in adapters.INPUT_TYPES.items() if kind == message_type)
+    return lambda data: up_of(adapters.frame_id_of(data, name))
 
 
 def _follower(options: RecordingOptions, body: SmplBody) -> Callable[[bytes, int], SmplFrame]:
@@ -140,13 +160,13 @@ def _follower(options: RecordingOptions, body: SmplBody) -> Callable[[bytes, int
 
     def decode(data: bytes, received_ns: int) -> SmplFrame:
         nonlocal followed
-        people, _ = stream.frames(data, received_ns)
+        people, frame_id = stream.frames(data, received_ns)
         followed = followed if followed is not None or not people else next(iter(people))
         if followed not in people:
             msg = "nobody is to be seen: of too few keypoints there are finite numbers, with confidence"
             if people:
                 msg = f"{followed} isn't to be seen; who is: {', '.join(people)}"
             raise adapters.DecodeError(msg)
-        return people[followed]
+        return replace(people[followed], up=up_of(frame_id))
 
     return decode

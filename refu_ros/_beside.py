@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msg_adapters import check_plausible
-from msg_adapters.axes import SMPL_COLUMNS
+from msg_adapters.axes import SMPL_COLUMNS, up_of_sender
 from refu_core import RefuError, SmplFrame
 from refu_core.frames import N_BETAS, N_JOINTS
 from refu_core.modes import BUILTIN_GARMENTS
@@ -126,7 +126,8 @@ class Dresser:
     def _dress(self, frame: SmplFrame, settings: NodeSettings, then: Then) -> object:
         pipeline = self._load(settings.pipeline)
         pipeline.margin = settings.margin
-        frame = settings.applied(frame)
+        up = up_of_sender(settings.axes, settings.frame_id, np.eye(3))
+        frame = replace(settings.applied(frame), up=up)
         output = pipeline(frame)
         rotation = np.eye(3)[list(SMPL_COLUMNS[settings.axes])]
         placed = {name: (mesh.local + frame.transl) @ rotation.T for name, mesh in output.items()}

@@ -5,13 +5,16 @@ from __future__ import annotations
 import re
 import time
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 import msg_adapters as adapters
+from msg_adapters.axes import up_of_sender
 from refu_core import FrameError, RefuError
 from refu_core.errors import printable
 from refu_ros._interfaces import interface, ros_qos
@@ -177,6 +180,13 @@ class Listener:
         except adapters.TransformError as error:
             self._node.statistics.drop("transform", str(error))
             return
+        up = up_of_sender(
+            self._settings.axes,
+            self._settings.frame_id if placement is not None else self._frames.get(person) or self._settings.frame_id,
+            np.eye(3) if placement is None else placement.rotation,
+        )
+        if not np.array_equal(frame.up, up.astype(np.float32)):
+            frame = replace(frame, up=up)
         self.scene.put(person, frame, placement, self._camera_at(person, frame.stamp_ns))
 
     # Frames ---------------------------------------------------------------------------------------

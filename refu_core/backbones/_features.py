@@ -32,7 +32,18 @@ def tilt_rotvec(up: Tensor) -> Tensor:
     x, y, z = up.unbind(-1)
     sine = (x * x + z * z).clamp_min(1e-12).sqrt()
     factor = torch.where(sine > 1e-5, torch.atan2(sine, y) / sine, torch.ones_like(sine))
-    return torch.stack((-z * factor, torch.zeros_like(x), x * factor), -1)
+    over = torch.where((sine <= 1e-5) & (y < 0), torch.pi, -z * factor)
+    return torch.stack((over, torch.zeros_like(x), x * factor), -1)
+
+
+def upright(pose: Tensor, up: Tensor) -> Tensor:
+    """Poses (B, 24, 3) [rad] as a network sees them that knows y as up, where `up` (B, 3), of unit length, is up.
+
+    Roots are without heading then. Those that have y up stay as they are, bit for bit.
+    """
+    of_root = (rotvec_to_rotmat(pose[:, 0]).mT @ up[..., None])[..., 0]
+    root = torch.where(up[:, 1:2] == 1, pose[:, 0], tilt_rotvec(of_root))
+    return torch.cat((root[:, None], pose[:, 1:]), 1)
 
 
 class PoseFeatures(nn.Module):

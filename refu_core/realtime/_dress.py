@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from refu_core.backbones import MAX_OFFSET
+from refu_core.backbones import MAX_OFFSET, upright
 from refu_core.body import RigidTransforms
 from refu_core.errors import FrameError, require_type
 from refu_core.frames import LAGS, N_JOINTS, N_PAST
@@ -52,9 +52,12 @@ class Dressed(NamedTuple):
     """Of the bodies' joints, that skin and garments were posed with, leading shape (B, 24)."""
 
 
-def dress(pose: Tensor, wearer: Wearer, *, past: Tensor | None = None, lap: Lap = _no_lap) -> Dressed:
+def dress(
+    pose: Tensor, wearer: Wearer, *, past: Tensor | None = None, up: Tensor | None = None, lap: Lap = _no_lap
+) -> Dressed:
     """Bodies in poses (B, 24, 3) [rad], dressed by the backbones: posed as g = T(θ, β)(t(β, γ) + D(θ, β, γ)).
 
+    Cloth hangs away from `up` (B, 3), of unit length and in the axes of the roots; from +y if not given.
     A backbone that heeds the past takes it from `past` (B, 4, 219), which `PoseHistory` explains, rest if not given.
     Where a collider pulls the skin apart, the cloth that lies on it goes along (`SkinBelow`).
     Pipeline, CUDA graph, training, evaluation and benchmark all call this. It is a pure function of tensors and
@@ -64,6 +67,8 @@ def dress(pose: Tensor, wearer: Wearer, *, past: Tensor | None = None, lap: Lap 
     require_batch("pose", pose, (N_JOINTS, 3), wearer.outfit, sizes=(len(wearer.betas),))
     if past is not None:
         require_batch("past", past, (len(LAGS), N_PAST), wearer.outfit, sizes=(len(pose),))
+    if up is not None:
+        require_batch("up", up, (3,), wearer.outfit, sizes=(len(pose),))
     turns, at_root = RootTurn.taken_off(pose, wearer.shape.joints)
     posed = wearer.outfit.body.posed(at_root, wearer.shape)
     lap("body", None)
@@ -72,9 +77,9 @@ def dress(pose: Tensor, wearer: Wearer, *, past: Tensor | None = None, lap: Lap 
         aside, rotation = outfit.collider.aside(posed.vertices, posed.transforms.rotation)
         body = outfit.collider.apart(aside, rotation)
         lap("collider", None)
-    drapes = {}
+    drapes, seen = {}, pose if up is None else upright(pose, up)
     for name, garment in wearer.garments.items():
-        drape = _drape(pose, past, wearer, outfit.wearables[name], garment, posed.transforms)
+        drape = _drape(seen, past, wearer, outfit.wearables[name], garment, posed.transforms)
         if outfit.collider is not None:
             drape = drape._replace(vertices=drape.vertices + outfit.below[name](body - posed.vertices))
         drapes[name] = drape

@@ -93,14 +93,15 @@ class FrameStep:
         adjust: Adjust | None = None,
         *,
         past: Tensor | None = None,
+        up: Tensor | None = None,
     ) -> list[Person]:
-        """Persons in poses (B, 24, 3) [rad]; `past` as for `dress`, `margins` [m] of the garments as in the outfit.
+        """Persons in poses (B, 24, 3) [rad]; `past` and `up` as for `dress`, `margins` [m] as the outfit's garments.
 
         `clocks`, one a person, are told how long the stages took; what is done for all at once is shared out. What was
         predicted may be changed by `adjust` before anything is done about collisions.
         """
         shared = StageClock()
-        dressed = dress(pose, replace(wearer, outfit=self.outfit), past=past, lap=shared.lap)
+        dressed = dress(pose, replace(wearer, outfit=self.outfit), past=past, up=up, lap=shared.lap)
         if adjust is not None:
             dressed = adjust(dressed)
             shared.lap("adjust")
@@ -142,10 +143,10 @@ class FrameStep:
         return persons
 
     def packed(self, inputs: Mapping[str, Tensor], margins: tuple[float, ...]) -> Tensor:
-        """The same of `pose`, `past` and a wearer's tensors: all in one tensor (B, …), which `unpacked` reads."""
+        """The same of `pose`, `past`, `up` and a wearer's tensors: all in one tensor (B, …), which `unpacked` reads."""
         rows = []
         wearer = Wearer.of_tensors(self.outfit, inputs)
-        for person in self(inputs["pose"], wearer, margins, past=inputs.get("past")):
+        for person in self(inputs["pose"], wearer, margins, past=inputs.get("past"), up=inputs.get("up")):
             parts = [person.turn(person.body), person.turn(person.skin), person.shift]
             for name in self.outfit.wearables:
                 worn = person.garments[name]

@@ -295,6 +295,8 @@ class GarmentPipeline:
         told = {}
         if self.heeds_past and any(frame.past is not None for frame in frames):
             told["past"] = _past(frames)
+        if any(frame.up[1] != 1 for frame in frames):
+            told["up"] = torch.as_tensor(np.stack([frame.up for frame in frames]))
         if self._graphs is not None and adjust is None:
             packed = self._graphs({"pose": pose, **told, **wearer.tensors()}, margins)
             outputs = [self._unpacked(frame, parts) for frame, parts in zip(frames, step.unpacked(packed), strict=True)]
@@ -378,7 +380,7 @@ def _key(frame: SmplFrame, *, of_pose: bool = True) -> bytes:
     """Equal for two persons who differ in their place alone."""
     style = b"" if frame.style is None else b"s" + frame.style.tobytes()
     past = b"" if frame.past is None else b"p" + frame.past.tobytes()
-    return frame.betas.tobytes() + (frame.pose.tobytes() + past if of_pose else b"") + style
+    return frame.betas.tobytes() + (frame.pose.tobytes() + frame.up.tobytes() + past if of_pose else b"") + style
 
 
 def _check_margin(margin: float | None) -> None:

@@ -22,6 +22,7 @@ from msg_adapters import (
     decode_transforms,
     encode_transforms,
 )
+from msg_adapters.axes import InputAxes, up_of_sender
 from msg_adapters.transforms import HISTORY_NS
 
 S = 10**9
@@ -175,3 +176,21 @@ def test_a_camera_that_looks_ahead_sees_people_upright() -> None:
     ahead, down = np.array([0.0, 0.0, 3.0]), np.array([0.0, 1.0, 0.0])
     np.testing.assert_allclose(found.rotation @ ahead + found.translation, [5.0, 0.0, 1.5], atol=1e-12)
     np.testing.assert_allclose(found.rotation @ down, [0.0, 0.0, -1.0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("axes", "frame_id", "degrees", "up"),
+    [
+        ("smpl", "map", 0, (0, 1, 0)),
+        ("smpl", "camera_color_optical_frame", 0, (0, 1, 0)),  # SMPL's axes, whatever the frame is called
+        ("smpl", "map", 30, (0.5, np.sqrt(0.75), 0)),  # a sender that leans to its right
+        ("frame", "map", 0, (0, 0, 1)),
+        ("frame", "robot/head_optical", 0, (0, -1, 0)),
+        ("frame", "map", -90, (0, -1, 0)),
+    ],
+)
+def test_up_is_where_the_frame_of_the_messages_has_it(
+    axes: InputAxes, frame_id: str, degrees: float, up: tuple[float, ...]
+) -> None:
+    turn = Rotation.from_euler("x", degrees, degrees=True).as_matrix()
+    np.testing.assert_allclose(up_of_sender(axes, frame_id, turn), up, atol=1e-12)

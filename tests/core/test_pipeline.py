@@ -165,7 +165,11 @@ def assert_same(a: np.ndarray, b: np.ndarray) -> None:
 
 @pytest.mark.parametrize(
     ("backbone", "sdf", "turn"),
-    [("skinned", "accurate", (0.4, -1.9, 0.7)), ("tailornet", "hybrid", (0, -1.9, 0))],  # cloth hangs: yaw alone
+    [
+        ("skinned", "accurate", (0.4, -1.9, 0.7)),
+        ("tailornet", "hybrid", (0.4, -1.9, 0.7)),
+        ("tailornet", "hybrid", (np.pi, 0, 0)),  # a camera's axes
+    ],
 )
 def test_turning_the_person_turns_the_garments(backbone: str, sdf: str, turn: tuple[float, ...]) -> None:
     pipeline = GarmentPipeline.load(["skirt-female"], backbone=backbone, sdf=sdf)
@@ -173,7 +177,7 @@ def test_turning_the_person_turns_the_garments(backbone: str, sdf: str, turn: tu
     rotation = Rotation.from_rotvec(turn)
     pose = np.array(here.pose)
     pose[0] = (rotation * Rotation.from_rotvec(pose[0])).as_rotvec()
-    there = SmplFrame(pose=pose, betas=here.betas)
+    there = SmplFrame(pose=pose, betas=here.betas, up=rotation.apply([0, 2, 0]))
     root = pipeline.body.rest_joints(torch.tensor(here.betas)[None])[0, 0].numpy()
     turned = pipeline(there)
     for name, mesh in pipeline(here).items():
@@ -285,6 +289,7 @@ def test_bad_options_are_named(garments: list[str], options: dict[str, object], 
         ({"pose": "standing"}, "pose must be"),
         ({"pose": np.zeros(72), "betas": np.zeros(9)}, r"betas must have the shape \(10,\)"),
         ({"pose": np.zeros(72), "transl": [0, np.inf, 0]}, "transl has 1 value that is NaN or infinite"),
+        ({"pose": np.zeros(72), "up": np.zeros(3)}, "up must be a direction"),
         ({"pose": np.full(72, 1e300)}, "beyond the range of float32"),
         ({"pose": np.zeros(72, complex)}, "pose must be .* numbers, got ndarray: values of the type complex128"),
         ({"pose": np.zeros(72, bool)}, "values of the type bool"),

@@ -76,7 +76,7 @@ def test_garments_are_in_the_same_place_either_way(tmp_path: Path) -> None:
     path, places = z_up(tmp_path / "a.npz"), []
     for axes in ("auto", "frame", "z-up"):
         out = tmp_path / f"{axes}.mcap"
-        run(path, input_axes=axes, output=out)
+        run(path, input_axes=axes, output=out, backbone="tailornet")  # cloth hangs the same way, too
         with adapters.BagReader(out) as reader:
             (message, *_) = reader.messages(["/garments"])
         places.append(adapters.decode_marker_array(message.data)[0].points)
