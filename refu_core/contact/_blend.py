@@ -79,7 +79,7 @@ class Blend:
         *,
         least: Tensor | None = None,
         steps: Sequence[float] = _STEPS,
-        reach: int = DEFAULT_CONTACT.blend_reach,
+        reach: int = DEFAULT_CONTACT.near,
     ) -> Tensor:
         """Smooth displacements [m], shape (N, B, 3), along each push at least as long as wanted. Differentiable.
 

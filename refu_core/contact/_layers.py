@@ -32,8 +32,7 @@ class Layer:
 
     The closest point is searched downhill, from the nearest of a few places around what was closest at rest. Cloth
     slides by a few edges only, so that takes half the time of a tree. On a folded sheet the search may end in the wrong
-    fold, and in another one in the next frame. So a vertex also looks at what its neighbours found; and one that ends
-    more than a centimetre below the sheet asks a tree.
+    fold, and in another one in the next frame, so a vertex also looks at what its neighbours found.
 
     What isn't near the sheet at rest (a sleeve beside shorts) is a stranger to it: a tree is asked where one comes to
     it, and its outside may face the sheet's.
@@ -67,7 +66,7 @@ class Layer:
         """What is done where triangles cut each other after all."""
         self._given, self._push, *self._fields = torch.zeros(4, *self._above.shape, device=self.device)
         self._moved = torch.zeros(len(above), dtype=torch.int32, device=self.device)
-        self._count, self._n_doubtful = torch.zeros(2, 1, dtype=torch.int32, device=self.device)
+        self._count = torch.zeros(1, dtype=torch.int32, device=self.device)
         self._commands: dict[str, Any] = {}
         self._record(self._above.cpu().numpy(), self._below.vertices.cpu().numpy())
 
@@ -88,7 +87,10 @@ class Layer:
             if not goes_on:
                 self._below.take(below)
             self._given.copy_(above)
-            self._look("look again" if goes_on else "look")
+            self._below.fit()
+            self._count.zero_()
+            self._commands["look again" if goes_on else "look"].launch()
+            self._commands["lift"].launch()
             n_low = self._count.clone()
             if self._is_serial and not int(n_low):
                 return above, n_low
@@ -111,51 +113,36 @@ class Layer:
             )
             raise MeshError(msg)
 
-    def _look(self, search: str) -> None:
-        """What has to be pushed, and how many vertices that are; a device that isn't waited for asks about everyone."""
-        self._count.zero_()
-        self._n_doubtful.zero_()
-        self._commands[search].launch()
-        self._commands["lift"].launch()
-        n = int(self._n_doubtful) if self._is_serial else len(self._above)
-        if n:
-            self._below.fit()
-            self._commands["ask"].set_dim(n)
-            self._commands["ask"].launch()
-
     def _move(self) -> None:
         """Pushes those with their neighbourhood."""
         if self._is_serial:
             self._commands["move all"].launch()
             return
         self._fields[0].copy_(self._push)
-        for round_ in range(self._settings.layer_rounds):
+        for round_ in range(self._settings.around):
             self._commands[f"spread{round_ % 2}"].launch()
         self._commands["move"].launch()
 
     def _record(self, rest: NDArray[np.float32], rest_below: NDArray[np.float32]) -> None:
         """Records the launches of a frame: each of them is shorter than what Python makes of its arguments."""
-        n, device, sheet, rounds = len(rest), str(self.device), self._below, self._settings.layer_rounds
+        n, device, sheet, rounds = len(rest), str(self.device), self._below, self._settings.around
         n_strips, each = (1, n) if self._is_serial else (n, 1)
         edges = rest_below[sheet.mesh.edges]
         longest = float(np.linalg.norm(edges[:, 0] - edges[:, 1], axis=1).max(initial=0.0))
-        rules = _rules(self._settings, self._settings.layer_stretch * longest)
+        rules = _rules(self._settings, longest)
         starts = [ints(values, self.device) for values in _starts(rest, rest_below, self._settings)]
         given, above, push, *fields = (
             as_warp(rows, wp.vec3) for rows in (self._given, self._above, self._push, *self._fields)
         )
         moved = as_warp(self._moved, wp.int32)
-        looks, found, doubtful, *reached = (wp.zeros(n, dtype=wp.int32, device=device) for _ in range(5))
-        count, n_doubtful = as_warp(self._count, wp.int32), as_warp(self._n_doubtful, wp.int32)
-        cut, below = self.parting.cut, [sheet.places, sheet.normals, sheet.cut]
+        looks, found, *reached = (wp.zeros(n, dtype=wp.int32, device=device) for _ in range(4))
+        count, cut = as_warp(self._count, wp.int32), self.parting.cut
         search = [given, sheet.places, sheet.cut, *starts, above, moved, looks, found]
-        lift = [*below, sheet.extent, above, cut, looks, found, rules, push, count, doubtful, n_doubtful]
-        ask = [sheet.tree, *below, above, cut, found, rules, doubtful, n_doubtful, push, count]
+        below = [sheet.tree, sheet.places, sheet.normals, sheet.cut, sheet.extent]
         for name, kernel, size, arguments in (
             ("look", kernels.search_kernel, n_strips, [each, False, *search]),
             ("look again", kernels.search_kernel, n_strips, [each, True, *search]),
-            ("lift", kernels.lift_kernel, n_strips, [each, *lift]),
-            ("ask", kernels.tree_kernel, n, ask),
+            ("lift", kernels.lift_kernel, n_strips, [each, *below, above, cut, looks, found, rules, push, count]),
             ("spread0", moving.spread_kernel, n, [push, cut, *fields]),
             ("spread1", moving.spread_kernel, n, [push, cut, *reversed(fields)]),
             ("move", moving.move_kernel, n, [fields[0], above, moved]),
@@ -166,8 +153,8 @@ class Layer:
 
 def _rules(settings: ContactSettings, longest: float) -> Any:
     rules = kernels.LayerRules()
-    rules.gap, rules.reach, rules.fade = settings.layer_gap, settings.layer_reach, settings.layer_fade
-    rules.agreement, rules.doubt, rules.longest = settings.layer_agreement, settings.layer_doubt, longest
+    rules.gap, rules.reach = settings.layer_gap, settings.layer_reach
+    rules.agreement, rules.longest = settings.layer_agreement, longest
     return rules
 
 
@@ -182,9 +169,9 @@ def _starts(
     for vertex in range(len(below)):
         if is_free[vertex]:
             places.append(vertex)
-            is_free[tree.query_ball_point(below[vertex], settings.layer_spacing)] = False
+            is_free[tree.query_ball_point(below[vertex], settings.layer_reach)] = False
     distance, closest = (np.asarray(found) for found in tree.query(above))
-    around = cKDTree(below[places]).query_ball_point(above, settings.layer_slides)
+    around = cKDTree(below[places]).query_ball_point(above, settings.layer_meets)
     each = [
         np.append(first, np.array(places)[others]) if near else np.zeros(0, np.int64)
         for first, others, near in zip(closest, around, distance < settings.layer_meets, strict=True)

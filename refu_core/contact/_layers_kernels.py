@@ -32,9 +32,7 @@ class LayerRules:
     gap: wp.float32
     reach: wp.float32
     longest: wp.float32
-    fade: wp.float32
     agreement: wp.float32
-    doubt: wp.float32
 
 
 @wp.func
@@ -69,32 +67,28 @@ def nearest_vertex(p: wp.vec3, start: int, points: wp.array[wp.vec3], cut: Cut) 
 
 
 @wp.func
-def nearest_face(p: wp.vec3, start: int, points: wp.array[wp.vec3], cut: Cut) -> tuple[int, int, wp.vec3, wp.vec3]:
-    """The face closest to p downhill from the fan of vertex `start`: feature, barycentrics, and p's offset from it."""
+def nearest_face(p: wp.vec3, start: int, points: wp.array[wp.vec3], cut: Cut) -> int:
+    """The face closest to p downhill from the fan of vertex `start`."""
     v = int(start)
     squared = float(wp.inf)
     face = int(-1)
-    feature = int(0)
     w = wp.vec3(1.0, 0.0, 0.0)
-    offset = wp.vec3(0.0, 0.0, 0.0)
     for _step in range(MOST_STEPS):
         last = face
         for k in range(cut.fan_start[v], cut.fan_start[v + 1]):
             f = cut.fan_face[k]
-            f_w, f_feature, f_offset = closest_on_face(p, f, points, cut.faces)
+            f_w, _feature, f_offset = closest_on_face(p, f, points, cut.faces)
             other = wp.length_sq(f_offset)
             if other < squared:
                 squared = other
                 face = f
-                feature = f_feature
                 w = f_w
-                offset = f_offset
         # The closest vertex isn't always a corner of the closest face: on, at the corner that weighs most.
         corner = heaviest(w)
         if face == last or cut.faces[face, corner] == v:
             break
         v = cut.faces[face, corner]
-    return face, feature, w, offset
+    return face
 
 
 @wp.func
@@ -175,9 +169,8 @@ def normal_on(face: int, w: wp.vec3, normals: wp.array[wp.vec3], cut: Cut) -> wp
 def lift_off(
     i: int,
     face: int,
-    feature: int,
-    offset: wp.vec3,
-    normal: wp.vec3,
+    below: wp.array[wp.vec3],
+    below_normals: wp.array[wp.vec3],
     below_cut: Cut,
     above: wp.array[wp.vec3],
     above_cut: Cut,
@@ -187,7 +180,9 @@ def lift_off(
     push: wp.array[wp.vec3],
     count: wp.array[int],
 ) -> None:
-    """What brings vertex i to the gap above the place on the sheet that it is off by `offset`."""
+    """What brings vertex i to the gap above the face of the sheet that is closest to it."""
+    w, feature, offset = closest_on_face(above[i], face, below, below_cut.faces)
+    normal = normal_on(face, w, below_normals, below_cut)
     height = wp.dot(offset, normal)
     far = wp.length(offset)
     if height >= rules.gap or far > rules.reach:
@@ -199,7 +194,7 @@ def lift_off(
     # Whatever ends does so gradually, or cloth would jump from frame to frame.
     share *= wp.min(1.0, 4.0 * (1.0 - far / rules.reach))
     if (below_cut.rim[face] >> feature) & 1 != 0:
-        share *= wp.max(0.0, 1.0 - wp.length(offset - height * normal) / rules.fade)
+        share *= wp.max(0.0, 1.0 - wp.length(offset - height * normal) / rules.reach)
     lift = share * (rules.gap - height) * normal
     if wp.length_sq(lift) > 0.0:
         push[i] = lift
@@ -210,6 +205,7 @@ def lift_off(
 def lift_kernel(
     each: int,
     # the garment below
+    tree: wp.uint64,
     below: wp.array[wp.vec3],
     below_normals: wp.array[wp.vec3],
     below_cut: Cut,
@@ -223,14 +219,11 @@ def lift_kernel(
     # outputs
     push: wp.array[wp.vec3],
     count: wp.array[int],
-    doubtful: wp.array[int],
-    n_doubtful: wp.array[int],
 ) -> None:
     """What brings each vertex that `looks` to the gap above the sheet, and how many they are that lack something.
 
     A fold that one vertex's search ended in is seldom in the way of its neighbours': what these `found` is looked at,
-    too. Whoever is far below the sheet is `doubtful`, and only listed. `each` vertices a thread
-    (`strips`).
+    too. Strangers ask a tree. `each` vertices a thread (`strips`).
     """
     first = wp.tid() * each
     for i in range(first, first + each):
@@ -241,7 +234,9 @@ def lift_kernel(
         v = int(found[i])
         if v == STRANGER:
             if is_within(p, extent, rules.gap):
-                doubtful[wp.atomic_add(n_doubtful, 0, 1)] = i
+                hit = wp.mesh_query_point_no_sign(tree, p, rules.reach)
+                if hit.result:
+                    lift_off(i, hit.face, below, below_normals, below_cut, above, above_cut, True, rules, push, count)
             continue
         squared = wp.length_sq(below[v] - p)
         # As near as that, it is the right fold.
@@ -256,46 +251,6 @@ def lift_kernel(
             if v != found[i]:
                 v = nearest_vertex(p, v, below, below_cut)
         # No point of a face is farther from its closest corner than from the middle of three edges of its longest one.
-        if wp.length(below[v] - p) > rules.reach + 0.578 * rules.longest:
-            continue
-        face, feature, w, offset = nearest_face(p, v, below, below_cut)
-        normal = normal_on(face, w, below_normals, below_cut)
-        if wp.dot(offset, normal) >= rules.gap:
-            continue
-        if wp.length(offset) > rules.doubt:
-            doubtful[wp.atomic_add(n_doubtful, 0, 1)] = i
-            continue
-        lift_off(i, face, feature, offset, normal, below_cut, above, above_cut, False, rules, push, count)
-
-
-@wp.kernel(enable_backward=False)
-def tree_kernel(
-    tree: wp.uint64,
-    # the garment below
-    below: wp.array[wp.vec3],
-    below_normals: wp.array[wp.vec3],
-    below_cut: Cut,
-    # the garment above
-    above: wp.array[wp.vec3],
-    above_cut: Cut,
-    found: wp.array[int],
-    rules: LayerRules,
-    doubtful: wp.array[int],
-    n_doubtful: wp.array[int],
-    # outputs
-    push: wp.array[wp.vec3],
-    count: wp.array[int],
-) -> None:
-    """The same of the doubtful, with the closest place of the whole sheet."""
-    n = wp.tid()
-    if n >= n_doubtful[0]:
-        return
-    i = doubtful[n]
-    p = above[i]
-    hit = wp.mesh_query_point_no_sign(tree, p, rules.reach)
-    if not hit.result:
-        return
-    face = hit.face
-    w, feature, offset = closest_on_face(p, face, below, below_cut.faces)
-    normal = normal_on(face, w, below_normals, below_cut)
-    lift_off(i, face, feature, offset, normal, below_cut, above, above_cut, found[i] == STRANGER, rules, push, count)
+        if wp.length(below[v] - p) <= rules.reach + 0.578 * rules.longest:
+            face = nearest_face(p, v, below, below_cut)
+            lift_off(i, face, below, below_normals, below_cut, above, above_cut, False, rules, push, count)

@@ -52,7 +52,7 @@ class Parting:
         )
         weight = as_warp(self._weight, wp.float32)
         own = [points, cut.faces]
-        bounds = [settings.parting_gap, settings.parting_step]
+        bounds = [settings.tolerance, settings.layer_gap]
         self._commands: dict[str, Any] = {}
         for name, kernel, size, arguments in (
             (
@@ -88,7 +88,7 @@ class Parting:
         """The outer garment, (V, 3) [m], levelled around the faces that were found to cut."""
         with torch_stream(self._device):
             self._points.copy_(above)
-            for k in range(self._settings.parting_reach):
+            for k in range(self._settings.near):
                 self._commands[f"widen{k % 2}"].launch()
             self._weight.copy_(self._marked)
             for k in range(self._settings.parting_rounds):

@@ -142,7 +142,7 @@ class Press:
             else:
                 self._cut.zero_()
                 self._run("press")
-                for sweep in range(self._settings.press_sweeps):
+                for sweep in range(self._settings.around):
                     self._run(f"spread {sweep}")
                 self._run("lower")
         pressed: Tensor = self._points.clone()
@@ -158,16 +158,16 @@ class Press:
         device = str(self.device)
         limbs = wp.array([mesh.id for mesh in self._limbs.meshes], dtype=wp.uint64, device=device)
         cut = [fabric.cut, fabric.spread]
-        sweeps, feel = how.press_sweeps, self._feel()
+        sweeps, feel = how.around, self._feel()
         look = (kernels.look_kernel, len(fabric.start) - 1, [fabric, self._limbs.bundles, feel])
         steps: dict[str, tuple[Any, int, list[Any]]] = {"look": look}
         if self._is_serial:
-            numbers = [feel, how.press_slope, sweeps, how.press_reach]
+            numbers = [feel, how.press_slope, sweeps, how.near]
             steps["press all"] = (kernels.press_all_kernel, 1, [fabric, limbs, *numbers])
         else:
             steps["press"] = (kernels.press_kernel, n, [fabric, limbs, feel])
             for sweep in range(sweeps):
-                slope = 0.0 if sweep < how.press_reach else how.press_slope
+                slope = 0.0 if sweep < how.near else how.press_slope
                 fields = [cut[sweep % 2], cut[1 - sweep % 2]]
                 steps[f"spread {sweep}"] = (kernels.spread_kernel, n, [fabric, slope, *fields])
             steps["lower"] = (kernels.lower_kernel, n, [fabric, 0.5 * how.press_room, cut[sweeps % 2]])
@@ -179,7 +179,7 @@ class Press:
     def _feel(self) -> Any:
         how, feel = self._settings, kernels.Feel()
         feel.room, feel.beside, feel.flat = how.press_room, self._beside, how.press_flat
-        feel.lies, feel.looks, feel.step = wp.vec2(*how.press_lies), how.press_looks, how.press_step
+        feel.lies, feel.looks, feel.step = wp.vec2(*how.press_lies), how.press_looks, how.press_room
         return feel
 
 

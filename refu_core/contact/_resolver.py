@@ -136,7 +136,7 @@ class Resolver:
     def _reconcile(self) -> None:
         """Where distances contradict each other along an edge, a closest face was missed."""
         self._run("compare")
-        for _ in range(self._settings.looks):
+        for _ in range(self._settings.max_pushes):
             n = self._length(_state.SUSPECTS)
             self._counts[_state.CHANGED].zero_()
             if n:
@@ -163,7 +163,7 @@ class Resolver:
         if self._is_serial:
             self._run("blend")
             return
-        for _ in range(self._settings.blend_reach):
+        for _ in range(self._settings.near):
             self._length(_state.REACHED)
             self._run("reach")
         self._length(_state.REACHED)
@@ -235,7 +235,7 @@ class Resolver:
         self._command("tally", _resolver_kernels.tally_kernel, [each, state])
         long_step, short_step = self._settings.blend_steps
         if self._is_serial:
-            inputs = [state, cloth, self._settings.blend_reach, self._settings.blend_pairs, long_step, short_step]
+            inputs = [state, cloth, self._settings.near, self._settings.blend_pairs, long_step, short_step]
             self._command("blend", _spread_kernels.blend_kernel, inputs)
             self._command("raise edges", _edge_kernels.raise_edges_kernel, [state, cloth, skin, rules])
             return

@@ -49,7 +49,7 @@ def contradict(i: int, j: int, state: State, rules: Rules) -> bool:
     """Whether the distances of two neighbours, one of them at the skin, differ by more than they are apart."""
     first = state.distance[i]
     second = state.distance[j]
-    excess = wp.abs(first - second) - rules.contradiction
+    excess = wp.abs(first - second) - rules.tolerance
     return wp.min(first, second) < rules.margin and excess > wp.length(state.origin[i] - state.origin[j])
 
 

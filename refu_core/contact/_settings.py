@@ -23,15 +23,19 @@ class ContactSettings:
     max_displacement: float = MAX_DISPLACEMENT
     """No vertex moves farther than this, however wrong its distance is [m]."""
     max_pushes: int = 4
-    """Pushes of a vertex, and rounds of raised edges; up to 16."""
+    """Pushes of a vertex, rounds of raised edges, and how many edges far a search goes from the rim of a patch of wrong
+    closest faces into it; up to 16."""
     tolerance: float = 2e-4
-    """What may be missing to the margin [m]."""
+    """What may be missing to the margin, how far apart triangles that cut each other are brought, and by how much more
+    than their edge is long distances at its ends may differ before one of them is doubted [m]."""
 
-    # Closest faces that an approximate distance missed
-    contradiction: float = 1e-3
-    """By how much more than their edge is long distances at its ends may differ [m]: none is quite consistent."""
-    looks: int = 3
-    """How far a search goes from the rim of a patch of wrong closest faces into it [edges]."""
+    # Cloth around what is moved
+    near: int = 2
+    """How far around a pushed vertex cloth goes along [edges]. Farther out nothing collides, and moving it makes
+    nothing truer; fingers are thinner than a garment's edges are long. Even."""
+    around: int = 6
+    """How far around a push off a garment below, a limb or a fold cloth gives way, less and less [edges]. Even: what is
+    swept ends where it began. Of shorts' and T-shirts' folds six leave 5 frames cut (with 64 rounds), four 6."""
 
     # Cloth behind the legs
     tent_share: float = 0.75
@@ -58,21 +62,11 @@ class ContactSettings:
     different legs, and pressed to them they tear. Of the skirt's edges .028 % are twice as long as at rest, where all
     is pressed .065 %."""
     press_looks: int = 6
-    """Looks along the way from the skin to a vertex."""
-    press_step: float = 0.008
-    """How far apart they are at least [m]."""
-    press_reach: int = 2
-    """How far around a pressed vertex others are drawn back as far as it is [edges]. Fingers are thinner than a
-    garment's edges are long: cloth between two of them would be left behind."""
+    """Looks along the way from the skin to a vertex, a `press_room` apart at least."""
     press_slope: float = 0.7
     """How fast that fades beyond, per length along the cloth's edges: a dent, not a tear."""
-    press_sweeps: int = 8
-    """How far a dent reaches [edges]. Even: what is swept ends where it began."""
 
     # Neighbours
-    blend_reach: int = 2
-    """How far the neighbourhood reaches that gives way with a pushed vertex [edges]. Farther out nothing collides, and
-    moving it makes nothing truer."""
     blend_steps: tuple[float, float] = (3.0, 0.75)
     """How far the two sweeps of a pair go towards the mean of the neighbours. The long step levels what is wide, the
     short one the ripples that the long one overdoes (Richardson). A pair leaves at most 0.6 of any ripple."""
@@ -100,11 +94,6 @@ class ContactSettings:
     unfold_cosines: tuple[float, float] = (0.5, 0.0)
     """Cosines between where cloth faces and where skinning turns it: below the first it gives way, at the second in
     full. Leaves 2; 0.25 to -0.25 leave 7."""
-    unfold_near: tuple[float, float] = (0.1, 0.2)
-    """Cloth up to the first distance from another garment at rest gives way, and from the second on it doesn't [m]: a
-    fold is no fault in itself. Everywhere, the mean error of vertices of T-shirt and shorts grows by 0.2 mm."""
-    unfold_reach: int = 6
-    """How far around a fold cloth gives way, too, less and less [edges]. Even. Six leave 5 (with 64 rounds), four 6."""
     unfold_fade: float = 0.8
     """What is left of that from edge to edge."""
     unfold_rounds: int = 100
@@ -112,40 +101,24 @@ class ContactSettings:
 
     # Garments over each other
     layer_gap: float = 0.004
-    """How far apart two garments are kept [m]: their triangles cut the corners between vertices."""
+    """How far apart two garments are kept, and triangles that cut each other go in one sweep [m]: they cut the corners
+    between vertices."""
     layer_margin: float = 0.5
     """Share of the body's margin that is left once a garment was brought off those below it again: what pushes a vertex
     off the body may push it into a layer, and the other way round. Both have this much to give."""
     layer_reach: float = 0.03
-    """How far the sheet below is felt [m], less and less in the last quarter. Only cloth in a fold is deeper, and which
-    side of the fold is closest changes from frame to frame."""
+    """How far the sheet below is felt [m], less and less in the last quarter, and beyond its open rims; as far apart
+    are the places on it from which the closest one is looked for. Only cloth in a fold is deeper, and which side
+    of the fold is closest changes from frame to frame."""
     layer_meets: float = 0.1
-    """Vertices farther than this from the other garment at rest don't lie on it in any pose [m]. They may come beside
-    it, as a sleeve does beside shorts: a tree is asked for what of them is near."""
-    layer_fade: float = 0.02
-    """How far beyond its open rims a sheet is still felt, less and less [m]: cloth runs smoothly over a waistband."""
+    """Cloth up to this far from the other garment at rest lies on it, and slides by less [m]. The rest may come beside
+    it, as a sleeve does beside shorts: a tree is asked for what of that is near. Folds farther than twice this are left
+    alone, since they are no fault in themselves: unfolded everywhere, vertices' mean error grows by 0.2 mm."""
     layer_agreement: float = 0.25
     """Cosine of the garments' normals from which on a push counts in full; at a right angle it doesn't count at all."""
-    layer_doubt: float = 0.012
-    """A search that ends this far below the sheet may have found another fold, so a tree is asked [m]."""
-    layer_stretch: float = 1.5
-    """Edges of the sheet below that are longer than this multiple of their rest length aren't searched along."""
-    layer_spacing: float = 0.05
-    """How far the places on a sheet are apart from which the closest one is looked for [m]."""
-    layer_slides: float = 0.14
-    """Places up to this far away at rest are among them [m]: so far garments slide, and folds come near."""
-    layer_rounds: int = 6
-    """How far the neighbourhood of a push reaches [edges], and how often it is swept. Even: the field ends where it
-    began."""
 
     # Triangles of garments that cut each other, or the body where it has no room for them. The counts of frames are of
     # a version that levelled cloth deep inside the body first, and had no `parting_most`.
-    parting_gap: float = 3e-4
-    """How far apart they are brought, so that rounding doesn't make them meet again [m]."""
-    parting_step: float = 0.004
-    """How far at most in one sweep [m]: as far as garments are kept apart."""
-    parting_reach: int = 2
-    """How far around what cuts cloth is levelled [edges]. Even, as the rounds are. More leave as many cuts."""
     parting_rounds: int = 32
     """How often it is levelled. Of 116 recorded frames 16 leave 6 cut, 32 leave 4."""
     parting_most: float = 0.012

@@ -47,7 +47,6 @@ class Rules:
     tolerance: wp.float32
     max_displacement: wp.float32
     max_pushes: wp.int32
-    contradiction: wp.float32
     bulge: wp.float32
     through: wp.float32
 

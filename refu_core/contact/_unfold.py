@@ -52,7 +52,7 @@ class Unfold:
             as_warp(one, wp.vec3) for one in (self._points, self._other, self._origin, normals)
         )
         weight, wider = as_warp(self._weight, wp.float32), as_warp(self._wider, wp.float32)
-        share = _share(garment, others, *settings.unfold_near).to(device)
+        share = _share(garment, others, settings.layer_meets).to(device)
         may = torch.nonzero(share)[:, 0].int()
         self._kept = upright, cut = kernels.Upright(), cut_of(garment.mesh, device)  # launches know addresses
         wp.launch(layers.normals_kernel, n, [as_warp(rest, wp.vec3), cut, upward], device=str(device))
@@ -79,7 +79,7 @@ class Unfold:
                 kernels.unfold_all_kernel,
                 1,
                 [
-                    *(*widening, settings.unfold_reach, settings.unfold_rounds, farthest),
+                    *(*widening, settings.around, settings.unfold_rounds, farthest),
                     *(*listed, is_listed, wider, origin, other, weight, points),
                 ],
             ),
@@ -103,7 +103,7 @@ class Unfold:
                 self._commands["unfold all"].launch()
             else:
                 self._origin.copy_(points)
-                for k in range(self._settings.unfold_reach):
+                for k in range(self._settings.around):
                     self._commands[f"widen{k % 2}"].launch()
                 for k in range(self._settings.unfold_rounds):
                     self._commands[f"level{k % 2}"].launch()
@@ -112,8 +112,8 @@ class Unfold:
         return unfolded
 
 
-def _share(garment: GarmentTemplate, others: Sequence[GarmentTemplate], near: float, far: float) -> Tensor:
-    """How much each vertex may give way, 0 to 1, shape (V,): by its distance from the `others` at rest."""
+def _share(garment: GarmentTemplate, others: Sequence[GarmentTemplate], near: float) -> Tensor:
+    """How much each vertex may give way, shape (V,): up to `near` [m] from the `others` at rest 1, twice as far 0."""
     meets = np.concatenate([one.v_template.detach().cpu().double().numpy() for one in others])
     distance = cKDTree(meets).query(garment.v_template.detach().cpu().double().numpy())[0]
-    return torch.from_numpy(np.clip((far - distance) / (far - near), 0, 1)).float()
+    return torch.from_numpy(np.clip(2 - distance / near, 0, 1)).float()

@@ -94,7 +94,7 @@ def test_what_cuts_is_found_and_levelled(seed: int, height: float) -> None:
     cut = np.unique(pairs[:, 0])
     ring, weight = ring_of(faces, len(high)), np.zeros(len(high))
     weight[faces.numpy()[cut].ravel()] = 1
-    for _ in range(DEFAULT_CONTACT.parting_reach):
+    for _ in range(DEFAULT_CONTACT.near):
         weight = np.array([max(weight[i], *weight[around]) for i, around in enumerate(ring)])
     wanted = levelled(high.double().numpy(), ring, weight, DEFAULT_CONTACT.parting_rounds)
     np.testing.assert_allclose(layer.parting.level(high).numpy(), wanted, atol=1e-5)
@@ -118,7 +118,7 @@ def test_sheets_that_cut_are_parted_and_nothing_else_is_moved(seed: int, height:
     checker.update(low.numpy())
     after = len(checker.with_other(found.numpy(), faces.numpy()))
     assert after == 0, "there is room for all"
-    farthest = calls * DEFAULT_CONTACT.parting_sweeps * DEFAULT_CONTACT.parting_step
+    farthest = calls * DEFAULT_CONTACT.parting_sweeps * DEFAULT_CONTACT.layer_gap
     assert (found - level).norm(dim=1).max() <= 3 * farthest
 
 

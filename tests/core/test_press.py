@@ -36,10 +36,10 @@ def beside(lower: float) -> tuple[Tensor, Tensor, Tensor]:
     return dressed.drapes[SKIRT].vertices[0], outfit().below[SKIRT](dressed.body)[0], dressed.body[0]
 
 
-def made(body: Tensor, sweeps: int = DEFAULT_CONTACT.press_sweeps, *, knows_arms: bool = False) -> Press:
+def made(body: Tensor, sweeps: int = DEFAULT_CONTACT.around, *, knows_arms: bool = False) -> Press:
     limbs = LimbMeshes(outfit().body)
     limbs.update(body)
-    how = replace(DEFAULT_CONTACT, press_sweeps=sweeps)
+    how = replace(DEFAULT_CONTACT, around=sweeps)
     return Press(outfit().wearables[SKIRT].template, limbs, knows_arms=knows_arms, settings=how)
 
 
@@ -95,7 +95,7 @@ def test_is_what_a_look_from_the_skin_says(knows_arms: bool) -> None:
                 off = distances((at[v] + go / h * (x[v] - at[v]))[None], triangles)[0]
                 off = min(off, aside * (least - go) / (whole - go))
                 least = min(least, go + (whole - go) * off / aside)
-                go += max(off, how.press_step)
+                go += max(off, how.press_room)
                 if go >= least:
                     break
         lies = np.clip((how.press_lies[1] - h) / (how.press_lies[1] - how.press_lies[0]), 0, 1)
@@ -114,8 +114,8 @@ def test_neighbours_are_drawn_back_as_far_and_what_the_slope_gives_less() -> Non
     edges = outfit().wearables[SKIRT].template.mesh.edges
     lengths = (points[edges[:, 0]] - points[edges[:, 1]]).norm(dim=1).double().numpy()
     sources = (cut > 1e-4).sum()
-    for sweep in range(DEFAULT_CONTACT.press_sweeps):
-        rise = lengths * (0 if sweep < DEFAULT_CONTACT.press_reach else DEFAULT_CONTACT.press_slope)
+    for sweep in range(DEFAULT_CONTACT.around):
+        rise = lengths * (0 if sweep < DEFAULT_CONTACT.near else DEFAULT_CONTACT.press_slope)
         others = cut[edges[:, ::-1]] - rise[:, None]
         np.maximum.at(cut, edges, others)
     kept = np.minimum(height, DEFAULT_CONTACT.press_room / 2)

@@ -53,7 +53,7 @@ def slowly(points: Tensor, rotation: Tensor) -> Array:
     shirt, shorts = (outfit().wearables[name].template for name in (SHIRT, SHORTS))
     faces, rest = shorts.faces.numpy(), shorts.v_template.double().numpy()
     gap = np.array([np.linalg.norm(shirt.v_template.double().numpy() - p, axis=1).min() for p in rest])
-    near, far = how.unfold_near
+    near, far = how.layer_meets, 2 * how.layer_meets
     share = np.clip((far - gap) / (far - near), 0, 1)
     turned = np.einsum("vj,jab,vb->va", shorts.weights.double(), rotation.double(), normals(rest, faces))
     found = points.double().numpy()
@@ -68,7 +68,7 @@ def slowly(points: Tensor, rotation: Tensor) -> Array:
     weight = share * np.clip((flat - cosine) / (flat - folded), 0, 1)
     start, items = shorts.mesh.ring
     rings = [items[start[i] : start[i + 1]] for i in range(len(found))]
-    for _ in range(how.unfold_reach):
+    for _ in range(how.around):
         wider = [min(how.unfold_fade * weight[around].max(), share[i]) for i, around in enumerate(rings)]
         weight = np.maximum(weight, wider)
     for _ in range(how.unfold_rounds):

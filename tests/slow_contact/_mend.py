@@ -30,7 +30,7 @@ def mend(
         look: The distance of points (R, 3) from faces near by (R,).
     """
     assert sample.face is not None  # the caller has seen to it
-    for _ in range(_SETTINGS.looks):
+    for _ in range(_SETTINGS.max_pushes):
         first, second = _contradictions(points, sample.distance, edges, margin)
         is_nearer = sample.distance[first].abs() < sample.distance[second].abs()
         trusted, other = torch.where(is_nearer, first, second), torch.where(is_nearer, second, first)
@@ -46,11 +46,11 @@ def mend(
 def _contradictions(points: Tensor, distance: Tensor, edges: Tensor, margin: float) -> tuple[Tensor, Tensor]:
     """Ends of the edges whose distances differ by more than their length, and of which one is below `margin`."""
     ends = distance[edges]
-    differs = (ends[:, 0] - ends[:, 1]).abs() > _SETTINGS.contradiction
+    differs = (ends[:, 0] - ends[:, 1]).abs() > _SETTINGS.tolerance
     suspects = edges[torch.nonzero(differs & (ends.amin(1) < margin))[:, 0]]
     first, second = suspects.unbind(1)
     length = torch.linalg.vector_norm(points[first] - points[second], dim=-1)
-    first, second = suspects[(distance[first] - distance[second]).abs() > length + _SETTINGS.contradiction].unbind(1)
+    first, second = suspects[(distance[first] - distance[second]).abs() > length + _SETTINGS.tolerance].unbind(1)
     return first, second
 
 
