@@ -298,8 +298,8 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         self._attend()
         if self._state == "active":
             self._hold_topics()
-        if self._fittings is not None:
-            for name, reason in self._fittings.without_planner.items():
+        if self._worker is not None:
+            for name, reason in self._worker.fittings.without_planner.items():
                 text = f"planners aren't sent {name}: {printable(reason)}"
                 self.get_logger().warning(text, throttle_duration_sec=60.0)
         report = self.statistics.report()

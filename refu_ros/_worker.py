@@ -74,7 +74,8 @@ class _Job:
         """All that a garment relative to the root depends on."""
         style = b"" if frame.style is None else frame.style.tobytes()
         past = b"" if frame.past is None else frame.past.tobytes()
-        return self.pipeline, self.settings.margin, frame.pose.tobytes() + frame.betas.tobytes() + style, past
+        up = frame.up.tobytes()
+        return self.pipeline, self.settings.margin, frame.pose.tobytes() + frame.betas.tobytes() + style, up, past
 
 
 class Worker:
@@ -131,6 +132,11 @@ class Worker:
     def use(self, pipeline: GarmentPipeline) -> None:
         """Another pipeline from the next tick on."""
         self._next = self._fitted(pipeline)
+
+    @property
+    def fittings(self) -> Fittings:
+        """What is known of the garments that the next tick will dress people in."""
+        return self._next[1]
 
     def _fitted(self, pipeline: GarmentPipeline) -> tuple[GarmentPipeline, Fittings]:
         return pipeline, Fittings(pipeline, weights=self.settings.weights or None).prepare()

@@ -9,6 +9,7 @@ is NaN, or exactly zero in all of x, y, z.
 from __future__ import annotations
 
 import re
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -128,6 +129,8 @@ def _keypoints(points: NDArray[np.float64], confidence: NDArray[np.floating], st
 def _name(namespace: str, number: int) -> str:
     """A person's name as garments' namespaces and topics may have it."""
     word = re.sub(r"\W", "_", namespace, flags=re.ASCII)[:_LONGEST_NAME]
+    if word != namespace:  # nobody else's, however they are written
+        word = f"{word}_{zlib.crc32(namespace.encode()):08x}"
     if word and not word[0].isalpha():
         word = f"person_{word}"
     return f"{word or 'person'}_{number}" if number else word

@@ -296,35 +296,48 @@ class People:
         self, skeleton: Skeleton, *, betas: ArrayLike | None = None, settings: TrackerSettings = DEFAULTS
     ) -> None:
         self.skeleton = skeleton
-        self._options = {"betas": betas, "settings": settings}
+        self._betas, self._settings = betas, settings
         self._tracks: dict[str, KeypointTracker] = {}
         self._newest: dict[str, tuple[int, int]] = {}
+        self._given: dict[str, tuple[int, int]] = {}
+        """The last stamp of each, and when there was last a later one than before."""
 
     def update(
         self, person: str, points: ArrayLike, *, confidence: ArrayLike | None, stamp_ns: int, now_ns: int
     ) -> SmplFrame | None:
-        """A person's pose after a frame of keypoints; as `KeypointTracker.update`."""
+        """A person's pose after a frame of keypoints; as `KeypointTracker.update`.
+
+        Stamps that haven't gone on for `hold` say nothing: then it is when messages come that counts.
+        """
         track = self._tracks.pop(person, None)
+        last, since = self._given.pop(person, (-1, now_ns))
+        since = now_ns if stamp_ns > last else min(since, now_ns)
+        self._given[person] = stamp_ns, since
+        if 1e-9 * (now_ns - since) > self._settings.hold:
+            stamp_ns = now_ns
         if track is None:
-            track = KeypointTracker(self.skeleton, **self._options)  # type: ignore[arg-type]
+            track = KeypointTracker(self.skeleton, betas=self._betas, settings=self._settings)
         self._tracks[person] = track
         before = track.stamp_ns
         frame = track.update(points, stamp_ns, confidence=confidence)
         if person not in self._newest or track.stamp_ns != before:  # or they were older than those that are known
             self._newest[person] = stamp_ns, now_ns
         for gone in list(self._tracks)[:-MOST_PEOPLE]:
-            del self._tracks[gone], self._newest[gone]
+            del self._tracks[gone], self._newest[gone], self._given[gone]
         return frame
 
     def at(self, now_ns: int) -> dict[str, SmplFrame]:
         """Everybody's pose by now, as far on from their newest keypoints as these are old.
 
-        The age is that on the receiver's clock: senders' clocks differ.
+        The age is that on the receiver's clock: senders' clocks differ. Where it has been set back, nobody is known
+        to be there until they come again.
         """
         poses = {}
         for person, track in self._tracks.items():
             stamp_ns, came_ns = self._newest[person]
-            frame = track.at(stamp_ns + max(0, now_ns - came_ns))
+            if now_ns < came_ns:
+                track.reset()
+            frame = track.at(stamp_ns + now_ns - came_ns)
             if frame is not None:
                 poses[person] = frame
         return poses

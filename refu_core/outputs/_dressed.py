@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from refu_core.errors import RefuError
 from refu_core.outputs._clearance import Clearance
 from refu_core.outputs._limbs import LimbContact, LimbContacts
 from refu_core.outputs._normals import VertexNormals
@@ -80,8 +79,8 @@ class Fittings:
     def _prepare_planner(self, name: str) -> None:
         try:
             self.planner(name)
-        except RefuError as error:
-            self.without_planner[name] = str(error)
+        except Exception as error:  # whatever it is: nobody else would say it, and others would wait for this garment
+            self.without_planner[name] = str(error) or type(error).__name__
 
     def normals(self, name: str) -> VertexNormals:
         """Of a garment."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +75,15 @@ def test_markers(one: Any, two: Any, alpha: Any) -> None:
         for name, points in zip(sorted(names), (one, two), strict=True):
             np.testing.assert_array_equal(found[name].points, points)
         np.testing.assert_array_equal(found[sorted(names)[0]].confidence, alpha)
+
+
+def test_different_people_have_different_names() -> None:
+    written = ["ann", "王", "李", "a/1", "a_1", "x" * 80, "x" * 81]
+    lists = [marker(7, 0, ns=name, points=np.ones((K, 3))) for name in written]
+    found = decode_keypoints("keypoint_markers", marker_array(*lists), K)
+    assert len(found) == len(written)
+    assert "ann" in found
+    assert all(re.fullmatch("[A-Za-z][A-Za-z0-9_]*", name) for name in found)
 
 
 def test_what_is_not_seen_is_nan() -> None:

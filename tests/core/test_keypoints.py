@@ -306,6 +306,29 @@ def test_keypoints_that_come_late_set_no_clock_back() -> None:
         assert people.at(5 * 10**9)["ann"].stamp_ns == 10**10
 
 
+@pytest.mark.parametrize("step", [0, -1])
+def test_stamps_that_do_not_go_on_keep_nobody_where_they_were(step: int) -> None:
+    people, frame = People(skeleton("zed38")), clip("walk").frames[0]
+    places = []
+    for i in range(60):
+        now = 10**12 + i * 33_000_000
+        moved = points_of(frame, "zed38") + np.array([0.02 * i, 0, 0])
+        seen = people.update("ann", moved, confidence=None, stamp_ns=5 * 10**9 + step * i, now_ns=now)
+        assert seen is not None
+        places.append(seen.transl[0] - frame.transl[0])
+    assert places[-1] == pytest.approx(0.02 * 59, abs=0.03)
+    assert set(people.at(now + 10**8)) == {"ann"}
+
+
+def test_a_clock_set_back_brings_nobody_back() -> None:
+    people, points = People(skeleton("zed38")), points_of(clip("walk").frames[0], "zed38")
+    for person, now in (("ann", 10_000), ("bob", 10_300)):
+        people.update(person, points, confidence=None, stamp_ns=now * 10**9, now_ns=now * 10**9)
+    assert people.at(9_000 * 10**9) == {}
+    people.update("bob", points, confidence=None, stamp_ns=9_001 * 10**9, now_ns=9_001 * 10**9)
+    assert set(people.at(9_001 * 10**9)) == {"bob"}
+
+
 def test_predictions_at_a_steady_rate() -> None:
     """Somebody who is seen 15 times a second is where they are 60 times a second."""
     known = clip("cmu_03_01").frames
