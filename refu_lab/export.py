@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from itertools import islice
@@ -115,7 +115,11 @@ def export(
     pipeline = load()
     source.history = PoseHistory() if pipeline.heeds_past else None
     frames, outputs, left_out = [], [], list[str]()
-    for number, record in enumerate(islice(source.records, first, first + count), first):
+    for number, record in enumerate(islice(source.records, first + count)):
+        if number < first:  # what comes of the rest depends on it: the past, and where keypoints were
+            with suppress(RefuError):
+                source.frame_of(record)
+            continue
         with _left_out(number, left_out):
             frame = source.frame_of(record)
             outputs.append(pipeline(frame))

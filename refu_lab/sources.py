@@ -63,7 +63,8 @@ class Source:
         """
         if record.error is not None:
             raise record.error
-        frame = replace(self.decode(record.raw, record.log_time_ns), stamp_ns=record.stamp_ns)
+        frame = self.decode(record.raw, record.log_time_ns)
+        frame = frame if frame.stamp_ns else replace(frame, stamp_ns=record.stamp_ns)
         adapters.check_plausible(frame)
         self.has_betas = self.has_betas or bool(frame.betas.any())
         self.has_style = self.has_style or frame.style is not None

@@ -861,27 +861,18 @@ def test_one_outputs_failure_is_no_others(pipeline: GarmentPipeline, monkeypatch
     assert "no openings today" in setup.statistics.report().reasons["not_finite"]
 
 
-def test_obstacles_are_moved_only_where_everybody_has_them(pipeline: GarmentPipeline) -> None:
-    """Two persons who take turns: who subscribes later is told all of each, when it is their turn."""
+def test_obstacles_are_whole_whoever_hears_them(pipeline: GarmentPipeline) -> None:
+    """Nobody has to have heard what came before: a planner may have been started anew between two messages."""
     setup = Setup(pipeline, planner_rate=0.0)
-    fittings, wanted = setup.worker._next[1], [1]
+    fittings = setup.worker.fittings
     while not fittings.has_planner(GARMENT):
         time.sleep(0.01)
-    setup.viewer.watchers = lambda topic: wanted[0] * (topic == "collision_object")  # type: ignore[method-assign]
     setup.viewer.others = {"collision_object"}
-
-    def operations(*persons: str) -> list[int]:
+    for persons in (("ann", "bob"), ("ann",), ("ann", "bob")):
         setup.viewer.sent.clear()
         setup.tick(**{person: frame() for person in persons})
-        return [data[-1] for _, data in setup.viewer.sent]
-
-    add, move = 0, 3
-    assert operations("ann", "bob") == [add, add]
-    assert operations("ann") == [move]
-    wanted[0] = 2
-    assert operations("ann") == [add]
-    assert operations("bob") == [add]
-    assert operations("ann", "bob") == [move, move]
+        assert [data[-1] for _, data in setup.viewer.sent] == [0] * len(persons)  # ADD
+        assert all(len(data) > 10_000 for _, data in setup.viewer.sent)
 
 
 @pytest.mark.parametrize("fields", [["colour"], ["normal", "x"]])

@@ -18,58 +18,50 @@ if TYPE_CHECKING:
 
 
 class Obstacles:
-    """Garments as MoveIt has obstacles: put in anew when their shape has changed, moved when only their place has.
+    """Garments as MoveIt has obstacles: each message puts one in, whole, in the place of the one that was there.
 
-    Whoever subscribes later is sent everything: to move what isn't there is an error. What planners can't have is left
-    out (`Fittings.without_planner`).
+    So it doesn't matter who has missed what, or has begun anew: to `move` what isn't there would be an error. What
+    planners can't have is left out (`Fittings.without_planner`).
     """
 
     message_type = COLLISION_OBJECT
     topic = "collision_object"
 
     def __init__(self) -> None:
-        self._sent: dict[str, dict[str, bytes]] = {}
-        self._watchers = 0
+        self._sent: dict[str, list[str]] = {}
         self._due: dict[str, float] = {}
 
     def topics(self, persons: Iterable[str], fittings: Fittings | None) -> list[str]:  # noqa: ARG002 - one topic for all
         return [self.topic]
 
     def messages(self, worn: Sequence[Dressed], moment: Moment) -> Messages:
-        before, watchers = self._watchers, moment.watchers(self.topic)
-        if watchers and not all(_is_prepared(one.fittings, name) for one in worn for name in one.fittings.names):
+        if not moment.watchers(self.topic):
+            return
+        if not all(_is_prepared(one.fittings, name) for one in worn for name in one.fittings.names):
             return  # soon
-        self._watchers = watchers
-        if watchers > before:
-            self._due.clear()
-            for sent in self._sent.values():
-                sent.update(dict.fromkeys(sent, b""))
-        for one in worn if watchers else ():
+        for one in worn:
             if not is_due(self._due, one.person, moment.wishes):
                 continue
             garments = [name for name in one.fittings.names if name not in one.fittings.without_planner]
             names = [garment_namespace(name, one.person) for name in garments]
-            sent = self._sent.setdefault(one.person, {})
-            for name in [name for name in sent if name not in names]:
-                del sent[name]
-                yield self.topic, self._remove(name, moment)
+            for name in self._sent.get(one.person, ()):
+                if name not in names:
+                    yield self.topic, self._remove(name, moment)
+            self._sent[one.person] = names
             for name, garment in zip(names, garments, strict=True):
-                shape = one.output[garment].local.tobytes() + one.rotation.tobytes()
-                is_moved = sent.get(name) == shape
-                sent[name] = shape
-                yield self.topic, self._put(one, name, garment, moment.wishes, is_moved=is_moved)
+                yield self.topic, self._put(one, name, garment, moment.wishes)
 
     @staticmethod
-    def _put(one: Dressed, name: str, garment: str, wishes: Wishes, *, is_moved: bool) -> bytes:
+    def _put(one: Dressed, name: str, garment: str, wishes: Wishes) -> bytes:
         subframes = {opening.name: Placement(opening.rotation, opening.centre) for opening in one.openings[garment]}
         return encode_collision_object(
             name,
-            "move" if is_moved else "add",
+            "add",
             stamp_ns=one.stamp_ns,
             frame_id=wishes.frame_id,
             placement=Placement(np.eye(3), one.offset),
-            mesh=None if is_moved else one.solid(garment),
-            subframes=None if is_moved else subframes,
+            mesh=one.solid(garment),
+            subframes=subframes,
         )
 
     @staticmethod

@@ -189,7 +189,7 @@ class DressedFilm:
 def _frame_of(source: Source, record: adapters.FrameRecord) -> SmplFrame | None:
     try:
         return source.frame_of(record)
-    except adapters.DecodeError:
+    except RefuError:
         return None
 
 

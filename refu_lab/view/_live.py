@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 import msg_adapters as adapters
-from msg_adapters.markers import DELETE, DELETE_ALL
 from refu_core import RefuError
 from refu_lab.view._film import Shape
-from refu_lab.view._markers import MarkerShapes, meshes_of
+from refu_lab.view._markers import MarkerScene
 
 TOPICS = ("garments", "body")
 _LOOK_S = 0.2
@@ -37,8 +36,7 @@ class LiveFilm:
         self.told: Callable[[], object] = lambda: None
         """Called, from another thread, when there is something new."""
         self._changed = threading.Condition()
-        self._shapes: dict[tuple[str, str, int], Shape] = {}
-        self._markers = MarkerShapes()
+        self._scene: MarkerScene[Shape] = MarkerScene(lambda shape: shape)
         self._stamp_ns = self._n_frames = self._n_bad = 0
         self._since: float | None = None
         self._heard = {*topics}
@@ -54,25 +52,29 @@ class LiveFilm:
         with self._changed:
             while not self._is_here() and not until():
                 self._changed.wait(_LOOK_S)
-            return bool(self._shapes)
+            return bool(self._scene.topics)
 
     def _is_here(self) -> bool:
         """Whether there is something to see: the ground is put under the first of it, so feet are waited for."""
         is_late = self._since is not None and time.monotonic() > self._since + _TOGETHER_S
-        return bool(self._shapes) and (is_late or {topic for topic, *_ in self._shapes} == self._heard)
+        return bool(self._scene.topics) and (is_late or self._scene.topics == self._heard)
 
     def shapes(self, index: int) -> Sequence[Shape]:  # noqa: ARG002
         """What was published last of each topic; nothing of who has left."""
         with self._changed:
-            return [*self._shapes.values()]
+            return self._scene.shown(time.monotonic_ns())
 
     def facts(self, index: int) -> list[str]:  # noqa: ARG002
         """How it goes."""
         with self._changed:
             passed = time.monotonic() - (self._since or time.monotonic())
             rate = f"{self._n_frames / passed:.0f} Hz" if passed > 1 else "…"
-            bad = [f"{self._n_bad} messages are no markers"] if self._n_bad else []
-            return [f"stamp {1e-9 * self._stamp_ns:.2f} s, {rate}", f"{len(self._shapes)} meshes, as published", *bad]
+            bad = [f"{self._n_bad} messages or meshes can't be drawn"] if self._n_bad else []
+            return [
+                f"stamp {1e-9 * self._stamp_ns:.2f} s, {rate}",
+                f"{len(self._scene.shown(time.monotonic_ns()))} meshes, as published",
+                *bad,
+            ]
 
     def close(self) -> None:
         """Hears no more."""
@@ -81,28 +83,12 @@ class LiveFilm:
     def _take(self, topic: str, data: bytes) -> None:
         with self._changed:
             try:
-                self._show(topic, data)
+                stamp_ns, n_odd = self._scene.take(topic, data, time.monotonic_ns())
             except RefuError:
-                self._n_bad += 1
+                stamp_ns, n_odd = 0, 1
+            self._n_bad += n_odd
+            if stamp_ns:
+                self._n_frames += stamp_ns != self._stamp_ns
+                self._stamp_ns, self._since = stamp_ns, self._since or time.monotonic()
             self._changed.notify_all()
         self.told()
-
-    def _show(self, topic: str, data: bytes) -> None:
-        markers = adapters.decode_marker_array(data)
-        for marker in markers:
-            if marker.action in (DELETE, DELETE_ALL):
-                gone = [
-                    key
-                    for key in self._shapes
-                    if key[0] == topic and (marker.action == DELETE_ALL or key[1:] == (marker.ns, marker.id))
-                ]
-                for key in gone:
-                    del self._shapes[key]
-        for marker in meshes_of(markers):
-            if not np.isfinite(marker.points).all():
-                continue
-            self._shapes[topic, marker.ns, marker.id] = self._markers.shape(marker)
-            if marker.stamp_ns != self._stamp_ns:
-                self._stamp_ns = marker.stamp_ns
-                self._n_frames += 1
-            self._since = self._since or time.monotonic()

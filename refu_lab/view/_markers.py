@@ -1,17 +1,22 @@
-"""Meshes of markers: triangles that share corners, seen from an origin that stays."""
+"""What markers show: meshes that stay until they are taken away, seen from an origin that stays."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from msg_adapters import Marker
-from msg_adapters.markers import ADD, TRIANGLE_LIST
+from msg_adapters import Marker, decode_marker_array
+from msg_adapters.errors import DecodeError
+from msg_adapters.markers import ADD, DELETE, DELETE_ALL, TRIANGLE_LIST
 from refu_lab.view._film import Shape
+
+_FARTHEST = 1e6
+"""A marker that is farther off is no thing to look at [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,9 +53,7 @@ class MarkerShapes:
         topology = self._topologies.get(key)
         if topology is None or not topology.fits(points):
             topology = self._topologies[key] = Topology.of(points)
-        vertices = points[topology.first] * marker.scale
-        if marker.pose != (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0):
-            vertices = Rotation.from_quat(marker.pose[3:]).apply(vertices) + marker.pose[:3]
+        vertices = _placed(points[topology.first], marker)
         if self._origin is None:
             self._origin = vertices[0].copy()
         person, _, name = marker.ns.rpartition("/")
@@ -58,6 +61,69 @@ class MarkerShapes:
         return Shape(name, person, (vertices - self._origin).astype(np.float32), topology.faces, color)
 
 
-def meshes_of(markers: Iterable[Marker]) -> list[Marker]:
-    """Those that are triangles to show."""
-    return [one for one in markers if one.type == TRIANGLE_LIST and one.action == ADD and len(one.points)]
+def _placed(points: NDArray[np.float64], marker: Marker) -> NDArray[np.float64]:
+    """Points (N, 3) [m] of a marker in its frame. A rotation that nobody has set is none."""
+    points = points * marker.scale
+    if any(marker.pose[3:6]):
+        points = Rotation.from_quat(marker.pose[3:]).apply(points)
+    return points + marker.pose[:3] if any(marker.pose[:3]) else points
+
+
+def is_mesh(marker: Marker) -> bool:
+    """Whether it shows triangles."""
+    return marker.type == TRIANGLE_LIST and marker.action == ADD and len(marker.points) > 0
+
+
+def is_drawable(marker: Marker) -> bool:
+    """Whether that can be done: with three corners a triangle, and no number that isn't one."""
+    numbers = np.array([*marker.pose, *marker.scale])
+    if len(marker.points) % 3 or not (np.abs(numbers) < _FARTHEST).all():
+        return False
+    return bool((np.abs(marker.points) < _FARTHEST).all())
+
+
+_Kept = TypeVar("_Kept")
+
+
+class MarkerScene(Generic[_Kept]):
+    """What is there of markers that come, of several topics: each stays until it is deleted, or its time is over."""
+
+    def __init__(self, keep: Callable[[Shape], _Kept]) -> None:
+        """What is kept of a shape is up to `keep`."""
+        self._keep, self._shapes = keep, MarkerShapes()
+        self._shown: dict[tuple[str, str, int], tuple[_Kept, float]] = {}
+
+    @property
+    def topics(self) -> set[str]:
+        """Those of which there is something."""
+        return {topic for topic, *_ in self._shown}
+
+    def shown(self, now_ns: float) -> list[_Kept]:
+        """What is there at a time of the receiver [ns]."""
+        return [kept for kept, until_ns in self._shown.values() if now_ns < until_ns]
+
+    def take(self, topic: str, data: bytes, now_ns: int) -> tuple[int, int]:
+        """A message's markers: its stamp, 0 where it shows no mesh, and how many meshes can't be drawn.
+
+        Raises `DecodeError` for what is no message of markers.
+        """
+        markers = decode_marker_array(data)
+        for marker in markers:
+            if marker.action == DELETE_ALL:
+                self._shown = {key: kept for key, kept in self._shown.items() if key[0] != topic}
+            elif marker.action == DELETE:
+                self._shown.pop((topic, marker.ns, marker.id), None)
+        meshes = [marker for marker in markers if is_mesh(marker)]
+        drawable = [marker for marker in meshes if is_drawable(marker)]
+        for marker in drawable:
+            until_ns = now_ns + marker.lifetime_ns if marker.lifetime_ns > 0 else np.inf
+            self._shown[topic, marker.ns, marker.id] = self._keep(self._shapes.shape(marker)), until_ns
+        return max((marker.stamp_ns or now_ns for marker in drawable), default=0), len(meshes) - len(drawable)
+
+
+def shows_meshes(data: bytes) -> bool:
+    """Whether a message has a mesh that can be drawn."""
+    try:
+        return any(is_mesh(marker) and is_drawable(marker) for marker in decode_marker_array(data))
+    except DecodeError:
+        return False

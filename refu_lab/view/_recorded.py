@@ -6,6 +6,7 @@ import os
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,12 @@ from tqdm import tqdm
 import msg_adapters as adapters
 from refu_core import RefuError
 from refu_lab.view._film import Cache, Shape
-from refu_lab.view._markers import MarkerShapes, meshes_of
+from refu_lab.view._markers import MarkerScene, shows_meshes
+
+_LONGEST_PAUSE_S = 1.0
+"""A longer one, between a bag's runs, is cut to this [s]."""
+_LOOKED_AT = 100
+"""Messages of markers among which a mesh is looked for."""
 
 
 @dataclass(frozen=True)
@@ -41,30 +47,38 @@ class RecordedFilm:
         """What there is to warn of, for people."""
         self._spool = tempfile.TemporaryFile()  # noqa: SIM115  (as long as the film)
         self._size = 0
-        self._markers = MarkerShapes()
-        frames: dict[int, list[_Stored]] = {}
-        n_bad = 0
+        scene: MarkerScene[_Stored] = MarkerScene(self._store)
+        moments: list[tuple[int, list[_Stored]]] = []
+        stamp_ns = n_bad = n_odd = 0
         with adapters.BagReader(path) as reader:
             topics = {topic.name: topic.message_count for topic in marker_topics(reader)}
             total = sum(topics.values())
             for message in tqdm(
                 reader.messages(topics), total=total, unit="message", desc="reading", disable=None if progress else True
             ):
-                shown = _triangles(message.data)
-                n_bad += shown is None
-                if shown:
-                    # The node's topics of one moment are written one after the other, with one stamp.
-                    stamp = max(marker.stamp_ns for marker in shown) or message.log_time_ns
-                    frames.setdefault(stamp, []).extend(map(self._store, shown))
+                try:
+                    stamp, n = scene.take(message.topic, message.data, message.log_time_ns)
+                except adapters.DecodeError:
+                    n_bad += 1
+                    continue
+                n_odd += n
+                if stamp == stamp_ns and moments:
+                    moments.pop()  # the node's topics of one moment are written one after the other, with one stamp
+                stamp_ns = stamp or stamp_ns
+                moments.append((message.log_time_ns, scene.shown(message.log_time_ns)))
             self.notes += reader.warnings
         if n_bad:
             self.notes.append(f"{path}: {n_bad} messages are no markers and are left out")
-        if not frames:
-            msg = f"{path}: nothing to show: no marker of triangles"
+        if n_odd:
+            self.notes.append(f"{path}: {n_odd} meshes can't be drawn: their numbers are none, or make no triangles")
+        while moments and not moments[0][1]:
+            moments.pop(0)
+        if not moments:
+            msg = f"{path}: nothing to show: no marker of triangles; --dress dresses people whose motion is in it"
             raise RefuError(msg)
-        stamps = sorted(frames)
-        self._frames = [frames[stamp] for stamp in stamps]
-        self._times = np.array([1e-9 * (stamp - stamps[0]) for stamp in stamps])
+        self._frames = [shown for _, shown in moments]
+        steps = 1e-9 * np.diff([log_time_ns for log_time_ns, _ in moments])
+        self._times = np.append(0.0, np.cumsum(np.clip(steps, 0.0, _LONGEST_PAUSE_S)))
         self._cache = Cache()
         self.front = _front(path)
 
@@ -85,8 +99,7 @@ class RecordedFilm:
         """Gives the temporary file back."""
         self._spool.close()
 
-    def _store(self, marker: adapters.Marker) -> _Stored:
-        shape = self._markers.shape(marker)
+    def _store(self, shape: Shape) -> _Stored:
         stored = _Stored(shape.name, shape.person, shape.color, shape.faces, len(shape.vertices), self._size)
         data = shape.vertices.tobytes()
         self._spool.write(data)
@@ -108,19 +121,11 @@ def marker_topics(reader: adapters.BagReader) -> list[adapters.TopicInfo]:
     return [topic for topic in reader.topics if topic.message_type == adapters.MARKER_ARRAY and topic.message_count]
 
 
-def has_markers(path: Path) -> bool:
-    """Whether a bag carries garments. Raises `BagError` for what is no bag."""
+def has_meshes(path: Path) -> bool:
+    """Whether a bag's markers show meshes, as those of garments do. Raises `BagError` for what is no bag."""
     with adapters.BagReader(path) as reader:
-        return bool(marker_topics(reader))
-
-
-def _triangles(data: bytes) -> list[adapters.Marker] | None:
-    """The meshes of a message; None for one that can't be decoded."""
-    try:
-        markers = adapters.decode_marker_array(data)
-    except adapters.DecodeError:
-        return None
-    return meshes_of(markers)
+        first = islice(reader.messages({topic.name for topic in marker_topics(reader)}), _LOOKED_AT)
+        return any(shows_meshes(message.data) for message in first)
 
 
 def _front(path: Path) -> float:

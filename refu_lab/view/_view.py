@@ -82,10 +82,11 @@ def open_film(options: ViewOptions, *, progress: bool = False) -> DressedFilm | 
     if options.live is not None:
         return LiveFilm(options.live or TOPICS)
     from refu_lab.view._dressed import DressedFilm
-    from refu_lab.view._recorded import RecordedFilm, has_markers
+    from refu_lab.view._recorded import RecordedFilm, has_meshes
 
     first = options.inputs[0]
-    if not options.dress and first.suffix.lower() not in SUFFIXES and has_markers(first):
+    names_motion = options.dressing.topic is not None or options.dressing.input_type is not None
+    if not (options.dress or names_motion or first.suffix.lower() in SUFFIXES) and has_meshes(first):
         if len(options.inputs) > 1:
             msg = f"{first}: has garments, and is shown alone; --dress dresses the motion of several"
             raise RefuError(msg)

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 import msg_adapters as adapters
+from msg_adapters.markers import MarkerMesh, encode_delete
 from refu_core import GarmentPipeline, RefuError, SmplFrame
 from refu_core.metrics import CollisionChecker
 from refu_lab.cli import main
@@ -29,7 +31,7 @@ from refu_lab.commands.view import ViewOptions
 from refu_lab.view import view
 from refu_lab.view._dressed import DressedFilm, Track
 from refu_lab.view._film import BODY, SKIN, Cache, Shape
-from refu_lab.view._markers import Topology
+from refu_lab.view._markers import MarkerShapes, Topology, is_drawable
 from refu_lab.view._marks import CLEARANCE, Marker, Marking
 from refu_lab.view._player import Player
 from refu_lab.view._recorded import RecordedFilm
@@ -120,6 +122,63 @@ def test_people_of_a_bag_are_shown_together_while_they_are_there(tmp_path: Path)
     middles = [by_name(shapes, person)[BODY].vertices[:, 1].mean() for person in ("anna", "ben")]
     assert middles[1] - middles[0] == pytest.approx(1.0, abs=0.05)
     assert {shape.person for shape in film.shapes(13)} == {"anna", "ben"}  # a tenth of a second after ben's last
+
+
+CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+
+
+def triangle(ns: str, stamp_ns: int, *, lifetime_ns: int = 0) -> bytes:
+    mesh = MarkerMesh(ns, np.array([[0, 1, 2]]), 3)
+    return adapters.MarkerArrayEncoder([mesh], lifetime_ns=lifetime_ns).encode([CORNERS], stamp_ns=stamp_ns)
+
+
+def test_recorded_people_stay_until_they_leave_whoever_was_told_of_last(tmp_path: Path) -> None:
+    """Two who are sent in turn, then one leaves, another's time is over, and the robot starts anew an hour later."""
+    ann, bob = (partial(triangle, f"{name}/shirt") for name in ("ann", "bob"))
+    said = [
+        (0, ann(10**9)),
+        (50, bob(10**9 + 5 * 10**7)),
+        (100, ann(10**9 + 10**8)),
+        (150, bob(10**9 + 15 * 10**7, lifetime_ns=10**8)),
+        (200, encode_delete([("ann/shirt", 0)], stamp_ns=10**9)),
+        (3_600_000, ann(10**9)),
+    ]
+    with adapters.BagWriter(tmp_path / "two.mcap") as writer:
+        writer.add_topic("/garments", adapters.MARKER_ARRAY)
+        for ms, data in said:
+            writer.write("/garments", data, log_time_ns=10**12 + ms * 10**6)
+    film = RecordedFilm(tmp_path / "two.mcap")
+    people = [sorted(shape.person for shape in film.shapes(i)) for i in range(len(film.times))]
+    assert people == [["ann"], ["ann", "bob"], ["ann", "bob"], ["ann", "bob"], ["bob"], ["ann"]]
+    np.testing.assert_allclose(film.times, [0, 0.05, 0.1, 0.15, 0.2, 1.2])
+    film.close()
+
+
+def test_markers_that_make_no_picture_are_left_out_and_a_rotation_unset_is_none() -> None:
+    (whole,) = adapters.decode_marker_array(triangle("shirt", 1))
+    unset = replace(whole, pose=(1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 0.0))
+    assert is_drawable(whole)
+    assert is_drawable(unset)
+    np.testing.assert_array_equal(MarkerShapes().shape(unset).vertices, MarkerShapes().shape(whole).vertices)
+    for odd in (
+        replace(whole, points=whole.points[:2]),
+        replace(whole, points=np.full((3, 3), np.nan)),
+        replace(whole, points=np.full((3, 3), 1e300)),
+        replace(whole, pose=(0.0, 0.0, np.inf, 0.0, 0.0, 0.0, 1.0)),
+    ):
+        assert not is_drawable(odd)
+
+
+def test_a_robots_own_markers_keep_nobody_from_being_dressed(tmp_path: Path) -> None:
+    path = tmp_path / "robot.mcap"
+    with adapters.BagWriter(path) as writer:
+        writer.add_topic("/smpl_params", adapters.INPUT_TYPES["multiarray"])
+        writer.add_topic("/robot", adapters.MARKER_ARRAY)
+        writer.write("/robot", encode_delete([("arm", 0)], stamp_ns=1), log_time_ns=10**18)
+        for frame in motion(2):
+            writer.write("/smpl_params", adapters.encoder_for("multiarray")(frame), log_time_ns=frame.stamp_ns)
+    film = open_film(ViewOptions(inputs=(path,), dressing=RecordingOptions(input=Path(), garments=SHORTS)))
+    assert isinstance(film, DressedFilm)
 
 
 def test_what_stays_from_frame_to_frame_is_one_array(film: DressedFilm) -> None:

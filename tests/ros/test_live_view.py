@@ -90,7 +90,7 @@ def test_a_film_shows_what_is_published_and_not_who_has_left(node: Node) -> None
         assert second.faces is first.faces
         np.testing.assert_allclose(second.vertices - first.vertices, [[0.0, 0.5, 0.0]] * len(node.rest), atol=1e-5)
         node.until(
-            lambda: any("messages are no markers" in fact for fact in film.facts(0)),
+            lambda: any("can't be drawn" in fact for fact in film.facts(0)),
             lambda: node.send_raw(b"\0\1\0\0\xff\xff\xff\xff"),
         )
         node.until(lambda: not film.shapes(0), node.leave)
