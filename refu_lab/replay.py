@@ -12,7 +12,7 @@ from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any, Literal, NamedTuple
 
@@ -291,6 +291,7 @@ def replay(
     load = cache(lambda: pipeline or options.load_pipeline())
     with ExitStack() as stack:
         source = open_source(options, lambda: load().body)  # whose faults are told at once
+        options = replace(options, frame_id=options.frame_id or source.frame_id)
         pipeline = load()
         pipeline(
             SmplFrame(pose=np.zeros((24, 3), np.float32))

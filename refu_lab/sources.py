@@ -49,6 +49,8 @@ class Source:
     """What the reader of a motion file took for granted."""
     gender: str = "neutral"
     """Whose motion it is, where the file says it."""
+    frame_id: str = "map"
+    """Of what comes of it."""
 
     history: PoseHistory | None = None
     """Tells frames their past, for garments that heed it (`GarmentPipeline.heeds_past`)."""
@@ -114,7 +116,23 @@ def open_source(options: RecordingOptions, body: Callable[[], SmplBody]) -> Sour
     bag = adapters.open_smpl_bag(options.input, topic=options.topic, input_type=options.input_type)
     topic, kind = bag.topic.name, bag.topic.message_type
     decode = _follower(options, body()) if bag.decoder is None else _decoding(bag.decoder, _up_of(options, kind))
-    return Source(options, f"{topic} ({kind})", topic, kind, decode, iter(bag), bag.message_count, bag)
+    given = _frame_of_first(bag) if options.axes == "frame" else ""
+    found = Source(options, f"{topic} ({kind})", topic, kind, decode, iter(bag), bag.message_count, bag)
+    return replace(found, frame_id=given or found.frame_id)
+
+
+def _frame_of_first(bag: adapters.SmplBag) -> str:
+    """The frame that a bag's first message of people is in; empty where it says none, or can't be read."""
+    record = next(iter(bag), None)
+    try:
+        if record is None or record.error is not None:
+            return ""
+        if bag.topic.message_type == adapters.MARKER_ARRAY:
+            return next((marker.frame_id for marker in adapters.decode_marker_array(record.raw)), "")
+        names = {kind: name for name, kind in adapters.INPUT_TYPES.items()}
+        return adapters.frame_id_of(record.raw, names.get(bag.topic.message_type, "pose_array"))
+    except adapters.DecodeError:
+        return ""
 
 
 def _motion_records(motion: adapters.Motion, topic: str) -> Iterator[FrameRecord]:

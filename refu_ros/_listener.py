@@ -213,7 +213,7 @@ class Listener:
 
     def _camera_at(self, person: str, stamp_ns: int) -> PinholeCamera | None:
         """The camera, where it was as this person was seen; None where there is none, or no transform of it."""
-        if (camera := self._camera) is None:
+        if (camera := self._camera) is None or not self._node.count_publishers(self._settings.camera_info):
             return None
         try:
             way = self._placement(camera.frame_id, stamp_ns)

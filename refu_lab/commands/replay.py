@@ -53,7 +53,7 @@ class ReplayOptions(RecordingOptions):
 
     output: Path | None = None
     speed: Literal["max", "real"] = setting("max", "as fast as possible, or paced (real)", choices=("max", "real"))
-    frame_id: str = setting("map", "frame_id of the markers", metavar="ID")
+    frame_id: str = setting("", "frame_id of the markers; map, or with axes of the frame itself that one", metavar="ID")
     max_frames: int | None = setting(None, "stop after N frames", parse=cli.positive, metavar="N")
     overwrite: bool = setting(False, "replace an output that is there already")
     evaluate: bool = setting(True, "look for collisions; without, nothing is kept of a frame but its latency")

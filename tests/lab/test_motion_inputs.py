@@ -84,6 +84,22 @@ def test_garments_are_in_the_same_place_either_way(tmp_path: Path) -> None:
     np.testing.assert_array_equal(places[0], places[2])
 
 
+def test_garments_are_in_the_frame_that_their_people_are_in(tmp_path: Path) -> None:
+    encode, path, out = adapters.encoder_for("pose_array"), tmp_path / "seen.mcap", tmp_path / "out.mcap"
+    with adapters.BagWriter(path) as writer:
+        writer.add_topic("/smpl_params", adapters.INPUT_TYPES["pose_array"])
+        writer.write("/smpl_params", encode(FRAMES[0], frame_id="head_optical"), log_time_ns=10**9)
+    for axes, given, frame_id in (
+        ("frame", {}, "head_optical"),
+        ("smpl", {}, "map"),
+        ("frame", {"frame_id": "world"}, "world"),
+    ):
+        run(path, input_axes=axes, output=out, overwrite=True, **given)
+        with adapters.BagReader(out) as reader:
+            (message,) = reader.messages(["/garments"])
+        assert adapters.decode_marker_array(message.data)[0].frame_id == frame_id
+
+
 def test_another_gender_is_said(tmp_path: Path) -> None:
     result = run(z_up(tmp_path / "a.npz", gender="female"))
     assert any("of a female body and is dressed as male" in text for text in result.warnings)
