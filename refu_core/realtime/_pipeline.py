@@ -18,6 +18,7 @@ from torch import Tensor
 from refu_core._device import checked_device
 from refu_core.backbones import Skinned
 from refu_core.body import BodyFit, SmplBody
+from refu_core.contact import DEFAULT_CONTACT, ContactSettings
 from refu_core.errors import FrameError, GarmentError, RefuError, require_type
 from refu_core.frames import LAGS, MAX_COEFFICIENT, N_PAST, N_STYLES, SmplFrame, checked_numbers
 from refu_core.garments import GarmentTemplate
@@ -146,6 +147,7 @@ class GarmentPipeline:
         graph: bool = True,
         certify: bool = True,
         collider: bool = True,
+        contact: ContactSettings = DEFAULT_CONTACT,
         threads: int = 1,
     ) -> GarmentPipeline:
         """Loads garments and what they need.
@@ -171,8 +173,8 @@ class GarmentPipeline:
                 distances that pushed them, which may be wrong.
             collider: bring garments off a body whose overlaps were pulled apart (`PipelineOutput.body`); without, off
                 the posed body itself as in the paper, in which there is no room where limbs run through each other.
-            threads: how many calls, or parts of a batch, may run at the same time; each has working memory of its own.
-                On a GPU one.
+            contact: the tuned numbers of collision handling.
+            threads: how many calls, or parts of a batch, may run at once, each in memory of its own; on a GPU one.
 
         Raises:
             GarmentError: no garment, an unknown one, garments of two bodies, or a bad style.
@@ -211,10 +213,10 @@ class GarmentPipeline:
         steps = []
         for k in range(threads if torch_device.type == "cpu" else 1):
             own = outfit.beside() if k else outfit
-            contact = None
+            stage = None
             if mode is not SdfMode.NONE:
-                contact = ContactStage(own, sdf=mode, uses_band="band" not in no_skip, certify=certify)
-            steps.append(FrameStep(own, contact))
+                stage = ContactStage(own, sdf=mode, uses_band="band" not in no_skip, certify=certify, settings=contact)
+            steps.append(FrameStep(own, stage))
         return cls(steps, margin=margin, style=gamma, no_skip=no_skip, graph=graph)
 
     @property

@@ -75,7 +75,7 @@ def motion_table(
     table = ResultTable("motion", "Recorded motion", _ABOUT, labels=labels)
     indices = {name: range(0, len(clip) - _step(clip), every) for name, clip in clips.items()}
     total, done = len(OUTFITS) * sum(map(len, indices.values())), 0
-    found: dict[str, dict[tuple[str, str], list[_Judged]]] = {}
+    found: dict[str, dict[tuple[str, str], list[Judged]]] = {}
     shifts: dict[str, dict[str, SkinShifts]] = {}
     for garments in OUTFITS:
         pipelines: dict[str, GarmentPipeline] = {}
@@ -88,13 +88,13 @@ def motion_table(
                 table.missing += [Missing(garment, method, str(error), command) for garment in garments]
         if not pipelines:
             continue
-        worn = _Worn(garments, pipelines)
+        worn = OutfitJudge(garments, pipelines)
         of_body = shifts.setdefault(worn.body.name, {})
         is_first = not of_body
         for name, clip in clips.items():
             shift = SkinShifts()
             for index in indices[name]:
-                judged, way = worn.judge(_pair(clip, index))
+                judged, way = worn.judge(frame_pair(clip, index))
                 for (garment, method), one in judged.items():
                     found.setdefault(garment, {}).setdefault((name, method), []).append(one)
                 shift.add(way)
@@ -157,7 +157,7 @@ class SkinShifts:
 
 
 @dataclass(frozen=True)
-class _Judged:
+class Judged:
     """One garment in one frame, as one method makes it."""
 
     on_collider: FrameMetrics
@@ -171,13 +171,12 @@ class _Judged:
     """Whether it cuts through a garment worn with it; None for one worn alone."""
 
 
-def _rows(group: str, method: str, judged: Sequence[_Judged]) -> list[ResultRow]:
-    if not judged:
-        return []
+def figures_of(judged: Sequence[Judged]) -> dict[str, float | None]:
+    """The figures of a garment over some frames, by metric; None where nothing is worn with it."""
     figures = Figures.over([one.on_collider for one in judged])
     jumps = np.array([one.jump_mm for one in judged])
     layers = [one.is_layer_cut for one in judged if one.is_layer_cut is not None]
-    values = {
+    return {
         "vfcp_percent": figures.vfcp_percent,
         "cfmp_percent": figures.cfmp_percent,
         "max_depth_mm": figures.max_depth_mm,
@@ -190,10 +189,14 @@ def _rows(group: str, method: str, judged: Sequence[_Judged]) -> list[ResultRow]
         "self_crossings": float(np.mean([one.n_crossings for one in judged])),
         "layers_cut_percent": 100 * float(np.mean(layers)) if layers else None,
     }
+
+
+def _rows(group: str, method: str, judged: Sequence[Judged]) -> list[ResultRow]:
+    values = figures_of(judged) if judged else {}
     return [ResultRow.of("motion", group, method, metric, value) for metric, value in values.items()]
 
 
-class _Worn:
+class OutfitJudge:
     """Garments worn together, as every method makes them, and what judges them."""
 
     def __init__(self, garments: Sequence[str], pipelines: Mapping[str, GarmentPipeline]) -> None:
@@ -225,11 +228,11 @@ class _Worn:
         lengths: NDArray[np.floating] = np.linalg.norm(a - b, axis=1)
         return lengths
 
-    def judge(self, frames: Sequence[SmplFrame]) -> tuple[dict[tuple[str, str], _Judged], NDArray[np.floating]]:
+    def judge(self, frames: Sequence[SmplFrame]) -> tuple[dict[tuple[str, str], Judged], NDArray[np.floating]]:
         """Judges the first of two frames, by (garment, method), and how far its skin went [m], shape (V,)."""
         skinned = self._skinned(frames)
         contact: SelfContact | None = None
-        judged: dict[tuple[str, str], _Judged] = {}
+        judged: dict[tuple[str, str], Judged] = {}
         for method, pipeline in self._pipelines.items():
             now, then = pipeline(frames)
             if contact is None:
@@ -246,13 +249,13 @@ class _Worn:
 
     def _judge(
         self, garment: str, out: PipelineOutput, frame: SmplFrame, contact: SelfContact, ahead: NDArray[np.floating]
-    ) -> _Judged:
+    ) -> Judged:
         local, faces = out[garment].local, self._sheets[garment].faces
         sheet = self._sheets[garment]
         sheet.update(local)
         others = [out[name] for name in out if name != garment]
         stretch = self._edge_lengths(garment, local) / self._lengths(garment, frame.betas.tobytes())
-        return _Judged(
+        return Judged(
             self._metrics[garment].add(local, self._collider.check(local, faces)),
             self._skin.check(local, faces).is_free,
             bool(contact.near(local, distance=NEAR).any()),
@@ -263,8 +266,8 @@ class _Worn:
         )
 
 
-def _pair(clip: Motion, index: int) -> list[SmplFrame]:
-    """A frame and the next one, with what was before them."""
+def frame_pair(clip: Motion, index: int) -> list[SmplFrame]:
+    """A frame of a clip and the one 1/60 s later, told what was before them."""
     first = max(0, index - math.ceil(LAGS[-1] * clip.fps) - 1)
     frames = PoseHistory.told(map(clip.frame, range(first, index + _step(clip) + 1)))
     return [frames[index - first], frames[-1]]

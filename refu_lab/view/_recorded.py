@@ -102,7 +102,11 @@ class RecordedFilm:
     def _store(self, shape: Shape) -> _Stored:
         stored = _Stored(shape.name, shape.person, shape.color, shape.faces, len(shape.vertices), self._size)
         data = shape.vertices.tobytes()
-        self._spool.write(data)
+        try:
+            self._spool.write(data)
+        except OSError as error:
+            msg = f"{tempfile.gettempdir()}: no room for what is shown ({error.strerror}); TMPDIR names another folder"
+            raise RefuError(msg) from error
         self._size += len(data)
         return stored
 
