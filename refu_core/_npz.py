@@ -122,7 +122,7 @@ def check_npy(file: IO[bytes], size: int) -> tuple[tuple[int, ...], np.dtype[Any
         raise ValueError(msg)
     shape, _, dtype = (npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0)(head)
     if dtype.hasobject:
-        msg = "Object arrays cannot be loaded: they are pickles"
+        msg = "an array of objects, which would be a pickle, and isn't read"
         raise ValueError(msg)
     wanted, there = dtype.itemsize * math.prod(shape), size - head.tell()
     if wanted != there or min(shape, default=0) < 0:
@@ -138,8 +138,12 @@ def _check_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, budget: Array
     if entry.compress_size > entry.file_size + (entry.file_size >> 8) + 1024:
         msg = f"{entry.filename} takes {entry.compress_size} bytes packed, and {entry.file_size} unpacked"
         raise ValueError(msg)
-    with archive.open(entry) as file:
-        budget.take(*check_npy(file, entry.file_size))
+    try:
+        with archive.open(entry) as file:
+            budget.take(*check_npy(file, entry.file_size))
+    except ValueError as cause:
+        msg = f"{entry.filename.removesuffix('.npy')}: {cause}"
+        raise ValueError(msg) from cause
 
 
 def _read_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray[Any]:

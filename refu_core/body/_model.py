@@ -75,7 +75,7 @@ class BodyArrays:
 
         def numbers(key: str) -> NDArray[np.float64]:
             try:
-                array = np.asarray(data[key], dtype=np.float64)
+                array = np.asarray(data[key], dtype=np.float64, order="C")
             except (TypeError, ValueError, OverflowError) as error:
                 msg = f"{source}: {key} is not an array of numbers: {error}"
                 raise BodyError(msg) from error
@@ -124,6 +124,10 @@ class BodyArrays:
                 raise BodyError(msg)
         if arrays.faces.min(initial=0) < 0 or arrays.faces.max(initial=0) >= n:
             msg = f"{source}: faces must index {n} vertices, got {arrays.faces.min()} to {arrays.faces.max()}"
+            raise BodyError(msg)
+        n_unused = n - len(np.unique(arrays.faces))
+        if n_unused:
+            msg = f"{source}: {n_unused} of {n} vertices belong to no face: leave them out"
             raise BodyError(msg)
         if np.abs(arrays.weights.sum(1) - 1).max() > 1e-3 or arrays.weights.min() < -1e-3:
             msg = f"{source}: the skinning weights of a vertex must sum to one, and none be negative"

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from refu_core.body._kinematics import JOINT_NAMES
+from refu_core.body._segments import SOFTNESS
 from refu_core.errors import BodyError, MeshError
 from refu_core.mesh import Connectivity
 
@@ -27,6 +28,9 @@ _LIMBS = ((1, 4), (2, 5), (4, 7), (5, 8), (16, 18), (17, 19), (18, 20), (19, 21)
 _AT_LIMB = 0.08
 """How far from a limb's middle the skin is, on average, that it moves [of the body's height]. Of the built-in bodies
 0.02 at most; skin of the next limb is 0.17 away."""
+_FARTHEST = 1 / 3
+"""How far a unit of shape, or of a pose's features, moves a vertex at most [of the body's height]: none does it by a
+tenth."""
 _AXES = ("x", "y", "z")
 _WANTED = "wanted metres, y up, facing +z, the subject's left at +x, in the T-pose"
 
@@ -41,7 +45,11 @@ def require_rest_pose(body: SmplBody, *, closed: bool = True) -> None:
     joints = body.arrays.joint_regressor @ body.arrays.v_template
     fault = _fault(body.arrays.v_template, joints) or _misled(body.arrays, joints)
     if not fault:
-        mesh = Connectivity.of(body.faces.cpu().numpy(), body.n_vertices)
+        try:
+            mesh = Connectivity.of(body.faces.cpu().numpy(), body.n_vertices)
+        except MeshError as error:
+            fault = str(error)
+    if not fault:
         corners = body.arrays.v_template[mesh.faces]
         volume = np.einsum("fc,fc->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
         if volume <= 0:
@@ -66,6 +74,15 @@ def _misled(arrays: BodyArrays, joints: NDArray[np.float64]) -> str:
         off = float(np.linalg.norm(arrays.v_template[follows].mean(0) - (joints[joint] + joints[end]) / 2))
         if off > _AT_LIMB * tall:
             return f"what follows its {JOINT_NAMES[joint]} is {off:.2f} m from there: weights are of other joints"
+    share = np.stack([arrays.weights[:, list(joints)].sum(axis=1) for joints, _ in SOFTNESS], axis=1)
+    n_faces = np.bincount(share[arrays.faces].sum(axis=1).argmax(axis=1), minlength=len(SOFTNESS))
+    for (part, *_), n in zip((joints for joints, _ in SOFTNESS), n_faces, strict=True):
+        if not n:
+            return f"no face follows its {JOINT_NAMES[part]} for the most part: the mesh lacks it, or is too coarse"
+    for name in ("shapedirs", "posedirs"):
+        found = getattr(arrays, name)
+        if found is not None and (far := float(np.abs(found).max())) > _FARTHEST * tall:
+            return f"{name} moves a vertex by {far:.3g} m a unit: it must be in metres, as v_template is"
     return ""
 
 
@@ -76,7 +93,7 @@ def _fault(vertices: NDArray[np.float64], joints: NDArray[np.float64]) -> str:
     tall = float(np.linalg.norm(up))
     if not _TALL[0] <= tall <= _TALL[1]:
         unit = min(_UNITS, key=lambda name: abs(np.log(max(tall, 1e-9) / _UNITS[name] / 1.4)))
-        guess = f": {unit}? Divide by {_UNITS[unit]:g}" if tall > 1 else ""
+        guess = f": {unit}? Divide v_template, shapedirs and posedirs by {_UNITS[unit]:g}" if tall > 1 else ""
         return f"it is {tall:.4g} from the ankles to the neck, wanted metres (about 1.4){guess}"
     low, high = vertices.min(0) - 0.1 * tall, vertices.max(0) + 0.1 * tall
     outside = [name for name, joint in at.items() if (joint < low).any() or (joint > high).any()]

@@ -27,13 +27,25 @@ _MAX_CORNERS = 1000
 
 @dataclass(frozen=True, eq=False)
 class SurfaceMesh:
-    """Triangles as a file has them: in any unit and axes, perhaps cut open along the seams of its UVs."""
+    """Triangles as a file has them: in any unit and axes, perhaps cut open along the seams of its UVs.
+
+    Raises `GarmentError` for arrays of another kind, no faces, and faces of vertices that there aren't.
+    """
 
     vertices: NDArray[np.float64]
     """Shape (V, 3)."""
     faces: NDArray[np.int64]
     """Shape (F, 3)."""
     uv: UvMap | None = None
+
+    def __post_init__(self) -> None:
+        try:
+            object.__setattr__(self, "vertices", np.asarray(self.vertices, np.float64).reshape(-1, 3))
+            faces = np.asarray(self.faces).astype(np.int64, casting="same_kind")
+            object.__setattr__(self, "faces", faces.reshape(-1, 3))
+            _check(self)
+        except (TypeError, ValueError) as error:
+            raise GarmentError(str(error)) from error
 
 
 def read_surface(path: str | os.PathLike[str]) -> SurfaceMesh:
@@ -54,7 +66,9 @@ def read_surface(path: str | os.PathLike[str]) -> SurfaceMesh:
             raise ValueError(msg)
         with np.errstate(all="ignore"):  # of what isn't finite; it is asked for below
             mesh = _parse_obj(content) if suffix == ".obj" else _by_trimesh(content, suffix)
-        _check(mesh)
+        if len(mesh.faces) > _MAX_FACES:
+            msg = f"it has {len(mesh.faces)} triangles, at most {_MAX_FACES} are read: decimate it"
+            raise ValueError(msg)
     except ImportError:
         raise
     except Exception as error:  # trimesh raises whatever a damaged file makes of it
@@ -67,9 +81,6 @@ def _check(mesh: SurfaceMesh) -> None:
     v, f = mesh.vertices, mesh.faces
     if not len(f):
         msg = "it has no faces"
-        raise ValueError(msg)
-    if len(f) > _MAX_FACES:
-        msg = f"it has {len(f)} triangles, at most {_MAX_FACES} are read: decimate it"
         raise ValueError(msg)
     if f.min() < 0 or f.max() >= len(v):
         msg = f"a face names vertex {f.max() + 1} of {len(v)}"

@@ -127,7 +127,7 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
         raise GarmentError(msg)
     poses = [placing.pose] if placing.pose is not None else [standing_pose(arms) for arms in _ARMS]
     bodies = [PosedBody(body, pose) for pose in poses]
-    turns = _turns(placing.up, mesh)
+    turns = _turns(placing.up, mesh, is_placed=placing.is_placed)
     found = [
         _Candidate(_at(samples, unit, turn, shift, here), kind, here)
         for here, turn, unit in itertools.product(bodies, turns, units)
@@ -228,6 +228,7 @@ def _searched(
     """The best of all heights along the body, moved on from there; none of no heights."""
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     few = Samples(*(array[::4] for array in samples))  # type: ignore[arg-type]
+    few = few._replace(area=4 * few.area)
     if scales:  # there is much to try: what nobody does isn't
         bodies, turns = bodies[:3], [turn for turn in turns if not _is_sideways(turn)]
     found = [
@@ -245,15 +246,17 @@ def _searched(
 
 
 def _at(samples: Samples, unit: float, turn: F64, shift: F64, body: PosedBody) -> Place:
-    turned = samples._replace(normals=samples.normals @ turn.T)
+    turned = samples._replace(normals=samples.normals @ turn.T, area=unit**2 * samples.area)
     points = unit * samples.points @ turn.T + shift
     return Place(unit, turn, shift, body.pose, fit_of(points, turned, body), float(points[:, 1].max()))
 
 
-def _turns(up: str | None, mesh: SurfaceMesh) -> list[F64]:
-    """Rotations that may bring a mesh upright and to face z; the likeliest first."""
+def _turns(up: str | None, mesh: SurfaceMesh, *, is_placed: bool) -> list[F64]:
+    """Rotations that may bring a mesh upright and to face z; the likeliest first. One that is placed faces z."""
     z_up = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     bases = {"y": [np.eye(3)], "z": [z_up], None: [np.eye(3), z_up]}[up]
+    if is_placed:
+        return bases
     found = [_about_y(quarters * np.pi / 2) @ base for quarters in (0, 2, 1, -1) for base in bases]
     askew = [(_skew(mesh, base), base) for base in bases]
     return found + [_about_y(half - angle) @ base for half in (0, np.pi) for angle, base in askew if angle]

@@ -151,6 +151,7 @@ def save_garment(template: GarmentTemplate, path: str | os.PathLike[str]) -> Pat
     if target.suffix != ".npz":
         msg = f"{target}: wanted the path of an .npz"
         raise GarmentError(msg)
+    require_name(target.stem)  # it is the garment's when it is read
     n = template.n_vertices
     weights = _rounded(template.weights, 16)
     arrays: dict[str, Any] = {

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
+from numpy.typing import NDArray
 from outside_meshes import Wanted, cloth, placed, quads_of_a_skirt, together
 from scipy.spatial.transform import Rotation
 
-from refu_core import GarmentError, load_body
+from refu_core import GarmentError, load_body, load_garment
 from refu_core.fitting import Placing, SurfaceMesh, fit_garment, read_surface
 from refu_core.fitting._clean import clean
 from refu_core.fitting._place import find_places
+from refu_core.garments import save_garment
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n"
 TSHIRT = Wanted(sleeve=0.35, step=0.028)
@@ -94,6 +97,71 @@ def test_tight_clothes_are_not_made_larger(ease: float) -> None:
     assert place.unit == pytest.approx(0.01)
     assert not place.pose.any()
     assert place.notes == ["lengths are cm", "it stood with the floor at 0 and was moved to the body's feet"]
+
+
+F64 = NDArray[np.float64]
+
+
+def _rings(radii: F64, heights: F64, n: int = 90) -> tuple[F64, NDArray[np.int64]]:
+    """A surface of revolution about y, a ring each, open at both ends and facing outward."""
+    angle = np.linspace(0, 2 * np.pi, n, endpoint=False)
+    around = np.stack((np.cos(angle), np.sin(angle)), 1)
+    flat = radii[:, None, None] * around
+    v = np.stack((flat[..., 0], np.broadcast_to(heights[:, None], flat.shape[:2]), flat[..., 1]), -1).reshape(-1, 3)
+    k, j = np.divmod(np.arange(n * (len(radii) - 1)), n)
+    p, q = k * n + j, k * n + (j + 1) % n
+    return v, np.concatenate((np.stack((p, q, p + n), 1), np.stack((q, q + n, p + n), 1)))
+
+
+@pytest.mark.parametrize("what", ["gown", "poncho"])
+@pytest.mark.parametrize("is_placed", [False, True])
+def test_wide_garments_are_worn_and_no_toys_beside_a_foot(what: str, is_placed: bool) -> None:
+    """On average they are farther off the skin than a small thing that lies near a limb."""
+    body = load_body("female")
+    joints, floor = body.joint_template.numpy(), float(body.v_template[:, 1].min())
+    if what == "gown":
+        heights = np.linspace(joints[9, 1] + 0.05, floor + 0.06, 60)
+        radii = np.interp(heights, [floor + 0.06, joints[3, 1], joints[9, 1]], [0.5, 0.2, 0.2])
+    else:
+        radii = np.linspace(0.11, 0.62, 40)
+        heights = joints[16, 1] + 0.12 - 0.4 * np.maximum(0, radii - 0.25)
+    v, f = _rings(radii, heights)
+    placing = Placing(unit=1.0, up="y", is_placed=True) if is_placed else Placing()
+    place = next(find_places(SurfaceMesh(v, f), body, placing))
+    assert (place.unit, place.fit.around > 0.1) == (1.0, True)
+    assert np.abs(place.shift).max() < 0.1
+
+
+def test_what_is_placed_is_not_turned() -> None:
+    """A cape, placed behind the back, would be nearer to the skin in front."""
+    body = load_body("male")
+    v, f = _rings(np.linspace(0.16, 0.28, 30), np.linspace(float(body.joint_template[12, 1]), -0.4, 30))
+    behind = v[f].mean(1)[:, 2] < 0.02
+    used, f = np.unique(f[behind], return_inverse=True)
+    mesh = SurfaceMesh(v[used] - [0, 0, 0.03], f.reshape(-1, 3))
+    place = next(find_places(mesh, body, Placing(unit=1.0, up="y", is_placed=True)))
+    np.testing.assert_array_equal(place.turn, np.eye(3))
+
+
+@pytest.mark.parametrize(
+    ("v", "f", "wanted"),
+    [
+        (np.zeros((3, 3)), [[0, 1, 3]], "names vertex 4 of 3"),
+        (np.full((3, 3), np.nan), [[0, 1, 2]], "NaN or infinite"),
+        (np.zeros((3, 3)), np.zeros((0, 3), int), "no faces"),
+        (np.zeros((3, 3)), [[0.0, 1.0, 2.0]], "Cannot cast"),
+        ("cloth", [[0, 1, 2]], "could not convert"),
+    ],
+)
+def test_meshes_that_make_no_sense_are_refused_where_they_are_made(v: Any, f: Any, wanted: str) -> None:
+    with pytest.raises(GarmentError, match=wanted):
+        SurfaceMesh(v, f)
+
+
+def test_what_is_saved_can_be_loaded_again(tmp_path: Path) -> None:
+    with pytest.raises(GarmentError, match="no garment is called 'my shirt'"):
+        save_garment(load_garment("tshirt-male"), tmp_path / "my shirt.npz")
+    assert not list(tmp_path.iterdir())
 
 
 def test_names_and_bodies_that_garments_cannot_have() -> None:

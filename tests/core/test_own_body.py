@@ -255,10 +255,25 @@ def _arms_hanging(arrays: dict[str, Any]) -> dict[str, Any]:
     return {**arrays, "v_template": body(pose).vertices[0].double().numpy()}
 
 
+def _headless(weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What follows neck and head, on the chest."""
+    moved = weights.copy()
+    moved[:, 9] += moved[:, 12] + moved[:, 15]
+    moved[:, [12, 15]] = 0
+    return moved
+
+
 _ARMS_EXCHANGED = [*range(16), 17, 16, 19, 18, 21, 20, 23, 22]
 WRONG: dict[str, tuple[Any, str]] = {
-    "millimetres": (lambda a: _turned(a, 1000 * np.eye(3)), "millimetres\\? Divide by 1000"),
-    "centimetres": (lambda a: _turned(a, 100 * np.eye(3)), "centimetres\\? Divide by 100"),
+    "millimetres": (lambda a: _turned(a, 1000 * np.eye(3)), r"millimetres\? Divide v_template, .* by 1000"),
+    "centimetres": (lambda a: _turned(a, 100 * np.eye(3)), r"centimetres\? Divide v_template, .* by 100"),
+    "shapes in millimetres": (
+        lambda a: {**a, "shapedirs": 1000 * a["shapedirs"]},
+        "shapedirs moves a vertex by",
+    ),
+    "bends in millimetres": (lambda a: {**a, "posedirs": 1000 * a["posedirs"]}, "posedirs moves a vertex by"),
+    "no head": (lambda a: {**a, "weights": _headless(a["weights"])}, "no face follows its neck"),
+    "a face twice at a vertex": (lambda a: {**a, "f": np.append(a["f"], [[5, 5, 6]], 0)}, "three different vertices"),
     "z up": (lambda a: _turned(a, [[1, 0, 0], [0, 0, -1], [0, 1, 0]]), r"up is \+z.*y up"),
     "lies on its side": (lambda a: _turned(a, [[0, 1, 0], [-1, 0, 0], [0, 0, 1]]), r"up is \+x"),
     "faces backwards": (lambda a: _turned(a, np.diag([-1, 1, -1])), r"left is -x, front is -z"),
@@ -283,6 +298,22 @@ def test_bodies_that_stand_otherwise_are_refused(what: str) -> None:
         load_fit(body)
     assert str(told.value).startswith("body mine: ")
     assert "\n" not in str(told.value)
+
+
+def test_vertices_of_no_face_are_refused() -> None:
+    """One a few metres off would make every grid around the body as large."""
+    arrays = dict(smpl_arrays("female"))
+    for key in ("v_template", "shapedirs", "posedirs", "weights"):
+        arrays[key] = np.concatenate((arrays[key], arrays[key][:1] + (4.0 if key == "v_template" else 0.0)))
+    arrays["J_regressor"] = np.pad(arrays["J_regressor"], ((0, 0), (0, 1)))
+    with pytest.raises(BodyError, match=r"mine\.npz: 1 of .* vertices belong to no face: leave them out"):
+        type(load_body("male").arrays).from_mapping(arrays, source="mine.npz")
+
+
+def test_how_arrays_lie_in_memory_plays_no_role() -> None:
+    arrays = {key: np.asfortranarray(value) for key, value in smpl_arrays("female").items()}
+    body = SmplBody(type(load_body("male").arrays).from_mapping(arrays, source="mine"), name="mine")
+    GarmentPipeline.load(["short-pant-male"], body=body, backbone="skinned")(SmplFrame(pose=np.zeros((24, 3))))
 
 
 def test_a_body_may_stand_beside_its_origin() -> None:
