@@ -32,10 +32,11 @@ class Layer:
 
     The closest point is searched downhill, from the nearest of a few places around what was closest at rest. Cloth
     slides by a few edges only, so that takes half the time of a tree. On a folded sheet the search may end in the wrong
-    fold, and in another one in the next frame, so a vertex also looks at what its neighbours found.
+    fold, and in another one in the next frame. So a vertex also looks at what its neighbours found; and one that ends
+    more than a centimetre below the sheet asks a tree.
 
-    What isn't near the sheet at rest (a sleeve beside shorts) is a stranger to it: a tree is asked where one comes to
-    it, and its outside may face the sheet's.
+    What isn't near the sheet at rest (a sleeve beside shorts) is a stranger to it, and asks the tree where it comes
+    there: its outside may face the sheet's.
     """
 
     def __init__(
@@ -154,7 +155,7 @@ class Layer:
 def _rules(settings: ContactSettings, longest: float) -> Any:
     rules = kernels.LayerRules()
     rules.gap, rules.reach = settings.layer_gap, settings.layer_reach
-    rules.agreement, rules.longest = settings.layer_agreement, longest
+    rules.agreement, rules.doubt, rules.longest = settings.layer_agreement, settings.layer_doubt, longest
     return rules
 
 

@@ -33,6 +33,7 @@ class LayerRules:
     reach: wp.float32
     longest: wp.float32
     agreement: wp.float32
+    doubt: wp.float32
 
 
 @wp.func
@@ -166,6 +167,13 @@ def normal_on(face: int, w: wp.vec3, normals: wp.array[wp.vec3], cut: Cut) -> wp
 
 
 @wp.func
+def closest_of_all(tree: wp.uint64, p: wp.vec3, reach: float) -> int:
+    """The closest face of the whole sheet, -1 where none is within reach."""
+    hit = wp.mesh_query_point_no_sign(tree, p, reach)
+    return wp.where(hit.result, hit.face, -1)
+
+
+@wp.func
 def lift_off(
     i: int,
     face: int,
@@ -180,7 +188,9 @@ def lift_off(
     push: wp.array[wp.vec3],
     count: wp.array[int],
 ) -> None:
-    """What brings vertex i to the gap above the face of the sheet that is closest to it."""
+    """What brings vertex i to the gap above the face of the sheet that is closest to it, if any is."""
+    if face < 0:
+        return
     w, feature, offset = closest_on_face(above[i], face, below, below_cut.faces)
     normal = normal_on(face, w, below_normals, below_cut)
     height = wp.dot(offset, normal)
@@ -223,7 +233,7 @@ def lift_kernel(
     """What brings each vertex that `looks` to the gap above the sheet, and how many they are that lack something.
 
     A fold that one vertex's search ended in is seldom in the way of its neighbours': what these `found` is looked at,
-    too. Strangers ask a tree. `each` vertices a thread (`strips`).
+    too. Strangers, and whoever is far below the sheet, ask a tree. `each` vertices a thread (`strips`).
     """
     first = wp.tid() * each
     for i in range(first, first + each):
@@ -234,9 +244,8 @@ def lift_kernel(
         v = int(found[i])
         if v == STRANGER:
             if is_within(p, extent, rules.gap):
-                hit = wp.mesh_query_point_no_sign(tree, p, rules.reach)
-                if hit.result:
-                    lift_off(i, hit.face, below, below_normals, below_cut, above, above_cut, True, rules, push, count)
+                face = closest_of_all(tree, p, rules.reach)
+                lift_off(i, face, below, below_normals, below_cut, above, above_cut, True, rules, push, count)
             continue
         squared = wp.length_sq(below[v] - p)
         # As near as that, it is the right fold.
@@ -253,4 +262,7 @@ def lift_kernel(
         # No point of a face is farther from its closest corner than from the middle of three edges of its longest one.
         if wp.length(below[v] - p) <= rules.reach + 0.578 * rules.longest:
             face = nearest_face(p, v, below, below_cut)
+            _w, _feature, offset = closest_on_face(p, face, below, below_cut.faces)
+            if wp.length(offset) > rules.doubt and wp.dot(offset, below_normals[v]) < 0.0:
+                face = closest_of_all(tree, p, rules.reach)
             lift_off(i, face, below, below_normals, below_cut, above, above_cut, False, rules, push, count)
