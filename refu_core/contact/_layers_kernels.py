@@ -262,7 +262,8 @@ def lift_kernel(
         # No point of a face is farther from its closest corner than from the middle of three edges of its longest one.
         if wp.length(below[v] - p) <= rules.reach + 0.578 * rules.longest:
             face = nearest_face(p, v, below, below_cut)
-            _w, _feature, offset = closest_on_face(p, face, below, below_cut.faces)
-            if wp.length(offset) > rules.doubt and wp.dot(offset, below_normals[v]) < 0.0:
+            w, _feature, offset = closest_on_face(p, face, below, below_cut.faces)
+            is_low = wp.dot(offset, normal_on(face, w, below_normals, below_cut)) < rules.gap
+            if is_low and wp.length(offset) > rules.doubt:
                 face = closest_of_all(tree, p, rules.reach)
             lift_off(i, face, below, below_normals, below_cut, above, above_cut, False, rules, push, count)
