@@ -20,7 +20,7 @@ from refu_core._files import open_file
 from refu_core.errors import RefuError
 
 MAX_BYTES = 256 << 20
-"""All arrays that are taken from a file together, as float64: a body of 100,000 vertices, an hour of motion at 120 Hz
+"""All arrays that are taken from a file together, as float64: a body of 45,000 vertices, an hour of motion at 120 Hz
 (half an hour with the hands of SMPL-X). What would be more is refused before any of it is unpacked."""
 _MAX_FILE_BYTES = 1 << 32
 """Of which only the directory and the arrays that are wanted are read."""

@@ -170,7 +170,10 @@ def normal_on(face: int, w: wp.vec3, normals: wp.array[wp.vec3], cut: Cut) -> wp
 def closest_of_all(tree: wp.uint64, p: wp.vec3, reach: float) -> int:
     """The closest face of the whole sheet, -1 where none is within reach."""
     hit = wp.mesh_query_point_no_sign(tree, p, reach)
-    return wp.where(hit.result, hit.face, -1)
+    face = int(-1)
+    if hit.result:
+        face = hit.face
+    return face
 
 
 @wp.func
