@@ -125,10 +125,6 @@ class BodyArrays:
         if arrays.faces.min(initial=0) < 0 or arrays.faces.max(initial=0) >= n:
             msg = f"{source}: faces must index {n} vertices, got {arrays.faces.min()} to {arrays.faces.max()}"
             raise BodyError(msg)
-        n_unused = n - len(np.unique(arrays.faces))
-        if n_unused:
-            msg = f"{source}: {n_unused} of {n} vertices belong to no face: leave them out"
-            raise BodyError(msg)
         if np.abs(arrays.weights.sum(1) - 1).max() > 1e-3 or arrays.weights.min() < -1e-3:
             msg = f"{source}: the skinning weights of a vertex must sum to one, and none be negative"
             raise BodyError(msg)

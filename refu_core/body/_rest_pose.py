@@ -65,8 +65,10 @@ def require_rest_pose(body: SmplBody, *, closed: bool = True) -> None:
 
 
 def _misled(arrays: BodyArrays, joints: NDArray[np.float64]) -> str:
-    """Whether a limb's joint moves skin that isn't at the limb; empty if none does."""
+    """What is wrong with faces, weights and directions, a limb's joint that moves other skin for one; or nothing."""
     tall = float(np.ptp(arrays.v_template[:, 1]))
+    if n_unused := len(arrays.v_template) - len(np.unique(arrays.faces)):
+        return f"{n_unused} of {len(arrays.v_template)} vertices belong to no face: leave them out"
     for joint, end in _LIMBS:
         follows = arrays.weights[:, joint] > 0.5
         if not follows.any():

@@ -243,6 +243,7 @@ def write_summary(folder: Path) -> Path:
     for file, title in (
         ("performance.md", "Run time: `refu benchmark`"),
         ("collider.md", "The collider: what each number does"),
+        ("contact.md", "Collision handling: what each number does"),
     ):
         if (folder / file).exists():
             links.append(f"- [{title}]({file})")
