@@ -70,7 +70,7 @@ def test_what_may_be_left_out(tmp_path: Path) -> None:
         ({"poses": np.zeros((0, 72))}, r"got \(0, 72\)"),
         ({"poses": np.zeros((T, 24, 2))}, r"got \(12, 24, 2\)"),
         ({"poses": np.full((T, 72), "x")}, "poses must be numbers"),
-        ({"poses": np.full((T, 72), None)}, "can't be read as .npz: Object arrays cannot be loaded"),
+        ({"poses": np.full((T, 72), None)}, "can't be read as .npz: .*an array of objects"),
         (
             {"trans": np.zeros((T - 1, 3))},
             r"trans or transl or translation must be \(12, 3\) like the pose, got \(11, 3\)",
