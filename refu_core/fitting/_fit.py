@@ -20,7 +20,7 @@ from refu_core.fitting._clean import (
 )
 from refu_core.fitting._mesh_file import SurfaceMesh
 from refu_core.fitting._pieces import apart, unsewn, without_bodies
-from refu_core.fitting._place import Place, Placing, find_places
+from refu_core.fitting._place import NO_OPENING, Place, Placing, find_places
 from refu_core.fitting._posed import PosedBody
 from refu_core.fitting._transfer import Transfer
 from refu_core.frames import N_BETAS, N_JOINTS
@@ -266,6 +266,7 @@ def _cleared(mesh: SurfaceMesh, body: PosedBody, notes: list[str]) -> F64:
             f"{100 * deep:.0f} % of the garment is more than {1e3 * _DEEP:.0f} mm inside the body {body.body.name}, "
             f"most of it near the {near}: it was made for another body or pose; say its --pose, or try --body"
         )
+        msg += "" if len(connectivity.boundary) else NO_OPENING
         raise GarmentError(msg)
     for _ in range(_ROUNDS):
         lift = _shortfall(v, body)

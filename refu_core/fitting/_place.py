@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 
 from refu_core.body import SmplBody
 from refu_core.errors import GarmentError
-from refu_core.fitting._clean import face_normals
+from refu_core.fitting._clean import face_normals, rim_of
 from refu_core.fitting._mesh_file import SurfaceMesh
 from refu_core.fitting._posed import LEFT_HIP, LEFT_SHOULDER, RIGHT_SHOULDER, PosedBody, standing_pose
 from refu_core.fitting._surround import Fit, Samples, fit_of, sample
@@ -102,6 +102,7 @@ class Place:
         return found
 
 
+NO_OPENING = ". It has no opening: if faces close its neck, sleeves, legs or hem, delete those"
 _UNDER_ARMS = 0.1
 """How far below the joints of the shoulders a garment that is held at the waist ends [m]."""
 
@@ -185,6 +186,8 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
         f"inside the body, it is {1e3 * fit.distance:.0f} mm off on average, and {100 * fit.facing:.0f} % of it faces "
         "outward; is it a garment for this body? Say its --unit, --up or --pose, or place it on the body first"
     )
+    if not len(rim_of(mesh.faces)):
+        msg += NO_OPENING
     raise GarmentError(msg)
 
 

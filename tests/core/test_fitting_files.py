@@ -132,6 +132,20 @@ def test_wide_garments_are_worn_and_no_toys_beside_a_foot(what: str, is_placed: 
     assert np.abs(place.shift).max() < 0.1
 
 
+def test_lids_on_the_openings_are_named() -> None:
+    shirt = load_garment("tshirt-male")
+    v, f = shirt.v_template.double().numpy(), shirt.faces.numpy()
+    mesh = trimesh.Trimesh(v, f, process=False)
+    for loop in mesh.outline().entities:
+        ring = loop.points[:-1] if loop.points[0] == loop.points[-1] else loop.points
+        v = np.concatenate((v, v[ring].mean(0, keepdims=True)))
+        f = np.concatenate((f, [(a, b, len(v) - 1) for a, b in zip(ring, np.roll(ring, -1), strict=True)]))
+    closed = trimesh.Trimesh(v, f, process=False)
+    closed.fix_normals()
+    with pytest.raises(GarmentError, match="It has no opening: if faces close"):
+        fit_garment(SurfaceMesh(closed.vertices, closed.faces), load_body("male"), name="capped")
+
+
 def test_what_is_placed_is_not_turned() -> None:
     """A cape, placed behind the back, would be nearer to the skin in front."""
     body = load_body("male")
