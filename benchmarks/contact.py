@@ -18,7 +18,7 @@ import torch
 from tqdm import tqdm
 
 from msg_adapters import Motion, read_motion
-from refu_core import GarmentPipeline, RefuError
+from refu_core import GarmentPipeline
 from refu_core.contact import DEFAULT_CONTACT, ContactSettings
 from refu_lab.reproduction import OutfitJudge, figures_of, frame_pair
 
@@ -52,8 +52,7 @@ class Change(NamedTuple):
 
     name: str
     text: str
-    settings: ContactSettings | None
-    """None for a value that has no meaning."""
+    settings: ContactSettings
 
 
 def changes() -> Iterator[Change]:
@@ -71,10 +70,7 @@ def changes() -> Iterator[Change]:
                 other = factor * value
             if other == value:
                 continue
-            try:
-                settings = dataclasses.replace(DEFAULT_CONTACT, **{field.name: other})
-            except RefuError:
-                settings = None
+            settings = dataclasses.replace(DEFAULT_CONTACT, **{field.name: other})
             yield Change(f"`{field.name}`", f"{value} → {other}", settings)
 
 
@@ -106,13 +102,9 @@ def main() -> None:
         for outfit in OUTFITS:
             if outfit == SKIRT and change.name.strip("`").startswith(OF_TOGETHER):
                 continue
-            if change.settings is None:
-                found = dict.fromkeys(outfit)
-            else:
-                found = figures(outfit, change.settings, clips, args.every)
-            for garment, values in found.items():
+            for garment, values in figures(outfit, change.settings, clips, args.every).items():
                 cells = [
-                    "" if values is None or values[metric] is None else form.format(values[metric])
+                    "" if values[metric] is None else form.format(values[metric])
                     for metric, (_, form) in COLUMNS.items()
                 ]
                 rows[garment].append(f"| {change.name} | {change.text} | {' | '.join(cells)} |")

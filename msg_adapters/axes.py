@@ -20,6 +20,11 @@ SMPL_COLUMNS: dict[InputAxes, tuple[int, int, int]] = {"smpl": (2, 0, 1), "frame
 """Column of SMPL that becomes the message's x, y and z."""
 
 
+def ros_from_sender(axes: InputAxes) -> NDArray[np.float64]:
+    """The rotation (3, 3) from the axes of a sender's roots to those of the message's frame."""
+    return np.eye(3)[list(SMPL_COLUMNS[axes])]
+
+
 def up_of(frame_id: str) -> NDArray[np.float64]:
     """Which way is up in a frame, shape (3,), as REP-103 has it: -y in a camera's optical frame, z in any other."""
     return np.array([0.0, -1.0, 0.0] if "optical" in frame_id.rsplit("/", maxsplit=1)[-1] else [0.0, 0.0, 1.0])
@@ -32,7 +37,7 @@ def up_of_sender(axes: InputAxes, frame_id: str, turn: NDArray[np.float64]) -> N
     """
     if axes == "smpl" and (turn == np.eye(3)).all():
         return np.array([0.0, 1.0, 0.0])
-    up: NDArray[np.float64] = (turn @ np.eye(3)[list(SMPL_COLUMNS[axes])]).T @ up_of(frame_id)
+    up: NDArray[np.float64] = (turn @ ros_from_sender(axes)).T @ up_of(frame_id)
     return up
 
 

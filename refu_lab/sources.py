@@ -115,7 +115,7 @@ def open_source(options: RecordingOptions, body: Callable[[], SmplBody]) -> Sour
         raise RefuError(msg)
     bag = adapters.open_smpl_bag(options.input, topic=options.topic, input_type=options.input_type)
     topic, kind = bag.topic.name, bag.topic.message_type
-    decode = _follower(options, body()) if bag.decoder is None else _decoding(bag.decoder, _up_of(options, kind))
+    decode = _follower(options, body()) if bag.decoder is None else _decoding(bag.decoder, _up_of(options, bag.decoder))
     given = _frame_of_first(bag) if options.axes == "frame" else ""
     found = Source(options, f"{topic} ({kind})", topic, kind, decode, iter(bag), bag.message_count, bag)
     return replace(found, frame_id=given or found.frame_id)
@@ -129,8 +129,7 @@ def _frame_of_first(bag: adapters.SmplBag) -> str:
             return ""
         if bag.topic.message_type == adapters.MARKER_ARRAY:
             return next((marker.frame_id for marker in adapters.decode_marker_array(record.raw)), "")
-        names = {kind: name for name, kind in adapters.INPUT_TYPES.items()}
-        return adapters.frame_id_of(record.raw, names.get(bag.topic.message_type, "pose_array"))
+        return adapters.frame_id_of(record.raw, "pose_array" if bag.decoder is None else bag.decoder.input_type)
     except adapters.DecodeError:
         return ""
 
@@ -162,11 +161,10 @@ def _decoding(decoder: adapters.Decoder, up_of_message: _Up) -> Callable[[bytes,
     return decode
 
 
-def _up_of(options: RecordingOptions, message_type: str) -> _Up:
+def _up_of(options: RecordingOptions, decoder: adapters.Decoder) -> _Up:
     if options.axes == "smpl":
         return lambda _: None
-    name = next(name for name, kind in adapters.INPUT_TYPES.items() if kind == message_type)
-    return lambda data: up_of(adapters.frame_id_of(data, name))
+    return lambda data: up_of(adapters.frame_id_of(data, decoder.input_type))
 
 
 def _follower(options: RecordingOptions, body: SmplBody) -> Callable[[bytes, int], SmplFrame]:

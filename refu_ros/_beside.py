@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msg_adapters import check_plausible
-from msg_adapters.axes import SMPL_COLUMNS, up_of_sender
+from msg_adapters.axes import ros_from_sender, up_of_sender
 from refu_core import RefuError, SmplFrame
 from refu_core.frames import N_BETAS, N_JOINTS
 from refu_core.modes import BUILTIN_GARMENTS
@@ -129,7 +129,7 @@ class Dresser:
         up = up_of_sender(settings.axes, settings.frame_id, np.eye(3))
         frame = replace(settings.applied(frame), up=up)
         output = pipeline(frame)
-        rotation = np.eye(3)[list(SMPL_COLUMNS[settings.axes])]
+        rotation = ros_from_sender(settings.axes)
         placed = {name: (mesh.local + frame.transl) @ rotation.T for name, mesh in output.items()}
         if not all(np.isfinite(points).all() for points in placed.values()):
             msg = "a garment isn't finite in this pose"

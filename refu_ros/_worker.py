@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from msg_adapters import Placement
-from msg_adapters.axes import SMPL_COLUMNS
+from msg_adapters.axes import ros_from_sender
 from msg_adapters.outputs import Moment, make_outputs
 from msg_adapters.scene import Arrival, Scene
 from msg_adapters.statistics import Statistics
@@ -280,7 +280,7 @@ class Worker:
             self._sent_with = job.fittings
             for row in self._outputs:
                 row.forget()
-        axes = Placement(np.eye(3)[list(SMPL_COLUMNS[job.settings.axes])])
+        axes = Placement(ros_from_sender(job.settings.axes))
         worn = []
         for person, frame in frames.items():
             arrival, output = job.arrivals[person], self._dressed[person].output

@@ -18,7 +18,7 @@ from refu_core.body._bundles import bundled
 from refu_core.body._creases import LEVELS, find_creases
 from refu_core.body._kinematics import PARENTS
 from refu_core.body._model import SmplBody
-from refu_core.body._segments import SOFTNESS, cut
+from refu_core.body._segments import SOFTNESS, cut, shares
 from refu_core.body._skinning import JointWeights
 from refu_core.mesh import Connectivity, vertex_normals
 
@@ -165,8 +165,7 @@ class Anatomy:
 
     def _bind_segments(self, rest: NDArray[np.float64], mesh: Connectivity, weights: NDArray[np.float64]) -> Any:
         how, n, device = self.settings, len(rest), str(self.device)
-        share = np.stack([weights[:, list(joints)].sum(axis=1) for joints, _ in SOFTNESS], axis=1)
-        solids = cut(mesh.faces, share)
+        solids = cut(mesh.faces, shares(weights))
         n_segments, sizes = len(solids.faces), np.diff(solids.middle_start)
         work = self.tensors
         work.add_points(len(sizes))

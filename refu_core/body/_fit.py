@@ -30,7 +30,7 @@ REGISTERED = "neutral"
 POOR_FIT = 3e-3
 """Surfaces that are farther apart than this on average [m] aren't those of two bodies in the T-pose. (Those in
 tests/smpl_file.py are .3 to .5 mm apart.)"""
-_TALL = (1.2, 2.3)
+_USUAL = (1.2, 2.3)
 """Bodies whose garments look as on the built-in ones [m]. At 1.3 m they do; at 0.9 m a collar stands off the neck."""
 _ANGLE_SPREAD = 0.1
 """Of a joint between two rest poses [rad]."""
@@ -106,8 +106,8 @@ class BodyFit:
         if self.is_poor:
             wanted = f"wanted {1e3 * POOR_FIT:g} mm at most"
             found += [f"the built-in mesh lies on {self.body.name} {self.text}, {wanted}: garments may fit it badly"]
-        if not _TALL[0] <= tall <= _TALL[1]:
-            wanted = f"garments are cut with the room and the folds of people of {_TALL[0]:g} to {_TALL[1]:g} m"
+        if not _USUAL[0] <= tall <= _USUAL[1]:
+            wanted = f"garments are cut with the room and the folds of people of {_USUAL[0]:g} to {_USUAL[1]:g} m"
             found += [f"{self.body.name} is {tall:.2f} m tall, and {wanted}: they stand off it, or are tight"]
         return found
 

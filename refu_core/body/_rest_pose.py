@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from refu_core.body._kinematics import JOINT_NAMES
-from refu_core.body._segments import SOFTNESS
+from refu_core.body._segments import SOFTNESS, segment_of_face, shares
 from refu_core.errors import BodyError, MeshError
 from refu_core.mesh import Connectivity
 
@@ -43,7 +43,7 @@ def require_rest_pose(body: SmplBody, *, closed: bool = True) -> None:
             are elsewhere.
     """
     joints = body.arrays.joint_regressor @ body.arrays.v_template
-    fault = _fault(body.arrays.v_template, joints) or _misled(body.arrays, joints)
+    fault = _fault(body.arrays.v_template, joints) or _misled(body.arrays, joints) or _lacking(body.arrays)
     if not fault:
         try:
             mesh = Connectivity.of(body.faces.cpu().numpy(), body.n_vertices)
@@ -65,10 +65,8 @@ def require_rest_pose(body: SmplBody, *, closed: bool = True) -> None:
 
 
 def _misled(arrays: BodyArrays, joints: NDArray[np.float64]) -> str:
-    """What is wrong with faces, weights and directions, a limb's joint that moves other skin for one; or nothing."""
+    """Whether a limb's joint moves skin that isn't at the limb; empty if none does."""
     tall = float(np.ptp(arrays.v_template[:, 1]))
-    if n_unused := len(arrays.v_template) - len(np.unique(arrays.faces)):
-        return f"{n_unused} of {len(arrays.v_template)} vertices belong to no face: leave them out"
     for joint, end in _LIMBS:
         follows = arrays.weights[:, joint] > 0.5
         if not follows.any():
@@ -76,10 +74,17 @@ def _misled(arrays: BodyArrays, joints: NDArray[np.float64]) -> str:
         off = float(np.linalg.norm(arrays.v_template[follows].mean(0) - (joints[joint] + joints[end]) / 2))
         if off > _AT_LIMB * tall:
             return f"what follows its {JOINT_NAMES[joint]} is {off:.2f} m from there: weights are of other joints"
-    share = np.stack([arrays.weights[:, list(joints)].sum(axis=1) for joints, _ in SOFTNESS], axis=1)
-    n_faces = np.bincount(share[arrays.faces].sum(axis=1).argmax(axis=1), minlength=len(SOFTNESS))
-    for (part, *_), n in zip((joints for joints, _ in SOFTNESS), n_faces, strict=True):
-        if not n:
+    return ""
+
+
+def _lacking(arrays: BodyArrays) -> str:
+    """Whether vertices lack faces, segments lack faces, or directions are in no metres; empty if not."""
+    tall = float(np.ptp(arrays.v_template[:, 1]))
+    if n_unused := len(arrays.v_template) - len(np.unique(arrays.faces)):
+        return f"{n_unused} of {len(arrays.v_template)} vertices belong to no face: leave them out"
+    there = segment_of_face(arrays.faces, shares(arrays.weights))
+    for k, ((part, *_), _) in enumerate(SOFTNESS):
+        if k not in there:
             return f"no face follows its {JOINT_NAMES[part]} for the most part: the mesh lacks it, or is too coarse"
     for name in ("shapedirs", "posedirs"):
         found = getattr(arrays, name)

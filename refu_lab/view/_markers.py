@@ -99,8 +99,9 @@ class MarkerScene(Generic[_Kept]):
         return {topic for topic, *_ in self._shown}
 
     def shown(self, now_ns: float) -> list[_Kept]:
-        """What is there at a time of the receiver [ns]."""
-        return [kept for kept, until_ns in self._shown.values() if now_ns < until_ns]
+        """What is there at a time of the receiver [ns]; the rest is forgotten."""
+        self._shown = {key: one for key, one in self._shown.items() if now_ns < one[1]}
+        return [kept for kept, _ in self._shown.values()]
 
     def take(self, topic: str, data: bytes, now_ns: int) -> tuple[int, int]:
         """A message's markers: its stamp, 0 where it shows no mesh, and how many meshes can't be drawn.
