@@ -329,15 +329,16 @@ class People:
     def at(self, now_ns: int) -> dict[str, SmplFrame]:
         """Everybody's pose by now, as far on from their newest keypoints as these are old.
 
-        The age is that on the receiver's clock: senders' clocks differ. Where it has been set back, nobody is known
-        to be there until they come again.
+        The age is that on the receiver's clock: senders' clocks differ. Where it has been set back by more than
+        `hold`, nobody is known to be there until they come again.
         """
         poses = {}
         for person, track in self._tracks.items():
             stamp_ns, came_ns = self._newest[person]
-            if now_ns < came_ns:
+            age_ns = now_ns - came_ns
+            if 1e-9 * age_ns < -self._settings.hold:
                 track.reset()
-            frame = track.at(stamp_ns + now_ns - came_ns)
+            frame = track.at(stamp_ns + max(0, age_ns))
             if frame is not None:
                 poses[person] = frame
         return poses
