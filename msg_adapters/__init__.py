@@ -41,7 +41,6 @@ from msg_adapters.inputs import decode_keypoints as decode_keypoints
 from msg_adapters.inputs import decoder_for as decoder_for
 from msg_adapters.inputs import encoder_for as encoder_for
 from msg_adapters.inputs import frame_id_of as frame_id_of
-from msg_adapters.joints import SMPL_JOINTS as SMPL_JOINTS
 from msg_adapters.markers import MARKER_ARRAY as MARKER_ARRAY
 from msg_adapters.markers import POINTS as POINTS
 from msg_adapters.markers import Marker as Marker

@@ -180,13 +180,12 @@ class Doubts:
 
 
 IDS_LIST = "hri_msgs/msg/IdsList"
-_MIN_STRING_BYTES = 4
 
 
 def decode_ids(data: Buffer) -> list[str]:
     """The ids of a `hri_msgs/IdsList` in CDR. Raises `DecodeError` for anything that isn't one."""
     reader = CdrReader(data)
     reader.fields("Ts")
-    ids = [reader.string() for _ in range(reader.length(item_bytes=_MIN_STRING_BYTES))]
+    ids = reader.strings()
     reader.finish()
     return ids

@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msg_adapters.cdr import Buffer, CdrReader
-from msg_adapters.errors import DecodeError
-from msg_adapters.inputs._frame import decoding
+from msg_adapters.errors import DecodeError, decoding
 from msg_adapters.markers import MARKER_ARRAY, Marker, decode_marker_array
 
 KeypointType = Literal["keypoint_poses", "keypoint_markers"]

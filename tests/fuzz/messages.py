@@ -7,9 +7,7 @@ import io
 import json
 import os
 from collections.abc import Callable
-from copy import deepcopy
 from pathlib import Path
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,7 +20,7 @@ from refu_lab.cli import _parser, main
 from refu_ros._settings import NodeSettings
 from tests.fuzz.contract import check_line
 from tests.fuzz.corpus import some_frame
-from tests.fuzz.strategies import FLOATS, INTEGERS, ODD_VALUES, Special, near, near_file, odd_value, place
+from tests.fuzz.strategies import FLOATS, INTEGERS, Special, near, near_file, odd_value, place
 
 if TYPE_CHECKING:
     import argparse
@@ -117,39 +115,6 @@ def surroundings(_: Path) -> Reader:
             readers[data[0] % len(readers)](data[1:])
 
     return near(good), read
-
-
-# Objects ------------------------------------------------------------------------------------------
-
-
-def objects(_: Path) -> Reader:
-    """Message objects whose fields are missing, or are of other kinds."""
-    odd = [*ODD_VALUES, object(), b"bytes", np.zeros((2, 2)), np.array(["x"]), np.float64("nan"), 1j]
-    point = {"x": 0.0, "y": 1.0, "z": 2.0, "w": 1.0}
-    header = {"stamp": {"sec": 1, "nanosec": 2}, "frame_id": "map"}
-    names = [f"{joint}_{axis}" for joint in adapters.SMPL_JOINTS for axis in "xyz"]
-    fields: dict[str, dict[str, Any]] = {
-        "multiarray": {
-            "layout": {"dim": [{"label": "pose", "size": 72, "stride": 72}], "data_offset": 0},
-            "data": [0.0] * 72,
-        },
-        "joint_state": {"header": header, "name": names, "position": [0.0] * 72},
-        "pose_array": {"header": header, "poses": [{"position": point, "orientation": point}] * 24},
-        "smpl_msgs": {"header": header, "body_pose": [0.0] * 69, "global_orient": [0.0] * 3, "betas": [0.0] * 10}
-        | {"transl": [0.0] * 3},
-    }
-    drawn = st.sampled_from(list(fields)).flatmap(lambda kind: st.tuples(st.just(kind), odd_value(fields[kind], odd)))
-
-    def read(value: tuple[str, Any]) -> None:
-        adapters.decoder_for(value[0]).from_message(_as_object(deepcopy(value[1])))
-
-    return drawn, read
-
-
-def _as_object(value: Any) -> Any:
-    if isinstance(value, dict):
-        return SimpleNamespace(**{key: _as_object(entry) for key, entry in value.items() if key.isidentifier()})
-    return [_as_object(entry) for entry in value] if isinstance(value, list) else value
 
 
 @st.composite

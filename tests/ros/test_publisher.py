@@ -109,7 +109,7 @@ def test_plays_a_bag(
     assert status == 0, log.read_text()
     assert "Traceback" not in log.read_text()
     recorded = load_motion(str(BAGS / bag))
-    frames = [adapters.decoder_for(input_type)(data) for data in listener.received["smpl_params"]]
+    frames = [adapters.decoder_for(input_type).from_bytes(data) for data in listener.received["smpl_params"]]
     indices = [int(np.abs(recorded.poses - frame.pose).max(axis=(1, 2)).argmin()) for frame in frames]
     # A topic's queue holds one: a listener that gets no turn in time misses some.
     assert all(0 < step < len(recorded) // 2 for step in np.diff(indices) % len(recorded)), indices
@@ -153,7 +153,7 @@ def test_no_frame_is_left_out_and_the_end_is_the_beginning_again(context: Contex
         node._tick()
     node.destroy_node()
     for i, data in enumerate(sent):
-        frame = adapters.decoder_for("joint_state")(data)
+        frame = adapters.decoder_for("joint_state").from_bytes(data)
         np.testing.assert_allclose(frame.pose, recorded.poses[i % len(recorded)], atol=1e-5)
     assert len(sent) == len(recorded) + 5
 
