@@ -310,4 +310,11 @@ class Worker:
             self._publish(row.gone(gone, self._moment(self.settings)))
 
     def _moment(self, settings: NodeSettings) -> Moment:
-        return Moment(settings, self._outlet.watchers, self._outlet.now_ns())
+        return Moment(
+            settings.frame_id,
+            settings.lifetime_ns,
+            settings.points_fields,
+            settings.planner_rate,
+            self._outlet.watchers,
+            self._outlet.now_ns(),
+        )

@@ -13,7 +13,14 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from reference import header, make, serialise
 
-from msg_adapters import KEYPOINT_TYPES, BagWriter, DecodeError, KeypointStream, decode_keypoints, open_smpl_bag
+from msg_adapters import (
+    KEYPOINT_TYPES,
+    BagWriter,
+    DecodeError,
+    KeypointStream,
+    open_smpl_bag,
+)
+from msg_adapters.inputs import decode_keypoints
 from refu_core.keypoints import Proportions, Skeleton, keypoint_layout
 from refu_core.keypoints._pose import Pose, exp_so3
 
