@@ -13,6 +13,8 @@ import yaml
 from msg_adapters.errors import BagError
 from refu_core._files import read_file
 
+BETAS_OF = "betas_of"
+"""Key in the metadata of a topic that says whose shape space its betas are of."""
 METADATA_FILE = "metadata.yaml"
 VERSION = 9
 STORAGES = ("mcap", "sqlite3")

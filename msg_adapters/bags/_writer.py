@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from msg_adapters.bags import _mcap
 from msg_adapters.bags._mcap_writer import Compression, McapWriter
 from msg_adapters.bags._metadata import (
+    BETAS_OF,
     MAX_TIME_NS,
     METADATA_FILE,
     QosProfile,
@@ -128,7 +128,7 @@ class BagWriter:
         with self._writing():
             schema_id = self._writer.add_schema(message_type, definition)
             metadata = {"offered_qos_profiles": profiles, "topic_type_hash": type_hash or ""}
-            metadata |= {_mcap.BETAS_OF: betas_of} if betas_of else {}
+            metadata |= {BETAS_OF: betas_of} if betas_of else {}
             channel_id = self._writer.add_channel(topic, schema_id, metadata)
         self._topics[topic] = _Topic(channel_id, message_type, type_hash or "", profiles)
 
