@@ -55,7 +55,6 @@ from msg_adapters.outputs import points_of as points_of
 from msg_adapters.people import IDS_LIST as IDS_LIST
 from msg_adapters.people import Doubts as Doubts
 from msg_adapters.people import InputStream as InputStream
-from msg_adapters.people import KeypointStream as KeypointStream
 from msg_adapters.people import check_plausible as check_plausible
 from msg_adapters.people import check_stamp as check_stamp
 from msg_adapters.people import decode_ids as decode_ids

@@ -62,9 +62,8 @@ class _Catalogue:
         if number not in self._topics and number in self._channels:
             schema, topic, encoding, metadata = self._channels[number]
             message_type, definition = self._schemas.get(schema, ("", ""))
-            type_hash, qos = metadata.get("topic_type_hash", ""), metadata.get("offered_qos_profiles", "")
-            betas_of = metadata.get(BETAS_OF, "")
-            self._topics[number] = TopicInfo(topic, message_type, encoding, 0, definition, type_hash, qos, betas_of)
+            type_hash, betas_of = metadata.get("topic_type_hash", ""), metadata.get(BETAS_OF, "")
+            self._topics[number] = TopicInfo(topic, message_type, encoding, 0, definition, type_hash, betas_of)
         return self._topics.get(number)
 
 

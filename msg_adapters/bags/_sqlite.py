@@ -76,9 +76,7 @@ class SqliteFile:
     def _topics(self, database: sqlite3.Connection, budget: Budget) -> dict[int, TopicInfo]:
         """The topics by their numbers, without their messages' count."""
         wanted = ["name", "type", "serialization_format"]
-        wanted += [
-            name for name in ("offered_qos_profiles", "type_description_hash") if name in self._columns["topics"]
-        ]
+        wanted += ["type_description_hash"] * ("type_description_hash" in self._columns["topics"])
         definitions = self._texts(database, budget)
         topics: dict[int, TopicInfo] = {}
         for number, *values in database.execute(f"SELECT id, {', '.join(wanted)} FROM topics LIMIT {_MAX_TOPICS}"):
@@ -93,7 +91,6 @@ class SqliteFile:
                 message_count=0,
                 definition=definitions.get(kind, ""),
                 type_hash=got.get("type_description_hash", ""),
-                qos=got.get("offered_qos_profiles", ""),
             )
         return topics
 

@@ -157,7 +157,7 @@ def reference_bag(path: Path, *, compression: str, chunk_bytes: int, messages: l
         writer.flush()
         times = [time_ns for _, time_ns, _ in messages]
         summaries = [
-            TopicSummary(topic, kind, message_definition(kind).type_hash, QosProfile().to_yaml(), count)
+            TopicSummary(topic, kind, message_definition(kind).type_hash, QosProfile(), count)
             for (topic, kind), count in zip(TWO_TOPICS, counts, strict=True)
         ]
         end = max(times, default=0)
