@@ -13,7 +13,7 @@ from msg_adapters.cdr import NS_PER_S
 from msg_adapters.errors import BagError, MotionFileError
 from msg_adapters.rotations import quaternion_from_rotvec, quaternion_product, rotvec_from_quaternion, slerp
 from refu_core.frames import N_JOINTS, SmplFrame
-from refu_core.recordings import MAX_FRAMES, SUFFIXES, Axes, Recording, n_resampled, read_recording
+from refu_core.recordings import SUFFIXES, Axes, Recording, n_resampled, read_recording
 from refu_core.skeleton import JOINT_NAMES
 
 _BLOCK = 10_000  # frames that are resampled at once: a clip of hours would take gigabytes
@@ -82,7 +82,6 @@ def read_motion(
     fps: float | None = None,
     axes: Axes = "auto",
     person: str | None = None,
-    max_frames: int = MAX_FRAMES,
 ) -> Motion:
     """Reads a file of motion: `docs/guide/inputs.md` lists what is recognised.
 
@@ -92,14 +91,10 @@ def read_motion(
         axes: what root orientations and translations are expressed in; `auto` sees it from the people, and says so in
             the motion's `notes`. The motion is in SMPL's axes, but for `frame`, which leaves it as it is.
         person: whose motion, where the file has several; the one with most frames if not given.
-        max_frames: a longer clip is refused.
 
     Raises `MotionFileError` for a file that can't be read or isn't recognised, or whose arrays have other shapes.
     """
     recording = read_recording(path, error=MotionFileError, fps=fps, axes=axes, person=person)
-    if len(recording.poses) > max_frames:
-        msg = f"{path}: {len(recording.poses)} frames, at most {max_frames} are read; cut the clip"
-        raise MotionFileError(msg)
     return Motion(**{item.name: getattr(recording, item.name) for item in fields(recording)})
 
 

@@ -81,11 +81,6 @@ class BagWriter:
         with suppress(BagError):  # the error under way says more
             self.finish()
 
-    @property
-    def message_count(self) -> int:
-        """Messages written so far."""
-        return sum(topic.message_count for topic in self._topics.values())
-
     def add_topic(
         self,
         topic: str,

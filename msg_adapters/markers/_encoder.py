@@ -184,16 +184,13 @@ class MarkerArrayEncoder:
         stamp_ns: int | Sequence[int],
         transl: ArrayLike | None = None,
     ) -> bytes:
-        """One frame.
+        """One frame. Raises `EncodeError` for a wrong shape, a vertex that isn't finite, a stamp that fits no ROS time.
 
         Args:
             vertices: for each mesh its vertices [m], shape (V, 3), float32 or float64, in SMPL axes (or, with
                 `axes="frame"`, in the axes of the frame).
             stamp_ns: time of the measurement [ns], of all meshes or of each.
             transl: added in float64 [m], in the same axes: shape (3,) for all meshes or (M, 3) for each.
-
-        Raises:
-            EncodeError: a shape is wrong, a vertex isn't finite, or the stamp doesn't fit a ROS time.
         """
         n = len(self._slots)
         if len(vertices) != n:
@@ -245,19 +242,10 @@ def encode_lists(
     size: float,
     lifetime_ns: int = 0,
 ) -> bytes:
-    """A MarkerArray with a marker each, of the type `kind`.
+    """A MarkerArray with a marker each, of the type `kind`: `LINE_STRIP` or `POINTS`, `size` [m] wide.
 
-    Args:
-        kind: `LINE_STRIP` or `POINTS`.
-        lists: namespace (the id is 0), stamp [ns], pose as position [m] and quaternion xyzw, and the points in that
-            pose [m], shape (K, 3).
-        frame_id: of the headers.
-        color: red, green, blue, alpha.
-        size: width of the lines or points [m].
-        lifetime_ns: viewers forget a marker that isn't renewed for so long; 0: never.
-
-    Raises:
-        EncodeError: points of another shape, not finite, none at all, or a stamp that doesn't fit a ROS time.
+    Each of `lists` is a namespace, a stamp [ns], a pose as position [m] and quaternion xyzw, and the points in that
+    pose [m], shape (K, 3). Raises `EncodeError` where these, or the stamp, can't be in a message.
     """
     writer, places = CdrWriter(), []
     writer.fields("I", len(lists))

@@ -372,7 +372,8 @@ def test_cameras(frame_id: str, width: int, height: int, focal: float, distortio
     message = make[CAMERA_INFO](header(5, frame_id), height, width, "plumb_bob", *numbers, 0, 0, region)
     camera = decode_camera_info(serialise(message, CAMERA_INFO))
     assert camera == decode_camera_info(serialise(message, CAMERA_INFO, little_endian=False))
-    assert camera.numbers == (width, height, (focal, 2 * focal), (4.0, 3.0))  # from the corner, not the first middle
+    assert (camera.width, camera.height, camera.focal) == (width, height, (focal, 2 * focal))
+    assert camera.centre == (4.0, 3.0)  # from the corner, not the first middle
     assert camera.frame_id == frame_id.lstrip("/")
     for size in (0, (1 << 15) + 1, 2**32 - 1):  # a picture of 1 x 200 million pixels took 1.6 GB
         message.height = size
