@@ -147,7 +147,6 @@ def encoder(_: Path) -> Reader:
             "faces": draw(_odd_array(faces)),
             "n": n,
             "color": draw(st.lists(rarely(0.5, *FLOATS), min_size=3, max_size=4)),
-            "id": draw(rarely(0, *integers)),
             "vertices": draw(_odd_array(vertices)),
             "stamp_ns": draw(rarely(5, *integers)),
             "transl": draw(rarely(None, np.ones(3), np.ones((1, 3)), [np.nan] * 3, "x", np.ones(2))),
@@ -156,7 +155,7 @@ def encoder(_: Path) -> Reader:
         }
 
     def read(v: dict[str, Any]) -> None:
-        mesh = adapters.MarkerMesh(v["name"], v["faces"], v["n"], color=tuple(v["color"]), id=v["id"])
+        mesh = adapters.MarkerMesh(v["name"], v["faces"], v["n"], color=tuple(v["color"]))
         meshes = adapters.MarkerArrayEncoder([mesh], frame_id=v["frame_id"], axes=v["axes"])
         message = meshes.encode([v["vertices"]], stamp_ns=v["stamp_ns"], transl=v["transl"])
         (marker,) = adapters.decode_marker_array(message)
