@@ -118,22 +118,16 @@ def open_smpl_bag(path: str | Path, *, topic: str | None = None, input_type: str
     Raises `BagError` when there is no such bag, it has no messages, or no topic, or several, could be meant.
     """
     reader = BagReader(path)
+    of_keypoints = [kind for name, kind in KEYPOINT_TYPES.items() if name == input_type]
+    kinds = of_keypoints or ([decoder_for(input_type).message_type] if input_type else [*INPUT_TYPES.values()])
     topics = reader.topics
+    if any(info.message_type in kinds and not info.message_count for info in topics):
+        topics = reader.count()  # a summary isn't believed that a topic is empty
     if not any(info.message_count for info in topics):
         why = "; " + "; ".join(reader.warnings) if reader.warnings else ""
         msg = f"{reader.path}: no message in this bag{why}"
         raise BagError(msg)
-    of_keypoints = [kind for name, kind in KEYPOINT_TYPES.items() if name == input_type]
-    kinds = of_keypoints or ([decoder_for(input_type).message_type] if input_type else [*INPUT_TYPES.values()])
-    try:
-        chosen = _choose(reader.path, topics, topic, kinds)
-        doubtful = not chosen.message_count
-    except BagError:
-        doubtful = any(not info.message_count and info.message_type in kinds for info in topics)
-        if not doubtful:
-            raise
-    if doubtful:  # a summary isn't believed that a topic is empty
-        chosen = _choose(reader.path, reader.count(), topic, kinds)
+    chosen = _choose(reader.path, topics, topic, kinds)
     if chosen.encoding != "cdr":
         msg = (
             f"{reader.path}: {chosen.name} is encoded as {chosen.encoding or 'nothing'}; wanted cdr, as ROS 2 writes it"
