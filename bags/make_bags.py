@@ -208,7 +208,7 @@ def write_bag(path: Path, *, input_type: str, pose: NDArray[np.float64], betas: 
     encode = encoder_for(input_type)
     transl = grounded_translation(pose, betas)
     with BagWriter(path, chunk_bytes=CHUNK_BYTES, overwrite=True) as bag:
-        bag.add_topic(TOPIC, INPUT_TYPES[input_type], betas_of="builtin")  # type: ignore[index]
+        bag.add_topic(TOPIC, INPUT_TYPES[input_type], betas_of="builtin")
         for i in range(len(pose)):
             stamp_ns = START_NS + round(i * 1e9 / FPS)
             frame = SmplFrame(pose[i].round(6), betas=betas.astype(np.float32), transl=transl[i], stamp_ns=stamp_ns)

@@ -33,7 +33,6 @@ from msg_adapters.inputs import INPUT_TYPES as INPUT_TYPES
 from msg_adapters.inputs import KEYPOINT_TYPES as KEYPOINT_TYPES
 from msg_adapters.inputs import Decoder as Decoder
 from msg_adapters.inputs import Encoder as Encoder
-from msg_adapters.inputs import InputType as InputType
 from msg_adapters.inputs import decoder_for as decoder_for
 from msg_adapters.inputs import encoder_for as encoder_for
 from msg_adapters.inputs import frame_id_of as frame_id_of

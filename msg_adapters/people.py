@@ -62,7 +62,7 @@ class InputStream:
         self.is_of_keypoints = input_type in KEYPOINT_TYPES
         self._input_type = input_type
         self._decoder = None if self.is_of_keypoints else decoder_for(input_type)
-        self.message_type = dict([*INPUT_TYPES.items(), *KEYPOINT_TYPES.items()])[input_type]  # type: ignore[index]
+        self.message_type = (INPUT_TYPES | KEYPOINT_TYPES)[input_type]
         self._people: tuple[People, int] | None = None
         """Who is followed, and how many keypoints each has."""
         self._followed: tuple[object, ...] = ()

@@ -6,7 +6,7 @@ import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # NumPy reads it; its threads wait for busy cores
 
@@ -14,7 +14,7 @@ import numpy as np
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from msg_adapters import INPUT_TYPES, Encoder, InputType, Motion, encoder_for, load_motion
+from msg_adapters import INPUT_TYPES, Encoder, Motion, encoder_for, load_motion
 from refu_core import FrameError, SmplFrame
 from refu_core.options import SettingsError, check, fixed
 from refu_core.recordings import Axes
@@ -75,7 +75,7 @@ class SmplPublisher(GuardedNode):
         self.motion = self._prepare(motion)
         self.finished = False
         self._index = 0
-        message_type = INPUT_TYPES[cast("InputType", self.options.input_type)]
+        message_type = INPUT_TYPES[self.options.input_type]
         message_class = interface(message_type)
         names = [name for name in self.options.persons if name]
         self._outputs = [

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Literal, Protocol
+from typing import Protocol
 
 from msg_adapters.cdr import Buffer, CdrReader
 from msg_adapters.definitions import full_type_name
@@ -13,15 +13,13 @@ from msg_adapters.errors import DecodeError
 from msg_adapters.inputs import _joint_state, _multiarray, _pose_array, _smpl
 from refu_core.frames import SmplFrame
 
-InputType = Literal["multiarray", "joint_state", "pose_array", "smpl_msgs"]
-
-_CODECS: dict[InputType, ModuleType] = {
+_CODECS: dict[str, ModuleType] = {
     "multiarray": _multiarray,
     "joint_state": _joint_state,
     "pose_array": _pose_array,
     "smpl_msgs": _smpl,
 }
-INPUT_TYPES: dict[InputType, str] = {name: codec.MESSAGE_TYPE for name, codec in _CODECS.items()}
+INPUT_TYPES: dict[str, str] = {name: codec.MESSAGE_TYPE for name, codec in _CODECS.items()}
 """Message type of each input type."""
 
 
@@ -36,13 +34,13 @@ class Encoder(Protocol):
 class Decoder:
     """Turns messages of one type into frames."""
 
-    input_type: InputType
+    input_type: str
     message_type: str
     from_bytes: Callable[[Buffer], SmplFrame]
     """The frame of a message in CDR; raises `DecodeError`. Its stamp is 0 where the message has none."""
 
 
-def _input_type(name: str) -> InputType:
+def _input_type(name: str) -> str:
     full_name = full_type_name(name)
     for input_type, message_type in INPUT_TYPES.items():
         if name == input_type or full_name == message_type:
@@ -70,7 +68,7 @@ def encoder_for(name: str) -> Encoder:
     return encoder
 
 
-def frame_id_of(data: Buffer, input_type: InputType) -> str:
+def frame_id_of(data: Buffer, input_type: str) -> str:
     """The frame of a message that could be decoded: its header's `frame_id`; empty where its type has no header.
 
     A body of ROS4HRI is in its own frame, `body_<id>`, whatever camera the header names.

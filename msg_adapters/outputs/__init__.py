@@ -10,7 +10,6 @@ from msg_adapters.outputs._meshes import encode_scene as encode_scene
 from msg_adapters.outputs._points import POINT_CLOUD as POINT_CLOUD
 from msg_adapters.outputs._points import POINT_FIELDS as POINT_FIELDS
 from msg_adapters.outputs._points import PointCloudEncoder as PointCloudEncoder
-from msg_adapters.outputs._points import PointField as PointField
 from msg_adapters.outputs._points import points_of as points_of
 from msg_adapters.outputs._rims import POLYGON as POLYGON
 from msg_adapters.outputs._rims import Rim as Rim

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,8 +13,7 @@ from msg_adapters.cdr import HEADER_BYTES, CdrWriter, split_stamp
 from msg_adapters.errors import DecodeError, EncodeError
 
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
-PointField = Literal["normal", "clearance", "sigma", "vertex", "garment", "visible"]
-POINT_FIELDS: tuple[PointField, ...] = ("normal", "clearance", "sigma", "vertex", "garment", "visible")
+POINT_FIELDS = ("normal", "clearance", "sigma", "vertex", "garment", "visible")
 """What a point may have besides its place."""
 
 _KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
@@ -33,9 +32,7 @@ class PointCloudEncoder:
     `counts` are the garments' vertices. One encoder serves one thread at a time.
     """
 
-    def __init__(
-        self, counts: Sequence[int], *, frame_id: str = "map", fields: Sequence[PointField] = POINT_FIELDS
-    ) -> None:
+    def __init__(self, counts: Sequence[int], *, frame_id: str = "map", fields: Sequence[str] = POINT_FIELDS) -> None:
         dtype = _layout(fields, most_vertices=max(counts))
         writer = CdrWriter()
         total, n_bytes = sum(counts), sum(counts) * dtype.itemsize

@@ -60,7 +60,7 @@ def frame(i: int) -> SmplFrame:
 def write_bag(path: Path, *, input_type: str = "joint_state", count: int = 40, **options: Any) -> Path:
     encode = encoder_for(input_type)
     with BagWriter(path, **options) as bag:
-        bag.add_topic(TOPIC, INPUT_TYPES[input_type])  # type: ignore[index]
+        bag.add_topic(TOPIC, INPUT_TYPES[input_type])
         for i in range(count):
             bag.write(TOPIC, encode(frame(i)), log_time_ns=frame(i).stamp_ns + 5)
     return bag.file_path
@@ -209,7 +209,7 @@ def test_round_trip(tmp_path: Path, input_type: str, compression: Any, name: str
     bag = open_smpl_bag(tmp_path / name)
     records = list(bag)
     assert bag.message_count == len(records) == 40
-    assert bag.topic.message_type == INPUT_TYPES[input_type]  # type: ignore[index]
+    assert bag.topic.message_type == INPUT_TYPES[input_type]
     assert not bag.reader.truncated
     assert bag.reader.warnings == []
     for i, record in enumerate(records):

@@ -39,7 +39,7 @@ def message_class(message_type: str) -> Any:
 @given(frame=frames())
 def test_inputs(input_type: str, frame: SmplFrame) -> None:
     data = encoder_for(input_type)(frame)
-    message = serialization.deserialize_message(data, message_class(INPUT_TYPES[input_type]))  # type: ignore[index]
+    message = serialization.deserialize_message(data, message_class(INPUT_TYPES[input_type]))
     decode = decoder_for(input_type).from_bytes
     ours, theirs = decode(data), decode(serialization.serialize_message(message))
     np.testing.assert_array_equal(ours.pose, theirs.pose)

@@ -42,7 +42,7 @@ BAGS = Path(__file__).parents[2] / "bags"
 class Listener:
     """A node that keeps the raw messages of some topics."""
 
-    def __init__(self, context: Context, input_type: adapters.InputType, topics: tuple[str, ...]) -> None:
+    def __init__(self, context: Context, input_type: str, topics: tuple[str, ...]) -> None:
         self.node = Node("listener", context=context)
         self.executor = SingleThreadedExecutor(context=context)
         self.executor.add_node(self.node)
@@ -93,9 +93,7 @@ def start(log: Path, **parameters: Any) -> Forked:
         ("pose_array", "walk", signal.SIGINT),
     ],
 )
-def test_plays_a_bag(
-    context: Context, tmp_path: Path, input_type: adapters.InputType, bag: str, stop: signal.Signals
-) -> None:
+def test_plays_a_bag(context: Context, tmp_path: Path, input_type: str, bag: str, stop: signal.Signals) -> None:
     """The bag's frames in order, in another type, stamped anew; then a clean end."""
     listener, before = Listener(context, input_type, ("smpl_params",)), time.time_ns()
     log = tmp_path / "log.txt"
