@@ -115,16 +115,7 @@ def _layout(fields: Sequence[str], *, most_vertices: int) -> np.dtype[Any]:
     if "vertex" in fields:
         columns.append(("vertex", "<u2" if most_vertices <= 1 << 16 else "<u4"))
     columns += [(name, "u1") for name in ("garment", "visible") if name in fields]
-    names, kinds = [name for name, _ in columns], [kind for _, kind in columns]
-    sizes = [np.dtype(kind).itemsize for kind in kinds]
-    ends = np.cumsum(sizes)
-    return _structure(names, kinds, (ends - sizes).tolist(), -(-int(ends[-1]) // 4) * 4)
-
-
-def _structure(names: Sequence[str], kinds: Sequence[Any], offsets: Sequence[int], itemsize: int) -> np.dtype[Any]:
-    spec: Any = {"names": list(names), "formats": list(kinds), "offsets": list(offsets), "itemsize": itemsize}
-    dtype: np.dtype[Any] = np.dtype(spec)
-    return dtype
+    return np.dtype(columns, align=True)
 
 
 def _columns(points: NDArray[Any], first: str) -> NDArray[np.float32]:
@@ -147,8 +138,9 @@ def points_of(message: Any) -> NDArray[Any]:
             msg = f"a row has {row_step}"
             raise ValueError(msg)
         kinds = [(_KINDS[one.datatype], (one.count,)) if one.count > 1 else _KINDS[one.datatype] for one in fields]
-        dtype = _structure([one.name for one in fields], kinds, [one.offset for one in fields], step)
-        order = dtype.newbyteorder(">" if message.is_bigendian else "<")
+        places = {"names": [one.name for one in fields], "offsets": [one.offset for one in fields]}
+        layout: Any = {**places, "formats": kinds, "itemsize": step}
+        order = np.dtype(layout).newbyteorder(">" if message.is_bigendian else "<")
         rows: NDArray[Any] = np.ndarray((height, width), order, message.data, strides=(row_step, step))
         return rows.reshape(-1)
     except (KeyError, ValueError, TypeError, OverflowError, MemoryError) as error:
