@@ -94,6 +94,7 @@ ADD, DELETE, DELETE_ALL = 0, 2, 3
 _IDENTITY_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 _LEAD_BYTES = 4  # before the header, so that the payload, and with it every float64, lies on a multiple of 8
 _NO_COLOR: Rgba = (0.0, 0.0, 0.0, 0.0)
+_NO_POINTS = np.zeros((0, 3))
 
 
 def _write_marker(
@@ -104,7 +105,7 @@ def _write_marker(
     action: int = ADD,
     stamp_ns: int = 0,
     color: Rgba = _NO_COLOR,
-    n_points: int = 0,
+    points: NDArray[Any] = _NO_POINTS,
     kind: int = TRIANGLE_LIST,
     size: float = 1.0,
     lifetime_ns: int = 0,
@@ -114,8 +115,8 @@ def _write_marker(
     stamp_at = writer.fields("Tssiii", stamp_ns, frame_id, ns, 0, kind, action)  # 0: id
     writer.fields("ddddddddddffff", *pose, size, size, size, *color)
     writer.fields("T?", lifetime_ns, False)  # frame_locked
-    writer.fields("I", n_points)
-    points_at = writer.array("f8", np.zeros(n_points * 3))
+    writer.fields("I", len(points))
+    points_at = writer.array("f8", points)
     writer.fields("IsTssI", 0, "", 0, "", "", 0)  # colors, texture_resource, texture
     writer.fields("IsssI?", 0, "", "", "", 0, False)  # uv_coordinates, text, mesh_resource, mesh_file and its materials
     return stamp_at, points_at
@@ -162,7 +163,8 @@ class MarkerArrayEncoder:
         writer.fields("I", len(meshes))
         options: dict[str, Any] = {"frame_id": frame_id, "lifetime_ns": lifetime_ns}
         places = [
-            _write_marker(writer, ns=mesh.ns, color=mesh.color, n_points=mesh.faces.size, **options) for mesh in meshes
+            _write_marker(writer, ns=mesh.ns, color=mesh.color, points=np.zeros((mesh.faces.size, 3)), **options)
+            for mesh in meshes
         ]
         blank = writer.to_bytes()
         # float64 storage guarantees the alignment that the views below rely on.
@@ -247,21 +249,16 @@ def encode_lists(
     Each of `lists` is a namespace, a stamp [ns], a pose as position [m] and quaternion xyzw, and the points in that
     pose [m], shape (K, 3). Raises `EncodeError` where these, or the stamp, can't be in a message.
     """
-    writer, places = CdrWriter(), []
+    writer = CdrWriter()
     writer.fields("I", len(lists))
     options: dict[str, Any] = {"frame_id": frame_id, "color": color, "kind": kind, "size": size}
     options["lifetime_ns"] = lifetime_ns
     for ns, stamp_ns, pose, points in lists:
-        n_points = len(finite_points(ns, points))
         if not np.isfinite(pose).all():
             msg = f"{ns}: wanted a finite pose, got {pose}"
             raise EncodeError(msg)
-        places.append(_write_marker(writer, ns=ns, stamp_ns=stamp_ns, n_points=n_points, pose=pose, **options))
-    message = bytearray(writer.to_bytes())
-    for (_, at), (*_, points) in zip(places, lists, strict=True):
-        data = points.astype("<f8").tobytes()
-        message[HEADER_BYTES + at : HEADER_BYTES + at + len(data)] = data
-    return bytes(message)
+        _write_marker(writer, ns=ns, stamp_ns=stamp_ns, points=finite_points(ns, points), pose=pose, **options)
+    return writer.to_bytes()
 
 
 def encode_delete(names: Sequence[str], *, stamp_ns: int, frame_id: str = "map") -> bytes:
