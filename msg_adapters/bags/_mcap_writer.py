@@ -92,19 +92,14 @@ class McapWriter:
         """The first record."""
         self._write(MAGIC + _record(HEADER, _text(profile), _text(library)))
 
-    def add_schema(self, name: str, definition: str) -> int:
-        """Declares a message type by its `ros2msg` text; returns its number."""
-        number = len(self._schemas) + 1
-        encoded = (_text(name), _text("ros2msg"), _text(definition))
-        self._schemas.append(_record(SCHEMA, struct.pack("<H", number), *encoded))
-        self._add(self._schemas[-1])
-        return number
-
-    def add_channel(self, topic: str, schema: int, metadata: Mapping[str, str]) -> int:
-        """Declares a topic of messages in CDR; returns its number."""
+    def add_channel(self, topic: str, message_type: str, definition: str, metadata: Mapping[str, str]) -> int:
+        """Declares a topic of messages in CDR, and their type by its `ros2msg` text; returns the channel's number."""
         number = len(self._channels) + 1
-        encoded = (struct.pack("<HH", number, schema), _text(topic), _text("cdr"), _text_map(metadata))
-        self._channels.append(_record(CHANNEL, *encoded))
+        schema = (struct.pack("<H", number), _text(message_type), _text("ros2msg"), _text(definition))
+        self._schemas.append(_record(SCHEMA, *schema))
+        self._add(self._schemas[-1])
+        channel = (struct.pack("<HH", number, number), _text(topic), _text("cdr"), _text_map(metadata))
+        self._channels.append(_record(CHANNEL, *channel))
         self._add(self._channels[-1])
         return number
 

@@ -109,11 +109,10 @@ class BagWriter:
         if definition is None:
             builtin = message_definition(message_type)
             definition, type_hash = builtin.text, type_hash or builtin.type_hash
+        metadata = {"offered_qos_profiles": qos.to_yaml(), "topic_type_hash": type_hash or ""}
+        metadata |= {BETAS_OF: betas_of} if betas_of else {}
         with self._writing():
-            schema_id = self._writer.add_schema(message_type, definition)
-            metadata = {"offered_qos_profiles": qos.to_yaml(), "topic_type_hash": type_hash or ""}
-            metadata |= {BETAS_OF: betas_of} if betas_of else {}
-            self._channels[topic] = self._writer.add_channel(topic, schema_id, metadata)
+            self._channels[topic] = self._writer.add_channel(topic, message_type, definition, metadata)
         self._topics[topic] = TopicSummary(topic, message_type, type_hash or "", qos)
 
     def write(self, topic: str, data: bytes, *, log_time_ns: int, publish_time_ns: int | None = None) -> None:
