@@ -11,13 +11,11 @@ import zlib
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import BinaryIO, Literal
+from typing import BinaryIO
 
 import zstandard
 
 from msg_adapters.bags._mcap import CHANNEL, CHUNK, DATA_END, FOOTER, MAGIC, MESSAGE, SCHEMA, STATISTICS
-
-Compression = Literal["zstd", "none"]
 
 HEADER, MESSAGE_INDEX, CHUNK_INDEX, METADATA, METADATA_INDEX, SUMMARY_OFFSET = 0x01, 0x07, 0x08, 0x0C, 0x0D, 0x0E
 _MESSAGE = struct.Struct("<BQHIQQ")
@@ -67,16 +65,13 @@ class _Chunk:
 class McapWriter:
     """One MCAP file on a stream that was just opened. Errors are the stream's own."""
 
-    def __init__(
-        self, stream: BinaryIO, *, compression: Compression, chunk_bytes: int, in_background: bool = False
-    ) -> None:
+    def __init__(self, stream: BinaryIO, *, chunk_bytes: int, in_background: bool) -> None:
         """`in_background` packs and writes a full chunk in a thread while the next one fills: its errors are raised by
         the call that comes to wait for it."""
         self.whole = 0
         """Where the last complete record ends [bytes]."""
         self._stream = stream
         self._chunk_bytes = chunk_bytes
-        self._compression = "" if compression == "none" else compression
         self._packer = zstandard.ZstdCompressor(level=_LEVEL)
         self._chunk = _Chunk()
         self._schemas: list[bytes] = []
@@ -185,9 +180,9 @@ class McapWriter:
     def _write_chunk(self, chunk: _Chunk) -> None:
         records = b"".join(chunk.parts)
         chunk.parts.clear()
-        packed = self._packer.compress(records) if self._compression else records
+        packed = self._packer.compress(records)
         times, start = struct.pack("<QQ", min(chunk.times), max(chunk.times)), self._stream.tell()
-        fields = struct.pack("<QI", len(records), zlib.crc32(records)) + _text(self._compression)
+        fields = struct.pack("<QI", len(records), zlib.crc32(records)) + _text("zstd")
         head = times + fields + struct.pack("<Q", len(packed))
         length = len(head) + len(packed)
         self._stream.write(struct.pack("<BQ", CHUNK, length) + head)
@@ -204,7 +199,7 @@ class McapWriter:
         self._write(b"".join(indexes))
         where = times + struct.pack("<QQ", start, end - start) + _number_map(places) + struct.pack("<Q", at - end)
         sizes = struct.pack("<QQ", len(packed), len(records))
-        self._chunk_indexes.append(_record(CHUNK_INDEX, where, _text(self._compression), sizes))
+        self._chunk_indexes.append(_record(CHUNK_INDEX, where, _text("zstd"), sizes))
 
     def _write(self, records: bytes) -> None:
         self._stream.write(records)

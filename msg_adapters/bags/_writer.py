@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from msg_adapters.bags._mcap_writer import Compression, McapWriter
+from msg_adapters.bags._mcap_writer import McapWriter
 from msg_adapters.bags._metadata import (
     BETAS_OF,
     MAX_TIME_NS,
@@ -42,7 +42,6 @@ class BagWriter:
         self,
         path: str | Path,
         *,
-        compression: Compression = "zstd",
         chunk_bytes: int = 1 << 20,
         overwrite: bool = False,
         in_background: bool = False,
@@ -61,9 +60,7 @@ class BagWriter:
         try:
             with self._writing():
                 self._stream = self._open(made, overwrite=overwrite)
-                self._writer = McapWriter(
-                    self._stream, compression=compression, chunk_bytes=chunk_bytes, in_background=in_background
-                )
+                self._writer = McapWriter(self._stream, chunk_bytes=chunk_bytes, in_background=in_background)
                 self._writer.start(profile="ros2", library="refu-ros")
         except BagError:
             for path in reversed(made):
