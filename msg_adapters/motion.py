@@ -77,11 +77,7 @@ class Motion(Recording):
 
 
 def read_motion(
-    path: str | Path,
-    *,
-    fps: float | None = None,
-    axes: Axes = "auto",
-    person: str | None = None,
+    path: str | Path, *, fps: float | None = None, axes: Axes = "auto", person: str | None = None
 ) -> Motion:
     """Reads a file of motion: `docs/guide/inputs.md` lists what is recognised.
 

@@ -10,14 +10,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from msg_adapters.bags._mcap_writer import McapWriter
-from msg_adapters.bags._metadata import (
-    BETAS_OF,
-    MAX_TIME_NS,
-    METADATA_FILE,
-    QosProfile,
-    TopicSummary,
-    dump_metadata,
-)
+from msg_adapters.bags._metadata import BETAS_OF, MAX_TIME_NS, METADATA_FILE, QosProfile, TopicSummary, dump_metadata
 from msg_adapters.definitions import full_type_name, message_definition
 from msg_adapters.errors import BagError
 
@@ -39,12 +32,7 @@ class BagWriter:
     """
 
     def __init__(
-        self,
-        path: str | Path,
-        *,
-        chunk_bytes: int = 1 << 20,
-        overwrite: bool = False,
-        in_background: bool = False,
+        self, path: str | Path, *, chunk_bytes: int = 1 << 20, overwrite: bool = False, in_background: bool = False
     ) -> None:
         self.path = Path(path)
         self._directory = None if self.path.suffix == ".mcap" else self.path

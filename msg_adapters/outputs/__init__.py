@@ -19,4 +19,3 @@ from msg_adapters.outputs._rims import encode_rims as encode_rims
 from msg_adapters.outputs._table import GARMENTS as GARMENTS
 from msg_adapters.outputs._table import make_outputs as make_outputs
 from msg_adapters.outputs._topics import Moment as Moment
-from msg_adapters.outputs._topics import Output as Output
