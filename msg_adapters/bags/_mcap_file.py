@@ -107,7 +107,8 @@ class McapFile:
 
     def _summary(self, budget: Budget) -> tuple[_Catalogue, Mapping[int, int] | None]:
         """What the file's end says of its channels, and how many messages each has (None: it doesn't)."""
-        catalogue, counts = _Catalogue(budget), None
+        catalogue = _Catalogue(budget)
+        counts: dict[int, int] | None = None
         with self._opened() as file:
             for opcode, content in _mcap.read_summary(file):
                 catalogue.add(opcode, content)

@@ -71,7 +71,7 @@ def from_bytes(data: Buffer) -> SmplFrame:
 
 def to_bytes(frame: SmplFrame, *, frame_id: str = "map") -> bytes:  # noqa: ARG001 - the type has no header
     """The message in CDR: pose, betas, transl, and style where the frame has one."""
-    blocks = {"pose": frame.pose.ravel(), "betas": frame.betas, "transl": frame.transl}
+    blocks: dict[str, NDArray[Any]] = {"pose": frame.pose.ravel(), "betas": frame.betas, "transl": frame.transl}
     if frame.style is not None:
         blocks["style"] = frame.style
     writer = CdrWriter()
