@@ -23,8 +23,9 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from msg_adapters import INPUT_TYPES, SMPL_JOINTS, BagWriter, encoder_for
+from msg_adapters import INPUT_TYPES, BagWriter, encoder_for
 from refu_core import SmplFrame, load_body
+from refu_core.skeleton import JOINT_NAMES
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -77,9 +78,9 @@ class Angles:
 
     def pose(self, count: int) -> NDArray[np.float64]:
         """Rotation vectors [rad], shape (T, 24, 3)."""
-        pose = np.zeros((count, len(SMPL_JOINTS), 3))
+        pose = np.zeros((count, len(JOINT_NAMES), 3))
         for joint, rotation in self.rotations.items():
-            pose[:, SMPL_JOINTS.index(joint)] = rotation.as_rotvec()
+            pose[:, JOINT_NAMES.index(joint)] = rotation.as_rotvec()
         return pose
 
 
@@ -123,7 +124,7 @@ def walk_pose(t: Curve) -> NDArray[np.float64]:
 def reach_squat_pose(t: Curve) -> NDArray[np.float64]:
     """Reach up with one arm, twist to both sides, squat; pose (T, 24, 3) [rad] at times [s]."""
     body = load_body("male")
-    ankles = [SMPL_JOINTS.index(f"{side}_ankle") for side in ("left", "right")]
+    ankles = [JOINT_NAMES.index(f"{side}_ankle") for side in ("left", "right")]
     abduction = np.full_like(t, 5.0)
     for _ in range(8):  # the legs open just so much that the feet stay where they are
         pose = reach_squat_angles(t, abduction).pose(len(t))
@@ -182,7 +183,7 @@ def grounded_translation(pose: NDArray[np.float64], betas: NDArray[np.float64]) 
     """Translations [m], shape (T, 3), that keep the standing sole in place and the lowest one on the floor (y = 0)."""
     body = load_body("male")
     weights = body.weights[
-        :, [SMPL_JOINTS.index(f"{side}_{part}") for side in ("left", "right") for part in ("ankle", "foot")]
+        :, [JOINT_NAMES.index(f"{side}_{part}") for side in ("left", "right") for part in ("ankle", "foot")]
     ]
     feet = (weights.sum(1) > 0.6).numpy()
     soles = np.concatenate(
@@ -207,7 +208,7 @@ def write_bag(path: Path, *, input_type: str, pose: NDArray[np.float64], betas: 
     encode = encoder_for(input_type)
     transl = grounded_translation(pose, betas)
     with BagWriter(path, chunk_bytes=CHUNK_BYTES, overwrite=True) as bag:
-        bag.add_topic(TOPIC, INPUT_TYPES[input_type], betas_of="builtin")  # type: ignore[index]
+        bag.add_topic(TOPIC, INPUT_TYPES[input_type], betas_of="builtin")
         for i in range(len(pose)):
             stamp_ns = START_NS + round(i * 1e9 / FPS)
             frame = SmplFrame(pose[i].round(6), betas=betas.astype(np.float32), transl=transl[i], stamp_ns=stamp_ns)

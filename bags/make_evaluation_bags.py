@@ -19,7 +19,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from msg_adapters import INPUT_TYPES, MARKER_ARRAY, BagWriter, encode_points, encoder_for, vertices_ros_from_smpl
+from msg_adapters import INPUT_TYPES, MARKER_ARRAY, POINTS, BagWriter, encoder_for, vertices_ros_from_smpl
+from msg_adapters.markers import encode_lists
 from refu_core import SmplFrame, load_body, load_garment
 from refu_core.simulation import GarmentDataset, GarmentSequences, SequencePlan, open_dataset
 from refu_core.simulation._plan import TEST
@@ -99,7 +100,8 @@ def write_bag(path: Path, parts: Mapping[str, slice], moments: Iterator[Moment])
                 truths += 1
                 points = vertices_ros_from_smpl(vertices.astype(np.float64) + frame.transl)
                 for garment, part in parts.items():
-                    data = encode_points(points[part], ns=garment, stamp_ns=frame.stamp_ns, color=colors[garment])
+                    cloud = (garment, frame.stamp_ns, (0, 0, 0, 0, 0, 0, 1), points[part])
+                    data = encode_lists(POINTS, [cloud], frame_id="map", color=colors[garment], size=0.004)
                     bag.write(TRUTH_TOPIC, data, log_time_ns=frame.stamp_ns)
     return frames, truths
 

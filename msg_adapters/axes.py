@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-
-FloatT = TypeVar("FloatT", bound=np.floating[Any])
 
 InputAxes = Literal["smpl", "frame"]
 """What a sender's root orientation and translation are expressed in.
@@ -41,11 +39,11 @@ def up_of_sender(axes: InputAxes, frame_id: str, turn: NDArray[np.float64]) -> N
     return up
 
 
-def vertices_ros_from_smpl(vertices: NDArray[FloatT]) -> NDArray[FloatT]:
+def vertices_ros_from_smpl(vertices: NDArray[Any]) -> NDArray[Any]:
     """(x, y, z)_ros = (z, x, y)_smpl of points [m], shape (..., 3)."""
     return np.roll(vertices, 1, axis=-1)
 
 
-def vertices_smpl_from_ros(vertices: NDArray[FloatT]) -> NDArray[FloatT]:
+def vertices_smpl_from_ros(vertices: NDArray[Any]) -> NDArray[Any]:
     """The inverse of `vertices_ros_from_smpl`: points [m], shape (..., 3)."""
     return np.roll(vertices, -1, axis=-1)

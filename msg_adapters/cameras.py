@@ -28,11 +28,6 @@ class Camera:
     centre: tuple[float, float]
     """cx and cy [pixels] from the picture's corner; a CameraInfo has them from the middle of the first pixel."""
 
-    @property
-    def numbers(self) -> tuple[int, int, tuple[float, float], tuple[float, float]]:
-        """All but its place."""
-        return self.width, self.height, self.focal, self.centre
-
 
 def decode_camera_info(data: Buffer) -> Camera:
     """The camera of a `sensor_msgs/CameraInfo` in CDR. Raises `DecodeError` for one uncalibrated, or too large."""

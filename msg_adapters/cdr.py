@@ -116,6 +116,10 @@ class CdrReader:
             msg = f"wanted a string in UTF-8, got {bytes(raw[:32])!r}: {error.reason}"
             raise DecodeError(msg) from None
 
+    def strings(self) -> list[str]:
+        """A sequence of strings."""
+        return [self.string() for _ in range(self.length(item_bytes=4))]
+
     def array(self, kind: str, count: int) -> NDArray[Any]:
         """A read-only view of `count` numbers of a numpy kind ("f4", "f8") in the byte order of the message."""
         dtype = np.dtype(f"{self._order}{kind}")

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
-from refu_core.errors import RefuError
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+from refu_core.errors import FrameError, RefuError
 
 
 class AdapterError(RefuError, ValueError):
@@ -27,3 +32,14 @@ class MotionFileError(AdapterError):
 
 class TransformError(AdapterError):
     """No transform leads from one frame to another, or none at the time asked for."""
+
+
+@contextmanager
+def decoding(message_type: str) -> Iterator[None]:
+    """Every error of a message's content becomes a `DecodeError` that names the message's type."""
+    try:
+        with np.errstate(invalid="ignore"):  # signalling NaNs warn when they are cast; the frame refuses all NaNs
+            yield
+    except (DecodeError, FrameError) as error:
+        msg = f"{message_type}: {error}"
+        raise DecodeError(msg) from None

@@ -11,10 +11,10 @@ import numpy as np
 from msg_adapters.bags import iter_smpl_frames
 from msg_adapters.cdr import NS_PER_S
 from msg_adapters.errors import BagError, MotionFileError
-from msg_adapters.joints import SMPL_JOINTS
 from msg_adapters.rotations import quaternion_from_rotvec, quaternion_product, rotvec_from_quaternion, slerp
 from refu_core.frames import N_JOINTS, SmplFrame
-from refu_core.recordings import MAX_FRAMES, SUFFIXES, Axes, Recording, n_resampled, read_recording
+from refu_core.recordings import SUFFIXES, Axes, Recording, n_resampled, read_recording
+from refu_core.skeleton import JOINT_NAMES
 
 _BLOCK = 10_000  # frames that are resampled at once: a clip of hours would take gigabytes
 
@@ -77,12 +77,7 @@ class Motion(Recording):
 
 
 def read_motion(
-    path: str | Path,
-    *,
-    fps: float | None = None,
-    axes: Axes = "auto",
-    person: str | None = None,
-    max_frames: int = MAX_FRAMES,
+    path: str | Path, *, fps: float | None = None, axes: Axes = "auto", person: str | None = None
 ) -> Motion:
     """Reads a file of motion: `docs/guide/inputs.md` lists what is recognised.
 
@@ -92,14 +87,10 @@ def read_motion(
         axes: what root orientations and translations are expressed in; `auto` sees it from the people, and says so in
             the motion's `notes`. The motion is in SMPL's axes, but for `frame`, which leaves it as it is.
         person: whose motion, where the file has several; the one with most frames if not given.
-        max_frames: a longer clip is refused.
 
     Raises `MotionFileError` for a file that can't be read or isn't recognised, or whose arrays have other shapes.
     """
     recording = read_recording(path, error=MotionFileError, fps=fps, axes=axes, person=person)
-    if len(recording.poses) > max_frames:
-        msg = f"{path}: {len(recording.poses)} frames, at most {max_frames} are read; cut the clip"
-        raise MotionFileError(msg)
     return Motion(**{item.name: getattr(recording, item.name) for item in fields(recording)})
 
 
@@ -130,17 +121,17 @@ _ROOT_HEIGHT_M = 1.156  # of the built-in male body's root above its soles
 def march() -> Motion:
     """Steps on the spot with swinging arms, in SMPL axes; the end joins the beginning."""
     t = np.arange(round(2 * _STEPS_S * MARCH_FPS)) / (2 * _STEPS_S * MARCH_FPS) * 2 * np.pi
-    pose = np.zeros((len(t), len(SMPL_JOINTS), 3))
+    pose = np.zeros((len(t), len(JOINT_NAMES), 3))
     x, z = np.eye(3)[[0, 2]]
     for side, sign in (("left", 1.0), ("right", -1.0)):
         lift = np.maximum(sign * np.sin(t), 0) ** 2  # one leg always stands, straight
-        pose[:, SMPL_JOINTS.index(f"{side}_hip"), 0] = -0.9 * lift
-        pose[:, SMPL_JOINTS.index(f"{side}_knee"), 0] = 1.3 * lift
-        pose[:, SMPL_JOINTS.index(f"{side}_ankle"), 0] = -0.4 * lift  # the sole stays level
+        pose[:, JOINT_NAMES.index(f"{side}_hip"), 0] = -0.9 * lift
+        pose[:, JOINT_NAMES.index(f"{side}_knee"), 0] = 1.3 * lift
+        pose[:, JOINT_NAMES.index(f"{side}_ankle"), 0] = -0.4 * lift  # the sole stays level
         down = quaternion_from_rotvec(np.broadcast_to(-sign * 1.15 * z, (len(t), 3)))
         swing = quaternion_from_rotvec((0.5 * sign * np.sin(t))[:, None] * x)
-        pose[:, SMPL_JOINTS.index(f"{side}_shoulder")] = rotvec_from_quaternion(quaternion_product(swing, down))
-        pose[:, SMPL_JOINTS.index(f"{side}_elbow"), 1] = -sign * 0.4
-    pose[:, SMPL_JOINTS.index("spine2"), 1] = 0.12 * np.sin(t)
+        pose[:, JOINT_NAMES.index(f"{side}_shoulder")] = rotvec_from_quaternion(quaternion_product(swing, down))
+        pose[:, JOINT_NAMES.index(f"{side}_elbow"), 1] = -sign * 0.4
+    pose[:, JOINT_NAMES.index("spine2"), 1] = 0.12 * np.sin(t)
     transl = np.tile([0.0, _ROOT_HEIGHT_M, 0.0], (len(t), 1))
     return Motion(pose.astype(np.float32), transl, np.zeros(10, np.float32), MARCH_FPS)

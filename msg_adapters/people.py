@@ -7,14 +7,14 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from msg_adapters.cdr import NS_PER_S, Buffer, CdrReader
 from msg_adapters.errors import DecodeError
 from msg_adapters.inputs import INPUT_TYPES, KEYPOINT_TYPES, decode_keypoints, decoder_for, frame_id_of
 from refu_core.errors import FrameError
 from refu_core.frames import PLAUSIBLE_ANGLE, PLAUSIBLE_COEFFICIENT, PLAUSIBLE_TRANSL, SmplFrame
-from refu_core.keypoints import LAYOUTS, MOST_PEOPLE, People, Proportions, Skeleton, TrackerSettings, keypoint_layout
+from refu_core.keypoints import MOST_PEOPLE, People, Proportions, Skeleton, TrackerSettings, keypoint_layout
 from refu_core.modes import FOREIGN_BETAS, ONE_STYLE
 from refu_core.options import DressOptions
 from refu_core.recordings import axis_of, upright_share
@@ -52,60 +52,6 @@ def check_stamp(stamp_ns: int) -> None:
         raise FrameError(msg)
 
 
-class KeypointStream:
-    """Messages of keypoints, from one sender or several. Not thread-safe.
-
-    Args:
-        input_type: a key of `KEYPOINT_TYPES`.
-        layout: which points of the body come, one of `refu_core.keypoints.LAYOUTS`.
-        proportions: of the body that is dressed.
-        betas: the people's shape (10,) where it is known; estimated from the lengths of bones if not given.
-        smoothing: of `TrackerSettings`.
-
-    Raises:
-        DecodeError: no such input type or layout.
-    """
-
-    def __init__(
-        self,
-        input_type: str,
-        layout: str,
-        proportions: Proportions,
-        *,
-        betas: ArrayLike | None = None,
-        smoothing: float = 1.0,
-    ) -> None:
-        if input_type not in KEYPOINT_TYPES or layout not in LAYOUTS:
-            msg = f"wanted {' or '.join(KEYPOINT_TYPES)} of {', '.join(LAYOUTS)}; got {input_type!r} of {layout!r}"
-            raise DecodeError(msg)
-        self._input_type = input_type
-        self._skeleton = Skeleton(keypoint_layout(layout), proportions)
-        self._people = People(self._skeleton, betas=betas, settings=TrackerSettings(smoothing=smoothing))
-
-    def frames(self, data: Buffer, now_ns: int, *, sender: str = "") -> tuple[dict[str, SmplFrame], str]:
-        """Everybody in a message by name, and the frame that it is in.
-
-        A name is the sender's and that of the namespace, as far as there are such. Raises `DecodeError`.
-        """
-        frames, frame_id = {}, ""
-        people = decode_keypoints(self._input_type, data, len(self._skeleton.layout))
-        if len(people) > MOST_PEOPLE:
-            msg = f"{len(people)} people in a message; up to {MOST_PEOPLE} are followed"
-            raise DecodeError(msg)
-        for name, seen in people.items():
-            person, frame_id = "_".join(word for word in (sender, name) if word), frame_id or seen.frame_id
-            frame = self._people.update(
-                person, seen.points, confidence=seen.confidence, stamp_ns=seen.stamp_ns or now_ns, now_ns=now_ns
-            )
-            if frame is not None:
-                frames[person] = frame
-        return frames, frame_id
-
-    def predicted(self, now_ns: int) -> dict[str, SmplFrame]:
-        """Everybody who is followed, by now."""
-        return self._people.at(now_ns)
-
-
 class InputStream:
     """Messages of one input type, of parameters or of keypoints, from senders who may mean harm. Not thread-safe.
 
@@ -116,35 +62,59 @@ class InputStream:
         self.is_of_keypoints = input_type in KEYPOINT_TYPES
         self._input_type = input_type
         self._decoder = None if self.is_of_keypoints else decoder_for(input_type)
-        self.message_type = dict([*INPUT_TYPES.items(), *KEYPOINT_TYPES.items()])[input_type]  # type: ignore[index]
-        self._people: KeypointStream | None = None
+        self.message_type = (INPUT_TYPES | KEYPOINT_TYPES)[input_type]
+        self._people: tuple[People, int] | None = None
+        """Who is followed, and how many keypoints each has."""
         self._followed: tuple[object, ...] = ()
 
-    def follow(self, body: SmplBody, layout: str, *, betas: tuple[float, ...] | None, smoothing: float) -> None:
-        """Says whose keypoints come, as of `KeypointStream`, before they do; people begin anew where that is new."""
+    def follow(
+        self, body: SmplBody, layout: str, *, betas: tuple[float, ...] | None = None, smoothing: float = 1.0
+    ) -> None:
+        """Says whose keypoints come, before they do; people begin anew where that is new.
+
+        Args:
+            body: that is dressed: keypoints are of somebody with its proportions.
+            layout: which points of the body come, one of `refu_core.keypoints.LAYOUTS`.
+            betas: the people's shape (10,) where it is known; estimated from the lengths of bones if not given.
+            smoothing: of `TrackerSettings`.
+        """
         followed = body, layout, betas, smoothing
         if self.is_of_keypoints and followed != self._followed:
-            self._followed, proportions = followed, Proportions.of_body(body)
-            self._people = KeypointStream(self._input_type, layout, proportions, betas=betas, smoothing=smoothing)
+            points = keypoint_layout(layout)
+            skeleton = Skeleton(points, Proportions.of_body(body))
+            people = People(skeleton, betas=betas, settings=TrackerSettings(smoothing=smoothing))
+            self._followed, self._people = followed, (people, len(points))
 
     def frames(self, data: Buffer, now_ns: int, *, sender: str = "") -> tuple[dict[str, SmplFrame], str]:
         """Everybody in a message by name, and the frame that it is in: empty where it names none.
 
-        What has no stamp, for want of a header or with an empty one, is of now. Raises `DecodeError` for a message that
-        can't be read, and `FrameError` for numbers that make no body.
+        The name is the sender's; of keypoints also that of the namespace, as far as there are such. What has no stamp,
+        for want of a header or with an empty one, is of now. Raises `DecodeError` for a message that can't be read, and
+        `FrameError` for numbers that make no body.
         """
         if self._decoder is not None:
             frame = self._decoder.from_bytes(data)
             frame = frame if frame.stamp_ns else replace(frame, stamp_ns=now_ns)
-            frames, frame_id = {sender: frame}, frame_id_of(data, self._decoder.input_type)
-        else:
-            assert self._people is not None, "nobody is followed"
-            frames, frame_id = self._people.frames(data, now_ns, sender=sender)
+            return {sender: frame}, frame_id_of(data, self._decoder.input_type)
+        assert self._people is not None, "nobody is followed"
+        followed, n_points = self._people
+        frames, frame_id = {}, ""
+        people = decode_keypoints(self._input_type, data, n_points)
+        if len(people) > MOST_PEOPLE:
+            msg = f"{len(people)} people in a message; up to {MOST_PEOPLE} are followed"
+            raise DecodeError(msg)
+        for name, seen in people.items():
+            person, frame_id = "_".join(word for word in (sender, name) if word), frame_id or seen.frame_id
+            own = followed.update(
+                person, seen.points, confidence=seen.confidence, stamp_ns=seen.stamp_ns or now_ns, now_ns=now_ns
+            )
+            if own is not None:
+                frames[person] = own
         return frames, frame_id
 
     def predicted(self, now_ns: int) -> dict[str, SmplFrame]:
         """Everybody whose keypoints are followed, by now."""
-        return {} if self._people is None else self._people.predicted(now_ns)
+        return {} if self._people is None else self._people[0].at(now_ns)
 
 
 class Doubts:
@@ -180,13 +150,12 @@ class Doubts:
 
 
 IDS_LIST = "hri_msgs/msg/IdsList"
-_MIN_STRING_BYTES = 4
 
 
 def decode_ids(data: Buffer) -> list[str]:
     """The ids of a `hri_msgs/IdsList` in CDR. Raises `DecodeError` for anything that isn't one."""
     reader = CdrReader(data)
     reader.fields("Ts")
-    ids = [reader.string() for _ in range(reader.length(item_bytes=_MIN_STRING_BYTES))]
+    ids = reader.strings()
     reader.finish()
     return ids

@@ -12,7 +12,6 @@ import msg_adapters as adapters
 from msg_adapters.axes import up_of
 from refu_core import FrameError, RefuError
 from refu_core.history import PoseHistory
-from refu_core.keypoints import Proportions
 from refu_core.modes import FOREIGN_BETAS, ONE_STYLE, BetasSource
 from refu_core.recordings import SUFFIXES, upright_turn
 from refu_lab.bodies import body_warnings
@@ -170,9 +169,8 @@ def _up_of(options: RecordingOptions, decoder: adapters.Decoder) -> _Up:
 def _follower(options: RecordingOptions, body: SmplBody) -> Callable[[bytes, int], SmplFrame]:
     """Decodes messages of keypoints to the frames of one person: `options.person`, or who comes first."""
     assert options.input_type is not None
-    stream = adapters.KeypointStream(
-        options.input_type, options.keypoints, Proportions.of_body(body), betas=options.known_betas
-    )
+    stream = adapters.InputStream(options.input_type)
+    stream.follow(body, options.keypoints, betas=options.known_betas)
     followed = options.person
 
     def decode(data: bytes, received_ns: int) -> SmplFrame:

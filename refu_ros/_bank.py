@@ -43,22 +43,19 @@ class Bank:
                 self._refused.add(kind)
                 self._node.get_logger().info(f"no {topic}: {error}")
                 continue
-            self._publishers[topic] = self._make(message_class, topic, lasting=lasting)
+            publisher = self._node.create_lifecycle_publisher(
+                message_class,
+                topic,
+                ros_qos(QOS),
+                qos_overriding_options=QoSOverridingOptions.with_default_policies() if lasting else None,
+                event_callbacks=PublisherEventCallbacks(matched=lambda _: self._on_match()),
+            )
+            publisher.lasts = lasting
+            if self._node.is_active:
+                publisher.on_activate(None)
+            self._publishers[topic] = publisher
         for topic in [topic for topic, one in self._publishers.items() if topic not in wanted and not one.lasts]:
             self._node.destroy_lifecycle_publisher(self._publishers.pop(topic))
-
-    def _make(self, message_class: Any, topic: str, *, lasting: bool) -> Any:
-        publisher = self._node.create_lifecycle_publisher(
-            message_class,
-            topic,
-            ros_qos(QOS),
-            qos_overriding_options=QoSOverridingOptions.with_default_policies() if lasting else None,
-            event_callbacks=PublisherEventCallbacks(matched=lambda _: self._on_match()),
-        )
-        publisher.lasts = lasting
-        if self._node.is_active:
-            publisher.on_activate(None)
-        return publisher
 
     def name(self, topic: str) -> str:
         """A topic's full name, after remapping."""

@@ -225,7 +225,7 @@ class Listener:
         back = (way or adapters.Placement()).inverse()
         from refu_core.outputs import PinholeCamera  # loads torch
 
-        return PinholeCamera(*camera.numbers, back.rotation, back.translation)
+        return PinholeCamera(camera.width, camera.height, camera.focal, camera.centre, back.rotation, back.translation)
 
     def _on_camera(self, data: bytes) -> None:
         self._camera = adapters.decode_camera_info(data)

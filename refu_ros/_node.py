@@ -31,7 +31,6 @@ from refu_ros._settings import NodeSettings
 
 if TYPE_CHECKING:
     from refu_core import GarmentPipeline
-    from refu_core.outputs import Fittings
     from refu_ros._worker import Worker
 
 NODE_NAME = "garment_node"
@@ -66,7 +65,6 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         self._has_sent = False
         self._listener = Listener(self)
         self._outputs = make_outputs(tf=self.settings.publish_tf)
-        self._fittings: Fittings | None = None
         self._bank = Bank(self, self._attend)
         # These live as long as the node: who looks stays connected while it is configured anew.
         lasting = {topic: one.message_type for one in self._outputs for topic in one.topics((), None)}
@@ -173,7 +171,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
     def _cleanup(self) -> None:
         if self._loader is not None:
             self._loader.close()
-        self._loader = self._pipeline = self._in_use = self._fittings = None
+        self._loader = self._pipeline = self._in_use = None
         self._state = "unconfigured"
 
     def _attend(self) -> None:
@@ -207,10 +205,9 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
 
     def _hold_topics(self) -> None:
         """Has the publishers of everybody who may come, in what they wear."""
-        if self._fittings is not None:
-            persons = self._listener.persons
-            kinds = {topic: one.message_type for one in self._outputs for topic in one.topics(persons, self._fittings)}
-            self._bank.hold(kinds)
+        assert self._worker is not None
+        persons, fittings = self._listener.persons, self._worker.fittings
+        self._bank.hold({topic: one.message_type for one in self._outputs for topic in one.topics(persons, fittings)})
 
     def device_lost(self, reason: str) -> None:
         """Goes on on the CPU, or ends, as `on_device_loss` says."""
@@ -261,9 +258,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         return SetParametersResult(successful=True)
 
     def _take(self, pipeline: GarmentPipeline, key: PipelineOptions) -> None:
-        from refu_core.outputs import Fittings  # loads torch
-
-        self._pipeline, self._in_use, self._fittings = pipeline, key, Fittings(pipeline)
+        self._pipeline, self._in_use = pipeline, key
         self._listener.follow(pipeline.body)
         for text in pipeline.warnings:
             self.get_logger().warning(text)
@@ -296,9 +291,8 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
 
     def _on_second(self) -> None:
         self._attend()
-        if self._state == "active":
-            self._hold_topics()
         if self._worker is not None:
+            self._hold_topics()
             for name, reason in self._worker.fittings.without_planner.items():
                 text = f"planners aren't sent {name}: {printable(reason)}"
                 self.get_logger().warning(text, throttle_duration_sec=60.0)

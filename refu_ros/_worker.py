@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -23,29 +23,13 @@ from refu_core.outputs import Dressed, Fittings
 from refu_core.realtime import PipelineOutput
 from refu_ros._settings import NodeSettings
 
+if TYPE_CHECKING:
+    from refu_ros._node import GarmentNode
+
 _IDLE_S = 0.1
 """How often the thread looks for persons who have left when nobody sends [s]."""
 _EMPTY_S = 2.0
 """The same when nobody is there [s]; a new person wakes the thread at once."""
-
-
-class Outlet(Protocol):
-    """Where the messages go."""
-
-    def is_watched(self) -> bool:
-        """Whether anybody wants anything."""
-
-    def watchers(self, topic: str) -> int:
-        """How many want a topic."""
-
-    def now_ns(self) -> int:
-        """ROS time [ns]."""
-
-    def send(self, topic: str, data: bytes) -> None:
-        """A message for a topic."""
-
-    def device_lost(self, reason: str) -> None:
-        """The pipeline's device has failed: nothing comes before there is another pipeline."""
 
 
 class _Known(NamedTuple):
@@ -83,14 +67,14 @@ class Worker:
 
     While one thread computes, another one takes what has come since, as many as the pipeline has `threads`. They send
     in the order in which they took, so nobody sees a frame after a later one. `settings` may be replaced at any time; a
-    tick sees one version of it.
+    tick sees one version of it. `outlet` is the node, to which messages go.
     """
 
     def __init__(
         self,
         scene: Scene,
         statistics: Statistics,
-        outlet: Outlet,
+        outlet: GarmentNode,
         *,
         settings: NodeSettings,
         pipeline: GarmentPipeline,
@@ -310,4 +294,11 @@ class Worker:
             self._publish(row.gone(gone, self._moment(self.settings)))
 
     def _moment(self, settings: NodeSettings) -> Moment:
-        return Moment(settings, self._outlet.watchers, self._outlet.now_ns())
+        return Moment(
+            settings.frame_id,
+            settings.lifetime_ns,
+            settings.points_fields,
+            settings.planner_rate,
+            self._outlet.watchers,
+            self._outlet.now_ns(),
+        )

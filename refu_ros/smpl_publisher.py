@@ -6,7 +6,7 @@ import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # NumPy reads it; its threads wait for busy cores
 
@@ -14,7 +14,7 @@ import numpy as np
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from msg_adapters import INPUT_TYPES, Encoder, InputType, Motion, encoder_for, load_motion
+from msg_adapters import INPUT_TYPES, Encoder, encoder_for, load_motion
 from refu_core import FrameError, SmplFrame
 from refu_core.options import SettingsError, check, fixed
 from refu_core.recordings import Axes
@@ -72,10 +72,14 @@ class SmplPublisher(GuardedNode):
         motion = load_motion(self.options.motion, axes=axes, fps=self.options.fps)
         for note in motion.notes:
             self.get_logger().warning(f"{self.options.motion}: {note}")
-        self.motion = self._prepare(motion)
+        if self.options.in_place:
+            motion = motion.in_place(up=1 if self.options.input_axes == "smpl" else 2)
+        if self.options.rate not in (0, motion.fps):
+            motion = motion.resampled(self.options.rate)
+        self.motion = motion
         self.finished = False
         self._index = 0
-        message_type = INPUT_TYPES[cast("InputType", self.options.input_type)]
+        message_type = INPUT_TYPES[self.options.input_type]
         message_class = interface(message_type)
         names = [name for name in self.options.persons if name]
         self._outputs = [
@@ -92,13 +96,6 @@ class SmplPublisher(GuardedNode):
             f"{self.options.motion or 'march on the spot'}: {len(self.motion)} frames at {self.motion.fps:g} Hz as "
             f"{message_type} on {', '.join(output.topic_name for output in self._outputs)}"
         )
-
-    def _prepare(self, motion: Motion) -> Motion:
-        if self.options.in_place:
-            motion = motion.in_place(up=1 if self.options.input_axes == "smpl" else 2)
-        if self.options.rate not in (0, motion.fps):
-            motion = motion.resampled(self.options.rate)
-        return motion
 
     def _tick(self) -> None:
         if self._index >= len(self.motion) and not self.options.loop:

@@ -31,10 +31,9 @@ from msg_adapters import (
     QosProfile,
     check_plausible,
     decode_marker_array,
-    decode_point_cloud,
 )
 from msg_adapters.bags import Recorder, RecorderState, Recording, free_path
-from msg_adapters.cdr import CdrWriter
+from msg_adapters.cdr import CdrReader, CdrWriter
 from msg_adapters.scene import Scene
 from msg_adapters.statistics import Statistics
 from refu_core import BodyError, FrameError, GarmentPipeline, MeshError, RefuError, SmplFrame, load_body
@@ -835,8 +834,8 @@ def test_each_output_comes_where_it_is_wanted_and_leaves_with_its_person(pipelin
     sent = dict(setup.viewer.sent)
     assert len(sent) == len(setup.viewer.sent)
     assert set(sent) == setup.viewer.others
-    points, stamp_ns, _ = decode_point_cloud(sent["ann/points"])
-    assert (len(points), stamp_ns) == (pipeline.garments[GARMENT].n_vertices, 5)
+    stamp_ns, _, _, n_points = CdrReader(sent["ann/points"]).fields("TsII")
+    assert (n_points, stamp_ns) == (pipeline.garments[GARMENT].n_vertices, 5)
     names = {f"{person}/{GARMENT}/{name}" for person in ("ann", "bob") for name in ("waist", "left_leg", "right_leg")}
     assert {marker.ns for marker in decode_marker_array(sent["openings"])} == names
     setup.viewer.sent.clear()

@@ -1,4 +1,4 @@
-"""The records of an MCAP file, read one after another without trusting any of their lengths.
+"""The records of an MCAP file, taken apart without trusting any of their lengths.
 
 A record is an opcode, a length and its content; a chunk's content is again records, compressed. What is damaged is
 reported and left out; what comes before it (and, where the framing holds, after it) is read.
@@ -13,14 +13,12 @@ import os
 import struct
 import zlib
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import BinaryIO
 
 import zstandard
 
-from msg_adapters.definitions import full_type_name
 from msg_adapters.errors import BagError
 from refu_core._files import open_file
 
@@ -35,12 +33,10 @@ _MAX_CHANNELS = 1 << 16
 _FOOTER_BYTES = _RECORD_HEADER.size + _FOOTER.size + len(MAGIC)
 _LONGEST = 1 << 62
 _LONGEST_MAGIC = 16
-_WANTED_FILE = (
+WANTED_FILE = (
     "a .mcap or .db3 file, a rosbag2 directory, or a file of motion (.npz, .pkl, .pt, .bvh …: docs/guide/inputs.md)"
 )
 _NO_OPCODE = "zeros where a record should start"  # what many a disk makes of the end that it never got
-BETAS_OF = "betas_of"
-"""Key in the metadata of a topic that says whose shape space its betas are of."""
 MAX_CHUNK_BYTES = 128 << 20
 """A chunk that claims to unpack to more is left out: a few kilobytes could otherwise claim all memory."""
 
@@ -56,9 +52,10 @@ class DamageError(Exception):
         super().__init__(template, *values)
         self.template = template
         """The same for all damage of a kind: a file may have a million of one kind."""
+        self.where = ""
 
     def __str__(self) -> str:
-        return self.template.format(*self.args[1:])
+        return self.template.format(*self.args[1:]) + self.where
 
 
 class Budget:
@@ -85,19 +82,17 @@ class Budget:
         self._left[what] = left
 
 
-class _Fields:
+class Fields:
     """Reads the fields of one record's content."""
 
     def __init__(self, content: memoryview) -> None:
-        self._content = content
-        self._at = 0
+        self.left = content
 
     def take(self, size: int) -> memoryview:
-        if size > len(self._content) - self._at:
+        if size > len(self.left):
             msg = "a field of {} bytes where {} are left"
-            raise DamageError(msg, size, len(self._content) - self._at)
-        view = self._content[self._at : self._at + size]
-        self._at += size
+            raise DamageError(msg, size, len(self.left))
+        view, self.left = self.left[:size], self.left[size:]
         return view
 
     def number(self, size: int) -> int:
@@ -111,97 +106,41 @@ class _Fields:
             raise DamageError(msg, error.reason) from None
 
     def string_map(self, budget: Budget) -> dict[str, str]:
-        entries = _Fields(self.take(self.number(4)))
-        result = {}
-        while entries._at < len(entries._content):
+        entries, result = Fields(self.take(self.number(4))), {}
+        while entries.left:
             budget.spend("records")
             key = entries.string()
             result[key] = entries.string()
         return result
 
 
-@dataclass(frozen=True)
-class Schema:
-    """A message type and its definition."""
-
-    id: int
-    type_name: str
-    """`package/msg/Type`."""
-    definition: str
-    """Text of the message type (`ros2msg`); empty where it is in another language."""
-
-
-@dataclass(frozen=True)
-class Channel:
-    """A topic."""
-
-    id: int
-    schema_id: int
-    topic: str
-    encoding: str
-    metadata: dict[str, str]
-
-
-@dataclass(frozen=True)
-class Message:
-    """A message, its payload still a view of the chunk."""
-
-    channel_id: int
-    log_time_ns: int
-    publish_time_ns: int
-    data: memoryview
-
-
-@dataclass(frozen=True)
-class Record:
-    """A record of the file; `offset` is where it starts [bytes]."""
-
-    opcode: int
-    content: memoryview
-    offset: int
-
-
-def parse_schema(content: memoryview) -> Schema:
-    """Raises `DamageError`, like all parsers here."""
-    fields = _Fields(content)
-    schema_id, name, encoding = fields.number(2), fields.string(), fields.string()
-    text = str(fields.take(fields.number(4)), "utf-8", "replace") if encoding == "ros2msg" else ""
-    return Schema(schema_id, full_type_name(name), text)
-
-
-def parse_channel(content: memoryview, budget: Budget) -> Channel:
-    """A channel record."""
-    fields = _Fields(content)
-    return Channel(fields.number(2), fields.number(2), fields.string(), fields.string(), fields.string_map(budget))
-
-
-def parse_message(content: memoryview) -> Message:
-    """A message record."""
+def parse_message(content: memoryview) -> tuple[int, int, int, memoryview]:
+    """A message's channel, log time and publish time [ns], and its payload, still a view. Raises `DamageError`."""
     if len(content) < _MESSAGE_HEADER.size:
         msg = "a message record of {} bytes"
         raise DamageError(msg, len(content))
-    channel_id, _, log_time_ns, publish_time_ns = _MESSAGE_HEADER.unpack_from(content)
-    return Message(channel_id, log_time_ns, publish_time_ns, content[_MESSAGE_HEADER.size :])
+    channel, _, log_ns, publish_ns = _MESSAGE_HEADER.unpack_from(content)
+    return channel, log_ns, publish_ns, content[_MESSAGE_HEADER.size :]
 
 
 def parse_message_counts(content: memoryview) -> dict[int, int]:
-    """Messages of each channel id, of a statistics record."""
-    fields = _Fields(content)
+    """Messages of each channel, of a statistics record."""
+    fields = Fields(content)
     fields.take(8 + 2 + 4 + 4 + 4 + 4 + 8 + 8)
-    counts = _Fields(fields.take(fields.number(4)))
-    if len(counts._content) > _MAX_CHANNELS * 10:
+    counts = Fields(fields.take(fields.number(4)))
+    if len(counts.left) > _MAX_CHANNELS * 10:
         msg = "statistics of more channels than there can be"
         raise DamageError(msg)
     result = {}
-    while counts._at < len(counts._content):
-        channel_id = counts.number(2)
-        result[channel_id] = counts.number(8)
+    while counts.left:
+        channel = counts.number(2)
+        result[channel] = counts.number(8)
     return result
 
 
 def unpack_chunk(content: memoryview, budget: Budget) -> memoryview:
     """The records of a chunk, decompressed and checked."""
-    fields = _Fields(content)
+    fields = Fields(content)
     fields.take(16)  # first and last log time
     size, crc = fields.number(8), fields.number(4)
     compression = fields.string()
@@ -267,31 +206,9 @@ def split_records(content: memoryview) -> Iterator[tuple[int, memoryview]]:
         at += length
 
 
-def starts_with(path: Path, magic: bytes) -> bool:
-    """Whether a file does. Raises `BagError` when it can't be opened."""
-    file, start = _open(path)
-    file.close()
-    return start.startswith(magic)
-
-
-def open_mcap(path: Path) -> BinaryIO:
-    """The file, positioned after its magic bytes.
-
-    Raises `BagError` when it can't be opened or isn't an MCAP file.
-    """
-    file, start = _open(path)
-    if start.startswith(MAGIC):
-        file.seek(len(MAGIC))
-        return file
-    file.close()
-    hint = "convert it with `rosbags-convert`" if start.startswith(b"#ROSBAG") else f"wanted {_WANTED_FILE}"
-    msg = f"{path}: not an MCAP file; {hint}"
-    raise BagError(msg)
-
-
-def _open(path: Path) -> tuple[BinaryIO, bytes]:
-    """The file and its first bytes."""
-    file = open_file(path, most=_LONGEST, error=BagError, wanted=_WANTED_FILE)
+def open_bag_file(path: Path) -> tuple[BinaryIO, bytes]:
+    """A file, after its first bytes, and these. Raises `BagError` when it can't be opened, or has to be converted."""
+    file = open_file(path, most=_LONGEST, error=BagError, wanted=WANTED_FILE)
     try:
         return file, file.read(_LONGEST_MAGIC)
     except OSError as error:
@@ -325,8 +242,8 @@ def read_summary(file: BinaryIO) -> Iterable[tuple[int, memoryview]]:
     return split_records(memoryview(summary))
 
 
-def iter_records(file: BinaryIO) -> Iterator[Record]:
-    """The file's records from its first one to the end of its data, one in memory at a time.
+def iter_records(file: BinaryIO) -> Iterator[tuple[int, memoryview, int]]:
+    """Opcode, content and place [bytes] of the file's records up to the end of its data, one in memory at a time.
 
     Raises `DamageError` where the file ends too early.
     """
@@ -347,7 +264,7 @@ def iter_records(file: BinaryIO) -> Iterator[Record]:
             msg = "the record at byte {} has {} MiB, at most {} are read"
             raise DamageError(msg, at, length >> 20, MAX_CHUNK_BYTES >> 20)
         if opcode in _WANTED:
-            yield Record(opcode, memoryview(file.read(length)), at)
+            yield opcode, memoryview(file.read(length)), at
         else:
             file.seek(length, os.SEEK_CUR)
         if opcode in (DATA_END, FOOTER):

@@ -11,13 +11,11 @@ import zlib
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import BinaryIO, Literal
+from typing import BinaryIO
 
 import zstandard
 
 from msg_adapters.bags._mcap import CHANNEL, CHUNK, DATA_END, FOOTER, MAGIC, MESSAGE, SCHEMA, STATISTICS
-
-Compression = Literal["zstd", "none"]
 
 HEADER, MESSAGE_INDEX, CHUNK_INDEX, METADATA, METADATA_INDEX, SUMMARY_OFFSET = 0x01, 0x07, 0x08, 0x0C, 0x0D, 0x0E
 _MESSAGE = struct.Struct("<BQHIQQ")
@@ -67,16 +65,13 @@ class _Chunk:
 class McapWriter:
     """One MCAP file on a stream that was just opened. Errors are the stream's own."""
 
-    def __init__(
-        self, stream: BinaryIO, *, compression: Compression, chunk_bytes: int, in_background: bool = False
-    ) -> None:
+    def __init__(self, stream: BinaryIO, *, chunk_bytes: int, in_background: bool) -> None:
         """`in_background` packs and writes a full chunk in a thread while the next one fills: its errors are raised by
         the call that comes to wait for it."""
         self.whole = 0
         """Where the last complete record ends [bytes]."""
         self._stream = stream
         self._chunk_bytes = chunk_bytes
-        self._compression = "" if compression == "none" else compression
         self._packer = zstandard.ZstdCompressor(level=_LEVEL)
         self._chunk = _Chunk()
         self._schemas: list[bytes] = []
@@ -92,19 +87,14 @@ class McapWriter:
         """The first record."""
         self._write(MAGIC + _record(HEADER, _text(profile), _text(library)))
 
-    def add_schema(self, name: str, definition: str) -> int:
-        """Declares a message type by its `ros2msg` text; returns its number."""
-        number = len(self._schemas) + 1
-        encoded = (_text(name), _text("ros2msg"), _text(definition))
-        self._schemas.append(_record(SCHEMA, struct.pack("<H", number), *encoded))
-        self._add(self._schemas[-1])
-        return number
-
-    def add_channel(self, topic: str, schema: int, metadata: Mapping[str, str]) -> int:
-        """Declares a topic of messages in CDR; returns its number."""
+    def add_channel(self, topic: str, message_type: str, definition: str, metadata: Mapping[str, str]) -> int:
+        """Declares a topic of messages in CDR, and their type by its `ros2msg` text; returns the channel's number."""
         number = len(self._channels) + 1
-        encoded = (struct.pack("<HH", number, schema), _text(topic), _text("cdr"), _text_map(metadata))
-        self._channels.append(_record(CHANNEL, *encoded))
+        schema = (struct.pack("<H", number), _text(message_type), _text("ros2msg"), _text(definition))
+        self._schemas.append(_record(SCHEMA, *schema))
+        self._add(self._schemas[-1])
+        channel = (struct.pack("<HH", number, number), _text(topic), _text("cdr"), _text_map(metadata))
+        self._channels.append(_record(CHANNEL, *channel))
         self._add(self._channels[-1])
         return number
 
@@ -190,9 +180,9 @@ class McapWriter:
     def _write_chunk(self, chunk: _Chunk) -> None:
         records = b"".join(chunk.parts)
         chunk.parts.clear()
-        packed = self._packer.compress(records) if self._compression else records
+        packed = self._packer.compress(records)
         times, start = struct.pack("<QQ", min(chunk.times), max(chunk.times)), self._stream.tell()
-        fields = struct.pack("<QI", len(records), zlib.crc32(records)) + _text(self._compression)
+        fields = struct.pack("<QI", len(records), zlib.crc32(records)) + _text("zstd")
         head = times + fields + struct.pack("<Q", len(packed))
         length = len(head) + len(packed)
         self._stream.write(struct.pack("<BQ", CHUNK, length) + head)
@@ -209,7 +199,7 @@ class McapWriter:
         self._write(b"".join(indexes))
         where = times + struct.pack("<QQ", start, end - start) + _number_map(places) + struct.pack("<Q", at - end)
         sizes = struct.pack("<QQ", len(packed), len(records))
-        self._chunk_indexes.append(_record(CHUNK_INDEX, where, _text(self._compression), sizes))
+        self._chunk_indexes.append(_record(CHUNK_INDEX, where, _text("zstd"), sizes))
 
     def _write(self, records: bytes) -> None:
         self._stream.write(records)

@@ -13,6 +13,8 @@ import yaml
 from msg_adapters.errors import BagError
 from refu_core._files import read_file
 
+BETAS_OF = "betas_of"
+"""Key in the metadata of a topic that says whose shape space its betas are of."""
 METADATA_FILE = "metadata.yaml"
 VERSION = 9
 STORAGES = ("mcap", "sqlite3")
@@ -34,17 +36,15 @@ class QosProfile:
     """Quality of service a topic was offered with; `ros2 bag play` offers it again."""
 
     reliability: Literal["reliable", "best_effort"] = "reliable"
-    durability: Literal["volatile", "transient_local"] = "volatile"
-    history: Literal["keep_last", "keep_all"] = "keep_last"
     depth: int = 10
 
     def to_metadata(self) -> dict[str, Any]:
         """The profile as rosbag2 writes it."""
         return {
-            "history": self.history,
+            "history": "keep_last",
             "depth": self.depth,
             "reliability": self.reliability,
-            "durability": self.durability,
+            "durability": "volatile",
             "deadline": dict(_FOREVER),
             "lifespan": dict(_FOREVER),
             "liveliness": "automatic",
@@ -70,22 +70,19 @@ class TopicInfo:
     definition: str
     """Text of the message type (`ros2msg`); empty where it is in another language."""
     type_hash: str
-    qos: str
-    """Offered profiles in YAML, as recorded."""
     betas_of: str = ""
     """Whose shape space β in the messages are of: `builtin`, or (empty) the bag doesn't say."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class TopicSummary:
     """A topic's entry in the metadata."""
 
     name: str
     message_type: str
     type_hash: str
-    qos: str
-    """The offered profiles in YAML."""
-    message_count: int
+    qos: QosProfile
+    message_count: int = 0
 
 
 class _Dumper(yaml.SafeDumper):
@@ -129,24 +126,6 @@ def _scalar(text: str) -> Any:
     return {"true": True, "false": False, "null": None, "~": None, "": None}.get(text, text)
 
 
-def read_profiles(text: str) -> list[Any]:
-    """The offered profiles of another bag's topic; none where the text has one that rosbag2 couldn't decode."""
-    wanted = QosProfile().to_metadata()
-    try:
-        profiles = _load(text)
-    except _UNREADABLE:
-        return []
-    whole = isinstance(profiles, list) and all(_like(profile, wanted) for profile in profiles)
-    return [{key: profile[key] for key in wanted} for profile in profiles] if whole else []
-
-
-def _like(value: Any, wanted: Any) -> bool:
-    """Whether a value has the same keys and types; bags before version 9 have numbers for names."""
-    if isinstance(wanted, dict):
-        return isinstance(value, dict) and all(_like(value.get(key), inner) for key, inner in wanted.items())
-    return type(value) is type(wanted) or (isinstance(wanted, str) and type(value) is int)
-
-
 def _dump(value: Any) -> str:
     return yaml.dump(value, Dumper=_Dumper, sort_keys=False, default_flow_style=False)
 
@@ -172,7 +151,7 @@ def dump_metadata(*, file_name: str, topics: Sequence[TopicSummary], start_ns: i
                     "name": topic.name,
                     "type": topic.message_type,
                     "serialization_format": "cdr",
-                    "offered_qos_profiles": _load(topic.qos) or [],
+                    "offered_qos_profiles": [topic.qos.to_metadata()],
                     "type_description_hash": topic.type_hash,
                 },
                 "message_count": topic.message_count,

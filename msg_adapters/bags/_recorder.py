@@ -16,8 +16,6 @@ from msg_adapters.bags._metadata import QosProfile
 from msg_adapters.bags._writer import BagWriter
 from msg_adapters.errors import BagError
 
-MAX_QUEUED_BYTES = 64 << 20
-SYNC_PERIOD_S = 1.0
 _MAX_QUEUED_MESSAGES = 10_000
 
 
@@ -101,8 +99,8 @@ class Recorder:
         self,
         path: str | Path,
         *,
-        sync_period: float = SYNC_PERIOD_S,
-        max_queued_bytes: int = MAX_QUEUED_BYTES,
+        sync_period: float = 1.0,
+        max_queued_bytes: int = 64 << 20,
         open_bag: Callable[[Path], BagWriter] = BagWriter,
         ended: Callable[[RecorderState], object] = lambda _: None,
     ) -> None:
@@ -136,8 +134,7 @@ class Recorder:
         with self._changed:
             if self._stopping or self._error:
                 return
-            full = self._queued_bytes + len(data) > self._max_queued_bytes or len(self._queue) >= _MAX_QUEUED_MESSAGES
-            if full:
+            if self._queued_bytes + len(data) > self._max_queued_bytes or len(self._queue) >= _MAX_QUEUED_MESSAGES:
                 self._dropped += 1
                 return
             self._queue.append(_Message(topic, message_type, qos, data, time_ns, time.monotonic()))
@@ -174,10 +171,9 @@ class Recorder:
         except OSError:
             size, free = 0, None
         with self._changed:
-            now = time.monotonic()
-            oldest = self._queue[0].since if self._queue else now
-            if self._unsynced is not None:
-                oldest = self._unsynced
+            now, oldest = time.monotonic(), self._unsynced
+            if oldest is None:
+                oldest = self._queue[0].since if self._queue else now
             return RecorderState(
                 path=self.path,
                 written=self._written,
@@ -195,21 +191,17 @@ class Recorder:
                 while (message := self._next()) is not None:
                     if message is _SYNC:
                         self._bag.sync()
+                        self._unsynced = None
                     else:
                         self._bag.add_topic(message.topic, message.message_type, qos=message.qos)
                         self._bag.write(message.topic, message.data, log_time_ns=message.time_ns)
-                    with self._changed:
-                        if message is _SYNC:
-                            self._unsynced = None
-                        else:
-                            self._written += 1
+                        self._written += 1
             self._unsynced = None
         except Exception as error:  # whatever it is, it ends the recording alone
             with self._changed:
                 self._error = str(error) or type(error).__name__
                 self._dropped += 1 + len(self._queue)
                 self._queue.clear()
-                self._queued_bytes = 0
         self._ended(self.state())
 
     def _next(self) -> _Message | None:

@@ -30,14 +30,14 @@ class FrameRecord:
     """The message as it was, in CDR."""
 
 
+@dataclass(frozen=True, eq=False)
 class SmplBag:
     """A bag and the topic of it that carries a body; iterating yields a `FrameRecord` for each message."""
 
-    def __init__(self, reader: BagReader, topic: TopicInfo, decoder: Decoder | None) -> None:
-        """Without a decoder, records are messages as they are: keypoints are of who is followed."""
-        self.reader = reader
-        self.topic = topic
-        self.decoder = decoder
+    reader: BagReader
+    topic: TopicInfo
+    decoder: Decoder | None
+    """None for keypoints, whose records are messages as they are: they are of who is followed."""
 
     @property
     def message_count(self) -> int:
@@ -55,9 +55,14 @@ class SmplBag:
             frame, error = None, None
             try:
                 if self.decoder is not None:
-                    frame = _stamped(self.decoder.from_bytes(message.data), message.log_time_ns)
+                    frame = self.decoder.from_bytes(message.data)
+                    if not frame.stamp_ns:  # then it is of its receipt
+                        split_stamp(message.log_time_ns)
+                        frame = replace(frame, stamp_ns=message.log_time_ns)
             except DecodeError as cause:
                 error = cause
+            except EncodeError as cause:
+                frame, error = None, DecodeError(f"no stamp, and was received at an impossible time: {cause}")
             yield FrameRecord(
                 frame=frame,
                 error=error,
@@ -66,18 +71,6 @@ class SmplBag:
                 topic=message.topic,
                 raw=message.data,
             )
-
-
-def _stamped(frame: SmplFrame, log_time_ns: int) -> SmplFrame:
-    """The frame, where it has no stamp with that of its receipt; one that no message holds is the message's fault."""
-    if frame.stamp_ns:
-        return frame
-    try:
-        split_stamp(log_time_ns)
-    except EncodeError as error:
-        msg = f"no stamp, and was received at an impossible time: {error}"
-        raise DecodeError(msg) from error
-    return replace(frame, stamp_ns=log_time_ns)
 
 
 def _listing(topics: Sequence[TopicInfo]) -> str:
@@ -118,22 +111,16 @@ def open_smpl_bag(path: str | Path, *, topic: str | None = None, input_type: str
     Raises `BagError` when there is no such bag, it has no messages, or no topic, or several, could be meant.
     """
     reader = BagReader(path)
+    of_keypoints = [kind for name, kind in KEYPOINT_TYPES.items() if name == input_type]
+    kinds = of_keypoints or ([decoder_for(input_type).message_type] if input_type else [*INPUT_TYPES.values()])
     topics = reader.topics
+    if any(info.message_type in kinds and not info.message_count for info in topics):
+        topics = reader.count()  # a summary isn't believed that a topic is empty
     if not any(info.message_count for info in topics):
         why = "; " + "; ".join(reader.warnings) if reader.warnings else ""
         msg = f"{reader.path}: no message in this bag{why}"
         raise BagError(msg)
-    of_keypoints = [kind for name, kind in KEYPOINT_TYPES.items() if name == input_type]
-    kinds = of_keypoints or ([decoder_for(input_type).message_type] if input_type else [*INPUT_TYPES.values()])
-    try:
-        chosen = _choose(reader.path, topics, topic, kinds)
-        doubtful = not chosen.message_count
-    except BagError:
-        doubtful = any(not info.message_count and info.message_type in kinds for info in topics)
-        if not doubtful:
-            raise
-    if doubtful:  # a summary isn't believed that a topic is empty
-        chosen = _choose(reader.path, reader.count(), topic, kinds)
+    chosen = _choose(reader.path, topics, topic, kinds)
     if chosen.encoding != "cdr":
         msg = (
             f"{reader.path}: {chosen.name} is encoded as {chosen.encoding or 'nothing'}; wanted cdr, as ROS 2 writes it"

@@ -7,76 +7,91 @@ are plain columns of plain tables; anything else in their place is refused.
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 from msg_adapters.bags._mcap import MAX_CHUNK_BYTES, Budget, DamageError
+from msg_adapters.bags._mcap_file import Found
 from msg_adapters.bags._metadata import TopicInfo
 from msg_adapters.definitions import full_type_name
 from msg_adapters.errors import BagError
+from refu_core.errors import printable
 
 MAGIC = b"SQLite format 3\x00"
 _NEEDED = {"topics": {"id", "name", "type", "serialization_format"}, "messages": {"topic_id", "timestamp", "data"}}
 _MAX_TOPICS = 1 << 16
-_UNREADABLE = "the database can't be read on ({})"
+_ERRORS = (sqlite3.Error, ValueError, TypeError, OverflowError, MemoryError)
+"""Of a damaged database: its own message may not be UTF-8, numbers may be texts, or too long."""
 
 
 class SqliteFile:
-    """One `.db3` file, opened to read and never written to. Raises `BagError` where it isn't a bag's."""
+    """One `.db3` file, opened to read and never written to; what is damaged is reported, and left out.
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    Raises `BagError` where it isn't a bag's.
+    """
+
+    def __init__(self, path: Path, report: Callable[[DamageError], None]) -> None:
+        self._path, self.report = path, report
         try:
-            with self._open() as database:
+            with self._opened() as database:
                 self._columns = {name: _columns(database, name) for name in _NEEDED}
                 self._definitions = _columns(database, "message_definitions")
-        except (sqlite3.Error, OverflowError) as error:
-            msg = f"{path}: the database can't be read: {error}"
-            raise BagError(msg) from error
+        except DamageError as damage:
+            msg = printable(f"{path}: {damage}")
+            raise BagError(msg) from damage
         for name, needed in _NEEDED.items():
             if missing := needed - self._columns[name]:
                 msg = f"{path}: not a bag: wanted rosbag2's table {name!r} with {', '.join(sorted(missing))}"
                 raise BagError(msg)
 
     @contextmanager
-    def _open(self) -> Iterator[sqlite3.Connection]:
+    def _opened(self) -> Iterator[sqlite3.Connection]:
+        """The database. Raises `DamageError` where it can't be read on."""
         # A recorder that was killed may leave a log of what isn't in the database yet; only then others are looked at.
-        log = self.path.with_name(f"{self.path.name}-wal")
+        log = self._path.with_name(f"{self._path.name}-wal")
         how = "mode=ro" if log.exists() else "mode=ro&immutable=1"
-        with closing(sqlite3.connect(f"file:{quote(str(self.path.absolute()))}?{how}", uri=True)) as database:
-            database.execute("PRAGMA trusted_schema = OFF")
-            database.execute("PRAGMA cell_size_check = ON")
-            yield database
-
-    def topics(self, budget: Budget) -> dict[int, TopicInfo]:
-        """The topics by their numbers, without their messages' count. Raises `DamageError`."""
-        has = self._columns["topics"]
-        wanted = ["name", "type", "serialization_format"]
-        wanted += [name for name in ("offered_qos_profiles", "type_description_hash") if name in has]
-        topics: dict[int, TopicInfo] = {}
         try:
-            with self._open() as database:
-                definitions = self._texts(database, budget)
-                rows = database.execute(f"SELECT id, {', '.join(wanted)} FROM topics LIMIT {_MAX_TOPICS}")
-                for number, *values in rows:
-                    texts = [value if isinstance(value, str) else "" for value in values]
-                    budget.spend("bytes of declarations", sum(map(len, texts)))
-                    got = dict(zip(wanted, texts, strict=True))
-                    kind = full_type_name(got["type"])
-                    topics[int(number)] = TopicInfo(
-                        name=got["name"],
-                        message_type=kind,
-                        encoding=got["serialization_format"],
-                        message_count=0,
-                        definition=definitions.get(kind, ""),
-                        type_hash=got.get("type_description_hash", ""),
-                        qos=got.get("offered_qos_profiles", ""),
-                    )
-        except (sqlite3.Error, ValueError, TypeError, OverflowError) as error:
-            raise DamageError(_UNREADABLE, error) from error
+            with closing(sqlite3.connect(f"file:{quote(str(self._path.absolute()))}?{how}", uri=True)) as database:
+                database.execute("PRAGMA trusted_schema = OFF")
+                database.execute("PRAGMA cell_size_check = ON")
+                yield database
+        except _ERRORS as error:
+            msg = "the database can't be read ({})"
+            raise DamageError(msg, error) from error
+
+    def topics(self, budget: Budget, *, by_reading: bool) -> tuple[list[tuple[TopicInfo, int]], bool]:  # noqa: ARG002
+        """With how many messages each has, and that this is more than a claim: it is always by reading."""
+        counts = f"SELECT topic_id, count(*) FROM messages GROUP BY topic_id LIMIT {_MAX_TOPICS}"
+        try:
+            with self._opened() as database:
+                found: dict[Any, int] = dict(database.execute(counts).fetchall())
+                return [(topic, found.get(n, 0)) for n, topic in self._topics(database, budget).items()], False
+        except DamageError as damage:
+            self.report(damage)
+            return [], False
+
+    def _topics(self, database: sqlite3.Connection, budget: Budget) -> dict[int, TopicInfo]:
+        """The topics by their numbers, without their messages' count."""
+        wanted = ["name", "type", "serialization_format"]
+        wanted += ["type_description_hash"] * ("type_description_hash" in self._columns["topics"])
+        definitions = self._texts(database, budget)
+        topics: dict[int, TopicInfo] = {}
+        for number, *values in database.execute(f"SELECT id, {', '.join(wanted)} FROM topics LIMIT {_MAX_TOPICS}"):
+            texts = [value if isinstance(value, str) else "" for value in values]
+            budget.spend("bytes of declarations", sum(map(len, texts)))
+            got = dict(zip(wanted, texts, strict=True))
+            kind = full_type_name(got["type"])
+            topics[int(number)] = TopicInfo(
+                name=got["name"],
+                message_type=kind,
+                encoding=got["serialization_format"],
+                message_count=0,
+                definition=definitions.get(kind, ""),
+                type_hash=got.get("type_description_hash", ""),
+            )
         return topics
 
     def _texts(self, database: sqlite3.Connection, budget: Budget) -> dict[str, str]:
@@ -91,39 +106,27 @@ class SqliteFile:
                 found[full_type_name(kind)] = text
         return found
 
-    def counts(self) -> dict[int, int]:
-        """Messages of each topic's number, by reading. Raises `DamageError`."""
+    def messages(self, budget: Budget) -> Iterator[Found]:
+        """The messages in the order they were recorded."""
         try:
-            with self._open() as database:
-                rows = database.execute(
-                    f"SELECT topic_id, count(*) FROM messages GROUP BY topic_id LIMIT {_MAX_TOPICS}"
-                )
-                return {number: count for number, count in rows if isinstance(number, int)}
-        except (sqlite3.Error, OverflowError) as error:
-            raise DamageError(_UNREADABLE, error) from error
-
-    def messages(self, budget: Budget) -> Iterator[tuple[int, int, bytes] | DamageError]:
-        """Topic's number, time [ns] and bytes of each message in the order of recording, or what is wrong with one.
-
-        Raises `DamageError` where the file can't be read on.
-        """
-        try:
-            with self._open() as database:
-                for topic, stamp, data in database.execute(
+            with self._opened() as database:
+                topics = self._topics(database, budget)
+                for number, stamp_ns, data in database.execute(
                     "SELECT topic_id, timestamp, data FROM messages ORDER BY rowid"
                 ):
                     budget.spend("records")
-                    if not (isinstance(topic, int) and isinstance(stamp, int) and isinstance(data, bytes)):
-                        yield DamageError("a message that isn't a topic's number, a time and bytes")
+                    if not (isinstance(number, int) and isinstance(stamp_ns, int) and isinstance(data, bytes)):
+                        self.report(DamageError("a message that isn't a topic's number, a time and bytes"))
                     elif len(data) > MAX_CHUNK_BYTES:
-                        yield DamageError(
-                            "a message of {} MiB, at most {} are read", len(data) >> 20, MAX_CHUNK_BYTES >> 20
-                        )
+                        what = "a message of {} MiB, at most {} are read"
+                        self.report(DamageError(what, len(data) >> 20, MAX_CHUNK_BYTES >> 20))
+                    elif number not in topics:
+                        self.report(DamageError("a message of the undeclared topic {}", number))
                     else:
                         budget.spend("bytes unpacked", len(data))
-                        yield topic, stamp, data
-        except (sqlite3.Error, OverflowError, MemoryError) as error:
-            raise DamageError(_UNREADABLE, error) from error
+                        yield topics[number], stamp_ns, stamp_ns, data
+        except DamageError as damage:
+            self.report(damage)
 
 
 def _columns(database: sqlite3.Connection, table: str) -> set[str]:

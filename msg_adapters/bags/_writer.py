@@ -6,33 +6,15 @@ import errno
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from msg_adapters.bags import _mcap
-from msg_adapters.bags._mcap_writer import Compression, McapWriter
-from msg_adapters.bags._metadata import (
-    MAX_TIME_NS,
-    METADATA_FILE,
-    QosProfile,
-    TopicSummary,
-    dump_metadata,
-    read_profiles,
-)
+from msg_adapters.bags._mcap_writer import McapWriter
+from msg_adapters.bags._metadata import BETAS_OF, MAX_TIME_NS, METADATA_FILE, QosProfile, TopicSummary, dump_metadata
 from msg_adapters.definitions import full_type_name, message_definition
 from msg_adapters.errors import BagError
 
 _DEFAULT_QOS = QosProfile()
-
-
-@dataclass
-class _Topic:
-    channel_id: int
-    message_type: str
-    type_hash: str
-    qos: str
-    message_count: int = 0
 
 
 class BagWriter:
@@ -50,13 +32,7 @@ class BagWriter:
     """
 
     def __init__(
-        self,
-        path: str | Path,
-        *,
-        compression: Compression = "zstd",
-        chunk_bytes: int = 1 << 20,
-        overwrite: bool = False,
-        in_background: bool = False,
+        self, path: str | Path, *, chunk_bytes: int = 1 << 20, overwrite: bool = False, in_background: bool = False
     ) -> None:
         self.path = Path(path)
         self._directory = None if self.path.suffix == ".mcap" else self.path
@@ -64,16 +40,15 @@ class BagWriter:
         """The MCAP file itself."""
         self._entered: list[Path] = []
         """Directories with entries that a power cut may still take."""
-        self._topics: dict[str, _Topic] = {}
+        self._topics: dict[str, TopicSummary] = {}
+        self._channels: dict[str, int] = {}
         self._start_ns, self._end_ns = MAX_TIME_NS, 0
         self._finished = False
         made: list[Path] = []
         try:
             with self._writing():
                 self._stream = self._open(made, overwrite=overwrite)
-                self._writer = McapWriter(
-                    self._stream, compression=compression, chunk_bytes=chunk_bytes, in_background=in_background
-                )
+                self._writer = McapWriter(self._stream, chunk_bytes=chunk_bytes, in_background=in_background)
                 self._writer.start(profile="ros2", library="refu-ros")
         except BagError:
             for path in reversed(made):
@@ -91,11 +66,6 @@ class BagWriter:
         with suppress(BagError):  # the error under way says more
             self.finish()
 
-    @property
-    def message_count(self) -> int:
-        """Messages written so far."""
-        return sum(topic.message_count for topic in self._topics.values())
-
     def add_topic(
         self,
         topic: str,
@@ -103,14 +73,14 @@ class BagWriter:
         *,
         definition: str | None = None,
         type_hash: str | None = None,
-        qos: QosProfile | str = _DEFAULT_QOS,
+        qos: QosProfile = _DEFAULT_QOS,
         betas_of: str = "",
     ) -> None:
         """Declare a topic before its first message; a second time with the same type does nothing.
 
-        `definition` (`ros2msg` text) and `type_hash` are built in for the types of this project. `qos` may also be the
-        YAML text of a bag that is copied from. `betas_of` says whose shape space β in the messages are of:
-        `builtin`, or nothing. It is kept with the topic, where `TopicInfo.betas_of` has it; others don't mind.
+        `definition` (`ros2msg` text) and `type_hash` are built in for the types of this project. `betas_of` says whose
+        shape space β in the messages are of: `builtin`, or nothing. It is kept with the topic, where
+        `TopicInfo.betas_of` has it; others don't mind.
 
         Raises `BagError` for a type that isn't built in without a definition, and for a second type on one topic.
         """
@@ -124,21 +94,18 @@ class BagWriter:
         if definition is None:
             builtin = message_definition(message_type)
             definition, type_hash = builtin.text, type_hash or builtin.type_hash
-        profiles = (qos if read_profiles(qos) else "") if isinstance(qos, str) else qos.to_yaml()
+        metadata = {"offered_qos_profiles": qos.to_yaml(), "topic_type_hash": type_hash or ""}
+        metadata |= {BETAS_OF: betas_of} if betas_of else {}
         with self._writing():
-            schema_id = self._writer.add_schema(message_type, definition)
-            metadata = {"offered_qos_profiles": profiles, "topic_type_hash": type_hash or ""}
-            metadata |= {_mcap.BETAS_OF: betas_of} if betas_of else {}
-            channel_id = self._writer.add_channel(topic, schema_id, metadata)
-        self._topics[topic] = _Topic(channel_id, message_type, type_hash or "", profiles)
+            self._channels[topic] = self._writer.add_channel(topic, message_type, definition, metadata)
+        self._topics[topic] = TopicSummary(topic, message_type, type_hash or "", qos)
 
     def write(self, topic: str, data: bytes, *, log_time_ns: int, publish_time_ns: int | None = None) -> None:
         """Append a message in CDR, received at `log_time_ns` and sent at `publish_time_ns` (None: the same).
 
         Raises `BagError` for an undeclared topic, a time that rosbag2 can't hold, and when writing fails.
         """
-        channel = self._topics.get(topic)
-        if channel is None:
+        if topic not in self._topics:
             msg = f"{self.path}: {topic} isn't declared; call add_topic first"
             raise BagError(msg)
         publish_time_ns = log_time_ns if publish_time_ns is None else publish_time_ns
@@ -147,13 +114,13 @@ class BagWriter:
             raise BagError(msg)
         with self._writing():
             self._writer.add_message(
-                channel.channel_id,
+                self._channels[topic],
                 data,
                 log_time_ns=log_time_ns,
                 publish_time_ns=publish_time_ns,
-                sequence=channel.message_count & 0xFFFFFFFF,
+                sequence=self._topics[topic].message_count & 0xFFFFFFFF,
             )
-        channel.message_count += 1
+        self._topics[topic].message_count += 1
         self._start_ns = min(self._start_ns, log_time_ns)
         self._end_ns = max(self._end_ns, log_time_ns)
 
@@ -175,7 +142,9 @@ class BagWriter:
         """
         if self._finished:
             return
-        text, record = self._metadata()
+        start_ns, end_ns = min(self._start_ns, self._end_ns), self._end_ns
+        topics = [*self._topics.values()]
+        text, record = dump_metadata(file_name=self.file_path.name, topics=topics, start_ns=start_ns, end_ns=end_ns)
         with self._writing():
             self._writer.add_metadata("rosbag2", {"serialized_metadata": record})
             self._writer.finish()
@@ -199,14 +168,6 @@ class BagWriter:
         while self._entered:  # a file that its directory doesn't know is lost with all its content
             _entries_to_disk(self._entered[-1])
             self._entered.pop()
-
-    def _metadata(self) -> tuple[str, str]:
-        topics = [
-            TopicSummary(name, topic.message_type, topic.type_hash, topic.qos, topic.message_count)
-            for name, topic in self._topics.items()
-        ]
-        start_ns = min(self._start_ns, self._end_ns)
-        return dump_metadata(file_name=self.file_path.name, topics=topics, start_ns=start_ns, end_ns=self._end_ns)
 
     def _open(self, made: list[Path], *, overwrite: bool) -> BinaryIO:
         """The file; `made` gets what wasn't there before, in order."""

@@ -6,7 +6,7 @@ other joints (a jaw, fingers) are ignored; `velocity` and `effort` aren't read.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,28 +14,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msg_adapters.cdr import Buffer, CdrReader, CdrWriter
-from msg_adapters.errors import DecodeError
+from msg_adapters.errors import DecodeError, decoding
 from msg_adapters.inputs import _ros4hri
-from msg_adapters.inputs._frame import decoding, reading_fields, smpl_frame, stamp_ns_of
-from msg_adapters.joints import SMPL_JOINTS
 from refu_core.frames import N_BETAS, SmplFrame
 from refu_core.recordings import PELVIS
+from refu_core.skeleton import JOINT_NAMES
 
 MESSAGE_TYPE = "sensor_msgs/msg/JointState"
-_POSE_NAMES = tuple(f"{joint}_{axis}" for joint in SMPL_JOINTS for axis in "xyz")
+_POSE_NAMES = tuple(f"{joint}_{axis}" for joint in JOINT_NAMES for axis in "xyz")
 _BETA_NAMES = tuple(f"beta_{i}" for i in range(N_BETAS))
 _TRANSL_NAMES = tuple(f"transl_{axis}" for axis in "xyz")
 _NAMES = (*_POSE_NAMES, *_BETA_NAMES, *_TRANSL_NAMES)
 _SLOTS = {name: slot for slot, name in enumerate(_NAMES)}
-_N_POSE, _N_BETA = len(_POSE_NAMES), len(_BETA_NAMES)
-_MIN_NAME_BYTES = 4
 _SHOWN = 6
 _MOST_REMEMBERED = 1 << 16  # bytes of names; SMPL's are 1.5 kB
-
-
-def _listing(names: Sequence[str]) -> str:
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return ", ".join(names[:_SHOWN]) + more
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,64 +38,50 @@ class _Layout:
     given: NDArray[np.intp]
     """Positions that are read, in the order of the message."""
     slots: NDArray[np.intp]
-    """Their places in `_NAMES`; as many."""
-
-    ros4hri: bool
-    """Whether the places are those in `_ros4hri.AXES` instead."""
+    """Their places in `_NAMES`, or in `_ros4hri.AXES`; as many."""
+    is_ros4hri: bool
 
     @classmethod
     def of(cls, names: Sequence[str]) -> _Layout:
         """Raises `DecodeError` for names that make no body."""
         body = None if any(name in _SLOTS for name in names) else _ros4hri.body_of(names)
         if body is not None:
-            wanted = [f"{joint}_{body}" for joint in _ros4hri.AXES]
-            places = _places(names, {name: slot for slot, name in enumerate(wanted)})
-            _check_complete(wanted, places, f"wanted the {len(wanted)} joints of ROS4HRI's human_description")
+            slots = {f"{joint}_{body}": slot for slot, joint in enumerate(_ros4hri.AXES)}
+            required, what = tuple(slots), f"wanted the {len(slots)} joints of ROS4HRI's human_description"
         else:
+            slots, required = _SLOTS, _POSE_NAMES
+            what = "wanted x, y, z of 24 joints, or ROS4HRI's waist_<id> and the others"
             misspelt = [name for name in names if name.startswith(("beta", "transl")) and name not in _SLOTS]
             if misspelt:  # left alone, they would silently leave the body at zero
-                msg = (
-                    f"unknown name {misspelt[0]!r}; "
-                    f"wanted beta_0 ... beta_{N_BETAS - 1} and transl_x, transl_y, transl_z"
-                )
+                msg = f"unknown name {misspelt[0]!r}; "
+                msg += f"wanted beta_0 ... beta_{N_BETAS - 1} and transl_x, transl_y, transl_z"
                 raise DecodeError(msg)
-            places = _places(names, _SLOTS)
-            _check_complete(_POSE_NAMES, places, "wanted x, y, z of 24 joints, or ROS4HRI's waist_<id> and the others")
-            n_transl = sum(name in places for name in _TRANSL_NAMES)
-            if n_transl not in (0, len(_TRANSL_NAMES)):
-                msg = f"{n_transl} of transl_x, transl_y, transl_z given; wanted all three or none"
+        places: dict[str, tuple[int, int]] = {}
+        for position, name in enumerate(names):
+            if name in places:
+                msg = f"the name {name} occurs twice"
                 raise DecodeError(msg)
-        given, slots = zip(*places.values(), strict=True)
-        return cls(len(names), np.array(given, np.intp), np.array(slots, np.intp), body is not None)
+            if name in slots:
+                places[name] = position, slots[name]
+        if missing := [name for name in required if name not in places]:
+            more = f" and {len(missing) - _SHOWN} more" if len(missing) > _SHOWN else ""
+            msg = f"{len(missing)} of {len(required)} names are missing: {', '.join(missing[:_SHOWN])}{more}; {what}"
+            raise DecodeError(msg)
+        n_transl = sum(name in places for name in _TRANSL_NAMES)
+        if n_transl not in (0, len(_TRANSL_NAMES)):
+            msg = f"{n_transl} of transl_x, transl_y, transl_z given; wanted all three or none"
+            raise DecodeError(msg)
+        given, wanted = zip(*places.values(), strict=True)
+        return cls(len(names), np.array(given, np.intp), np.array(wanted, np.intp), body is not None)
 
     def frame(self, position: NDArray[Any], stamp_ns: int) -> SmplFrame:
         """The frame of as many positions as there are names."""
         values = np.zeros(len(_NAMES))
         values[self.slots] = position[self.given]
-        if self.ros4hri:
-            pose = _ros4hri.pose_of(values[: len(_ros4hri.AXES)])
-            return smpl_frame(pose, None, -PELVIS, stamp_ns=stamp_ns)
-        pose, betas, transl = np.split(values, [_N_POSE, _N_POSE + _N_BETA])
-        return smpl_frame(pose, betas, transl, stamp_ns=stamp_ns)
-
-
-def _places(names: Sequence[str], slots: Mapping[str, int]) -> dict[str, tuple[int, int]]:
-    """Position in the message, and slot, of each name that has one."""
-    places: dict[str, tuple[int, int]] = {}
-    for position, name in enumerate(names):
-        if name in places:
-            msg = f"the name {name} occurs twice"
-            raise DecodeError(msg)
-        if name in slots:
-            places[name] = position, slots[name]
-    return places
-
-
-def _check_complete(wanted: Sequence[str], given: Mapping[str, Any], what: str) -> None:
-    missing = [name for name in wanted if name not in given]
-    if missing:
-        msg = f"{len(missing)} of {len(wanted)} names are missing: {_listing(missing)}; {what}"
-        raise DecodeError(msg)
+        if self.is_ros4hri:
+            return SmplFrame(_ros4hri.pose_of(values[: len(_ros4hri.AXES)]), transl=-PELVIS, stamp_ns=stamp_ns)
+        pose, betas, transl = np.split(values, [len(_POSE_NAMES), -len(_TRANSL_NAMES)])
+        return SmplFrame(pose, betas, transl, stamp_ns=stamp_ns)
 
 
 _last: tuple[tuple[str, bytes], _Layout] | None = None
@@ -111,34 +89,28 @@ _last: tuple[tuple[str, bytes], _Layout] | None = None
 names its joints alike in all of its messages."""
 
 
-def _check_count(n_names: int, position: NDArray[Any]) -> None:
-    if n_names != position.size:
-        msg = f"{n_names} names but {position.size} positions; each name needs its angle in position"
-        raise DecodeError(msg)
-
-
 def from_bytes(data: Buffer) -> SmplFrame:
     """The frame of a message in CDR."""
     global _last  # one assignment: another thread's at the same time does no harm
     with decoding(MESSAGE_TYPE):
-        reader, layout, names = CdrReader(data), None, []
+        reader, last = CdrReader(data), _last
         stamp_ns, _ = reader.fields("Ts")
         reader.align(4)
-        if _last is not None and reader.repeats(_last[0]):
-            layout = _last[1]
+        place = reader.place
+        if last is not None and reader.repeats(last[0]):
+            layout = last[1]
         else:
-            place = reader.place
-            names = [reader.string() for _ in range(reader.length(item_bytes=_MIN_NAME_BYTES))]
+            layout = _Layout.of(reader.strings())
             raw = reader.since(place)
+            if len(raw[1]) <= _MOST_REMEMBERED:
+                _last = raw, layout
         position = reader.array("f8", reader.length(item_bytes=8))
         for _ in ("velocity", "effort"):
             reader.array("f8", reader.length(item_bytes=8))
         reader.finish()
-        _check_count(layout.n_names if layout is not None else len(names), position)
-        if layout is None:
-            layout = _Layout.of(names)
-            if len(raw[1]) <= _MOST_REMEMBERED:
-                _last = raw, layout
+        if layout.n_names != position.size:
+            msg = f"{layout.n_names} names but {position.size} positions; each name needs its angle in position"
+            raise DecodeError(msg)
         return layout.frame(position, stamp_ns)
 
 
@@ -146,22 +118,11 @@ def body_of(data: Buffer) -> str | None:
     """The id of the ROS4HRI body in a message that could be decoded, None for SMPL's joints."""
     reader, names = CdrReader(data), []
     reader.fields("Ts")
-    for _ in range(reader.length(item_bytes=_MIN_NAME_BYTES)):
+    for _ in range(reader.length(item_bytes=4)):
         names.append(reader.string())
         if names[-1] in _SLOTS:  # the first one is, where they are SMPL's
             return None
     return _ros4hri.body_of(names)
-
-
-def from_message(message: Any) -> SmplFrame:
-    """The frame of a message object."""
-    with decoding(MESSAGE_TYPE):
-        with reading_fields(message):
-            stamp_ns = stamp_ns_of(message.header)
-            names = [str(name) for name in message.name]
-            position = np.asarray(message.position, dtype=np.float64).reshape(-1)
-        _check_count(len(names), position)
-        return _Layout.of(names).frame(position, stamp_ns)
 
 
 def to_bytes(frame: SmplFrame, *, frame_id: str = "map") -> bytes:

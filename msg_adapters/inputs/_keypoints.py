@@ -12,19 +12,15 @@ import re
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from msg_adapters.cdr import Buffer, CdrReader
-from msg_adapters.errors import DecodeError
-from msg_adapters.inputs._frame import decoding
+from msg_adapters.errors import DecodeError, decoding
 from msg_adapters.markers import MARKER_ARRAY, Marker, decode_marker_array
 
-KeypointType = Literal["keypoint_poses", "keypoint_markers"]
-
-KEYPOINT_TYPES: dict[KeypointType, str] = {
+KEYPOINT_TYPES: dict[str, str] = {
     "keypoint_poses": "geometry_msgs/msg/PoseArray",
     "keypoint_markers": MARKER_ARRAY,
 }

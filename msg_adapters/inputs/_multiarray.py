@@ -8,14 +8,13 @@ numbers after the one before it (0 stands for its size), the first one at `layou
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from msg_adapters.cdr import Buffer, CdrReader, CdrWriter
-from msg_adapters.errors import DecodeError
-from msg_adapters.inputs._frame import decoding, reading_fields, smpl_frame
+from msg_adapters.errors import DecodeError, decoding
 from refu_core.frames import N_BETAS, N_JOINTS, N_STYLES, SmplFrame
 
 MESSAGE_TYPE = "std_msgs/msg/Float32MultiArray"
@@ -25,18 +24,12 @@ _MAX_DIMENSIONS = 16
 _MIN_DIMENSION_BYTES = 12
 
 
-class _Dimension(NamedTuple):
-    label: str
-    size: int
-    stride: int
-
-
-def _blocks(dimensions: Sequence[_Dimension], offset: int, data: NDArray[Any]) -> dict[str, NDArray[Any]]:
-    """The declared blocks by label."""
+def _blocks(dimensions: Sequence[tuple[Any, ...]], offset: int, data: NDArray[Any]) -> dict[str, Any]:
+    """The declared blocks by label, of each dimension's label, size and stride."""
     if not dimensions:
         msg = f"the layout of {data.size} numbers isn't declared; {_LABELLING}"
         raise DecodeError(msg)
-    blocks: dict[str, NDArray[Any]] = {}
+    blocks: dict[str, Any] = {}
     start = end = offset
     for label, size, stride in dimensions:
         if label not in _SIZES or label in blocks:
@@ -61,11 +54,6 @@ def _blocks(dimensions: Sequence[_Dimension], offset: int, data: NDArray[Any]) -
     return blocks
 
 
-def _frame(dimensions: Sequence[_Dimension], offset: int, data: NDArray[Any]) -> SmplFrame:
-    blocks = _blocks(dimensions, offset, data)
-    return smpl_frame(blocks["pose"], blocks.get("betas"), blocks.get("transl"), style=blocks.get("style"))
-
-
 def from_bytes(data: Buffer) -> SmplFrame:
     """The frame of a message in CDR; its stamp is 0, this type has no header."""
     with decoding(MESSAGE_TYPE):
@@ -74,22 +62,11 @@ def from_bytes(data: Buffer) -> SmplFrame:
         if count > _MAX_DIMENSIONS:
             msg = f"{count} dimensions in layout.dim; {_LABELLING}"
             raise DecodeError(msg)
-        dimensions = [_Dimension(*reader.fields("sII")) for _ in range(count)]
+        dimensions = [reader.fields("sII") for _ in range(count)]
         (offset,) = reader.fields("I")
         values = reader.array("f4", reader.length(item_bytes=4))
         reader.finish()
-        return _frame(dimensions, offset, values)
-
-
-def from_message(message: Any) -> SmplFrame:
-    """The frame of a message object."""
-    with decoding(MESSAGE_TYPE):
-        with reading_fields(message):
-            layout = message.layout
-            dimensions = [_Dimension(str(d.label), int(d.size), int(d.stride)) for d in layout.dim]
-            offset = int(layout.data_offset)
-            values = np.asarray(message.data, dtype=np.float32).reshape(-1)
-        return _frame(dimensions, offset, values)
+        return SmplFrame(**_blocks(dimensions, offset, values))
 
 
 def to_bytes(frame: SmplFrame, *, frame_id: str = "map") -> bytes:  # noqa: ARG001 - the type has no header

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from types import ModuleType
+from typing import Protocol
 
 from msg_adapters.cdr import Buffer, CdrReader
 from msg_adapters.definitions import full_type_name
@@ -12,14 +13,13 @@ from msg_adapters.errors import DecodeError
 from msg_adapters.inputs import _joint_state, _multiarray, _pose_array, _smpl
 from refu_core.frames import SmplFrame
 
-InputType = Literal["multiarray", "joint_state", "pose_array", "smpl_msgs"]
-
-INPUT_TYPES: dict[InputType, str] = {
-    "multiarray": _multiarray.MESSAGE_TYPE,
-    "joint_state": _joint_state.MESSAGE_TYPE,
-    "pose_array": _pose_array.MESSAGE_TYPE,
-    "smpl_msgs": _smpl.MESSAGE_TYPE,
+_CODECS: dict[str, ModuleType] = {
+    "multiarray": _multiarray,
+    "joint_state": _joint_state,
+    "pose_array": _pose_array,
+    "smpl_msgs": _smpl,
 }
+INPUT_TYPES: dict[str, str] = {name: codec.MESSAGE_TYPE for name, codec in _CODECS.items()}
 """Message type of each input type."""
 
 
@@ -34,29 +34,13 @@ class Encoder(Protocol):
 class Decoder:
     """Turns messages of one type into frames."""
 
-    input_type: InputType
+    input_type: str
     message_type: str
     from_bytes: Callable[[Buffer], SmplFrame]
     """The frame of a message in CDR; raises `DecodeError`. Its stamp is 0 where the message has none."""
-    from_message: Callable[[Any], SmplFrame]
-    """The frame of a message object of rclpy, rosbags or mcap-ros2; raises `DecodeError`."""
-
-    def __call__(self, message: Any) -> SmplFrame:
-        """The frame of a message in either form."""
-        if isinstance(message, (bytes, bytearray, memoryview)):
-            return self.from_bytes(message)
-        return self.from_message(message)
 
 
-_ENCODERS: dict[InputType, Encoder] = {
-    "multiarray": _multiarray.to_bytes,
-    "joint_state": _joint_state.to_bytes,
-    "pose_array": _pose_array.to_bytes,
-    "smpl_msgs": _smpl.to_bytes,
-}
-
-
-def _input_type(name: str) -> InputType:
+def _input_type(name: str) -> str:
     full_name = full_type_name(name)
     for input_type, message_type in INPUT_TYPES.items():
         if name == input_type or full_name == message_type:
@@ -73,19 +57,18 @@ def decoder_for(name: str, *, definition: str | None = None) -> Decoder:
     Raises `DecodeError` for a name that isn't an input type, and for a definition without the fields wanted.
     """
     input_type = _input_type(name)
-    message_type = INPUT_TYPES[input_type]
-    if input_type == "smpl_msgs":
-        return Decoder(input_type, message_type, _smpl.bytes_decoder(definition), _smpl.from_message)
-    module = {"multiarray": _multiarray, "joint_state": _joint_state, "pose_array": _pose_array}[input_type]
-    return Decoder(input_type, message_type, module.from_bytes, module.from_message)
+    codec = _CODECS[input_type]
+    from_bytes = _smpl.bytes_decoder(definition) if input_type == "smpl_msgs" else codec.from_bytes
+    return Decoder(input_type, codec.MESSAGE_TYPE, from_bytes)
 
 
 def encoder_for(name: str) -> Encoder:
     """The encoder of an input type or of a message type's name; raises `DecodeError` for any other name."""
-    return _ENCODERS[_input_type(name)]
+    encoder: Encoder = _CODECS[_input_type(name)].to_bytes
+    return encoder
 
 
-def frame_id_of(data: Buffer, input_type: InputType) -> str:
+def frame_id_of(data: Buffer, input_type: str) -> str:
     """The frame of a message that could be decoded: its header's `frame_id`; empty where its type has no header.
 
     A body of ROS4HRI is in its own frame, `body_<id>`, whatever camera the header names.

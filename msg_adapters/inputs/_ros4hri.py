@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from msg_adapters.axes import vertices_smpl_from_ros
 from msg_adapters.errors import DecodeError
-from msg_adapters.joints import SMPL_JOINTS
 from msg_adapters.rotations import quaternion_from_rotvec, quaternion_product, rotvec_from_quaternion
 from refu_core.frames import MAX_ANGLE
+from refu_core.skeleton import JOINT_NAMES
 
 AXES = {
     "waist": (0, 1, 0), "r_head": (1, 0, 0), "y_head": (0, 0, 1), "p_head": (0, -1, 0),
@@ -30,7 +30,7 @@ AXES = {
 
 
 def _joints(*names: str) -> list[int]:
-    return [SMPL_JOINTS.index(name) for name in names]
+    return [JOINT_NAMES.index(name) for name in names]
 
 
 _AXES = vertices_smpl_from_ros(np.array([*AXES.values()], np.float64))
@@ -63,7 +63,7 @@ def pose_of(angles: NDArray[np.float64]) -> NDArray[np.float64]:
     vectors = angles[:, None] * _AXES
     turns = quaternion_from_rotvec(vectors)
     limbs = turns[4:].reshape(4, 4, 4).swapaxes(0, 1)  # joint, limb, xyzw
-    pose = np.zeros((len(SMPL_JOINTS), 3))
+    pose = np.zeros((len(JOINT_NAMES), 3))
     pose[_SPINE] = vectors[0] / len(_SPINE)
     pose[_HEAD] = rotvec_from_quaternion(reduce(quaternion_product, turns[1:4])) / len(_HEAD)
     pose[_BALLS] = rotvec_from_quaternion(reduce(quaternion_product, [*limbs[:3], _REST]))

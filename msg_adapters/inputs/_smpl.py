@@ -7,16 +7,13 @@ precision of the arrays; only the names and sizes are relied on.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from msg_adapters.cdr import Buffer, CdrReader, CdrWriter
 from msg_adapters.definitions import message_definition
-from msg_adapters.errors import DecodeError
-from msg_adapters.inputs._frame import decoding, reading_fields, smpl_frame, stamp_ns_of
+from msg_adapters.errors import DecodeError, decoding
 from refu_core.frames import N_BETAS, N_JOINTS, SmplFrame
 
 MESSAGE_TYPE = "smpl_msgs/msg/Smpl"
@@ -56,11 +53,6 @@ def parse_layout(definition: str) -> Layout:
     return tuple(layout)
 
 
-def _frame(values: Mapping[str, NDArray[Any]], stamp_ns: int) -> SmplFrame:
-    pose = np.concatenate([values["global_orient"], values["body_pose"]])
-    return smpl_frame(pose, values["betas"], values["transl"], stamp_ns=stamp_ns)
-
-
 def bytes_decoder(definition: str | None = None) -> Callable[[Buffer], SmplFrame]:
     """A decoder of CDR bytes laid out as `definition` says (None: the published message)."""
     layout = parse_layout(definition or message_definition(MESSAGE_TYPE).text)
@@ -72,22 +64,10 @@ def bytes_decoder(definition: str | None = None) -> Callable[[Buffer], SmplFrame
             stamp_ns, _ = reader.fields("Ts")
             values = {name: reader.array(kind, size) for name, kind, size in layout}
             reader.finish()
-            return _frame(values, stamp_ns)
+            pose = np.concatenate([values["global_orient"], values["body_pose"]])
+            return SmplFrame(pose, values["betas"], values["transl"], stamp_ns=stamp_ns)
 
     return from_bytes
-
-
-def from_message(message: Any) -> SmplFrame:
-    """The frame of a message object."""
-    with decoding(MESSAGE_TYPE):
-        with reading_fields(message):
-            stamp_ns = stamp_ns_of(message.header)
-            values = {name: np.asarray(getattr(message, name), dtype=np.float64).reshape(-1) for name in _SIZES}
-        for name, size in _SIZES.items():
-            if values[name].size != size:
-                msg = f"{name} must have {size} numbers, got {values[name].size}"
-                raise DecodeError(msg)
-        return _frame(values, stamp_ns)
 
 
 def to_bytes(frame: SmplFrame, *, frame_id: str = "map") -> bytes:

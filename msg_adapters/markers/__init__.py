@@ -15,5 +15,6 @@ from msg_adapters.markers._encoder import MarkerArrayEncoder as MarkerArrayEncod
 from msg_adapters.markers._encoder import MarkerMesh as MarkerMesh
 from msg_adapters.markers._encoder import encode_delete as encode_delete
 from msg_adapters.markers._encoder import encode_lists as encode_lists
-from msg_adapters.markers._encoder import encode_points as encode_points
+from msg_adapters.markers._encoder import finite_points as finite_points
 from msg_adapters.markers._encoder import garment_namespace as garment_namespace
+from msg_adapters.markers._encoder import triangles as triangles

@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -36,6 +36,27 @@ def numbers(what: str, values: Any) -> NDArray[Any]:
     return array
 
 
+def finite_points(what: str, values: ArrayLike) -> NDArray[Any]:
+    """Points as an array of shape (K, 3), K > 0. Raises `EncodeError` for any other, and for what isn't finite."""
+    points = numbers(what, values)
+    if points.ndim != 2 or points.shape[1] != 3 or not len(points) or not np.isfinite(points).all():
+        msg = f"{what}: wanted finite points of shape (K, 3), K > 0, got {points.shape}"
+        raise EncodeError(msg)
+    return points
+
+
+def triangles(what: str, faces: ArrayLike, n_vertices: int) -> NDArray[np.integer[Any]]:
+    """Faces as an array of shape (F, 3), F > 0. Raises `EncodeError` for any other, and for vertices there are not."""
+    array = numbers(f"{what}: faces", faces)
+    if array.ndim != 2 or array.shape[1] != 3 or not len(array) or array.dtype.kind not in "iu":
+        msg = f"{what}: wanted faces of shape (F, 3) of integers, F > 0, got {array.shape} of {array.dtype}"
+        raise EncodeError(msg)
+    if array.min() < 0 or array.max() >= n_vertices:
+        msg = f"{what}: wanted face indices in [0, {n_vertices}), got {array.min()} ... {array.max()}"
+        raise EncodeError(msg)
+    return array
+
+
 def garment_namespace(garment: str, person: str = "") -> str:
     """Namespace of a garment's marker: `<person>/<garment>`, or the garment's name where there is one person."""
     return f"{person}/{garment}" if person else garment
@@ -49,28 +70,20 @@ class MarkerMesh:
     """
 
     ns: str
-    """Namespace; with `id` it names the marker."""
+    """Namespace; it names the marker, whose id is 0."""
     faces: NDArray[np.integer[Any]]
     """Vertex indices of the triangles, shape (F, 3), F > 0."""
     n_vertices: int
     """Number of vertices each frame will bring."""
     color: Rgba = CLOTH
     """Red, green, blue, alpha in [0, 1]."""
-    id: int = 0
 
     def __post_init__(self) -> None:
-        faces = numbers(f"{self.ns}: faces", self.faces)
-        if faces.ndim != 2 or faces.shape[1] != 3 or not len(faces) or not np.issubdtype(faces.dtype, np.integer):
-            msg = f"{self.ns}: wanted faces of shape (F, 3) of integers, F > 0, got {faces.shape} of {faces.dtype}"
-            raise EncodeError(msg)
-        if faces.min() < 0 or faces.max() >= self.n_vertices:
-            msg = f"{self.ns}: wanted face indices in [0, {self.n_vertices}), got {faces.min()} ... {faces.max()}"
-            raise EncodeError(msg)
-        color = numbers(f"{self.ns}: colour", self.color).astype(np.float64)
+        object.__setattr__(self, "faces", triangles(self.ns, self.faces, self.n_vertices))
+        color = numbers(f"{self.ns}: colour", self.color)
         if color.shape != (4,) or not ((color >= 0) & (color <= 1)).all():
             msg = f"{self.ns}: wanted a colour of 4 numbers in [0, 1] (red, green, blue, alpha), got {self.color}"
             raise EncodeError(msg)
-        object.__setattr__(self, "faces", faces)
 
 
 MARKER_ARRAY = "visualization_msgs/msg/MarkerArray"
@@ -81,35 +94,35 @@ ADD, DELETE, DELETE_ALL = 0, 2, 3
 _IDENTITY_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 _LEAD_BYTES = 4  # before the header, so that the payload, and with it every float64, lies on a multiple of 8
 _NO_COLOR: Rgba = (0.0, 0.0, 0.0, 0.0)
+_NO_POINTS = np.zeros((0, 3))
 
 
 def _write_marker(
     writer: CdrWriter,
     *,
-    key: tuple[str, int],
-    action: int,
+    ns: str,
     frame_id: str,
+    action: int = ADD,
     stamp_ns: int = 0,
     color: Rgba = _NO_COLOR,
-    n_points: int = 0,
+    points: NDArray[Any] = _NO_POINTS,
     kind: int = TRIANGLE_LIST,
     size: float = 1.0,
     lifetime_ns: int = 0,
     pose: Sequence[float] = _IDENTITY_POSE,
 ) -> tuple[int, int]:
     """Append one visualization_msgs/Marker; returns the payload offsets of its stamp and points."""
-    stamp_at = writer.fields("Tssiii", stamp_ns, frame_id, *key, kind, action)
+    stamp_at = writer.fields("Tssiii", stamp_ns, frame_id, ns, 0, kind, action)  # 0: id
     writer.fields("ddddddddddffff", *pose, size, size, size, *color)
     writer.fields("T?", lifetime_ns, False)  # frame_locked
-    writer.fields("I", n_points)
-    points_at = writer.array("f8", np.zeros(n_points * 3))
+    writer.fields("I", len(points))
+    points_at = writer.array("f8", points)
     writer.fields("IsTssI", 0, "", 0, "", "", 0)  # colors, texture_resource, texture
     writer.fields("IsssI?", 0, "", "", "", 0, False)  # uv_coordinates, text, mesh_resource, mesh_file and its materials
     return stamp_at, points_at
 
 
-@dataclass(frozen=True, eq=False)
-class _Slot:
+class _Slot(NamedTuple):
     """Where a marker's changing parts lie, as views into the message."""
 
     mesh: MarkerMesh
@@ -127,7 +140,7 @@ class MarkerArrayEncoder:
 
     One encoder serves one thread at a time. Viewers forget a mesh that isn't renewed for `lifetime_ns`; 0: never.
 
-    Raises `EncodeError` for no mesh at all, and for two meshes of one namespace and id.
+    Raises `EncodeError` for no mesh at all, and for two meshes of one namespace.
     """
 
     def __init__(
@@ -138,9 +151,9 @@ class MarkerArrayEncoder:
         axes: InputAxes = "smpl",
         lifetime_ns: int = 0,
     ) -> None:
-        keys = [(mesh.ns, mesh.id) for mesh in meshes]
-        if not keys or len(set(keys)) != len(keys):
-            msg = f"wanted meshes with distinct (namespace, id), got {keys}"
+        names = [mesh.ns for mesh in meshes]
+        if not names or len(set(names)) != len(names):
+            msg = f"wanted meshes with distinct namespaces, got {names}"
             raise EncodeError(msg)
         if axes not in SMPL_COLUMNS:
             msg = f"wanted axes {' or '.join(SMPL_COLUMNS)}, got {axes!r}"
@@ -148,16 +161,9 @@ class MarkerArrayEncoder:
         self._columns = SMPL_COLUMNS[axes]
         writer = CdrWriter()
         writer.fields("I", len(meshes))
+        options: dict[str, Any] = {"frame_id": frame_id, "lifetime_ns": lifetime_ns}
         places = [
-            _write_marker(
-                writer,
-                key=(mesh.ns, mesh.id),
-                action=ADD,
-                frame_id=frame_id,
-                color=mesh.color,
-                n_points=mesh.faces.size,
-                lifetime_ns=lifetime_ns,
-            )
+            _write_marker(writer, ns=mesh.ns, color=mesh.color, points=np.zeros((mesh.faces.size, 3)), **options)
             for mesh in meshes
         ]
         blank = writer.to_bytes()
@@ -167,18 +173,11 @@ class MarkerArrayEncoder:
         self._message[:] = np.frombuffer(blank, np.uint8)
         payload = self._message[HEADER_BYTES:]
         self._payload = payload.data
-        self._slots = tuple(self._slot(mesh, payload, *place) for mesh, place in zip(meshes, places, strict=True))
-
-    @staticmethod
-    def _slot(mesh: MarkerMesh, payload: NDArray[np.uint8], stamp_at: int, points_at: int) -> _Slot:
-        corners = np.ascontiguousarray(mesh.faces, dtype=np.intp).reshape(-1)
-        return _Slot(
-            mesh=mesh,
-            corners=corners,
-            stamp_at=stamp_at,
-            points=payload[points_at : points_at + corners.size * 24].view("<f8").reshape(-1, 3),
-            placed=np.empty((mesh.n_vertices, 3)),
-        )
+        self._slots = []
+        for mesh, (stamp_at, points_at) in zip(meshes, places, strict=True):
+            corners = np.ascontiguousarray(mesh.faces, dtype=np.intp).reshape(-1)
+            points = payload[points_at : points_at + corners.size * 24].view("<f8").reshape(-1, 3)
+            self._slots.append(_Slot(mesh, corners, stamp_at, points, np.empty((mesh.n_vertices, 3))))
 
     def encode(
         self,
@@ -187,16 +186,13 @@ class MarkerArrayEncoder:
         stamp_ns: int | Sequence[int],
         transl: ArrayLike | None = None,
     ) -> bytes:
-        """One frame.
+        """One frame. Raises `EncodeError` for a wrong shape, a vertex that isn't finite, a stamp that fits no ROS time.
 
         Args:
             vertices: for each mesh its vertices [m], shape (V, 3), float32 or float64, in SMPL axes (or, with
                 `axes="frame"`, in the axes of the frame).
             stamp_ns: time of the measurement [ns], of all meshes or of each.
             transl: added in float64 [m], in the same axes: shape (3,) for all meshes or (M, 3) for each.
-
-        Raises:
-            EncodeError: a shape is wrong, a vertex isn't finite, or the stamp doesn't fit a ROS time.
         """
         n = len(self._slots)
         if len(vertices) != n:
@@ -239,32 +235,6 @@ class MarkerArrayEncoder:
         np.take(slot.placed, slot.corners, axis=0, out=slot.points, mode="clip")
 
 
-def encode_points(
-    points: ArrayLike,
-    *,
-    ns: str,
-    stamp_ns: int,
-    frame_id: str = "map",
-    color: Rgba = CLOTH,
-    size: float = 0.004,
-) -> bytes:
-    """A MarkerArray with one marker of type POINTS: a mesh's vertices alone, a sixth of what its triangles take.
-
-    Args:
-        points: in the axes of `frame_id` [m], shape (V, 3).
-        ns: namespace; the id is 0.
-        stamp_ns: time of the measurement [ns].
-        frame_id: of the header.
-        color: red, green, blue, alpha.
-        size: width of the squares that viewers draw [m].
-
-    Raises:
-        EncodeError: points of another shape, not finite, none at all, or a stamp that doesn't fit a ROS time.
-    """
-    lists = [(ns, stamp_ns, _IDENTITY_POSE, numbers(ns, points).astype(np.float64))]
-    return encode_lists(POINTS, lists, frame_id=frame_id, color=color, size=size)
-
-
 def encode_lists(
     kind: int,
     lists: Sequence[tuple[str, int, Sequence[float], NDArray[np.float64]]],
@@ -274,55 +244,30 @@ def encode_lists(
     size: float,
     lifetime_ns: int = 0,
 ) -> bytes:
-    """A MarkerArray with a marker each, of the type `kind`.
+    """A MarkerArray with a marker each, of the type `kind`: `LINE_STRIP` or `POINTS`, `size` [m] wide.
 
-    Args:
-        kind: `LINE_STRIP` or `POINTS`.
-        lists: namespace (the id is 0), stamp [ns], pose as position [m] and quaternion xyzw, and the points in that
-            pose [m], shape (K, 3).
-        frame_id: of the headers.
-        color: red, green, blue, alpha.
-        size: width of the lines or points [m].
-        lifetime_ns: viewers forget a marker that isn't renewed for so long; 0: never.
-
-    Raises:
-        EncodeError: points of another shape, not finite, none at all, or a stamp that doesn't fit a ROS time.
-    """
-    writer, points_at = CdrWriter(), []
-    writer.fields("I", len(lists))
-    for ns, stamp_ns, pose, points in lists:
-        is_finite = np.isfinite(points).all() and np.isfinite(pose).all()
-        if points.ndim != 2 or points.shape[1] != 3 or not len(points) or not is_finite:
-            msg = f"{ns}: wanted finite points of shape (K, 3), K > 0, in a finite pose, got {points.shape}"
-            raise EncodeError(msg)
-        _, at = _write_marker(
-            writer,
-            key=(ns, 0),
-            action=ADD,
-            frame_id=frame_id,
-            stamp_ns=stamp_ns,
-            color=color,
-            n_points=len(points),
-            kind=kind,
-            size=size,
-            lifetime_ns=lifetime_ns,
-            pose=pose,
-        )
-        points_at.append(at)
-    message = bytearray(writer.to_bytes())
-    for at, (*_, points) in zip(points_at, lists, strict=True):
-        data = points.astype("<f8").tobytes()
-        message[HEADER_BYTES + at : HEADER_BYTES + at + len(data)] = data
-    return bytes(message)
-
-
-def encode_delete(keys: Sequence[tuple[str, int]], *, stamp_ns: int, frame_id: str = "map") -> bytes:
-    """A MarkerArray that removes the markers named by (namespace, id): a person has left.
-
-    Raises `EncodeError` when an id or the stamp doesn't fit the message.
+    Each of `lists` is a namespace, a stamp [ns], a pose as position [m] and quaternion xyzw, and the points in that
+    pose [m], shape (K, 3). Raises `EncodeError` where these, or the stamp, can't be in a message.
     """
     writer = CdrWriter()
-    writer.fields("I", len(keys))
-    for key in keys:
-        _write_marker(writer, key=key, action=DELETE, frame_id=frame_id, stamp_ns=stamp_ns)
+    writer.fields("I", len(lists))
+    options: dict[str, Any] = {"frame_id": frame_id, "color": color, "kind": kind, "size": size}
+    options["lifetime_ns"] = lifetime_ns
+    for ns, stamp_ns, pose, points in lists:
+        if not np.isfinite(pose).all():
+            msg = f"{ns}: wanted a finite pose, got {pose}"
+            raise EncodeError(msg)
+        _write_marker(writer, ns=ns, stamp_ns=stamp_ns, points=finite_points(ns, points), pose=pose, **options)
+    return writer.to_bytes()
+
+
+def encode_delete(names: Sequence[str], *, stamp_ns: int, frame_id: str = "map") -> bytes:
+    """A MarkerArray that removes the markers of these namespaces: a person has left.
+
+    Raises `EncodeError` when the stamp doesn't fit the message.
+    """
+    writer = CdrWriter()
+    writer.fields("I", len(names))
+    for ns in names:
+        _write_marker(writer, ns=ns, action=DELETE, frame_id=frame_id, stamp_ns=stamp_ns)
     return writer.to_bytes()

@@ -8,21 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from msg_adapters.cdr import CdrWriter
 from msg_adapters.errors import EncodeError
-from msg_adapters.markers import MarkerMesh
+from msg_adapters.markers import MarkerMesh, finite_points, triangles
 from msg_adapters.rotations import quaternion_from_matrix
 from msg_adapters.transforms import Placement
 
 MESH = "shape_msgs/msg/Mesh"
 COLLISION_OBJECT = "moveit_msgs/msg/CollisionObject"
-Operation = Literal["add", "remove", "append", "move"]
-_OPERATIONS: dict[Operation, int] = {"add": 0, "remove": 1, "append": 2, "move": 3}
+_ADD, _REMOVE = 0, 1
 
 
 def encode_mesh(vertices: ArrayLike, faces: ArrayLike) -> bytes:
@@ -37,7 +35,6 @@ def encode_mesh(vertices: ArrayLike, faces: ArrayLike) -> bytes:
 
 def encode_collision_object(
     name: str,
-    operation: Operation,
     *,
     stamp_ns: int,
     frame_id: str = "map",
@@ -49,21 +46,15 @@ def encode_collision_object(
 
     Args:
         name: the object's id.
-        operation: `add` puts it in, in the place of one of that name; `move` sets the pose of one that is there, and
-            has no mesh; `remove` takes it out.
         stamp_ns: time of the measurement [ns].
         frame_id: of the header.
         placement: of the object in that frame.
-        mesh: vertices relative to the object [m], shape (V, 3), and triangles, shape (F, 3); for `add` and `append`.
+        mesh: vertices relative to the object [m], shape (V, 3), and triangles, shape (F, 3), that are put in, in the
+            place of an object of that name; where there is none, the object is taken out.
         subframes: of the object, relative to it, by name; MoveIt plans to `<object>/<name>`.
 
-    Raises:
-        EncodeError: no such operation, a mesh that is missing, one too many, or one that can't be.
+    Raises `EncodeError` for a mesh that can't be.
     """
-    if operation not in _OPERATIONS or (mesh is not None) != (operation in ("add", "append")):
-        what = "a mesh" if mesh is not None else "no mesh"
-        msg = f"wanted add or append with a mesh, or move or remove without one, got {operation!r} with {what}"
-        raise EncodeError(msg)
     writer = CdrWriter()
     frames = subframes or {}
     writer.fields("Ts", stamp_ns, frame_id)
@@ -81,7 +72,7 @@ def encode_collision_object(
     writer.fields("I", len(frames))
     for frame in frames.values():
         _pose(writer, frame)
-    writer.fields("B", _OPERATIONS[operation])
+    writer.fields("B", _REMOVE if mesh is None else _ADD)
     return writer.to_bytes()
 
 
@@ -91,17 +82,8 @@ def _pose(writer: CdrWriter, placement: Placement) -> None:
 
 
 def _mesh(writer: CdrWriter, vertices: ArrayLike, faces: ArrayLike) -> None:
-    points, triangles = np.asarray(vertices), np.asarray(faces)
-    if points.ndim != 2 or points.shape[1:] != (3,) or not np.isfinite(points).all():
-        msg = f"wanted finite vertices of shape (V, 3), got {points.shape}"
-        raise EncodeError(msg)
-    if triangles.ndim != 2 or triangles.shape[1:] != (3,) or triangles.dtype.kind not in "iu" or not len(triangles):
-        msg = f"wanted triangles of shape (F, 3) of integers, F > 0, got {triangles.dtype} of shape {triangles.shape}"
-        raise EncodeError(msg)
-    if triangles.min() < 0 or triangles.max() >= len(points):
-        msg = f"wanted triangles of vertices 0 to {len(points) - 1}, got {triangles.min()} to {triangles.max()}"
-        raise EncodeError(msg)
-    writer.sequence("u4", triangles)
+    points = finite_points("mesh", vertices)
+    writer.sequence("u4", triangles("mesh", faces, len(points)))
     writer.sequence("f8", points)
 
 
@@ -141,21 +123,17 @@ def encode_scene(
         writer.fields("TBs", stamp_ns, _MATCHING_ID, name)
     writer.fields("I", len(entities))
     for one in entities:
-        _write(writer, one, frame_id, lifetime_ns)
+        mesh, vertices = one.mesh, finite_points(one.mesh.ns, one.vertices)
+        if len(vertices) != mesh.n_vertices:
+            msg = f"{mesh.ns}: wanted {mesh.n_vertices} vertices, got {len(vertices)}"
+            raise EncodeError(msg)
+        writer.fields("TssT?", one.stamp_ns, frame_id, mesh.ns, lifetime_ns, False)  # frame_locked
+        writer.fields("IIIIII", *[0] * 6)  # metadata, arrows, cubes, spheres, cylinders, lines
+        writer.fields("I", 1)
+        writer.array("f8", [*one.position, *_IDENTITY])
+        writer.sequence("f8", vertices)
+        writer.array("f8", mesh.color)
+        writer.fields("I", 0)  # colors
+        writer.sequence("u4", mesh.faces.ravel())
+        writer.fields("II", 0, 0)  # texts, models
     return writer.to_bytes()
-
-
-def _write(writer: CdrWriter, one: Entity, frame_id: str, lifetime_ns: int) -> None:
-    mesh, vertices = one.mesh, one.vertices
-    if vertices.shape != (mesh.n_vertices, 3) or not np.isfinite(vertices).all():
-        msg = f"{mesh.ns}: wanted finite vertices of shape ({mesh.n_vertices}, 3), got {vertices.shape}"
-        raise EncodeError(msg)
-    writer.fields("TssT?", one.stamp_ns, frame_id, mesh.ns, lifetime_ns, False)  # frame_locked
-    writer.fields("IIIIII", *[0] * 6)  # metadata, arrows, cubes, spheres, cylinders, lines
-    writer.fields("I", 1)
-    writer.array("f8", [*one.position, *_IDENTITY])
-    writer.sequence("f8", vertices)
-    writer.array("f8", mesh.color)
-    writer.fields("I", 0)  # colors
-    writer.sequence("u4", mesh.faces.ravel())
-    writer.fields("II", 0, 0)  # texts, models

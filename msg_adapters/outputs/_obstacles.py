@@ -5,19 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from msg_adapters.markers import garment_namespace
 from msg_adapters.outputs._meshes import COLLISION_OBJECT, encode_collision_object
-from msg_adapters.outputs._topics import is_due
+from msg_adapters.outputs._topics import Output, is_due
 from msg_adapters.transforms import Placement
 
 if TYPE_CHECKING:
-    from msg_adapters.outputs._topics import Messages, Moment, Wishes
+    from msg_adapters.outputs._topics import Messages, Moment
     from refu_core.outputs import Dressed, Fittings
 
 
-class Obstacles:
+class Obstacles(Output):
     """Garments as MoveIt has obstacles: each message puts one in, whole, in the place of the one that was there.
 
     So it doesn't matter who has missed what, or has begun anew: to `move` what isn't there would be an error. What
@@ -40,43 +38,36 @@ class Obstacles:
         if not all(_is_prepared(one.fittings, name) for one in worn for name in one.fittings.names):
             return  # soon
         for one in worn:
-            if not is_due(self._due, one.person, moment.wishes):
+            if not is_due(self._due, one.person, moment):
                 continue
             garments = [name for name in one.fittings.names if name not in one.fittings.without_planner]
             names = [garment_namespace(name, one.person) for name in garments]
-            for name in self._sent.get(one.person, ()):
-                if name not in names:
-                    yield self.topic, self._remove(name, moment)
+            yield from self._remove([name for name in self._sent.get(one.person, ()) if name not in names], moment)
             self._sent[one.person] = names
             for name, garment in zip(names, garments, strict=True):
-                yield self.topic, self._put(one, name, garment, moment.wishes)
-
-    @staticmethod
-    def _put(one: Dressed, name: str, garment: str, wishes: Wishes) -> bytes:
-        subframes = {opening.name: Placement(opening.rotation, opening.centre) for opening in one.openings[garment]}
-        return encode_collision_object(
-            name,
-            "add",
-            stamp_ns=one.stamp_ns,
-            frame_id=wishes.frame_id,
-            placement=Placement(np.eye(3), one.offset),
-            mesh=one.solid(garment),
-            subframes=subframes,
-        )
-
-    @staticmethod
-    def _remove(name: str, moment: Moment) -> bytes:
-        frame_id = moment.wishes.frame_id
-        return encode_collision_object(name, "remove", stamp_ns=moment.now_ns, frame_id=frame_id)
+                openings = {
+                    opening.name: Placement(opening.rotation, opening.centre) for opening in one.openings[garment]
+                }
+                yield (
+                    self.topic,
+                    encode_collision_object(
+                        name,
+                        stamp_ns=one.stamp_ns,
+                        frame_id=moment.frame_id,
+                        placement=Placement(translation=one.offset),
+                        mesh=one.solid(garment),
+                        subframes=openings,
+                    ),
+                )
 
     def gone(self, persons: Sequence[str], moment: Moment) -> Messages:
         for person in persons:
             self._due.pop(person, None)
-            for name in self._sent.pop(person, ()):
-                yield self.topic, self._remove(name, moment)
+            yield from self._remove(self._sent.pop(person, ()), moment)
 
-    def forget(self) -> None:
-        """Nothing: what has gone is seen by its name."""
+    def _remove(self, names: Iterable[str], moment: Moment) -> Messages:
+        for name in names:
+            yield self.topic, encode_collision_object(name, stamp_ns=moment.now_ns, frame_id=moment.frame_id)
 
 
 def _is_prepared(fittings: Fittings, garment: str) -> bool:

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from msg_adapters.cdr import CdrWriter
-from msg_adapters.errors import EncodeError
-from msg_adapters.markers import LINE_STRIP, encode_lists
+from msg_adapters.markers import LINE_STRIP, encode_lists, finite_points
 from msg_adapters.rotations import quaternion_from_matrix
 from msg_adapters.transforms import Transform, encode_transforms
 
@@ -39,13 +38,9 @@ def encode_polygon(ring: ArrayLike, *, stamp_ns: int, frame_id: str = "map") -> 
 
     Raises `EncodeError` for points that aren't finite or of another shape, and a stamp that doesn't fit a ROS time.
     """
-    points = np.asarray(ring, np.float64)
-    if points.ndim != 2 or points.shape[1:] != (3,) or not np.isfinite(points).all():
-        msg = f"wanted finite points of shape (K, 3), got {points.shape}"
-        raise EncodeError(msg)
     writer = CdrWriter()
     writer.fields("Ts", stamp_ns, frame_id)
-    writer.sequence("f4", points)
+    writer.sequence("f4", finite_points("polygon", ring))
     return writer.to_bytes()
 
 

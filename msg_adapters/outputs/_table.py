@@ -13,7 +13,7 @@ from msg_adapters.outputs._meshes import MESH, SCENE_UPDATE, Entity, encode_mesh
 from msg_adapters.outputs._obstacles import Obstacles
 from msg_adapters.outputs._points import POINT_CLOUD, POINT_FIELDS, PointCloudEncoder
 from msg_adapters.outputs._rims import POLYGON, Rim, encode_frames, encode_polygon, encode_rims
-from msg_adapters.outputs._topics import Apart, Layouts, Moment, Output, Together, Wishes
+from msg_adapters.outputs._topics import Apart, Layouts, Moment, Output, Together
 from msg_adapters.transforms import TF_MESSAGE
 
 if TYPE_CHECKING:
@@ -54,15 +54,16 @@ def _rims_of(one: Dressed) -> list[Rim]:
 
 def _markers(
     meshes: Callable[[Dressed], list[MarkerMesh]], vertices: Callable[[Dressed], list[Any]]
-) -> Callable[[Sequence[Dressed], Wishes, Layouts], bytes]:
-    def encode(worn: Sequence[Dressed], wishes: Wishes, layouts: Layouts) -> bytes:
+) -> Callable[[Sequence[Dressed], Moment, Layouts], bytes]:
+    def encode(worn: Sequence[Dressed], moment: Moment, layouts: Layouts) -> bytes:
+        frame_id, lifetime_ns = moment.frame_id, moment.lifetime_ns
+
         def make() -> MarkerArrayEncoder:
             every = [mesh for one in worn for mesh in meshes(one)]
-            return MarkerArrayEncoder(every, frame_id=wishes.frame_id, axes="frame", lifetime_ns=wishes.lifetime_ns)
+            return MarkerArrayEncoder(every, frame_id=frame_id, axes="frame", lifetime_ns=lifetime_ns)
 
-        key = tuple(one.person for one in worn), wishes.frame_id, wishes.lifetime_ns
         arrays = [vertices(one) for one in worn]
-        data: bytes = layouts.get(key, make).encode(
+        data: bytes = layouts.get((tuple(one.person for one in worn), frame_id, lifetime_ns), make).encode(
             [points for own in arrays for points in own],
             stamp_ns=[one.stamp_ns for one, own in zip(worn, arrays, strict=True) for _ in own],
             transl=[one.offset for one, own in zip(worn, arrays, strict=True) for _ in own],
@@ -73,74 +74,53 @@ def _markers(
 
 
 def _delete_markers(names: Sequence[str], moment: Moment) -> bytes:
-    frame_id = moment.wishes.frame_id
-    return encode_delete([(name, 0) for name in names], stamp_ns=moment.now_ns, frame_id=frame_id)
+    return encode_delete(names, stamp_ns=moment.now_ns, frame_id=moment.frame_id)
 
 
 def _garment_names(one: Dressed) -> list[str]:
     return [garment_namespace(name, one.person) for name in one.fittings.names]
 
 
-def _rim_names(one: Dressed) -> list[str]:
-    return [
-        f"{garment_namespace(name, one.person)}/{opening}"
-        for name in one.fittings.names
-        for opening in one.fittings.openings(name).names
-    ]
-
-
-def _encode_rims(worn: Sequence[Dressed], wishes: Wishes, layouts: Layouts) -> bytes:  # noqa: ARG001
+def _encode_rims(worn: Sequence[Dressed], moment: Moment, _: Layouts) -> bytes:
     rims = [rim for one in worn for rim in _rims_of(one)]
-    return encode_rims(rims, frame_id=wishes.frame_id, lifetime_ns=wishes.lifetime_ns)
+    return encode_rims(rims, frame_id=moment.frame_id, lifetime_ns=moment.lifetime_ns)
 
 
-def _encode_scene(worn: Sequence[Dressed], wishes: Wishes, layouts: Layouts) -> bytes:
+def _encode_scene(worn: Sequence[Dressed], moment: Moment, layouts: Layouts) -> bytes:
     entities = [
-        Entity(
-            layouts.get((one.person, name), partial(_mesh_of, one, name)),
-            points,
-            one.offset,
-            one.stamp_ns,
-        )
+        Entity(layouts.get((one.person, name), partial(_mesh_of, one, name)), points, one.offset, one.stamp_ns)
         for one in worn
         for name, points in one.vertices.items()
     ]
-    return encode_scene(entities, frame_id=wishes.frame_id, lifetime_ns=wishes.lifetime_ns)
+    return encode_scene(entities, frame_id=moment.frame_id, lifetime_ns=moment.lifetime_ns)
 
 
 def _delete_entities(names: Sequence[str], moment: Moment) -> bytes:
-    frame_id = moment.wishes.frame_id
-    return encode_scene([], deleted=names, stamp_ns=moment.now_ns, frame_id=frame_id)
+    return encode_scene([], deleted=names, stamp_ns=moment.now_ns, frame_id=moment.frame_id)
 
 
-def _encode_tf(worn: Sequence[Dressed], wishes: Wishes, layouts: Layouts) -> bytes:  # noqa: ARG001
-    return encode_frames([rim for one in worn for rim in _rims_of(one)], frame_id=wishes.frame_id)
+def _encode_tf(worn: Sequence[Dressed], moment: Moment, _: Layouts) -> bytes:
+    return encode_frames([rim for one in worn for rim in _rims_of(one)], frame_id=moment.frame_id)
 
 
-class _Points:
-    """A message of one person's garments, laid out once."""
-
-    def __init__(self) -> None:
-        self._layouts = Layouts()
-
-    def encode(self, one: Dressed, _: Any, wishes: Wishes) -> bytes:
-        fields = [name for name in POINT_FIELDS if name in wishes.points_fields and (name != "visible" or one.camera)]
-        counts = tuple(len(points) for points in one.vertices.values())
-        key = counts, wishes.frame_id, tuple(fields)
-        encoder: PointCloudEncoder = self._layouts.get(
-            key, lambda: PointCloudEncoder(counts, frame_id=wishes.frame_id, fields=fields)
-        )
-        ways: dict[str, Callable[[], Any]] = {"clearance": one.clearance, "sigma": one.sigma, "visible": one.visible}
-        return encoder.encode(
-            [*one.vertices.values()],
-            stamp_ns=one.stamp_ns,
-            offset=one.offset,
-            normals=one.normals() if "normal" in fields else None,
-            values={name: make() for name, make in ways.items() if name in fields},
-        )
+def _encode_points(layouts: Layouts, one: Dressed, _: Any, moment: Moment) -> bytes:
+    fields = [name for name in POINT_FIELDS if name in moment.points_fields and (name != "visible" or one.camera)]
+    counts = tuple(len(points) for points in one.vertices.values())
+    encoder: PointCloudEncoder = layouts.get(
+        (counts, moment.frame_id, tuple(fields)),
+        lambda: PointCloudEncoder(counts, frame_id=moment.frame_id, fields=fields),
+    )
+    ways: dict[str, Callable[[], Any]] = {
+        "normal": one.normals,
+        "clearance": one.clearance,
+        "sigma": one.sigma,
+        "visible": one.visible,
+    }
+    values = {name: make() for name, make in ways.items() if name in fields}
+    return encoder.encode([*one.vertices.values()], stamp_ns=one.stamp_ns, offset=one.offset, values=values)
 
 
-def _encode_contacts(one: Dressed, _: Any, wishes: Wishes) -> bytes:
+def _encode_contacts(one: Dressed, _: Any, moment: Moment) -> bytes:
     """A status each two parts: geometry, from which no force follows."""
     statuses = []
     for contact in one.contacts():
@@ -150,7 +130,7 @@ def _encode_contacts(one: Dressed, _: Any, wishes: Wishes) -> bytes:
         values = {name: f"{value:.6f}" for name, value in numbers.items()}
         text = "cloth pressed between them, by geometry: not a force"
         statuses.append(DiagnosticStatus(OK, " / ".join(contact.parts), text, one.person, values))
-    return encode_diagnostics(statuses, stamp_ns=one.stamp_ns, frame_id=wishes.frame_id)
+    return encode_diagnostics(statuses, stamp_ns=one.stamp_ns, frame_id=moment.frame_id)
 
 
 def _opening_places(fittings: Fittings) -> Iterator[tuple[str, tuple[str, int]]]:
@@ -159,17 +139,17 @@ def _opening_places(fittings: Fittings) -> Iterator[tuple[str, tuple[str, int]]]
             yield f"{OPENINGS}/{_token(name)}/{opening}", (name, i)
 
 
-def _encode_polygon(one: Dressed, place: tuple[str, int], wishes: Wishes) -> bytes:
+def _encode_polygon(one: Dressed, place: tuple[str, int], moment: Moment) -> bytes:
     name, i = place
     ring = one.openings[name][i].ring + one.offset
-    return encode_polygon(ring, stamp_ns=one.stamp_ns, frame_id=wishes.frame_id)
+    return encode_polygon(ring, stamp_ns=one.stamp_ns, frame_id=moment.frame_id)
 
 
 def _mesh_places(fittings: Fittings) -> list[tuple[str, str]]:
     return [(f"mesh/{_token(name)}", name) for name in fittings.names]
 
 
-def _encode_mesh(one: Dressed, name: str, wishes: Wishes) -> bytes:  # noqa: ARG001 - a mesh has no header
+def _encode_mesh(one: Dressed, name: str, moment: Moment) -> bytes:  # noqa: ARG001 - a mesh has no header
     vertices, faces = one.solid(name)
     return encode_mesh(vertices + one.offset, faces)
 
@@ -183,9 +163,11 @@ def make_outputs(*, tf: bool = False) -> list[Output]:
     table: list[Output] = [
         Together(GARMENTS, MARKER_ARRAY, _garment_names, garments, _delete_markers),
         Together(BODY, MARKER_ARRAY, lambda one: [garment_namespace("body", one.person)], body, _delete_markers),
-        Together(OPENINGS, MARKER_ARRAY, _rim_names, _encode_rims, _delete_markers),
+        Together(
+            OPENINGS, MARKER_ARRAY, lambda one: [rim.name for rim in _rims_of(one)], _encode_rims, _delete_markers
+        ),
         Together("scene", SCENE_UPDATE, _garment_names, _encode_scene, _delete_entities),
-        Apart(POINT_CLOUD, lambda _: [("points", None)], _Points().encode),
+        Apart(POINT_CLOUD, lambda _: [("points", None)], partial(_encode_points, Layouts())),
         Apart(DIAGNOSTIC_ARRAY, lambda _: [("contacts", None)], _encode_contacts),
         Apart(POLYGON, _opening_places, _encode_polygon),
         Apart(MESH, _mesh_places, _encode_mesh, slow=True),

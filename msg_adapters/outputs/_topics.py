@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from msg_adapters.markers import garment_namespace
 
 if TYPE_CHECKING:
     from refu_core.outputs import Dressed, Fittings
@@ -16,55 +18,41 @@ Messages = Iterator[tuple[str, bytes]]
 """Topics, and what is to be sent there."""
 
 
-class Wishes(Protocol):
-    """How everything is to be sent."""
-
-    @property
-    def frame_id(self) -> str:
-        """Of every header."""
-
-    @property
-    def lifetime_ns(self) -> int:
-        """Viewers forget what isn't renewed for so long [ns]; 0: never."""
-
-    @property
-    def points_fields(self) -> Sequence[str]:
-        """What points have besides their place, of `POINT_FIELDS`."""
-
-    @property
-    def planner_rate(self) -> float:
-        """Meshes for planners, at most so many a second; 0 for no limit [Hz]."""
-
-
 class Moment(NamedTuple):
     """What an output has to know besides the people."""
 
-    wishes: Wishes
+    frame_id: str
+    """Of every header."""
+    lifetime_ns: int
+    """Viewers forget what isn't renewed for so long [ns]; 0: never."""
+    points_fields: Sequence[str]
+    """What points have besides their place, of `POINT_FIELDS`."""
+    planner_rate: float
+    """Meshes for planners, at most so many a second; 0 for no limit [Hz]."""
     watchers: Callable[[str], int]
     """How many want a topic."""
     now_ns: int
 
 
-class Output(Protocol):
+class Output:
     """One row of the table."""
 
     message_type: str
 
     def topics(self, persons: Iterable[str], fittings: Fittings | None) -> list[str]:
         """Where it goes for these people in these garments; None: before anything is known of them."""
+        raise NotImplementedError
 
     def messages(self, worn: Sequence[Dressed], moment: Moment) -> Messages:
         """What is to be sent of one tick, and where; nothing is computed for a topic that nobody wants."""
+        raise NotImplementedError
 
-    def gone(self, persons: Sequence[str], moment: Moment) -> Messages:
+    def gone(self, persons: Sequence[str], moment: Moment) -> Messages:  # noqa: ARG002
         """What tells viewers that somebody has left."""
+        return iter(())
 
     def forget(self) -> None:
         """Other garments are worn from now on, or other people wear them."""
-
-
-def _topic_of(person: str, place: str) -> str:
-    return f"{person}/{place}" if person else place
 
 
 class Layouts:
@@ -84,7 +72,7 @@ class Layouts:
         self._known.clear()
 
 
-class Together:
+class Together(Output):
     """One message of all people on one topic, in which each thing has a name: viewers are told which of them have gone.
 
     Args:
@@ -99,7 +87,7 @@ class Together:
         topic: str,
         message_type: str,
         names: Callable[[Dressed], Sequence[str]],
-        encode: Callable[[Sequence[Dressed], Wishes, Layouts], bytes],
+        encode: Callable[[Sequence[Dressed], Moment, Layouts], bytes],
         delete: Callable[[Sequence[str], Moment], bytes],
     ) -> None:
         self.topic, self.message_type = topic, message_type
@@ -113,7 +101,7 @@ class Together:
     def messages(self, worn: Sequence[Dressed], moment: Moment) -> Messages:
         if not moment.watchers(self.topic):
             return
-        yield self.topic, self._encode(worn, moment.wishes, self._layouts)
+        yield self.topic, self._encode(worn, moment, self._layouts)
         for one in worn:
             names = self._names(one)
             left = sorted(set(self._shown.get(one.person, ())) - set(names))
@@ -131,7 +119,7 @@ class Together:
 
 
 @dataclass
-class Apart:
+class Apart(Output):
     """A topic for each person, and for each part of what they wear: nobody has to be told that it has gone.
 
     Args:
@@ -143,38 +131,33 @@ class Apart:
 
     message_type: str
     places: Callable[[Fittings], Iterable[tuple[str, Any]]]
-    encode: Callable[[Dressed, Any, Wishes], bytes]
+    encode: Callable[[Dressed, Any, Moment], bytes]
     slow: bool = False
-
-    def __post_init__(self) -> None:
-        self._due: dict[str, float] = {}
+    due: dict[str, float] = field(default_factory=dict)
+    """When each topic of planners' meshes is next."""
 
     def topics(self, persons: Iterable[str], fittings: Fittings | None) -> list[str]:
         if fittings is None:
             return []
-        return [_topic_of(person, place) for person in persons for place, _ in self.places(fittings)]
+        return [garment_namespace(place, person) for person in persons for place, _ in self.places(fittings)]
 
     def messages(self, worn: Sequence[Dressed], moment: Moment) -> Messages:
         for one in worn:
             for place, what in self.places(one.fittings):
-                topic = _topic_of(one.person, place)
-                if moment.watchers(topic) and (not self.slow or self._is_due(one, what, topic, moment)):
-                    yield topic, self.encode(one, what, moment.wishes)
-
-    def _is_due(self, one: Dressed, garment: str, topic: str, moment: Moment) -> bool:
-        return one.fittings.has_planner(garment) and is_due(self._due, topic, moment.wishes)
-
-    def gone(self, persons: Sequence[str], moment: Moment) -> Messages:  # noqa: ARG002
-        return iter(())
+                topic = garment_namespace(place, one.person)
+                if not moment.watchers(topic):
+                    continue
+                if not self.slow or (one.fittings.has_planner(what) and is_due(self.due, topic, moment)):
+                    yield topic, self.encode(one, what, moment)
 
     def forget(self) -> None:
-        self._due.clear()
+        self.due.clear()
 
 
-def is_due(due: dict[str, float], key: str, wishes: Wishes) -> bool:
+def is_due(due: dict[str, float], key: str, moment: Moment) -> bool:
     """Whether so much time has gone by; if so, it begins anew."""
     now = time.monotonic()
     if now < due.get(key, 0.0):
         return False
-    due[key] = now + (1 / wishes.planner_rate if wishes.planner_rate else 0.0)
+    due[key] = now + (1 / moment.planner_rate if moment.planner_rate else 0.0)
     return True

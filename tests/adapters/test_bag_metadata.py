@@ -117,7 +117,7 @@ def decode_bag(file: Path) -> dict[str, Any]:
 
 def write_bag(path: Path) -> Path:
     with BagWriter(path) as bag:
-        for name, qos in (("/a", QosProfile()), ("/b", QosProfile("best_effort", "transient_local", "keep_all", 1))):
+        for name, qos in (("/a", QosProfile()), ("/b", QosProfile("best_effort", 1))):
             bag.add_topic(name, INPUT_TYPES["multiarray"], qos=qos)
             bag.write(name, encoder_for("multiarray")(SmplFrame([0.0] * 72)), log_time_ns=7)
     return bag.file_path

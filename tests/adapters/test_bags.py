@@ -33,7 +33,6 @@ from msg_adapters import (
     MarkerArrayEncoder,
     MarkerMesh,
     QosProfile,
-    decoder_for,
     encode_diagnostics,
     encoder_for,
     iter_smpl_frames,
@@ -61,7 +60,7 @@ def frame(i: int) -> SmplFrame:
 def write_bag(path: Path, *, input_type: str = "joint_state", count: int = 40, **options: Any) -> Path:
     encode = encoder_for(input_type)
     with BagWriter(path, **options) as bag:
-        bag.add_topic(TOPIC, INPUT_TYPES[input_type])  # type: ignore[index]
+        bag.add_topic(TOPIC, INPUT_TYPES[input_type])
         for i in range(count):
             bag.write(TOPIC, encode(frame(i)), log_time_ns=frame(i).stamp_ns + 5)
     return bag.file_path
@@ -89,9 +88,8 @@ def test_mcap_ros2_decodes_every_message(every_type: Path) -> None:
         decoded = make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
         messages = {channel.topic: message for _, channel, _, message in decoded}
     assert len(messages) == len(INPUT_TYPES) + 2
-    for name in INPUT_TYPES:
-        read = decoder_for(name).from_message(messages[f"/in/{name}"])
-        np.testing.assert_allclose(read.pose, frame(1).pose, atol=1e-6)
+    names, position = messages["/in/joint_state"].name, messages["/in/joint_state"].position
+    np.testing.assert_array_equal(position[names.index("left_hip_x") :][:3], frame(1).pose[1])
     marker = messages["/garments"].markers[0]
     assert marker.ns == "skirt-female"
     assert [(p.x, p.y, p.z) for p in marker.points] == [(0, 1, 0), (0, 0, 1), (1, 0, 0)]
@@ -139,11 +137,10 @@ def test_the_file_is_laid_out_as_rosbag2_lays_it_out(tmp_path: Path) -> None:
     assert information["duration"]["nanoseconds"] == 39 * STEP_NS
 
 
-def reference_bag(path: Path, *, compression: str, chunk_bytes: int, messages: list[tuple[int, int, int]]) -> None:
+def reference_bag(path: Path, *, chunk_bytes: int, messages: list[tuple[int, int, int]]) -> None:
     """As `BagWriter` writes it, by the mcap package."""
-    kinds = {"zstd": CompressionType.ZSTD, "none": CompressionType.NONE}
     with path.open("wb") as file:
-        writer = Writer(file, chunk_size=chunk_bytes, compression=kinds[compression])
+        writer = Writer(file, chunk_size=chunk_bytes, compression=CompressionType.ZSTD)
         writer.start(profile="ros2", library="refu-ros")
         channels = []
         for topic, message_type in TWO_TOPICS:
@@ -159,7 +156,7 @@ def reference_bag(path: Path, *, compression: str, chunk_bytes: int, messages: l
         writer.flush()
         times = [time_ns for _, time_ns, _ in messages]
         summaries = [
-            TopicSummary(topic, kind, message_definition(kind).type_hash, QosProfile().to_yaml(), count)
+            TopicSummary(topic, kind, message_definition(kind).type_hash, QosProfile(), count)
             for (topic, kind), count in zip(TWO_TOPICS, counts, strict=True)
         ]
         end = max(times, default=0)
@@ -178,20 +175,19 @@ def content(seed: int, size: int) -> bytes:
 @settings(max_examples=60, deadline=None)
 @given(
     st.lists(st.tuples(st.integers(0, 1), st.integers(0, 2**40), st.integers(0, 5000)), max_size=12),
-    st.sampled_from(["zstd", "none"]),
     st.sampled_from([1, 3000, 1 << 20]),
 )
 def test_the_file_is_the_mcap_packages_own(
-    tmp_path_factory: pytest.TempPathFactory, messages: list[tuple[int, int, int]], compression: Any, chunk_bytes: int
+    tmp_path_factory: pytest.TempPathFactory, messages: list[tuple[int, int, int]], chunk_bytes: int
 ) -> None:
     """Byte for byte, also where chunks are packed in the background."""
     folder = tmp_path_factory.mktemp("own")
     wanted = folder / "wanted" / "bag.mcap"
     wanted.parent.mkdir()
-    reference_bag(wanted, compression=compression, chunk_bytes=chunk_bytes, messages=messages)
+    reference_bag(wanted, chunk_bytes=chunk_bytes, messages=messages)
     for in_background in (False, True):
         path = folder / str(in_background) / "bag.mcap"
-        with BagWriter(path, compression=compression, chunk_bytes=chunk_bytes, in_background=in_background) as bag:
+        with BagWriter(path, chunk_bytes=chunk_bytes, in_background=in_background) as bag:
             for topic, message_type in TWO_TOPICS:
                 bag.add_topic(topic, message_type)
             for topic_number, time_ns, size in messages:
@@ -203,15 +199,14 @@ def test_the_file_is_the_mcap_packages_own(
 
 
 @pytest.mark.parametrize("input_type", INPUT_TYPES)
-@pytest.mark.parametrize("compression", ["zstd", "none"])
 @pytest.mark.parametrize("name", ["bag", "bag.mcap"])
-def test_round_trip(tmp_path: Path, input_type: str, compression: Any, name: str) -> None:
-    path = write_bag(tmp_path / name, input_type=input_type, compression=compression)
+def test_round_trip(tmp_path: Path, input_type: str, name: str) -> None:
+    path = write_bag(tmp_path / name, input_type=input_type)
     assert path.parent == (tmp_path / "bag" if name == "bag" else tmp_path)
     bag = open_smpl_bag(tmp_path / name)
     records = list(bag)
     assert bag.message_count == len(records) == 40
-    assert bag.topic.message_type == INPUT_TYPES[input_type]  # type: ignore[index]
+    assert bag.topic.message_type == INPUT_TYPES[input_type]
     assert not bag.reader.truncated
     assert bag.reader.warnings == []
     for i, record in enumerate(records):
@@ -253,10 +248,11 @@ def test_a_topic_says_whose_betas_it_has(tmp_path: Path) -> None:
     assert topic.betas_of == ""
 
 
-def test_two_channels_of_one_topic_are_one(tmp_path: Path) -> None:
+@pytest.mark.parametrize("compression", [CompressionType.LZ4, CompressionType.NONE])
+def test_two_channels_of_one_topic_are_one(tmp_path: Path, compression: CompressionType) -> None:
     data = encoder_for("joint_state")(frame(0))
     with (tmp_path / "two.mcap").open("wb") as file:
-        writer = Writer(file, compression=CompressionType.LZ4)
+        writer = Writer(file, compression=compression)
         writer.start(profile="ros2")
         schema = writer.register_schema("sensor_msgs/JointState", "ros2msg", b"")  # the short name occurs as well
         for _ in range(2):

@@ -267,16 +267,3 @@ def test_names_that_are_no_bag(path: str) -> None:
     said = refusal(partial(open_smpl_bag, path))
     assert said.isprintable()
     assert len(said) <= 310
-
-
-# What is taken over into a bag of ours ------------------------------------------------------------
-
-
-@pytest.mark.parametrize("qos", ["- {}", "a: b", "!!int ''", "- &a\n  b: *a", "[" * 5000, "- history: 1", "\udc80"])
-def test_profiles_of_a_hostile_bag_are_left_out(tmp_path: Path, qos: str) -> None:
-    with BagWriter(tmp_path / "bag") as bag:
-        bag.add_topic("/a", "std_msgs/Bool", definition="bool data", qos=qos)
-        bag.write("/a", b"\0\1\0\0\1", log_time_ns=1)
-    (topic,) = BagReader(tmp_path / "bag").topics
-    assert topic.qos == ""
-    assert "offered_qos_profiles: []" in (tmp_path / "bag" / "metadata.yaml").read_text()

@@ -125,6 +125,20 @@ def test_programs_in_the_place_of_tables_are_refused(tmp_path: Path, statements:
         BagReader(path)
 
 
+def test_what_a_damaged_database_is_called_need_not_be_text(tmp_path: Path) -> None:
+    """SQLite says of which table the definition is damaged, in whatever bytes its name has."""
+    path = handmade(tmp_path / "named.db3", messages=rows(0, 1))
+    damaged = (
+        path.read_bytes()
+        .replace(b"tabletopics", b"tablet\xff\x1bics")
+        .replace(b"CREATE TABLE topics", b"CREATE TABLE (opics")
+    )
+    path.write_bytes(damaged)
+    with pytest.raises(BagError, match=r"named\.db3: the database can't be read") as caught:
+        BagReader(path)
+    assert str(caught.value).isprintable()
+
+
 @given(st.data())
 def test_damage_is_a_warning_or_one_clear_error(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
     folder = tmp_path_factory.mktemp("damaged")

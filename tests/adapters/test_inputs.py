@@ -5,7 +5,6 @@ from __future__ import annotations
 import struct
 import tracemalloc
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,6 @@ from rosbags.typesys import get_types_from_msg
 
 from msg_adapters import (
     INPUT_TYPES,
-    SMPL_JOINTS,
     DecodeError,
     EncodeError,
     decoder_for,
@@ -28,6 +26,7 @@ from msg_adapters import (
 )
 from msg_adapters.cdr import CdrReader, CdrWriter
 from refu_core import SmplFrame
+from refu_core.skeleton import JOINT_NAMES
 
 MULTIARRAY, JOINT_STATE, POSE_ARRAY, SMPL = INPUT_TYPES.values()
 REST = SmplFrame(np.zeros(72))
@@ -69,14 +68,13 @@ def test_round_trip(input_type: str, frame: SmplFrame) -> None:
 
 
 @given(input_types, frames(), st.booleans(), st.integers(0, 15))
-def test_bytes_and_objects_agree(input_type: str, frame: SmplFrame, little_endian: bool, padding: int) -> None:
-    message_type = INPUT_TYPES[input_type]
-    message = deserialise(encoder_for(input_type)(frame), message_type)
-    data = serialise(message, message_type, little_endian=little_endian)
-    decoder = decoder_for(message_type)
-    assert_same(decoder(data + bytes(padding)), decoder(message))
+def test_either_byte_order_and_padding(input_type: str, frame: SmplFrame, little_endian: bool, padding: int) -> None:
+    message_type, sent = INPUT_TYPES[input_type], encoder_for(input_type)(frame)
+    data = serialise(deserialise(sent, message_type), message_type, little_endian=little_endian)
+    decode = decoder_for(message_type).from_bytes
+    assert_same(decode(data + bytes(padding)), decode(sent))
     with pytest.raises(DecodeError, match="another type"):
-        decoder(data + bytes(16))
+        decode(data + bytes(16))
 
 
 def test_decoders_by_any_name() -> None:
@@ -104,7 +102,7 @@ def test_multiarray_blocks_in_any_order_with_gaps(order: list[str], count: int, 
     for label in kept:
         parts += [values[label], np.full(gap, 9e9)]
     dims = [(label, len(values[label]), len(values[label]) + gap if gap else 0) for label in kept]
-    frame = decoder_for("multiarray")(multiarray(dims, np.concatenate(parts), offset))
+    frame = decoder_for("multiarray").from_bytes(multiarray(dims, np.concatenate(parts), offset))
     np.testing.assert_array_equal(frame.pose.ravel(), values["pose"].astype(np.float32))
     for label in ("betas", "transl"):
         expected = values[label] if label in kept else np.zeros(len(values[label]))
@@ -126,10 +124,8 @@ def test_multiarray_blocks_in_any_order_with_gaps(order: list[str], count: int, 
     ],
 )
 def test_multiarray_layouts_that_are_refused(dims: list[tuple[str, int, int]], count: int, message: str) -> None:
-    data = multiarray(dims, np.zeros(count))
-    for form in (data, deserialise(data, MULTIARRAY)):
-        with pytest.raises(DecodeError, match=message if dims[16:] == [] or form is data else "second"):
-            decoder_for("multiarray")(form)
+    with pytest.raises(DecodeError, match=message):
+        decoder_for("multiarray").from_bytes(multiarray(dims, np.zeros(count)))
 
 
 # ------------------------------------------------------------------------------------------------ JointState
@@ -142,13 +138,13 @@ def joint_state(entries: dict[str, float] | list[tuple[str, float]], extra_posit
     return serialise(make(JOINT_STATE, header(5), [name for name, _ in pairs], position, empty, empty), JOINT_STATE)
 
 
-JOINTS = {f"{joint}_{axis}": 0.01 * i for i, (joint, axis) in enumerate((j, a) for j in SMPL_JOINTS for a in "xyz")}
+JOINTS = {f"{joint}_{axis}": 0.01 * i for i, (joint, axis) in enumerate((j, a) for j in JOINT_NAMES for a in "xyz")}
 TRANSL = {"transl_x": 1.0, "transl_y": 2.0, "transl_z": 3.0}
 
 
 @given(st.permutations(list((JOINTS | TRANSL | {"beta_3": -1.5, "jaw_x": 7.0}).items())))
 def test_joint_state_in_any_order(entries: list[tuple[str, float]]) -> None:
-    frame = decoder_for("joint_state")(joint_state(entries))
+    frame = decoder_for("joint_state").from_bytes(joint_state(entries))
     np.testing.assert_allclose(frame.pose.ravel(), np.arange(72) * 0.01, rtol=1e-6)
     np.testing.assert_array_equal(frame.betas, np.eye(10)[3] * -1.5)
     np.testing.assert_array_equal(frame.transl, [1, 2, 3])
@@ -170,7 +166,7 @@ def test_joint_state_in_any_order(entries: list[tuple[str, float]]) -> None:
 )
 def test_joint_states_that_are_refused(entries: Any, extra: int, message: str) -> None:
     with pytest.raises(DecodeError, match=message) as caught:
-        decoder_for("joint_state")(joint_state(entries, extra))
+        decoder_for("joint_state").from_bytes(joint_state(entries, extra))
     assert str(caught.value).startswith(JOINT_STATE)
 
 
@@ -185,7 +181,7 @@ def test_names_are_remembered_without_mixing_up_senders(senders: list[list[tuple
         raw = joint_state(entries, extra_positions=kind == "too many")
         if kind == "big-endian":
             raw = big_endian_joint_state(entries)
-        decode = decoder_for("joint_state")
+        decode = decoder_for("joint_state").from_bytes
         if kind in ("good", "big-endian"):
             frame = decode(raw)
             np.testing.assert_allclose(frame.pose.ravel(), np.arange(72) * 0.01, rtol=1e-6)
@@ -224,7 +220,7 @@ def pose_array(quaternions: Any, position: Any = (0, 0, 0)) -> bytes:
 def test_quaternions_are_normalised_and_have_no_sign(scale: float, flip: bool) -> None:
     rotvec = np.random.default_rng(3).normal(size=(24, 3))
     quaternions = quaternion_from_rotvec(rotvec) * scale * (-1 if flip else 1)
-    frame = decoder_for("pose_array")(pose_array(quaternions, (1e5, -2, 0.1)))
+    frame = decoder_for("pose_array").from_bytes(pose_array(quaternions, (1e5, -2, 0.1)))
     assert_same_rotations(frame.pose, rotvec)
     np.testing.assert_array_equal(frame.transl, [1e5, -2, 0.1])
 
@@ -234,15 +230,14 @@ def test_orientations_that_are_no_rotation(bad: tuple[float, ...]) -> None:
     quaternions = np.tile([0.0, 0, 0, 1], (24, 1))
     quaternions[4] = bad
     with pytest.raises(DecodeError, match="the orientation of left_knee isn't a rotation"):
-        decoder_for("pose_array")(pose_array(quaternions))
+        decoder_for("pose_array").from_bytes(pose_array(quaternions))
 
 
 @pytest.mark.parametrize("count", [0, 23, 25])
 def test_pose_arrays_of_other_lengths(count: int) -> None:
     data = pose_array(np.tile([0.0, 0, 0, 1], (count, 1)))
-    for form in (data, deserialise(data, POSE_ARRAY)):
-        with pytest.raises(DecodeError, match=f"wanted 24 poses, one for each joint of SMPL, got {count}"):
-            decoder_for("pose_array")(form)
+    with pytest.raises(DecodeError, match=f"wanted 24 poses, one for each joint of SMPL, got {count}"):
+        decoder_for("pose_array").from_bytes(data)
 
 
 @given(st.floats(0, np.pi), st.floats(-1, 1), st.floats(-1, 1))
@@ -265,7 +260,7 @@ def test_smpl_is_read_by_the_definition_it_came_with(frame: SmplFrame, fields: l
     values = {"body_pose": frame.pose[1:], "global_orient": frame.pose[0], "betas": frame.betas, "transl": frame.transl}
     for field in fields:
         writer.array({"float32": "f4", "float64": "f8"}[kind], values.get(field.split()[1], np.zeros(72)))
-    decoded = decoder_for("smpl_msgs", definition=definition)(writer.to_bytes())
+    decoded = decoder_for("smpl_msgs", definition=definition).from_bytes(writer.to_bytes())
     assert_same(decoded, frame if kind == "float64" else replace(frame, transl=frame.transl.astype(np.float32)))
 
 
@@ -348,7 +343,7 @@ def test_every_truncation(input_type: str) -> None:
     data = encoder_for(input_type)(REST)
     for length in range(len(data)):
         with pytest.raises(DecodeError):
-            decoder_for(input_type)(data[:length])
+            decoder_for(input_type).from_bytes(data[:length])
 
 
 def test_absurd_lengths_allocate_nothing() -> None:
@@ -356,19 +351,10 @@ def test_absurd_lengths_allocate_nothing() -> None:
     tracemalloc.start()
     for input_type in INPUT_TYPES:
         with pytest.raises(DecodeError, match=r"claims|wanted|more bytes"):
-            decoder_for(input_type)(claims + bytes(64))
+            decoder_for(input_type).from_bytes(claims + bytes(64))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 1 << 20
-
-
-@pytest.mark.parametrize(
-    "message", [None, 3, "text", SimpleNamespace(), SimpleNamespace(header=None, layout=[], poses=1)]
-)
-@pytest.mark.parametrize("input_type", INPUT_TYPES)
-def test_objects_of_another_type(input_type: str, message: Any) -> None:
-    with pytest.raises(DecodeError, match="wanted a message object of this type"):
-        decoder_for(input_type).from_message(message)
 
 
 def test_strings_must_be_utf8_and_end() -> None:

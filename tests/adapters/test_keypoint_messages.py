@@ -13,7 +13,15 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from reference import header, make, serialise
 
-from msg_adapters import KEYPOINT_TYPES, BagWriter, DecodeError, KeypointStream, decode_keypoints, open_smpl_bag
+from msg_adapters import (
+    KEYPOINT_TYPES,
+    BagWriter,
+    DecodeError,
+    InputStream,
+    open_smpl_bag,
+)
+from msg_adapters.inputs import decode_keypoints
+from refu_core import load_body
 from refu_core.keypoints import Proportions, Skeleton, keypoint_layout
 from refu_core.keypoints._pose import Pose, exp_so3
 
@@ -132,21 +140,21 @@ def standing(layout: str, place: float = 0.0) -> Any:
 
 
 def test_a_message_of_more_people_than_are_followed_is_refused() -> None:
-    stream = KeypointStream("keypoint_markers", "coco17", Proportions.builtin("male"))
+    stream = InputStream("keypoint_markers")
+    stream.follow(load_body("male"), "coco17")
     data = marker_array(*(marker(7, ns=f"p{i}", points=standing("coco17", i)) for i in range(65)))
     with pytest.raises(DecodeError, match="65 people in a message; up to 64"):
         stream.frames(data, 5)
 
 
 def test_streams_and_bags(tmp_path: Path) -> None:
-    stream = KeypointStream("keypoint_markers", "coco17", Proportions.builtin("male"))
+    stream = InputStream("keypoint_markers")
+    stream.follow(load_body("male"), "coco17")
     data = marker_array(*(marker(7, ns=ns, points=standing("coco17", x)) for ns, x in (("a", 0.0), ("b", 2.0))))
     frames, frame_id = stream.frames(data, 5, sender="left")
     assert (sorted(frames), frame_id) == (["left_a", "left_b"], "camera")
     assert frames["left_b"].transl[0] - frames["left_a"].transl[0] == pytest.approx(2, abs=1e-6)
     assert sorted(stream.predicted(10**8)) == ["left_a", "left_b"]
-    with pytest.raises(DecodeError, match=r"wanted keypoint_poses or keypoint_markers of coco17, .* of 'coco'"):
-        KeypointStream("keypoint_markers", "coco", Proportions.builtin("male"))
     with BagWriter(tmp_path / "a.mcap") as writer:
         writer.add_topic("/skeletons", POSES)
         for i in range(3):

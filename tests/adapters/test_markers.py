@@ -21,16 +21,16 @@ from msg_adapters import (
     MarkerArrayEncoder,
     MarkerMesh,
     decode_marker_array,
-    encode_delete,
     encode_diagnostics,
-    encode_points,
     garment_namespace,
     vertices_from_points,
     vertices_ros_from_smpl,
     vertices_smpl_from_ros,
 )
+from msg_adapters.markers import encode_delete, encode_lists
 
 TRIANGLE = np.array([[0, 1, 2]])
+IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 def reference_marker(
@@ -87,7 +87,7 @@ def scenes(draw: st.DrawFn) -> dict[str, Any]:
             draw(st.sampled_from([np.int32, np.int64, np.uint16]))
         )
         color = tuple(rng.random(4).astype(np.float32).tolist())
-        mesh = MarkerMesh(draw(texts), faces, n, color=color, id=i)
+        mesh = MarkerMesh(f"{i}{draw(texts)}", faces, n, color=color)
         meshes.append(mesh)
         vertices.append(rng.normal(size=(n, 3)).astype(draw(st.sampled_from([np.float32, np.float64]))))
     transl = draw(st.sampled_from([None, "one", "each"]))
@@ -120,7 +120,7 @@ def test_bytes_are_the_reference_serialisers(scene: dict[str, Any]) -> None:
         markers.append(
             reference_marker(
                 ns=mesh.ns,
-                marker_id=mesh.id,
+                marker_id=0,
                 action=0,
                 stamp_ns=scene["stamp_ns"],
                 frame_id=scene["frame_id"],
@@ -131,7 +131,7 @@ def test_bytes_are_the_reference_serialisers(scene: dict[str, Any]) -> None:
         )
     assert data == serialise(make(MARKER_ARRAY, markers), MARKER_ARRAY)
     for decoded, marker, mesh in zip(decode_marker_array(data), markers, scene["meshes"], strict=True):
-        assert (decoded.ns, decoded.id, decoded.type, decoded.action) == (mesh.ns, mesh.id, 11, 0)
+        assert (decoded.ns, decoded.id, decoded.type, decoded.action) == (mesh.ns, 0, 11, 0)
         assert (decoded.stamp_ns, decoded.frame_id) == (scene["stamp_ns"], scene["frame_id"])
         assert (decoded.pose, decoded.scale, decoded.color) == ((0, 0, 0, 0, 0, 0, 1), (1, 1, 1), mesh.color)
         np.testing.assert_array_equal(decoded.points, [(p.x, p.y, p.z) for p in marker.points])
@@ -152,7 +152,8 @@ def test_colours_of_points_are_read() -> None:
 def test_points(ns: str, frame_id: str, stamp_ns: int, count: int) -> None:
     points = np.random.default_rng(count).normal(size=(count, 3))
     color = (0.25, 0.5, 1.0, 1.0)
-    data = encode_points(points, ns=ns, stamp_ns=stamp_ns, frame_id=frame_id, color=color, size=0.01)
+    rows = [(ns, stamp_ns, IDENTITY, points)]
+    data = encode_lists(POINTS, rows, frame_id=frame_id, color=color, size=0.01)
     rest: dict[str, Any] = {"ns": ns, "stamp_ns": stamp_ns, "frame_id": frame_id, "color": color, "colors": []}
     wanted = reference_marker(marker_id=0, action=0, points=points, kind=8, size=0.01, **rest)
     assert data == serialise(make(MARKER_ARRAY, [wanted]), MARKER_ARRAY)
@@ -164,14 +165,14 @@ def test_points(ns: str, frame_id: str, stamp_ns: int, count: int) -> None:
 @pytest.mark.parametrize("points", [np.zeros((0, 3)), np.zeros((4, 2)), np.full((2, 3), np.nan)])
 def test_points_that_cant_be_drawn_are_refused(points: Any) -> None:
     with pytest.raises(EncodeError, match="finite points"):
-        encode_points(points, ns="a", stamp_ns=0)
+        encode_lists(POINTS, [("a", 0, IDENTITY, points)], frame_id="", color=(1.0,) * 4, size=0.01)
 
 
-@given(st.lists(st.tuples(texts, st.integers(-(2**31), 2**31 - 1)), max_size=3), texts, stamps)
-def test_deletions(keys: list[tuple[str, int]], frame_id: str, stamp_ns: int) -> None:
+@given(st.lists(texts, max_size=3), texts, stamps)
+def test_deletions(names: list[str], frame_id: str, stamp_ns: int) -> None:
     rest: dict[str, Any] = {"stamp_ns": stamp_ns, "frame_id": frame_id, "color": (0.0,) * 4, "points": [], "colors": []}
-    gone = [reference_marker(ns=ns, marker_id=i, action=2, **rest) for ns, i in keys]
-    assert encode_delete(keys, stamp_ns=stamp_ns, frame_id=frame_id) == serialise(
+    gone = [reference_marker(ns=ns, marker_id=0, action=2, **rest) for ns in names]
+    assert encode_delete(names, stamp_ns=stamp_ns, frame_id=frame_id) == serialise(
         make(MARKER_ARRAY, gone), MARKER_ARRAY
     )
 

@@ -15,35 +15,36 @@ from rosbags.typesys import get_types_from_msg
 
 from msg_adapters import (
     CAMERA_INFO,
-    COLLISION_OBJECT,
     IDS_LIST,
     MESH,
-    POINT_CLOUD,
     POINT_FIELDS,
-    POLYGON,
-    SCENE_UPDATE,
     TF_MESSAGE,
     DecodeError,
     EncodeError,
-    Entity,
     MarkerMesh,
     Placement,
-    PointCloudEncoder,
-    Rim,
     decode_camera_info,
     decode_ids,
     decode_marker_array,
-    decode_point_cloud,
-    encode_collision_object,
-    encode_frames,
     encode_mesh,
-    encode_polygon,
-    encode_rims,
-    encode_scene,
     message_definition,
     points_of,
     quaternion_from_matrix,
     quaternion_from_rotvec,
+)
+from msg_adapters.outputs import (
+    COLLISION_OBJECT,
+    POINT_CLOUD,
+    POLYGON,
+    SCENE_UPDATE,
+    Entity,
+    PointCloudEncoder,
+    Rim,
+    encode_collision_object,
+    encode_frames,
+    encode_polygon,
+    encode_rims,
+    encode_scene,
 )
 from msg_adapters.rotations import matrix_from_quaternion
 
@@ -81,13 +82,10 @@ def same_again(data: bytes, message_type: str) -> Any:
 
 def cloud(counts: tuple[int, ...], fields: Any = POINT_FIELDS, seed: int = 0) -> dict[str, Any]:
     rng = np.random.default_rng(seed)
-    given = {
-        "vertices": [rng.normal(size=(n, 3)).astype(np.float32) for n in counts],
-        "normals": [rng.normal(size=(n, 3)).astype(np.float32) for n in counts] if "normal" in fields else None,
-    }
+    vertices, normals = ([rng.normal(size=(n, 3)).astype(np.float32) for n in counts] for _ in range(2))
     values: dict[str, Any] = {k: [rng.random(n, np.float32) for n in counts] for k in ("clearance", "sigma")}
-    values["visible"] = [rng.random(n) > 0.5 for n in counts]
-    return {**given, "values": {name: value for name, value in values.items() if name in fields}}
+    values |= {"normal": normals, "visible": [rng.random(n) > 0.5 for n in counts]}
+    return {"vertices": vertices, "values": {name: value for name, value in values.items() if name in fields}}
 
 
 @given(st.lists(st.integers(1, 50), min_size=1, max_size=4), st.sets(st.sampled_from(POINT_FIELDS)), texts, stamps)
@@ -98,9 +96,8 @@ def test_points(counts: list[int], fields: set[Any], frame_id: str, stamp_ns: in
     offset = np.array([1.0, -20.0, 3.0])
     first = encoder.encode(given.pop("vertices"), stamp_ns=5, **given)
     given = cloud(tuple(counts), fields, seed=1)
-    data = encoder.encode(given["vertices"], stamp_ns=stamp_ns, offset=offset, normals=given["normals"],
-                          values=given["values"])  # fmt: skip
-    assert len(data) == len(first) == encoder.n_bytes
+    data = encoder.encode(given["vertices"], stamp_ns=stamp_ns, offset=offset, values=given["values"])
+    assert len(data) == len(first)
     message = same_again(data, POINT_CLOUD)
     assert (message.header.stamp.sec * 10**9 + message.header.stamp.nanosec, message.header.frame_id) == (
         stamp_ns,
@@ -108,16 +105,15 @@ def test_points(counts: list[int], fields: set[Any], frame_id: str, stamp_ns: in
     )
     assert (message.height, message.width, message.is_dense, message.is_bigendian) == (1, sum(counts), True, False)
     assert message.row_step == message.point_step * sum(counts) == len(message.data)
-    points, stamp, frame = decode_point_cloud(data)
-    assert (stamp, frame) == (stamp_ns, frame_id)
-    np.testing.assert_array_equal(points_of(message), points)
+    points = points_of(message)
 
     def of(*names: str) -> Any:
         return np.stack([points[name] for name in names], axis=-1)
 
     np.testing.assert_array_equal(of("x", "y", "z"), np.concatenate(given["vertices"]) + offset.astype(np.float32))
     if "normal" in fields:
-        np.testing.assert_array_equal(of("normal_x", "normal_y", "normal_z"), np.concatenate(given["normals"]))
+        normals = np.concatenate(given["values"].pop("normal"))
+        np.testing.assert_array_equal(of("normal_x", "normal_y", "normal_z"), normals)
     for name, value in given["values"].items():
         np.testing.assert_array_equal(points[name], np.concatenate(value))
     if "vertex" in fields:
@@ -128,26 +124,20 @@ def test_points(counts: list[int], fields: set[Any], frame_id: str, stamp_ns: in
 
 
 def test_points_of_many_vertices_have_wider_numbers() -> None:
-    n = (1 << 16) + 1
-    data = PointCloudEncoder([n], fields=["vertex"]).encode([np.zeros((n, 3), np.float32)], stamp_ns=0)
-    assert decode_point_cloud(data)[0]["vertex"][-1] == n - 1
-    assert PointCloudEncoder([n - 1], fields=["vertex"]).n_bytes < len(data)
+    for n, kind in (((1 << 16) + 1, np.uint32), (1 << 16, np.uint16)):
+        encoder = PointCloudEncoder([n], fields=["vertex"])
+        data = encoder.encode([np.zeros((n, 3), np.float32)], stamp_ns=0, values={})
+        vertex = points_of(deserialise(data, POINT_CLOUD))["vertex"]
+        assert (vertex[-1], vertex.dtype) == (n - 1, kind)
 
 
 def test_points_that_cannot_be() -> None:
-    for counts, fields in (([], ()), ([0], ()), ([1] * 256, ()), ([1], ["colour"])):
-        with pytest.raises(EncodeError, match="wanted"):
-            PointCloudEncoder(counts, fields=fields)  # type: ignore[arg-type]
     encoder = PointCloudEncoder([4], fields=["clearance"])
     good, clearance = [np.zeros((4, 3))], {"clearance": [np.zeros(4)]}
     for vertices, values in (
         ([np.zeros((3, 3))], clearance),
         ([np.zeros((4, 2))], clearance),
-        ([*good, *good], clearance),
-        (good, {}),
-        (good, {**clearance, "sigma": [np.zeros(4)]}),
         (good, {"clearance": [np.zeros(3)]}),
-        ([np.full((4, 3), "x")], clearance),
     ):
         with pytest.raises(EncodeError, match="wanted"):
             encoder.encode(vertices, stamp_ns=0, values=values)
@@ -158,7 +148,8 @@ def test_points_that_cannot_be() -> None:
         encoder.encode(good, stamp_ns=0, values=clearance, offset=(0.0, 1e300, 0.0))
     # A sum that overflows, of numbers that don't, is no reason to refuse them.
     huge = np.full((4, 3), 3e38, np.float32)
-    assert np.isfinite(decode_point_cloud(encoder.encode([huge], stamp_ns=0, values=clearance))[0]["x"]).all()
+    message = deserialise(encoder.encode([huge], stamp_ns=0, values=clearance), POINT_CLOUD)
+    assert np.isfinite(points_of(message)["x"]).all()
 
 
 @given(
@@ -183,8 +174,8 @@ def test_a_cameras_points_come_row_by_row(
     fields.insert(1, field("rgb", 12, 2, 1))
     cloud = typestore().types[POINT_CLOUD]
     message = cloud(header(), height, width, fields, order == ">", step, row_step, data, False)
-    for points in (points_of(message), decode_point_cloud(serialise(message, POINT_CLOUD))[0]):
-        np.testing.assert_array_equal(np.stack([points[axis] for axis in "xyz"], -1), wanted.reshape(-1, 3))
+    points = points_of(message)
+    np.testing.assert_array_equal(np.stack([points[axis] for axis in "xyz"], -1), wanted.reshape(-1, 3))
     message.row_step = width * step - 1
     if height > 1 and width:
         with pytest.raises(DecodeError, match="a row has"):
@@ -193,13 +184,16 @@ def test_a_cameras_points_come_row_by_row(
 
 @given(st.data())
 def test_damaged_points_are_refused(data: st.DataObject) -> None:
-    raw = bytearray(PointCloudEncoder([3], fields=["vertex"]).encode([np.zeros((3, 3))], stamp_ns=0))
+    raw = PointCloudEncoder([3], fields=["vertex"]).encode([np.zeros((3, 3))], stamp_ns=0, values={})
+    message = deserialise(raw, POINT_CLOUD)
+    numbers = st.integers(0, 2**32 - 1) | st.integers(0, 70)
     for _ in range(data.draw(st.integers(1, 3))):
-        at = data.draw(st.integers(4, len(raw) - 1))
-        raw[at] = data.draw(st.integers(0, 255))
-    del raw[data.draw(st.integers(5, len(raw))) :]
+        name = data.draw(st.sampled_from(["height", "width", "point_step", "row_step", "offset", "datatype", "count"]))
+        of = message if hasattr(message, name) else data.draw(st.sampled_from(message.fields))
+        setattr(of, name, data.draw(numbers))
+    message.data = message.data[: data.draw(st.integers(0, len(message.data)))]
     try:
-        points, _, _ = decode_point_cloud(raw)
+        points = points_of(message)
     except DecodeError:
         return
     points.tobytes()
@@ -273,7 +267,7 @@ def test_meshes(vertices: Any, rotation: Any, name: str, stamp_ns: int) -> None:
     frames = {"neck": placement, "hem": Placement()}
     kind = {"stamp_ns": stamp_ns, "frame_id": "odom", "placement": placement}
     added = same_again(
-        encode_collision_object(name, "add", mesh=(vertices, FACES), subframes=frames, **kind), COLLISION_OBJECT
+        encode_collision_object(name, mesh=(vertices, FACES), subframes=frames, **kind), COLLISION_OBJECT
     )
     assert (added.id, added.operation, added.header.frame_id) == (name, added.ADD, "odom")
     assert (added.pose.position.x, added.pose.position.z) == (1.0, 3.0)
@@ -283,9 +277,8 @@ def test_meshes(vertices: Any, rotation: Any, name: str, stamp_ns: int) -> None:
     assert len(added.subframe_poses) == 2
     assert (len(added.meshes), len(added.mesh_poses), added.mesh_poses[0].orientation.w) == (1, 1, 1.0)
     np.testing.assert_array_equal([(p.x, p.y, p.z) for p in added.meshes[0].vertices], vertices)
-    for operation, code in (("move", added.MOVE), ("remove", added.REMOVE)):
-        other = same_again(encode_collision_object(name, operation, **kind), COLLISION_OBJECT)  # type: ignore[arg-type]
-        assert (other.id, other.operation, other.meshes) == (name, code, [])
+    removed = same_again(encode_collision_object(name, **kind), COLLISION_OBJECT)
+    assert (removed.id, removed.operation, removed.meshes) == (name, added.REMOVE, [])
 
 
 def test_meshes_that_cannot_be() -> None:
@@ -300,9 +293,6 @@ def test_meshes_that_cannot_be() -> None:
     ):
         with pytest.raises(EncodeError, match="wanted"):
             encode_mesh(vertices, faces)
-    for operation, mesh in (("add", None), ("move", (points, FACES)), ("replace", None)):
-        with pytest.raises(EncodeError, match="wanted add"):
-            encode_collision_object("a", operation, stamp_ns=0, mesh=mesh)  # type: ignore[arg-type]
 
 
 @given(texts, texts, stamps)
@@ -352,9 +342,7 @@ def test_rclpy_reads_them() -> None:
     given = cloud((7, 5))
     data = PointCloudEncoder((7, 5)).encode(given.pop("vertices"), stamp_ns=5, **given)
     message = read(data, POINT_CLOUD)
-    np.testing.assert_array_equal(points_of(message), decode_point_cloud(data)[0])
-    again = serialization.serialize_message(message)
-    np.testing.assert_array_equal(decode_point_cloud(again)[0], decode_point_cloud(data)[0])
+    np.testing.assert_array_equal(points_of(message), points_of(deserialise(data, POINT_CLOUD)))
     polygon = read(encode_polygon(np.eye(3), stamp_ns=3), POLYGON)
     assert [(p.x, p.y, p.z) for p in polygon.polygon.points] == [*map(tuple, np.eye(3))]
     mesh = read(encode_mesh(np.eye(4, 3), FACES), MESH)
@@ -384,7 +372,8 @@ def test_cameras(frame_id: str, width: int, height: int, focal: float, distortio
     message = make[CAMERA_INFO](header(5, frame_id), height, width, "plumb_bob", *numbers, 0, 0, region)
     camera = decode_camera_info(serialise(message, CAMERA_INFO))
     assert camera == decode_camera_info(serialise(message, CAMERA_INFO, little_endian=False))
-    assert camera.numbers == (width, height, (focal, 2 * focal), (4.0, 3.0))  # from the corner, not the first middle
+    assert (camera.width, camera.height, camera.focal) == (width, height, (focal, 2 * focal))
+    assert camera.centre == (4.0, 3.0)  # from the corner, not the first middle
     assert camera.frame_id == frame_id.lstrip("/")
     for size in (0, (1 << 15) + 1, 2**32 - 1):  # a picture of 1 x 200 million pixels took 1.6 GB
         message.height = size

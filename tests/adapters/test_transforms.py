@@ -16,14 +16,11 @@ from msg_adapters import (
     TF_MESSAGE,
     DecodeError,
     Placement,
-    Transform,
     TransformBuffer,
     TransformError,
-    decode_transforms,
-    encode_transforms,
 )
 from msg_adapters.axes import InputAxes, up_of_sender
-from msg_adapters.transforms import HISTORY_NS
+from msg_adapters.transforms import HISTORY_NS, Transform, decode_transforms, encode_transforms
 
 S = 10**9
 

@@ -31,7 +31,6 @@ from refu_core.outputs import (
     visible,
 )
 from refu_lab.stress._frames import everyday_pose
-from refu_ros._settings import NodeSettings
 
 GARMENTS = ["tshirt-male", "short-pant-male"]
 
@@ -231,7 +230,7 @@ def test_a_garment_that_planners_cannot_have_keeps_no_other_from_them() -> None:
     fittings, obstacles = Fittings(worn), Obstacles()
     frame = SmplFrame(pose=np.zeros((24, 3)))
     dressed = Dressed("", frame, worn(frame), fittings, np.eye(3), np.zeros(3))
-    moment = Moment(NodeSettings(planner_rate=0.0), lambda _: 1, 0)
+    moment = Moment("map", 0, (), 0.0, lambda _: 1, 0)
     deadline = time.monotonic() + 120
     while not (sent := list(obstacles.messages([dressed], moment))) and time.monotonic() < deadline:
         time.sleep(0.1)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from mcap.writer import CompressionType, Writer
 
 import msg_adapters as adapters
 from refu_core import SmplFrame, load_body, load_garment
@@ -118,14 +119,19 @@ def some_frame(seed: int = 0, *, with_style: bool = False) -> SmplFrame:
 
 def bags(path: Path) -> list[bytes]:
     """MCAP files, two of them valid; writes at `path`."""
-    found = []
-    for compression in ("zstd", "none"):
-        with adapters.BagWriter(path, compression=compression, chunk_bytes=900, overwrite=True) as writer:
-            for kind in ("multiarray", "smpl_msgs"):
-                writer.add_topic(f"/{kind}/smpl_params", adapters.INPUT_TYPES[kind])
-                for i in range(3):
-                    writer.write(f"/{kind}/smpl_params", adapters.encoder_for(kind)(some_frame(i)), log_time_ns=1 + i)
-        found.append(path.read_bytes())
+    with adapters.BagWriter(path, chunk_bytes=900, overwrite=True) as writer:
+        for kind in ("multiarray", "smpl_msgs"):
+            writer.add_topic(f"/{kind}/smpl_params", adapters.INPUT_TYPES[kind])
+            for i in range(3):
+                writer.write(f"/{kind}/smpl_params", adapters.encoder_for(kind)(some_frame(i)), log_time_ns=1 + i)
+    plain = Writer(stream := io.BytesIO(), chunk_size=900, compression=CompressionType.NONE)
+    plain.start(profile="ros2")
+    schema = plain.register_schema(adapters.INPUT_TYPES["multiarray"], "ros2msg", b"")
+    channel = plain.register_channel("/smpl_params", "cdr", schema)
+    for i in range(3):
+        plain.add_message(channel, 1 + i, adapters.encoder_for("multiarray")(some_frame(i)), 1 + i)
+    plain.finish()
+    found = [path.read_bytes(), stream.getvalue()]
     first = split_mcap(found[0])[:1]
     for part in mcap_bombs(struct.pack("<BQ", 4, 0)):
         many = part * ((48 << 20) // len(part))

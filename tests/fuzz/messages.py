@@ -7,22 +7,22 @@ import io
 import json
 import os
 from collections.abc import Callable
-from copy import deepcopy
 from pathlib import Path
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from hypothesis import strategies as st
 
 import msg_adapters as adapters
+from msg_adapters.markers import encode_delete
+from msg_adapters.transforms import Transform, encode_transforms
 from refu_core import SmplFrame
 from refu_core.options import specs_of
 from refu_lab.cli import _parser, main
 from refu_ros._settings import NodeSettings
 from tests.fuzz.contract import check_line
 from tests.fuzz.corpus import some_frame
-from tests.fuzz.strategies import FLOATS, INTEGERS, ODD_VALUES, Special, near, near_file, odd_value, place
+from tests.fuzz.strategies import FLOATS, INTEGERS, Special, near, near_file, odd_value, place
 
 if TYPE_CHECKING:
     import argparse
@@ -85,7 +85,7 @@ def markers(_: Path) -> Reader:
     faces = np.array([[0, 1, 2], [2, 1, 3]])
     meshes = adapters.MarkerArrayEncoder([adapters.MarkerMesh("a/b", faces, 4)])
     good = meshes.encode([np.eye(4, 3)], stamp_ns=5)
-    others = [adapters.encode_delete([("a", 0), ("b", 1)], stamp_ns=1)]
+    others = [encode_delete(["a", "b"], stamp_ns=1)]
 
     def read(data: bytes) -> None:
         for marker in adapters.decode_marker_array(data):
@@ -95,61 +95,21 @@ def markers(_: Path) -> Reader:
 
 
 def surroundings(_: Path) -> Reader:
-    """What else the node reads of a graph, by the first byte: transforms, ids, cameras; and points of its own."""
-    numbers = adapters.Transform(5, "map", "cam", np.zeros(3), np.array([0.0, 0, 0, 1]))
-    transforms = adapters.encode_transforms([numbers, numbers])
-    points = adapters.PointCloudEncoder([4]).encode(
-        [np.eye(4, 3)],
-        stamp_ns=5,
-        normals=[np.eye(4, 3)],
-        values={name: [np.zeros(4)] for name in ("clearance", "sigma", "visible")},
-    )
+    """What else the node reads of a graph, by the first byte: transforms, ids, cameras."""
+    numbers = Transform(5, "map", "cam", np.zeros(3), np.array([0.0, 0, 0, 1]))
+    transforms = encode_transforms([numbers, numbers])
     readers: list[Callable[[bytes], object]] = [
         lambda data: adapters.TransformBuffer().put(data, is_static=False),
         adapters.decode_ids,
         adapters.decode_camera_info,
-        adapters.decode_point_cloud,
     ]
-    good = [bytes([kind]) + data for kind in range(len(readers)) for data in (transforms, points)]
+    good = [bytes([kind]) + transforms for kind in range(len(readers))]
 
     def read(data: bytes) -> None:
         if data:
             readers[data[0] % len(readers)](data[1:])
 
     return near(good), read
-
-
-# Objects ------------------------------------------------------------------------------------------
-
-
-def objects(_: Path) -> Reader:
-    """Message objects whose fields are missing, or are of other kinds."""
-    odd = [*ODD_VALUES, object(), b"bytes", np.zeros((2, 2)), np.array(["x"]), np.float64("nan"), 1j]
-    point = {"x": 0.0, "y": 1.0, "z": 2.0, "w": 1.0}
-    header = {"stamp": {"sec": 1, "nanosec": 2}, "frame_id": "map"}
-    names = [f"{joint}_{axis}" for joint in adapters.SMPL_JOINTS for axis in "xyz"]
-    fields: dict[str, dict[str, Any]] = {
-        "multiarray": {
-            "layout": {"dim": [{"label": "pose", "size": 72, "stride": 72}], "data_offset": 0},
-            "data": [0.0] * 72,
-        },
-        "joint_state": {"header": header, "name": names, "position": [0.0] * 72},
-        "pose_array": {"header": header, "poses": [{"position": point, "orientation": point}] * 24},
-        "smpl_msgs": {"header": header, "body_pose": [0.0] * 69, "global_orient": [0.0] * 3, "betas": [0.0] * 10}
-        | {"transl": [0.0] * 3},
-    }
-    drawn = st.sampled_from(list(fields)).flatmap(lambda kind: st.tuples(st.just(kind), odd_value(fields[kind], odd)))
-
-    def read(value: tuple[str, Any]) -> None:
-        adapters.decoder_for(value[0]).from_message(_as_object(deepcopy(value[1])))
-
-    return drawn, read
-
-
-def _as_object(value: Any) -> Any:
-    if isinstance(value, dict):
-        return SimpleNamespace(**{key: _as_object(entry) for key, entry in value.items() if key.isidentifier()})
-    return [_as_object(entry) for entry in value] if isinstance(value, list) else value
 
 
 @st.composite
@@ -187,7 +147,6 @@ def encoder(_: Path) -> Reader:
             "faces": draw(_odd_array(faces)),
             "n": n,
             "color": draw(st.lists(rarely(0.5, *FLOATS), min_size=3, max_size=4)),
-            "id": draw(rarely(0, *integers)),
             "vertices": draw(_odd_array(vertices)),
             "stamp_ns": draw(rarely(5, *integers)),
             "transl": draw(rarely(None, np.ones(3), np.ones((1, 3)), [np.nan] * 3, "x", np.ones(2))),
@@ -196,7 +155,7 @@ def encoder(_: Path) -> Reader:
         }
 
     def read(v: dict[str, Any]) -> None:
-        mesh = adapters.MarkerMesh(v["name"], v["faces"], v["n"], color=tuple(v["color"]), id=v["id"])
+        mesh = adapters.MarkerMesh(v["name"], v["faces"], v["n"], color=tuple(v["color"]))
         meshes = adapters.MarkerArrayEncoder([mesh], frame_id=v["frame_id"], axes=v["axes"])
         message = meshes.encode([v["vertices"]], stamp_ns=v["stamp_ns"], transl=v["transl"])
         (marker,) = adapters.decode_marker_array(message)

@@ -277,7 +277,6 @@ _ALL = (
     Target("pose_array", "geometry_msgs/PoseArray in CDR", ms.cdr("pose_array")),
     Target("smpl_msgs", "smpl_msgs/Smpl in CDR", ms.cdr("smpl_msgs")),
     Target("definition", "the .msg text that a bag carries", ms.definition),
-    Target("objects", "message objects with odd fields", ms.objects),
     Target("markers", "visualization_msgs/MarkerArray in CDR", ms.markers),
     Target("surroundings", "transforms, tracked ids, cameras and points in CDR", ms.surroundings),
     Target("encoder", "odd meshes to a MarkerArray", ms.encoder),

@@ -23,6 +23,7 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
 import msg_adapters as adapters
+from msg_adapters.markers import encode_delete
 from refu_core import GarmentPipeline, SmplFrame, load_body, load_garment
 from refu_core.garments import BUILTIN_GARMENTS, PAPER_GARMENTS
 from refu_core.modes import ONE_STYLE
@@ -325,7 +326,7 @@ def empty_bag(path: Path) -> Path:
 def bag_of_something_else(path: Path) -> Path:
     with adapters.BagWriter(path) as writer:
         writer.add_topic("/markers", adapters.MARKER_ARRAY)
-        writer.write("/markers", adapters.encode_delete([("a", 0)], stamp_ns=0), log_time_ns=0)
+        writer.write("/markers", encode_delete(["a"], stamp_ns=0), log_time_ns=0)
     return path
 
 

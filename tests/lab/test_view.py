@@ -140,7 +140,7 @@ def test_recorded_people_stay_until_they_leave_whoever_was_told_of_last(tmp_path
         (50, bob(10**9 + 5 * 10**7)),
         (100, ann(10**9 + 10**8)),
         (150, bob(10**9 + 15 * 10**7, lifetime_ns=10**8)),
-        (200, encode_delete([("ann/shirt", 0)], stamp_ns=10**9)),
+        (200, encode_delete(["ann/shirt"], stamp_ns=10**9)),
         (3_600_000, ann(10**9)),
     ]
     with adapters.BagWriter(tmp_path / "two.mcap") as writer:
@@ -174,7 +174,7 @@ def test_a_robots_own_markers_keep_nobody_from_being_dressed(tmp_path: Path) -> 
     with adapters.BagWriter(path) as writer:
         writer.add_topic("/smpl_params", adapters.INPUT_TYPES["multiarray"])
         writer.add_topic("/robot", adapters.MARKER_ARRAY)
-        writer.write("/robot", encode_delete([("arm", 0)], stamp_ns=1), log_time_ns=10**18)
+        writer.write("/robot", encode_delete(["arm"], stamp_ns=1), log_time_ns=10**18)
         for frame in motion(2):
             writer.write("/smpl_params", adapters.encoder_for("multiarray")(frame), log_time_ns=frame.stamp_ns)
     film = open_film(ViewOptions(inputs=(path,), dressing=RecordingOptions(input=Path(), garments=SHORTS)))

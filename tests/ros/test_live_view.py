@@ -18,6 +18,7 @@ from rclpy.qos import QoSProfile
 from visualization_msgs.msg import MarkerArray
 
 import msg_adapters as adapters
+from msg_adapters.markers import encode_delete
 from refu_core import RefuError, load_garment
 from refu_lab.cli import main
 from refu_lab.commands.replay import RecordingOptions
@@ -50,7 +51,7 @@ class Node:
 
     def leave(self) -> None:
         """Nobody is there."""
-        self._publisher.publish(adapters.encode_delete([("tshirt-male", 0)], stamp_ns=0))
+        self._publisher.publish(encode_delete(["tshirt-male"], stamp_ns=0))
 
     def send_raw(self, data: bytes) -> None:
         """Any bytes."""

@@ -30,20 +30,17 @@ from std_msgs.msg import String
 from visualization_msgs.msg import MarkerArray
 
 from msg_adapters import (
-    COLLISION_OBJECT,
     IDS_LIST,
-    SCENE_UPDATE,
-    Transform,
     TransformBuffer,
     decode_marker_array,
-    encode_transforms,
     encoder_for,
-    matrix_from_quaternion,
     message_definition,
     points_of,
 )
 from msg_adapters.cdr import CdrWriter
 from msg_adapters.inputs._ros4hri import AXES
+from msg_adapters.outputs import COLLISION_OBJECT, SCENE_UPDATE
+from msg_adapters.transforms import Transform, encode_transforms, matrix_from_quaternion
 from refu_core import GarmentPipeline, SmplFrame, load_garment
 from refu_core.outputs import Openings
 from refu_ros import garment_node
