@@ -19,8 +19,7 @@ from refu_core._files import open_file
 from refu_core._npz import DAMAGE as ARCHIVE_DAMAGE
 from refu_core._npz import ArrayBudget, check_npy, npz_names, read_npz
 from refu_core._pickle import DAMAGE, PickledArrays
-from refu_core._pickle_machine import MAX_PICKLE_BYTES, Machine, Record
-from refu_core._torch_stream import MAGIC, read_stream
+from refu_core._pickle_machine import MAX_PICKLE_BYTES, STREAM_MAGIC, Record, Unpickler, read_stream
 from refu_core.errors import RefuError
 from refu_core.recordings._layouts import ALL_KEYS, POSE_KEYS, SUFFIXES, WANTED, is_like_known
 
@@ -141,10 +140,10 @@ def open_content(path: Path, *, error: type[RefuError]) -> Content:
             if magic == _NPY:
                 return _npy(file, file.size)
             unpacker = next((made for start, made in _UNPACKERS.items() if magic.startswith(start)), None)
-            # All at once: the machine reads byte by byte, which takes three times as long from a file.
+            # All at once: the unpickler reads byte by byte, which takes three times as long from a file.
             data = io.BytesIO(file.read() if unpacker is None else _unpacked(file.read(), unpacker()))
-            root = Machine(is_model=False).run(data)
-            if type(root) is int and root == MAGIC:
+            root = Unpickler(data).load()
+            if type(root) is int and root == STREAM_MAGIC:
                 root, storage = read_stream(data)
                 return Content(root, PickledArrays(storage))
             return Content(root)
@@ -197,7 +196,7 @@ def _npy(file: BinaryIO, size: int) -> Content:
     version = npy.read_magic(file)
     _, _, dtype = (npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0)(file)
     if dtype.hasobject:
-        return Content(Machine(is_model=False).run(file))
+        return Content(Unpickler(file).load())
     file.seek(0)
     shape, dtype = check_npy(file, size)
     ArrayBudget().take(shape, dtype)
@@ -225,7 +224,7 @@ def _torch(path: Path, error: type[RefuError]) -> Content:
         with zipfile.ZipFile(path) as archive:
             name = next(name for name in archive.namelist() if name.endswith("data.pkl"))
             folder = name.rpartition("/")[0]
-            tree = Machine(is_model=False).run(io.BytesIO(_member(archive, name)))
+            tree = Unpickler(io.BytesIO(_member(archive, name))).load()
         return Content(tree, PickledArrays(storage))
     except (*DAMAGE, *ARCHIVE_DAMAGE) as cause:
         msg = f"{path}: can't be read as a file of torch: {str(cause) or type(cause).__name__}"
