@@ -9,6 +9,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
+from refu_core.recordings._mhr import N_KEYPOINTS
 from refu_core.recordings._rotations import BODY, WHOLE
 
 SUFFIXES = (".npz", ".npy", ".pkl", ".pickle", ".pk", ".p", ".joblib", ".pt", ".pth", ".smpl", ".bvh")
@@ -39,6 +40,8 @@ class Layout:
     """Whether that is the whole pose; beside others there may be a root, or rotations, under unknown names."""
     holds_places: bool = False
     """Whether the pose is places of joints, and no rotations."""
+    counts: tuple[int, ...] = ()
+    """Of joints or points, where they are others than SMPL's."""
     turns_about_origin: bool = False
     """Whether the root turns the body about the origin of its mesh, and not about its pelvis."""
 
@@ -46,9 +49,19 @@ class Layout:
     def joints(self) -> tuple[tuple[int, ...], ...]:
         """How many each array may have."""
         if len(self.pose) == 1:
-            return ((*WHOLE, *BODY),)
+            return (self.counts or (*WHOLE, *BODY),)
         return (1,), (*BODY, *WHOLE) if self.repeats_root else BODY
 
+
+MHR = Layout(
+    writers="SAM 3D Body",
+    pose=("pred_keypoints_3d",),
+    transl=("pred_cam_t",),
+    place="camera",
+    is_whole=False,
+    counts=(N_KEYPOINTS,),
+)
+"""Its keypoints, about the body, and where that is before the camera [m]."""
 
 LAYOUTS: tuple[Layout, ...] = (
     Layout(writers="WHAM, in the world", pose=("pose_world",), transl=("trans_world",)),
@@ -95,6 +108,7 @@ LAYOUTS: tuple[Layout, ...] = (
     Layout(writers="a body without its root", pose=("body_pose",), is_whole=False),
     Layout(writers="joints alone", pose=("joints",), is_whole=False, holds_places=True),
     Layout(writers="MDM's samples", pose=("motion",), is_whole=False, is_time_last=True, holds_places=True),
+    MHR,
 )
 """In the order of preference, where a file holds several."""
 
@@ -105,8 +119,6 @@ SCALINGS = ("smpl_scaling",)
 """AIST++'s translations are of a body that is larger by so much."""
 MODELS = ("surface_model_type",)
 
-KEYPOINTS, KEYPOINTS_PLACE = "pred_keypoints_3d", "pred_cam_t"
-"""Of SAM 3D Body, about the body, and where that is before the camera [m]."""
 SOMA_NAMES = "joint_names"
 _SOMA = (SOMA_NAMES, "absolute_pose", "unit", "identity_model_type", "identity_coeffs")
 TRACK_IDS = ("track_id", "person_id", "tid", "id")
@@ -115,7 +127,7 @@ POSE_KEYS = frozenset(name for layout in LAYOUTS if layout.is_whole for name in 
 """Of whole poses."""
 ALL_KEYS = frozenset(
     {name for layout in LAYOUTS for names in (layout.pose, layout.transl, layout.betas) for name in names}
-    | {*RATES, *GENDERS, *FRAME_NUMBERS, *SCALINGS, *MODELS, *_SOMA, KEYPOINTS, KEYPOINTS_PLACE}
+    | {*RATES, *GENDERS, *FRAME_NUMBERS, *SCALINGS, *MODELS, *_SOMA}
 )
 """Everything that is read; all else in a file, meshes and pictures, is left unread."""
 
