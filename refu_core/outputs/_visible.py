@@ -13,9 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from refu_core import _warp  # noqa: F401  (quiets Warp before it starts)
 from refu_core.errors import MeshError
-from refu_core.mesh import check_faces
+from refu_core.mesh import as_points, check_faces
 from refu_core.outputs import _visible_kernels as kernels
-from refu_core.outputs._check import as_points
 
 NEAR = 0.05
 """What is nearer to the camera isn't seen [m]."""
@@ -75,10 +74,7 @@ class PinholeCamera:
     ) -> PinholeCamera:
         """A camera at `eye` [m], shape (3,), that has `target` [m] in the middle and the y axis up.
 
-        `fov` is the angle from its left to its right border [rad].
-
-        Raises:
-            MeshError: it would look straight up or down.
+        `fov` is the angle from its left to its right border [rad]. Raises `MeshError` if it looks straight up or down.
         """
         away = np.asarray(target, np.float64) - np.asarray(eye, np.float64)
         right = np.cross(away, [0.0, 1.0, 0.0])
@@ -124,9 +120,8 @@ def visible(
     occluders: Sequence[Mesh] = (),
     *,
     buffer_width: int = BUFFER_WIDTH,
-    tolerance: float = TOLERANCE,
 ) -> NDArray[np.bool_]:
-    """Which vertices of a mesh a camera sees, from whichever side.
+    """Which vertices of a mesh a camera sees, from whichever side, shape (V,).
 
     Args:
         vertices: [m], shape (V, 3).
@@ -134,35 +129,23 @@ def visible(
         camera: in the axes of the vertices.
         occluders: other meshes in the same axes: the body, other garments.
         buffer_width: columns of the buffer of depths. What is narrower than a pixel may be missed.
-        tolerance: how far behind a surface a vertex may be to lie on it [m].
-
-    Returns:
-        Whether each vertex is seen, shape (V,).
 
     Raises:
         MeshError: not finite vertices, or not faces of them.
     """
-    return all_visible([(vertices, faces), *occluders], camera, buffer_width=buffer_width, tolerance=tolerance)[0]
+    return all_visible([(vertices, faces), *occluders], camera, buffer_width=buffer_width)[0]
 
 
 def all_visible(
-    meshes: Sequence[Mesh],
-    camera: PinholeCamera,
-    *,
-    buffer_width: int = BUFFER_WIDTH,
-    tolerance: float = TOLERANCE,
+    meshes: Sequence[Mesh], camera: PinholeCamera, *, buffer_width: int = BUFFER_WIDTH
 ) -> list[NDArray[np.bool_]]:
-    """`visible` of several meshes that hide each other, for the price of one.
-
-    Raises:
-        MeshError: as `visible`.
-    """
+    """`visible` of several meshes that hide each other, for the price of one. Raises `MeshError` as that does."""
     drawn = _draw(meshes, camera.scaled(min(camera.width, buffer_width)))
     seen = np.zeros(len(drawn.seen), np.bool_)
     wp.launch(
         kernels.visible_kernel,
         len(seen),
-        [drawn.seen, drawn.faces, NEAR, tolerance, drawn.buffer],
+        [drawn.seen, drawn.faces, NEAR, TOLERANCE, drawn.buffer],
         [wp.array(seen, dtype=wp.bool, device="cpu", copy=False)],
         device="cpu",
     )
@@ -170,11 +153,7 @@ def all_visible(
 
 
 def depth_image(meshes: Sequence[Mesh], camera: PinholeCamera) -> DepthImage:
-    """What a depth camera would measure, without noise, in its own resolution.
-
-    Raises:
-        MeshError: as `visible`.
-    """
+    """What a depth camera would measure, without noise, in its own resolution. Raises `MeshError` as `visible`."""
     drawn = _draw(meshes, camera)
     found = drawn.buffer.numpy()
     empty = found == np.iinfo(np.int64).max
