@@ -85,7 +85,7 @@ def _rim_names(one: Dressed) -> list[str]:
     return [
         f"{garment_namespace(name, one.person)}/{opening}"
         for name in one.fittings.names
-        for opening in one.fittings.openings(name).names
+        for opening in one.fittings.openings[name].names
     ]
 
 
@@ -155,7 +155,7 @@ def _encode_contacts(one: Dressed, _: Any, wishes: Wishes) -> bytes:
 
 def _opening_places(fittings: Fittings) -> Iterator[tuple[str, tuple[str, int]]]:
     for name in fittings.names:
-        for i, opening in enumerate(fittings.openings(name).names):
+        for i, opening in enumerate(fittings.openings[name].names):
             yield f"{OPENINGS}/{_token(name)}/{opening}", (name, i)
 
 

@@ -48,24 +48,18 @@ class Fittings:
 
     def prepare(self) -> Fittings:
         """Finds at once what it would be asked for with the first frame, but planners' meshes: they take too long."""
-        _ = self._openings, self._normals, self.clearance, self.contacts, self.sigma
+        _ = self.openings, self.normals, self.clearance, self.contacts, self.sigma
         return self
 
     @cached_property
-    def _openings(self) -> dict[str, Openings]:
+    def openings(self) -> dict[str, Openings]:
+        """Of each garment."""
         return {name: Openings(garment) for name, garment in self.garments.items()}
 
     @cached_property
-    def _normals(self) -> dict[str, VertexNormals]:
+    def normals(self) -> dict[str, VertexNormals]:
+        """Of each garment."""
         return {name: VertexNormals(faces, self.counts[name]) for name, faces in self.faces.items()}
-
-    def openings(self, name: str) -> Openings:
-        """Of a garment."""
-        return self._openings[name]
-
-    def normals(self, name: str) -> VertexNormals:
-        """Of a garment."""
-        return self._normals[name]
 
     def planner(self, name: str) -> PlannerMesh:
         """A garment's; takes ten seconds or so when it is made for the first time ever."""
@@ -143,11 +137,11 @@ class Dressed:
     @cached_property
     def openings(self) -> dict[str, tuple[Opening, ...]]:
         """Of each garment."""
-        return {name: self.fittings.openings(name).frames(points) for name, points in self.vertices.items()}
+        return {name: self.fittings.openings[name].frames(points) for name, points in self.vertices.items()}
 
     def normals(self) -> list[NDArray[np.float32]]:
         """At the vertices of each garment, shape (V, 3)."""
-        return [self.fittings.normals(name)(points) for name, points in self.vertices.items()]
+        return [self.fittings.normals[name](points) for name, points in self.vertices.items()]
 
     def clearance(self) -> list[NDArray[np.float32]]:
         """How far each garment's vertices are from the body [m], shape (V,)."""

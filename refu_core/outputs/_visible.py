@@ -104,15 +104,6 @@ class PinholeCamera:
         )
 
 
-class DepthImage(NamedTuple):
-    """What a camera sees of several meshes."""
-
-    depth: NDArray[np.float32]
-    """Along the camera's z at the middle of each pixel [m], shape (H, W); infinite where nothing is."""
-    mesh: NDArray[np.int32]
-    """Number of the mesh that is seen there, shape (H, W); -1 for none."""
-
-
 def visible(
     vertices: ArrayLike,
     faces: ArrayLike,
@@ -121,17 +112,11 @@ def visible(
     *,
     buffer_width: int = BUFFER_WIDTH,
 ) -> NDArray[np.bool_]:
-    """Which vertices of a mesh a camera sees, from whichever side, shape (V,).
+    """Which of a mesh's vertices (V, 3) [m] a camera in their axes sees, from whichever side, shape (V,).
 
-    Args:
-        vertices: [m], shape (V, 3).
-        faces: shape (F, 3).
-        camera: in the axes of the vertices.
-        occluders: other meshes in the same axes: the body, other garments.
-        buffer_width: columns of the buffer of depths. What is narrower than a pixel may be missed.
-
-    Raises:
-        MeshError: not finite vertices, or not faces of them.
+    `occluders` are other meshes in the same axes: the body, other garments. What is narrower than a pixel of a buffer
+    of depths, which has `buffer_width` columns, may be missed. Raises `MeshError` for vertices that aren't finite, and
+    for what aren't faces of them.
     """
     return all_visible([(vertices, faces), *occluders], camera, buffer_width=buffer_width)[0]
 
@@ -152,15 +137,13 @@ def all_visible(
     return np.split(seen, drawn.ends[:-1])
 
 
-def depth_image(meshes: Sequence[Mesh], camera: PinholeCamera) -> DepthImage:
-    """What a depth camera would measure, without noise, in its own resolution. Raises `MeshError` as `visible`."""
-    drawn = _draw(meshes, camera)
-    found = drawn.buffer.numpy()
-    empty = found == np.iinfo(np.int64).max
-    depth = np.where(empty, np.inf, (found >> 32) * 1e-6).astype(np.float32)
-    face = found & 0xFFFFFFFF
-    number = np.searchsorted(drawn.face_ends, np.where(empty, 0, face), side="right").astype(np.int32)
-    return DepthImage(depth, np.where(empty, np.int32(-1), number))
+def depth_image(meshes: Sequence[Mesh], camera: PinholeCamera) -> NDArray[np.float32]:
+    """What a depth camera would measure, without noise, in its own resolution: along its z [m], shape (H, W).
+
+    Infinite where nothing is. Raises `MeshError` as `visible`.
+    """
+    found = _draw(meshes, camera).buffer.numpy()
+    return np.where(found == np.iinfo(np.int64).max, np.inf, (found >> 32) * 1e-6).astype(np.float32)
 
 
 class _Drawn(NamedTuple):
@@ -168,7 +151,6 @@ class _Drawn(NamedTuple):
     faces: Any
     buffer: Any
     ends: NDArray[np.int64]
-    face_ends: NDArray[np.int64]
 
 
 def _draw(meshes: Sequence[Mesh], camera: PinholeCamera) -> _Drawn:
@@ -186,4 +168,4 @@ def _draw(meshes: Sequence[Mesh], camera: PinholeCamera) -> _Drawn:
     seen = wp.array(there.astype(np.float32), dtype=wp.vec3, device="cpu", copy=False)
     buffer = wp.full((camera.height, camera.width), np.iinfo(np.int64).max, dtype=wp.int64, device="cpu")
     wp.launch(kernels.raster_kernel, len(corners), [seen, faces, NEAR], [buffer], device="cpu")
-    return _Drawn(seen, faces, buffer, ends, np.cumsum([len(own) for own in checked]))
+    return _Drawn(seen, faces, buffer, ends)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal
 
 from refu_core.recordings._mhr import N_KEYPOINTS
 from refu_core.recordings._rotations import BODY, WHOLE
@@ -31,8 +30,6 @@ class Layout:
     """Names that the translation may have [m]."""
     betas: tuple[str, ...] = ("betas", "beta", "shape")
     """Names that the shape may have."""
-    place: Literal["world", "camera", "screen"] = "world"
-    """What the translation means; on a screen its depth is for a focal length that was made up, and it isn't read."""
     is_time_last: bool = False
     repeats_root: bool = False
     """Whether the second array has room for the root, too, and is zero there."""
@@ -57,7 +54,6 @@ MHR = Layout(
     writers="SAM 3D Body",
     pose=("pred_keypoints_3d",),
     transl=("pred_cam_t",),
-    place="camera",
     is_whole=False,
     counts=(N_KEYPOINTS,),
 )
@@ -79,15 +75,9 @@ LAYOUTS: tuple[Layout, ...] = (
     Layout(writers="smplx, GVHMR, 4DHumans, HMR 2", pose=("global_orient", "body_pose")),
     Layout(writers="EMDB", pose=("poses_root", "poses_body")),
     Layout(writers="AIST++", pose=("smpl_poses",), transl=("smpl_trans",)),
-    Layout(
-        writers="ROMP, BEV, TRACE",
-        pose=("smpl_thetas",),
-        transl=("cam_trans",),
-        betas=("smpl_betas",),
-        place="camera",
-    ),
-    Layout(writers="HybrIK", pose=("pred_thetas",), transl=("transl",), betas=("pred_betas",), place="camera"),
-    Layout(writers="TRAM", pose=("pred_rotmat",), transl=("pred_trans",), betas=("pred_shape",), place="camera"),
+    Layout(writers="ROMP, BEV, TRACE", pose=("smpl_thetas",), transl=("cam_trans",), betas=("smpl_betas",)),
+    Layout(writers="HybrIK", pose=("pred_thetas",), transl=("transl",), betas=("pred_betas",)),
+    Layout(writers="TRAM", pose=("pred_rotmat",), transl=("pred_trans",), betas=("pred_shape",)),
     Layout(writers="PHC and other humanoid controllers", pose=("pose_aa",), transl=("trans_orig", "trans")),
     Layout(
         writers="Meshcapade",
@@ -97,13 +87,8 @@ LAYOUTS: tuple[Layout, ...] = (
         is_whole=False,
     ),
     Layout(writers="MDM", pose=("thetas",), transl=("root_translation",), is_time_last=True),
-    Layout(
-        writers="WHAM, VIBE, CLIFF, in the camera",
-        pose=("pose",),
-        transl=("trans", "global_t", "transl"),
-        place="camera",
-    ),
-    Layout(writers="BEDLAM, in the camera", pose=("poses_cam",), transl=("trans_cam",), place="camera"),
+    Layout(writers="WHAM, VIBE, CLIFF, in the camera", pose=("pose",), transl=("trans", "global_t", "transl")),
+    Layout(writers="BEDLAM, in the camera", pose=("poses_cam",), transl=("trans_cam",)),
     Layout(writers="a body without its root", pose=("pose_body",), is_whole=False),
     Layout(writers="a body without its root", pose=("body_pose",), is_whole=False),
     Layout(writers="joints alone", pose=("joints",), is_whole=False, holds_places=True),
