@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
+import lzma
 import math
+import pickle
 import struct
 import zipfile
 import zlib
@@ -34,10 +36,11 @@ _MAX_HEADER_BYTES = 1 << 14
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """What numpy writes; other methods ask for gigabytes of their own."""
 DAMAGE = (
-    *(OSError, ValueError, TypeError, KeyError, RecursionError, MemoryError, OverflowError, EOFError, struct.error),
-    *(TokenError, SyntaxError, zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError),
+    *(OSError, ValueError, TypeError, LookupError, AttributeError, RecursionError, MemoryError, OverflowError),
+    *(EOFError, struct.error, TokenError, SyntaxError, NotImplementedError, RuntimeError),
+    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, pickle.UnpicklingError),
 )
-"""What zipfile and numpy raise on damaged files."""
+"""What readers of archives, arrays and pickles raise on damaged files."""
 
 
 class ArrayBudget:

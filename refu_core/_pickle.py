@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import io
 import operator
-import pickle
-import struct
 from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
@@ -15,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_array
 
 from refu_core._files import open_file
-from refu_core._npz import ArrayBudget
+from refu_core._npz import DAMAGE, ArrayBudget
 from refu_core._pickle_machine import (
     MAX_PICKLE_BYTES,
     STREAM_MAGIC,
@@ -26,14 +24,9 @@ from refu_core._pickle_machine import (
     exactly,
     is_plain,
     read_stream,
+    scalar_of,
 )
 from refu_core.errors import RefuError
-
-DAMAGE = (
-    *(ValueError, TypeError, LookupError, AttributeError, struct.error, OverflowError, MemoryError, OSError),
-    *(EOFError, pickle.UnpicklingError),
-)
-"""What the unpickler, and arrays, raise where a file is damaged."""
 
 
 class PickledArrays:
@@ -62,8 +55,7 @@ class PickledArrays:
         if kind == "tensor":
             return self._tensor(value)
         if kind == "scalar":
-            dtype, raw = value.args
-            return np.frombuffer(exactly(bytes, raw), dtype_of(exactly(Record, dtype)), count=1).reshape(())
+            return scalar_of(value)
         if isinstance(value, (list, tuple)) and all(type(item) in (int, float) for item in value):
             self._budget.take((len(value),), np.dtype(np.float64))
             return np.asarray(value)

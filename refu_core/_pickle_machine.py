@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 from typing import Any, BinaryIO, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 MAX_PICKLE_BYTES = 512 << 20
 """The largest official file has 236 MiB: it's text, and takes three times what its arrays do."""
@@ -96,7 +97,7 @@ class _Opcodes(dict[int, Any]):
 class Unpickler(pickle._Unpickler):
     """Of a model it takes no names but those that a model needs; of data it takes any and lets foreign objects lie.
 
-    `load` raises one of `DAMAGE` of `_pickle` where the file is damaged.
+    `load` raises one of `DAMAGE` where the file is damaged.
     """
 
     stack: list[Any]
@@ -258,6 +259,12 @@ def dtype_of(record: Record) -> np.dtype[Any]:
     return np.dtype(f"{order}{code}" if order in ("<", ">") else code)
 
 
+def scalar_of(record: Record) -> NDArray[Any]:
+    """NumPy's scalar that a record of one stands for; trackers count persons with them."""
+    dtype, raw = record.args
+    return np.frombuffer(exactly(bytes, raw), dtype_of(exactly(Record, dtype)), count=1).reshape(())
+
+
 def is_plain(code: Any) -> bool:
     """Whether this is NumPy's short name of a plain number, as `f4`."""
     return type(code) is str and re.fullmatch("[biuf][1248]", code) is not None
@@ -286,14 +293,6 @@ def _put(holder: Any, items: list[Any]) -> None:
     """
     target = holder.items if type(holder) is Record else exactly(dict, holder)
     for key, value in zip(items[::2], items[1::2], strict=True):
-        name = _number_of(key) if type(key) is Record else key
+        name = scalar_of(key).item() if type(key) is Record and key.kind == "scalar" else key
         if isinstance(name, (str, int)):
             target[name] = value
-
-
-def _number_of(scalar: Record) -> int | None:
-    """The whole number that NumPy's scalar of it stands for, which trackers count persons with."""
-    if scalar.kind != "scalar" or len(scalar.args) != 2 or type(scalar.args[1]) is not bytes:
-        return None
-    kind = str(scalar.args[0].args[0]) if type(scalar.args[0]) is Record and scalar.args[0].args else ""
-    return int.from_bytes(scalar.args[1], "little", signed=True) if re.fullmatch("[iu][1248]", kind) else None

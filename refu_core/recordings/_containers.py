@@ -16,9 +16,8 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from refu_core._files import open_file
-from refu_core._npz import DAMAGE as ARCHIVE_DAMAGE
-from refu_core._npz import ArrayBudget, check_npy, npz_names, read_npz
-from refu_core._pickle import DAMAGE, PickledArrays
+from refu_core._npz import DAMAGE, ArrayBudget, check_npy, npz_names, read_npz
+from refu_core._pickle import PickledArrays
 from refu_core._pickle_machine import MAX_PICKLE_BYTES, STREAM_MAGIC, Record, Unpickler, read_stream
 from refu_core.errors import RefuError
 from refu_core.recordings._layouts import ALL_KEYS, POSE_KEYS, SUFFIXES, WANTED, is_like_known
@@ -77,7 +76,7 @@ class Content:
                 array = np.stack(rows)
             else:
                 array = self._arrays.of(value)
-        except (RecursionError, *DAMAGE) as cause:
+        except DAMAGE as cause:
             raise ValueError(str(cause) or type(cause).__name__) from cause
         self._made[id(value)] = value, array  # held beside its array, so that the number stays its own
         return array
@@ -147,7 +146,7 @@ def open_content(path: Path, *, error: type[RefuError]) -> Content:
                 root, storage = read_stream(data)
                 return Content(root, PickledArrays(storage))
             return Content(root)
-        except (*DAMAGE, *ARCHIVE_DAMAGE, lzma.LZMAError) as cause:
+        except DAMAGE as cause:
             is_other = path.suffix and path.suffix.lower() not in SUFFIXES
             why = f"no file of motion is a {path.suffix}" if is_other else str(cause) or type(cause).__name__
             msg = f"{path}: can't be read: {why}; wanted {WANTED}"
@@ -187,7 +186,7 @@ def _object(path: Path, name: str) -> Any:
                 return None
             data = head + member.read(_MOST_HELD)
         return _npy(io.BytesIO(data), len(data)).root
-    except (*DAMAGE, *ARCHIVE_DAMAGE):
+    except DAMAGE:
         return None
 
 
@@ -226,7 +225,7 @@ def _torch(path: Path, error: type[RefuError]) -> Content:
             folder = name.rpartition("/")[0]
             tree = Unpickler(io.BytesIO(_member(archive, name))).load()
         return Content(tree, PickledArrays(storage))
-    except (*DAMAGE, *ARCHIVE_DAMAGE) as cause:
+    except DAMAGE as cause:
         msg = f"{path}: can't be read as a file of torch: {str(cause) or type(cause).__name__}"
         raise error(msg) from cause
 

@@ -191,7 +191,7 @@ def _read_tensors(path: Path, sha256: Any) -> dict[str, Tensor]:
                 raise WeightsError(msg)
             file.seek(0)
             return load(file.read())
-    except (SafetensorError, AttributeError, *DAMAGE) as error:
+    except (SafetensorError, *DAMAGE) as error:
         if isinstance(error, WeightsError):
             raise
         what = "larger than this machine's memory" if isinstance(error, MemoryError) else "not a safetensors file"
