@@ -85,7 +85,9 @@ class Record:
 
 
 _REFUSED = (pickle.EXT1, pickle.EXT2, pickle.EXT4, pickle.LONG4)
-_KNOWN = {code: how for code, how in pickle._Unpickler.dispatch.items() if bytes([code]) not in _REFUSED}
+_KNOWN: dict[int, Any] = {
+    code: how for code, how in pickle._Unpickler.dispatch.items() if bytes([code]) not in _REFUSED
+}
 
 
 class _Opcodes(dict[int, Any]):
@@ -201,8 +203,7 @@ class Unpickler(pickle._Unpickler):
             raise ValueError(msg)
         return Record("buffer", (self.read(n_bytes), kind, shape, state.get("order")))
 
-    dispatch: ClassVar[dict[int, Any]] = _Opcodes(_KNOWN)
-    dispatch |= {
+    _own: ClassVar[dict[int, Any]] = {
         pickle.FRAME[0]: lambda self: self.read(8),
         pickle.REDUCE[0]: _call,
         pickle.NEWOBJ[0]: _call,
@@ -219,6 +220,7 @@ class Unpickler(pickle._Unpickler):
         pickle.ADDITEMS[0]: _KNOWN[pickle.APPENDS[0]],
         pickle.FROZENSET[0]: _KNOWN[pickle.LIST[0]],
     }
+    dispatch: ClassVar[dict[int, Any]] = _Opcodes(_KNOWN | _own)
 
 
 def read_stream(file: BinaryIO) -> tuple[Any, Callable[[str], bytes]]:

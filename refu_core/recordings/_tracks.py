@@ -62,13 +62,11 @@ def _people(content: Content, frames: list[list[Mapping[Key, Any]]]) -> dict[str
 
 def places_in_time(frames: NDArray[Any] | None, n: int) -> NDArray[np.int64] | None:
     """Which frames n of them are, from 0 on, by their numbers; None where none is missing, or these aren't numbers."""
-    if frames is None or frames.dtype.kind not in "iu" or frames.size != n:
+    if frames is None or frames.dtype.kind not in "iu" or not frames.size == n > 0:
         return None
-    at = frames.reshape(-1).astype(np.int64)
+    at: NDArray[np.int64] = frames.reshape(-1).astype(np.int64) - int(frames.flat[0])
     gaps = np.diff(at)
-    if not len(gaps) or (gaps == 1).all() or gaps.min() < 1 or at[-1] - at[0] >= MAX_FRAMES:
-        return None
-    return at - at[0]
+    return None if not len(gaps) or (gaps == 1).all() or gaps.min() < 1 or at[-1] >= MAX_FRAMES else at
 
 
 def filled(
