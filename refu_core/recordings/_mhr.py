@@ -14,6 +14,8 @@ _PLACES = dict(zip(_BODY.split(), range(21), strict=True))
 _PLACES |= {"r_index": 28, "r_pinky": 40, "r_wrist": 41, "l_index": 49, "l_pinky": 61, "l_wrist": 62, "neck": 69}
 """Which of the 70 are points of the keypoint layouts; of a hand its knuckles, as fingers bend."""
 POINTS = tuple(_PLACES)
+_MOST_LOST = 100
+"""Frames for one in which a person is seen; numbers that say more than that are none."""
 
 
 def is_of_mhr(keypoints: NDArray[Any]) -> bool:
@@ -32,7 +34,7 @@ def places_of_mhr(
         at: which of the T frames they are, (N,); None for all.
     """
     seen = keypoints.reshape(-1, N_KEYPOINTS, 3).astype(np.float64)[:, list(_PLACES.values())] + place[:, None]
-    if at is None:
+    if at is None or at[-1] > _MOST_LOST * len(at):
         return seen
     places = np.full((int(at[-1]) + 1, *seen.shape[1:]), np.nan)
     places[at] = seen

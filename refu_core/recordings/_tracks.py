@@ -64,8 +64,8 @@ def places_in_time(frames: NDArray[Any] | None, n: int) -> NDArray[np.int64] | N
     """Which frames n of them are, from 0 on, by their numbers; None where none is missing, or these aren't numbers."""
     if frames is None or frames.dtype.kind not in "iu" or not frames.size == n > 0:
         return None
-    at: NDArray[np.int64] = frames.reshape(-1).astype(np.int64) - int(frames.flat[0])
-    gaps = np.diff(at)
+    at: NDArray[np.int64] = frames.reshape(-1).astype(np.int64)
+    at, gaps = at - at[0], np.diff(at)
     return None if not len(gaps) or (gaps == 1).all() or gaps.min() < 1 or at[-1] >= MAX_FRAMES else at
 
 
