@@ -23,8 +23,10 @@ MAX_PICKLE_BYTES = 512 << 20
 """The largest official file has 236 MiB: it's text, and takes three times what its arrays do."""
 STREAM_MAGIC = 0x1950A86A20F9469CFC6C
 """What a stream of torch begins with: a pickle of this number alone."""
-_MAX_READS = 1_500_000
+_MODEL_READS, _DATA_READS = 200_000, 1_500_000
 """An opcode takes one to three. An official file has some hundred opcodes; a tracker's has a thousand a frame."""
+_MAX_MARKS = 10_000
+"""Values in values; Python itself writes no more than a thousand."""
 _MAX_NAMES = 10_000
 """Python writes each name once in a file, and then refers to it."""
 _MAX_NESTED = 4
@@ -103,6 +105,7 @@ class Unpickler(pickle._Unpickler):
     """
 
     stack: list[Any]
+    metastack: list[list[Any]]
     append: Callable[[Any], None]
     pop_mark: Callable[[], list[Any]]
     read: Callable[[int], bytes]
@@ -111,7 +114,7 @@ class Unpickler(pickle._Unpickler):
     def __init__(self, file: BinaryIO | Unpickler, *, is_model: bool = False, nested: int = 0) -> None:
         super().__init__(file, encoding="latin1")
         self._is_model, self._nested = is_model, nested
-        self._left, self._n_names = _MAX_READS, 0
+        self._left, self._n_names = _MODEL_READS if is_model else _DATA_READS, 0
         self._read_uncounted, self._file_read = file.read, self._read_counted
         self.storages: dict[str, np.dtype[Any]] = {}
         """The types of the storages beside the pickle by their keys: torch's."""
@@ -119,7 +122,7 @@ class Unpickler(pickle._Unpickler):
     def _read_counted(self, n: int) -> bytes:
         self._left -= 1
         if self._left < 0:
-            msg = f"more than {_MAX_READS} opcodes and values"
+            msg = "too many opcodes and values"
             raise ValueError(msg)
         return self._read_uncounted(n)
 
@@ -141,6 +144,12 @@ class Unpickler(pickle._Unpickler):
         if len(pid) > 2 and type(pid[1]) is Name and type(pid[2]) is str and is_plain(pid[1].kind):
             self.storages[pid[2]] = np.dtype(f"<{pid[1].kind}")
         return storage
+
+    def _mark(self) -> None:
+        if len(self.metastack) == _MAX_MARKS:
+            msg = f"values in each other, {_MAX_MARKS} deep"
+            raise ValueError(msg)
+        _KNOWN[pickle.MARK[0]](self)
 
     def _call(self) -> None:
         args = exactly(tuple, self.stack.pop())
@@ -205,6 +214,7 @@ class Unpickler(pickle._Unpickler):
 
     _own: ClassVar[dict[int, Any]] = {
         pickle.FRAME[0]: lambda self: self.read(8),
+        pickle.MARK[0]: _mark,
         pickle.REDUCE[0]: _call,
         pickle.NEWOBJ[0]: _call,
         pickle.NEWOBJ_EX[0]: _call_with_names,
