@@ -33,6 +33,10 @@ MAX_BYTES = 3 << 30
 MAX_CARD_BYTES = 1 << 20
 LARGEST = 1e4
 """No weight is larger: those that ship are below 30, and what overflowed in training is far above."""
+_DTYPES = {
+    *(torch.float64, torch.float32, torch.float16, torch.bfloat16),
+    *(torch.int64, torch.int32, torch.int8, torch.bool),
+}
 _PIECE = 1 << 22
 _STEP = ".step"
 """After a tensor's name: how much a step of its difference is, a number."""
@@ -190,7 +194,11 @@ def _read_tensors(path: Path, sha256: Any) -> dict[str, Tensor]:
                 msg = f"{damaged}; get both files again"
                 raise WeightsError(msg)
             file.seek(0)
-            return load(file.read())
+            tensors: dict[str, Tensor] = load(file.read())
+            if not {tensor.dtype for tensor in tensors.values()} <= _DTYPES:
+                msg = "it has numbers of another type"
+                raise ValueError(msg)
+            return tensors
     except (SafetensorError, *DAMAGE) as error:
         if isinstance(error, WeightsError):
             raise
