@@ -166,7 +166,7 @@ def _follow(pipeline: GarmentPipeline, garment: str, moments: list[Moment], *, k
         eye = middle + np.array([2 * np.sin(way), 0.5, 2 * np.cos(way)])
         camera = PinholeCamera.looking_at(middle, eye, width=320, height=240)
         skin = (out.skin, skin_faces)
-        points = measured(depth_image([(moment.truth, faces), skin], camera).depth, camera, rng)
+        points = measured(depth_image([(moment.truth, faces), skin], camera), camera, rng)
         seen = moment.truth[visible(moment.truth, faces, camera, [skin])]
 
         def off(vertices: NDArray[np.float32], seen: Points = seen) -> float:
@@ -203,7 +203,7 @@ def times() -> None:
     worn, body = out["tshirt-male"].local, (out.body, pipeline.body.faces.numpy())
     meshes = [(out[name].local, out[name].faces) for name in out]
     camera = PinholeCamera.looking_at([0, 0, 0], [0.3, 0.4, 2.2], width=320, height=240)
-    depth = depth_image([*meshes, body], camera).depth
+    depth = depth_image([*meshes, body], camera)
     points = measured(depth, camera, np.random.default_rng(0))
     rims, solid, every = Openings(shirt), PlannerMesh.of(pipeline, shirt.name), Sigma(pipeline)
     clear, limbs, observer = Clearance.of(pipeline), LimbContacts.of(pipeline), Observer(pipeline)

@@ -30,7 +30,7 @@ def main() -> None:
         true = true + 0.015 * (true[:, 2:] > true[:, 2].mean()) * np.array([0.0, 0.0, 1.0])
         camera = PinholeCamera.looking_at(true.mean(0), [0.4, 1.3, 2.0], width=320, height=240)
         skin = (plain.skin + plain.transl, pipeline.body.faces)
-        depth = depth_image([(true, plain[name].faces), skin], camera).depth
+        depth = depth_image([(true, plain[name].faces), skin], camera)
         row, column = np.nonzero(np.isfinite(depth))
         z = depth[row, column] + rng.normal(0, 0.003, len(row))
         x = (column + 0.5 - camera.centre[0]) / camera.focal[0] * z

@@ -25,14 +25,9 @@ class Engine(Protocol):
     ) -> Iterator[tuple[int, Result | Lost]]:
         """Yields each task's number and result as they come, each once.
 
-        Args:
-            make: makes a process's function, once for all its tasks; it is sent to each process.
-            tasks: what the function is called with; sent, too, and so are the results. Each is asked for when its time
-                has come, so that a sequence may read it then.
-
-        Raises what a task raises; `RefuError` when the processes are out of reach.
+        `make` makes a process's function, once for all its tasks; it is sent to each process, as tasks and results are.
+        A task is asked for when its time has come. Raises what a task raises; `RefuError` without processes in reach.
         """
-        ...
 
 
 class InProcess:

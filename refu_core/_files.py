@@ -46,18 +46,10 @@ class InputFile(io.BufferedReader):
 
 
 def open_file(path: str | os.PathLike[str], *, most: int, error: type[RefuError], wanted: str) -> InputFile:
-    """Opens a regular file of 1 to `most` bytes to read.
+    """Opens a regular file of 1 to `most` bytes, or a link to one, to read; `wanted` says what it should be.
 
-    Files of /proc say that they are empty, and are refused as such.
-
-    Args:
-        path: of the file, or of a link to it.
-        most: a larger file is refused [bytes].
-        error: what is raised.
-        wanted: what the file should be, for the message.
-
-    Raises:
-        error: there is no such file, it isn't a regular one, it is empty or too large, or it can't be opened.
+    Raises `error` where there is none, it isn't a regular file, it is empty (as those of /proc say) or too large, or it
+    can't be opened.
     """
     try:
         got = _fault(Path(path).stat(), most)

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import io
+import lzma
 import math
+import pickle
 import struct
 import zipfile
 import zlib
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from tokenize import TokenError
 from typing import IO, Any
@@ -33,10 +36,11 @@ _MAX_HEADER_BYTES = 1 << 14
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """What numpy writes; other methods ask for gigabytes of their own."""
 DAMAGE = (
-    *(OSError, ValueError, TypeError, KeyError, RecursionError, MemoryError, OverflowError, EOFError, struct.error),
-    *(TokenError, SyntaxError, zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError),
+    *(OSError, ValueError, TypeError, LookupError, AttributeError, RecursionError, MemoryError, OverflowError),
+    *(EOFError, struct.error, TokenError, SyntaxError, NotImplementedError, RuntimeError),
+    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, pickle.UnpicklingError),
 )
-"""What zipfile and numpy raise on damaged files."""
+"""What readers of archives, arrays and pickles raise on damaged files."""
 
 
 class ArrayBudget:
@@ -71,35 +75,35 @@ def read_npz(path: Path, *, keys: Collection[str], error: type[RefuError], wante
     Raises:
         error: the file can't be read, holds anything else under one of the keys, or more than `MAX_BYTES`.
     """
-    with open_file(path, most=_MAX_FILE_BYTES, error=error, wanted=wanted) as file:
-        file.step = _MAX_READ
-        try:
-            with zipfile.ZipFile(file) as archive:
-                names = {entry: entry.filename.removesuffix(".npy") for entry in archive.infolist()}
-                entries = {name: entry for entry, name in names.items() if name in keys}
-                if len(entries) < sum(name in keys for name in names.values()):
-                    msg = "it has two arrays of one name"
-                    raise ValueError(msg)
-                size = sum(entry.file_size for entry in entries.values())
-                if size > MAX_BYTES:
-                    msg = f"unpacks to {size >> 20} MiB, at most {MAX_BYTES >> 20} MiB are read"
-                    raise ValueError(msg)
-                budget = ArrayBudget()
-                for entry in entries.values():
-                    _check_entry(archive, entry, budget)
-                return {key: _read_entry(archive, entry) for key, entry in entries.items()}
-        except DAMAGE as cause:
-            msg = f"{path}: can't be read as .npz: {str(cause) or type(cause).__name__}"
-            raise error(msg) from cause
+    with _archive(path, error, wanted) as archive:
+        names = {entry: entry.filename.removesuffix(".npy") for entry in archive.infolist()}
+        entries = {name: entry for entry, name in names.items() if name in keys}
+        if len(entries) < sum(name in keys for name in names.values()):
+            msg = "it has two arrays of one name"
+            raise ValueError(msg)
+        size = sum(entry.file_size for entry in entries.values())
+        if size > MAX_BYTES:
+            msg = f"unpacks to {size >> 20} MiB, at most {MAX_BYTES >> 20} MiB are read"
+            raise ValueError(msg)
+        budget = ArrayBudget()
+        for entry in entries.values():
+            _check_entry(archive, entry, budget)
+        return {key: _read_entry(archive, entry) for key, entry in entries.items()}
 
 
 def npz_names(path: Path, *, error: type[RefuError], wanted: str) -> list[str]:
     """The names of what an archive holds. Raises `error` as `read_npz`."""
+    with _archive(path, error, wanted) as archive:
+        return [name.removesuffix(".npy") for name in archive.namelist()]
+
+
+@contextmanager
+def _archive(path: Path, error: type[RefuError], wanted: str) -> Iterator[zipfile.ZipFile]:
     with open_file(path, most=_MAX_FILE_BYTES, error=error, wanted=wanted) as file:
         file.step = _MAX_READ
         try:
             with zipfile.ZipFile(file) as archive:
-                return [name.removesuffix(".npy") for name in archive.namelist()]
+                yield archive
         except DAMAGE as cause:
             msg = f"{path}: can't be read as .npz: {str(cause) or type(cause).__name__}"
             raise error(msg) from cause

@@ -1,27 +1,32 @@
-"""Arrays of pickles: what the machine has read, rebuilt within the budget of all files."""
+"""Arrays of pickles: what the unpickler has read, rebuilt within the budget of all files."""
 
 from __future__ import annotations
 
 import io
 import operator
-import re
-import struct
 from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csc_array
 
 from refu_core._files import open_file
-from refu_core._npz import ArrayBudget
-from refu_core._pickle_machine import MAX_PICKLE_BYTES, Machine, Record, exactly, kind_of_name
-from refu_core._torch_stream import MAGIC, read_stream
+from refu_core._npz import DAMAGE, ArrayBudget
+from refu_core._pickle_machine import (
+    MAX_PICKLE_BYTES,
+    STREAM_MAGIC,
+    Name,
+    Record,
+    Unpickler,
+    dtype_of,
+    exactly,
+    is_plain,
+    read_stream,
+    scalar_of,
+)
 from refu_core.errors import RefuError
-
-DAMAGE = (ValueError, TypeError, LookupError, struct.error, OverflowError, MemoryError, OSError)
-"""What the machine, and arrays, raise where a file is damaged."""
-_STORAGES = ("f4", "f8", "f2", "i8", "i4", "i2", "u1", "i1", "b1")
 
 
 class PickledArrays:
@@ -42,15 +47,15 @@ class PickledArrays:
             value = value.state["x"]
         if isinstance(value, Record) and value.kind == "parameter" and value.args:
             value = value.args[0]
-        if isinstance(value, Record) and value.kind in ("array", "buffer"):
+        kind = value.kind if isinstance(value, Record) else ""
+        if kind in ("array", "buffer"):
             return self._plain(value)
-        if isinstance(value, Record) and value.kind == "sparse":
+        if kind == "sparse":
             return self._sparse(exactly(dict, value.state))
-        if isinstance(value, Record) and value.kind == "tensor":
+        if kind == "tensor":
             return self._tensor(value)
-        if isinstance(value, Record) and value.kind == "scalar":
-            dtype, raw = value.args
-            return np.frombuffer(exactly(bytes, raw), _dtype(exactly(Record, dtype)), count=1).reshape(())
+        if kind == "scalar":
+            return scalar_of(value)
         if isinstance(value, (list, tuple)) and all(type(item) in (int, float) for item in value):
             self._budget.take((len(value),), np.dtype(np.float64))
             return np.asarray(value)
@@ -70,7 +75,7 @@ class PickledArrays:
         if not isinstance(kind, Record) or kind.kind != "dtype" or not isinstance(raw, bytes):
             msg = "an array of objects"
             raise ValueError(msg)
-        dtype = _dtype(kind)
+        dtype = dtype_of(kind)
         shape = tuple(operator.index(n) for n in exactly(tuple, shape))
         self._budget.take(shape, dtype)
         flat: NDArray[Any] = np.frombuffer(raw, dtype)
@@ -83,8 +88,8 @@ class PickledArrays:
         if exactly(Record, storage).kind == "stream":  # a pickle of tensors that torch knows nothing of
             storage, given = _streamed(storage)
         _, name, key = exactly(Record, storage).args[:3]
-        kind = kind_of_name(name)
-        if given is None or kind not in _STORAGES or type(key) is not str:
+        kind = exactly(Name, name).kind
+        if given is None or not is_plain(kind) or type(key) is not str:
             msg = "a tensor without its numbers, or of a type that isn't read"
             raise ValueError(msg)
         shape, strides = (tuple(operator.index(n) for n in exactly(tuple, pair)) for pair in (shape, strides))
@@ -109,37 +114,23 @@ class PickledArrays:
         rows, columns = (operator.index(n) for n in exactly(tuple, state["_shape" if "_shape" in state else "shape"]))
         data, indices, pointers = (self.of(state[key]).reshape(-1) for key in ("data", "indices", "indptr"))
         self._budget.take((rows, columns), np.dtype(np.float64))
-        if len(pointers) != columns + 1 or len(indices) != len(data) or indices.dtype.kind not in "iu":
-            msg = f"a sparse matrix of {rows} x {columns} with {len(data)} entries"
+        if not indices.dtype.kind == pointers.dtype.kind == "i":
+            msg = f"a sparse matrix with places of {indices.dtype} and {pointers.dtype}"
             raise ValueError(msg)
-        counts = np.diff(pointers)
-        if counts.min(initial=0) < 0 or counts.sum() != len(indices):
-            msg = f"a sparse matrix whose columns have {counts.sum()} entries, and {len(indices)} are given"
-            raise ValueError(msg)
-        dense = np.zeros((rows, columns))
-        column = np.repeat(np.arange(columns), counts)
-        np.add.at(dense, (indices, column), data)
+        matrix = csc_array((data.astype(np.float64), indices, pointers), shape=(rows, columns))
+        matrix.check_format(full_check=True)
+        dense: NDArray[Any] = matrix.toarray()
         return dense
 
 
 def _streamed(record: Record) -> tuple[Record, Callable[[str], bytes]]:
     """A storage that torch has written as a stream of its own, and what gives its bytes."""
     file = io.BytesIO(exactly(bytes, record.args[0] if record.args else None))
-    if Machine(is_model=False).run(file) != MAGIC:
+    if Unpickler(file).load() != STREAM_MAGIC:
         msg = "a tensor whose numbers are no stream of torch"
         raise ValueError(msg)
     storage, given = read_stream(file)
     return exactly(Record, storage), given
-
-
-def _dtype(record: Record) -> np.dtype[Any]:
-    code = record.args[0] if record.args else None
-    order = record.state[1] if type(record.state) is tuple and len(record.state) > 1 else "|"
-    code, order = (text.decode("latin1") if type(text) is bytes else text for text in (code, order))
-    if type(code) is not str or not re.fullmatch("[biuf][1248]", code):
-        msg = f"arrays of the type {code[:20] if type(code) is str else type(code).__name__!r} are not read"
-        raise ValueError(msg)
-    return np.dtype(order + code) if order in ("<", ">") else np.dtype(code)
 
 
 def read_smpl_pickle(
@@ -152,7 +143,7 @@ def read_smpl_pickle(
     """
     with open_file(path, most=MAX_PICKLE_BYTES, error=error, wanted=wanted) as file:
         try:
-            content = Machine(is_model=True).run(file)
+            content = Unpickler(file, is_model=True).load()
         except DAMAGE as cause:
             msg = f"{path}: can't be read as an SMPL pickle: {str(cause) or type(cause).__name__}"
             raise error(msg) from cause

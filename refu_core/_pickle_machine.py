@@ -1,28 +1,30 @@
-"""Reads pickles without executing anything in them: official SMPL `.pkl` files, and what pose estimators write.
+"""Reads pickles as data: official SMPL `.pkl` files, and what pose estimators write with pickle, joblib or torch.
 
-The first were written by Python 2 and hold numpy arrays, a scipy sparse matrix and `chumpy` objects; the others hold
-dictionaries of arrays, as pickle, joblib or torch write them. Python's own unpickler isn't used at all. The machine
-below knows the opcodes that such a file needs, and makes of them text, numbers, lists and inert records of what an
-object was built from. Nothing is imported or called, nothing is hashed but text and whole numbers, and nothing is
-walked by recursion, so that nested values do no harm either. Arrays are rebuilt from the records afterwards
-(`_pickle`), within the budget of all files.
+The standard library's unpickler (the one in Python) keeps the stack. Here every name becomes an inert record of what an
+object was built from, so nothing is imported or called. Opcodes that would hash any value, make room for what they only
+announce, or know Python's registries are replaced or refused. Arrays are made of the records afterwards (`_pickle`),
+within the budget of all files.
 """
 
 from __future__ import annotations
 
-import codecs
 import math
-import pickletools
+import pickle
 import re
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, BinaryIO
+from dataclasses import dataclass, field
+from typing import Any, BinaryIO, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 MAX_PICKLE_BYTES = 512 << 20
 """The largest official file has 236 MiB: it's text, and takes three times what its arrays do."""
-_MODEL_OPCODES, _DATA_OPCODES = 100_000, 1_000_000
-"""An official file has some hundreds; a tracker's has a thousand a frame."""
+STREAM_MAGIC = 0x1950A86A20F9469CFC6C
+"""What a stream of torch begins with: a pickle of this number alone."""
+_MODEL_READS, _DATA_READS = 200_000, 1_500_000
+"""An opcode takes one to three. An official file has some hundred opcodes; a tracker's has a thousand a frame."""
 _MAX_MARKS = 10_000
 """Values in values; Python itself writes no more than a thousand."""
 _MAX_NAMES = 10_000
@@ -30,10 +32,8 @@ _MAX_NAMES = 10_000
 _MAX_NESTED = 4
 """Pickles in a pickle: joblib writes arrays of objects so."""
 _LONG_TEXT = 1 << 16
-_OPCODES = {opcode.code.encode("latin1"): opcode for opcode in pickletools.opcodes}
-_READERS = {opcode.name: opcode.arg.reader for opcode in pickletools.opcodes if opcode.arg}
 _NUMPY = ("numpy.core", "numpy._core")
-_NAMES: dict[str, str] = {
+MODEL_NAMES: dict[str, str] = {
     "numpy.dtype": "dtype",
     "numpy.ndarray": "array",
     "_codecs.encode": "latin1",
@@ -45,7 +45,7 @@ _NAMES: dict[str, str] = {
     **{f"chumpy.{name}": "chumpy" for name in ("ch.Ch", "ch.MatVecMult", "reordering.Select")},
 }
 """What a model may name, and what it is here."""
-DATA_NAMES: dict[str, str] = _NAMES | {
+_DATA_NAMES: dict[str, str] = MODEL_NAMES | {
     **{f"{package}.multiarray.scalar": "scalar" for package in _NUMPY},
     **{f"collections.{name}": "mapping" for name in ("OrderedDict", "defaultdict")},
     "joblib.numpy_pickle.NumpyArrayWrapper": "joblib",
@@ -61,20 +61,10 @@ DATA_NAMES: dict[str, str] = _NAMES | {
     },
 }
 """What a file of data may name, besides; everything else that it names stands there inert (`foreign`)."""
-_READABLE = (
-    *("INT", "LONG", "LONG1", "BININT", "BININT1", "BININT2", "FLOAT", "BINFLOAT", "BINSTRING", "SHORT_BINSTRING"),
-    *("SHORT_BINUNICODE", "SHORT_BINBYTES", "BINBYTES", "BINBYTES8"),
-)
-_ARGUMENTS: dict[str, Callable[[BinaryIO], Any]] = {
-    **{name: _READERS[name] for name in ("PROTO", "FRAME", "PUT", "BINPUT", "LONG_BINPUT")},
-    **{name: _READERS[name] for name in ("GET", "BINGET", "LONG_BINGET")},
-    "GLOBAL": lambda file: [file.readline().rstrip().decode("ascii") for _ in range(2)],
-}
-"""Of opcodes that change what is there, and what reads it."""
 
 
 @dataclass(eq=False, slots=True)
-class _Name:
+class Name:
     """A name of the table, or `foreign`."""
 
     kind: str
@@ -87,199 +77,220 @@ class Record:
     kind: str
     args: tuple[Any, ...] = ()
     state: Any = None
-    items: dict[str | int, Any] | None = None
+    items: dict[str | int, Any] = field(default_factory=dict)
     """What was put into it, where it is some class's kind of dictionary."""
 
+    def extend(self, _: Any) -> None:
+        """What is put into some class's kind of list isn't kept."""
 
-class Machine:
-    """The stack, and what the opcodes do to it.
+    append = extend
 
-    Of a model it takes nothing but what a model needs; of data it takes what there is and lets foreign objects lie.
-    """
 
-    def __init__(self, *, is_model: bool, nested: int = 0) -> None:
-        self._stack: list[Any] = []
-        self._marked: list[list[Any]] = []
-        self._memo: dict[int, Any] = {}
-        self._n_names = 0
-        self._is_model = is_model
-        self._nested = nested
-        self.storages: dict[str, str] = {}
-        """The types of the storages beside the pickle, as `f4`, by their keys: torch's."""
+_REFUSED = (pickle.EXT1, pickle.EXT2, pickle.EXT4, pickle.LONG4)
+_KNOWN: dict[int, Any] = {
+    code: how for code, how in pickle._Unpickler.dispatch.items() if bytes([code]) not in _REFUSED
+}
 
-    def run(self, file: BinaryIO) -> Any:
-        """What a pickle holds. Raises `ValueError`, `LookupError` or `struct.error` where it is damaged."""
-        most = _MODEL_OPCODES if self._is_model else _DATA_OPCODES
-        for _ in range(most):
-            opcode = _OPCODES.get(file.read(1))
-            if opcode is None:
-                msg = f"no opcode at byte {file.tell()}"
-                raise ValueError(msg)
-            if opcode.name == "STOP":
-                return self._stack.pop()
-            if opcode.name in _VALUES:
-                self._stack.append(_VALUES[opcode.name](file))
-            else:
-                self._do(opcode.name, _ARGUMENTS[opcode.name](file) if opcode.name in _ARGUMENTS else None)
-                top = self._stack[-1] if opcode.name == "BUILD" else None
-                if type(top) is Record and top.kind == "joblib":
-                    self._stack[-1] = self._array_behind(top, file)
-        msg = f"more than {most} opcodes"
+
+class _Opcodes(dict[int, Any]):
+    def __missing__(self, code: int) -> None:
+        msg = f"it uses the opcode {chr(code)!r}, which no plain data need: refused, nothing was executed"
         raise ValueError(msg)
 
-    def _do(self, name: str, argument: Any) -> None:
-        match name:
-            case "PROTO" | "FRAME":
-                pass
-            case "MARK":
-                if len(self._marked) == _MAX_MARKS:
-                    msg = f"values in each other, {_MAX_MARKS} deep"
-                    raise ValueError(msg)
-                self._marked.append(self._stack)
-                self._stack = []
-            case "PUT" | "BINPUT" | "LONG_BINPUT":
-                self._memo[argument] = self._stack[-1]
-            case "MEMOIZE":
-                self._memo[len(self._memo)] = self._stack[-1]
-            case "GET" | "BINGET" | "LONG_BINGET":
-                self._stack.append(self._memo[argument])
-            case "TUPLE1" | "TUPLE2" | "TUPLE3":
-                self._stack.append(tuple(self._last(int(name[-1]))))
-            case "TUPLE" | "LIST" | "DICT":
-                items = self._since_mark()
-                self._stack.append(self._dict(items) if name == "DICT" else items if name == "LIST" else tuple(items))
-            case "APPEND" | "APPENDS":
-                items = self._last(1) if name == "APPEND" else self._since_mark()
-                if not self._is_foreign(self._stack[-1]):
-                    exactly(list, self._stack[-1]).extend(items)
-            case "SETITEM" | "SETITEMS":
-                items = self._last(2) if name == "SETITEM" else self._since_mark()
-                top = self._stack[-1]
-                if self._is_foreign(top):
-                    top.items = top.items or {}
-                    top = top.items
-                exactly(dict, top).update(self._dict(items))
-            case "GLOBAL" | "STACK_GLOBAL":
-                module, name = self._last(2) if argument is None else argument
-                self._stack.append(self._named(f"{exactly(str, module)}.{exactly(str, name)}"))
-            case "REDUCE" | "NEWOBJ":
-                called, args = self._last(2)
-                kind = "foreign" if self._is_foreign(called) else exactly(_Name, called).kind
-                self._stack.append(_made(kind, exactly(tuple, args)))
-            case "BUILD":
-                state = self._stack.pop()
-                if not (type(self._stack[-1]) is dict and not self._is_model):  # what else a kind of dictionary knows
-                    exactly(Record, self._stack[-1]).state = state
-            case _ if self._is_model:
-                msg = f"it uses {name}, which no SMPL model needs: refused, nothing was executed"
-                raise ValueError(msg)
-            case "BINPERSID":
-                self._stack.append(self._storage(exactly(tuple, self._stack.pop())))
-            case "EMPTY_SET":
-                self._stack.append([])
-            case "ADDITEMS":
-                items = self._since_mark()
-                exactly(list, self._stack[-1]).extend(items)
-            case "FROZENSET":
-                self._stack.append(self._since_mark())
-            case "NEWOBJ_EX":
-                called, args, _ = self._last(3)
-                self._stack.append(Record("foreign"))
-            case _:
-                msg = f"it uses {name}, which no file of plain data needs: refused, nothing was executed"
-                raise ValueError(msg)
 
-    def _storage(self, args: tuple[Any, ...]) -> Record:
-        kind, key = (kind_of_name(args[1]), args[2]) if len(args) > 2 else ("", "")
-        if re.fullmatch("[biuf][1248]", kind) and type(key) is str:
-            self.storages[key] = kind
-        return Record("storage", args)
+class Unpickler(pickle._Unpickler):
+    """Of a model it takes no names but those that a model needs; of data it takes any and lets foreign objects lie.
 
-    def _last(self, n: int) -> list[Any]:
-        if len(self._stack) < n:
-            msg = f"{n} values wanted, and {len(self._stack)} there"
-            raise LookupError(msg)
-        items = self._stack[-n:]
-        del self._stack[-n:]
-        return items
+    `load` raises one of `DAMAGE` where the file is damaged.
+    """
 
-    def _since_mark(self) -> list[Any]:
-        items, self._stack = self._stack, self._marked.pop()
-        return items
+    stack: list[Any]
+    metastack: list[list[Any]]
+    append: Callable[[Any], None]
+    pop_mark: Callable[[], list[Any]]
+    read: Callable[[int], bytes]
+    readline: Callable[[], bytes]
 
-    def _is_foreign(self, value: Any) -> bool:
-        """An object of a class that isn't known here, or that class: it may be built in any way, and stays inert."""
-        return not self._is_model and type(value) in (Record, _Name) and value.kind == "foreign"
+    def __init__(self, file: BinaryIO | Unpickler, *, is_model: bool = False, nested: int = 0) -> None:
+        super().__init__(file, encoding="latin1")
+        self._is_model, self._nested = is_model, nested
+        self._left, self._n_names = _MODEL_READS if is_model else _DATA_READS, 0
+        self._read_uncounted, self._file_read = file.read, self._read_counted
+        self.storages: dict[str, np.dtype[Any]] = {}
+        """The types of the storages beside the pickle by their keys: torch's."""
 
-    def _named(self, name: str) -> _Name:
+    def _read_counted(self, n: int) -> bytes:
+        self._left -= 1
+        if self._left < 0:
+            msg = "too many opcodes and values"
+            raise ValueError(msg)
+        return self._read_uncounted(n)
+
+    def find_class(self, module: str, name: str) -> Name:
+        """Stands for what a pickle names."""
         self._n_names += 1
         if self._n_names > _MAX_NAMES:
             msg = f"it names objects more than {_MAX_NAMES} times"
             raise ValueError(msg)
-        if not self._is_model:
-            return _Name(DATA_NAMES.get(name, "foreign"))
-        if name not in _NAMES:
-            msg = f"it refers to {name[:80]}, which no SMPL model needs: refused, nothing was executed"
+        full = f"{module}.{name}"
+        if self._is_model and full not in MODEL_NAMES:
+            msg = f"it refers to {full[:80]}, which no SMPL model needs: refused, nothing was executed"
             raise ValueError(msg)
-        return _Name(_NAMES[name])
+        return Name(_DATA_NAMES.get(full, "foreign"))
 
-    def _dict(self, items: list[Any]) -> dict[str | int, Any]:
-        pairs = zip(items[::2], items[1::2], strict=True)
-        if self._is_model:
-            return {exactly(str, key): value for key, value in pairs}
-        named = ((_number_of(key) if type(key) is Record else key, value) for key, value in pairs)
-        return {key: value for key, value in named if isinstance(key, (str, int))}
+    def persistent_load(self, pid: Any) -> Record:
+        """Stands for a storage of torch, which is beside the pickle."""
+        storage = Record("storage", exactly(tuple, pid))
+        if len(pid) > 2 and type(pid[1]) is Name and type(pid[2]) is str and is_plain(pid[1].kind):
+            self.storages[pid[2]] = np.dtype(f"<{pid[1].kind}")
+        return storage
 
-    def _array_behind(self, wrapper: Record, file: BinaryIO) -> Any:
+    def _mark(self) -> None:
+        if len(self.metastack) == _MAX_MARKS:
+            msg = f"values in each other, {_MAX_MARKS} deep"
+            raise ValueError(msg)
+        _KNOWN[pickle.MARK[0]](self)
+
+    def _call(self) -> None:
+        args = exactly(tuple, self.stack.pop())
+        self.stack[-1] = _made(self.stack[-1], args)
+
+    def _call_with_names(self) -> None:
+        self.stack.pop()
+        self._call()
+
+    def _build(self) -> None:
+        state, built = self.stack.pop(), self.stack[-1]
+        if type(built) is dict:  # what else some class's kind of dictionary knows
+            return
+        exactly(Record, built).state = state
+        if built.kind == "joblib":
+            self.stack[-1] = self._array_behind(exactly(dict, state))
+
+    def _set_item(self) -> None:
+        value, key = self.stack.pop(), self.stack.pop()
+        _put(self.stack[-1], [key, value])
+
+    def _set_items(self) -> None:
+        items = self.pop_mark()
+        _put(self.stack[-1], items)
+
+    def _dict(self) -> None:
+        items = self.pop_mark()
+        self.append({})
+        _put(self.stack[-1], items)
+
+    def _text(self, length: str) -> None:
+        (n,) = struct.unpack(length, self.read(struct.calcsize(length)))
+        text = self.read(n)
+        # Long text is bytes that Python 3 wrote as text; one other character would make each four times as wide.
+        if len(text) > _LONG_TEXT and text.translate(None, bytes(range(0xC4))):
+            msg = "a long text that isn't of bytes"
+            raise ValueError(msg)
+        self.append(text.decode("utf-8", "surrogatepass"))
+
+    def _line(self) -> None:
+        line = self.readline()
+        if len(line) > _LONG_TEXT and re.search(rb"\\(?:U|u(?!00))", line):
+            msg = "a long text that isn't of bytes"
+            raise ValueError(msg)
+        self.append(line[:-1].decode("raw-unicode-escape"))
+
+    def _array_behind(self, state: dict[str, Any]) -> Any:
         """The array whose bytes joblib has put between two opcodes."""
-        state = exactly(dict, wrapper.state)
         kind, shape = exactly(Record, state["dtype"]), exactly(tuple, state["shape"])
         if str(kind.args[0] if kind.args else "").startswith("O"):
             if self._nested == _MAX_NESTED:
                 msg = f"arrays of objects, {_MAX_NESTED} deep"
                 raise ValueError(msg)
-            return Machine(is_model=False, nested=self._nested + 1).run(file)
+            return Unpickler(self, nested=self._nested + 1).load()
         if state.get("numpy_array_alignment_bytes") is not None:
-            file.read(file.read(1)[0])
-        n_bytes = math.prod(exactly(int, n) for n in shape) * _item_size(kind)
+            self.read(self.read(1)[0])
+        n_bytes = math.prod(exactly(int, n) for n in shape) * dtype_of(kind).itemsize
         if not 0 <= n_bytes <= MAX_PICKLE_BYTES:
             msg = f"an array of {n_bytes >> 20} MiB"
             raise ValueError(msg)
-        return Record("buffer", (file.read(n_bytes), kind, shape, state.get("order")))
+        return Record("buffer", (self.read(n_bytes), kind, shape, state.get("order")))
+
+    _own: ClassVar[dict[int, Any]] = {
+        pickle.FRAME[0]: lambda self: self.read(8),
+        pickle.MARK[0]: _mark,
+        pickle.REDUCE[0]: _call,
+        pickle.NEWOBJ[0]: _call,
+        pickle.NEWOBJ_EX[0]: _call_with_names,
+        pickle.BUILD[0]: _build,
+        pickle.SETITEM[0]: _set_item,
+        pickle.SETITEMS[0]: _set_items,
+        pickle.DICT[0]: _dict,
+        pickle.BINUNICODE[0]: lambda self: self._text("<I"),
+        pickle.BINUNICODE8[0]: lambda self: self._text("<Q"),
+        pickle.UNICODE[0]: _line,
+        pickle.BYTEARRAY8[0]: _KNOWN[pickle.BINBYTES8[0]],
+        pickle.EMPTY_SET[0]: _KNOWN[pickle.EMPTY_LIST[0]],
+        pickle.ADDITEMS[0]: _KNOWN[pickle.APPENDS[0]],
+        pickle.FROZENSET[0]: _KNOWN[pickle.LIST[0]],
+    }
+    dispatch: ClassVar[dict[int, Any]] = _Opcodes(_KNOWN | _own)
 
 
-def _item_size(dtype: Record) -> int:
-    code = str(dtype.args[0] if dtype.args else "")
-    if not re.fullmatch("[biuf][1248]", code):
-        msg = f"arrays of the type {code[:20]!r} are not read"
-        raise ValueError(msg)
-    return int(code[1])
-
-
-def _number_of(scalar: Record) -> int | None:
-    """The whole number that NumPy's scalar of it stands for, which trackers count persons with."""
-    if scalar.kind != "scalar" or len(scalar.args) != 2 or type(scalar.args[1]) is not bytes:
-        return None
-    kind = str(scalar.args[0].args[0]) if type(scalar.args[0]) is Record and scalar.args[0].args else ""
-    return int.from_bytes(scalar.args[1], "little", signed=True) if re.fullmatch("[iu][1248]", kind) else None
+def read_stream(file: BinaryIO) -> tuple[Any, Callable[[str], bytes]]:
+    """What torch wrote before its files were archives, and what gives a storage's bytes by its key: `STREAM_MAGIC`,
+    which has been read, then more pickles, then numbers."""
+    for _ in ("version", "machine"):
+        Unpickler(file).load()
+    unpickler = Unpickler(file)
+    root = unpickler.load()
+    parts: dict[str, bytes] = {}
+    for key in exactly(list, Unpickler(file).load()):
+        (count,) = struct.unpack("<q", file.read(8))
+        size = count * unpickler.storages[key].itemsize
+        part = file.read(size) if size >= 0 else b""
+        if len(part) != size:
+            msg = f"a tensor of {size} bytes that was cut short"
+            raise ValueError(msg)
+        parts[key] = part
+    return root, parts.__getitem__
 
 
 def exactly(kind: type[Any], value: Any) -> Any:
     """`value`, if that is what it is."""
     if type(value) is not kind:
-        msg = f"{type(value).__name__.strip('_')} where {kind.__name__.strip('_')} was expected"
+        msg = f"{type(value).__name__} where {kind.__name__} was expected"
         raise ValueError(msg)
     return value
 
 
-def _made(kind: str, args: tuple[Any, ...]) -> Any:
+def dtype_of(record: Record) -> np.dtype[Any]:
+    """The type of numbers that a record of one stands for."""
+    code = record.args[0] if record.args else None
+    order = record.state[1] if type(record.state) is tuple and len(record.state) > 1 else "|"
+    code, order = (text.decode("latin1") if type(text) is bytes else text for text in (code, order))
+    if not is_plain(code):
+        msg = f"arrays of the type {code[:20] if type(code) is str else type(code).__name__!r} are not read"
+        raise ValueError(msg)
+    return np.dtype(f"{order}{code}" if order in ("<", ">") else code)
+
+
+def scalar_of(record: Record) -> NDArray[Any]:
+    """NumPy's scalar that a record of one stands for; trackers count persons with them."""
+    dtype, raw = record.args
+    return np.frombuffer(exactly(bytes, raw), dtype_of(exactly(Record, dtype)), count=1).reshape(())
+
+
+def is_plain(code: Any) -> bool:
+    """Whether this is NumPy's short name of a plain number, as `f4`."""
+    return type(code) is str and re.fullmatch("[biuf][1248]", code) is not None
+
+
+def _made(called: Any, args: tuple[Any, ...]) -> Any:
     """What a call of a name gives."""
+    if type(called) is Record:  # what a foreign call has given
+        return Record("foreign")
+    kind = exactly(Name, called).kind
+    if kind == "new":  # Python 2's way to make an object: of its class, which is the first argument
+        kind, args = exactly(Name, args[0]).kind, ()
     if kind == "mapping":
         return {}
-    if kind == "new" and exactly(_Name, args[0]).kind == "mapping":
-        return {}
-    if kind == "new":  # Python 2's way to make an object: of its class, which is the first argument
-        return Record(exactly(_Name, args[0]).kind)
     if kind == "new array":
         return Record("array")
     if kind == "latin1":  # how Python 3 writes bytes into protocol 2
@@ -287,54 +298,13 @@ def _made(kind: str, args: tuple[Any, ...]) -> Any:
     return args[0] if kind == "bytearray" and args else Record(kind, args)
 
 
-def _quoted(file: BinaryIO) -> str:
-    """A line of Python 2's text, which pickletools knows in ASCII only."""
-    line = file.readline().strip()
-    if len(line) < 2 or line[:1] not in b"'\"" or line[-1:] != line[:1]:
-        msg = "text without quotation marks"
-        raise ValueError(msg)
-    decoded: bytes = codecs.escape_decode(line[1:-1])[0]
-    return decoded.decode("latin1")
+def _put(holder: Any, items: list[Any]) -> None:
+    """Puts keys and values into a dictionary, or what stands for one.
 
-
-def _line(file: BinaryIO) -> str:
-    line = file.readline()
-    if len(line) > _LONG_TEXT and re.search(rb"\\(?:U|u(?!00))", line):
-        msg = "a long text that isn't of bytes"
-        raise ValueError(msg)
-    return line[:-1].decode("raw-unicode-escape")
-
-
-def _utf8(length: str) -> Callable[[BinaryIO], str]:
-    def read(file: BinaryIO) -> str:
-        (n,) = struct.unpack(length, file.read(struct.calcsize(length)))
-        text = file.read(n)
-        # Long text is bytes that Python 3 wrote as text; one other character would make each four times as wide.
-        if len(text) != n or (n > _LONG_TEXT and text.translate(None, bytes(range(0xC4)))):
-            msg = f"a text of {n} bytes that was cut short, or isn't of bytes"
-            raise ValueError(msg)
-        return text.decode("utf-8", "surrogatepass")
-
-    return read
-
-
-_VALUES: dict[str, Callable[[BinaryIO], Any]] = {
-    "NONE": lambda _: None,
-    "NEWTRUE": lambda _: True,
-    "NEWFALSE": lambda _: False,
-    "EMPTY_LIST": lambda _: [],
-    "EMPTY_DICT": lambda _: {},
-    "EMPTY_TUPLE": lambda _: (),
-    "STRING": _quoted,
-    "UNICODE": _line,
-    "BINUNICODE": _utf8("<I"),
-    "BINUNICODE8": _utf8("<Q"),
-    **{name: _READERS[name] for name in _READABLE},
-    "BYTEARRAY8": lambda file: bytes(_READERS["BYTEARRAY8"](file)),
-}
-"""Opcodes that put a value on the stack, and what reads it."""
-
-
-def kind_of_name(value: Any) -> str:
-    """What a class that a pickle names is here; empty for anything else."""
-    return value.kind if type(value) is _Name else ""
+    Keys that are neither words nor whole numbers are left out: to hash one may never end.
+    """
+    target = holder.items if type(holder) is Record else exactly(dict, holder)
+    for key, value in zip(items[::2], items[1::2], strict=True):
+        name = scalar_of(key).item() if type(key) is Record and key.kind == "scalar" else key
+        if isinstance(name, (str, int)):
+            target[name] = value

@@ -165,6 +165,29 @@ def check_faces(faces: Any, *, n_vertices: int | None = None) -> NDArray[np.int3
     return np.ascontiguousarray(array, dtype=np.int32)
 
 
+def as_points(
+    name: str, values: Any, n: int | None = None, *, dtype: type[np.floating[Any]] = np.float64
+) -> NDArray[Any]:
+    """`values` (a tensor, too) as finite points of a type, contiguous, shape (n, 3).
+
+    Raises:
+        MeshError: they aren't that.
+    """
+    try:
+        points = np.ascontiguousarray(values.detach().cpu() if hasattr(values, "detach") else values, dtype=dtype)
+    except (TypeError, ValueError) as error:
+        msg = f"{name} must be numbers of the shape ({'N' if n is None else n}, 3), got {type(values).__name__}"
+        raise MeshError(msg) from error
+    if points.ndim != 2 or points.shape[1] != 3 or (n is not None and len(points) != n):
+        msg = f"{name} must have the shape ({'N' if n is None else n}, 3), got {points.shape}"
+        raise MeshError(msg)
+    if not np.isfinite(points).all():
+        bad = int((~np.isfinite(points)).any(axis=1).sum())
+        msg = f"{name} must be finite, got {bad} of {len(points)} with NaN or infinite coordinates"
+        raise MeshError(msg)
+    return points
+
+
 def vertex_normals(vertices: NDArray[_Float], faces: NDArray[np.int32]) -> NDArray[_Float]:
     """Unit normals at the vertices (V, 3) of faces (F, 3): the mean of the faces around each, by area; shape (V, 3)."""
     a, b, c = vertices[faces].transpose(1, 0, 2)

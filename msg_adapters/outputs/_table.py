@@ -135,7 +135,7 @@ def _encode_contacts(one: Dressed, _: Any, moment: Moment) -> bytes:
 
 def _opening_places(fittings: Fittings) -> Iterator[tuple[str, tuple[str, int]]]:
     for name in fittings.names:
-        for i, opening in enumerate(fittings.openings(name).names):
+        for i, opening in enumerate(fittings.openings[name].names):
             yield f"{OPENINGS}/{_token(name)}/{opening}", (name, i)
 
 

@@ -88,7 +88,7 @@ class CollisionChecker:
         Raises `MeshError` for wrong shapes, values that aren't finite, or where no body was set.
         """
         vertices = as_vertices("the garment's vertices", garment_vertices)
-        found = crossings(self._body, vertices, self._triangles_of(garment_faces, vertices))
+        found = crossings(self._body.mesh_id, vertices, self._triangles_of(garment_faces, vertices))
         points = torch.from_numpy(vertices)
         # 2 where limbs are in each other; where skin is turned inside out it is -1, and nobody's inside.
         inside = (self._winding(points) > 0).cpu().numpy()

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
+from scipy import sparse
 
 from refu_core.errors import MeshError
 from refu_core.mesh import Connectivity, check_faces
 from refu_core.metrics._collisions import Collisions
-from refu_core.metrics._folds import SWEEPS, FoldBands
 from refu_core.metrics._intersect import as_vertices
 
 ON_SKIN = 1e-6
 """Vertices no deeper than this [m] lie on the skin and not inside: positions of a metre are stored to a tenth of it."""
+SWEEPS = (1, 4, 16, 64)
+"""Sweeps that each band is what they take away, finest first. Half a step to the mean of the neighbours each."""
 
 
 @dataclass(frozen=True)
@@ -114,40 +115,51 @@ class Figures:
         return asdict(self)
 
 
-@dataclass(eq=False)
-class GarmentMetrics:
-    """Gathers the metrics of one garment over frames.
+class FoldBands:
+    """Splits a garment into bands: folds of some edges' length, of some more, and the shape that is left.
 
-    `faces` are the garment's, shape (G, 3). Raises `MeshError` when they aren't triangles.
+    Networks that are trained for a small error predict the mean of what cloth may do, which is smoother than cloth. The
+    mean error hardly says so. The energy of the bands does.
     """
 
-    faces: NDArray[np.int32]
-    _frames: list[FrameMetrics] = field(default_factory=list, init=False, repr=False)
-    _laplacian: csr_array | None = field(default=None, init=False, repr=False)
-    _bands: FoldBands | None = field(default=None, init=False, repr=False)
+    def __init__(self, mesh: Connectivity) -> None:
+        half = 0.5 * mesh.uniform_laplacian()
+        self._sweep = sparse.csr_array(sparse.eye_array(mesh.n_vertices) - half)
 
-    def __post_init__(self) -> None:
-        self.faces = check_faces(self.faces)
+    def split(self, vertices: Any) -> NDArray[np.float64]:
+        """The bands of arrays (V, ...) over the vertices, finest first, and what is left: (5, V, ...). They add up."""
+        array = np.asarray(vertices, np.float64)
+        rest = array.reshape(len(array), -1)
+        bands = []
+        for n_sweeps in SWEEPS:
+            level = rest
+            for _ in range(n_sweeps):
+                level = self._sweep @ level
+            bands.append(rest - level)
+            rest = level
+        return np.stack([*bands, rest]).reshape(len(SWEEPS) + 1, *array.shape)
 
-    def add(
-        self,
-        vertices: Any,
-        collisions: Collisions,
-        *,
-        truth: Any = None,
-        resolved: Any = None,
-    ) -> FrameMetrics:
-        """Takes in a frame and returns its figures over all vertices.
+    def energies(self, vertices: Any) -> NDArray[np.float64]:
+        """Of vertices (V, ..., 3) [m] the energy of each band, finest first [m^2], shape (4, ...)."""
+        energies: NDArray[np.float64] = (self.split(vertices)[:-1] ** 2).sum(axis=(1, -1))
+        return energies
 
-        Args:
-            vertices: The garment [m], shape (N, 3).
-            collisions: Its exact collisions.
-            truth: The true garment [m], shape (N, 3), where there is one.
-            resolved: Vertices that collided before collisions were handled, bool, shape (N,): the local Laplacian error
-                is over these (the supplement's "initial collided vertex"); over all vertices by default.
 
-        Raises:
-            MeshError: Arrays whose shapes don't belong together.
+class GarmentMetrics:
+    """Gathers the metrics of one garment over frames."""
+
+    def __init__(self, faces: Any) -> None:
+        """For a garment of these faces, shape (G, 3). Raises `MeshError` when they aren't triangles."""
+        self.faces = check_faces(faces)
+        self._frames: list[FrameMetrics] = []
+        self._known: tuple[sparse.csr_array, FoldBands] | None = None
+
+    def add(self, vertices: Any, collisions: Collisions, *, truth: Any = None, resolved: Any = None) -> FrameMetrics:
+        """Takes in a garment's vertices (N, 3) [m] with their exact collisions; returns figures over all vertices.
+
+        `truth` are the true vertices, where there are some. The local Laplacian error is over those that `resolved`,
+        bool, (N,), marks: what collided before collisions were handled (the supplement's "initial collided vertex");
+        over all by default. Raises `MeshError` for arrays whose shapes don't belong together.
         """
         garment = as_vertices("the garment's vertices", vertices)
         n = len(garment)
@@ -160,10 +172,17 @@ class GarmentMetrics:
                 f"{None if target is None else target.shape}, {region.shape}, {collisions.inside.shape}"
             )
             raise MeshError(msg)
-        errors = laplacians = None
+        errors = laplacians = folds = None
         if target is not None:
             errors = np.linalg.norm(garment.astype(np.float64) - target, axis=1)
-            laplacians = np.linalg.norm(self._laplacian_of(garment) - self._laplacian_of(target), axis=1)
+            if self._known is None:
+                mesh = Connectivity.of(self.faces, n)
+                self._known = mesh.uniform_laplacian(), FoldBands(mesh)
+            laplacian, bands = self._known
+            laplacians = np.linalg.norm(
+                laplacian @ garment.astype(np.float64) - laplacian @ target.astype(np.float64), axis=1
+            )
+            folds = bands.energies(np.stack((garment, target), axis=1)).T.tolist()
         depth = collisions.depth.astype(np.float64)
         frame = FrameMetrics(
             n_vertices=n,
@@ -176,7 +195,7 @@ class GarmentMetrics:
             collision_error_mm=1e3 * float(depth.sum()),
             mpve_mm=None if errors is None else 1e3 * float(errors.mean()),
             laplacian_mm=None if laplacians is None or not region.any() else 1e3 * float(laplacians[region].mean()),
-            folds=None if target is None else self._folds_of(garment, target),
+            folds=folds,
         )
         self._frames.append(frame)
         return frame
@@ -184,17 +203,3 @@ class GarmentMetrics:
     def summary(self) -> Figures:
         """The figures over the frames added so far."""
         return Figures.over(self._frames)
-
-    def _folds_of(self, *garments: NDArray[np.float32]) -> list[list[float]]:
-        """Of each the energies of its bands: one look at the mesh for all."""
-        if self._bands is None:
-            self._bands = FoldBands(Connectivity.of(self.faces, len(garments[0])))
-        energies: list[list[float]] = self._bands.energies(np.stack(garments, axis=1)).T.tolist()
-        return energies
-
-    def _laplacian_of(self, vertices: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Each vertex minus the mean of its neighbours along edges (the uniform Laplacian) [m], shape (N, 3)."""
-        if self._laplacian is None or self._laplacian.shape[0] != len(vertices):
-            self._laplacian = Connectivity.of(self.faces, len(vertices)).uniform_laplacian()
-        product: NDArray[np.float64] = self._laplacian @ vertices.astype(np.float64)
-        return product

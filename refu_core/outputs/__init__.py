@@ -21,7 +21,6 @@ from refu_core.outputs._sigma import bend_of as bend_of
 from refu_core.outputs._sigma import fit_sigma as fit_sigma
 from refu_core.outputs._sigma import load_sigma as load_sigma
 from refu_core.outputs._sigma import save_sigma as save_sigma
-from refu_core.outputs._visible import DepthImage as DepthImage
 from refu_core.outputs._visible import PinholeCamera as PinholeCamera
 from refu_core.outputs._visible import all_visible as all_visible
 from refu_core.outputs._visible import depth_image as depth_image

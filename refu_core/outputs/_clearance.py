@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from refu_core.errors import MeshError
-from refu_core.outputs._check import as_points
+from refu_core.mesh import as_points
 from refu_core.sdf import BandSdf, Links
 
 if TYPE_CHECKING:
@@ -31,54 +30,37 @@ class Clearance:
     where it matters, as the accurate mode does (`BandSdf`): the rest of a garment is told by its edges to be outside.
     """
 
-    def __init__(self, body: SmplBody, garments: Mapping[str, GarmentTemplate], *, reach: float = REACH) -> None:
-        """For garments on a body; all is on the CPU, where a pipeline's outputs are.
+    reach = REACH
 
-        Raises:
-            MeshError: the reach isn't positive.
-        """
-        if not 0 < reach < math.inf:
-            msg = f"a clearance needs a positive reach in metres, got {reach}"
-            raise MeshError(msg)
-        self.reach = float(reach)
-        """[m]"""
+    def __init__(self, body: SmplBody, garments: Mapping[str, GarmentTemplate]) -> None:
+        """For garments on a body; all is on the CPU, where a pipeline's outputs are."""
         self._sdf = BandSdf(body.faces.cpu(), band=self.reach, rest=body.v_template.detach().cpu())
         self._links = {name: Links(garment.mesh.ring) for name, garment in garments.items()}
 
     @classmethod
-    def of(cls, pipeline: GarmentPipeline, *, reach: float = REACH) -> Clearance:
-        """For what a pipeline puts out. Raises `MeshError` as the class does."""
-        return cls(pipeline.body, pipeline.garments, reach=reach)
+    def of(cls, pipeline: GarmentPipeline) -> Clearance:
+        """For what a pipeline puts out."""
+        return cls(pipeline.body, pipeline.garments)
 
     def __call__(self, output: PipelineOutput) -> dict[str, NDArray[np.float32]]:
-        """Of each garment in a pipeline's output: as `of_garment`, by name.
-
-        Raises:
-            MeshError: a garment that this wasn't made for.
-        """
+        """Of each garment in a pipeline's output: as `of_garment`, by name."""
         self.update(output.body)
         return {name: self.of_garment(name, garment.local) for name, garment in output.items()}
 
     def update(self, body: Any) -> None:
         """Takes over a posed collider, vertices (V, 3) [m]. Raises `MeshError` for what is none."""
-        self._sdf.update(torch.from_numpy(as_points("the body's vertices", body).astype(np.float32)))
+        self._sdf.update(torch.from_numpy(as_points("the body's vertices", body, dtype=np.float32)))
 
     def of_garment(self, name: str, vertices: Any) -> NDArray[np.float32]:
-        """Distance of a garment's vertices to the collider, negative inside [m], shape (V,).
+        """Distance of a garment's vertices (V, 3) [m] to the collider, negative inside [m], shape (V,).
 
-        Exact inside and up to `reach`; farther out it is `reach`, which the vertex is at least away.
-
-        Args:
-            name: of the garment.
-            vertices: in the axes of the body that `update` was given [m], shape (V, 3).
-
-        Raises:
-            MeshError: an unknown garment, not its vertices, or no body yet.
+        Exact inside and up to `reach`; farther out it is `reach`, which the vertex is at least away. Raises `MeshError`
+        for an unknown garment, for what aren't its vertices, and where `update` was given no body yet.
         """
         if name not in self._links:
             msg = f"no garment {name!r} here: wanted one of {', '.join(self._links)}"
             raise MeshError(msg)
         links = self._links[name]
-        points = as_points("the garment's vertices", vertices, links.n_vertices).astype(np.float32)
+        points = as_points("the garment's vertices", vertices, links.n_vertices, dtype=np.float32)
         distance: NDArray[np.float32] = self._sdf.clipped(torch.from_numpy(points), links).distance.numpy()
         return distance

@@ -41,51 +41,44 @@ class Fittings:
         self.colors = {name: (*garment.card.color, 1.0) for name, garment in self.garments.items()}
         self.body = pipeline.body.faces.cpu().numpy(), len(pipeline.body.v_template)
         """The body's faces, and how many vertices it has."""
-        self._known: dict[tuple[Any, str], Any] = {}
+        self._planners: dict[str, PlannerMesh] = {}
         self._preparing: dict[str, threading.Thread] = {}
         self.without_planner: dict[str, str] = {}
         """Garments that planners can't have, and why."""
 
     def prepare(self) -> Fittings:
         """Finds at once what it would be asked for with the first frame, but planners' meshes: they take too long."""
-        for name in self.names:
-            self.openings(name)
-            self.normals(name)
-        _ = self.clearance, self.contacts, self.sigma
+        _ = self.openings, self.normals, self.clearance, self.contacts, self.sigma
         return self
 
-    def _once(self, make: Any, name: str, *arguments: Any) -> Any:
-        if (make, name) not in self._known:
-            self._known[make, name] = make(*arguments)
-        return self._known[make, name]
+    @cached_property
+    def openings(self) -> dict[str, Openings]:
+        """Of each garment."""
+        return {name: Openings(garment) for name, garment in self.garments.items()}
 
-    def openings(self, name: str) -> Openings:
-        """Of a garment."""
-        found: Openings = self._once(Openings, name, self.garments[name])
-        return found
+    @cached_property
+    def normals(self) -> dict[str, VertexNormals]:
+        """Of each garment."""
+        return {name: VertexNormals(faces, self.counts[name]) for name, faces in self.faces.items()}
 
     def planner(self, name: str) -> PlannerMesh:
         """A garment's; takes ten seconds or so when it is made for the first time ever."""
-        found: PlannerMesh = self._once(PlannerMesh.of, name, self._pipeline, name)
-        return found
+        if name not in self._planners:
+            self._planners[name] = PlannerMesh.of(self._pipeline, name)
+        return self._planners[name]
 
     def has_planner(self, name: str) -> bool:
         """Whether `planner` would answer at once. Who asks first starts to make it, in a thread of its own."""
         if name not in self._preparing:
             self._preparing[name] = threading.Thread(target=self._prepare_planner, args=(name,), daemon=True)
             self._preparing[name].start()
-        return (PlannerMesh.of, name) in self._known
+        return name in self._planners
 
     def _prepare_planner(self, name: str) -> None:
         try:
             self.planner(name)
         except Exception as error:  # whatever it is: nobody else would say it, and others would wait for this garment
             self.without_planner[name] = str(error) or type(error).__name__
-
-    def normals(self, name: str) -> VertexNormals:
-        """Of a garment."""
-        found: VertexNormals = self._once(VertexNormals, name, self.faces[name], self.counts[name])
-        return found
 
     @cached_property
     def clearance(self) -> Clearance:
@@ -144,11 +137,11 @@ class Dressed:
     @cached_property
     def openings(self) -> dict[str, tuple[Opening, ...]]:
         """Of each garment."""
-        return {name: self.fittings.openings(name).frames(points) for name, points in self.vertices.items()}
+        return {name: self.fittings.openings[name].frames(points) for name, points in self.vertices.items()}
 
     def normals(self) -> list[NDArray[np.float32]]:
         """At the vertices of each garment, shape (V, 3)."""
-        return [self.fittings.normals(name)(points) for name, points in self.vertices.items()]
+        return [self.fittings.normals[name](points) for name, points in self.vertices.items()]
 
     def clearance(self) -> list[NDArray[np.float32]]:
         """How far each garment's vertices are from the body [m], shape (V,)."""

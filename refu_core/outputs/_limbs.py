@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -12,9 +12,7 @@ from numpy.typing import NDArray
 
 from refu_core._warp import as_warp
 from refu_core.body import DEFAULT_GAP, SEGMENTS, part_of_faces
-from refu_core.errors import MeshError
 from refu_core.outputs import _limbs_kernels as kernels
-from refu_core.outputs._check import as_points
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -54,16 +52,8 @@ class LimbContacts:
     It is geometry alone: nothing in it knows how stiff cloth or flesh is, so no force can be had from it.
     """
 
-    def __init__(self, body: SmplBody, garments: Mapping[str, GarmentTemplate], *, within: float = PRESSED) -> None:
-        """For garments on a body, on the CPU.
-
-        Raises:
-            MeshError: `within` [m] isn't positive.
-        """
-        if not 0 < within < 1:
-            msg = f"wanted a positive distance in metres, got {within}"
-            raise MeshError(msg)
-        self._within = within
+    def __init__(self, body: SmplBody, garments: Mapping[str, GarmentTemplate]) -> None:
+        """For garments on a body, on the CPU."""
         self._faces = {name: garment.faces.cpu().numpy() for name, garment in garments.items()}
         n = body.n_vertices
         self._points, self._shift = torch.zeros(2, n, 3)
@@ -83,42 +73,35 @@ class LimbContacts:
         self._parts = parts
 
     @classmethod
-    def of(cls, pipeline: GarmentPipeline, *, within: float = PRESSED) -> LimbContacts:
-        """For what a pipeline puts out. Raises `MeshError` as the class does."""
-        return cls(pipeline.body, pipeline.garments, within=within)
+    def of(cls, pipeline: GarmentPipeline) -> LimbContacts:
+        """For what a pipeline puts out."""
+        return cls(pipeline.body, pipeline.garments)
 
     def __call__(self, output: PipelineOutput) -> tuple[LimbContact, ...]:
-        """The contacts in a pipeline's output, that of the largest area first.
-
-        Raises:
-            MeshError: it is of other garments, or of another body.
-        """
-        body = as_points("the body's vertices", output.body, len(self._points))
-        self._points.copy_(torch.from_numpy(body))
-        self._shift.copy_(torch.from_numpy(body - output.skin))
+        """The contacts in the output of the pipeline, that of the largest area first."""
+        self._points.copy_(torch.from_numpy(output.body))
+        self._shift.copy_(torch.from_numpy(output.body - output.skin))
         for mesh in self._meshes:
             mesh.refit()
         wp.launch(kernels.box_kernel, len(_PARTS), [self._parts], device="cpu")
         found: list[tuple[NDArray[np.int32], NDArray[np.float64]]] = []
         for name, garment in output.items():
-            if name not in self._faces:
-                msg = f"no garment {name!r} here: wanted one of {', '.join(self._faces)}"
-                raise MeshError(msg)
             found.append(self._pressed(garment.local, self._faces[name]))
         pairs = np.concatenate([pair for pair, _ in found])
         rows = np.concatenate([row for _, row in found])
         contacts = [_contact(int(pair), rows[pairs == pair]) for pair in np.unique(pairs)]
         return tuple(sorted(contacts, key=lambda contact: -contact.area))
 
-    def _pressed(self, vertices: Any, faces: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+    def _pressed(
+        self, points: NDArray[np.float32], faces: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
         """Of the vertices that are pressed: the pair, (M,), and area, depth and place, (M, 5)."""
-        points = as_points("the garment's vertices", vertices).astype(np.float32)
         n = len(points)
         pair, depth = np.empty(n, np.int32), np.empty(n, np.float32)
         wp.launch(
             kernels.pressed_kernel,
             n,
-            [wp.array(points, dtype=wp.vec3, device="cpu", copy=False), self._parts, self._within, _OPPOSED],
+            [wp.array(points, dtype=wp.vec3, device="cpu", copy=False), self._parts, PRESSED, _OPPOSED],
             [
                 wp.array(pair, dtype=wp.int32, device="cpu", copy=False),
                 wp.array(depth, dtype=wp.float32, device="cpu", copy=False),

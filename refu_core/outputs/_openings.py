@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from refu_core.outputs._check import as_points
+from refu_core.mesh import as_points
 from refu_core.outputs._rings import Ring, newell, rings_of
 
 if TYPE_CHECKING:
@@ -57,21 +57,17 @@ class Openings:
         rest = garment.v_template.detach().cpu().double().numpy()
         self._n_vertices = len(rest)
         rings = rings_of(garment)
-        self.names: tuple[str, ...] = tuple(ring.name for ring in rings)
+        self.names: tuple[str, ...] = tuple(rings)
         """Of the openings, in the order of `frames`."""
-        self._rings = [(ring, _along(ring, rest)) for ring in rings]
+        self._rings = [(name, ring, _along(ring, rest)) for name, ring in rings.items()]
 
     def frames(self, vertices: Any) -> tuple[Opening, ...]:
-        """The openings of a garment as it is worn.
+        """The openings of a garment as it is worn, in the right-handed axes of its `vertices` (V, 3) [m].
 
-        Args:
-            vertices: Of the garment [m], shape (V, 3), in any right-handed axes; openings are in the same.
-
-        Raises:
-            MeshError: not finite numbers of that shape.
+        Raises `MeshError` for anything but finite numbers of that shape.
         """
         points = as_points("the garment's vertices", vertices, self._n_vertices)
-        return tuple(_frame(ring, along, points) for ring, along in self._rings)
+        return tuple(_frame(name, ring, along, points) for name, ring, along in self._rings)
 
 
 def _along(ring: Ring, rest: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -87,7 +83,7 @@ def _along(ring: Ring, rest: NDArray[np.float64]) -> NDArray[np.float64]:
     return weight
 
 
-def _frame(ring: Ring, along: NDArray[np.float64], points: NDArray[np.float64]) -> Opening:
+def _frame(name: str, ring: Ring, along: NDArray[np.float64], points: NDArray[np.float64]) -> Opening:
     rim = points[ring.vertices]
     after = np.roll(rim, -1, axis=0)
     centre = ring.shares @ rim
@@ -108,7 +104,7 @@ def _frame(ring: Ring, along: NDArray[np.float64], points: NDArray[np.float64]) 
     y = np.cross(z, x)
     flat = away @ np.stack((x, y), axis=1)
     width, height = (flat.max(0) - flat.min(0)).tolist()
-    return Opening(ring.name, centre, np.stack((x, y, z), axis=1), width, height, perimeter, rim)
+    return Opening(name, centre, np.stack((x, y, z), axis=1), width, height, perimeter, rim)
 
 
 def _unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:

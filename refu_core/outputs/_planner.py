@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,10 +12,11 @@ from scipy.sparse import csr_array
 
 from refu_core._cache import keep, recall
 from refu_core.errors import MeshError
-from refu_core.outputs._check import as_points
+from refu_core.frames import N_JOINTS, SmplFrame
+from refu_core.mesh import as_points
 from refu_core.outputs._planner_fit import fitted_means
-from refu_core.outputs._practice import practised
 from refu_core.outputs._simplify import simplify
+from refu_core.skeleton import JOINT_NAMES
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -31,6 +31,26 @@ MAX_TRIANGLES = 2000
 _LEAST_TRIANGLES = 100
 _VERSION = 3
 """Of what is recalled: another one is computed anew."""
+_POSES = {
+    "T-pose": "",
+    "stands": "left_shoulder 0 0 -1.15, right_shoulder 0 0 1.15",
+    "arms overhead": "left_shoulder 0 0 0.95, right_shoulder 0 0 -0.95, left_collar 0 0 0.3, right_collar 0 0 -0.3",
+    "squats": "left_hip -1.3 0.2 0.4, right_hip -1.3 -0.2 -0.4, left_knee 1.7 0 0, right_knee 1.7 0 0, spine1 0.2 0 0, "
+    "left_shoulder 0.2 0 -0.7, right_shoulder 0.2 0 0.7",
+    "walks": "left_hip -0.6 0 0.05, right_hip 0.35 0 0, left_knee 0.3 0 0, right_knee 0.6 0 0, spine2 0 0.15 0, "
+    "left_shoulder 0.3 0.1 -1.1, right_shoulder -0.3 0.3 1.1, left_elbow 0 -0.4 0, right_elbow 0 0.5 0",
+    "reaches forward": "left_shoulder 0 -0.9 -0.3, right_shoulder 0.2 0 1.2, left_elbow 0 -0.5 0, spine1 0.15 0.1 0, "
+    "spine3 0 0.2 0",
+    "one arm overhead, the other bent": "left_shoulder 0 0 1.0, left_collar 0 0 0.3, spine2 0 0 -0.15, "
+    "right_shoulder 0 0.3 1.15, right_elbow 0 1.3 0",
+    "a knee up, an arm across": "left_shoulder 0.3 -1.1 -0.9, right_shoulder 0 0.2 1.0, left_elbow 0 -1.5 0, "
+    "right_elbow 0 0.8 0, left_hip -1.2 0.1 0.1, left_knee 1.3 0 0",
+    "bends over": "spine1 0.35 0.1 0, spine2 0.25 0.1 0, spine3 0.15 0 0, left_hip -0.7 0 0.1, right_hip -0.6 0 -0.1, "
+    "left_knee 0.5 0 0, right_knee 0.4 0 0, left_shoulder 0 -0.6 -1.0, right_shoulder 0 0.8 0.9",
+    "sits": "left_hip -1.5 0 0.15, right_hip -1.5 0 -0.1, left_knee 1.5 0 0, right_knee 1.4 0 0, "
+    "left_shoulder 0.2 -0.2 -1.2, right_shoulder 0.2 0.4 1.1, right_elbow 0 1.2 0",
+}
+"""What people do that a planner's mesh has to fit in: joints and their rotation vectors [rad]."""
 Worn = NDArray[np.float64]
 
 
@@ -54,15 +74,10 @@ class PlannerMesh:
     ) -> None:
         """Prepares for a garment, in some seconds the first time; then what was found is recalled (`REFU_CACHE`).
 
-        Args:
-            garment: what is decimated.
-            max_triangles: the most that the solid has, 100 at least.
-            half_thickness: from the middle of the cloth to either side [m].
-            worn: gives the garment as it is worn in several poses [m], shape (P, V, 3); asked only where nothing is
-                recalled. Without, the rest pose has to do. `of` makes them.
-
-        Raises:
-            MeshError: fewer triangles or no thickness are asked for, or the garment can't be drawn so coarse.
+        The solid has `max_triangles` at most, and its sides are `half_thickness` [m] from the middle of the cloth.
+        `worn` gives the garment as it is worn in several poses [m], (P, V, 3), where nothing is recalled; without, the
+        rest pose has to do. Raises `MeshError` for fewer than 100 triangles, no thickness, and where a garment can't be
+        drawn so coarse.
         """
         if max_triangles < _LEAST_TRIANGLES or not 0 < half_thickness < math.inf:
             msg = (
@@ -74,15 +89,17 @@ class PlannerMesh:
         """[m]"""
         rest = garment.v_template.detach().cpu().double().numpy()
         self._n_vertices = len(rest)
-        kept, self._sheet, self._take = _prepared(garment, rest, max_triangles, worn)
-        self.faces: NDArray[np.int32] = _solid(self._sheet, len(kept))
+        kept, self.sheet, self._take = _prepared(garment, rest, max_triangles, worn)
+        """`sheet`: faces of the sheet in the middle of the solid, counter-clockwise from outside, shape (S, 3)."""
+        """Faces of the sheet in the middle of the solid, counter-clockwise from outside, shape (S, 3)."""
+        self.faces: NDArray[np.int32] = _solid(self.sheet, len(kept))
         """Counter-clockwise from outside, shape (T, 3); the same in every frame."""
         if len(self.faces) > max_triangles:
             msg = f"{garment.name} can't be drawn with {max_triangles} triangles, {len(self.faces)} are its least"
             raise MeshError(msg)
-        corners = np.repeat(np.arange(len(self._sheet)), 3)
+        corners = np.repeat(np.arange(len(self.sheet)), 3)
         self._around = csr_array(
-            (np.ones(3 * len(self._sheet)), (self._sheet.ravel(), corners)), shape=(len(kept), len(self._sheet))
+            (np.ones(3 * len(self.sheet)), (self.sheet.ravel(), corners)), shape=(len(kept), len(self.sheet))
         )
 
     @classmethod
@@ -96,45 +113,27 @@ class PlannerMesh:
     ) -> PlannerMesh:
         """For a pipeline's garment of this name, which it dresses in ten poses the first time.
 
-        Raises:
-            MeshError: as the constructor does, or the pipeline has no such garment.
+        Raises `MeshError` as the constructor does, and where the pipeline has no such garment.
         """
         template = pipeline.garments.get(garment)
         if template is None:
             msg = f"the pipeline has no garment {garment!r}: wanted one of {', '.join(pipeline.garments)}"
             raise MeshError(msg)
-        return cls(template, max_triangles, half_thickness=half_thickness, worn=lambda: practised(pipeline, garment))
-
-    @property
-    def sheet(self) -> NDArray[np.int32]:
-        """Faces of the sheet in the middle of the solid, counter-clockwise from outside, shape (S, 3)."""
-        return self._sheet
-
-    @cached_property
-    def n_vertices(self) -> int:
-        """Vertices of the solid."""
-        return 2 * self._take.shape[0]
+        return cls(template, max_triangles, half_thickness=half_thickness, worn=lambda: _practised(pipeline, garment))
 
     def middle(self, vertices: Any) -> NDArray[np.float64]:
-        """The sheet in the middle of the solid [m], shape (n_vertices / 2, 3), as `solid`."""
+        """The sheet in the middle of the solid [m], as `solid`, shape (N / 2, 3)."""
         points = as_points("the garment's vertices", vertices, self._n_vertices)
         sheet: NDArray[np.float64] = self._take @ points
         return sheet
 
     def solid(self, vertices: Any) -> NDArray[np.float64]:
-        """The solid of a garment as it is worn.
+        """Vertices of the solid for `faces` [m], shape (N, 3), of a garment's `vertices` (V, 3) [m].
 
-        Args:
-            vertices: Of the garment [m], shape (V, 3), in any right-handed axes.
-
-        Returns:
-            Vertices for `faces` in the same axes [m], shape (n_vertices, 3).
-
-        Raises:
-            MeshError: not finite numbers of that shape.
+        Axes are any right-handed ones. Raises `MeshError` for anything but finite numbers of that shape.
         """
         middle = self.middle(vertices)
-        a, b, c = middle[self._sheet].transpose(1, 0, 2)
+        a, b, c = middle[self.sheet].transpose(1, 0, 2)
         u, v = b - a, c - a
         normal = np.empty_like(u)
         for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
@@ -169,3 +168,15 @@ def _solid(sheet: NDArray[np.int32], n: int) -> NDArray[np.int32]:
     a, b = start[rim], end[rim]
     walls = np.concatenate((np.stack((b, a, a + n), 1), np.stack((b, a + n, b + n), 1)))
     return np.concatenate((sheet, sheet[:, ::-1] + n, walls)).astype(np.int32)
+
+
+def _practised(pipeline: GarmentPipeline, garment: str) -> NDArray[np.float64]:
+    """A pipeline's garment as it is worn while somebody does these things [m], shape (P, V, 3)."""
+    worn = []
+    for turns in _POSES.values():
+        pose = np.zeros((N_JOINTS, 3))
+        for joint, *turn in map(str.split, filter(None, turns.split(", "))):
+            pose[JOINT_NAMES.index(joint)] = [float(number) for number in turn]
+        # Not by calling it, whose last result is remembered for whoever asks the same again.
+        worn.append(pipeline.adjusted(SmplFrame(pose=pose.astype(np.float32)), lambda dressed: dressed)[garment].local)
+    return np.stack(worn).astype(np.float64)

@@ -37,7 +37,6 @@ _UPPER = (*joints_of("head"), 9, 13, 14)
 class Ring:
     """One opening's rim in the rest pose."""
 
-    name: str
     vertices: NDArray[np.intp]
     """In order, counter-clockwise as seen from outside, each once, shape (K,)."""
     inner: NDArray[np.intp]
@@ -47,18 +46,19 @@ class Ring:
     """Share of the rim's length that is each vertex's, shape (K,)."""
 
 
-def rings_of(garment: GarmentTemplate) -> list[Ring]:
-    """The openings of a garment in its rest pose, named; none of a closed one."""
+def rings_of(garment: GarmentTemplate) -> dict[str, Ring]:
+    """The openings of a garment in its rest pose by their names, in the order of `NAMES`; none of a closed one."""
     rest = garment.v_template.detach().cpu().double().numpy()
     weights = garment.weights.detach().cpu().double().numpy()
     found: list[tuple[str, float, Ring]] = []
     for loop, inner in _loops(garment.mesh.faces):
         for part, across, is_front in _parts(loop, inner, rest):
-            ring = _ring(part, across, rest)
-            length = _lengths(rest[part]).sum()
-            if length >= LEAST_PERIMETER:
+            length = _lengths(rest[part])
+            share = 0.5 * (length + np.roll(length, 1))
+            ring = Ring(part, across, share / share.sum())
+            if length.sum() >= LEAST_PERIMETER:
                 name = "front" if is_front else _called(ring, rest, weights)
-                found.append((name, float(length), ring))
+                found.append((name, float(length.sum()), ring))
     found.sort(key=lambda one: -one[1])
     named: dict[str, Ring] = {}
     for name, _, ring in found:  # of two that would have one name, the longer has it
@@ -66,7 +66,7 @@ def rings_of(garment: GarmentTemplate) -> list[Ring]:
             name = f"opening_{sum(known.startswith('opening') for known in named)}"
         named[name] = ring
     order = [*(name for name in NAMES if name in named), *sorted(name for name in named if name not in NAMES)]
-    return [Ring(name, named[name].vertices, named[name].inner, named[name].shares) for name in order]
+    return {name: named[name] for name in order}
 
 
 def newell(points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -140,12 +140,6 @@ def _longest_run(mask: NDArray[np.bool_], length: NDArray[np.float64]) -> NDArra
     ends = np.flatnonzero(np.diff(mask[rows].astype(np.int8), append=0) == -1)
     runs: Sequence[NDArray[np.intp]] = [rows[a : b + 1] for a, b in zip(starts, ends, strict=True)]
     return max(runs, key=lambda run: float(length[run].sum()))
-
-
-def _ring(loop: NDArray[np.intp], inner: NDArray[np.intp], rest: NDArray[np.float64]) -> Ring:
-    length = _lengths(rest[loop])
-    share = 0.5 * (length + np.roll(length, 1))
-    return Ring("", loop, inner, share / share.sum())
 
 
 def _called(ring: Ring, rest: NDArray[np.float64], weights: NDArray[np.float64]) -> str:

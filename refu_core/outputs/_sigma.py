@@ -10,15 +10,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
+from refu_core.body import PARENTS
 from refu_core.errors import FrameError, MeshError, WeightsError
 from refu_core.frames import N_JOINTS
-from refu_core.outputs._input_sigma import input_variance
 from refu_core.weights import load_weights, save_weights, weights_folder
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from refu_core.body import SmplBody
     from refu_core.frames import SmplFrame
     from refu_core.garments import GarmentTemplate
     from refu_core.realtime import GarmentPipeline, PipelineOutput
@@ -69,17 +71,11 @@ def bend_of(garment: GarmentTemplate, pose: NDArray[Any]) -> NDArray[np.float64]
 
 
 def fit_sigma(garment: GarmentTemplate, errors: NDArray[Any], poses: NDArray[Any]) -> SigmaMap:
-    """σ of a garment from predictions whose truth is known, and which its network hasn't seen.
+    """σ of a garment from N predictions whose truth is known, and which its network hasn't seen.
 
-    In each pose region σ is scaled so that nine in ten of the true vertices are within `RADIUS_90` of it.
-
-    Args:
-        garment: whose σ it is.
-        errors: distance of each predicted vertex to the true one [m], shape (N, V).
-        poses: of these samples [rad], shape (N, 24, 3).
-
-    Raises:
-        MeshError: arrays of other shapes, or fewer than 10 samples a region.
+    `errors` are distances of predicted vertices to the true ones [m], (N, V), `poses` those of the samples [rad],
+    (N, 24, 3). In each pose region σ is scaled so that nine in ten of the true vertices are within `RADIUS_90` of it.
+    Raises `MeshError` for arrays of other shapes, and for fewer than 10 samples a region.
     """
     length = np.asarray(errors, np.float64)
     where = np.asarray(poses, np.float64)
@@ -110,8 +106,7 @@ def save_sigma(
 ) -> Path:
     """Writes `sigma` beside a garment's weights, in its folder below `folder` or below those that ship.
 
-    Raises:
-        WeightsError: it can't be written.
+    Raises `WeightsError` where it can't be written.
     """
     tensors = {
         "sigma": torch.from_numpy(found.sigma).half(),
@@ -125,8 +120,7 @@ def save_sigma(
 def load_sigma(garment: GarmentTemplate, *, folder: str | os.PathLike[str] | None = None) -> SigmaMap:
     """What `save_sigma` wrote; `SigmaMap.unknown` where there is no such file.
 
-    Raises:
-        WeightsError: it is damaged, or of another garment.
+    Raises `WeightsError` for one that is damaged, or of another garment.
     """
     stem = weights_folder(garment.name, folder) / _FILE
     if not stem.with_suffix(".json").exists():
@@ -150,8 +144,7 @@ class Sigma:
     def __init__(self, pipeline: GarmentPipeline, *, folder: str | os.PathLike[str] | None = None) -> None:
         """For a pipeline; `folder` is that of weights of one's own, if it was loaded with one.
 
-        Raises:
-            WeightsError: a file of σ is damaged.
+        Raises `WeightsError` for a damaged file of σ.
         """
         self._body = pipeline.body
         self._garments = pipeline.garments
@@ -169,9 +162,10 @@ class Sigma:
         pose_covariance: NDArray[Any] | None = None,
         transl_covariance: NDArray[Any] | None = None,
     ) -> dict[str, NDArray[np.float32]]:
-        """σ of each garment's vertices in a coordinate [m], by name, shape (V,); never NaN.
+        """σ of each garment's vertices in a coordinate [m], by name, shape (V,), for a frame and what was made of it.
 
-        A ball of `RADIUS_90` σ holds the true vertex in nine cases of ten, if the input is as it says.
+        A ball of `RADIUS_90` σ holds the true vertex in nine cases of ten, if the input is as it says; σ is never NaN.
+        Raises `FrameError` for a covariance of another shape, not finite, or with a negative variance.
 
         Args:
             frame: that was dressed.
@@ -179,11 +173,10 @@ class Sigma:
             pose_covariance: of the rotation vectors [rad²], shape (72, 72), or (24, 3, 3) where joints are
                 independent; it is pushed through the kinematics.
             transl_covariance: of the translation [m²], shape (3, 3).
-
-        Raises:
-            FrameError: a covariance of another shape, not finite, or with a negative variance.
         """
-        pose = None if pose_covariance is None else _covariance("pose_covariance", pose_covariance)
+        pose = None
+        if pose_covariance is not None:
+            pose = _covariance("pose_covariance", pose_covariance, (3 * N_JOINTS, 3 * N_JOINTS), (N_JOINTS, 3, 3))
         transl = 0.0
         if transl_covariance is not None:
             transl = float(np.trace(_covariance("transl_covariance", transl_covariance, (3, 3)))) / 3
@@ -193,23 +186,79 @@ class Sigma:
             if pose is not None or transl > 0:
                 variance = sigma.astype(np.float64) ** 2 + transl
                 if pose is not None:
-                    variance += input_variance(self._body, garment, frame, output[name].local, pose)
+                    variance += _input_variance(self._body, garment, frame, output[name].local, pose)
                 sigma = np.sqrt(variance).astype(np.float32)
             found[name] = sigma
         return found
 
 
 def _covariance(name: str, value: Any, *shapes: tuple[int, ...]) -> NDArray[np.float64]:
-    wanted = shapes or ((3 * N_JOINTS, 3 * N_JOINTS), (N_JOINTS, 3, 3))
     try:
         array = np.asarray(value, np.float64)
-    except (TypeError, ValueError) as error:
-        msg = f"{name} must be numbers of the shape {' or '.join(map(str, wanted))}, got {type(value).__name__}"
-        raise FrameError(msg) from error
-    if array.shape not in wanted or not np.isfinite(array).all():
-        msg = f"{name} must be finite numbers of the shape {' or '.join(map(str, wanted))}, got {array.shape}"
+    except (TypeError, ValueError):
+        array = np.full(0, np.nan)
+    if array.shape not in shapes or not np.isfinite(array).all():
+        wanted, got = " or ".join(map(str, shapes)), array.shape if array.size else type(value).__name__
+        msg = f"{name} must be finite numbers of the shape {wanted}, got {got}"
         raise FrameError(msg)
     if (np.diagonal(array, axis1=-2, axis2=-1) < 0).any():
         msg = f"{name} has a negative variance on its diagonal"
         raise FrameError(msg)
     return array
+
+
+def _input_variance(
+    body: SmplBody,
+    garment: GarmentTemplate,
+    frame: SmplFrame,
+    vertices: NDArray[np.float32],
+    covariance: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Variance of a garment's vertices in a coordinate, by the pose's covariance, to first order [m²], shape (V,).
+
+    A joint turns what hangs on it about itself: dx = -w [x - p]× G J dθ, with the vertex's weight w of all joints below
+    it, the posed joint p, its world rotation G, and the right Jacobian J of its rotation vector θ.
+
+    `vertices` are without the translation [m], (V, 3); `covariance` is of rotation vectors [rad²], (72, 72) or
+    (24, 3, 3).
+    """
+    device = body.device
+    pose = torch.tensor(frame.pose, device=device, dtype=body.dtype)[None]
+    posed = body.posed(pose, body.shape(torch.tensor(frame.betas, device=device, dtype=body.dtype)[None]))
+    joints = posed.joints[0].cpu().double().numpy()
+    turn = posed.transforms.rotation[0].cpu().double().numpy() @ _right_jacobians(frame.pose.astype(np.float64))
+    hangs = garment.weights.detach().cpu().double().numpy() @ _below()
+    arm = hangs[:, :, None] * (vertices[:, None].astype(np.float64) - joints)
+    n = len(joints)
+    if covariance.ndim == 3:
+        covariance = block_diag(*covariance)
+    blocks = covariance.reshape(n, 3, n, 3)
+    spread = np.einsum("aij,ajbk,blk->abil", turn, blocks, turn, optimize=True)
+    trace = np.trace(spread, axis1=2, axis2=3)
+    flat = arm.reshape(len(arm), -1)
+    # tr([a]× S [b]×ᵀ) = (a·b) tr S - bᵀ S a
+    form = np.einsum("ab,il->aibl", trace, np.eye(3)) - spread.transpose(0, 3, 1, 2)
+    total = ((flat @ form.reshape(3 * n, 3 * n)) * flat).sum(1)
+    return np.asarray(np.maximum(total, 0.0) / 3)
+
+
+def _below() -> NDArray[np.float64]:
+    """1 where a joint (row) hangs on another or is that one (column), shape (24, 24)."""
+    found = np.eye(len(PARENTS))
+    for joint, parent in enumerate(PARENTS):
+        if parent >= 0:
+            found[joint] += found[parent]
+    return found
+
+
+def _right_jacobians(pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Of rotation vectors (N, 3) [rad], shape (N, 3, 3): R(θ + dθ) = R(θ) exp([J dθ]×)."""
+    angle = np.linalg.norm(pose, axis=1)[:, None, None]
+    x, y, z = pose.T
+    zero = np.zeros_like(x)
+    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+    square = np.maximum(angle, 1e-3) ** 2
+    first = np.where(angle < 1e-3, 0.5, (1 - np.cos(angle)) / square)
+    second = np.where(angle < 1e-3, 1 / 6, (angle - np.sin(angle)) / (square * np.maximum(angle, 1e-3)))
+    found: NDArray[np.float64] = np.eye(3) - first * cross + second * (cross @ cross)
+    return found

@@ -30,15 +30,10 @@ Vector = tuple[float, float, float]
 def simplify(
     shapes: NDArray[np.float64], faces: NDArray[np.int32], most: int
 ) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
-    """Collapses edges until the faces, twice, and a wall along the boundary are `most` triangles or fewer.
+    """Collapses edges until the faces, twice, and a wall along the boundary are `most` triangles, if that can be.
 
-    Args:
-        shapes: of one mesh [m], shape (P, V, 3); in the first, no triangle is turned over.
-        faces: shape (F, 3), of a surface with or without a boundary.
-        most: triangles of the sheet's two sides and its walls; where no edge can be collapsed any more there are more.
-
-    Returns:
-        The vertices that are kept, (K,), and faces into them, (G, 3).
+    `shapes` (P, V, 3) [m] are of one mesh of faces (F, 3), in the first of which no triangle is turned over. The result
+    are the vertices that are kept, (K,), and faces into them, (G, 3).
     """
     return _Sheet(shapes, faces).collapsed(most)
 

@@ -13,9 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from refu_core import _warp  # noqa: F401  (quiets Warp before it starts)
 from refu_core.errors import MeshError
-from refu_core.mesh import check_faces
+from refu_core.mesh import as_points, check_faces
 from refu_core.outputs import _visible_kernels as kernels
-from refu_core.outputs._check import as_points
 
 NEAR = 0.05
 """What is nearer to the camera isn't seen [m]."""
@@ -75,10 +74,7 @@ class PinholeCamera:
     ) -> PinholeCamera:
         """A camera at `eye` [m], shape (3,), that has `target` [m] in the middle and the y axis up.
 
-        `fov` is the angle from its left to its right border [rad].
-
-        Raises:
-            MeshError: it would look straight up or down.
+        `fov` is the angle from its left to its right border [rad]. Raises `MeshError` if it looks straight up or down.
         """
         away = np.asarray(target, np.float64) - np.asarray(eye, np.float64)
         right = np.cross(away, [0.0, 1.0, 0.0])
@@ -108,15 +104,6 @@ class PinholeCamera:
         )
 
 
-class DepthImage(NamedTuple):
-    """What a camera sees of several meshes."""
-
-    depth: NDArray[np.float32]
-    """Along the camera's z at the middle of each pixel [m], shape (H, W); infinite where nothing is."""
-    mesh: NDArray[np.int32]
-    """Number of the mesh that is seen there, shape (H, W); -1 for none."""
-
-
 def visible(
     vertices: ArrayLike,
     faces: ArrayLike,
@@ -124,64 +111,39 @@ def visible(
     occluders: Sequence[Mesh] = (),
     *,
     buffer_width: int = BUFFER_WIDTH,
-    tolerance: float = TOLERANCE,
 ) -> NDArray[np.bool_]:
-    """Which vertices of a mesh a camera sees, from whichever side.
+    """Which of a mesh's vertices (V, 3) [m] a camera in their axes sees, from whichever side, shape (V,).
 
-    Args:
-        vertices: [m], shape (V, 3).
-        faces: shape (F, 3).
-        camera: in the axes of the vertices.
-        occluders: other meshes in the same axes: the body, other garments.
-        buffer_width: columns of the buffer of depths. What is narrower than a pixel may be missed.
-        tolerance: how far behind a surface a vertex may be to lie on it [m].
-
-    Returns:
-        Whether each vertex is seen, shape (V,).
-
-    Raises:
-        MeshError: not finite vertices, or not faces of them.
+    `occluders` are other meshes in the same axes: the body, other garments. What is narrower than a pixel of a buffer
+    of depths, which has `buffer_width` columns, may be missed. Raises `MeshError` for vertices that aren't finite, and
+    for what aren't faces of them.
     """
-    return all_visible([(vertices, faces), *occluders], camera, buffer_width=buffer_width, tolerance=tolerance)[0]
+    return all_visible([(vertices, faces), *occluders], camera, buffer_width=buffer_width)[0]
 
 
 def all_visible(
-    meshes: Sequence[Mesh],
-    camera: PinholeCamera,
-    *,
-    buffer_width: int = BUFFER_WIDTH,
-    tolerance: float = TOLERANCE,
+    meshes: Sequence[Mesh], camera: PinholeCamera, *, buffer_width: int = BUFFER_WIDTH
 ) -> list[NDArray[np.bool_]]:
-    """`visible` of several meshes that hide each other, for the price of one.
-
-    Raises:
-        MeshError: as `visible`.
-    """
+    """`visible` of several meshes that hide each other, for the price of one. Raises `MeshError` as that does."""
     drawn = _draw(meshes, camera.scaled(min(camera.width, buffer_width)))
     seen = np.zeros(len(drawn.seen), np.bool_)
     wp.launch(
         kernels.visible_kernel,
         len(seen),
-        [drawn.seen, drawn.faces, NEAR, tolerance, drawn.buffer],
+        [drawn.seen, drawn.faces, NEAR, TOLERANCE, drawn.buffer],
         [wp.array(seen, dtype=wp.bool, device="cpu", copy=False)],
         device="cpu",
     )
     return np.split(seen, drawn.ends[:-1])
 
 
-def depth_image(meshes: Sequence[Mesh], camera: PinholeCamera) -> DepthImage:
-    """What a depth camera would measure, without noise, in its own resolution.
+def depth_image(meshes: Sequence[Mesh], camera: PinholeCamera) -> NDArray[np.float32]:
+    """What a depth camera would measure, without noise, in its own resolution: along its z [m], shape (H, W).
 
-    Raises:
-        MeshError: as `visible`.
+    Infinite where nothing is. Raises `MeshError` as `visible`.
     """
-    drawn = _draw(meshes, camera)
-    found = drawn.buffer.numpy()
-    empty = found == np.iinfo(np.int64).max
-    depth = np.where(empty, np.inf, (found >> 32) * 1e-6).astype(np.float32)
-    face = found & 0xFFFFFFFF
-    number = np.searchsorted(drawn.face_ends, np.where(empty, 0, face), side="right").astype(np.int32)
-    return DepthImage(depth, np.where(empty, np.int32(-1), number))
+    found = _draw(meshes, camera).buffer.numpy()
+    return np.where(found == np.iinfo(np.int64).max, np.inf, (found >> 32) * 1e-6).astype(np.float32)
 
 
 class _Drawn(NamedTuple):
@@ -189,7 +151,6 @@ class _Drawn(NamedTuple):
     faces: Any
     buffer: Any
     ends: NDArray[np.int64]
-    face_ends: NDArray[np.int64]
 
 
 def _draw(meshes: Sequence[Mesh], camera: PinholeCamera) -> _Drawn:
@@ -207,4 +168,4 @@ def _draw(meshes: Sequence[Mesh], camera: PinholeCamera) -> _Drawn:
     seen = wp.array(there.astype(np.float32), dtype=wp.vec3, device="cpu", copy=False)
     buffer = wp.full((camera.height, camera.width), np.iinfo(np.int64).max, dtype=wp.int64, device="cpu")
     wp.launch(kernels.raster_kernel, len(corners), [seen, faces, NEAR], [buffer], device="cpu")
-    return _Drawn(seen, faces, buffer, ends, np.cumsum([len(own) for own in checked]))
+    return _Drawn(seen, faces, buffer, ends)

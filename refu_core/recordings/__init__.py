@@ -1,12 +1,12 @@
 """Recorded motion: one reader for what archives, pose estimators and motion capture write."""
 
 from refu_core.recordings._layouts import SUFFIXES as SUFFIXES
-from refu_core.recordings._rate import FASTEST as FASTEST
-from refu_core.recordings._rate import FPS_RANGE as FPS_RANGE
-from refu_core.recordings._rate import MAX_FRAMES as MAX_FRAMES
-from refu_core.recordings._rate import n_resampled as n_resampled
+from refu_core.recordings._read import read_recording as read_recording
+from refu_core.recordings._recording import FASTEST as FASTEST
+from refu_core.recordings._recording import FPS_RANGE as FPS_RANGE
+from refu_core.recordings._recording import MAX_FRAMES as MAX_FRAMES
 from refu_core.recordings._recording import Recording as Recording
-from refu_core.recordings._recording import read_recording as read_recording
+from refu_core.recordings._recording import n_resampled as n_resampled
 from refu_core.recordings._rotations import LONGEST_TURN as LONGEST_TURN
 from refu_core.recordings._upright import AXES as AXES
 from refu_core.recordings._upright import PELVIS as PELVIS

@@ -19,8 +19,7 @@ from refu_core._files import read_file
 from refu_core.errors import RefuError
 from refu_core.recordings._followed import follow, metres_of
 from refu_core.recordings._layouts import WANTED
-from refu_core.recordings._rate import MAX_FRAMES, check_fps
-from refu_core.recordings._recording import Recording
+from refu_core.recordings._recording import MAX_FRAMES, Recording, check_fps
 from refu_core.recordings._upright import Axes
 
 Array = NDArray[np.float64]

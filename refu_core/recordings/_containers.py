@@ -16,11 +16,9 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from refu_core._files import open_file
-from refu_core._npz import DAMAGE as ARCHIVE_DAMAGE
-from refu_core._npz import ArrayBudget, check_npy, npz_names, read_npz
-from refu_core._pickle import DAMAGE, PickledArrays
-from refu_core._pickle_machine import MAX_PICKLE_BYTES, Machine, Record
-from refu_core._torch_stream import MAGIC, read_stream
+from refu_core._npz import DAMAGE, ArrayBudget, check_npy, npz_names, read_npz
+from refu_core._pickle import PickledArrays
+from refu_core._pickle_machine import MAX_PICKLE_BYTES, STREAM_MAGIC, Record, Unpickler, read_stream
 from refu_core.errors import RefuError
 from refu_core.recordings._layouts import ALL_KEYS, POSE_KEYS, SUFFIXES, WANTED, is_like_known
 
@@ -78,7 +76,7 @@ class Content:
                 array = np.stack(rows)
             else:
                 array = self._arrays.of(value)
-        except (RecursionError, *DAMAGE) as cause:
+        except DAMAGE as cause:
             raise ValueError(str(cause) or type(cause).__name__) from cause
         self._made[id(value)] = value, array  # held beside its array, so that the number stays its own
         return array
@@ -141,14 +139,14 @@ def open_content(path: Path, *, error: type[RefuError]) -> Content:
             if magic == _NPY:
                 return _npy(file, file.size)
             unpacker = next((made for start, made in _UNPACKERS.items() if magic.startswith(start)), None)
-            # All at once: the machine reads byte by byte, which takes three times as long from a file.
+            # All at once: the unpickler reads byte by byte, which takes three times as long from a file.
             data = io.BytesIO(file.read() if unpacker is None else _unpacked(file.read(), unpacker()))
-            root = Machine(is_model=False).run(data)
-            if type(root) is int and root == MAGIC:
+            root = Unpickler(data).load()
+            if type(root) is int and root == STREAM_MAGIC:
                 root, storage = read_stream(data)
                 return Content(root, PickledArrays(storage))
             return Content(root)
-        except (*DAMAGE, *ARCHIVE_DAMAGE, lzma.LZMAError) as cause:
+        except DAMAGE as cause:
             is_other = path.suffix and path.suffix.lower() not in SUFFIXES
             why = f"no file of motion is a {path.suffix}" if is_other else str(cause) or type(cause).__name__
             msg = f"{path}: can't be read: {why}; wanted {WANTED}"
@@ -188,7 +186,7 @@ def _object(path: Path, name: str) -> Any:
                 return None
             data = head + member.read(_MOST_HELD)
         return _npy(io.BytesIO(data), len(data)).root
-    except (*DAMAGE, *ARCHIVE_DAMAGE):
+    except DAMAGE:
         return None
 
 
@@ -197,7 +195,7 @@ def _npy(file: BinaryIO, size: int) -> Content:
     version = npy.read_magic(file)
     _, _, dtype = (npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0)(file)
     if dtype.hasobject:
-        return Content(Machine(is_model=False).run(file))
+        return Content(Unpickler(file).load())
     file.seek(0)
     shape, dtype = check_npy(file, size)
     ArrayBudget().take(shape, dtype)
@@ -225,9 +223,9 @@ def _torch(path: Path, error: type[RefuError]) -> Content:
         with zipfile.ZipFile(path) as archive:
             name = next(name for name in archive.namelist() if name.endswith("data.pkl"))
             folder = name.rpartition("/")[0]
-            tree = Machine(is_model=False).run(io.BytesIO(_member(archive, name)))
+            tree = Unpickler(io.BytesIO(_member(archive, name))).load()
         return Content(tree, PickledArrays(storage))
-    except (*DAMAGE, *ARCHIVE_DAMAGE) as cause:
+    except DAMAGE as cause:
         msg = f"{path}: can't be read as a file of torch: {str(cause) or type(cause).__name__}"
         raise error(msg) from cause
 

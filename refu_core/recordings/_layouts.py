@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal
 
+from refu_core.recordings._mhr import N_KEYPOINTS
 from refu_core.recordings._rotations import BODY, WHOLE
 
 SUFFIXES = (".npz", ".npy", ".pkl", ".pickle", ".pk", ".p", ".joblib", ".pt", ".pth", ".smpl", ".bvh")
@@ -30,8 +30,6 @@ class Layout:
     """Names that the translation may have [m]."""
     betas: tuple[str, ...] = ("betas", "beta", "shape")
     """Names that the shape may have."""
-    place: Literal["world", "camera", "screen"] = "world"
-    """What the translation means; on a screen its depth is for a focal length that was made up, and it isn't read."""
     is_time_last: bool = False
     repeats_root: bool = False
     """Whether the second array has room for the root, too, and is zero there."""
@@ -39,6 +37,8 @@ class Layout:
     """Whether that is the whole pose; beside others there may be a root, or rotations, under unknown names."""
     holds_places: bool = False
     """Whether the pose is places of joints, and no rotations."""
+    counts: tuple[int, ...] = ()
+    """Of joints or points, where they are others than SMPL's."""
     turns_about_origin: bool = False
     """Whether the root turns the body about the origin of its mesh, and not about its pelvis."""
 
@@ -46,9 +46,18 @@ class Layout:
     def joints(self) -> tuple[tuple[int, ...], ...]:
         """How many each array may have."""
         if len(self.pose) == 1:
-            return ((*WHOLE, *BODY),)
+            return (self.counts or (*WHOLE, *BODY),)
         return (1,), (*BODY, *WHOLE) if self.repeats_root else BODY
 
+
+MHR = Layout(
+    writers="SAM 3D Body",
+    pose=("pred_keypoints_3d",),
+    transl=("pred_cam_t",),
+    is_whole=False,
+    counts=(N_KEYPOINTS,),
+)
+"""Its keypoints, about the body, and where that is before the camera [m]."""
 
 LAYOUTS: tuple[Layout, ...] = (
     Layout(writers="WHAM, in the world", pose=("pose_world",), transl=("trans_world",)),
@@ -66,15 +75,9 @@ LAYOUTS: tuple[Layout, ...] = (
     Layout(writers="smplx, GVHMR, 4DHumans, HMR 2", pose=("global_orient", "body_pose")),
     Layout(writers="EMDB", pose=("poses_root", "poses_body")),
     Layout(writers="AIST++", pose=("smpl_poses",), transl=("smpl_trans",)),
-    Layout(
-        writers="ROMP, BEV, TRACE",
-        pose=("smpl_thetas",),
-        transl=("cam_trans",),
-        betas=("smpl_betas",),
-        place="camera",
-    ),
-    Layout(writers="HybrIK", pose=("pred_thetas",), transl=("transl",), betas=("pred_betas",), place="camera"),
-    Layout(writers="TRAM", pose=("pred_rotmat",), transl=("pred_trans",), betas=("pred_shape",), place="camera"),
+    Layout(writers="ROMP, BEV, TRACE", pose=("smpl_thetas",), transl=("cam_trans",), betas=("smpl_betas",)),
+    Layout(writers="HybrIK", pose=("pred_thetas",), transl=("transl",), betas=("pred_betas",)),
+    Layout(writers="TRAM", pose=("pred_rotmat",), transl=("pred_trans",), betas=("pred_shape",)),
     Layout(writers="PHC and other humanoid controllers", pose=("pose_aa",), transl=("trans_orig", "trans")),
     Layout(
         writers="Meshcapade",
@@ -84,17 +87,13 @@ LAYOUTS: tuple[Layout, ...] = (
         is_whole=False,
     ),
     Layout(writers="MDM", pose=("thetas",), transl=("root_translation",), is_time_last=True),
-    Layout(
-        writers="WHAM, VIBE, CLIFF, in the camera",
-        pose=("pose",),
-        transl=("trans", "global_t", "transl"),
-        place="camera",
-    ),
-    Layout(writers="BEDLAM, in the camera", pose=("poses_cam",), transl=("trans_cam",), place="camera"),
+    Layout(writers="WHAM, VIBE, CLIFF, in the camera", pose=("pose",), transl=("trans", "global_t", "transl")),
+    Layout(writers="BEDLAM, in the camera", pose=("poses_cam",), transl=("trans_cam",)),
     Layout(writers="a body without its root", pose=("pose_body",), is_whole=False),
     Layout(writers="a body without its root", pose=("body_pose",), is_whole=False),
     Layout(writers="joints alone", pose=("joints",), is_whole=False, holds_places=True),
     Layout(writers="MDM's samples", pose=("motion",), is_whole=False, is_time_last=True, holds_places=True),
+    MHR,
 )
 """In the order of preference, where a file holds several."""
 
@@ -105,8 +104,6 @@ SCALINGS = ("smpl_scaling",)
 """AIST++'s translations are of a body that is larger by so much."""
 MODELS = ("surface_model_type",)
 
-KEYPOINTS, KEYPOINTS_PLACE = "pred_keypoints_3d", "pred_cam_t"
-"""Of SAM 3D Body, about the body, and where that is before the camera [m]."""
 SOMA_NAMES = "joint_names"
 _SOMA = (SOMA_NAMES, "absolute_pose", "unit", "identity_model_type", "identity_coeffs")
 TRACK_IDS = ("track_id", "person_id", "tid", "id")
@@ -115,7 +112,7 @@ POSE_KEYS = frozenset(name for layout in LAYOUTS if layout.is_whole for name in 
 """Of whole poses."""
 ALL_KEYS = frozenset(
     {name for layout in LAYOUTS for names in (layout.pose, layout.transl, layout.betas) for name in names}
-    | {*RATES, *GENDERS, *FRAME_NUMBERS, *SCALINGS, *MODELS, *_SOMA, KEYPOINTS, KEYPOINTS_PLACE}
+    | {*RATES, *GENDERS, *FRAME_NUMBERS, *SCALINGS, *MODELS, *_SOMA}
 )
 """Everything that is read; all else in a file, meshes and pictures, is left unread."""
 

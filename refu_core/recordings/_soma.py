@@ -6,7 +6,6 @@ Nothing of SOMA's own package or model is needed.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ from refu_core.recordings._containers import Content
 from refu_core.recordings._layouts import RATES, SOMA_NAMES
 from refu_core.recordings._rotations import rotvecs_of
 from refu_core.recordings._upright import PELVIS
+from refu_core.recordings._values import word_of
 
 _CHAINS = "Hips LeftLeg RightLeg Spine1 LeftShin RightShin Spine2 LeftFoot RightFoot Chest LeftToeBase RightToeBase "
 _CHAINS += "Neck1+Neck2 LeftShoulder RightShoulder Head LeftArm RightArm LeftForeArm RightForeArm LeftHand RightHand"
@@ -39,7 +39,7 @@ def smpl_of_soma(content: Content, notes: list[str]) -> Content:
     if missing:
         msg = f"{SOMA_NAMES}: wanted those of SOMA's body, without {', '.join(missing[:4])} among {len(names)}"
         raise ValueError(msg)
-    if bool(_value(content, root, "absolute_pose", default=False)):
+    if word_of(content, root.get("absolute_pose")) in ("true", "1"):
         msg = "SOMA's poses are absolute: save them relative to the T-pose (with joint_orient), which needs no model"
         raise ValueError(msg)
     turns, _ = rotvecs_of(content.array(root["poses"]), "poses", (len(names),), notes, has_root=True)
@@ -48,7 +48,7 @@ def smpl_of_soma(content: Content, notes: list[str]) -> Content:
         poses[:, joint] = _together([turns[:, names.index(name)] for name in chain])
     notes.append(f"SOMA's {len(names)} joints, another body than SMPL's: {len(chains)} of SMPL's turn as they do")
     found: dict[str | int, Any] = {"poses": poses, **{name: root[name] for name in RATES if name in root}}
-    unit = str(_value(content, root, "unit", default="meters"))
+    unit = word_of(content, root.get("unit")) or "meters"
     if unit not in _METRES:
         msg = f"unit: wanted {', '.join(_METRES)}, got {unit[:20]!r}"
         raise ValueError(msg)
@@ -56,7 +56,7 @@ def smpl_of_soma(content: Content, notes: list[str]) -> Content:
         transl = content.array(root["transl"])
         is_place = transl.dtype.kind in "iuf" and transl.shape[-1:] == (3,)
         found["transl"] = _METRES[unit] * transl - PELVIS if is_place else transl
-    kind = str(_value(content, root, "identity_model_type", default=""))
+    kind = word_of(content, root.get("identity_model_type"))
     if kind in _SMPL and root.get("identity_coeffs") is not None:
         found["betas"] = content.array(root["identity_coeffs"])
         found["surface_model_type"] = kind
@@ -74,9 +74,3 @@ def _together(turns: list[NDArray[np.float64]]) -> NDArray[np.float64]:
     first, second = (Rotation.from_rotvec(turn[sound]) for turn in turns)
     whole[sound] = (first * second).as_rotvec()
     return whole
-
-
-def _value(content: Content, root: Mapping[str | int, Any], name: str, *, default: Any) -> Any:
-    """The one value of an entry."""
-    values = [] if root.get(name) is None else content.array(root[name]).reshape(-1).tolist()
-    return values[0] if values else default

@@ -2,53 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from refu_core._pickle_machine import Record
 from refu_core.recordings import _layouts as table
-from refu_core.recordings._containers import Content, Key, entries
-from refu_core.recordings._people import name_of, sequences, who_is_who
-from refu_core.recordings._rate import MAX_FRAMES
+from refu_core.recordings._containers import MOST_DEPTH, Content, Key, entries
+from refu_core.recordings._recording import MAX_FRAMES
 from refu_core.recordings._rotations import is_one_frame
 
+_SAME = 0.75
+"""Who is farther from where a person was in the image before is somebody else [m], as for trackers."""
+_HOLDERS = (dict, list, tuple, Record)
+"""What holds anything; most values of a file are numbers, and aren't looked into."""
+_MOST_LOOKS = 200_000
+"""Values of a file that are looked at in search of persons: five thousand seconds of somebody at 30 Hz."""
 _IMAGES = (".jpg", ".jpeg", ".png", ".bmp", ".webp")
-_ARRAYS = ("global_orient", "body_pose", "betas")
 
 
-def tracks_of(content: Content) -> Mapping[Any, Any] | None:
-    """The persons of frames that have PHALP's lists `smpl` and `tid`, None where a file isn't such.
-
-    Raises `ValueError` for frames whose lists don't fit each other.
-    """
-    frames = [inside for inside in map(entries, (entries(content.root) or {}).values()) if inside is not None]
-    if not frames or not all("smpl" in frame and "tid" in frame for frame in frames):
-        return None
-    persons: dict[int, dict[str, list[Any]]] = {}
-    for number, frame in enumerate(frames):
-        bodies = list((entries(frame["smpl"]) or {}).values())
-        for person, body in zip(_ids(content, frame["tid"]), bodies, strict=False):
-            values = entries(body) or {}
-            if not all(name in values for name in _ARRAYS):
-                msg = f"frame {number}: a person without {', '.join(_ARRAYS)}"
-                raise ValueError(msg)
-            track = persons.setdefault(person, {name: [] for name in (*_ARRAYS, "frame_ids")})
-            if track["frame_ids"][-1:] == [number]:
-                continue
-            track["frame_ids"].append(number)
-            for name in _ARRAYS:
-                track[name].append(content.array(values[name]))
-    return {
-        person: {name: np.stack(rows) if name != "frame_ids" else np.array(rows) for name, rows in track.items()}
-        for person, track in persons.items()
-    }
-
-
-def frames_of(content: Content) -> Mapping[Any, Any] | None:
-    """The persons of frames that are each one pose, None where a file doesn't go frame by frame.
+def frames_of(content: Content) -> Mapping[Any, Any]:
+    """The persons of frames that are each one pose, none where a file doesn't go frame by frame.
 
     Estimators that see single images leave a list of dictionaries, one of lists, or a dictionary by the image's name.
 
@@ -59,13 +36,13 @@ def frames_of(content: Content) -> Mapping[Any, Any] | None:
         return _layout_of(content, node) is not None
 
     content = _rows_apart(content)
-    found = [frames for frames in sequences(content.root, is_body) if len(frames) > 1]
+    found = [frames for frames in _sequences(content.root, is_body) if len(frames) > 1]
     tracks: dict[str, Any] = {}
     for k, frames in enumerate(found):
         people = _people(content, frames)
         for name, track in people.items():
             tracks[name if len(found) == 1 else str(k) if len(people) == 1 else f"{k}.{name}"] = track
-    return tracks or None
+    return tracks
 
 
 def _people(content: Content, frames: list[list[Mapping[Key, Any]]]) -> dict[str, Any]:
@@ -74,7 +51,7 @@ def _people(content: Content, frames: list[list[Mapping[Key, Any]]]) -> dict[str
         raise ValueError(msg)
     layout = next(_layout_of(content, bodies[0]) for bodies in frames if bodies)
     assert layout is not None
-    named = who_is_who([(name_of(body), _place_of(content, body, layout)) for body in bodies] for bodies in frames)
+    named = _who_is_who([(_name_of(body), _place_of(content, body, layout)) for body in bodies] for bodies in frames)
     persons: dict[str, list[tuple[int, Mapping[Key, Any]]]] = {}
     for number, (bodies, names) in enumerate(zip(frames, named, strict=True)):
         for name, body in zip(names, bodies, strict=True):
@@ -83,29 +60,46 @@ def _people(content: Content, frames: list[list[Mapping[Key, Any]]]) -> dict[str
     return {name: _stacked(content, layout, seen) for name, seen in persons.items()}
 
 
+def places_in_time(frames: NDArray[Any] | None, n: int) -> NDArray[np.int64] | None:
+    """Which frames n of them are, from 0 on, by their numbers; None where none is missing, or these aren't numbers."""
+    if frames is None or frames.dtype.kind not in "iu" or not frames.size == n > 0:
+        return None
+    at: NDArray[np.int64] = frames.reshape(-1).astype(np.int64)
+    at, gaps = at - at[0], np.diff(at)
+    return None if not len(gaps) or (gaps == 1).all() or gaps.min() < 1 or at[-1] >= MAX_FRAMES else at
+
+
 def filled(
-    poses: NDArray[np.float64], transl: NDArray[np.float64], frames: NDArray[Any], notes: list[str]
+    poses: NDArray[np.float64], transl: NDArray[np.float64], frames: NDArray[Any] | None, notes: list[str]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The frames that a tracker has lost in between, on the shorter arc between those around them."""
-    at = frames.reshape(-1)
-    gaps = np.diff(at) if at.dtype.kind in "iu" and len(at) == len(poses) else np.zeros(0)
-    if not len(gaps) or (gaps == 1).all() or gaps.min() < 1 or at[-1] - at[0] >= MAX_FRAMES:
+    at = places_in_time(frames, len(poses))
+    if at is None or not (np.isfinite(poses).all() and np.isfinite(transl).all()):
         return poses, transl
-    if not (np.isfinite(poses).all() and np.isfinite(transl).all()):
-        return poses, transl
-    wanted = np.arange(at[0], at[-1] + 1)
+    wanted = np.arange(at[-1] + 1)
     joints = [Slerp(at, Rotation.from_rotvec(poses[:, j]))(wanted).as_rotvec() for j in range(poses.shape[1])]
     notes.append(f"{len(wanted) - len(at)} of {len(wanted)} frames are missing: interpolated")
     return np.stack(joints, 1), np.stack([np.interp(wanted, at, transl[:, k]) for k in range(3)], 1)
 
 
 def _rows_apart(content: Content) -> Content:
-    """Of a dictionary by the image's name, the rows of whose arrays are people: a list of them an image."""
+    """Where a frame has arrays or lists with a row a person, a list of people an image: PHALP's `smpl` and `tid`, and
+    dictionaries by the image's name."""
+    frames = entries(content.root) or {}
+    insides = [entries(frame) or {} for frame in frames.values()]
+    if frames and all("smpl" in inside and "tid" in inside for inside in insides):
+        return Content(dict(zip(frames, (_identified(content, inside) for inside in insides), strict=True)))
     for _, node in content.nodes():
         if not node or not all(isinstance(key, str) and key.lower().endswith(_IMAGES) for key in node):
             continue
         return Content({image: _rows(content, entries(seen) or {}) for image, seen in node.items()})
     return content
+
+
+def _identified(content: Content, frame: Mapping[Key, Any]) -> list[dict[Key, Any]]:
+    bodies = [entries(body) or {} for body in (entries(frame["smpl"]) or {}).values()]
+    names = content.array(frame["tid"]).reshape(-1).tolist() if bodies else []
+    return [{**body, "track_id": int(name)} for name, body in zip(names, bodies, strict=False)]
 
 
 def _rows(content: Content, seen: Mapping[Key, Any]) -> Any:
@@ -162,5 +156,89 @@ def _stacked(content: Content, layout: table.Layout, seen: list[tuple[int, Mappi
     return track
 
 
-def _ids(content: Content, value: Any) -> list[int]:
-    return [int(number) for number in content.array(value).reshape(-1)] if len(value or ()) else []
+def _sequences(root: Any, is_body: Callable[[Mapping[Key, Any]], bool]) -> Iterator[list[list[Mapping[Key, Any]]]]:
+    """Whatever has persons in it, frame by frame, from the outside inwards; lists that are shared are seen once.
+
+    People don't outnumber frames: a dictionary of one list isn't a frame with everybody of the list; it is looked into.
+    """
+
+    def bodies(value: Any) -> list[Mapping[Key, Any]]:
+        """The persons of a frame: it is one, or has some; whoever is first shows which."""
+        if type(value) not in _HOLDERS:
+            return []
+        if id(value) not in persons:
+            persons[id(value)] = _persons(value)
+        return persons[id(value)]
+
+    def _persons(value: Any) -> list[Mapping[Key, Any]]:
+        inside = _mapping(value)
+        if inside is not None and is_body(inside):
+            return [inside]
+        inner = (found for one in _items(value) if type(one) in _HOLDERS and (found := _mapping(one)) is not None)
+        first = next(inner, None)
+        return [] if first is None or not is_body(first) else [first, *filter(is_body, inner)]
+
+    inside = _mapping(root)
+    if inside is not None and is_body(inside):
+        yield [[inside]]
+        return
+    persons: dict[int, list[Mapping[Key, Any]]] = {}
+    known: set[int] = set()
+    level, looks = [root], 0
+    for _ in range(MOST_DEPTH):
+        below: list[Any] = []
+        for value in level:
+            items = _items(value)
+            looks += len(items)
+            if id(value) in known or looks > _MOST_LOOKS:
+                continue
+            known.add(id(value))
+            frames = [bodies(item) for item in items]
+            most = max(map(len, frames), default=0)
+            if most and (most <= len(frames) or not isinstance(value, dict)):
+                yield frames
+            else:
+                below += [item for item in items if type(item) in _HOLDERS and len(_items(item))]
+        level = below
+
+
+def _name_of(body: Mapping[Key, Any]) -> str:
+    """What a tracker calls somebody; empty where it doesn't."""
+    return next((str(body[key]) for key in table.TRACK_IDS if isinstance(body.get(key), (int, str))), "")
+
+
+def _who_is_who(frames: Iterable[Sequence[tuple[str, NDArray[np.float64]]]]) -> Iterator[list[str]]:
+    """Names of those who are seen in each frame, by name and place (3,) [m]: the tracker's, else a number.
+
+    Somebody without a name is who was nearest, if near enough; of no place (NaN), who comes as late in the list.
+    """
+    last: dict[str, NDArray[np.float64]] = {}
+    for seen in frames:
+        free, found = set(last), []
+        for rank, (given, place) in enumerate(seen):
+            name = given
+            if not name and np.isnan(place).any():
+                name = str(rank)
+            elif not name:
+                near = {one: float(np.linalg.norm(last[one] - place)) for one in free}
+                name = min(near, key=near.__getitem__, default="")
+                name = name if name and near[name] <= _SAME else str(len(last))
+            free.discard(name)
+            last[name] = place
+            found.append(name)
+        yield found
+
+
+def _mapping(value: Any) -> Mapping[Key, Any] | None:
+    return None if isinstance(value, (list, tuple)) else entries(value)
+
+
+def _items(value: Any) -> Sequence[Any]:
+    if isinstance(value, Record) and value.kind == "array":  # NumPy's way to save objects
+        state = value.state
+        held = state[4] if isinstance(state, tuple) and len(state) == 5 and isinstance(state[4], list) else ()
+        return _items(held[0]) if len(held) == 1 else held
+    inside = _mapping(value)
+    if inside is not None:
+        return list(inside.values())
+    return value if isinstance(value, (list, tuple)) else ()

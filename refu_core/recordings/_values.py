@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import Any
 
 import numpy as np
@@ -76,13 +77,9 @@ def fps_of(content: Content, value: Any) -> float:
     if type(value) in (int, float):
         return float(value)
     array = np.asarray(value) if isinstance(value, str) else content.array(value)
-    try:
-        if array.size == 1 and array.dtype.kind in "iuf":
-            return float(array.item())
-        if array.size == 1 and array.dtype.kind in "US":
+    if array.size == 1 and array.dtype.kind in "iufUS":
+        with contextlib.suppress(ValueError):
             return float(word_of(content, array))
-    except ValueError:
-        pass
     msg = f"no frame rate: {table.RATES[0]} must be one number, got {array.dtype} {array.shape}"
     raise ValueError(msg)
 

@@ -28,8 +28,7 @@ Module = TypeVar("Module", bound=nn.Module)
 def config_of_card(kind: type[Config], values: Any) -> Config:
     """The configuration `kind` that a card describes.
 
-    Raises:
-        WeightsError: it has other fields, fields of other types, or sizes that no network has.
+    Raises `WeightsError` for other fields, fields of other types, and sizes that no network has.
     """
     if not isinstance(values, Mapping):
         msg = f"wanted the fields of {kind.__name__}, got {str(values)[:80]}: train it again"
@@ -47,17 +46,10 @@ def config_of_card(kind: type[Config], values: Any) -> Config:
 
 
 def build_for(tensors: Mapping[str, Tensor], build: Callable[[], Module], *, shared: str = " ") -> Module:
-    """What `build` makes, with `tensors` in it.
+    """What `build` makes, with `tensors` in it; names that begin with `shared` stay as `build` makes them.
 
-    It is first made without memory: a card may claim sizes that no machine has, and its tensors give it away.
-
-    Args:
-        tensors: by name.
-        build: makes the module.
-        shared: beginning of the names that come from elsewhere and stay as `build` makes them.
-
-    Raises:
-        WeightsError: the module can't be built, or has other tensors.
+    It is first made without memory: a card may claim sizes that no machine has, and its tensors give it away. Raises
+    `WeightsError` where the module can't be built, or has other tensors.
     """
     try:
         with torch.device("meta"), warnings.catch_warnings():
@@ -66,10 +58,8 @@ def build_for(tensors: Mapping[str, Tensor], build: Callable[[], Module], *, sha
         got = {k: v.shape for k, v in tensors.items()}
         if wanted != got:
             other = sorted(k for k in {**wanted, **got} if wanted.get(k) != got.get(k))
-            msg = (
-                f"wanted {len(wanted)} tensors, got {len(got)}; {len(other)} are missing, surplus or of another shape, "
-            )
-            msg += f"{other[0][:80]} for one"
+            msg = f"wanted {len(wanted)} tensors, got {len(got)}; {len(other)} are missing, surplus or of another "
+            msg += f"shape, {other[0][:80]} for one"
             raise WeightsError(msg)
         module = build()
         module.load_state_dict(dict(tensors), strict=False)

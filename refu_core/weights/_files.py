@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import os
 import struct
 from collections.abc import Mapping
@@ -34,7 +33,10 @@ MAX_BYTES = 3 << 30
 MAX_CARD_BYTES = 1 << 20
 LARGEST = 1e4
 """No weight is larger: those that ship are below 30, and what overflowed in training is far above."""
-_DTYPES = {"F64": 8, "F32": 4, "F16": 2, "BF16": 2, "I64": 8, "I32": 4, "I8": 1, "BOOL": 1}
+_DTYPES = {
+    *(torch.float64, torch.float32, torch.float16, torch.bfloat16),
+    *(torch.int64, torch.int32, torch.int8, torch.bool),
+}
 _PIECE = 1 << 22
 _STEP = ".step"
 """After a tensor's name: how much a step of its difference is, a number."""
@@ -63,20 +65,11 @@ def weights_folder(garment: str, root: str | os.PathLike[str] | None = None) -> 
 def save_weights(
     stem: str | Path, tensors: Mapping[str, Tensor], card: Mapping[str, Any], *, base: str | None = None
 ) -> Path:
-    """Writes `stem`.safetensors and its card `stem`.json; neither is ever left half written.
+    """Writes `stem`.safetensors, which is returned, and its card `stem`.json; neither is ever left half written.
 
-    Args:
-        stem: path without suffix.
-        tensors: by name.
-        card: what is known of them.
-        base: name of weights in the same folder, not stored as differences themselves, that these are stored as
-            differences from. What the base has and `tensors` hasn't is read as the base's.
-
-    Returns:
-        The file of the tensors.
-
-    Raises:
-        WeightsError: a tensor isn't finite, the base can't be read, or the disk can't be written.
+    `base` is the name of weights in the same folder, stored whole, that these are stored as differences from. What it
+    has and `tensors` hasn't is read as the base's. Raises `WeightsError` where a tensor isn't finite, the base can't be
+    read, or the disk can't be written.
     """
     stem = Path(stem)
     _require_sense(stem, tensors)
@@ -96,12 +89,12 @@ def save_weights(
         "sha256": hashlib.sha256(data).hexdigest(),
         "versions": {name: version(name) for name in ("refu-ros", "torch")},
     }
-    path = _with_suffix(stem, ".safetensors")
+    path = Path(f"{stem}.safetensors")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path, sync=True) as file:
             file.write(data)
-        with replacing(_with_suffix(stem, ".json"), sync=True) as file:
+        with replacing(Path(f"{stem}.json"), sync=True) as file:
             file.write((json.dumps(full, indent=1) + "\n").encode())
     except OSError as error:
         msg = f"{stem}: weights can't be written: {error}"
@@ -109,20 +102,11 @@ def save_weights(
     return path
 
 
-def load_card(stem: str | Path) -> dict[str, Any]:
-    """The card of weights alone. Raises `WeightsError` where there is none, or it is no card of weights."""
-    return _read_card(_with_suffix(Path(stem), ".json"))
-
-
 def load_weights(stem: str | Path, *, expect: Mapping[str, Any] | None = None) -> Weights:
     """Reads `stem`.safetensors and its card, onto the CPU.
 
-    Args:
-        stem: path without suffix.
-        expect: what the card must say, `{"garment": ..., "body_fingerprint": ...}` for instance.
-
-    Raises:
-        WeightsError: a file is missing, damaged, of another format, or made for something other than `expect`.
+    `expect` is what the card must say, `{"garment": ..., "body_fingerprint": ...}` for instance. Raises `WeightsError`
+    where a file is missing, damaged, of another format, or made for something else.
     """
     stored = _load_stored(Path(stem), expect=expect)
     if "base" not in stored.card:
@@ -141,8 +125,8 @@ def load_weights(stem: str | Path, *, expect: Mapping[str, Any] | None = None) -
 
 
 def _load_stored(stem: Path, *, expect: Mapping[str, Any] | None = None) -> Weights:
-    path = _with_suffix(stem, ".safetensors")
-    card = _read_card(_with_suffix(stem, ".json"))
+    path = Path(f"{stem}.safetensors")
+    card = load_card(stem)
     for key, wanted in (expect or {}).items():
         if card.get(key) != wanted:
             msg = f"{path}: wanted weights whose {key} is {wanted}, got {card.get(key)}; train some with `refu train`, "
@@ -194,11 +178,14 @@ def _sum(base: Weights, stored: Weights) -> dict[str, Tensor]:
 
 
 def _read_tensors(path: Path, sha256: Any) -> dict[str, Tensor]:
-    """The tensors of a file; nothing is taken of it before its header and its hash are known to be right."""
+    """The tensors of a file; none is made before the hash is known to be right."""
     damaged = f"{path}: damaged, or not the file that its card describes"
     try:
         with _open(path, MAX_BYTES) as file:
-            _check_header(file)
+            (n,) = struct.unpack("<Q", file.read(8))
+            if n > MAX_CARD_BYTES:
+                msg = f"a header of {n} bytes"
+                raise ValueError(msg)
             file.seek(0)
             digest = hashlib.sha256()
             while step := file.read(_PIECE):
@@ -207,8 +194,12 @@ def _read_tensors(path: Path, sha256: Any) -> dict[str, Tensor]:
                 msg = f"{damaged}; get both files again"
                 raise WeightsError(msg)
             file.seek(0)
-            return load(file.read())
-    except (SafetensorError, AttributeError, *DAMAGE) as error:
+            tensors: dict[str, Tensor] = load(file.read())
+            if not {tensor.dtype for tensor in tensors.values()} <= _DTYPES:
+                msg = "it has numbers of another type"
+                raise ValueError(msg)
+            return tensors
+    except (SafetensorError, *DAMAGE) as error:
         if isinstance(error, WeightsError):
             raise
         what = "larger than this machine's memory" if isinstance(error, MemoryError) else "not a safetensors file"
@@ -216,20 +207,9 @@ def _read_tensors(path: Path, sha256: Any) -> dict[str, Tensor]:
         raise WeightsError(msg) from error
 
 
-def _check_header(file: InputFile) -> None:
-    """Checks that a file is as long as its tensors, of plain types, are. Raises `ValueError` and the like."""
-    (n,) = struct.unpack("<Q", file.read(8))
-    if n > MAX_CARD_BYTES:
-        msg = f"a header of {n} bytes"
-        raise ValueError(msg)
-    entries = {key: value for key, value in parse_json(file.read(n)).items() if key != "__metadata__"}
-    size = sum(_DTYPES[entry["dtype"]] * math.prod(entry["shape"]) for entry in entries.values())
-    if size != file.size - 8 - n:
-        msg = f"{len(entries)} tensors of {size} bytes, the file has {file.size - 8 - n}"
-        raise ValueError(msg)
-
-
-def _read_card(path: Path) -> dict[str, Any]:
+def load_card(stem: str | Path) -> dict[str, Any]:
+    """The card of weights alone. Raises `WeightsError` where there is none, or it is no card of weights."""
+    path = Path(f"{stem}.json")
     try:
         with _open(path, MAX_CARD_BYTES) as file:
             card = parse_json(file.read())
@@ -250,7 +230,3 @@ def _open(path: Path, most: int) -> InputFile:
         msg = f"{path}: no such weights; train some with `refu train`"
         raise WeightsError(msg)
     return open_file(path, most=most, error=WeightsError, wanted="weights or their card, as `refu train` writes them")
-
-
-def _with_suffix(stem: Path, suffix: str) -> Path:
-    return stem.with_name(stem.name + suffix)

@@ -39,7 +39,7 @@ def moments(pipeline: GarmentPipeline) -> list[Moment]:
 
 def seen_by(camera: PinholeCamera, meshes: list, rng: np.random.Generator) -> np.ndarray:
     """A depth camera's points, wrong by 3 mm."""
-    depth = depth_image(meshes, camera).depth
+    depth = depth_image(meshes, camera)
     row, column = np.nonzero(np.isfinite(depth))
     z = depth[row, column] + rng.normal(0, 0.003, len(row))
     x = (column + 0.5 - camera.centre[0]) / camera.focal[0] * z

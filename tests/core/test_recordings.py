@@ -511,7 +511,7 @@ def test_keypoints_of_others_are_not_taken_for_mhr(tmp_path: Path) -> None:
     path = save(tmp_path / "a.npz", pred_keypoints_3d=points[:, :44], pred_cam_t=place)
     with pytest.raises(MotionFileError, match="no poses; wanted"):
         read_motion(path, fps=30)
-    with pytest.raises(MotionFileError, match=r"must be \(30, 3\) like the keypoints"):
+    with pytest.raises(MotionFileError, match=r"must be \(30, 3\) like the pose"):
         read_motion(save(path, pred_keypoints_3d=points, pred_cam_t=place[:2]), fps=30)
     path.with_suffix(".pkl").write_bytes(pickle.dumps({"pred_keypoints_3d": points}))
     with pytest.raises(MotionFileError, match="no frame rate"):

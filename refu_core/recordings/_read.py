@@ -1,0 +1,318 @@
+"""Reads one person's motion from any file that is recognised."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from refu_core.errors import RefuError
+from refu_core.frames import N_JOINTS
+from refu_core.recordings import _layouts as table
+from refu_core.recordings._bvh import read_bvh
+from refu_core.recordings._containers import Content, Key, entries, open_content
+from refu_core.recordings._followed import SMPL_POINTS, are_places, follow, metres_of
+from refu_core.recordings._mhr import POINTS, is_of_mhr, places_of_mhr
+from refu_core.recordings._recording import MAX_FRAMES, Recording, check_fps, tell_pace
+from refu_core.recordings._rotations import BODY, WHOLE, rotvecs_of
+from refu_core.recordings._soma import smpl_of_soma
+from refu_core.recordings._tracks import filled, frames_of, places_in_time
+from refu_core.recordings._upright import AXES, PELVIS, Axes, to_smpl
+from refu_core.recordings._values import betas_of, fps_of, gender_of, pelvis_of, transl_of, word_of
+
+_BODY_JOINTS = 22  # what SMPL, SMPL-H and SMPL-X share; SMPL's two hand joints have no counterpart in the others
+_WORLD, _CAMERA = ("world", "global"), ("cam", "incam", "camera")
+_SHOWN = 8
+_ROOTS = ("root", "orient", "globalrot")
+_NO_ROOTS = ("trans", "pos", "loc", "vel")
+"""Parts of what roots are called, and of what else is called so."""
+
+
+@dataclass(frozen=True)
+class _Found:
+    """A mapping with the arrays of a layout."""
+
+    layout: table.Layout
+    path: tuple[Key, ...]
+    node: Mapping[Key, Any]
+
+    @property
+    def rank(self) -> tuple[int, int]:
+        """What is in the world before what is in a camera, then the order of the table."""
+        words = [str(step).lower() for step in self.path]
+        is_world = any(word in step for step in words for word in _WORLD)
+        is_camera = any(word in step for step in words for word in _CAMERA)
+        return (0 if is_world else 2 if is_camera else 1), table.LAYOUTS.index(self.layout)
+
+
+def read_recording(
+    path: str | Path,
+    *,
+    error: type[RefuError],
+    fps: float | None = None,
+    axes: Axes = "auto",
+    person: str | None = None,
+) -> Recording:
+    """Reads the motion of a file; `docs/guide/inputs.md` lists what is recognised.
+
+    Args:
+        path: an .npz, .npy, pickle (also joblib's and torch's) or .bvh. Nothing in a pickle is executed.
+        error: what is raised.
+        fps: frames a second, in place of what the file says; must be given where it says nothing.
+        axes: what root orientations and translations are expressed in.
+        person: whose motion, where the file has several; the one with most frames if not given.
+
+    Raises:
+        error: the file can't be read, isn't recognised, has no frame rate, or its arrays have other shapes or meanings.
+    """
+    path = Path(path)
+    if axes not in AXES or not isinstance(fps, (int, float, type(None))):
+        msg = f"{path}: wanted axes of {', '.join(AXES)} and frames a second as a number, got {axes!r} and {fps!r}"
+        raise error(msg)
+    if path.suffix.lower() == ".bvh":
+        return read_bvh(path, error=error, fps=fps, axes=axes)
+    content = open_content(path, error=error)
+    try:
+        return _recording(content, fps=fps, axes=axes, person=person)
+    except ValueError as cause:
+        msg = f"{path}: {cause}"
+        raise error(msg) from cause
+
+
+def _recording(content: Content, *, fps: float | None, axes: Axes, person: str | None) -> Recording:
+    notes: list[str] = []
+    content, like = _spelled(smpl_of_soma(content, notes))
+    if like:
+        notes.append(f"taken by like names: {', '.join(f'{key} as {name}' for key, name in like.items())}")
+    found, above = _find(content, person, notes)
+    layout, node = found.layout, found.node
+    arrays = {name: content.array(node[name]) for name in layout.pose}
+    if layout.is_time_last:
+        arrays = {name: np.moveaxis(array, -1, 0) for name, array in arrays.items()}
+    if layout.holds_places:
+        arrays = {name: _places(array, name) for name, array in arrays.items()}
+    n_persons = _persons(arrays)
+    which = _chosen([str(i) for i in range(n_persons)], person, [0] * n_persons, notes) if n_persons > 1 else 0
+    if n_persons:
+        arrays = {name: array[which] for name, array in arrays.items()}
+
+    def one(names: Sequence[str]) -> NDArray[Any] | None:
+        name = next((name for name in names if node.get(name) is not None), None)
+        if name is None:
+            return None
+        array = content.array(node[name])
+        array = np.moveaxis(array, -1, 0) if layout.is_time_last and array.ndim == 2 else array
+        return array[which] if n_persons and len(array) == n_persons and array.ndim > 1 else array
+
+    rate = check_fps(fps if fps is not None else fps_of(content, _first(above, table.RATES)))
+    frames = one(table.FRAME_NUMBERS)
+    if layout is table.MHR:
+        (array,) = arrays.values()
+        notes.append("MHR, another body than SMPL's: followed by its keypoints")
+        at = places_in_time(frames, len(array))
+        places = places_of_mhr(array, transl_of(one(layout.transl), layout, len(array), notes), at)
+        return follow(POINTS, places, fps=rate, axes=axes, usual="y-down", notes=notes)
+    if _is_of_places(arrays):
+        ((name, array),) = arrays.items()
+        notes.append(f"{name} {array.shape} holds places of joints and no rotations: SMPL's skeleton is fitted to them")
+        places = array[:, : len(SMPL_POINTS)].astype(np.float64)
+        places = metres_of(SMPL_POINTS, places[0], notes) * places
+        return follow(SMPL_POINTS, places, fps=rate, axes=axes, usual="smpl", notes=notes)
+    poses = _poses(arrays, layout, node, notes)
+    n = len(poses)
+    transl = transl_of(one(layout.transl), layout, n, notes)
+    scaling = one(table.SCALINGS)
+    if scaling is not None:
+        transl = transl / float(scaling.reshape(-1)[0])
+        notes.append(f"translations are divided by {table.SCALINGS[0]}")
+    if layout.turns_about_origin:
+        transl = transl + pelvis_of(poses[:, 0]) - PELVIS
+    is_smplx = (
+        any("smplx" in table.spelled(key) for key in like)
+        or "x" in word_of(content, _first(above, table.MODELS))
+        or _columns(arrays) in (165, 330, 495)
+    )
+    betas = betas_of(one(layout.betas), n, notes, is_smplx=is_smplx)
+    poses, transl = filled(poses, transl, frames, notes)
+    of_amass = _columns(arrays) in (156, 165) and _first(above, table.RATES[:2]) is not None
+    roots = poses[:, 0].astype(np.float64)
+    roots, transl = to_smpl(roots, transl, axes, notes, usual="z-up" if of_amass else "smpl")
+    if axes != "frame":
+        with np.errstate(over="ignore", invalid="ignore"):
+            poses[:, 0] = roots
+    tell_pace(transl, rate, notes)
+    gender = gender_of(word_of(content, _first(above, table.GENDERS), which), notes)
+    with np.errstate(over="ignore", invalid="ignore"):  # becomes inf or NaN, which the frame refuses
+        return Recording(poses.astype(np.float32), transl, betas, rate, gender, tuple(notes))
+
+
+def _places(array: NDArray[Any], name: str) -> NDArray[Any]:
+    """Places of joints (T, n, 3), or of several persons (N, T, n, 3)."""
+    if array.ndim == 4:  # the time was last: it is first now, and persons are second
+        array = array.swapaxes(0, 1)
+    if array.ndim == 2 and array.shape[1] % 3 == 0:
+        array = array.reshape(len(array), -1, 3)
+    shown = array[0] if array.ndim == 4 and len(array) else array
+    if not _is_of_places({name: shown}):
+        msg = f"{name} {array.shape}: no places of SMPL's joints, (T, n, 3) with n = 22 or 24, between which are bones"
+        raise ValueError(msg)
+    return array
+
+
+def _is_of_places(arrays: Mapping[str, NDArray[Any]]) -> bool:
+    if len(arrays) != 1:
+        return False
+    (array,) = arrays.values()
+    is_alike = array.ndim == 3 and array.shape[1] in WHOLE and array.shape[2] == 3 and array.dtype.kind == "f"
+    return is_alike and len(array) > 0 and are_places(array.astype(np.float64))
+
+
+# Where it is ----------------------------------------------------------------------------------------------------------
+
+
+def _find(content: Content, person: str | None, notes: list[str]) -> tuple[_Found, list[Mapping[Key, Any]]]:
+    """The mapping that holds the motion, and those around it from the inside outwards."""
+    if isinstance(content.root, np.ndarray):
+        notes.append("an array without a name: taken as poses")
+        bare: dict[Key, Any] = _bare(content.root, notes)
+        poses = next(layout for layout in table.LAYOUTS if layout.pose == ("poses",))
+        return _Found(poses, (), bare), [bare]
+    tracks = frames_of(content)
+    whole = entries(content.root) or {}  # of which a frame rate may stand beside the frames
+    if tracks:
+        notes.append("the file goes frame by frame: each person's frames are put together")
+        content = Content(tracks)
+    nodes = dict(content.nodes())
+    every = [
+        _Found(layout, path, node)
+        for path, node in nodes.items()
+        for layout in table.LAYOUTS
+        if all(node.get(name) is not None for name in layout.pose)
+        and (layout is not table.MHR or is_of_mhr(content.array(node[layout.pose[0]])))
+    ]
+    if not every:
+        raise ValueError(_unknown(nodes))
+    best = min(found.rank for found in every)
+    same = [found for found in every if found.rank == best]
+    others = {" with ".join(found.layout.pose) for found in every if found.rank[0] != best[0]}
+    is_both = best[1] == 0 and any("camera" in found.layout.writers for found in every)
+    if is_both or (best[0] == 0 and others):
+        notes.append("the file has the motion in a camera, too: the one in the world is taken")
+    names = [_person(found.path) for found in same]
+    lengths = [content.array(found.node[found.layout.pose[0]]).shape[:1] for found in same]
+    found = same[_chosen(names, person, [sum(length) for length in lengths], notes) if len(same) > 1 else 0]
+    return found, [nodes[found.path[:i]] for i in range(len(found.path), -1, -1) if found.path[:i] in nodes] + [whole]
+
+
+def _spelled(content: Content) -> tuple[Content, Mapping[Key, str]]:
+    """With known names, and which they are, where a pose's are spelled otherwise or have a word before them."""
+    names = None
+    for _, node in content.nodes():
+        exact = [one for one in table.LAYOUTS if all(node.get(name) is not None for name in one.pose)]
+        if any(one.is_whole for one in exact):
+            return content, {}
+        known = table.names_like([key for key, value in node.items() if value is not None])
+        names = names or known
+    return (content.renamed(names), names) if names else (content, {})
+
+
+def _bare(array: NDArray[Any], notes: list[str]) -> dict[Key, Any]:
+    """An array alone: a pose, or the columns of Motion-X."""
+    if array.ndim == 2 and array.shape[1] == 322:
+        notes.append("322 columns: taken as Motion-X's")
+        return {"poses": array[:, :66], "trans": array[:, 309:312], "betas": array[:, 312:322]}
+    if array.ndim == 2 and array.shape[1] == 263:
+        msg = f"263 columns are HumanML3D features; {table.UNREAD_ADVICE['HumanML3D features']}"
+        raise ValueError(msg)
+    return {"poses": array}
+
+
+def _person(path: tuple[Key, ...]) -> str:
+    return next((str(step) for step in reversed(path) if isinstance(step, int)), "/".join(map(str, path)) or "0")
+
+
+def _persons(arrays: Mapping[str, NDArray[Any]]) -> int:
+    """How many persons the first axis counts (SLAHMR), 0 where there is no such axis."""
+    ways = [3 * n for n in (*WHOLE, *BODY)]
+    batched = [array for array in arrays.values() if array.ndim == 3 and array.shape[2] in ways and array.shape[1] > 1]
+    batched += [array for array in arrays.values() if array.ndim == 4 and array.shape[3] == 3 and array.shape[2] > 3]
+    return len(batched[0]) if batched else 0
+
+
+def _chosen(names: Sequence[str], person: str | None, lengths: Sequence[int], notes: list[str]) -> int:
+    listing = ", ".join(f"{name} ({n} frames)" if n else name for name, n in zip(names[:_SHOWN], lengths, strict=False))
+    listing += " …" if len(names) > _SHOWN else ""
+    if person is not None:
+        if person not in names:
+            msg = f"no person {person!r}; the file has {listing}"
+            raise ValueError(msg)
+        return names.index(person)
+    best = max(range(len(names)), key=lambda i: lengths[i])
+    notes.append(f"{len(names)} persons: {listing}; {names[best]} is taken (--person chooses another)")
+    return best
+
+
+def _unknown(nodes: Mapping[tuple[Key, ...], Mapping[Key, Any]]) -> str:
+    keys = list(dict.fromkeys(str(key) for node in list(nodes.values())[:_SHOWN] for key in node))
+    for what, names in table.UNREAD.items():
+        if any(name in keys for name in names):
+            return f"{what} parameters aren't read: {table.UNREAD_ADVICE[what]}"
+    has = ", ".join(keys[:_SHOWN]) + (" …" if len(keys) > _SHOWN else "") or "nothing that has a name"
+    return f"no poses; wanted {table.accepted()} (docs/guide/inputs.md); the file has {has}"
+
+
+def _first(above: Sequence[Mapping[Key, Any]], names: Sequence[str]) -> Any:
+    """The first of these entries, nearest to the motion."""
+    return next((node[name] for node in above for name in names if node.get(name) is not None), None)
+
+
+# What it means --------------------------------------------------------------------------------------------------------
+
+
+def _columns(arrays: Mapping[str, NDArray[Any]]) -> int:
+    return sum(int(np.prod(array.shape[1:])) for array in arrays.values())
+
+
+def _poses(
+    arrays: Mapping[str, NDArray[Any]], layout: table.Layout, node: Mapping[Key, Any], notes: list[str]
+) -> NDArray[np.float64]:
+    """SMPL's 24 joints of any layout."""
+    names, given = list(arrays), list(arrays.values())
+    if len(given) == 2:
+        root, _ = rotvecs_of(given[0], names[0], (1,), notes, has_root=True)
+        body, n = rotvecs_of(given[1], names[1], layout.joints[1], notes, has_root=False)
+        if n in WHOLE:
+            if body[:, 0].any():
+                msg = f"{names[1]} has a root of its own beside {names[0]}; wanted zeros there, or no {names[0]}"
+                raise ValueError(msg)
+            body, n = body[:, 1:], n - 1
+        if len(root) != len(body):
+            msg = f"{names[0]} has {len(root)} frames, {names[1]} {len(body)}; wanted as many"
+            raise ValueError(msg)
+    else:
+        whole, n = rotvecs_of(given[0], names[0], (*WHOLE, *BODY), notes, has_root=True)
+        if n in BODY:
+            words = {key: table.spelled(key) for key in node}
+            others = [
+                key
+                for key, word in words.items()
+                if any(part in word for part in _ROOTS) and not any(part in word for part in _NO_ROOTS)
+            ]
+            if others:
+                msg = f"{names[0]} has no root, and {others[0]} may be it: save it as root_orient with pose_body"
+                raise ValueError(msg)
+            notes.append(f"{names[0]} has no root: the person stands upright and looks along z")
+            root, body = np.zeros((len(whole), 1, 3)), whole
+        else:
+            root, body, n = whole[:, :1], whole[:, 1:], n - 1
+    kept = n if n == N_JOINTS - 1 else _BODY_JOINTS - 1
+    if len(body) > MAX_FRAMES:
+        msg = f"{len(body)} frames, at most {MAX_FRAMES} are read; cut the clip"
+        raise ValueError(msg)
+    poses = np.zeros((len(body), N_JOINTS, 3))
+    poses[:, :1], poses[:, 1 : 1 + kept] = root, body[:, :kept]
+    return poses
