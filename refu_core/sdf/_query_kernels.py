@@ -56,16 +56,16 @@ def query_skin_kernel(
     skin: Skin,
     queries: wp.array[wp.vec3],
     near: wp.array[int],
-    rows: wp.array[int],
+    is_asked: wp.array[wp.bool],
     # outputs
     out_face: wp.array[int],
     out_distance: wp.array[float],
     out_gradient: wp.array[wp.vec3],
 ) -> None:
-    """`query_skin` at the queries numbered `rows`, or at all where there are no rows; `near` has a face of each."""
+    """`query_skin` at the queries that are asked, or at all where `is_asked` is empty; `near` has a face of each."""
     i = wp.tid()
-    if rows.shape[0] > 0:
-        i = rows[i]
+    if is_asked.shape[0] > 0 and not is_asked[i]:
+        return
     distance, gradient, face = query_skin(skin, queries[i], near[i])
     out_face[i] = face
     out_distance[i] = distance
