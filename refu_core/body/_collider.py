@@ -81,7 +81,7 @@ class Collider:
     @torch.no_grad()
     def _part(self, skin: Tensor, rotation: Tensor) -> Tensor:
         """One body, in memory that the next one overwrites."""
-        work = self.anatomy.tensors
+        work = self.anatomy.memory
         work.rotation.copy_(rotation)
         work.ints.zero_()
         with torch_stream(self.device):
@@ -97,7 +97,7 @@ class Collider:
     def _touch(self) -> None:
         """Which segments each vertex has to give way to."""
         self._run("look")
-        wanted = int(self.anatomy.tensors.counts[kernels.WANTED]) if self._is_serial else -1
+        wanted = int(self.anatomy.memory.counts[kernels.WANTED]) if self._is_serial else -1
         for k, tree in enumerate(self.anatomy.trees):
             if (wanted >> k) & 1:
                 tree.refit()
@@ -111,7 +111,7 @@ class Collider:
     @property
     def _parted(self) -> Tensor:
         """Where the last sweeps end."""
-        work = self.anatomy.tensors
+        work = self.anatomy.memory
         at: Tensor = work.here if self.settings.smooth_last % 2 == 0 else work.there
         return at
 
@@ -153,9 +153,9 @@ class Collider:
     @torch.no_grad()
     def touched(self, skin: Tensor) -> Tensor:
         """Which segments each vertex of `skin` (V, 3) [m] has to give way to, bool, shape (V, K)."""
-        self.anatomy.tensors.ints.zero_()
-        self.anatomy.tensors.take(skin)
-        self.anatomy.tensors.counts[kernels.BENT_JOINTS] = -1  # any may be
+        self.anatomy.memory.ints.zero_()
+        self.anatomy.memory.take(skin)
+        self.anatomy.memory.counts[kernels.BENT_JOINTS] = -1  # any may be
         with torch_stream(self.device):
             self._touch()
         bits: Tensor = wp.to_torch(self.anatomy.work.touched)
