@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -180,27 +180,13 @@ def _grouped(owner: NDArray[Any], items: NDArray[Any], n: int) -> Adjacency:
     return Adjacency(start.astype(np.int32), items[order].astype(np.int32))
 
 
-def grouped(places: NDArray[np.float32], width: int = 8) -> NDArray[np.int64]:
-    """An order of places (N, 3) in which each eight (or `width`), each 64, and so on are close together.
-
-    The last few are remembered: every pipeline and every checker of a mesh asks for the same. So it is read-only.
-    """
-    return _order_of(np.ascontiguousarray(places).tobytes(), np.dtype(places.dtype).str, width)
-
-
-@lru_cache(maxsize=64)
-def _order_of(place_bytes: bytes, dtype: str, width: int) -> NDArray[np.int64]:
-    """Of places as bytes, by which they are known again."""
-    places = np.frombuffer(place_bytes, dtype).reshape(-1, 3)
+def grouped(places: NDArray[np.floating[Any]], width: int = 8) -> NDArray[np.int64]:
+    """An order of places (N, 3) in which each eight (or `width`), each 64, and so on are close together."""
     n = len(places)
     sizes_of_groups = width ** np.arange(20, dtype=np.int64)
     order, bounds = np.arange(n), np.array([0, n])
-    while True:
+    while (is_open := np.diff(bounds) > 1).any():
         starts, sizes = bounds[:-1], np.diff(bounds)
-        is_open = sizes > 1
-        if not is_open.any():
-            order.flags.writeable = False
-            return order
         here = places[order]
         extent = np.maximum.reduceat(here, starts) - np.minimum.reduceat(here, starts)
         group = np.repeat(np.arange(len(starts)), sizes)
@@ -210,3 +196,4 @@ def _order_of(place_bytes: bytes, dtype: str, width: int) -> NDArray[np.int64]:
         unit = sizes_of_groups[np.searchsorted(sizes_of_groups, sizes[is_open]) - 1]
         half = np.maximum(-(-sizes[is_open] // unit) // 2, 1) * unit
         bounds = np.union1d(bounds, starts[is_open] + half)
+    return order

@@ -8,6 +8,7 @@ at a time, and the points lie sorted by row and cell, so that what a face sees o
 
 import warp as wp
 
+from refu_core.body._bundle_kernels import greater, lesser
 from refu_core.sdf._closest_kernels import PosedMesh, closest_on_triangle, measured_to
 
 wp.set_module_options({"enable_backward": False})
@@ -35,21 +36,6 @@ def cell_number(x: float, per_metre: float) -> int:
     cell = x * per_metre
     cell = wp.where(cell < _MOST_CELLS, cell, _MOST_CELLS)
     return int(wp.floor(wp.where(cell > -_MOST_CELLS, cell, -_MOST_CELLS)))
-
-
-@wp.func
-def lesser(p: wp.vec3, q: wp.vec3) -> wp.vec3:
-    """By coordinate, of numbers: wp.min would look for NaN."""
-    return wp.vec3(
-        wp.where(q[0] < p[0], q[0], p[0]), wp.where(q[1] < p[1], q[1], p[1]), wp.where(q[2] < p[2], q[2], p[2])
-    )
-
-
-@wp.func
-def greater(p: wp.vec3, q: wp.vec3) -> wp.vec3:
-    return wp.vec3(
-        wp.where(q[0] > p[0], q[0], p[0]), wp.where(q[1] > p[1], q[1], p[1]), wp.where(q[2] > p[2], q[2], p[2])
-    )
 
 
 @wp.func

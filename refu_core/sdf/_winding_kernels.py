@@ -8,7 +8,7 @@ line slips between two faces, or crosses both.
 
 import warp as wp
 
-from refu_core.sdf._band_kernels import greater, lesser
+from refu_core.body._bundle_kernels import greater, lesser
 
 # Contracted multiply-adds would round a x b and b x a differently.
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
