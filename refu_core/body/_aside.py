@@ -15,7 +15,7 @@ from torch.nn.functional import embedding_bag
 
 from refu_core._warp import Repeated, as_warp, is_plain, torch_stream
 from refu_core.body import _aside_kernels as kernels
-from refu_core.body._closest import weights_at
+from refu_core.body._collider_gradient import weights_at
 from refu_core.body._collider_kernels import Means
 from refu_core.body._kinematics import rotvec_to_rotmat
 from refu_core.body._parts import ARMS, joints_of, part_of_faces

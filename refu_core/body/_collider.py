@@ -11,10 +11,8 @@ from torch import Tensor
 
 from refu_core._warp import as_warp, is_plain, torch_stream
 from refu_core.body import _collider_kernels as kernels
-from refu_core.body import _part_kernels as parting
 from refu_core.body import _step_kernels as steps
 from refu_core.body._anatomy import DEFAULT_GAP, Anatomy, ColliderSettings
-from refu_core.body._closest import Closest
 from refu_core.body._collider_gradient import part_with_gradient
 from refu_core.body._kinematics import PARENTS, RigidTransforms
 from refu_core.body._model import SmplBody
@@ -160,31 +158,6 @@ class Collider:
             self._touch()
         bits: Tensor = wp.to_torch(self.anatomy.work.touched)
         return (bits[:, None] >> torch.arange(len(self.anatomy.trees), device=bits.device)) & 1 == 1
-
-    @torch.no_grad()
-    def closest(self, points: Tensor, segment: Tensor) -> Closest:
-        """What points (N, 3) [m] are closest to of a segment each (N,), in the pose that `touched` was asked for."""
-        n = len(points)
-        face = torch.zeros(n, dtype=torch.int32, device=self.device)
-        weights, sign = torch.zeros(n, 3, device=self.device), torch.zeros(n, device=self.device)
-        inputs = [
-            as_warp(points.float().contiguous(), wp.vec3),
-            as_warp(segment.int(), wp.int32),
-            self.anatomy.segments,
-        ]
-        outputs = [as_warp(face, wp.int32), as_warp(weights, wp.vec3), as_warp(sign, wp.float32)]
-        if n:
-            with torch_stream(self.device):
-                wp.launch(parting.closest_kernel, n, inputs, outputs, device=str(self.device))
-        return Closest(face.long(), weights, sign)
-
-    def with_caps(self, skin: Tensor) -> Tensor:
-        """`skin` (V, 3) [m] and the middles of the caps after it. Differentiable."""
-        caps = self.anatomy.caps
-        start, vertex, weight = (wp.to_torch(one) for one in (caps.start, caps.vertex, caps.weight))
-        of_middle = torch.repeat_interleave(torch.arange(len(start) - 1, device=skin.device), start.long().diff())
-        middles = skin.new_zeros(len(start) - 1, 3)
-        return torch.cat((skin, middles.index_add(0, of_middle, skin[vertex.long()] * weight.to(skin)[:, None])))
 
 
 _HELD = 0.99

@@ -110,8 +110,8 @@ class MeshSdf(ABC):
         if not tracked and points.dtype == torch.float32:
             return found.sample()
         corners = self._vertices.to(points)[self.faces.long()[found.face.long()]]
-        kind, barycentrics, normal = self._features(where, found.face)
-        feature = Feature(kind, normal.to(points), found.distance.sign().to(points), barycentrics.to(points))
+        kind, _, normal = self._features(where, found.face)
+        feature = Feature(kind, normal.to(points), found.distance.sign().to(points))
         return signed_distance(points, corners, feature)._replace(face=found.face)
 
     def of_garment(self, garment: GarmentTemplate) -> GarmentSdf:  # noqa: ARG002
