@@ -144,7 +144,7 @@ class Anatomy:
         seams.least = self._floats(least)
         self.creases, self.least = found, torch.as_tensor(least, device=self.device)
         """What is held by which seam, and the height over its plane that is kept [m], shape (R,)."""
-        seams.stations = wp.array(found.stations, dtype=kernels.Stations, device=str(self.device))
+        seams.stations = wp.array(found.stations.astype(np.int32), dtype=kernels.Stations, device=str(self.device))
         seams.weights = wp.array(
             found.weights.astype(np.float32), dtype=kernels.StationWeights, device=str(self.device)
         )

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from refu_core.sdf._box_kernels import Boxes, closest_in_boxes, guess, is_beyond
+from refu_core.sdf._box_kernels import Boxes, closest_in_boxes, guess
 from refu_core.sdf._closest_kernels import PosedMesh, distance_to_face, measured_to
 from refu_core.sdf._walk_kernels import Guides, first_at, walk_from
 
@@ -44,10 +44,6 @@ def query_skin(skin: Skin, p: wp.vec3, near: int) -> tuple[float, wp.vec3, int]:
         face, feature, _w, _above = walk_from(p, near, skin.mesh, skin.guides)
         face = first_at(face, feature, skin.mesh)
     distance, gradient = measured_to(p, face, skin.mesh)
-    if distance < 0.0 and skin.boxes.order.shape[0] > 0 and is_beyond(p, skin.boxes):
-        # A thousand kilometres off all faces are equally far, and rounding may have taken one of the other side.
-        distance = -distance
-        gradient = -gradient
     return distance, gradient, face
 
 
