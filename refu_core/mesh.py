@@ -40,11 +40,7 @@ class Connectivity:
 
     @classmethod
     def of(cls, faces: Any, n_vertices: int | None = None) -> Connectivity:
-        """Of `faces`, integers of shape (F, 3), and as many vertices as they name, if not told.
-
-        Raises:
-            MeshError: they aren't triangles of three different vertices each.
-        """
+        """Of `faces`, integers of shape (F, 3), and as many vertices as they name, if not told; raises `MeshError`."""
         checked = check_faces(faces, n_vertices=n_vertices)
         return cls(checked, int(checked.max()) + 1 if n_vertices is None else n_vertices)
 
@@ -99,11 +95,7 @@ class Connectivity:
         return chosen
 
     def require_closed(self) -> None:
-        """Nothing, where the mesh is a closed, consistently oriented surface.
-
-        Raises:
-            MeshError: it isn't.
-        """
+        """Raises `MeshError` where the mesh isn't a closed, consistently oriented surface."""
         start, end = self.faces.ravel(), np.roll(self.faces, -1, axis=1).ravel()
         n_faces = self.n_faces_of_edge
         n_open, n_crowded = int((n_faces == 1).sum()), int((n_faces > 2).sum())
@@ -121,8 +113,7 @@ class Connectivity:
     def across(self) -> NDArray[np.int32]:
         """The face on the other side of the edges (0, 1), (1, 2), (2, 0) of each face of a closed mesh, shape (F, 3).
 
-        Raises:
-            MeshError: as `require_closed`.
+        Raises `MeshError` as `require_closed` does.
         """
         self.require_closed()
         # Every edge has exactly two corners: sorting by edge puts partners side by side.
@@ -146,8 +137,7 @@ class Connectivity:
 def check_faces(faces: Any, *, n_vertices: int | None = None) -> NDArray[np.int32]:
     """`faces` as a contiguous int32 array of shape (F, 3).
 
-    Raises:
-        MeshError: not integers of that shape, or not three different vertices each, below `n_vertices`.
+    Raises `MeshError` where they aren't integers of that shape, three different ones each, below `n_vertices`.
     """
     array = np.asarray(faces)
     if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0 or array.dtype.kind not in "iu":

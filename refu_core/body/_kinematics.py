@@ -18,8 +18,7 @@ from refu_core.skeleton import PARENTS as PARENTS
 def rotvec_to_rotmat(rotvec: Tensor) -> Tensor:
     """Rotation matrices of rotation vectors [rad]: shape (..., 3) -> (..., 3, 3) (Rodrigues' formula).
 
-    Smooth with finite derivatives at the zero rotation, where sin θ / θ and (1 - cos θ) / θ² are taken from
-    their series.
+    Smooth, with finite derivatives at the zero rotation.
     """
     if is_plain(rotvec):
         flat = rotvec.reshape(-1, 3).contiguous()
@@ -54,15 +53,11 @@ class RigidTransforms(NamedTuple):
 
 
 def forward_kinematics(rotations: Tensor, joints: Tensor) -> tuple[Tensor, RigidTransforms]:
-    """Poses the joint tree.
+    """Posed joints [m], shape (B, 24, 3), and the transforms that take points at rest with each joint's bone.
 
     Args:
         rotations: rotation of each joint relative to its parent, shape (B, 24, 3, 3).
         joints: rest positions of the joints [m], shape (B, 24, 3), or (1, 24, 3) for bodies of one shape.
-
-    Returns:
-        Posed joints [m], shape (B, 24, 3), and the transforms that take a rest-pose point of each joint's bone to its
-        posed place.
     """
     if is_plain(rotations, joints):
         return _chained(rotations.contiguous(), joints.contiguous())

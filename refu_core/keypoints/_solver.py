@@ -74,13 +74,7 @@ class Solution(NamedTuple):
 
 
 class Solver:
-    """Finds the most likely pose of one skeleton's keypoints.
-
-    Args:
-        skeleton: whose they are.
-        fits_betas: whether the shape is looked for, too.
-        settings: the tuned numbers.
-    """
+    """Finds the most likely pose of one skeleton's keypoints, and its betas where it `fits_betas`."""
 
     def __init__(self, skeleton: Skeleton, *, fits_betas: bool, settings: TrackerSettings) -> None:
         self._skeleton = skeleton
@@ -114,7 +108,7 @@ class Solver:
             deviation: of each keypoint along an axis [m], shape (K,).
             prior: precision of the prediction's parts, shape (85,); None for a guess, which pulls at nothing.
             rest: the share of a look that joints at rest count as.
-            steps: of Gauss and Newton at most.
+            steps: Gauss-Newton steps at most.
         """
         precision = np.full(N_PARTS, _FLAT) if prior is None else prior
         noise, free = np.square(deviation), self._free

@@ -34,9 +34,6 @@ if TYPE_CHECKING:
     from refu_core.body import SmplBody
     from refu_core.garments import GarmentTemplate
 
-# Over one segment of the body the distance mostly falls all the way to the closest face. From one to another it may
-# have to rise first.
-_PARTS = tuple(SEGMENTS.values())
 _SPACING = 0.05
 """Edge of the cubes of the rest pose that have one guide of each part in them [m]."""
 _CELL = 0.045
@@ -64,8 +61,6 @@ class ApproxSdf(MeshSdf):
     So the distance is always that to a face of the posed body: exact, or too large where no walk ended at the closest
     face. Sign, gradient and derivatives are those of `ExactSdf`. Within 2 cm of the skin the mean error is some
     hundredths of a millimetre, at less than a fifth of the exact query's cost (benchmarks/sdf.py).
-
-    It needs the posed vertices alone, so it works for every β, γ and pose.
     """
 
     is_exact = False
@@ -88,7 +83,8 @@ class ApproxSdf(MeshSdf):
         # A GPU isn't waited for to know whether anything is that deep.
         self._is_serial = self.device.type == "cpu"
         faces, rest = body.faces.cpu().numpy(), body.v_template.double().cpu().numpy()
-        part = part_of_faces(body.weights.cpu(), body.faces.cpu(), _PARTS).int().numpy()
+        # Over one segment the distance mostly falls all the way to the closest face; to another it may rise first.
+        part = part_of_faces(body.weights.cpu(), body.faces.cpu(), SEGMENTS.values()).int().numpy()
         self._cube = np.floor(rest[faces].mean(1) / _SPACING).astype(np.int64)
         """Which cube of the rest pose each face is in, shape (F, 3)."""
         self._links = torch.zeros(len(part), 2, 4, dtype=torch.int32, device=self.device)

@@ -256,6 +256,13 @@ def test_people_come_and_go() -> None:
     assert np.linalg.norm(jumped.transl - known[20].transl - [5, 0, 3]) < 0.1
 
 
+def test_a_person_whose_keypoints_are_refused_is_nobody() -> None:
+    people = People(skeleton("coco17"))
+    with pytest.raises(FrameError):
+        people.update("a", np.zeros((5, 3)), confidence=None, stamp_ns=1, now_ns=1)
+    assert people.at(2) == {}
+
+
 def test_clocks() -> None:
     frame = clip("walk").frames[0]
     track, points = KeypointTracker(skeleton("zed38")), points_of(frame, "zed38")
