@@ -161,7 +161,7 @@ class BandSdf(MeshSdf):
         if self._tree is None:
             self._tree = BoxTree(self.faces, points)
         if not self._tree_is_posed:
-            self._tree.fit(self._posed.points)
+            self._tree.fit(points)
             self._tree_is_posed = True
         return self._tree
 

@@ -56,9 +56,9 @@ def least_of(eight: Eight) -> float:
 
 @wp.kernel(enable_backward=False)
 def fit_kernel(
-    points: wp.array[wp.vec3],
     faces: wp.array2d[int],
     boxes: Boxes,
+    points: wp.array[wp.vec3],
     # output
     bounds: wp.array3d[float],
 ) -> None:
