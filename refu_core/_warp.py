@@ -53,11 +53,6 @@ def as_warp(tensor: Tensor, dtype: Any) -> Any:
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
 
 
-def argument(tensor: Tensor, dtype: Any) -> Any:
-    """`as_warp` for one launch, in half the time: the tensor must outlive the launch."""
-    return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
-
-
 class Repeated(threading.local):
     """A kernel that is launched with other arrays of the same shapes again and again.
 
@@ -77,7 +72,10 @@ class Repeated(threading.local):
         if key not in self._known:
             if len(self._known) >= _MOST_SIZES:
                 self._known.clear()
-            arrays = [argument(tensor, kind) for tensor, kind in zip(tensors, self._kinds, strict=True)]
+            arrays = [
+                wp.from_torch(tensor.detach(), dtype=kind, requires_grad=False, return_ctype=True)
+                for tensor, kind in zip(tensors, self._kinds, strict=True)
+            ]
             inputs = [*self._fixed, *arrays]
             self._known[key] = wp.launch(self._kernel, dim, inputs, device=str(device), record_cmd=True), arrays
         command, arrays = self._known[key]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from refu_core.errors import MeshError
 from refu_core.outputs._check import as_points
-from refu_core.sdf import BandSdf, Links
+from refu_core.sdf import BandSdf
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -43,7 +43,7 @@ class Clearance:
         self.reach = float(reach)
         """[m]"""
         self._sdf = BandSdf(body.faces.cpu(), band=self.reach, rest=body.v_template.detach().cpu())
-        self._links = {name: Links(garment.mesh.ring) for name, garment in garments.items()}
+        self._rings = {name: garment.mesh.ring for name, garment in garments.items()}
 
     @classmethod
     def of(cls, pipeline: GarmentPipeline, *, reach: float = REACH) -> Clearance:
@@ -75,10 +75,10 @@ class Clearance:
         Raises:
             MeshError: an unknown garment, not its vertices, or no body yet.
         """
-        if name not in self._links:
-            msg = f"no garment {name!r} here: wanted one of {', '.join(self._links)}"
+        if name not in self._rings:
+            msg = f"no garment {name!r} here: wanted one of {', '.join(self._rings)}"
             raise MeshError(msg)
-        links = self._links[name]
-        points = as_points("the garment's vertices", vertices, links.n_vertices).astype(np.float32)
-        distance: NDArray[np.float32] = self._sdf.clipped(torch.from_numpy(points), links).distance.numpy()
+        ring = self._rings[name]
+        points = as_points("the garment's vertices", vertices, len(ring.start) - 1).astype(np.float32)
+        distance: NDArray[np.float32] = self._sdf.clipped(torch.from_numpy(points), ring).distance.numpy()
         return distance

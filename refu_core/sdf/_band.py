@@ -43,15 +43,6 @@ _FEW = 200
 _N_ROWS = int(ROWS_X) * int(ROWS_Z)
 
 
-class Links:
-    """The edges of a garment as the kernels of the band read them."""
-
-    def __init__(self, ring: Adjacency) -> None:
-        """From the neighbours of each vertex (`Connectivity.ring`)."""
-        self.n_vertices = len(ring.start) - 1
-        self.arrays = [torch.from_numpy(array) for array in ring]
-
-
 class BandSdf(MeshSdf):
     """The exact signed distance for garments on one CPU core; beyond a band around the skin only the side is computed.
 
@@ -87,23 +78,23 @@ class BandSdf(MeshSdf):
         self._tree_is_posed = False
         self._all = torch.empty(0, dtype=torch.bool)
 
-    def clipped(self, points: Tensor, links: Links) -> SdfSample:
+    def clipped(self, points: Tensor, ring: Adjacency) -> SdfSample:
         """The signed distance and gradient of a garment's vertices [m], shape (N, 3), clipped from above.
 
-        Distances are exact inside the body and up to `band` outside of it; farther out they are `band` (and the
-        gradient and face, -1, mean nothing). Not differentiable.
+        `ring` are the vertices next to each (`Connectivity.ring`). Distances are exact inside the body and up to `band`
+        outside of it; farther out they are `band` (and gradient and face, -1, mean nothing). Not differentiable.
 
         Raises `MeshError` as `query` does.
         """
         self._require_update()
         where = self._checked(points)
-        if links.n_vertices != len(where):
-            msg = f"the links are of {links.n_vertices} vertices, got {len(where)}"
+        if len(ring.start) - 1 != len(where):
+            msg = f"the ring is of {len(ring.start) - 1} vertices, got {len(where)}"
             raise MeshError(msg)
         if not len(where):
             return SdfSample(where[:, 0], where, torch.empty(0, dtype=torch.int32))
         found = self._scan(where, beyond=self.band)
-        state, patches = self._scan.spread(where, found, links)
+        state, patches = self._scan.spread(where, found, ring)
         is_asked = state == int(ASKED)
         is_asked[patches] = True
         if self._ask_tree(where, found, is_asked):
@@ -116,10 +107,10 @@ class BandSdf(MeshSdf):
 
     def of_garment(self, garment: GarmentTemplate) -> GarmentSdf:
         """As `BodySdf.of_garment`; distances beyond the band are computed only where `reach` asks for them."""
-        links = Links(garment.mesh.ring)
+        ring = garment.mesh.ring
 
         def ask_garment(vertices: Tensor, *, on_mean: Tensor, reach: float = math.inf) -> SdfSample:  # noqa: ARG001
-            return self.clipped(vertices, links) if reach <= self.band else self.query(vertices)
+            return self.clipped(vertices, ring) if reach <= self.band else self.query(vertices)
 
         return ask_garment
 
@@ -192,10 +183,11 @@ class Scan:
         self._scan.launch()
         return ask(self._finish, points, torch.full((1,), beyond))
 
-    def spread(self, points: Tensor, found: Found, links: Links) -> tuple[Tensor, Tensor]:
+    def spread(self, points: Tensor, found: Found, ring: Adjacency) -> tuple[Tensor, Tensor]:
         """The state of each point, shape (N,), by its edges, and one point of each patch that nothing reaches."""
         state, queue, patches = torch.empty(3, len(points), dtype=torch.int32)
-        self._spread((1,), points, self._sizes, *links.arrays, found.distance, found.face, state, queue, patches)
+        edges = map(torch.from_numpy, ring)
+        self._spread((1,), points, self._sizes, *edges, found.distance, found.face, state, queue, patches)
         return state, patches[: int(self._sizes[2])].long()
 
     def _make_room(self, n: int) -> None:
