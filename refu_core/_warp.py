@@ -53,11 +53,6 @@ def as_warp(tensor: Tensor, dtype: Any) -> Any:
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
 
 
-def argument(tensor: Tensor, dtype: Any) -> Any:
-    """`as_warp` for one launch, in half the time: the tensor must outlive the launch."""
-    return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
-
-
 class Repeated(threading.local):
     """A kernel that is launched with other arrays of the same shapes again and again.
 
@@ -65,9 +60,9 @@ class Repeated(threading.local):
     size, and told where the memory is from then on. Every thread has its own.
     """
 
-    def __init__(self, kernel: Any, kinds: Sequence[Any]) -> None:
-        """`kinds` are the Warp types of all of the kernel's arguments, arrays all of them, outputs included."""
-        self._kernel, self._kinds = kernel, kinds
+    def __init__(self, kernel: Any, kinds: Sequence[Any], fixed: Sequence[Any] = ()) -> None:
+        """The kernel takes the `fixed` arguments, then arrays of the Warp types `kinds`, outputs included."""
+        self._kernel, self._kinds, self._fixed = kernel, kinds, fixed
         self._known: dict[Any, tuple[Any, list[Any]]] = {}
 
     def __call__(self, dim: Sequence[int], *tensors: Tensor) -> None:
@@ -77,8 +72,12 @@ class Repeated(threading.local):
         if key not in self._known:
             if len(self._known) >= _MOST_SIZES:
                 self._known.clear()
-            arrays = [argument(tensor, kind) for tensor, kind in zip(tensors, self._kinds, strict=True)]
-            self._known[key] = wp.launch(self._kernel, dim, arrays, device=str(device), record_cmd=True), arrays
+            arrays = [
+                wp.from_torch(tensor.detach(), dtype=kind, requires_grad=False, return_ctype=True)
+                for tensor, kind in zip(tensors, self._kinds, strict=True)
+            ]
+            inputs = [*self._fixed, *arrays]
+            self._known[key] = wp.launch(self._kernel, dim, inputs, device=str(device), record_cmd=True), arrays
         command, arrays = self._known[key]
         for array, tensor in zip(arrays, tensors, strict=True):
             array.data, array._ref = tensor.data_ptr(), tensor

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -40,11 +40,7 @@ class Connectivity:
 
     @classmethod
     def of(cls, faces: Any, n_vertices: int | None = None) -> Connectivity:
-        """Of `faces`, integers of shape (F, 3), and as many vertices as they name, if not told.
-
-        Raises:
-            MeshError: they aren't triangles of three different vertices each.
-        """
+        """Of `faces`, integers of shape (F, 3), and as many vertices as they name, if not told; raises `MeshError`."""
         checked = check_faces(faces, n_vertices=n_vertices)
         return cls(checked, int(checked.max()) + 1 if n_vertices is None else n_vertices)
 
@@ -99,11 +95,7 @@ class Connectivity:
         return chosen
 
     def require_closed(self) -> None:
-        """Nothing, where the mesh is a closed, consistently oriented surface.
-
-        Raises:
-            MeshError: it isn't.
-        """
+        """Raises `MeshError` where the mesh isn't a closed, consistently oriented surface."""
         start, end = self.faces.ravel(), np.roll(self.faces, -1, axis=1).ravel()
         n_faces = self.n_faces_of_edge
         n_open, n_crowded = int((n_faces == 1).sum()), int((n_faces > 2).sum())
@@ -121,8 +113,7 @@ class Connectivity:
     def across(self) -> NDArray[np.int32]:
         """The face on the other side of the edges (0, 1), (1, 2), (2, 0) of each face of a closed mesh, shape (F, 3).
 
-        Raises:
-            MeshError: as `require_closed`.
+        Raises `MeshError` as `require_closed` does.
         """
         self.require_closed()
         # Every edge has exactly two corners: sorting by edge puts partners side by side.
@@ -146,8 +137,7 @@ class Connectivity:
 def check_faces(faces: Any, *, n_vertices: int | None = None) -> NDArray[np.int32]:
     """`faces` as a contiguous int32 array of shape (F, 3).
 
-    Raises:
-        MeshError: not integers of that shape, or not three different vertices each, below `n_vertices`.
+    Raises `MeshError` where they aren't integers of that shape, three different ones each, below `n_vertices`.
     """
     array = np.asarray(faces)
     if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0 or array.dtype.kind not in "iu":
@@ -203,27 +193,13 @@ def _grouped(owner: NDArray[Any], items: NDArray[Any], n: int) -> Adjacency:
     return Adjacency(start.astype(np.int32), items[order].astype(np.int32))
 
 
-def grouped(places: NDArray[np.float32], width: int = 8) -> NDArray[np.int64]:
-    """An order of places (N, 3) in which each eight (or `width`), each 64, and so on are close together.
-
-    The last few are remembered: every pipeline and every checker of a mesh asks for the same. So it is read-only.
-    """
-    return _order_of(np.ascontiguousarray(places).tobytes(), np.dtype(places.dtype).str, width)
-
-
-@lru_cache(maxsize=64)
-def _order_of(place_bytes: bytes, dtype: str, width: int) -> NDArray[np.int64]:
-    """Of places as bytes, by which they are known again."""
-    places = np.frombuffer(place_bytes, dtype).reshape(-1, 3)
+def grouped(places: NDArray[np.floating[Any]], width: int = 8) -> NDArray[np.int64]:
+    """An order of places (N, 3) in which each eight (or `width`), each 64, and so on are close together."""
     n = len(places)
     sizes_of_groups = width ** np.arange(20, dtype=np.int64)
     order, bounds = np.arange(n), np.array([0, n])
-    while True:
+    while (is_open := np.diff(bounds) > 1).any():
         starts, sizes = bounds[:-1], np.diff(bounds)
-        is_open = sizes > 1
-        if not is_open.any():
-            order.flags.writeable = False
-            return order
         here = places[order]
         extent = np.maximum.reduceat(here, starts) - np.minimum.reduceat(here, starts)
         group = np.repeat(np.arange(len(starts)), sizes)
@@ -233,3 +209,4 @@ def _order_of(place_bytes: bytes, dtype: str, width: int) -> NDArray[np.int64]:
         unit = sizes_of_groups[np.searchsorted(sizes_of_groups, sizes[is_open]) - 1]
         half = np.maximum(-(-sizes[is_open] // unit) // 2, 1) * unit
         bounds = np.union1d(bounds, starts[is_open] + half)
+    return order

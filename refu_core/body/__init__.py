@@ -1,54 +1,35 @@
 """SMPL-layout body models: linear blend skinning, loaders, and the built-in CC0 bodies."""
 
-from refu_core.body._anatomy import DEFAULT_GAP, ColliderSettings
-from refu_core.body._collider import Collider
-from refu_core.body._fit import POOR_FIT, BodyFit, Difference, ShapeMap, load_fit
-from refu_core.body._io import BUILTIN_BODIES, load_body
-from refu_core.body._kinematics import (
-    RigidTransforms,
-    forward_kinematics,
-    rotvec_to_rotmat,
-)
-from refu_core.body._model import BodyOutput, Shape, SmplBody
-from refu_core.body._parts import ARMS, LEGS, MIRRORED_JOINTS, SEGMENTS, joints_of, part_of_faces, weight_of_parts
-from refu_core.body._register import Registration
-from refu_core.body._rest_pose import require_rest_pose
-from refu_core.body._skinning import JointWeights, Skinning, apply_transforms, blend_transforms, unapply_transforms
-from refu_core.body._surface import Surface
-from refu_core.skeleton import JOINT_NAMES, PARENTS
-
-__all__ = [
-    "ARMS",
-    "BUILTIN_BODIES",
-    "DEFAULT_GAP",
-    "JOINT_NAMES",
-    "LEGS",
-    "MIRRORED_JOINTS",
-    "PARENTS",
-    "POOR_FIT",
-    "SEGMENTS",
-    "BodyFit",
-    "BodyOutput",
-    "Collider",
-    "ColliderSettings",
-    "Difference",
-    "JointWeights",
-    "Registration",
-    "RigidTransforms",
-    "Shape",
-    "ShapeMap",
-    "Skinning",
-    "SmplBody",
-    "Surface",
-    "apply_transforms",
-    "blend_transforms",
-    "forward_kinematics",
-    "joints_of",
-    "load_body",
-    "load_fit",
-    "part_of_faces",
-    "require_rest_pose",
-    "rotvec_to_rotmat",
-    "unapply_transforms",
-    "weight_of_parts",
-]
+from refu_core.body._anatomy import DEFAULT_GAP as DEFAULT_GAP
+from refu_core.body._anatomy import ColliderSettings as ColliderSettings
+from refu_core.body._collider import Collider as Collider
+from refu_core.body._fit import POOR_FIT as POOR_FIT
+from refu_core.body._fit import BodyFit as BodyFit
+from refu_core.body._fit import Difference as Difference
+from refu_core.body._fit import ShapeMap as ShapeMap
+from refu_core.body._fit import load_fit as load_fit
+from refu_core.body._io import BUILTIN_BODIES as BUILTIN_BODIES
+from refu_core.body._io import load_body as load_body
+from refu_core.body._kinematics import RigidTransforms as RigidTransforms
+from refu_core.body._kinematics import forward_kinematics as forward_kinematics
+from refu_core.body._kinematics import rotvec_to_rotmat as rotvec_to_rotmat
+from refu_core.body._model import BodyOutput as BodyOutput
+from refu_core.body._model import Shape as Shape
+from refu_core.body._model import SmplBody as SmplBody
+from refu_core.body._parts import ARMS as ARMS
+from refu_core.body._parts import LEGS as LEGS
+from refu_core.body._parts import MIRRORED_JOINTS as MIRRORED_JOINTS
+from refu_core.body._parts import SEGMENTS as SEGMENTS
+from refu_core.body._parts import joints_of as joints_of
+from refu_core.body._parts import part_of_faces as part_of_faces
+from refu_core.body._parts import weight_of_parts as weight_of_parts
+from refu_core.body._register import Registration as Registration
+from refu_core.body._rest_pose import require_rest_pose as require_rest_pose
+from refu_core.body._skinning import JointWeights as JointWeights
+from refu_core.body._skinning import Skinning as Skinning
+from refu_core.body._skinning import apply_transforms as apply_transforms
+from refu_core.body._skinning import blend_transforms as blend_transforms
+from refu_core.body._skinning import unapply_transforms as unapply_transforms
+from refu_core.body._surface import Surface as Surface
+from refu_core.skeleton import JOINT_NAMES as JOINT_NAMES
+from refu_core.skeleton import PARENTS as PARENTS

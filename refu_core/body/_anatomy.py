@@ -18,7 +18,7 @@ from refu_core.body._bundles import bundled
 from refu_core.body._creases import LEVELS, find_creases
 from refu_core.body._kinematics import PARENTS
 from refu_core.body._model import SmplBody
-from refu_core.body._segments import SOFTNESS, cut, shares
+from refu_core.body._segments import SOFTNESS, Solids, cut, shares
 from refu_core.body._skinning import JointWeights
 from refu_core.mesh import Connectivity, vertex_normals
 
@@ -91,17 +91,19 @@ class Anatomy:
         """Shape (E, 2)."""
         self.weights = torch.as_tensor(weights, device=self.device)
         """Skinning weights, shape (V, 24)."""
-        self.tensors = Tensors(len(rest), len(mesh.edges), settings.deepen_rounds, self.device)
+        solids = cut(mesh.faces, shares(weights))
+        n_middles = len(solids.middle_start) - 1
+        self.memory = Memory(len(rest), n_middles, len(mesh.edges), settings.deepen_rounds, self.device)
         self.rings = self._bind_rings(mesh)
         self.bones = self._bind_bones(rest, mesh, weights)
         self.seams = self._bind_seams(rest, mesh, weights)
-        self.segments = self._bind_segments(rest, mesh, weights)
+        self.segments = self._bind_segments(rest, solids, weights)
         self.farthest = self._thickness(rest, mesh).mul(settings.thin).clamp(max=settings.farthest)
         """How far skin may be moved [m], shape (V,)."""
         joints = body.joint_template.double().cpu().numpy()
         self.aside = Aside(rest, mesh, weights, joints, settings.aside_farthest, settings.aside_rounds, self.device)
         """Arms out of what isn't an arm."""
-        self.work = self.tensors.bound()
+        self.work = self.memory.work
         self.work.farthest = as_warp(self.farthest, wp.float32)
 
     def _bind_rings(self, mesh: Connectivity) -> Any:
@@ -116,9 +118,10 @@ class Anatomy:
 
     def _bind_bones(self, rest: NDArray[np.float64], mesh: Connectivity, weights: NDArray[np.float64]) -> Any:
         bones = kernels.Bones()
-        work = self.tensors
-        bones.rotation, bones.between = as_warp(work.rotation, wp.mat33), as_warp(work.between, wp.mat33)
-        bones.bent = wp.zeros(len(PARENTS), dtype=wp.float32, device=str(self.device))
+        device, n = str(self.device), len(PARENTS)
+        bones.rotation = as_warp(self.memory.rotation, wp.mat33)
+        bones.between = wp.zeros(n * len(LEVELS), dtype=wp.mat33, device=device)
+        bones.bent = wp.zeros(n, dtype=wp.float32, device=device)
         start, joint, weight = JointWeights.of(torch.as_tensor(weights))
         bones.start, bones.joint, bones.weight = self._ints(start), self._ints(joint), self._floats(weight)
         normals = _smooth_normals(rest, mesh)
@@ -141,7 +144,7 @@ class Anatomy:
         seams.least = self._floats(least)
         self.creases, self.least = found, torch.as_tensor(least, device=self.device)
         """What is held by which seam, and the height over its plane that is kept [m], shape (R,)."""
-        seams.stations = wp.array(found.stations, dtype=kernels.Stations, device=str(self.device))
+        seams.stations = wp.array(found.stations.astype(np.int32), dtype=kernels.Stations, device=str(self.device))
         seams.weights = wp.array(
             found.weights.astype(np.float32), dtype=kernels.StationWeights, device=str(self.device)
         )
@@ -163,14 +166,11 @@ class Anatomy:
         np.minimum.at(least, mesh.ring.owner, found[mesh.ring.items])
         return torch.as_tensor(least, device=self.device)
 
-    def _bind_segments(self, rest: NDArray[np.float64], mesh: Connectivity, weights: NDArray[np.float64]) -> Any:
+    def _bind_segments(self, rest: NDArray[np.float64], solids: Solids, weights: NDArray[np.float64]) -> Any:
         how, n, device = self.settings, len(rest), str(self.device)
-        solids = cut(mesh.faces, shares(weights))
         n_segments, sizes = len(solids.faces), np.diff(solids.middle_start)
-        work = self.tensors
-        work.add_points(len(sizes))
-        work.points[:n] = torch.as_tensor(rest)
-        points = as_warp(work.points, wp.vec3)
+        self.memory.points[:n] = torch.as_tensor(rest)
+        points = as_warp(self.memory.points, wp.vec3)
         self.caps = kernels.Means()
         self.caps.start, self.caps.vertex = self._ints(solids.middle_start), self._ints(solids.middle_vertex)
         self.caps.weight, self.caps.mean = self._floats(np.repeat(1 / np.maximum(sizes, 1), sizes)), points[n:]
@@ -180,7 +180,8 @@ class Anatomy:
         segments = parting.Segments()
         segments.trees = wp.array([tree.id for tree in self.trees], dtype=wp.uint64, device=device)
         segments.own = self._ints(solids.of_vertex)
-        segments.faces = wp.array(np.concatenate(solids.faces), dtype=wp.vec3i, device=device)
+        faces = np.concatenate(solids.faces)
+        segments.faces = wp.array(faces, dtype=wp.vec3i, device=device)
         segments.first_face = self._ints(np.cumsum([0, *map(len, solids.faces)]))
         softness = np.array([one for _, one in SOFTNESS])
         segments.ratio = self._floats(softness[None] / softness[:, None])
@@ -189,11 +190,11 @@ class Anatomy:
         segments.gap = clearance
         wp.launch(parting.clearance_kernel, (n, n_segments), [points, segments, clearance], device=device)
         segments.gap = self._floats(np.minimum(how.gap, how.segment_share * clearance.numpy()))
-        self.bundles = bundled(work.points.cpu().numpy(), solids.faces, self.device)
+        self.bundles = bundled(points.numpy(), solids.faces, self.device)
         self.skins = self._bind_skins(segments.gap.numpy())
         self.own = torch.as_tensor(solids.of_vertex.astype(np.int64), device=self.device)
         """The segment of each vertex, shape (V,)."""
-        self.faces = torch.as_tensor(np.concatenate(solids.faces).astype(np.int64), device=self.device)
+        self.faces = torch.as_tensor(faces.astype(np.int64), device=self.device)
         """Of all segments, one after another, into vertices and the middles of caps, shape (F, 3)."""
         self.kept, self.ratio = wp.to_torch(segments.gap), wp.to_torch(segments.ratio)
         """What vertices keep from segments [m], shape (V, K), and how many times as soft segment k is as i, (K, K)."""
@@ -225,51 +226,36 @@ class Anatomy:
         return wp.array(np.ascontiguousarray(values, np.float32), dtype=wp.vec3, device=str(self.device))
 
 
-class Tensors:
-    """The memory of `kernels.Work`, as torch sees it."""
+class Memory:
+    """What a call works in, as torch sees it and, as `work`, the kernels."""
 
-    def __init__(self, n_vertices: int, n_edges: int, n_rounds: int, device: torch.device) -> None:
-        self._device, self._sizes = device, (n_vertices, n_edges)
-        self._rounds = n_rounds
+    def __init__(self, n_vertices: int, n_middles: int, n_edges: int, n_rounds: int, device: torch.device) -> None:
         self.rotation = torch.zeros(len(PARENTS), 3, 3, device=device)
-        self.between = torch.zeros(len(PARENTS) * len(LEVELS), 3, 3, device=device)
-        # What every call begins with as zeros.
-        self.ints = torch.zeros(
-            len(_BY_VERTEX) * n_vertices + kernels.FRONT + n_rounds + 1, dtype=torch.int32, device=device
-        )
-        self.counts = self.ints[len(_BY_VERTEX) * n_vertices :]
-
-    def add_points(self, n_middles: int) -> None:
-        """Makes what depends on how the body is cut."""
-        n = self._sizes[0]
-        self.places = torch.zeros(4, n + n_middles, 3, device=self._device)
-        self.skin, self.here, self.there = (place[:n] for place in self.places[:3])
+        self.places = torch.zeros(4, n_vertices + n_middles, 3, device=device)
+        self.skin, self.here, self.there = self.places[:3, :n_vertices].unbind()
         self.points = self.places[3]
+        by_vertex = ("is_moved", "is_end", "is_front", "touched", "outside")
+        n_ints = len(by_vertex) * n_vertices
+        self.ints = torch.zeros(n_ints + kernels.FRONT + n_rounds + 1, dtype=torch.int32, device=device)
+        """What every call begins with as zeros."""
+        self.counts = self.ints[n_ints:]
+        self.work = work = kernels.Work()
+        for name in ("skin", "points", "here", "there"):
+            setattr(work, name, as_warp(getattr(self, name), wp.vec3))
+        for name, ints in zip(by_vertex, self.ints[:n_ints].view(len(by_vertex), -1), strict=True):
+            setattr(work, name, as_warp(ints, wp.int32))
+        work.counts = as_warp(self.counts, wp.int32)
+        for name in ("moved", "near", "boxed", "ends", "touching"):
+            setattr(work, name, wp.zeros(n_vertices, dtype=wp.int32, device=str(device)))
+        work.front = wp.zeros((n_rounds + 1, n_vertices), dtype=wp.int32, device=str(device))
+        work.share, work.reach = (wp.zeros(n_vertices, dtype=wp.float32, device=str(device)) for _ in range(2))
+        work.parted = wp.zeros(n_vertices, dtype=wp.vec3, device=str(device))
+        work.hot = wp.zeros(n_edges, dtype=wp.int32, device=str(device))
+        work.steps = wp.zeros(n_edges, dtype=wp.vec3, device=str(device))
 
     def take(self, skin: torch.Tensor) -> None:
         """Takes over a posed body (V, 3) [m]."""
-        self.places[:, : self._sizes[0]] = skin
-
-    def bound(self) -> Any:
-        """As the kernels take it."""
-        n, n_edges = self._sizes
-        work = kernels.Work()
-        for name in ("skin", "points", "here", "there"):
-            setattr(work, name, as_warp(getattr(self, name), wp.vec3))
-        for name in ("moved", "near", "boxed", "ends", "touching"):
-            setattr(work, name, wp.zeros(n, dtype=wp.int32, device=str(self._device)))
-        work.front = wp.zeros((self._rounds + 1, n), dtype=wp.int32, device=str(self._device))
-        work.share, work.reach = (wp.zeros(n, dtype=wp.float32, device=str(self._device)) for _ in range(2))
-        work.parted = wp.zeros(n, dtype=wp.vec3, device=str(self._device))
-        work.hot = wp.zeros(n_edges, dtype=wp.int32, device=str(self._device))
-        work.steps = wp.zeros(n_edges, dtype=wp.vec3, device=str(self._device))
-        for i, name in enumerate(_BY_VERTEX):
-            setattr(work, name, as_warp(self.ints[i * n : (i + 1) * n], wp.int32))
-        work.counts = as_warp(self.counts, wp.int32)
-        return work
-
-
-_BY_VERTEX = ("is_moved", "is_end", "is_front", "touched", "outside")
+        self.places[:, : len(self.skin)] = skin
 
 
 def _paths(weights: NDArray[np.float64], of_vertex: NDArray[np.int32]) -> NDArray[np.int32]:

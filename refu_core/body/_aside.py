@@ -13,9 +13,9 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-from refu_core._warp import as_warp, is_plain, torch_stream
+from refu_core._warp import Repeated, as_warp, is_plain, torch_stream
 from refu_core.body import _aside_kernels as kernels
-from refu_core.body._closest import weights_at
+from refu_core.body._collider_gradient import weights_at
 from refu_core.body._collider_kernels import Means
 from refu_core.body._kinematics import rotvec_to_rotmat
 from refu_core.body._parts import ARMS, joints_of, part_of_faces
@@ -89,10 +89,9 @@ class Aside:
         self._points = torch.zeros(len(rest) + len(rows) - self._first_cap, 3, device=device)
         indices = wp.array(np.ascontiguousarray(solids.faces[0].ravel()), dtype=wp.int32, device=str(device))
         self._tree: Any = wp.Mesh(as_warp(self._points, wp.vec3), indices)
-        self._n_near = torch.zeros(1, dtype=torch.int32)
-        self._inside = torch.zeros(len(arm), dtype=torch.int32)
+        self._find = Repeated(kernels.inside_kernel, (wp.vec3, wp.int32, wp.vec3), [self._tree.id, *self._corners])
         if self._is_serial:
-            self._looks = self._recorded_looks(mesh, weights)
+            self._look = self._recorded_look(mesh, weights)
 
     def __call__(self, skin: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor]:
         """Of one body: skin (V, 3) [m] and the joints' `rotation` (24, 3, 3), both with the arms aside.
@@ -134,8 +133,8 @@ class Aside:
         means: Tensor = embedding_bag(self._vertex, skin, self._start, mode="sum", per_sample_weights=weight)
         return means
 
-    def _recorded_looks(self, mesh: Connectivity, weights: Array) -> list[Any]:
-        """What `_is_any_inside` launches."""
+    def _recorded_look(self, mesh: Connectivity, weights: Array) -> Any:
+        """What finds box, caps and `_places`, the middles, and counts those that are near the body in `_n_near`."""
         body = [joints for joints, _ in SOFTNESS if not any(set(joints) & set(arm) for arm in ARMS)]
         part_of = part_of_faces(torch.from_numpy(weights), torch.from_numpy(mesh.faces).long(), [*body, *ARMS]).numpy()
         corners = [np.unique(mesh.faces[part_of == k]) for k in range(len(body)) if (part_of == k).any()]
@@ -146,42 +145,35 @@ class Aside:
             for one in (start, self._vertex, np.cumsum([0, *map(len, corners)]), np.concatenate(corners))
         )
         means.weight = wp.array(self._weight.numpy(), dtype=wp.float32, device="cpu")
-        means.mean, unused = (wp.zeros(len(start) - 1, dtype=wp.vec3, device="cpu") for _ in range(2))
-        skin, n_near, inside = (
-            as_warp(self._points, wp.vec3),
-            *(as_warp(one, wp.int32) for one in (self._n_near, self._inside)),
-        )
-        near = [skin, mesh.n_vertices, n_middles, means, segment_start, corner, *self._corners, n_near]
-        return [
-            wp.launch(kernel, dim, inputs, device="cpu", record_cmd=True)
-            for kernel, dim, inputs in (
-                (kernels.near_kernel, 1, near),
-                (kernels.inside_kernel, n_middles, [self._tree.id, *self._corners, means.mean, inside, unused]),
-            )
-        ]
+        places, self._n_near = torch.zeros(len(start) - 1, 3), torch.zeros(1, dtype=torch.int32)
+        self._places = places[:n_middles]
+        means.mean = as_warp(places, wp.vec3)
+        inputs = [as_warp(self._points, wp.vec3), mesh.n_vertices, n_middles, means, segment_start, corner]
+        outputs = [*self._corners, as_warp(self._n_near, wp.int32)]
+        return wp.launch(kernels.near_kernel, 1, inputs, outputs, device="cpu", record_cmd=True)
 
     def _is_any_inside(self, skin: Tensor) -> bool:
         """Whether any middle is inside the body. First by boxes of its segments: no tree is asked where none is near.
 
         Only of a CPU. Box and tree are those of `skin` where it is true.
         """
-        near, inside = self._looks
         self._points[: len(skin)].copy_(skin.detach())
-        near.launch()
+        self._look.launch()
         if not self._n_near:
             return False
         self._tree.refit()
-        inside.launch()
-        return bool(self._inside.amax() >= 0)
+        return bool((self._inside(self._places)[0] >= 0).any())
+
+    def _inside(self, at: Tensor) -> tuple[Tensor, Tensor]:
+        """The closest face of the body to each place (C, 3) [m], and the weights of its corners; -1 outside."""
+        at = at.detach().float().contiguous()
+        face, weights = torch.empty(len(at), dtype=torch.int32, device=self._device), torch.zeros_like(at)
+        self._find((len(at),), at, face, weights)
+        return face, weights
 
     def _way_out(self, points: Tensor, at: Tensor) -> Tensor:
         """From each place (C, 3) [m] to the surface, of those that are inside; zeros for others."""
-        face = torch.zeros(len(at), dtype=torch.int32, device=self._device)
-        known = torch.zeros(len(at), 3, device=self._device)
-        inputs = [self._tree.id, *self._corners, as_warp(at.detach().float().contiguous(), wp.vec3)]
-        outputs = [as_warp(face, wp.int32), as_warp(known, wp.vec3)]
-        with torch_stream(self._device):
-            wp.launch(kernels.inside_kernel, len(at), inputs, outputs, device=str(self._device))
+        face, known = self._inside(at)
         corners = points[self._faces[face.clamp_min(0).long()]]
         weights = known if is_plain(points) else weights_at(at, corners, known.to(at))
         out = (weights[..., None] * corners).sum(1) - at

@@ -2,56 +2,66 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
+import warp as wp
 from torch import Tensor
 
+from refu_core._warp import as_warp, torch_stream
 from refu_core.body import _collider_kernels as kernels
-from refu_core.body._closest import weights_at
 from refu_core.body._creases import LEVELS
 from refu_core.body._kinematics import PARENTS
+from refu_core.body._part_kernels import closest_kernel
 
 if TYPE_CHECKING:
+    from refu_core.body._anatomy import Anatomy
     from refu_core.body._collider import Collider
 
 
 def part_with_gradient(collider: Collider, skin: Tensor, rotation: Tensor) -> Tensor:
     """As `Collider._part`, differentiable in `skin` (V, 3) and the joints' `rotation` (24, 3, 3), in any precision."""
-    how = collider.settings
+    how, known = collider.settings, collider.anatomy
+    farthest, own = known.farthest.to(skin), known.own
     p = skin
     is_moved = torch.zeros(len(skin), dtype=torch.bool, device=skin.device)
     between, bent = _between(rotation)
     for _ in range(how.crease_rounds):
-        step = _crease_step(collider, skin, p, between, bent)
+        step = _crease_step(known, skin, p, between, bent)
         is_moved = is_moved | (step.detach() != 0).any(1)
         p = p + step
-    p = _within(p, skin, collider.anatomy.farthest.to(skin))
-    p = _smooth(collider, skin, p, is_moved, how.smooth_first)
-    points = collider.with_caps(p)
+    p = _within(p, skin, farthest)
+    p = _smooth(known, skin, p, is_moved, how.smooth_first)
+    points = torch.cat((p, _means(known.caps, p)))
     touched = collider.touched(p)
-    normals = _unit(
-        torch.einsum("vj,jab,vb->va", collider.anatomy.weights.to(p), rotation, collider.anatomy.normals.to(p))
-    )
-    start, own = p, collider.anatomy.own
+    normals = _unit(torch.einsum("vj,jab,vb->va", known.weights.to(p), rotation, known.normals.to(p)))
+    start = p
     vertex, segment = torch.nonzero(touched, as_tuple=True)
+    ratio, keeps = known.ratio[own[vertex], segment].to(p), known.kept[vertex, segment].to(p)
     for _ in range(how.part_rounds):
         sunk = ((start - p) * normals).sum(1)
-        ratio, keeps = collider.anatomy.ratio[own[vertex], segment].to(p), collider.anatomy.kept[vertex, segment].to(p)
         step = _ways_out(
-            collider, points, normals, p[vertex], normals[vertex], sunk[vertex], segment, ratio=ratio, keeps=keeps
+            known, points, normals, p[vertex], normals[vertex], sunk[vertex], segment, ratio=ratio, keeps=keeps
         )
         step = _together(step, vertex, len(p))
         is_moved = is_moved | (step.detach() != 0).any(1)
         p = p + step
     is_parted = (p.detach() != start.detach()).any(1)
-    p = torch.where(is_parted[:, None], _within(p, skin, collider.anatomy.farthest.to(skin)), p)
-    p = _smooth(collider, skin, p, is_moved, how.smooth_last)
+    p = torch.where(is_parted[:, None], _within(p, skin, farthest), p)
+    p = _smooth(known, skin, p, is_moved, how.smooth_last)
     for _ in range(how.edge_rounds):
-        step = _edge_step(collider, points, normals, start, p, touched)
+        step = _edge_step(known, points, normals, start, p, touched)
         is_raised = (step.detach() != 0).any(1)
-        p = torch.where(is_raised[:, None], _within(p + step, skin, collider.anatomy.farthest.to(skin)), p)
+        p = torch.where(is_raised[:, None], _within(p + step, skin, farthest), p)
     return p
+
+
+def _means(of: Any, points: Tensor) -> Tensor:
+    """Those that a `Means` has of points (V, 3) [m]."""
+    start, vertex, weight = (wp.to_torch(one) for one in (of.start, of.vertex, of.weight))
+    n = len(start) - 1
+    owner = torch.repeat_interleave(torch.arange(n, device=points.device), start.long().diff())
+    return points.new_zeros(n, 3).index_add(0, owner, points[vertex.long()] * weight.to(points)[:, None])
 
 
 def _within(p: Tensor, skin: Tensor, farthest: Tensor) -> Tensor:
@@ -84,39 +94,33 @@ def _between(rotation: Tensor) -> tuple[Tensor, Tensor]:
     return (above[:, None] @ matrix).flatten(0, 1), bent.repeat_interleave(len(LEVELS))
 
 
-def _crease_step(collider: Collider, skin: Tensor, p: Tensor, between: Tensor, bent: Tensor) -> Tensor:
-    seams = collider.anatomy.creases
-    n_stations = len(seams.station_start) - 1
-    of_station = torch.repeat_interleave(torch.arange(n_stations), torch.as_tensor(seams.station_start).long().diff())
-    weighted = skin[torch.as_tensor(seams.station_vertex).long()] * torch.as_tensor(seams.station_weight).to(p)[:, None]
-    stations = p.new_zeros(n_stations, 3).index_add(0, of_station.to(p.device), weighted)
+def _crease_step(known: Anatomy, skin: Tensor, p: Tensor, between: Tensor, bent: Tensor) -> Tensor:
+    seams, stations = known.creases, _means(known.stations, skin)
     weights = torch.as_tensor(seams.weights).to(p)
     through = (stations[torch.as_tensor(seams.stations).long()] * weights[..., None]).sum(1)
     of_seam = torch.as_tensor(seams.rotation).long()
-    rotated = between[of_seam]
-    normal = (rotated @ torch.as_tensor(seams.normal).to(p)[..., None])[..., 0]
+    normal = (between[of_seam] @ torch.as_tensor(seams.normal).to(p)[..., None])[..., 0]
     vertex = torch.as_tensor(seams.vertex).long().to(p.device)
-    lacks = bent[of_seam] * (collider.anatomy.least.to(p) - ((p[vertex] - through) * normal).sum(1))
+    lacks = bent[of_seam] * (known.least.to(p) - ((p[vertex] - through) * normal).sum(1))
     return _together(lacks.clamp_min(0)[:, None] * normal, vertex, len(p))
 
 
-def _smooth(collider: Collider, skin: Tensor, p: Tensor, is_moved: Tensor, sweeps: int) -> Tensor:
-    how = collider.settings
-    away = p - skin
+def _smooth(known: Anatomy, skin: Tensor, p: Tensor, is_moved: Tensor, sweeps: int) -> Tensor:
+    how, away = known.settings, p - skin
     # Where nothing was moved the length's derivative has no direction.
     length = torch.where(is_moved, (away * away).sum(1), 1.0).sqrt()
     share = torch.where(is_moved, (length / how.smooth_full).clamp_max(1) * how.smooth_step, 0.0)[:, None]
-    start, ring = collider.anatomy.mesh.ring
-    owner = torch.as_tensor(collider.anatomy.mesh.ring.owner).to(p.device)
+    start, ring = known.mesh.ring
+    owner = torch.as_tensor(known.mesh.ring.owner).to(p.device)
     degree = torch.as_tensor(start).diff().to(p)[:, None]
     for _ in range(sweeps):
         mean = torch.zeros_like(p).index_add(0, owner, p[torch.as_tensor(ring).long()]) / degree
-        p = torch.where(is_moved[:, None], _within(p + share * (mean - p), skin, collider.anatomy.farthest.to(skin)), p)
+        p = torch.where(is_moved[:, None], _within(p + share * (mean - p), skin, known.farthest.to(skin)), p)
     return p
 
 
 def _ways_out(
-    collider: Collider,
+    known: Anatomy,
     points: Tensor,
     normals: Tensor,
     p: Tensor,
@@ -128,30 +132,66 @@ def _ways_out(
     keeps: Tensor,
 ) -> Tensor:
     """How points (N, 3) [m] give way to a segment each, shape (N, 3); zeros where they needn't."""
-    found = collider.closest(p, segment)
-    corners = collider.anatomy.faces[found.face.clamp_min(0)]
-    weights = weights_at(p, points[corners], found.weights.to(p))
+    face, about, sign = _closest(known, p, segment)
+    corners = known.faces[face.clamp_min(0)]
+    weights = weights_at(p, points[corners], about.to(p))
     away = p - (weights[..., None] * points[corners]).sum(1)
     squared = (away * away).sum(1)
-    distance = found.sign.to(p) * torch.where(squared > 0, squared, 1.0).sqrt() * (squared > 0)
+    distance = sign.to(p) * torch.where(squared > 0, squared, 1.0).sqrt() * (squared > 0)
     lacks = keeps - distance - ratio * sunk
     padded = torch.cat((normals, normals.new_zeros(len(points) - len(normals), 3)))
     other = _unit((weights[..., None] * padded[corners]).sum(1))
     way = _unit(other - (other * normal).sum(1, keepdim=True).clamp_min(0) * normal - normal)
     rate = (way * other).sum(1) - ratio * (way * normal).sum(1)
     step = (lacks / torch.minimum(torch.maximum(rate, 0.5 + 0.5 * ratio), 1 + ratio))[:, None] * way
-    is_needed = (found.face >= 0) & (lacks > 0)
+    is_needed = (face >= 0) & (lacks > 0)
     return torch.where(is_needed[:, None], step, torch.zeros_like(step))
 
 
-def _edge_step(
-    collider: Collider, points: Tensor, normals: Tensor, start: Tensor, p: Tensor, touched: Tensor
-) -> Tensor:
-    own = collider.anatomy.own
-    v, w = collider.anatomy.edges.T
+@torch.no_grad()
+def _closest(known: Anatomy, points: Tensor, segment: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """What points (N, 3) [m] are closest to of a segment each (N,), in the pose that `touched` was asked for.
+
+    The face (N,), -1 for none near; the weights of its corners (N, 3); and the sign of the distance (N,), -1 inside.
+    """
+    n, device = len(points), points.device
+    face = torch.zeros(n, dtype=torch.int32, device=device)
+    weights, sign = torch.zeros(n, 3, device=device), torch.zeros(n, device=device)
+    asked = as_warp(points.float().contiguous(), wp.vec3), as_warp(segment.int(), wp.int32)
+    outputs = [as_warp(face, wp.int32), as_warp(weights, wp.vec3), as_warp(sign, wp.float32)]
+    if n:
+        with torch_stream(device):
+            wp.launch(closest_kernel, n, [*asked, known.segments], outputs, device=str(device))
+    return face.long(), weights, sign
+
+
+def weights_at(p: Tensor, corners: Tensor, about: Tensor) -> Tensor:
+    """Weights of a triangle's corners at its point closest to p, shape (N, 3), which is on what it is `about` on."""
+    a, b, c = corners.unbind(1)
+    is_on = about > _ON
+    ab, ac, ap = b - a, c - a, p - a
+    d00, d01, d11 = (ab * ab).sum(1), (ab * ac).sum(1), (ac * ac).sum(1)
+    d20, d21 = (ap * ab).sum(1), (ap * ac).sum(1)
+    area = (d00 * d11 - d01 * d01).clamp_min(1e-30)
+    v, w = (d11 * d20 - d01 * d21) / area, (d00 * d21 - d01 * d20) / area
+    within = torch.stack((1 - v - w, v, w), 1)
+    first, second = (is_on * about.new_tensor((3.0, 2.0, 1.0))).topk(2, dim=1).indices.unbind(1)
+    rows = torch.arange(len(p), device=p.device)
+    start, end = corners[rows, first], corners[rows, second]
+    along = end - start
+    t = ((p - start) * along).sum(1) / (along * along).sum(1).clamp_min(1e-30)
+    t = torch.where(is_on.sum(1) > 1, t, torch.zeros_like(t))
+    zeros = torch.zeros_like(within)
+    on_edge = zeros.index_put((rows, first), 1 - t).index_put((rows, second), t, accumulate=True)
+    return torch.where(is_on.all(1)[:, None], within, on_edge)
+
+
+def _edge_step(known: Anatomy, points: Tensor, normals: Tensor, start: Tensor, p: Tensor, touched: Tensor) -> Tensor:
+    own = known.own
+    v, w = known.edges.T
     gone = start - p
     squared = ((gone[v] - gone[w]) ** 2).sum(1)
-    steep = collider.settings.steep
+    steep = known.settings.steep
     share = (torch.where(squared > steep**2, squared, 1.0).sqrt() / steep - 1).clamp_max(1)
     is_steep = squared > steep**2
     either = (touched[v] | touched[w]) & is_steep[:, None]
@@ -160,13 +200,13 @@ def _edge_step(
     is_other = (segment != own[v]) & (segment != own[w])
     edge, segment, v, w = edge[is_other], segment[is_other], v[is_other], w[is_other]
     sunk = 0.5 * ((gone[v] * normals[v]).sum(1) + (gone[w] * normals[w]).sum(1))
-    keeps = torch.minimum(collider.anatomy.kept[v, segment], collider.anatomy.kept[w, segment]).to(p)
-    ratio = collider.anatomy.ratio[own[v], segment].to(p)
+    keeps = torch.minimum(known.kept[v, segment], known.kept[w, segment]).to(p)
+    ratio = known.ratio[own[v], segment].to(p)
     normal = _unit(normals[v] + normals[w])
     middle = 0.5 * (p[v] + p[w])
-    step = _ways_out(collider, points, normals, middle, normal, sunk, segment, ratio=ratio, keeps=keeps)
-    one_an_edge = _together(step, edge, len(collider.anatomy.edges)) * (share * is_steep)[:, None]
-    v, w = collider.anatomy.edges.T
+    step = _ways_out(known, points, normals, middle, normal, sunk, segment, ratio=ratio, keeps=keeps)
+    one_an_edge = _together(step, edge, len(known.edges)) * (share * is_steep)[:, None]
+    v, w = known.edges.T
     return _together(torch.cat((one_an_edge, one_an_edge)), torch.cat((v, w)), len(p))
 
 
@@ -183,3 +223,7 @@ def _together(steps: Tensor, owner: Tensor, n: int) -> Tensor:
 
 def _unit(vectors: Tensor) -> Tensor:
     return vectors / (vectors * vectors).sum(-1, keepdim=True).clamp_min(1e-24).sqrt()
+
+
+_ON = 1e-6
+"""A closest point with less of a corner than this lies on the edge across."""

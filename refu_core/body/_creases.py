@@ -37,14 +37,14 @@ class Creases(NamedTuple):
     turns with the joint by the seam's level, keeps skin of both sides apart.
     """
 
-    station_start: NDArray[np.int32]
+    station_start: NDArray[np.int64]
     """Station s is the mean of the vertices number `station_start[s]` to `station_start[s + 1]` of the next two,
     shape (S + 1,)."""
-    station_vertex: NDArray[np.int32]
+    station_vertex: NDArray[np.int64]
     station_weight: NDArray[np.float64]
-    vertex: NDArray[np.int32]
+    vertex: NDArray[np.int64]
     """Shape (R,)."""
-    rotation: NDArray[np.int32]
+    rotation: NDArray[np.int64]
     """The joint times the number of `LEVELS`, plus the seam's level, shape (R,)."""
     normal: NDArray[np.float64]
     """Of the plane in the rest pose, towards the vertex's side, shape (R, 3)."""
@@ -52,7 +52,7 @@ class Creases(NamedTuple):
     """Distance from the plane in the rest pose [m], positive, shape (R,)."""
     along: NDArray[np.float64]
     """Distance from the seam in the rest pose [m], shape (R,)."""
-    stations: NDArray[np.int32]
+    stations: NDArray[np.int64]
     """What the plane goes through is the mean of these, shape (R, 6) …"""
     weights: NDArray[np.float64]
     """… by these weights, shape (R, 6)."""
@@ -96,12 +96,9 @@ def _find(rest_bytes: bytes, edge_bytes: bytes, weight_bytes: bytes, reach: floa
         first = len(station_rows)
         for one in near:
             on = np.flatnonzero(one)
-            pairs = (
-                np.concatenate([start[on], end[on]]),
-                np.concatenate([one[on] * (1 - share[on]), one[on] * share[on]]),
-            )
-            vertices, inverse = np.unique(pairs[0], return_inverse=True)
-            station_rows.append((vertices, np.bincount(inverse, pairs[1])))
+            vertices, inverse = np.unique(np.concatenate([start[on], end[on]]), return_inverse=True)
+            ends = np.concatenate([one[on] * (1 - share[on]), one[on] * share[on]])
+            station_rows.append((vertices, np.bincount(inverse, ends)))
         places = np.stack([w @ rest[v] for v, w in station_rows[first:]])
         normals = _parting(places, rest, moved > level, tree)
         # What is near the seam, on either side of it
@@ -116,31 +113,16 @@ def _find(rest_bytes: bytes, edge_bytes: bytes, weight_bytes: bytes, reach: floa
         through = np.einsum("rk,rkc->rc", weight, places[chosen])
         height = np.einsum("rc,rc->r", rest[vertex] - through, normal)
         ahead = height > _AHEAD * along[vertex]
-        fields = (
-            vertex,
-            np.full(len(vertex), joint * len(LEVELS) + i),
-            normal,
-            height,
-            along[vertex],
-            chosen + first,
-            weight,
-        )
+        rotation = np.full(len(vertex), joint * len(LEVELS) + i)
+        fields = vertex, rotation, normal, height, along[vertex], chosen + first, weight
         rows.append([field[ahead] for field in fields])
     order = np.argsort(np.concatenate([row[0] for row in rows]), kind="stable")
-    vertex, rotation, normals, height, along_, stations, weight = (
-        np.concatenate(field)[order] for field in zip(*rows, strict=True)
-    )
+    station_vertex, station_weight = (np.concatenate(field) for field in zip(*station_rows, strict=True))
     return Creases(
-        np.cumsum([0, *(len(v) for v, _ in station_rows)]).astype(np.int32),
-        np.concatenate([v for v, _ in station_rows]).astype(np.int32),
-        np.concatenate([w for _, w in station_rows]),
-        vertex.astype(np.int32),
-        rotation.astype(np.int32),
-        normals.astype(np.float64),
-        height.astype(np.float64),
-        along_.astype(np.float64),
-        stations.astype(np.int32),
-        weight.astype(np.float64),
+        np.cumsum([0, *(len(v) for v, _ in station_rows)]),
+        station_vertex,
+        station_weight,
+        *(np.concatenate(field)[order] for field in zip(*rows, strict=True)),
     )
 
 

@@ -18,8 +18,7 @@ from refu_core.skeleton import PARENTS as PARENTS
 def rotvec_to_rotmat(rotvec: Tensor) -> Tensor:
     """Rotation matrices of rotation vectors [rad]: shape (..., 3) -> (..., 3, 3) (Rodrigues' formula).
 
-    Smooth with finite derivatives at the zero rotation, where sin θ / θ and (1 - cos θ) / θ² are taken from
-    their series.
+    Smooth, with finite derivatives at the zero rotation.
     """
     if is_plain(rotvec):
         flat = rotvec.reshape(-1, 3).contiguous()
@@ -54,30 +53,20 @@ class RigidTransforms(NamedTuple):
 
 
 def forward_kinematics(rotations: Tensor, joints: Tensor) -> tuple[Tensor, RigidTransforms]:
-    """Poses the joint tree.
+    """Posed joints [m], shape (B, 24, 3), and the transforms that take points at rest with each joint's bone.
 
     Args:
         rotations: rotation of each joint relative to its parent, shape (B, 24, 3, 3).
         joints: rest positions of the joints [m], shape (B, 24, 3), or (1, 24, 3) for bodies of one shape.
-
-    Returns:
-        Posed joints [m], shape (B, 24, 3), and the transforms that take a rest-pose point of each joint's bone to its
-        posed place.
     """
     if is_plain(rotations, joints):
         return _chained(rotations.contiguous(), joints.contiguous())
-    batch, n = rotations.shape[:2]
-    chains = _chains(joints.device)
-    # Homogeneous, with a joint that stays where it is as the root's parent.
-    pose = torch.eye(4, dtype=joints.dtype, device=joints.device).repeat(batch, n + 1, 1, 1)
-    pose[:, :n, :3, :3] = rotations
-    pose[:, 0, :3, 3] = joints[:, 0]
-    pose[:, 1:n, :3, 3] = joints[:, 1:] - joints[:, chains[0][1:n]]
-    # Each round multiplies a joint's chain by the one that ends where it begins, which doubles its length: four
-    # products instead of 23 in a row.
-    for above in chains:
-        pose = pose[:, above] @ pose
-    rotation, posed = pose[:, :n, :3, :3], pose[:, :n, :3, 3]
+    turns, places = [rotations[:, 0]], [joints[:, 0].expand(len(rotations), 3)]
+    for joint, parent in enumerate(PARENTS[1:], start=1):
+        bone = joints[:, joint] - joints[:, parent]
+        turns.append(turns[parent] @ rotations[:, joint])
+        places.append(places[parent] + (turns[parent] @ bone[..., None])[..., 0])
+    rotation, posed = torch.stack(turns, 1), torch.stack(places, 1)
     return posed, RigidTransforms(rotation, posed - (rotation @ joints.unsqueeze(-1)).squeeze(-1))
 
 
@@ -97,14 +86,3 @@ def _parents(device: torch.device) -> Tensor:
 
 _rotate = Repeated(rotation_kernel, (wp.vec3, wp.mat33))
 _chain = Repeated(chain_kernel, (wp.mat33, wp.vec3, wp.int32, wp.mat33, wp.vec3, wp.vec3))
-
-
-@cache
-def _chains(device: torch.device) -> tuple[Tensor, ...]:
-    """For each round the joint above the chain of each joint, which is 1, 2, 4, … joints long; the last is no joint."""
-    end = len(PARENTS)
-    chains = [[end if parent < 0 else parent for parent in (*PARENTS, -1)]]
-    while any(joint != end for joint in chains[-1]):
-        chains.append([chains[-1][joint] for joint in chains[-1]])
-    with torch.inference_mode(False):  # who asks first may not track gradients, and the next one may
-        return tuple(torch.tensor(chain, device=device) for chain in chains[:-1])

@@ -20,14 +20,9 @@ _skin = Repeated(skin_kernel, (wp.vec3, wp.int32, wp.int32, wp.float32, Transfor
 
 
 def blend_transforms(weights: Tensor, transforms: RigidTransforms) -> RigidTransforms:
-    """Blends the joints' transforms by skinning weights.
+    """The joints' transforms, leading shape (B, 24), blended by skinning weights (V, 24), whose rows sum to one.
 
-    Args:
-        weights: skinning weights, rows sum to one, shape (V, 24).
-        transforms: of the joints, leading shape (B, 24).
-
-    Returns:
-        Transforms of the vertices, leading shape (B, V); the "rotation" of a blend isn't orthonormal.
+    Leading shape (B, V); the "rotation" of a blend isn't orthonormal.
     """
     batch = transforms.rotation.shape[0]
     blended = weights @ _stacked(transforms)

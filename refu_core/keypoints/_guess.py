@@ -55,11 +55,9 @@ def first_pose(skeleton: Skeleton, points: Array, seen: NDArray[np.bool_], start
 
 def _turn_above(turns: Array, joint: int) -> Array:
     """Of a joint's parent in the world."""
-    chain, turn = [], np.eye(3)
+    turn = np.eye(3)
     while (joint := PARENTS[joint]) >= 0:
-        chain.append(joint)
-    for above in reversed(chain):
-        turn = turn @ turns[above]
+        turn = turns[joint] @ turn
     return turn
 
 

@@ -151,21 +151,28 @@ class Skeleton:
         points = joints[at] + np.einsum("kij,kj->ki", turns[at], self.layout.offsets)
         return Posed(turns, joints, moves, points)
 
+    def jacobian(self, posed: Posed, *, of_betas: bool) -> Array:
+        """How keypoints move with the pelvis, each of `turning` about the joint's own axes, and betas if wanted.
+
+        Shape (3 K, 3 + 3 m + 10), or without the 10.
+        """
+        n, m = len(self.layout), len(self.turning)
+        arms = posed.points[:, None] - posed.joints[self.turning]
+        turns = (skew(self.carried[:, :, None] * -arms) @ posed.turns[self.turning]).swapaxes(1, 2)
+        columns = [np.broadcast_to(_IDENTITY, (n, 3, 3)), turns.reshape(n, 3, 3 * m)]
+        columns += [posed.moves[self.layout.joints]] if of_betas else []
+        return np.concatenate(columns, axis=2).reshape(3 * n, -1)
+
 
 def exp_so3(vectors: Array) -> Array:
-    """Rotation matrices (n, 3, 3) of rotation vectors (n, 3) [rad]: Rodrigues' formula."""
-    squared = np.einsum("ij,ij->i", vectors, vectors)[:, None, None]
-    half = np.sqrt(0.25 * squared + _TINY)
-    sinc = np.sin(half) / half
-    b = 0.5 * sinc * sinc
-    matrices: Array = (1 - b * squared) * _IDENTITY + (sinc * np.cos(half)) * skew(vectors)
-    matrices += (b * vectors[:, :, None]) * vectors[:, None, :]
+    """Rotation matrices (n, 3, 3) of rotation vectors (n, 3) [rad]."""
+    matrices: Array = Rotation.from_rotvec(vectors).as_matrix()
     return matrices
 
 
 def log_so3(matrices: Array) -> Array:
     """Rotation vectors (n, 3) [rad], no longer than pi, of rotation matrices (n, 3, 3)."""
-    vector = axes_of(matrices)
+    vector = matrices.reshape(-1, 9) @ _CROSSES.T  # twice the sine times the axis
     twice_sine = np.sqrt(np.einsum("ij,ij->i", vector, vector) + _TINY)
     twice_cosine = np.einsum("ijj->i", matrices) - 1
     result: Array = (np.arctan2(twice_sine, twice_cosine) / twice_sine)[:, None] * vector
@@ -175,12 +182,6 @@ def log_so3(matrices: Array) -> Array:
 
 
 def skew(vectors: Array) -> Array:
-    """Matrices (n, 3, 3) that multiply as the cross product with vectors (n, 3) does."""
-    matrices: Array = (vectors @ _CROSSES).reshape(-1, 3, 3)
+    """Matrices (…, 3, 3) that multiply as the cross product with vectors (…, 3) does."""
+    matrices: Array = (vectors @ _CROSSES).reshape(*vectors.shape, 3)
     return matrices
-
-
-def axes_of(matrices: Array) -> Array:
-    """Vectors (n, 3) of what is skew in matrices (n, 3, 3), times two: of a bᵀ it is b × a."""
-    vectors: Array = matrices.reshape(-1, 9) @ _CROSSES.T
-    return vectors

@@ -6,11 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dpotrf, dpotrs, dtrtri
+from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
 from refu_core.frames import N_BETAS, N_JOINTS
-from refu_core.keypoints._normal import NormalEquations
-from refu_core.keypoints._pose import Pose, Posed, Skeleton, log_so3, skew
+from refu_core.keypoints._pose import Pose, Skeleton, log_so3, skew
 from refu_core.keypoints._settings import TrackerSettings
 from refu_core.skeleton import JOINT_NAMES
 
@@ -75,24 +74,19 @@ class Solution(NamedTuple):
 
 
 class Solver:
-    """Finds the most likely pose of one skeleton's keypoints.
-
-    Args:
-        skeleton: whose they are.
-        fits_betas: whether the shape is looked for, too.
-        settings: the tuned numbers.
-    """
+    """Finds the most likely pose of one skeleton's keypoints, and its betas where it `fits_betas`."""
 
     def __init__(self, skeleton: Skeleton, *, fits_betas: bool, settings: TrackerSettings) -> None:
         self._skeleton = skeleton
         self._settings = settings
-        self._turning = turning = skeleton.turning
-        self._turns = slice(3, 3 + 3 * len(turning))
-        parts = [np.arange(3), (3 + 3 * turning[:, None] + np.arange(3)).ravel()]
-        parts += [np.arange(N_PARTS)[BETAS]] if fits_betas else []
-        self._free = np.concatenate(parts)
+        self._fits_betas = fits_betas
+        turns = 3 + 3 * skeleton.turning[:, None] + np.arange(3)
+        parts = [np.arange(3), turns.ravel(), np.arange(N_PARTS)[BETAS] if fits_betas else []]
+        self._free = np.concatenate(parts).astype(np.intp)
         """The unknowns among the parts of a step."""
-        self._equations = NormalEquations(skeleton, fits_betas=fits_betas)
+        of_turns = 3 + np.arange(turns.size).reshape(-1, 3)
+        self._blocks = of_turns[:, :, None], of_turns[:, None]
+        """Where the turns of each joint stand in the normal equations' matrix."""
 
     def solve(
         self,
@@ -114,82 +108,51 @@ class Solver:
             deviation: of each keypoint along an axis [m], shape (K,).
             prior: precision of the prediction's parts, shape (85,); None for a guess, which pulls at nothing.
             rest: the share of a look that joints at rest count as.
-            steps: of Gauss and Newton at most.
+            steps: Gauss-Newton steps at most.
         """
         precision = np.full(N_PARTS, _FLAT) if prior is None else prior
-        noise = np.square(deviation)
+        noise, free = np.square(deviation), self._free
         posed = self._skeleton.posed(pose)
+        jacobian = self._skeleton.jacobian(posed, of_betas=self._fits_betas)
         # How far off a keypoint may be that is none the worse: by its own noise and by that of the prediction.
-        doubt = _LOOSE**2 if prior is None else self._doubt(posed, 1 / prior)
+        doubt = _LOOSE**2 if prior is None else (np.square(jacobian) @ (1 / prior[free])).reshape(-1, 3).mean(axis=1)
         tolerated = self._settings.outlier**2 * 3 * (noise + doubt)
         step, factor, resting = np.zeros(N_PARTS), None, _Resting(pose, rest)
+        pulled = np.zeros(N_PARTS)
+        pulled[BETAS] = rest
         for k in range(steps):
             off = points - posed.points
             far = np.einsum("ki,ki->k", off, off) / tolerated
-            counted = weights / (np.square(1 + far) * noise)
-            axes = posed.turns[self._turning]
-            matrix = self._matrix(posed, axes, counted, precision, resting.stiffness, rest)
-            found, info = dpotrf(matrix, lower=1, overwrite_a=1)
+            weighted = np.repeat(weights / (np.square(1 + far) * noise), 3)[:, None] * jacobian
+            matrix = jacobian.T @ weighted
+            matrix.reshape(-1)[:: len(matrix) + 1] += (precision + pulled)[free]
+            matrix[self._blocks] += resting.stiffness[self._skeleton.turning]
+            found, info = dpotrf(matrix, lower=1)
             if info:  # not positive: keypoints that say nothing
                 break
             factor = found
             pull = resting.pull - precision * step
             pull[BETAS] -= rest * pose.betas
-            right = self._equations.right(posed, counted, off) + self._in_world(pull, axes)
-            turned = dpotrs(factor, right, lower=1)[0]
+            solved = dpotrs(factor, off.ravel() @ weighted + pull[free], lower=1)[0]
             change = np.zeros(N_PARTS)
-            change[self._free] = self._in_joints(turned, axes)
+            change[free] = solved
             short = min(1.0, _BOLDEST / max(float(np.abs(change[TURNS]).max()), 1e-9))
             change *= short
             pose = pose.moved(change, most_beta=self._settings.most_beta)
             step += change  # turns that follow each other add up, as long as the second one is small
             if k + 1 == steps:
                 break
-            linear = self._equations.moved(posed, short * turned)
+            linear = posed.points + short * (jacobian @ solved).reshape(-1, 3)
             posed = self._skeleton.posed(pose)
             bent = posed.points - linear
             if (np.einsum("ki,ki->k", bent, bent) < _CLOSE**2).all():
                 break
+            jacobian = self._skeleton.jacobian(posed, of_betas=self._fits_betas)
             resting = _Resting(pose, rest) if prior is None else resting.after(change)
         variance = 1 / np.maximum(precision, _FLAT)
         if factor is not None:
-            variance[self._free] = self._variance(factor, axes)
+            variance[free] = dpotri(factor, lower=1)[0].diagonal()
         return Solution(pose, variance, step)
-
-    def _matrix(
-        self, posed: Posed, axes: Array, weights: Array, precision: Array, stiffness: Array, rest: float
-    ) -> Array:
-        held = stiffness[self._turning]
-        held.reshape(-1, 9)[:, ::4] += precision[TURNS].reshape(N_JOINTS, 3)[self._turning]
-        diagonal = precision[self._free]
-        diagonal[self._turns] = 0.0
-        diagonal[self._turns.stop :] += rest
-        return self._equations.matrix(posed, weights, diagonal, axes @ held @ axes.swapaxes(1, 2))
-
-    def _doubt(self, posed: Posed, variance: Array) -> Array:
-        """How unsure keypoints are along an axis, on average [m²], shape (K,)."""
-        turns = variance[TURNS].reshape(N_JOINTS, 3)[self._turning]
-        return self._equations.doubt(posed, variance[:3], turns, variance[BETAS])
-
-    def _in_world(self, parts: Array, axes: Array) -> Array:
-        """The unknowns, of parts (85,) of a step."""
-        given: Array = parts[self._free]
-        given[self._turns] = (axes @ given[self._turns].reshape(-1, 3, 1)).ravel()
-        return given
-
-    def _in_joints(self, given: Array, axes: Array) -> Array:
-        """The unknowns, turned from the world's axes to the joints' own ones."""
-        own: Array = given.copy()
-        own[self._turns] = (given[self._turns].reshape(-1, 1, 3) @ axes).ravel()
-        return own
-
-    def _variance(self, factor: Array, axes: Array) -> Array:
-        """Of the unknowns, turns about the joints' own axes: the diagonal of (L Lᵀ)⁻¹."""
-        root, n = dtrtri(factor, lower=1)[0].T, len(factor)
-        turns = root[self._turns].reshape(-1, 3, n)
-        root[self._turns] = (axes.swapaxes(1, 2) @ turns).reshape(-1, n)
-        variance: Array = np.einsum("ij,ij->i", root, root)
-        return variance
 
 
 class _Resting:

@@ -9,6 +9,7 @@ seen goes on for a while and then comes to rest, and how much a keypoint moves t
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -34,12 +35,9 @@ class _Seen(NamedTuple):
 
 
 class KeypointTracker:
-    """One person. Not thread-safe.
+    """One person, by keypoints of a skeleton on the body that is dressed. Not thread-safe.
 
-    Args:
-        skeleton: the keypoints' layout on the body that is dressed.
-        betas: the person's shape (10,) where it is known; estimated from the lengths of bones if not given.
-        settings: the tuned numbers.
+    The person's `betas` (10,) are estimated from the lengths of bones if they aren't given.
     """
 
     def __init__(
@@ -289,6 +287,19 @@ MOST_PEOPLE = 64
 """People who are followed at once; whose keypoints haven't come for longest is forgotten."""
 
 
+@dataclass
+class _Person:
+    track: KeypointTracker
+    newest_ns: int
+    """Stamp of the newest keypoints, by the sender's clock."""
+    came_ns: int
+    """When they came."""
+    went_on_ns: int
+    """When there was last a stamp later than the one before."""
+    last_ns: int = -1
+    """The last stamp."""
+
+
 class People:
     """Tracks by name. Times are of two clocks: the sender's stamps, and when messages came. Not thread-safe."""
 
@@ -297,10 +308,7 @@ class People:
     ) -> None:
         self.skeleton = skeleton
         self._betas, self._settings = betas, settings
-        self._tracks: dict[str, KeypointTracker] = {}
-        self._newest: dict[str, tuple[int, int]] = {}
-        self._given: dict[str, tuple[int, int]] = {}
-        """The last stamp of each, and when there was last a later one than before."""
+        self._people: dict[str, _Person] = {}
 
     def update(
         self, person: str, points: ArrayLike, *, confidence: ArrayLike | None, stamp_ns: int, now_ns: int
@@ -309,21 +317,21 @@ class People:
 
         Stamps that haven't gone on for `hold` say nothing: then it is when messages come that counts.
         """
-        track = self._tracks.pop(person, None)
-        last, since = self._given.pop(person, (-1, now_ns))
-        since = now_ns if stamp_ns > last else min(since, now_ns)
-        self._given[person] = stamp_ns, since
-        if 1e-9 * (now_ns - since) > self._settings.hold:
-            stamp_ns = now_ns
-        if track is None:
+        one = self._people.pop(person, None)
+        if one is None:
             track = KeypointTracker(self.skeleton, betas=self._betas, settings=self._settings)
-        self._tracks[person] = track
-        before = track.stamp_ns
-        frame = track.update(points, stamp_ns, confidence=confidence)
-        if person not in self._newest or track.stamp_ns != before:  # or they were older than those that are known
-            self._newest[person] = stamp_ns, now_ns
-        for gone in list(self._tracks)[:-MOST_PEOPLE]:
-            del self._tracks[gone], self._newest[gone], self._given[gone]
+            one = _Person(track, stamp_ns, now_ns, now_ns)
+        self._people[person] = one
+        one.went_on_ns = now_ns if stamp_ns > one.last_ns else min(one.went_on_ns, now_ns)
+        one.last_ns = stamp_ns
+        if 1e-9 * (now_ns - one.went_on_ns) > self._settings.hold:
+            stamp_ns = now_ns
+        before = one.track.stamp_ns
+        frame = one.track.update(points, stamp_ns, confidence=confidence)
+        if one.track.stamp_ns != before:  # or they were older than those that are known
+            one.newest_ns, one.came_ns = stamp_ns, now_ns
+        for gone in list(self._people)[:-MOST_PEOPLE]:
+            del self._people[gone]
         return frame
 
     def at(self, now_ns: int) -> dict[str, SmplFrame]:
@@ -333,12 +341,11 @@ class People:
         `hold`, nobody is known to be there until they come again.
         """
         poses = {}
-        for person, track in self._tracks.items():
-            stamp_ns, came_ns = self._newest[person]
-            age_ns = now_ns - came_ns
+        for person, one in self._people.items():
+            age_ns = now_ns - one.came_ns
             if 1e-9 * age_ns < -self._settings.hold:
-                track.reset()
-            frame = track.at(stamp_ns + max(0, age_ns))
+                one.track.reset()
+            frame = one.track.at(one.newest_ns + max(0, age_ns))
             if frame is not None:
                 poses[person] = frame
         return poses

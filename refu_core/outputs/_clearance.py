@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from refu_core.errors import MeshError
 from refu_core.mesh import as_points
-from refu_core.sdf import BandSdf, Links
+from refu_core.sdf import BandSdf
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -35,7 +35,7 @@ class Clearance:
     def __init__(self, body: SmplBody, garments: Mapping[str, GarmentTemplate]) -> None:
         """For garments on a body; all is on the CPU, where a pipeline's outputs are."""
         self._sdf = BandSdf(body.faces.cpu(), band=self.reach, rest=body.v_template.detach().cpu())
-        self._links = {name: Links(garment.mesh.ring) for name, garment in garments.items()}
+        self._rings = {name: garment.mesh.ring for name, garment in garments.items()}
 
     @classmethod
     def of(cls, pipeline: GarmentPipeline) -> Clearance:
@@ -57,10 +57,9 @@ class Clearance:
         Exact inside and up to `reach`; farther out it is `reach`, which the vertex is at least away. Raises `MeshError`
         for an unknown garment, for what aren't its vertices, and where `update` was given no body yet.
         """
-        if name not in self._links:
-            msg = f"no garment {name!r} here: wanted one of {', '.join(self._links)}"
+        if name not in self._rings:
+            msg = f"no garment {name!r} here: wanted one of {', '.join(self._rings)}"
             raise MeshError(msg)
-        links = self._links[name]
-        points = as_points("the garment's vertices", vertices, links.n_vertices, dtype=np.float32)
-        distance: NDArray[np.float32] = self._sdf.clipped(torch.from_numpy(points), links).distance.numpy()
+from refu_core.mesh import as_points
+from refu_core.sdf import BandSdf
         return distance

@@ -3,7 +3,6 @@
 from refu_core.sdf._approx import ApproxSdf as ApproxSdf
 from refu_core.sdf._band import BAND as BAND
 from refu_core.sdf._band import BandSdf as BandSdf
-from refu_core.sdf._band import Links as Links
 from refu_core.sdf._band import exact_sdf as exact_sdf
 from refu_core.sdf._exact import ClosestPoints as ClosestPoints
 from refu_core.sdf._exact import ExactSdf as ExactSdf

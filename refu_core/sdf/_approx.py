@@ -11,11 +11,11 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import as_warp, torch_stream
+from refu_core._warp import Repeated, as_warp
 from refu_core.body import SEGMENTS, part_of_faces
 from refu_core.errors import MeshError
 from refu_core.sdf._exact import ExactSdf
-from refu_core.sdf._mesh import Found, MeshSdf, Recorded
+from refu_core.sdf._mesh import FOUND, Found, MeshSdf, ask
 from refu_core.sdf._protocol import GarmentSdf, SdfSample
 from refu_core.sdf._rest import RestFaces
 from refu_core.sdf._walk_kernels import (
@@ -31,14 +31,9 @@ from refu_core.sdf._walk_kernels import (
 )
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from refu_core.body import SmplBody
     from refu_core.garments import GarmentTemplate
 
-# Over one segment of the body the distance mostly falls all the way to the closest face. From one to another it may
-# have to rise first.
-_PARTS = tuple(SEGMENTS.values())
 _SPACING = 0.05
 """Edge of the cubes of the rest pose that have one guide of each part in them [m]."""
 _CELL = 0.045
@@ -49,11 +44,6 @@ outside."""
 EXACT_FROM = 0.03
 """Points deeper than this by their walk are asked exactly [m]. In most frames no cloth is as deep. Where some is, the
 exact query's tree is refitted, for a tenth of what the walks take."""
-
-_MANY = 1000
-"""From so many points on, their order matters."""
-_MAX_ORDERS = 16
-"""Orders that are kept, one for each number of points."""
 
 
 class ApproxSdf(MeshSdf):
@@ -71,8 +61,6 @@ class ApproxSdf(MeshSdf):
     So the distance is always that to a face of the posed body: exact, or too large where no walk ended at the closest
     face. Sign, gradient and derivatives are those of `ExactSdf`. Within 2 cm of the skin the mean error is some
     hundredths of a millimetre, at less than a fifth of the exact query's cost (benchmarks/sdf.py).
-
-    It needs the posed vertices alone, so it works for every β, γ and pose.
     """
 
     is_exact = False
@@ -94,16 +82,19 @@ class ApproxSdf(MeshSdf):
         self._exact_from = exact_from
         # A GPU isn't waited for to know whether anything is that deep.
         self._is_serial = self.device.type == "cpu"
-        part = _part_of_faces(body)
+        faces, rest = body.faces.cpu().numpy(), body.v_template.double().cpu().numpy()
+        # Over one segment the distance mostly falls all the way to the closest face; to another it may rise first.
+        part = part_of_faces(body.weights.cpu(), body.faces.cpu(), SEGMENTS.values()).int().numpy()
+        self._cube = np.floor(rest[faces].mean(1) / _SPACING).astype(np.int64)
+        """Which cube of the rest pose each face is in, shape (F, 3)."""
         self._links = torch.zeros(len(part), 2, 4, dtype=torch.int32, device=self.device)
         self._links[:, 0, :3] = self.faces
         self._links[:, 0, 3] = torch.from_numpy(part)
         self._links[:, 1, :3] = wp.to_torch(self._posed.across)
-        cube = _cube_of_faces(body)
-        rank = np.empty(len(part), np.int64)
-        rank[np.lexsort(cube.T)] = np.arange(len(part))
-        self._rank = torch.from_numpy(rank)
-        self._guide_rows: Any = wp.array(_guide_rows(body, part, cube), dtype=wp.vec4i, device=str(self.device))
+        # Guides are spread over the body: one of each part in each cube.
+        chosen = np.sort(np.unique(np.column_stack([self._cube, part]), axis=0, return_index=True)[1])
+        rows = np.column_stack([faces[chosen], (part[chosen] << FACE_BITS) | chosen]).astype(np.int32)
+        self._guide_rows = torch.from_numpy(rows).to(self.device)
         self._table = torch.empty(ROWS, COLUMNS, dtype=torch.int32, device=self.device)
         self._guides = Guides()
         self._guides.links = as_warp(self._links.view(-1, 4), wp.vec4i)
@@ -112,23 +103,26 @@ class ApproxSdf(MeshSdf):
         self._exact = ExactSdf(body.faces, device=self.device, rebuild_distance=math.inf)
         self._exact.update(body.v_template.float())
         self._exact_is_late = True
-        self._enter: Any = None  # both recorded for the tensors that hold the pose
-        self._walk: Recorded | None = None
-        self._none = wp.empty(0, dtype=wp.int32, device=str(self.device))
-        self._orders: dict[int, Any] = {}
+        self._none = torch.empty(0, dtype=torch.int32, device=self.device)
 
     @cached_property
     def _rest_faces(self) -> RestFaces:
         return RestFaces(self._body)
 
-    def of_garment(self, garment: GarmentTemplate) -> GarmentSdf:  # noqa: ARG002
+    def of_garment(self, garment: GarmentTemplate) -> GarmentSdf:
         """As `BodySdf.of_garment`: walks begin where the vertices were near before posing."""
-        rest_faces = self._rest_faces
+        rest_faces, order = self._rest_faces, self._none
+        if self._is_serial:
+            # Points over the same cube of the rest pose in a row: each finds in the cache what the last one read.
+            order = torch.from_numpy(np.lexsort(self._cube[rest_faces(garment.v_template).numpy()].T)).int()
 
-        def ask(vertices: Tensor, *, on_mean: Tensor, reach: float = math.inf) -> SdfSample:  # noqa: ARG001
-            return self.query(vertices, near=rest_faces(on_mean))
+        def ask_garment(vertices: Tensor, *, on_mean: Tensor, reach: float = math.inf) -> SdfSample:  # noqa: ARG001
+            self._require_update()
+            where = self._checked(vertices)
+            near = self._checked_faces(rest_faces(on_mean), len(where))
+            return self._walk_from(where, near, order if len(order) == len(where) else self._none).sample()
 
-        return ask
+        return ask_garment
 
     def _bind_skin(self) -> Any:
         skin = super()._bind_skin()
@@ -139,92 +133,27 @@ class ApproxSdf(MeshSdf):
         self._exact_is_late = True
         self._table.fill_(EMPTY)
         if is_new:
-            self._enter = wp.launch(
-                enter_guides_kernel,
-                dim=len(self._guide_rows),
-                inputs=[self._posed.points, self._guide_rows, _CELL, _DEPTH],
-                outputs=[self._guides.table],
-                device=str(self.device),
-                record_cmd=True,
-            )
-            if self.device.type == "cpu":
-                self._walk = Recorded(walk_kernel, (self._posed, self._guides), (self._none,))
-        with torch_stream(self.device):
-            self._enter.launch()
+            fixed = [self._posed.points, _CELL, _DEPTH]
+            self._enter = Repeated(enter_guides_kernel, (wp.vec4i, wp.int32), fixed)
+            self._walk = Repeated(walk_kernel, (wp.vec3, wp.int32, wp.int32, *FOUND), [self._posed, self._guides])
+            fixed = [self._exact.mesh_id, self._posed, self._exact_from]
+            self._ask_deep = Repeated(requery_deep_kernel, (wp.vec3, *FOUND), fixed)
+        self._enter((len(self._guide_rows),), self._guide_rows, self._table)
 
     def _find(self, points: Tensor, near: Tensor | None) -> Found:
-        near = self._seek(points) if near is None else near
-        if self._walk is not None:
-            found = self._walk.ask(points, near, last=self._order(near))
-            if len(points) and (not self._is_serial or float(found.distance.min()) < -self._exact_from):
-                self._ask_deep(points, found)
-            return found
-        found = Found.empty(len(points), self.device)
-        if len(points):
-            with torch_stream(self.device):
-                wp.launch(
-                    walk_kernel,
-                    dim=len(points),
-                    inputs=[self._posed, self._guides, as_warp(points, wp.vec3), as_warp(near, wp.int32), self._none],
-                    outputs=found.as_warp(),
-                    device=str(self.device),
-                )
-            self._ask_deep(points, found)
+        if near is None:  # nothing is known to be near: the exact query is right, and as slow
+            near = self._exact_of_pose().closest(points).face
+        return self._walk_from(points, near, self._none)
+
+    def _walk_from(self, points: Tensor, near: Tensor, order: Tensor) -> Found:
+        found = ask(self._walk, points, near, order)
+        if len(points) and (not self._is_serial or float(found.distance.min()) < -self._exact_from):
+            self._exact_of_pose()
+            self._ask_deep((len(points),), points, *found)
         return found
-
-    def _ask_deep(self, points: Tensor, found: Found) -> None:
-        """Replaces the answers of walks that ended far above a point by those of the exact query."""
-        exact = self._exact_of_pose()
-        with torch_stream(self.device):
-            wp.launch(
-                requery_deep_kernel,
-                dim=len(points),
-                inputs=[exact.mesh_id, self._posed, self._exact_from, as_warp(points, wp.vec3)],
-                outputs=found.as_warp(),
-                device=str(self.device),
-            )
-
-    def _order(self, near: Tensor) -> Any:
-        """Points over the same cube of the rest pose in a row, so that each finds in the cache what the last one read.
-
-        Any order gives the same answers, so the order is that of the first points of their number.
-        """
-        n = len(near)
-        if n < _MANY:
-            return self._none
-        if n not in self._orders:
-            if len(self._orders) >= _MAX_ORDERS:
-                self._orders.clear()
-            self._orders[n] = wp.array(self._rank[near.long()].argsort().int().numpy(), dtype=wp.int32, device="cpu")
-        return self._orders[n]
-
-    def _seek(self, points: Tensor) -> Tensor:
-        """The closest faces, by the exact query, where nothing is known to be near: right, and as slow."""
-        return self._exact_of_pose().closest(points).face
 
     def _exact_of_pose(self) -> ExactSdf:
         if self._exact_is_late:
             self._exact.update(self._require_update())
             self._exact_is_late = False
         return self._exact
-
-
-def _part_of_faces(body: SmplBody) -> NDArray[np.int32]:
-    part: NDArray[np.int32] = part_of_faces(body.weights.cpu(), body.faces.cpu(), _PARTS).int().numpy()
-    return part
-
-
-def _cube_of_faces(body: SmplBody) -> NDArray[np.int64]:
-    """Which cube of the rest pose each face is in, shape (F, 3)."""
-    middles = body.v_template.double().cpu().numpy()[body.faces.cpu().numpy()].mean(1)
-    cube: NDArray[np.int64] = np.floor(middles / _SPACING).astype(np.int64)
-    return cube
-
-
-def _guide_rows(body: SmplBody, part: NDArray[np.int32], cube: NDArray[np.int64]) -> NDArray[np.int32]:
-    """Faces spread over the body, one of each part in each cube of the rest pose, for `enter_guides_kernel`."""
-    faces = body.faces.cpu().numpy()
-    _, first = np.unique(np.column_stack([cube, part]), axis=0, return_index=True)
-    chosen = np.sort(first)
-    rows: NDArray[np.int32] = np.column_stack([faces[chosen], (part[chosen] << FACE_BITS) | chosen]).astype(np.int32)
-    return rows

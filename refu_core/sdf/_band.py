@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -11,15 +10,26 @@ import warp as wp
 from numpy.typing import NDArray
 from torch import Tensor
 
-from refu_core._warp import as_warp
+from refu_core._warp import Repeated
 from refu_core.errors import MeshError
 from refu_core.mesh import Adjacency
+from refu_core.sdf._band_kernels import (
+    ASKED,
+    ROW,
+    ROWS_X,
+    ROWS_Z,
+    Cells,
+    finish_kernel,
+    scan_kernel,
+    sort_kernel,
+    spread_sides_kernel,
+)
 from refu_core.sdf._box_tree import BoxTree
+from refu_core.sdf._closest_kernels import PosedMesh
 from refu_core.sdf._exact import ExactSdf
-from refu_core.sdf._mesh import Found, MeshSdf, Recorded
+from refu_core.sdf._mesh import FOUND, Found, MeshSdf, ask
 from refu_core.sdf._protocol import GarmentSdf, SdfSample
 from refu_core.sdf._query_kernels import query_skin_kernel
-from refu_core.sdf._scan import Scan
 
 if TYPE_CHECKING:
     from refu_core.body import SmplBody
@@ -30,15 +40,7 @@ BAND = 0.008
 shorter than twice the band for most of them to say that both their ends are on one side."""
 _FEW = 200
 """Fewer points than this are cheaper in a tree than in cells, which all faces of the body have to look through."""
-
-
-class Links:
-    """The edges of a garment as the kernels of the band read them."""
-
-    def __init__(self, ring: Adjacency) -> None:
-        """From the neighbours of each vertex (`Connectivity.ring`)."""
-        self.n_vertices = len(ring.start) - 1
-        self.arrays = [as_warp(torch.from_numpy(array), wp.int32) for array in ring]
+_N_ROWS = int(ROWS_X) * int(ROWS_Z)
 
 
 class BandSdf(MeshSdf):
@@ -74,51 +76,43 @@ class BandSdf(MeshSdf):
         self.band = band
         self._tree = None if rest is None else BoxTree(self.faces, rest)
         self._tree_is_posed = False
-        self._scan: Scan | None = None
-        self._few: Recorded | None = None
-        self._none = wp.empty(0, dtype=wp.int32, device="cpu")
+        self._all = torch.empty(0, dtype=torch.bool)
 
-    def clipped(self, points: Tensor, links: Links) -> SdfSample:
+    def clipped(self, points: Tensor, ring: Adjacency) -> SdfSample:
         """The signed distance and gradient of a garment's vertices [m], shape (N, 3), clipped from above.
 
-        Distances are exact inside the body and up to `band` outside of it; farther out they are `band` (and the
-        gradient and face, -1, mean nothing). Not differentiable.
+        `ring` are the vertices next to each (`Connectivity.ring`). Distances are exact inside the body and up to `band`
+        outside of it; farther out they are `band` (and gradient and face, -1, mean nothing). Not differentiable.
 
         Raises `MeshError` as `query` does.
         """
         self._require_update()
         where = self._checked(points)
+        if len(ring.start) - 1 != len(where):
+            msg = f"the ring is of {len(ring.start) - 1} vertices, got {len(where)}"
+            raise MeshError(msg)
         if not len(where):
             return SdfSample(where[:, 0], where, torch.empty(0, dtype=torch.int32))
-        if links.n_vertices != len(where):
-            msg = f"the links are of {links.n_vertices} vertices, got {len(where)}"
-            raise MeshError(msg)
-        scan = self._scan_of_pose()
-        found = scan.near(where, beyond=self.band)
-        n_inside, n_patches = scan.spread(links.arrays)
-        if n_inside or n_patches:
-            self._pose_tree()
-            scan.ask(n_inside + n_patches)
-        if n_patches:
+        found = self._scan(where, beyond=self.band)
+        state, patches = self._scan.spread(where, found, ring)
+        is_asked = state == int(ASKED)
+        is_asked[patches] = True
+        if self._ask_tree(where, found, is_asked):
             # One of a patch that nothing reaches was asked; if it is inside, so may be all of them.
-            patches, patch_of = scan.asked(n_inside + n_patches)[n_inside:], scan.patch_of(len(where))
-            rest = torch.isin(patch_of, patch_of[patches][found.distance[patches] < 0])
-            rest[patches] = False
-            rows = torch.nonzero(rest)[:, 0]
-            scan.ask(len(rows), rows)
-        if n_inside or n_patches:
+            is_patch = torch.isin(state, state[patches][found.distance[patches] < 0])
+            self._ask_tree(where, found, is_patch & ~is_asked)
             # Farther out than the band a distance is clipped where it happens to be known, too.
             found.distance.clamp_(max=self.band)
         return found.sample()
 
     def of_garment(self, garment: GarmentTemplate) -> GarmentSdf:
         """As `BodySdf.of_garment`; distances beyond the band are computed only where `reach` asks for them."""
-        links = Links(garment.mesh.ring)
+        ring = garment.mesh.ring
 
-        def ask(vertices: Tensor, *, on_mean: Tensor, reach: float = math.inf) -> SdfSample:  # noqa: ARG001
-            return self.clipped(vertices, links) if reach <= self.band else self.query(vertices)
+        def ask_garment(vertices: Tensor, *, on_mean: Tensor, reach: float = math.inf) -> SdfSample:  # noqa: ARG001
+            return self.clipped(vertices, ring) if reach <= self.band else self.query(vertices)
 
-        return ask
+        return ask_garment
 
     def skin(self) -> Any:
         """As `MeshSdf.skin`."""
@@ -128,47 +122,84 @@ class BandSdf(MeshSdf):
     def _bind_skin(self) -> Any:
         skin = super()._bind_skin()
         skin.boxes = self._pose_tree().boxes
+        self._tell = Repeated(query_skin_kernel, (wp.vec3, wp.int32, wp.bool, *FOUND), [skin])
         return skin
 
     def _take_pose(self, *, is_new: bool) -> None:
         if is_new:
-            self._scan = self._few = None
+            self._scan = Scan(self._posed, len(self.faces), self.band)
         self._tree_is_posed = False
 
     def _find(self, points: Tensor, near: Tensor | None) -> Found:
         if near is not None or len(points) < _FEW:
-            skin = self.skin()
-            if self._few is None:
-                self._few = Recorded(query_skin_kernel, (skin,), (self._none,))
-            return self._few.ask(points, near)
-        scan = self._scan_of_pose()
-        found = scan.near(points, beyond=math.inf)
-        far = torch.nonzero(found.face < 0)[:, 0]
-        if len(far):
-            self._pose_tree()
-            scan.ask(len(far), far)
+            near = torch.full((len(points),), -1, dtype=torch.int32) if near is None else near
+            self.skin()
+            return ask(self._tell, points, near, self._all)
+        found = self._scan(points, beyond=math.inf)
+        self._ask_tree(points, found, found.face < 0)
         return found
+
+    def _ask_tree(self, points: Tensor, found: Found, is_asked: Tensor) -> bool:
+        """Replaces those of the answers that are asked for by the tree's, and says whether there are any."""
+        any_asked = bool(is_asked.any())
+        if any_asked:
+            self.skin()
+            self._tell((len(points),), points, found.face, is_asked, *found)
+        return any_asked
 
     def _pose_tree(self) -> BoxTree:
         points = self._require_update()
         if self._tree is None:
             self._tree = BoxTree(self.faces, points)
         if not self._tree_is_posed:
-            self._tree.fit(self._posed.points)
+            self._tree.fit(points)
             self._tree_is_posed = True
         return self._tree
 
-    def _scan_of_pose(self) -> Scan:
-        if self._scan is None:
-            self._scan = Scan(self._posed, len(self.faces), self.band, partial(_record, self.skin()))
-        return self._scan
 
+class Scan:
+    """Which of a garment's vertices are near the skin of a posed body, and on which side the others are."""
 
-def _record(skin: Any, points: Any, rows: Any, answers: Found) -> Any:
-    """A recorded launch that asks for the points in `rows`; the faces that `answers` has already are hints."""
-    outputs = answers.as_warp()
-    inputs = [skin, points, outputs[0], rows]
-    return wp.launch(query_skin_kernel, len(rows), inputs, outputs, device="cpu", record_cmd=True)
+    def __init__(self, body: PosedMesh, n_faces: int, band: float) -> None:
+        """For a `body` of `n_faces`; `band` in metres."""
+        self._body, self._n_faces = body, n_faces
+        self._cells = cells = Cells()
+        cells.limit, cells.per_metre = band, 0.5 / band  # a cell is twice as wide as the band
+        cells.number_of_row = wp.full(_N_ROWS, -1, dtype=wp.int32, device="cpu")
+        cells.rows = wp.empty(_N_ROWS, dtype=wp.int32, device="cpu")
+        cells.occupied = wp.empty(_N_ROWS, dtype=wp.uint64, device="cpu")
+        cells.extent = wp.zeros(2, dtype=wp.vec3, device="cpu")
+        self._sizes = torch.zeros(3, dtype=torch.int32)
+        self._spread = Repeated(spread_sides_kernel, (wp.vec3, *[wp.int32] * 3, wp.float32, *[wp.int32] * 4))
+        self._room = 0
+
+    def __call__(self, points: Tensor, *, beyond: float) -> Found:
+        """What is closest to each point (N, 3) within the band; face -1 and the distance `beyond` where nothing is."""
+        n = len(points)
+        if n > self._room:
+            self._make_room(max(n, 2 * self._room))
+        self._sizes[0] = n
+        self._sort((1,), points, self._sizes)
+        self._scan.launch()
+        return ask(self._finish, points, torch.full((1,), beyond))
+
+    def spread(self, points: Tensor, found: Found, ring: Adjacency) -> tuple[Tensor, Tensor]:
+        """The state of each point, shape (N,), by its edges, and one point of each patch that nothing reaches."""
+        state, queue, patches = torch.empty(3, len(points), dtype=torch.int32)
+        edges = map(torch.from_numpy, ring)
+        self._spread((1,), points, self._sizes, *edges, found.distance, found.face, state, queue, patches)
+        return state, patches[: int(self._sizes[2])].long()
+
+    def _make_room(self, n: int) -> None:
+        """For n points."""
+        self._room, cells = n, self._cells
+        cells.slot, cells.face = (wp.empty(n, dtype=wp.int32, device="cpu") for _ in range(2))
+        cells.start = wp.empty((min(n, _N_ROWS), ROW + 2), dtype=wp.int32, device="cpu")
+        cells.points = wp.empty(n, dtype=wp.vec3, device="cpu")
+        cells.squared = wp.empty(n, dtype=wp.float32, device="cpu")
+        self._sort = Repeated(sort_kernel, (wp.vec3, wp.int32), [cells])
+        self._scan = wp.launch(scan_kernel, self._n_faces, [self._body, cells], device="cpu", record_cmd=True)
+        self._finish = Repeated(finish_kernel, (wp.vec3, wp.float32, *FOUND), [self._body, cells])
 
 
 def exact_sdf(body: SmplBody, *, uses_band: bool = True) -> BandSdf | ExactSdf:

@@ -8,6 +8,7 @@ at a time, and the points lie sorted by row and cell, so that what a face sees o
 
 import warp as wp
 
+from refu_core.body._bundle_kernels import greater, lesser
 from refu_core.sdf._closest_kernels import PosedMesh, closest_on_triangle, measured_to
 
 wp.set_module_options({"enable_backward": False})
@@ -35,21 +36,6 @@ def cell_number(x: float, per_metre: float) -> int:
     cell = x * per_metre
     cell = wp.where(cell < _MOST_CELLS, cell, _MOST_CELLS)
     return int(wp.floor(wp.where(cell > -_MOST_CELLS, cell, -_MOST_CELLS)))
-
-
-@wp.func
-def lesser(p: wp.vec3, q: wp.vec3) -> wp.vec3:
-    """By coordinate, of numbers: wp.min would look for NaN."""
-    return wp.vec3(
-        wp.where(q[0] < p[0], q[0], p[0]), wp.where(q[1] < p[1], q[1], p[1]), wp.where(q[2] < p[2], q[2], p[2])
-    )
-
-
-@wp.func
-def greater(p: wp.vec3, q: wp.vec3) -> wp.vec3:
-    return wp.vec3(
-        wp.where(q[0] > p[0], q[0], p[0]), wp.where(q[1] > p[1], q[1], p[1]), wp.where(q[2] > p[2], q[2], p[2])
-    )
 
 
 @wp.func
@@ -92,7 +78,7 @@ class Cells:
 
 
 @wp.kernel
-def sort_kernel(points: wp.array[wp.vec3], sizes: wp.array[int], cells: Cells) -> None:
+def sort_kernel(cells: Cells, points: wp.array[wp.vec3], sizes: wp.array[int]) -> None:
     """Sorts the first `sizes[0]` points into cells, in place of the last; `sizes[1]` becomes the number of rows."""
     for r in range(sizes[1]):
         cells.number_of_row[cells.rows[r]] = -1
@@ -208,8 +194,8 @@ def scan_kernel(mesh: PosedMesh, cells: Cells) -> None:
 @wp.kernel
 def finish_kernel(
     mesh: PosedMesh,
-    points: wp.array[wp.vec3],
     cells: Cells,
+    points: wp.array[wp.vec3],
     beyond: wp.array[float],
     # outputs
     out_face: wp.array[int],
@@ -249,12 +235,12 @@ def spread_sides_kernel(
     # outputs
     state: wp.array[int],
     queue: wp.array[int],
-    asked: wp.array[int],
+    patch: wp.array[int],
 ) -> None:
     """On which side of the skin the vertices beyond the band are, by way of the garment's edges.
 
-    `asked` lists those that may be inside, and one of each large patch that no vertex of the band reaches; `sizes[2]`
-    and `sizes[3]` say how many of either kind there are. The distance of what is beyond the band is the band.
+    `patch` lists one of each large patch that no vertex of the band reaches, `sizes[2]` in all. The distance of what is
+    beyond the band is the band.
     """
     n = sizes[0]
     tail = int(0)
@@ -268,7 +254,6 @@ def spread_sides_kernel(
                 tail += 1
     # From the inside first: what both sides reach lies where the body runs into itself, and is asked.
     here = int(0)
-    inside = int(0)
     while here < tail:
         q = queue[here]
         here += 1
@@ -279,9 +264,7 @@ def spread_sides_kernel(
                 face[other] = face[q]  # where to begin: it is not far from there
                 queue[tail] = other
                 tail += 1
-                asked[inside] = other
-                inside += 1
-    # The rest hangs together in pieces; those of the patches are kept from the end of the list until all are known.
+    # The rest hangs together in pieces.
     patches = int(0)
     for seed in range(n):
         if state[seed] < 0:
@@ -308,19 +291,12 @@ def spread_sides_kernel(
                     q = queue[k]
                     if state[q] != JOINED:
                         state[q] = ASKED
-                        asked[inside] = q
-                        inside += 1
             elif in_band > 0:
                 for k in range(tail):
                     q = queue[k]
                     if state[q] != JOINED:
                         state[q] = OUTSIDE
             else:
+                patch[patches] = seed
                 patches += 1
-                asked[n - patches] = seed
-    for k in range(patches):
-        queue[k] = asked[n - 1 - k]
-    for k in range(patches):
-        asked[inside + k] = queue[k]
-    sizes[2] = inside
-    sizes[3] = patches
+    sizes[2] = patches

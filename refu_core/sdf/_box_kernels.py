@@ -56,9 +56,9 @@ def least_of(eight: Eight) -> float:
 
 @wp.kernel(enable_backward=False)
 def fit_kernel(
-    points: wp.array[wp.vec3],
     faces: wp.array2d[int],
     boxes: Boxes,
+    points: wp.array[wp.vec3],
     # output
     bounds: wp.array3d[float],
 ) -> None:
@@ -69,12 +69,6 @@ def fit_kernel(
     for back in range(last + 1):
         node = last - back
         if node >= n_above:
-            low_x = Eight(wp.inf)
-            low_y = Eight(wp.inf)
-            low_z = Eight(wp.inf)
-            high_x = Eight(-wp.inf)
-            high_y = Eight(-wp.inf)
-            high_z = Eight(-wp.inf)
             for k in range(8):
                 place = WIDTH * (node - n_above) + k
                 if place < n:
@@ -82,18 +76,9 @@ def fit_kernel(
                     a = points[faces[face, 0]]
                     b = points[faces[face, 1]]
                     c = points[faces[face, 2]]
-                    low_x[k] = least(a[0], b[0], c[0])
-                    low_y[k] = least(a[1], b[1], c[1])
-                    low_z[k] = least(a[2], b[2], c[2])
-                    high_x[k] = -least(-a[0], -b[0], -c[0])
-                    high_y[k] = -least(-a[1], -b[1], -c[1])
-                    high_z[k] = -least(-a[2], -b[2], -c[2])
-            boxes.bounds[node, 0] = low_x
-            boxes.bounds[node, 1] = low_y
-            boxes.bounds[node, 2] = low_z
-            boxes.bounds[node, 3] = high_x
-            boxes.bounds[node, 4] = high_y
-            boxes.bounds[node, 5] = high_z
+                    for axis in range(3):
+                        bounds[node, axis, k] = least(a[axis], b[axis], c[axis])
+                        bounds[node, axis + 3, k] = -least(-a[axis], -b[axis], -c[axis])
         if node > 0:
             above = (node - 1) // WIDTH
             child = (node - 1) & 7
@@ -113,18 +98,6 @@ def squared_gaps(p: wp.vec3, node: int, boxes: Boxes) -> Eight:
     along_y = wp.max(wp.max(boxes.bounds[node, 1] - y, y - boxes.bounds[node, 4]), none)
     along_z = wp.max(wp.max(boxes.bounds[node, 2] - z, z - boxes.bounds[node, 5]), none)
     return wp.cw_mul(along_x, along_x) + wp.cw_mul(along_y, along_y) + wp.cw_mul(along_z, along_z)
-
-
-@wp.func
-def is_beyond(p: wp.vec3, boxes: Boxes) -> bool:
-    """Whether p is outside of the box around everything."""
-    beyond = bool(False)
-    for axis in range(3):
-        least = wp.min(boxes.bounds[0, axis])
-        greatest = wp.max(boxes.bounds[0, axis + 3])
-        if p[axis] < least or p[axis] > greatest:
-            beyond = True
-    return beyond
 
 
 @wp.func

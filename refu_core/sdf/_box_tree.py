@@ -9,7 +9,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import as_warp
+from refu_core._warp import Repeated, as_warp
 from refu_core.errors import MeshError
 from refu_core.mesh import grouped
 from refu_core.sdf._box_kernels import MAX_FACES, WIDTH, Boxes, Eight, fit_kernel
@@ -44,15 +44,8 @@ class BoxTree:
         self.boxes.bounds = wp.from_torch(self._bounds, dtype=Eight)
         self.boxes.order = as_warp(self._order, wp.int32)
         self.boxes.first = _WIDTH * n_above + 1
-        self._faces = as_warp(faces, wp.int32)
-        self._fit: Any = None
-        self._fits: Any = None
+        self._fit = Repeated(fit_kernel, (wp.vec3, wp.float32), [as_warp(faces, wp.int32), self.boxes])
 
-    def fit(self, points: Any) -> None:
-        """Fits the boxes to a pose, whose vertices are a Warp array; recorded for it, as it is mostly the same one."""
-        if self._fits is not points:
-            inputs = [points, self._faces, self.boxes]
-            bounds = as_warp(self._bounds, wp.float32)
-            self._fit = wp.launch(fit_kernel, 1, inputs, [bounds], device="cpu", record_cmd=True)
-            self._fits = points
-        self._fit.launch()
+    def fit(self, points: Tensor) -> None:
+        """Fits the boxes to a pose with the vertices `points` (V, 3) [m]."""
+        self._fit((1,), points, self._bounds)

@@ -194,22 +194,22 @@ def distance_to_face(p: wp.vec3, face: int, mesh: PosedMesh) -> float:
 def closest_kernel(
     tree: wp.uint64,
     mesh: PosedMesh,
+    by_winding: bool,
     queries: wp.array[wp.vec3],
     near: wp.array[int],
-    max_distance: float,
-    by_winding: bool,
+    max_distance: wp.array[float],
     # outputs
     out_face: wp.array[int],
     out_distance: wp.array[float],
     out_gradient: wp.array[wp.vec3],
 ) -> None:
-    """Closest point, signed distance there and its gradient; face -1 where nothing is close enough.
+    """Closest point, signed distance there and its gradient; face -1 where nothing is within `max_distance`.
 
     Where a face `near` is known (not -1), nothing farther away than that is looked at.
     """
     i = wp.tid()
     p = queries[i]
-    limit = float(max_distance)
+    limit = max_distance[0]
     if near.shape[0] > 0 and near[i] >= 0:
         # More by what rounding may come to, here and in the tree.
         rounding = 1.0e-5 * (1.0 + wp.length(p))

@@ -10,18 +10,16 @@ import warp as wp
 from numpy.typing import NDArray
 from torch import Tensor
 
-from refu_core._warp import as_warp, torch_stream
+from refu_core._warp import Repeated, as_warp, torch_stream
 from refu_core.errors import MeshError
 from refu_core.sdf._closest_kernels import closest_kernel
-from refu_core.sdf._mesh import Found, MeshSdf, Recorded
+from refu_core.sdf._mesh import FOUND, Found, MeshSdf, ask
 
 REBUILD_DISTANCE = 0.4
 """How far a vertex may move, on a CPU, before the BVH is built anew [m]. A refit costs 0.2 ms and keeps the tree. Once
 limbs that it grouped have parted, its boxes overlap, and queries take 1.5 to 2.5 times as long. Building takes about as
 long as the query of one garment; with this distance it happens every 10 to 30 frames of a motion."""
 
-_FEW = 2048
-"""More points than this are worth a launch of their own."""
 _UNLIMITED = 1e18  # [m]; its square is still a float32
 Sign = Literal["normal", "winding"]
 
@@ -74,8 +72,7 @@ class ExactSdf(MeshSdf):
         self._rebuild_distance = rebuild_distance
         self._built_at = torch.empty(0, 3)  # the pose the BVH was built for
         self._mesh: Any = None
-        self._none = wp.empty(0, dtype=wp.int32, device=str(self.device))
-        self._few: Recorded | None = None  # recorded for the tree as it is now
+        self._none = torch.empty(0, dtype=torch.int32, device=self.device)
 
     def _take_pose(self, *, is_new: bool) -> None:
         if is_new or self._has_drifted():
@@ -87,11 +84,13 @@ class ExactSdf(MeshSdf):
     def rebuild(self) -> None:
         """Builds the BVH anew for the present pose; answers don't depend on it. Raises `MeshError` before `update`."""
         self._built_at = self._require_update().clone()
-        self._few = self._skin = None
+        self._skin = None
         with torch_stream(self.device):
             self._mesh = wp.Mesh(
                 self._posed.points, as_warp(self.faces.view(-1), wp.int32), support_winding_number=self._by_winding
             )
+        kinds = (wp.vec3, wp.int32, wp.float32, *FOUND)
+        self._ask = Repeated(closest_kernel, kinds, [self._mesh.id, self._posed, self._by_winding])
 
     def _has_drifted(self) -> bool:
         # A GPU would have to be waited for to know, and hides a loose tree better.
@@ -122,28 +121,11 @@ class ExactSdf(MeshSdf):
             raise MeshError(msg)
         self._require_update()
         where = self._checked(points)
-        found = self._launch(where, min(max_distance, _UNLIMITED), near)
+        found = self._find(where, near, min(max_distance, _UNLIMITED))
         _, barycentrics, _ = self._features(where, found.face)
         sign = torch.where(found.distance < 0, -1.0, 1.0)
         return ClosestPoints(found.face, barycentrics, found.distance.abs(), sign)
 
-    def _find(self, points: Tensor, near: Tensor | None) -> Found:
-        if self.device.type == "cpu" and len(points) <= _FEW:
-            if self._few is None:
-                self._few = Recorded(closest_kernel, (self._mesh.id, self._posed), (_UNLIMITED, self._by_winding))
-            return self._few.ask(points, near)
-        return self._launch(points, _UNLIMITED, near)
-
-    def _launch(self, points: Tensor, max_distance: float, near: Tensor | None = None) -> Found:
-        found = Found.empty(len(points), self.device)
-        if len(points):
-            asked = as_warp(points, wp.vec3), self._none if near is None else as_warp(near, wp.int32)
-            with torch_stream(self.device):
-                wp.launch(
-                    closest_kernel,
-                    dim=len(points),
-                    inputs=[self._mesh.id, self._posed, *asked, max_distance, self._by_winding],
-                    outputs=found.as_warp(),
-                    device=str(self.device),
-                )
-        return found
+    def _find(self, points: Tensor, near: Tensor | None, max_distance: float = _UNLIMITED) -> Found:
+        farthest = torch.full((1,), max_distance, device=self.device)
+        return ask(self._ask, points, self._none if near is None else near, farthest)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
@@ -11,7 +10,7 @@ import warp as wp
 from numpy.typing import NDArray
 from torch import Tensor
 
-from refu_core._warp import as_warp, torch_stream
+from refu_core._warp import Repeated, as_warp
 from refu_core.errors import MeshError
 from refu_core.mesh import Connectivity
 from refu_core.sdf._analytic import Feature, signed_distance
@@ -33,67 +32,23 @@ class Found(NamedTuple):
     gradient: Tensor
     """Unit gradient, shape (N, 3)."""
 
-    @staticmethod
-    def empty(n: int, device: torch.device) -> Found:
-        """Room for n points."""
-        face = torch.empty(n, dtype=torch.int32, device=device)
-        return Found(face, torch.empty(n, device=device), torch.empty(n, 3, device=device))
-
     def sample(self) -> SdfSample:
-        """Distances, gradients and faces, copied."""
-        return SdfSample(self.distance.clone(), self.gradient.clone(), self.face.clone())
-
-    def as_warp(self) -> list[Any]:
-        """The fields as a kernel's outputs."""
-        kinds = (wp.int32, wp.float32, wp.vec3)
-        return [as_warp(tensor, kind) for tensor, kind in zip(self, kinds, strict=True)]
+        """The same as a sample."""
+        return SdfSample(self.distance, self.gradient, self.face)
 
 
-class Recorded:
-    """A launch on a CPU, recorded once, with memory of its own for questions and answers.
+FOUND = (wp.int32, wp.float32, wp.vec3)
+"""The fields' types, as `Repeated` takes them."""
 
-    Making a launch's arguments in Python takes three times as long as 50 points do, and new memory must be cleared by
-    the system first.
-    """
 
-    def __init__(self, kernel: Any, before: Sequence[Any], after: Sequence[Any]) -> None:
-        """The kernel's inputs `before` and `after` the points and their near faces; outputs are `Found`'s."""
-        self._kernel, self._before, self._after = kernel, before, after
-        self._room = self._dim = 0
-        self._make_room(256)
-
-    def ask(self, points: Tensor, near: Tensor | None = None, *, last: Any = None) -> Found:
-        """What the kernel says of checked points, shape (N, 3); the answers are overwritten by the next call's.
-
-        Faces that aren't given are -1. `last` takes the place of the kernel's last input, if it is given.
-        """
-        n = len(points)
-        if n > self._room:
-            self._make_room(max(n, 2 * self._room))
-        self._points[:n] = points
-        if near is None:
-            self._near[:n] = -1
-        else:
-            self._near[:n] = near
-        if n:
-            if last is not None:
-                self._command.set_param_at_index(len(self._before) + 1 + len(self._after), last)
-            if n != self._dim:
-                self._command.set_dim(n)
-                self._dim = n
-            self._command.launch()
-        return Found(*(field[:n] for field in self._found))
-
-    def _make_room(self, n: int) -> None:
-        self._room, self._dim = n, n
-        self._points = torch.zeros(n, 3)
-        self._near = torch.zeros(n, dtype=torch.int32)
-        self._found = Found.empty(n, self._points.device)
-        asked = as_warp(self._points, wp.vec3), as_warp(self._near, wp.int32)
-        inputs = [*self._before, *asked, *self._after]
-        self._command = wp.launch(
-            self._kernel, dim=n, inputs=inputs, outputs=self._found.as_warp(), device="cpu", record_cmd=True
-        )
+def ask(kernel: Repeated, points: Tensor, *more: Tensor) -> Found:
+    """What a kernel says of points (N, 3) [m]; it takes them, `more`, and the fields of `Found` to be filled."""
+    n, device = len(points), points.device
+    face = torch.empty(n, dtype=torch.int32, device=device)
+    found = Found(face, torch.empty(n, device=device), torch.empty(n, 3, device=device))
+    if n:
+        kernel((n,), points, *more, *found)
+    return found
 
 
 class MeshSdf(ABC):
@@ -132,6 +87,8 @@ class MeshSdf(ABC):
             require_outward(vertices.detach().to(self.device).double()[None], self.faces)
             self._points = torch.empty(len(vertices), 3, device=self.device)
             self._posed.points = as_warp(self._points, wp.vec3)
+            kinds = (wp.vec3, wp.int32, wp.int32, wp.vec3, wp.vec3)
+            self._find_features = Repeated(feature_kernel, kinds, [self._posed])
             self._skin = None
         self._vertices = vertices
         self._points.copy_(vertices.detach())
@@ -147,15 +104,15 @@ class MeshSdf(ABC):
         """
         self._require_update()
         where = self._checked(points)
-        found = self._find(where, self._checked_faces(near, len(where)))
+        found = self._find(where, None if near is None else self._checked_faces(near, len(where)))
         assert self._vertices is not None  # _require_update has seen to it
         tracked = torch.is_grad_enabled() and (points.requires_grad or self._vertices.requires_grad)
         if not tracked and points.dtype == torch.float32:
             return found.sample()
         corners = self._vertices.to(points)[self.faces.long()[found.face.long()]]
-        kind, barycentrics, normal = self._features(where, found.face)
-        feature = Feature(kind, normal.to(points), found.distance.sign().to(points), barycentrics.to(points))
-        return signed_distance(points, corners, feature)._replace(face=found.face.clone())
+        kind, _, normal = self._features(where, found.face)
+        feature = Feature(kind, normal.to(points), found.distance.sign().to(points))
+        return signed_distance(points, corners, feature)._replace(face=found.face)
 
     def of_garment(self, garment: GarmentTemplate) -> GarmentSdf:  # noqa: ARG002
         """As `BodySdf.of_garment`."""
@@ -166,14 +123,7 @@ class MeshSdf(ABC):
         kind = torch.empty_like(face)
         barycentrics, normal = torch.empty(2, len(face), 3, device=self.device)
         if len(face):
-            with torch_stream(self.device):
-                wp.launch(
-                    feature_kernel,
-                    dim=len(face),
-                    inputs=[self._posed, as_warp(points, wp.vec3), as_warp(face, wp.int32)],
-                    outputs=[as_warp(kind, wp.int32), as_warp(barycentrics, wp.vec3), as_warp(normal, wp.vec3)],
-                    device=str(self.device),
-                )
+            self._find_features((len(face),), points, face, kind, barycentrics, normal)
         return kind, barycentrics, normal
 
     def skin(self) -> Any:
@@ -197,18 +147,13 @@ class MeshSdf(ABC):
 
     @abstractmethod
     def _find(self, points: Tensor, near: Tensor | None) -> Found:
-        """The closest face to each of the checked `points`, shape (N, 3), whose `near` faces may be known, (N,).
-
-        The answers may lie in memory that the next call overwrites.
-        """
+        """The closest face to each of the checked `points`, shape (N, 3), whose `near` faces may be known, (N,)."""
 
     def _checked(self, points: Tensor) -> Tensor:
         require_points(points)
         return points.detach().to(device=self.device, dtype=torch.float32).contiguous()
 
-    def _checked_faces(self, near: Tensor | None, n: int) -> Tensor | None:
-        if near is None:
-            return None
+    def _checked_faces(self, near: Tensor, n: int) -> Tensor:
         if not isinstance(near, Tensor) or near.shape != (n,) or near.is_floating_point():
             got = f"{near.dtype} of shape {tuple(near.shape)}" if isinstance(near, Tensor) else type(near).__name__
             msg = f"near must be integers of the shape ({n},), got {got}"

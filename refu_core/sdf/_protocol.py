@@ -87,15 +87,9 @@ def query_batch(
 ) -> SdfSample:
     """`sdf` of a batch of bodies, each at points of its own; fields lead with (B, N).
 
-    Bodies are asked one after the other: derivatives of all are kept, and `sdf` ends at the last one.
-
-    Args:
-        sdf: Any signed distance.
-        vertices: Bodies [m], shape (B, V, 3).
-        points: Shape (B, N, 3) [m].
-        near: Near faces, shape (N,) for all bodies or (B, N).
-        pose: What the bodies were posed by [rad], shape (B, 24, 3).
-        betas: Their shapes, shape (B, 10).
+    Bodies are asked one after the other: derivatives of all are kept, and `sdf` ends at the last one. Of `vertices`
+    (B, V, 3) [m] at `points` (B, N, 3) [m], with `near` faces (N,) for all or (B, N); `pose` (B, 24, 3) [rad] and
+    `betas` (B, 10) are what they were posed by.
     """
     samples = []
     for i, (body, here) in enumerate(zip(vertices, points, strict=True)):

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from refu_core.sdf._box_kernels import Boxes, closest_in_boxes, guess, is_beyond
+from refu_core.sdf._box_kernels import Boxes, closest_in_boxes, guess
 from refu_core.sdf._closest_kernels import PosedMesh, distance_to_face, measured_to
 from refu_core.sdf._walk_kernels import Guides, first_at, walk_from
 
@@ -44,10 +44,6 @@ def query_skin(skin: Skin, p: wp.vec3, near: int) -> tuple[float, wp.vec3, int]:
         face, feature, _w, _above = walk_from(p, near, skin.mesh, skin.guides)
         face = first_at(face, feature, skin.mesh)
     distance, gradient = measured_to(p, face, skin.mesh)
-    if distance < 0.0 and skin.boxes.order.shape[0] > 0 and is_beyond(p, skin.boxes):
-        # A thousand kilometres off all faces are equally far, and rounding may have taken one of the other side.
-        distance = -distance
-        gradient = -gradient
     return distance, gradient, face
 
 
@@ -56,16 +52,16 @@ def query_skin_kernel(
     skin: Skin,
     queries: wp.array[wp.vec3],
     near: wp.array[int],
-    rows: wp.array[int],
+    is_asked: wp.array[wp.bool],
     # outputs
     out_face: wp.array[int],
     out_distance: wp.array[float],
     out_gradient: wp.array[wp.vec3],
 ) -> None:
-    """`query_skin` at the queries numbered `rows`, or at all where there are no rows; `near` has a face of each."""
+    """`query_skin` at the queries that are asked, or at all where `is_asked` is empty; `near` has a face of each."""
     i = wp.tid()
-    if rows.shape[0] > 0:
-        i = rows[i]
+    if is_asked.shape[0] > 0 and not is_asked[i]:
+        return
     distance, gradient, face = query_skin(skin, queries[i], near[i])
     out_face[i] = face
     out_distance[i] = distance

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, distance_transform_edt
 from torch import Tensor
 
-from refu_core._warp import as_warp, torch_stream
+from refu_core._warp import Repeated
 from refu_core.sdf._exact import ExactSdf
 from refu_core.sdf._walk_kernels import grid_lookup_kernel
 
@@ -41,13 +41,12 @@ class RestFaces:
 
     def __init__(self, body: SmplBody) -> None:
         """Around the mean shape of `body`, on its device."""
-        self._device = torch.device(body.device)
         rest, faces = body.v_template.float().cpu().numpy(), body.faces.cpu().numpy().astype(np.int32)
-        low, shape, rows = _grid_of(rest.tobytes(), faces.tobytes(), str(self._device))
-        self._low, self._shape = wp.vec3(*low), wp.vec3i(*shape)
-        self._grid = wp.array(rows, dtype=wp.int32, device=str(self._device))
-        self._dim = 0
-        self._make_room(1024)
+        low, shape, rows = _grid_of(rest.tobytes(), faces.tobytes(), str(body.device))
+        self._device = torch.device(body.device)
+        grid = wp.array(rows, dtype=wp.int32, device=str(self._device))
+        fixed = [wp.vec3(*low), _CELL, wp.vec3i(*shape), grid]
+        self._look_up = Repeated(grid_lookup_kernel, (wp.vec3, wp.int32), fixed)
 
     def under(self, unposed: Tensor, betas: Tensor, shapedirs: Tensor) -> Tensor:
         """Near body faces, int32 of shape (B, V), of unposed garments [m], shape (B, V, 3), on shapes (B, 10).
@@ -58,33 +57,11 @@ class RestFaces:
 
     def __call__(self, unposed: Tensor) -> Tensor:
         """Near body faces, int32 of shape (...,), of places on the mean shape in the rest pose [m], shape (..., 3)."""
-        places = unposed.detach().to(device=self._device, dtype=torch.float32).reshape(-1, 3)
-        n = len(places)
-        # On a GPU always anew: a CUDA graph may go on using the last room.
-        if n > len(self._places) or self._device.type != "cpu":
-            self._make_room(n)
-        self._places[:n] = places
-        if n:
-            if n != self._dim:
-                self._look_up.set_dim(n)
-                self._dim = n
-            with torch_stream(self._device):
-                self._look_up.launch()
-        return self._near[:n].clone().view(unposed.shape[:-1])
-
-    def _make_room(self, n: int) -> None:
-        """For n places. The launch is recorded: making it in Python takes longer than the look-ups."""
-        self._dim = n
-        self._places = torch.empty(n, 3, device=self._device)
-        self._near = torch.empty(n, dtype=torch.int32, device=self._device)
-        self._look_up = wp.launch(
-            grid_lookup_kernel,
-            dim=n,
-            inputs=[as_warp(self._places, wp.vec3), self._low, _CELL, self._shape, self._grid],
-            outputs=[as_warp(self._near, wp.int32)],
-            device=str(self._device),
-            record_cmd=True,
-        )
+        places = unposed.detach().to(device=self._device, dtype=torch.float32).reshape(-1, 3).contiguous()
+        near = torch.empty(len(places), dtype=torch.int32, device=self._device)
+        if len(places):
+            self._look_up((len(places),), places, near)
+        return near.view(unposed.shape[:-1])
 
 
 @lru_cache(maxsize=3)

@@ -76,11 +76,11 @@ def row_of(x: int, y: int, z: int) -> int:
 
 @wp.kernel(enable_backward=False)
 def grid_lookup_kernel(
-    places: wp.array[wp.vec3],
     low: wp.vec3,
     cell: float,
     shape: wp.vec3i,
     grid: wp.array2d[int],
+    places: wp.array[wp.vec3],
     # outputs
     near: wp.array[int],
 ) -> None:
@@ -100,9 +100,9 @@ def grid_lookup_kernel(
 @wp.kernel(enable_backward=False)
 def enter_guides_kernel(
     points: wp.array[wp.vec3],
-    guides: wp.array[wp.vec4i],
     cell: float,
     depth: float,
+    guides: wp.array[wp.vec4i],
     # outputs
     table: wp.array2d[int],
 ) -> None:

@@ -8,7 +8,7 @@ line slips between two faces, or crosses both.
 
 import warp as wp
 
-from refu_core.sdf._band_kernels import greater, lesser
+from refu_core.body._bundle_kernels import greater, lesser
 
 # Contracted multiply-adds would round a x b and b x a differently.
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -70,16 +70,16 @@ def per_metre_of(grid: wp.array[wp.vec3]) -> wp.vec3:
 
 @wp.kernel
 def extent_kernel(
-    each: int,
+    each: wp.array[int],
     points: wp.array[wp.vec3],
     # output, and infinite before
     grid: wp.array[wp.vec3],
 ) -> None:
     """The corners of the box around the points; `each` points a thread."""
-    begin = wp.tid() * each
+    begin = wp.tid() * each[0]
     low = points[begin]
     high = low
-    for q in range(begin + 1, begin + each):
+    for q in range(begin + 1, begin + each[0]):
         low = lesser(low, points[q])
         high = greater(high, points[q])
     wp.atomic_min(grid, 0, low)

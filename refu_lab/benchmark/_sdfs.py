@@ -17,7 +17,7 @@ from torch import Tensor
 
 from refu_core.body import SmplBody
 from refu_core.garments import GarmentTemplate
-from refu_core.sdf import ApproxSdf, BandSdf, BodySdf, ExactSdf, Links, NeuralSdf, RestFaces, SdfNetwork
+from refu_core.sdf import ApproxSdf, BandSdf, BodySdf, ExactSdf, NeuralSdf, RestFaces, SdfNetwork
 
 Array = NDArray[np.float32]
 PLAIN_QUERY = "warp refit + query"
@@ -116,11 +116,11 @@ def _plain(faces: NDArray[np.int32], rest: Array, device: str) -> Callable[[SdfF
 
 
 def _band(body: SmplBody, garment: GarmentTemplate) -> Callable[[SdfFrame], Array]:
-    sdf, links = BandSdf(body.faces), Links(garment.mesh.ring)
+    sdf = BandSdf(body.faces)
 
     def ask(frame: SdfFrame) -> Array:
         sdf.update(torch.from_numpy(frame.body))
-        answer: Array = sdf.clipped(torch.from_numpy(frame.garment), links).distance.numpy()
+        answer: Array = sdf.clipped(torch.from_numpy(frame.garment), garment.mesh.ring).distance.numpy()
         return answer
 
     return ask

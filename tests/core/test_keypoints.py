@@ -19,7 +19,6 @@ from scipy.spatial.transform import Rotation
 from msg_adapters import iter_smpl_frames, read_motion
 from refu_core import FrameError, SmplFrame, load_body
 from refu_core.keypoints import LAYOUTS, KeypointTracker, People, Proportions, Skeleton, keypoint_layout
-from refu_core.keypoints._normal import NormalEquations
 from refu_core.keypoints._pose import Pose, exp_so3, log_so3
 from refu_core.skeleton import JOINT_NAMES
 
@@ -113,40 +112,15 @@ def test_joints_are_the_bodys(layout: str) -> None:
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from(["zed38", "coco17"]), st.booleans())
 @settings(max_examples=10)
-def test_normal_equations_are_those_of_small_steps(seed: int, layout: str, fits_betas: bool) -> None:
-    """Without a Jacobian; its columns are what keypoints do when one thing is moved a little."""
+def test_the_jacobian_is_that_of_small_steps(seed: int, layout: str, fits_betas: bool) -> None:
     rng = np.random.default_rng(seed)
     bones = skeleton(layout)
-    equations = NormalEquations(bones, fits_betas=fits_betas)
     pose = Pose(rng.normal(size=3), exp_so3(rng.normal(size=(24, 3))), rng.normal(size=10))
-    posed, n, m = bones.posed(pose), len(bones.layout), len(bones.turning)
-    weights, off = rng.random(n), rng.normal(size=(n, 3))
-    numbers = [0, 1, 2, *(3 + 3 * bones.turning[:, None] + np.arange(3)).ravel(), *range(75, 85)][: equations.size]
-    steps = np.zeros((equations.size, 85))
-    steps[np.arange(equations.size), numbers] = 1.0
-    axes = posed.turns[bones.turning]
-    turned = steps.copy()  # about the world's axes, as the equations have it
-    turned[:, 3:75].reshape(-1, 24, 3)[:, bones.turning] = np.einsum(
-        "nmi,mij->nmj", steps[:, 3:75].reshape(-1, 24, 3)[:, bones.turning], axes
-    )
-    moved = [(bones.posed(pose.moved(s)).points - bones.posed(pose.moved(-s)).points) / 2e-5 for s in 1e-5 * turned]
-    jacobian = np.array(moved)
-    wanted = np.einsum("aki,k,bki->ab", jacobian, weights, jacobian)
-    diagonal, held = rng.random(equations.size), rng.normal(size=(m, 3, 3))
-    for i in range(m):
-        wanted[3 + 3 * i : 6 + 3 * i, 3 + 3 * i : 6 + 3 * i] += held[i]
-    matrix = equations.matrix(posed, weights, diagonal, held)
-    np.testing.assert_allclose(np.tril(matrix), np.tril(wanted + np.diag(diagonal)), atol=1e-7)
-    right = np.einsum("aki,k,ki->a", jacobian, weights, off)
-    np.testing.assert_allclose(equations.right(posed, weights, off), right, atol=1e-7)
-    step = rng.normal(size=equations.size)
-    by_step = posed.points + np.einsum("aki,a->ki", jacobian, step)
-    np.testing.assert_allclose(equations.moved(posed, step), by_step, atol=1e-7)
-    pelvis, turns, betas = rng.random(3), rng.random((m, 3)), rng.random(10)
-    own = np.array([(bones.posed(pose.moved(s)).points - posed.points) / 1e-6 for s in 1e-6 * steps])
-    variance = np.concatenate([pelvis, turns.ravel(), betas])[: equations.size]
-    doubt = np.einsum("aki,a->k", np.square(own), variance) / 3
-    np.testing.assert_allclose(equations.doubt(posed, pelvis, turns, betas), doubt, atol=1e-4)
+    numbers = [0, 1, 2, *(3 + 3 * bones.turning[:, None] + np.arange(3)).ravel(), *range(75, 85)]
+    steps = 1e-5 * np.eye(85)[numbers if fits_betas else numbers[:-10]]
+    moved = [(bones.posed(pose.moved(s)).points - bones.posed(pose.moved(-s)).points) / 2e-5 for s in steps]
+    jacobian = bones.jacobian(bones.posed(pose), of_betas=fits_betas)
+    np.testing.assert_allclose(jacobian, np.reshape(moved, (len(steps), -1)).T, atol=1e-7)
 
 
 @given(hnp.arrays(np.float64, (4, 3), elements=st.floats(-1.8, 1.8)))
@@ -280,6 +254,13 @@ def test_people_come_and_go() -> None:
     )  # another person under the same name
     assert jumped is not None
     assert np.linalg.norm(jumped.transl - known[20].transl - [5, 0, 3]) < 0.1
+
+
+def test_a_person_whose_keypoints_are_refused_is_nobody() -> None:
+    people = People(skeleton("coco17"))
+    with pytest.raises(FrameError):
+        people.update("a", np.zeros((5, 3)), confidence=None, stamp_ns=1, now_ns=1)
+    assert people.at(2) == {}
 
 
 def test_clocks() -> None:

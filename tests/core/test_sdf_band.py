@@ -19,7 +19,7 @@ from refu_core.garments import PAPER_GARMENTS, load_garment
 from refu_core.mesh import Adjacency, Connectivity, grouped
 from refu_core.metrics._self_contact import SelfContactDetector
 from refu_core.sdf import ExactSdf
-from refu_core.sdf._band import BAND, BandSdf, Links
+from refu_core.sdf._band import BAND, BandSdf
 from refu_core.simulation import load_clips
 
 BALL = trimesh.creation.icosphere(subdivisions=3, radius=0.3)
@@ -33,11 +33,11 @@ def posed_ball() -> tuple[BandSdf, ExactSdf]:
     return band, exact
 
 
-def links_of(mesh: trimesh.Trimesh) -> Links:
-    return Links(Connectivity.of(mesh.faces, len(mesh.vertices)).ring)
+def ring_of(mesh: trimesh.Trimesh) -> Adjacency:
+    return Connectivity.of(mesh.faces, len(mesh.vertices)).ring
 
 
-SHELL_LINKS = links_of(SHELL)
+SHELL_RING = ring_of(SHELL)
 
 
 def shell(radius: float, centre: tuple[float, float, float] = (0, 0, 0)) -> Tensor:
@@ -62,7 +62,7 @@ def test_clipped_is_exact_and_sees_all_that_is_inside(name: str, motions: list[P
     garment = load_garment(name)
     body = load_body(garment.body)
     band, exact = BandSdf(body.faces), ExactSdf(body.faces)
-    links = Links(garment.mesh.ring)
+    ring = garment.mesh.ring
     detector = SelfContactDetector(body.faces, body.v_template)
     generator = torch.Generator().manual_seed(1)
     clips = [clip for path in motions for clip in load_clips(path)]
@@ -75,7 +75,7 @@ def test_clipped_is_exact_and_sees_all_that_is_inside(name: str, motions: list[P
         points = garment.pose(garment.rest(betas) + noise, posed.transforms)[0]
         for sdf in (band, exact):
             sdf.update(posed.vertices[0])
-        got, wanted = band.clipped(points, links), exact.query(points)
+        got, wanted = band.clipped(points, ring), exact.query(points)
         known = got.distance < BAND
         assert (got.distance[known] - wanted.distance[known]).abs().max() < 1e-6
         assert (got.gradient - wanted.gradient)[known].norm(dim=1).quantile(0.99) < 1e-3
@@ -104,7 +104,7 @@ def test_clipped_is_exact_and_sees_all_that_is_inside(name: str, motions: list[P
 def test_shells(radius: float, centre: tuple[float, float, float], inside: float) -> None:
     band, exact = posed_ball()
     points = shell(radius, centre)
-    got, wanted = band.clipped(points, SHELL_LINKS).distance, exact.query(points).distance
+    got, wanted = band.clipped(points, SHELL_RING).distance, exact.query(points).distance
     torch.testing.assert_close(got, wanted.clamp(max=BAND), atol=1e-6, rtol=0)
     assert (got < 0).float().mean() == pytest.approx(inside, abs=0.1)
 
@@ -121,7 +121,7 @@ def test_any_shell_with_any_band(radius: float, x: float, y: float, width: float
     for sdf in (band, exact):
         sdf.update(torch.tensor(BALL.vertices, dtype=torch.float32))
     points = shell(radius, (x, y, 0.1))
-    got, wanted = band.clipped(points, SHELL_LINKS), exact.query(points)
+    got, wanted = band.clipped(points, SHELL_RING), exact.query(points)
     torch.testing.assert_close(got.distance, wanted.distance.clamp(max=width), atol=1e-6, rtol=0)
     assert (got.face[wanted.distance < width] >= 0).all()
 
@@ -130,8 +130,8 @@ def test_loose_pieces_are_judged_by_themselves() -> None:
     """A button in the body and one outside of it, beside a shell: no edge says anything of either."""
     band, exact = posed_ball()
     points = torch.cat((shell(0.302), torch.tensor([[0.0, 0, 0], [0.0, 0.9, 0]])))
-    links = Links(Connectivity.of(SHELL.faces, len(points)).ring)
-    got = band.clipped(points, links).distance
+    ring = Connectivity.of(SHELL.faces, len(points)).ring
+    got = band.clipped(points, ring).distance
     torch.testing.assert_close(got, exact.query(points).distance.clamp(max=BAND), atol=1e-6, rtol=0)
 
 
@@ -156,18 +156,16 @@ def test_what_a_limb_shuts_in_beside_the_skin_of_another_is_asked(reach: float) 
     wanted = exact.query(where).distance
     assert ((wanted > 0) & (wanted < BAND)).any()
     assert (wanted < -BAND).any()
-    got = band.clipped(where, Links(Connectivity.of(sheet.faces, len(points)).ring)).distance
+    got = band.clipped(where, Connectivity.of(sheet.faces, len(points)).ring).distance
     torch.testing.assert_close(got, wanted.clamp(max=BAND), atol=1e-6, rtol=0)
 
 
 @settings(max_examples=40)
-@given(seed=st.integers(0, 2**31), n=st.integers(1, 700), spread=st.sampled_from([0.2, 0.5, 5.0, 1e4, 1e7]))
+@given(seed=st.integers(0, 2**31), n=st.integers(1, 700), spread=st.sampled_from([0.2, 0.5, 5.0, 1e4]))
 def test_query_is_the_exact_one(seed: int, n: int, spread: float) -> None:
     band, exact = posed_ball()
     points = torch.randn(n, 3, generator=torch.Generator().manual_seed(seed)) * spread
     got, wanted = band.query(points).distance, exact.query(points).distance
-    if spread > 1e6:  # there rounding chooses among all faces, and the far ones say "inside"
-        wanted = wanted.abs()
     torch.testing.assert_close(got, wanted, atol=1e-6, rtol=1e-6)
 
 
@@ -207,7 +205,7 @@ def test_nothing_is_carried_over() -> None:
         fresh = BandSdf(BALL.faces)
         for sdf in (worn, fresh):
             sdf.update(body)
-        got, wanted = (sdf.clipped(points, links_of(mesh)) for sdf in (worn, fresh))
+        got, wanted = (sdf.clipped(points, ring_of(mesh)) for sdf in (worn, fresh))
         torch.testing.assert_close(got.distance, wanted.distance, atol=1e-7, rtol=0)
         torch.testing.assert_close(got.gradient, wanted.gradient, atol=1e-4, rtol=0)
 
@@ -270,19 +268,19 @@ def test_a_face_without_area_hides_none() -> None:
 
 def test_no_points() -> None:
     band, _ = posed_ball()
-    links = Links(Adjacency(np.zeros(1, np.int32), np.zeros(0, np.int32)))
-    assert band.clipped(torch.zeros(0, 3), links).distance.shape == (0,)
+    ring = Adjacency(np.zeros(1, np.int32), np.zeros(0, np.int32))
+    assert band.clipped(torch.zeros(0, 3), ring).distance.shape == (0,)
 
 
 def test_bad_input() -> None:
     for width in (0.0, -1.0, math.inf, math.nan):
         with pytest.raises(MeshError, match="band must be positive"):
             BandSdf(BALL.faces, band=width)
-    links = SHELL_LINKS
+    ring = SHELL_RING
     with pytest.raises(MeshError, match="no body yet"):
-        BandSdf(BALL.faces).clipped(shell(1.0), links)
+        BandSdf(BALL.faces).clipped(shell(1.0), ring)
     band, _ = posed_ball()
-    with pytest.raises(MeshError, match="links are of 10242 vertices, got 5"):
-        band.clipped(torch.zeros(5, 3), links)
+    with pytest.raises(MeshError, match="ring is of 10242 vertices, got 5"):
+        band.clipped(torch.zeros(5, 3), ring)
     with pytest.raises(MeshError, match="finite"):
-        band.clipped(torch.full((10242, 3), math.nan), links)
+        band.clipped(torch.full((10242, 3), math.nan), ring)
