@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
@@ -56,6 +57,18 @@ def as_warp(tensor: Tensor, dtype: Any) -> Any:
 def argument(tensor: Tensor, dtype: Any) -> Any:
     """`as_warp` for one launch, in half the time: the tensor must outlive the launch."""
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
+
+
+def ints(values: Any, device: Any) -> Any:
+    """Whole numbers as a Warp array."""
+    return wp.array(np.ascontiguousarray(values, np.int32), dtype=wp.int32, device=str(device))
+
+
+def recorded(kernel: Any, dim: int, inputs: Sequence[Any], device: Any) -> Any:
+    """A launch to be made again and again, on what its arrays hold by then."""
+    command = wp.launch(kernel, dim, inputs, device=str(device), record_cmd=True)
+    command.kept = inputs  # it knows addresses
+    return command
 
 
 class Repeated(threading.local):

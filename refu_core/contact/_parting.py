@@ -8,9 +8,9 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import as_warp, torch_stream
+from refu_core._warp import as_warp, ints, recorded, torch_stream
 from refu_core.contact import _parting_kernels as kernels
-from refu_core.contact._level_kernels import level_kernel
+from refu_core.contact._level_kernels import level_kernel, widen_kernel
 from refu_core.contact._settings import ContactSettings
 from refu_core.contact._sheet import Sheet, cut_of
 from refu_core.mesh import Connectivity, grouped
@@ -36,44 +36,29 @@ class Parting:
         self._settings, self._device, self._sheet = settings, rest.device, sheet
         self._is_serial = rest.device.type == "cpu"
         n, n_faces = len(rest), len(cut.faces)
-        self._points = torch.zeros(n, 3, device=rest.device)
-        self._other = torch.zeros_like(self._points)
-        self._marked, self._wider, self._pulled = torch.zeros(3, n, dtype=torch.int32, device=rest.device)
-        self._weight = torch.zeros(n, device=rest.device)
+        self._points, self._other = torch.zeros(2, n, 3, device=rest.device)
+        self._marked, self._wider = torch.zeros(2, n, device=rest.device)
         self.n_cut = torch.zeros(1, dtype=torch.int32, device=rest.device)
         """How many pairs of its faces and the sheet's were found to cut each other, shape (1,)."""
-        self._n_left = torch.zeros_like(self.n_cut)
         self._ways = torch.zeros(2, n_faces, 3, device=rest.device)
-        order = grouped(rest.cpu().numpy()[cut.faces.numpy()].mean(axis=1))
-        in_groups = wp.array(order, dtype=wp.int32, device=str(rest.device))
-        points, other, way, place = (as_warp(rows, wp.vec3) for rows in (self._points, self._other, *self._ways))
-        marked, wider, pulled, count, left = (
-            as_warp(rows, wp.int32) for rows in (self._marked, self._wider, self._pulled, self.n_cut, self._n_left)
-        )
-        weight = as_warp(self._weight, wp.float32)
-        own = [points, cut.faces]
+        data = kernels.Outer()
+        data.points, data.way, data.place = (as_warp(rows, wp.vec3) for rows in (self._points, *self._ways))
+        data.order = ints(grouped(rest.cpu().numpy()[mesh.faces].mean(axis=1)), rest.device)
+        data.cut, data.count = cut, as_warp(self.n_cut, wp.int32)
+        data.marked, wider = (as_warp(one, wp.float32) for one in (self._marked, self._wider))
+        data.pulled = wp.zeros(n, dtype=wp.int32, device=str(rest.device))
+        other, alike = as_warp(self._other, wp.vec3), wp.ones(n, dtype=wp.float32, device=str(rest.device))
         bounds = [settings.tolerance, settings.layer_gap]
-        self._commands: dict[str, Any] = {}
-        for name, kernel, size, arguments in (
-            (
-                "find",
-                kernels.find_kernel,
-                -(-n_faces // int(BLOCK)),
-                [sheet.tree, sheet.extent, *own, in_groups, marked, count],
-            ),
-            ("widen0", kernels.widen_kernel, n, [marked, cut, wider]),
-            ("widen1", kernels.widen_kernel, n, [wider, cut, marked]),
-            ("level0", level_kernel, n, [points, weight, cut.ring_start, cut.ring, other]),
-            ("level1", level_kernel, n, [other, weight, cut.ring_start, cut.ring, points]),
-            (
-                "measure",
-                kernels.measure_kernel,
-                n_faces,
-                [sheet.tree, sheet.normals, sheet.cut.faces, *own, marked, *bounds, left, way, place, pulled],
-            ),
-            ("part", kernels.part_kernel, n, [way, place, cut, points, pulled, marked]),
-        ):
-            self._commands[name] = wp.launch(kernel, size, arguments, device=str(rest.device), record_cmd=True)
+        launches: dict[str, tuple[Any, int, list[Any]]] = {
+            "find": (kernels.find_kernel, -(-n_faces // int(BLOCK)), [sheet.data, data]),
+            "widen0": (widen_kernel, n, [data.marked, alike, cut, 1.0, wider]),
+            "widen1": (widen_kernel, n, [wider, alike, cut, 1.0, data.marked]),
+            "level0": (level_kernel, n, [data.points, data.marked, cut, other]),
+            "level1": (level_kernel, n, [other, data.marked, cut, data.points]),
+            "measure": (kernels.measure_kernel, n_faces, [sheet.data, data, *bounds]),
+            "part": (kernels.part_kernel, n, [data]),
+        }
+        self._commands = {name: recorded(*launch, rest.device) for name, launch in launches.items()}
 
     def find(self, above: Tensor) -> None:
         """Finds the faces of the outer garment, vertices (V, 3) [m], that cut the sheet."""
@@ -90,7 +75,6 @@ class Parting:
             self._points.copy_(above)
             for k in range(self._settings.near):
                 self._commands[f"widen{k % 2}"].launch()
-            self._weight.copy_(self._marked)
             for k in range(self._settings.parting_rounds):
                 self._commands[f"level{k % 2}"].launch()
         return self._points.clone()
@@ -104,9 +88,9 @@ class Parting:
             self._points.copy_(above)
             self._ways[1].zero_()
             for _ in range(self._settings.parting_sweeps):
-                self._n_left.zero_()
+                self.n_cut.zero_()
                 self._commands["measure"].launch()
-                if self._is_serial and not int(self._n_left):
+                if self._is_serial and not int(self.n_cut):
                     break
                 self._commands["part"].launch()
         return self._points.clone()

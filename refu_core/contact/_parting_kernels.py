@@ -2,72 +2,89 @@
 
 import warp as wp
 
-from refu_core.contact._layers_kernels import Cut
+from refu_core.contact._layers_kernels import Below, Cut
 from refu_core.sdf._crossing_kernels import BLOCK, Corners, double, meeting_edges
 
 wp.set_module_options({"fuse_fp": False, "enable_backward": False})
 
 
-@wp.func
-def corner(face: int, k: int, points: wp.array[wp.vec3], faces: wp.array2d[int]) -> wp.vec3:
-    return points[faces[face, k]]
+@wp.struct
+class Outer:
+    """The garment above a sheet, and memory to part it in."""
+
+    points: wp.array[wp.vec3]
+    """Its vertices [m]."""
+    cut: Cut
+    order: wp.array[int]
+    """Its faces, `BLOCK` after `BLOCK` near together."""
+    marked: wp.array[float]
+    """1 for corners of faces that cut the sheet, then for whoever was moved last."""
+    pulled: wp.array[int]
+    """Whether a vertex is a corner of a face that cuts the sheet still."""
+    way: wp.array[wp.vec3]
+    place: wp.array[wp.vec3]
+    """How far each face has to go [m], and which place of it, in barycentrics."""
+    count: wp.array[int]
+    """Pairs of faces, or faces, that cut each other."""
 
 
 @wp.func
-def cut_each_other(
-    face: int, points: wp.array[wp.vec3], faces: wp.array2d[int], a: wp.vec3, b: wp.vec3, c: wp.vec3
-) -> bool:
+def corner(face: int, k: int, outer: Outer) -> wp.vec3:
+    return outer.points[outer.cut.faces[face, k]]
+
+
+@wp.func
+def cut_each_other(face: int, outer: Outer, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> bool:
     """Whether a face cuts triangle abc of another mesh."""
-    i = faces[face, 0]
-    j = faces[face, 1]
-    k = faces[face, 2]
+    i = outer.cut.faces[face, 0]
+    j = outer.cut.faces[face, 1]
+    k = outer.cut.faces[face, 2]
     own = wp.vec3i(i, j, k)
     # The other's edges are looked at from one face alone: any order of their ends will do.
     edges = meeting_edges(
-        own, double(points[i]), double(points[j]), double(points[k]), own, double(a), double(b), double(c), False
+        own,
+        double(outer.points[i]),
+        double(outer.points[j]),
+        double(outer.points[k]),
+        own,
+        double(a),
+        double(b),
+        double(c),
+        False,
     )
     return edges > 0
 
 
 @wp.kernel
-def find_kernel(
-    tree: wp.uint64,
-    extent: wp.array[wp.vec3],
-    points: wp.array[wp.vec3],
-    faces: wp.array2d[int],
-    order: wp.array[int],
-    # outputs
-    marked: wp.array[int],
-    count: wp.array[int],
-) -> None:
-    """Marks the corners of faces that cut the mesh of `tree`, and counts the pairs."""
+def find_kernel(below: Below, outer: Outer) -> None:
+    """Marks the corners of faces that cut the sheet, and counts the pairs."""
     first = BLOCK * wp.tid()
-    end = wp.min(first + BLOCK, order.shape[0])
+    end = wp.min(first + BLOCK, outer.order.shape[0])
     lower = wp.vec3(wp.inf)
     upper = wp.vec3(-wp.inf)
     lows = Corners()
     highs = Corners()
     for n in range(first, end):
-        face = order[n]
-        a = corner(face, 0, points, faces)
-        b = corner(face, 1, points, faces)
-        c = corner(face, 2, points, faces)
+        face = outer.order[n]
+        a = corner(face, 0, outer)
+        b = corner(face, 1, outer)
+        c = corner(face, 2, outer)
         low = wp.min(wp.min(a, b), c)
         high = wp.max(wp.max(a, b), c)
         lows[n - first] = low
         highs[n - first] = high
         lower = wp.min(lower, low)
         upper = wp.max(upper, high)
-    lower = wp.max(lower, extent[0])
-    upper = wp.min(upper, extent[1])
+    lower = wp.max(lower, below.extent[0])
+    upper = wp.min(upper, below.extent[1])
     if lower[0] > upper[0] or lower[1] > upper[1] or lower[2] > upper[2]:
         return
-    query = wp.mesh_query_aabb(tree, lower, upper)
+    query = wp.mesh_query_aabb(below.tree, lower, upper)
     other = int(0)
     while wp.mesh_query_aabb_next(query, other):
-        p = wp.mesh_get_point(tree, 3 * other)
-        q = wp.mesh_get_point(tree, 3 * other + 1)
-        r = wp.mesh_get_point(tree, 3 * other + 2)
+        p = wp.mesh_get_point(below.tree, 3 * other)
+        q = wp.mesh_get_point(below.tree, 3 * other + 1)
+        r = wp.mesh_get_point(below.tree, 3 * other + 2)
         low = wp.min(wp.min(p, q), r)
         high = wp.max(wp.max(p, q), r)
         for n in range(first, end):
@@ -76,20 +93,11 @@ def find_kernel(
                 continue
             if highs[i, 0] < low[0] or highs[i, 1] < low[1] or highs[i, 2] < low[2]:
                 continue
-            if cut_each_other(order[n], points, faces, p, q, r):
-                wp.atomic_add(count, 0, 1)
+            face = outer.order[n]
+            if cut_each_other(face, outer, p, q, r):
+                wp.atomic_add(outer.count, 0, 1)
                 for k in range(3):
-                    marked[faces[order[n], k]] = 1
-
-
-@wp.kernel
-def widen_kernel(marked: wp.array[int], cut: Cut, wider: wp.array[int]) -> None:
-    """The marked, and their neighbours."""
-    i = wp.tid()
-    mark = int(marked[i])
-    for r in range(cut.ring_start[i], cut.ring_start[i + 1]):
-        mark = wp.max(mark, marked[cut.ring[r]])
-    wider[i] = mark
+                    outer.marked[outer.cut.faces[face, k]] = 1.0
 
 
 @wp.func
@@ -159,85 +167,65 @@ def depth_below(
 
 
 @wp.kernel
-def measure_kernel(
-    tree: wp.uint64,
-    below_normals: wp.array[wp.vec3],
-    below_faces: wp.array2d[int],
-    points: wp.array[wp.vec3],
-    faces: wp.array2d[int],
-    marked: wp.array[int],
-    gap: float,
-    most: float,
-    # outputs
-    count: wp.array[int],
-    way: wp.array[wp.vec3],
-    place: wp.array[wp.vec3],
-    pulled: wp.array[int],
-) -> None:
+def measure_kernel(below: Below, outer: Outer, gap: float, most: float) -> None:
     """The way of each face with a marked corner out of what it cuts deepest, and the place on it where that is.
 
-    Along the normal of the sheet, as far as clears it, but no farther than `most`. Counts the faces that cut, whose
-    corners are `pulled`.
+    Along the normal of the sheet, as far as clears it, but no farther than `most`. Counts the faces that cut.
     """
     face = wp.tid()
-    if marked[faces[face, 0]] == 0 and marked[faces[face, 1]] == 0 and marked[faces[face, 2]] == 0:
+    is_marked = float(0.0)
+    for k in range(3):
+        is_marked += outer.marked[outer.cut.faces[face, k]]
+    if is_marked == 0.0:
         return
-    place[face] = wp.vec3()
-    a = corner(face, 0, points, faces)
-    b = corner(face, 1, points, faces)
-    c = corner(face, 2, points, faces)
+    outer.place[face] = wp.vec3()
+    a = corner(face, 0, outer)
+    b = corner(face, 1, outer)
+    c = corner(face, 2, outer)
     deepest = float(0.0)
-    query = wp.mesh_query_aabb(tree, wp.min(wp.min(a, b), c), wp.max(wp.max(a, b), c))
+    query = wp.mesh_query_aabb(below.tree, wp.min(wp.min(a, b), c), wp.max(wp.max(a, b), c))
     other = int(0)
     while wp.mesh_query_aabb_next(query, other):
-        p = wp.mesh_get_point(tree, 3 * other)
-        q = wp.mesh_get_point(tree, 3 * other + 1)
-        r = wp.mesh_get_point(tree, 3 * other + 2)
-        if cut_each_other(face, points, faces, p, q, r):
+        p = wp.mesh_get_point(below.tree, 3 * other)
+        q = wp.mesh_get_point(below.tree, 3 * other + 1)
+        r = wp.mesh_get_point(below.tree, 3 * other + 2)
+        if cut_each_other(face, outer, p, q, r):
             n = wp.normalize(
-                below_normals[below_faces[other, 0]]
-                + below_normals[below_faces[other, 1]]
-                + below_normals[below_faces[other, 2]]
+                below.normals[below.cut.faces[other, 0]]
+                + below.normals[below.cut.faces[other, 1]]
+                + below.normals[below.cut.faces[other, 2]]
             )
             depth, w = depth_below(n, a, b, c, p, q, r)
             if depth > deepest:
                 deepest = depth
-                place[face] = w
-                way[face] = wp.min(depth + gap, most) * n
+                outer.place[face] = w
+                outer.way[face] = wp.min(depth + gap, most) * n
     if deepest > 0.0:
-        wp.atomic_add(count, 0, 1)
+        wp.atomic_add(outer.count, 0, 1)
         for k in range(3):
-            pulled[faces[face, k]] = 1
+            outer.pulled[outer.cut.faces[face, k]] = 1
 
 
 @wp.kernel
-def part_kernel(
-    way: wp.array[wp.vec3],
-    place: wp.array[wp.vec3],
-    cut: Cut,
-    # outputs
-    points: wp.array[wp.vec3],
-    pulled: wp.array[int],
-    marked: wp.array[int],
-) -> None:
+def part_kernel(outer: Outer) -> None:
     """Moves the corners of faces as far as brings their deepest places out; who is moved is marked, and nobody else.
 
     A face that cut has a corner that is moved. Where no corner was, there is nothing new to measure.
     """
     i = wp.tid()
-    marked[i] = 0
-    if pulled[i] == 0:
+    outer.marked[i] = 0.0
+    if outer.pulled[i] == 0:
         return
-    pulled[i] = 0
+    outer.pulled[i] = 0
     total = wp.vec3()
     weight = float(0.0)
-    for f in range(cut.fan_start[i], cut.fan_start[i + 1]):
-        face = cut.fan_face[f]
-        w = place[face]
-        own = wp.where(cut.faces[face, 0] == i, w[0], wp.where(cut.faces[face, 1] == i, w[1], w[2]))
+    for f in range(outer.cut.fan_start[i], outer.cut.fan_start[i + 1]):
+        face = outer.cut.fan_face[f]
+        w = outer.place[face]
+        own = wp.where(outer.cut.faces[face, 0] == i, w[0], wp.where(outer.cut.faces[face, 1] == i, w[1], w[2]))
         if own > 0.0:
-            total += own * own / wp.dot(w, w) * way[face]
+            total += own * own / wp.dot(w, w) * outer.way[face]
             weight += own
     if weight > 0.0:
-        points[i] += total / weight
-        marked[i] = 1
+        outer.points[i] += total / weight
+        outer.marked[i] = 1.0
