@@ -5,6 +5,8 @@ import warp as wp
 from refu_core.contact._state import BESIDE, CUTTING, NEAR, RAISED, SHIFTED, Cloth, Rules, State, bounded, keep
 from refu_core.sdf import Skin, query_skin
 
+wp.set_module_options({"enable_backward": False})
+
 
 @wp.func
 def middle_deficit(edge: int, state: State, cloth: Cloth, skin: Skin, rules: Rules) -> tuple[float, wp.vec3]:
@@ -19,7 +21,7 @@ def middle_deficit(edge: int, state: State, cloth: Cloth, skin: Skin, rules: Rul
     return lack * wp.clamp(2.0 - lack / rules.through, 0.0, 1.0), gradient
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def suspect_kernel(each: int, state: State, cloth: Cloth, rules: Rules) -> None:
     """Lists the edges whose middle may be closer to the skin than half the margin (`_raise_edges`)."""
     if state.counts[NEAR] + state.counts[SHIFTED] == 0:
@@ -97,7 +99,7 @@ def lift(i: int, state: State, skin: Skin, rules: Rules) -> None:
         state.moved[i] = 1
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def raise_edges_kernel(state: State, cloth: Cloth, skin: Skin, rules: Rules) -> None:
     """All rounds by one thread; those that stay low take the places of those before them in the list of suspects."""
     n = int(state.counts[CUTTING])

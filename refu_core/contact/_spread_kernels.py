@@ -4,6 +4,8 @@ import warp as wp
 
 from refu_core.contact._state import BESIDE, REACHED, SOURCE, Cloth, State
 
+wp.set_module_options({"enable_backward": False})
+
 
 @wp.func
 def reach(i: int, state: State, cloth: Cloth) -> None:
@@ -34,7 +36,7 @@ def spread(
     smoother[i] = here
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def blend_kernel(state: State, cloth: Cloth, rings: int, pairs: int, long_step: float, short_step: float) -> None:
     """All sweeps, in pairs, by one thread: the lists are short, and a launch costs what hundreds of steps do."""
     first = int(0)

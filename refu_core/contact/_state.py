@@ -7,8 +7,6 @@ waited for: there a launch is as long as any list can be, and what is beyond its
 
 import warp as wp
 
-from refu_core.contact._settings import MOST_PUSHES
-
 # What a kernel counts.
 NEAR = wp.constant(0)  # vertices nearer than the margin, which are pushed
 REACHED = wp.constant(1)  # vertices that a push reaches by way of its neighbours
@@ -19,8 +17,7 @@ STUCK = wp.constant(5)  # inside after all
 RAISED = wp.constant(6)  # ends of edges that cut the skin
 CHANGED = wp.constant(7)  # distances that were replaced
 SHIFTED = wp.constant(8)  # vertices that were moved since the last call
-CUTTING = wp.constant(9)  # such edges; a number for each round follows
-N_COUNTS = 10 + MOST_PUSHES
+CUTTING = wp.constant(9)  # such edges; a number for each of `max_pushes` rounds follows
 
 # A vertex reached by pushes, or pushed itself.
 BESIDE = wp.constant(1)
@@ -49,9 +46,6 @@ class Rules:
     max_pushes: wp.int32
     bulge: wp.float32
     through: wp.float32
-
-
-RULES = tuple(name for name in Rules.vars if name != "margin")  # type: ignore[attr-defined]  # Warp's own
 
 
 @wp.struct
