@@ -54,8 +54,8 @@ class Layer:
         self._settings = settings
         self.device = above.device
         self._is_serial = self.device.type == "cpu"
-        mesh = Connectivity.of(above_faces.cpu(), len(above))
         self._below = Sheet(Connectivity.of(below_faces.cpu(), len(below)), below)
+        mesh = Connectivity.of(above_faces.cpu(), len(above))
         self.parting = Parting(mesh, above, self._below, settings=settings)
         """What is done where triangles cut each other after all."""
         n = len(above)
