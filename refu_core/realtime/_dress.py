@@ -111,5 +111,5 @@ def _drape(
         unposed, on_mean = unposed + displacement, on_mean + displacement
     z = None
     if wearable.refu is not None:
-        z = wearable.refu.feature(garment.betas, pose, style, predicted.feature)
+        z = wearable.refu.feature(garment.betas, pose, style)
     return Drape(wearable.template.pose(unposed, transforms), unposed, on_mean, z)

@@ -21,7 +21,6 @@ def repulse(
     scale: float | Tensor = 1.0,
     margin: float | Tensor = 0.0,
     max_displacement: float = MAX_DISPLACEMENT,
-    fallback: Tensor | None = None,
 ) -> Tensor:
     """ReFU: the points [m], shape (N, 3), with those closer to the body than `margin` moved along the gradient.
 
@@ -31,11 +30,11 @@ def repulse(
 
     Args:
         points: Garment vertices [m], shape (N, 3).
-        sample: Signed distance and gradient at the points; the gradient needs no unit length.
+        sample: Signed distance and gradient at the points; the gradient needs no unit length, and up stands in for one
+            that is zero or not finite.
         scale: α, one number or shape (N,); 1 is the paper's "fixed scale".
         margin: ε ≥ 0 [m]; a tensor of shape () where it is learned.
         max_displacement: Bound on each point's movement [m].
-        fallback: Direction where the gradient is zero or not finite, shape (3,) or (N, 3); up by default.
 
     Raises:
         MeshError: Arrays whose shapes don't belong together, or a negative margin or bound.
@@ -47,10 +46,7 @@ def repulse(
     deficit = margin - sample.distance[rows]
     alpha = scale[rows] if isinstance(scale, Tensor) and scale.ndim else scale
     offset = (alpha * deficit).clamp(-max_displacement, max_displacement)
-    if fallback is None:
-        fallback = points.new_tensor(_UP)
-    direction = unit_direction(sample.gradient[rows], fallback[rows] if fallback.ndim == 2 else fallback)
-    pushed: Tensor = points.index_add(0, rows, offset[:, None] * direction)
+    pushed: Tensor = points.index_add(0, rows, offset[:, None] * unit_direction(sample.gradient[rows]))
     return pushed
 
 
@@ -59,12 +55,12 @@ def pushed_rows(distance: Tensor, margin: float | Tensor) -> Tensor:
     return torch.nonzero(distance.detach() < margin)[:, 0]
 
 
-def unit_direction(gradient: Tensor, fallback: Tensor) -> Tensor:
-    """∇f/|∇f| (paper, Eq. 3), shape (N, 3); `fallback` where that isn't defined. Finite, and so are its derivatives."""
+def unit_direction(gradient: Tensor) -> Tensor:
+    """∇f/|∇f| (paper, Eq. 3), shape (N, 3); up where that isn't defined. Finite, and so are its derivatives."""
     length = torch.linalg.vector_norm(gradient.detach(), dim=-1, keepdim=True)
     defined = torch.isfinite(length) & (length > torch.finfo(gradient.dtype).tiny ** 0.5)
     # Normalising the stand-in, too, keeps NaN out of the branch that isn't taken and so out of its derivative.
-    usable = torch.where(defined, gradient, fallback)
+    usable = torch.where(defined, gradient, gradient.new_tensor(_UP))
     direction: Tensor = usable / torch.linalg.vector_norm(usable, dim=-1, keepdim=True)
     return direction
 

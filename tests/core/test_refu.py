@@ -276,15 +276,6 @@ def test_config_makes_the_same_layer() -> None:
         Refu.from_config({**Refu(3, least=0.0).config, "scale": {"colour": "blue"}})
 
 
-def test_backbones_feature_stands_in_for_h() -> None:
-    refu = Refu(N, least=0.0, scale=SMALL["compact"], feature_size=17)
-    assert not any(name.startswith("scale.h") for name, _ in refu.named_parameters())
-    given_ = torch.randn(2, 17)
-    assert refu.feature(*random_bodies(2), given=given_) is given_
-    with pytest.raises(WeightsError, match="backbone gave none"):
-        refu.feature(*random_bodies(2))
-
-
 def test_refuses_what_does_not_belong_together() -> None:
     refu, points, sample, z = random_layer()
     with pytest.raises(MeshError, match=r"\(B, 8, 3\)"):
