@@ -19,10 +19,6 @@ Lap = Callable[[str, str | None], None]
 """Called at the end of a stage, with its name and the garment's, if it was for one."""
 
 
-def _no_lap(stage: str, garment: str | None) -> None:
-    """Nobody wants to know."""
-
-
 class Drape(NamedTuple):
     """One garment on a batch of bodies."""
 
@@ -53,7 +49,7 @@ class Dressed(NamedTuple):
 
 
 def dress(
-    pose: Tensor, wearer: Wearer, *, past: Tensor | None = None, up: Tensor | None = None, lap: Lap = _no_lap
+    pose: Tensor, wearer: Wearer, *, past: Tensor | None = None, up: Tensor | None = None, lap: Lap = lambda *_: None
 ) -> Dressed:
     """Bodies in poses (B, 24, 3) [rad], dressed by the backbones: posed as g = T(θ, β)(t(β, γ) + D(θ, β, γ)).
 
