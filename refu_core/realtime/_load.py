@@ -112,6 +112,6 @@ def wearable_of(
             f"{hint}train some with `refu train {template.name} --body`"
         )
         raise WeightsError(msg)
-    margin = DEFAULT_MARGIN if refu is None else float(refu.margin)
+    margin = DEFAULT_MARGIN if refu is None else refu.margin
     feels_arms = all(joint in template.card.joints for arm in ARMS for joint in arm[:2])  # shoulders and elbows
     return Wearable(worn, network, refu, margin, betas, feels_arms and stored.card.get("knows_limbs") is True)

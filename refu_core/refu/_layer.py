@@ -32,7 +32,6 @@ class Refu(nn.Module):
         least: float,
         scale: ScaleSettings | None = REALTIME,
         margin: float = DEFAULT_MARGIN,
-        learn_margin: bool = False,
     ) -> None:
         """A layer for garments of `n_vertices` N.
 
@@ -41,36 +40,27 @@ class Refu(nn.Module):
             least: lower end of α's range: 1 with an accurate distance, 0 with an approximate one (paper, Sec. 3.1).
             scale: sizes of the networks that predict α; None fixes it at 1.
             margin: ε > 0 [m], or 0 for the paper's.
-            learn_margin: whether ε is trained, too, from `margin` on.
 
         Raises:
-            MeshError: a margin that is negative, or zero and to be learned.
+            MeshError: a margin that is negative or not finite.
         """
         super().__init__()
-        if not (margin >= 0 and math.isfinite(margin)) or (learn_margin and margin == 0):
-            msg = f"wanted a margin of 0 m or more (above 0 where it is learned), got {margin}"
+        if not 0 <= margin < math.inf:
+            msg = f"wanted a margin of 0 m or more, got {margin}"
             raise MeshError(msg)
         self.config: dict[str, Any] = {
             "n_vertices": n_vertices,
             "least": least,
             "scale": None if scale is None else asdict(scale),
             "margin": margin,
-            "learn_margin": learn_margin,
         }
         """What the layer was made with, for a weights' card; `from_config` takes it."""
-        self.n_vertices = n_vertices
+        self.n_vertices, self.margin = n_vertices, margin
         self.scale = None if scale is None else ScaleNet(n_vertices, least=least, settings=scale)
-        self._fixed_margin = margin
-        # A logarithm keeps it positive, and Adam's steps relative.
-        self.log_margin = nn.Parameter(torch.tensor(math.log(margin))) if learn_margin else None
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Refu:
-        """The layer, untrained, that `config` describes.
-
-        Raises:
-            WeightsError: that isn't such a description.
-        """
+        """The layer, untrained, that `config` describes. Raises `WeightsError` where that isn't such a description."""
         try:
             scale = config["scale"]
             return cls(
@@ -78,16 +68,10 @@ class Refu(nn.Module):
                 least=float(config["least"]),
                 scale=None if scale is None else config_of_card(ScaleSettings, scale),
                 margin=float(config["margin"]),
-                learn_margin=bool(config["learn_margin"]),
             )
         except (KeyError, TypeError, ValueError, OverflowError, RuntimeError) as error:
             msg = f"not the description of a ReFU layer ({error!r}): train it anew with this version"
             raise WeightsError(msg) from error
-
-    @property
-    def margin(self) -> float | Tensor:
-        """ε [m]; a tensor of shape () where it is learned."""
-        return self._fixed_margin if self.log_margin is None else self.log_margin.exp()
 
     def feature(self, betas: Tensor, pose: Tensor, style: Tensor | None) -> Tensor | None:
         """z of some bodies, shape (B, M), as `ScaleNet.feature`; None where α is fixed."""

@@ -19,21 +19,21 @@ def repulse(
     sample: SdfSample,
     *,
     scale: float | Tensor = 1.0,
-    margin: float | Tensor = 0.0,
+    margin: float = 0.0,
     max_displacement: float = MAX_DISPLACEMENT,
 ) -> Tensor:
     """ReFU: the points [m], shape (N, 3), with those closer to the body than `margin` moved along the gradient.
 
     x' = x - α (f(x) - ε) ∇f/|∇f| where f(x) < ε, and x elsewhere: the paper's Eq. 2 to 4, with f - ε in the place of f.
-    Differentiable with respect to the points, the sample, the scale and the margin. At f = ε the derivative is that of
-    the outer branch.
+    Differentiable with respect to the points, the sample and the scale. At f = ε the derivative is that of the outer
+    branch.
 
     Args:
         points: Garment vertices [m], shape (N, 3).
         sample: Signed distance and gradient at the points; the gradient needs no unit length, and up stands in for one
             that is zero or not finite.
         scale: α, one number or shape (N,); 1 is the paper's "fixed scale".
-        margin: ε ≥ 0 [m]; a tensor of shape () where it is learned.
+        margin: ε ≥ 0 [m].
         max_displacement: Bound on each point's movement [m].
 
     Raises:
@@ -50,7 +50,7 @@ def repulse(
     return pushed
 
 
-def pushed_rows(distance: Tensor, margin: float | Tensor) -> Tensor:
+def pushed_rows(distance: Tensor, margin: float) -> Tensor:
     """Which points a push moves, int64, shape (R,): those with f < ε."""
     return torch.nonzero(distance.detach() < margin)[:, 0]
 
@@ -65,9 +65,7 @@ def unit_direction(gradient: Tensor) -> Tensor:
     return direction
 
 
-def _check(
-    points: Tensor, sample: SdfSample, scale: float | Tensor, margin: float | Tensor, max_displacement: float
-) -> None:
+def _check(points: Tensor, sample: SdfSample, scale: float | Tensor, margin: float, max_displacement: float) -> None:
     require_tensor("points", points)
     n = len(points)
     if points.shape != (n, 3) or sample.distance.shape != (n,) or sample.gradient.shape != (n, 3):
@@ -79,7 +77,6 @@ def _check(
     if isinstance(scale, Tensor) and scale.shape not in ((), (n,)):
         msg = f"scale must be one number or have the shape ({n},), got {tuple(scale.shape)}"
         raise MeshError(msg)
-    epsilon = float(margin.detach()) if isinstance(margin, Tensor) else margin
-    if not (epsilon >= 0 and max_displacement >= 0):
-        msg = f"margin and max_displacement must not be negative, got {epsilon} and {max_displacement}"
+    if not (margin >= 0 and max_displacement >= 0):
+        msg = f"margin and max_displacement must not be negative, got {margin} and {max_displacement}"
         raise MeshError(msg)
