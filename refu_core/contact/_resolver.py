@@ -95,7 +95,7 @@ class Resolver:
         state.rise = wp.zeros(e, dtype=wp.vec3, device=str(self.device))
         # On a CPU a kernel is one thread and can do several short steps, and reading a number costs nothing.
         self._is_serial = self.device.type == "cpu"
-        self._read_counts = self._counts.numpy() if self._is_serial else None
+        self._read_counts = self._counts.numpy() if self._is_serial else np.zeros(0)
         self._launches = lru_cache(_MOST_MARGINS)(self._recorded)
 
     @torch.no_grad()
@@ -131,13 +131,22 @@ class Resolver:
         if not 0 <= margin < math.inf:
             msg = f"wanted a margin of 0 m or more, got {margin}"
             raise MeshError(msg)
-        if start is not None and start.face is None:
-            msg = "start must name the closest faces: ask an ExactSdf, BandSdf or ApproxSdf"
-            raise MeshError(msg)
         with torch_stream(self.device):
-            self._take(points, start)
             self._commands = self._launches(sdf.skin(), margin)
-            self._run("go on" if start is None else "begin")
+            self._counts.zero_()
+            if not self._is_serial:
+                self._bounds.zero_()
+            self._vectors["origin"].copy_(points)
+            if start is None:
+                self._run("go on")
+            elif start.face is None:
+                msg = "start must name the closest faces: ask an ExactSdf, BandSdf or ApproxSdf"
+                raise MeshError(msg)
+            else:
+                self._floats["first"].copy_(start.distance)
+                self._vectors["first_gradient"].copy_(start.gradient)
+                self._ints["first_face"].copy_(start.face)
+                self._run("begin")
             if not sdf.is_exact:
                 self._reconcile()
             self._run("list")
@@ -152,18 +161,6 @@ class Resolver:
         counts = self._counts[_state.INSIDE : _state.STUCK + 1].float()
         numbers = torch.cat((counts, depth.clamp_min(0)))
         return Resolution(self._vectors["place"].clone(), self._floats["distance"].clone(), numbers)
-
-    def _take(self, points: Tensor, start: SdfSample | None) -> None:
-        """Takes over a frame."""
-        self._counts.zero_()
-        if not self._is_serial:
-            self._bounds.zero_()
-        self._vectors["origin"].copy_(points)
-        if start is not None:
-            assert start.face is not None  # these distances are to faces
-            self._floats["first"].copy_(start.distance)
-            self._vectors["first_gradient"].copy_(start.gradient)
-            self._ints["first_face"].copy_(start.face)
 
     def _reconcile(self) -> None:
         """Where distances contradict each other along an edge, a closest face was missed."""
@@ -186,21 +183,17 @@ class Resolver:
         else:
             alpha.fill_(scale)
         self._run("scale")
-        self._blend()
-        self._length(_state.REACHED)
-        self._run("settle")
-
-    def _blend(self) -> None:
-        """Neighbours of pushed vertices give way with them."""
         if self._is_serial:
             self._run("blend")
-            return
-        for _ in range(self._settings.near):
-            self._length(_state.REACHED)
-            self._run("reach")
-        self._length(_state.REACHED)
-        for sweep in range(2 * self._settings.blend_pairs):
-            self._run(f"spread{sweep % 2}")
+        else:
+            for _ in range(self._settings.near):
+                self._close(_state.REACHED)
+                self._run("reach")
+            self._close(_state.REACHED)
+            for sweep in range(2 * self._settings.blend_pairs):
+                self._run(f"spread{sweep % 2}")
+            self._close(_state.REACHED)
+        self._run("settle")
 
     def _raise_edges(self) -> None:
         """Raises both ends of the edges that run too low."""
@@ -229,7 +222,6 @@ class Resolver:
         self._run("close", (1, which))
 
     def _count(self, which: int) -> int:
-        assert self._read_counts is not None  # of a CPU
         return int(self._read_counts[which])
 
     def _run(self, name: str, parameter: tuple[int, int] | None = None) -> None:

@@ -1,4 +1,4 @@
-"""What the steps of `resolve` read and write: a garment, a frame of it, and numbers.
+"""What the steps of a `Resolver` read and write: a garment, a frame of it, and numbers.
 
 Lists of vertices are filled by kernels: `counts[NAME]` says how many they are. On a CPU they are in order, on a GPU in
 any; nothing depends on it. On a CPU one thread goes through a list. To know how long it is a GPU would have to be
@@ -53,17 +53,15 @@ class State:
     """A garment in one frame, by vertex; lengths in metres."""
 
     origin: wp.array[wp.vec3]
-    """Before."""
+    """Before; there it has this distance:"""
     first: wp.array[wp.float32]
     first_gradient: wp.array[wp.vec3]
     first_face: wp.array[wp.int32]
-    """Distance there."""
     place: wp.array[wp.vec3]
-    """The best place so far."""
+    """The best place so far; there it has this distance:"""
     distance: wp.array[wp.float32]
     gradient: wp.array[wp.vec3]
     face: wp.array[wp.int32]
-    """Distance there."""
     way: wp.array[wp.float32]
     """How far a vertex has to go along the gradient."""
     goal: wp.array[wp.float32]

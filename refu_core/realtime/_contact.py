@@ -40,18 +40,7 @@ class Worn(NamedTuple):
     raw: Tensor
     """The same before collision handling [m], shape (V, 3)."""
     numbers: Tensor
-    """As `Resolved.numbers`."""
-    n_clipped: Tensor
-    """As `Resolved.n_clipped`."""
-
-
-class Resolved(NamedTuple):
-    """A garment off the body and off the garments below it, and the numbers of a `GarmentStats`."""
-
-    vertices: Tensor
-    """[m], shape (V, 3)."""
-    numbers: Tensor
-    """`n_inside`, `n_pushed`, `n_unresolved`, `max_depth` and `n_layered`, float32, shape (5,)."""
+    """`n_inside`, `n_pushed`, `n_unresolved`, `max_depth` and `n_layered` of a `GarmentStats`, float32, shape (5,)."""
     n_clipped: Tensor
     """Vertices that weren't asked for their distance, since they are far off, shape ()."""
 
@@ -164,7 +153,7 @@ class ContactStage:
         margin: float,
         scale: float | VertexScale,
         n_layered: Tensor,
-    ) -> Resolved:
+    ) -> Worn:
         """Vertices (V, 3) [m] off the body, which has the last word, and within reach of where limbs `pressed` them.
 
         `raw` (V, 3) [m] are the vertices as they were predicted, `rest` (V, 3) [m] those of the wearer's garment in the
@@ -193,7 +182,7 @@ class ContactStage:
             vertices = pressed + torch.renorm(vertices - pressed, 2, 0, self._settings.max_displacement)
         if self.way_out is not None:
             vertices, numbers[_N_UNRESOLVED] = self.way_out(vertices, pressed, margin)
-        return Resolved(vertices, torch.cat((numbers, n_layered)), n_clipped)
+        return Worn(vertices, raw, torch.cat((numbers, n_layered)), n_clipped)
 
     def _part(self, name: str, done: Resolution, worn: Mapping[str, Worn], *, margin: float) -> Resolution:
         """A garment off the body, off the `worn` inner ones where triangles cut each other after all.

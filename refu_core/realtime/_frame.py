@@ -117,15 +117,16 @@ class FrameStep:
             garments: dict[str, Worn] = {}
             for name in self._order:
                 drape = dressed.drapes[name]
-                raw = vertices = drape.vertices[person]
-                numbers, n_clipped = raw.new_zeros(N_NUMBERS), raw.new_zeros(())
-                if self.contact is not None:
+                raw = drape.vertices[person]
+                if self.contact is None:
+                    garments[name] = Worn(raw, raw, raw.new_zeros(N_NUMBERS), raw.new_zeros(()))
+                else:
                     flat = self.contact.unfold(name, raw, dressed.transforms.rotation[person])
                     pressed = self.contact.press(name, flat)
                     vertices, n_layered = self.contact.lift(name, pressed, garments)
                     if len(self._order) > 1:
                         clock.lap("layers", name)
-                    vertices, numbers, n_clipped = self.contact.resolve(
+                    garments[name] = self.contact.resolve(
                         name,
                         vertices,
                         garments,
@@ -137,7 +138,6 @@ class FrameStep:
                         scale=scale_of(self.outfit.wearables[name], drape, person),
                         n_layered=n_layered,
                     )
-                garments[name] = Worn(vertices, raw, numbers, n_clipped)
                 clock.lap("refu", name)
             persons.append(Person(turn, body, skin, shifts[person], garments))
         return persons
