@@ -49,16 +49,7 @@ def suspect_kernel(each: int, state: State, cloth: Cloth, rules: Rules) -> None:
 
 
 @wp.func
-def measure(
-    edge: int,
-    rounds: int,
-    state: State,
-    cloth: Cloth,
-    skin: Skin,
-    rules: Rules,
-    # output
-    low: wp.array[int],
-) -> None:
+def measure(edge: int, rounds: int, state: State, cloth: Cloth, skin: Skin, rules: Rules, low: wp.array[int]) -> None:
     """Whether a suspected edge is too low, and by how much; after the first of the `rounds`, if it was moved."""
     a = cloth.edges[edge, 0]
     b = cloth.edges[edge, 1]

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from refu_core._warp import as_warp, ints, recorded, torch_stream
 from refu_core.contact import _layers_kernels as kernels
-from refu_core.contact import _layers_move_kernels as moving
 from refu_core.contact._parting import Parting
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
 from refu_core.contact._sheet import Sheet
@@ -57,7 +56,7 @@ class Layer:
         self._below = Sheet(Connectivity.of(below_faces.cpu(), len(below)), below)
         mesh = Connectivity.of(above_faces.cpu(), len(above))
         self.parting = Parting(mesh, above, self._below, settings=settings)
-        """What is done where triangles cut each other after all."""
+        """What is done where triangles of this garment and the inner one of the last call cut each other after all."""
         n = len(above)
         self._given, self._points, self._push, *self._fields = torch.zeros(5, n, 3, device=self.device)
         self._count = torch.zeros(1, dtype=torch.int32, device=self.device)
@@ -102,14 +101,6 @@ class Layer:
                 self._commands["move"].launch()
         return self._points.clone(), n_low
 
-    def find_cuts(self, above: Tensor) -> Tensor:
-        """How many pairs of faces of the outer garment, (V, 3) [m], and the inner one of the last call cut each other.
-
-        An int32 of shape (1,). `parting` goes on from what was found.
-        """
-        self.parting.find(above)
-        return self.parting.n_cut.clone()
-
     def _recorded(self, data: Any, rules: Any) -> dict[str, Any]:
         """The launches of a frame: each of them is shorter than what Python makes of its arguments."""
         n, sheet = len(self._points), self._below.data
@@ -118,10 +109,10 @@ class Layer:
             "look": (kernels.search_kernel, n_strips, [each, False, sheet, data]),
             "look again": (kernels.search_kernel, n_strips, [each, True, sheet, data]),
             "lift": (kernels.lift_kernel, n_strips, [each, sheet, data, rules]),
-            "spread0": (moving.spread_kernel, n, [data, data.field, data.smoother]),
-            "spread1": (moving.spread_kernel, n, [data, data.smoother, data.field]),
-            "move": (moving.move_kernel, n, [data]),
-            "move all": (moving.move_all_kernel, 1, [data, self._settings.around]),
+            "spread0": (kernels.spread_kernel, n, [data, data.field, data.smoother]),
+            "spread1": (kernels.spread_kernel, n, [data, data.smoother, data.field]),
+            "move": (kernels.move_kernel, n, [data]),
+            "move all": (kernels.move_all_kernel, 1, [data, self._settings.around]),
         }
         return {name: recorded(*launch, self.device) for name, launch in launches.items()}
 

@@ -1,8 +1,10 @@
-"""How far one garment's vertices are from the outer side of another one's sheet: one code for CPU and CUDA."""
+"""Brings one garment's vertices to the outer side of another one's sheet: one code for CPU and CUDA."""
 
 import warp as wp
 
 from refu_core.sdf._closest_kernels import closest_on_face, mean_normal
+
+wp.set_module_options({"enable_backward": False})
 
 # Nothing is so far from where it was at rest; it is a limit to what a sheet crumpled into itself may take.
 MOST_STEPS = wp.constant(64)
@@ -144,14 +146,14 @@ def is_within(p: wp.vec3, extent: wp.array[wp.vec3], room: float) -> bool:
     return wp.min(wp.min(above_low), wp.min(below_high)) >= -room
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def normals_kernel(points: wp.array[wp.vec3], cut: Cut, normals: wp.array[wp.vec3]) -> None:
     """Unit normals of a garment's vertices."""
     v = wp.tid()
     normals[v] = normal_at(v, points, cut)
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def search_kernel(each: int, goes_on: bool, below: Below, above: Above) -> None:
     """Takes over what is given, and finds the vertex of the sheet that each vertex comes to, downhill.
 
@@ -226,7 +228,7 @@ def lift_off(i: int, face: int, faces_it: bool, below: Below, above: Above, rule
         wp.atomic_add(above.count, 0, 1)
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def lift_kernel(each: int, below: Below, above: Above, rules: LayerRules) -> None:
     """What brings each vertex that is looked at to the gap above the sheet, and how many they are that lack something.
 
@@ -264,3 +266,69 @@ def lift_kernel(each: int, below: Below, above: Above, rules: LayerRules) -> Non
             if is_low and wp.length(offset) > rules.doubt:
                 face = closest_of_all(p, rules.reach, below)
             lift_off(i, face, False, below, above, rules)
+
+
+@wp.func
+def spread(i: int, above: Above, field: wp.array[wp.vec3], smoother: wp.array[wp.vec3]) -> None:
+    """One round of `Blend.spread`."""
+    start = above.cut.ring_start[i]
+    end = above.cut.ring_start[i + 1]
+    total = wp.vec3(0.0, 0.0, 0.0)
+    for r in range(start, end):
+        total += field[above.cut.ring[r]]
+    mean = total / float(wp.max(end - start, 1))
+    length = wp.length(above.push[i])
+    if length > 0.0:
+        way = above.push[i] / length
+        mean += wp.max(0.0, length - wp.dot(mean, way)) * way
+    smoother[i] = mean
+
+
+@wp.kernel
+def spread_kernel(above: Above, field: wp.array[wp.vec3], smoother: wp.array[wp.vec3]) -> None:
+    """`spread` of one vertex a thread."""
+    spread(wp.tid(), above, field, smoother)
+
+
+@wp.kernel
+def move_kernel(above: Above) -> None:
+    """Moves the vertices."""
+    i = wp.tid()
+    above.points[i] += above.field[i]
+    above.moved[i] = wp.where(wp.length_sq(above.field[i]) > 0.0, 1, 0)
+
+
+@wp.kernel
+def move_all_kernel(above: Above, rounds: int) -> None:
+    """All rounds, and the move, by one thread: of the pushed, and of those that so many rounds reach from there."""
+    n = int(0)
+    for i in range(above.push.shape[0]):
+        if wp.length_sq(above.push[i]) > 0.0:
+            above.field[i] = above.push[i]
+            above.is_reached[i] = 1
+            above.reached[n] = i
+            n += 1
+    first = int(0)
+    for _ in range(rounds):
+        last = int(n)
+        for k in range(first, last):
+            for r in range(above.cut.ring_start[above.reached[k]], above.cut.ring_start[above.reached[k] + 1]):
+                j = above.cut.ring[r]
+                if above.is_reached[j] == 0:
+                    above.is_reached[j] = 1
+                    above.reached[n] = j
+                    n += 1
+        first = last
+    for sweep in range(rounds):
+        for k in range(n):
+            if sweep % 2 == 0:
+                spread(above.reached[k], above, above.field, above.smoother)
+            else:
+                spread(above.reached[k], above, above.smoother, above.field)
+    for k in range(n):
+        i = above.reached[k]
+        above.points[i] += above.field[i]
+        above.moved[i] = 1
+        above.is_reached[i] = 0
+        above.field[i] = wp.vec3()
+        above.smoother[i] = wp.vec3()

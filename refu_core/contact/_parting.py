@@ -38,13 +38,12 @@ class Parting:
         n, n_faces = len(rest), len(cut.faces)
         self._points, self._other = torch.zeros(2, n, 3, device=rest.device)
         self._marked, self._wider = torch.zeros(2, n, device=rest.device)
-        self.n_cut = torch.zeros(1, dtype=torch.int32, device=rest.device)
-        """How many pairs of its faces and the sheet's were found to cut each other, shape (1,)."""
+        self._count = torch.zeros(1, dtype=torch.int32, device=rest.device)
         self._ways = torch.zeros(2, n_faces, 3, device=rest.device)
         data = kernels.Outer()
         data.points, data.way, data.place = (as_warp(rows, wp.vec3) for rows in (self._points, *self._ways))
         data.order = ints(grouped(rest.cpu().numpy()[mesh.faces].mean(axis=1)), rest.device)
-        data.cut, data.count = cut, as_warp(self.n_cut, wp.int32)
+        data.cut, data.count = cut, as_warp(self._count, wp.int32)
         data.marked, wider = (as_warp(one, wp.float32) for one in (self._marked, self._wider))
         data.pulled = wp.zeros(n, dtype=wp.int32, device=str(rest.device))
         other, alike = as_warp(self._other, wp.vec3), wp.ones(n, dtype=wp.float32, device=str(rest.device))
@@ -60,14 +59,15 @@ class Parting:
         }
         self._commands = {name: recorded(*launch, rest.device) for name, launch in launches.items()}
 
-    def find(self, above: Tensor) -> None:
-        """Finds the faces of the outer garment, vertices (V, 3) [m], that cut the sheet."""
+    def find(self, above: Tensor) -> Tensor:
+        """How many pairs of faces of the outer garment, (V, 3) [m], and of the sheet cut each other, int32, (1,)."""
         self._sheet.fit()
         with torch_stream(self._device):
             self._marked.zero_()
-            self.n_cut.zero_()
+            self._count.zero_()
             self._points.copy_(above)
             self._commands["find"].launch()
+        return self._count.clone()
 
     def level(self, above: Tensor) -> Tensor:
         """The outer garment, (V, 3) [m], levelled around the faces that were found to cut."""
@@ -88,9 +88,9 @@ class Parting:
             self._points.copy_(above)
             self._ways[1].zero_()
             for _ in range(self._settings.parting_sweeps):
-                self.n_cut.zero_()
+                self._count.zero_()
                 self._commands["measure"].launch()
-                if self._is_serial and not int(self.n_cut):
+                if self._is_serial and not int(self._count):
                     break
                 self._commands["part"].launch()
         return self._points.clone()
@@ -100,10 +100,8 @@ class Parting:
 
         Where a hand is deep in a hip, the way out of the one leads into the other, and nothing is done.
         """
-        self.find(above)
-        n_before = self.n_cut.clone()
+        n_before = self.find(above)
         if self._is_serial and not int(n_before):
             return above
         parted = above + torch.renorm(self.part(above) - above, 2, 0, self._settings.parting_most)
-        self.find(parted)
-        return torch.where(self.n_cut < n_before, parted, above)
+        return torch.where(self.find(parted) < n_before, parted, above)

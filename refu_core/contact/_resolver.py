@@ -12,7 +12,7 @@ import warp as wp
 from torch import Tensor
 
 from refu_core._warp import as_warp, ints, recorded, torch_stream
-from refu_core.contact import _edge_kernels, _resolver_kernels, _round_kernels, _spread_kernels, _state
+from refu_core.contact import _edge_kernels, _resolver_kernels, _round_kernels, _state
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
 from refu_core.errors import MeshError
 from refu_core.mesh import Connectivity
@@ -252,7 +252,7 @@ class Resolver:
         long_step, short_step = how.blend_steps
         if self._is_serial:
             numbers = [how.near, how.blend_pairs, long_step, short_step]
-            steps["blend"] = (_spread_kernels.blend_kernel, [state, cloth, *numbers])
+            steps["blend"] = (_resolver_kernels.blend_kernel, [state, cloth, *numbers])
             steps["raise edges"] = (_edge_kernels.raise_edges_kernel, [state, cloth, skin, rules])
             return {name: recorded(kernel, 1, inputs, self.device) for name, (kernel, inputs) in steps.items()}
         steps["reach"] = (_round_kernels.reach_kernel, [state, cloth])

@@ -3,7 +3,7 @@
 import warp as wp
 
 from refu_core.contact._edge_kernels import choose, lift, measure
-from refu_core.contact._spread_kernels import reach, spread
+from refu_core.contact._resolver_kernels import reach, spread
 from refu_core.contact._state import CUTTING, RAISED, REACHED, Cloth, Rules, State, listed
 from refu_core.sdf import Skin
 
@@ -27,12 +27,7 @@ def reach_kernel(state: State, cloth: Cloth) -> None:
 
 @wp.kernel
 def spread_kernel(
-    state: State,
-    cloth: Cloth,
-    step: float,
-    field: wp.array[wp.vec3],
-    # output
-    smoother: wp.array[wp.vec3],
+    state: State, cloth: Cloth, step: float, field: wp.array[wp.vec3], smoother: wp.array[wp.vec3]
 ) -> None:
     """One sweep of `Blend.spread`."""
     i = listed(wp.tid(), REACHED, state.reached, state)
@@ -42,14 +37,7 @@ def spread_kernel(
 
 @wp.kernel
 def measure_kernel(
-    state: State,
-    cloth: Cloth,
-    skin: Skin,
-    rules: Rules,
-    rounds: int,
-    suspects: wp.array[int],
-    # output
-    low: wp.array[int],
+    state: State, cloth: Cloth, skin: Skin, rules: Rules, rounds: int, suspects: wp.array[int], low: wp.array[int]
 ) -> None:
     """Lists those of the edges that are low."""
     edge = listed(wp.tid(), CUTTING + rounds, suspects, state)

@@ -189,12 +189,13 @@ class ContactStage:
 
         As often as that leaves fewer cuts: in a crease without room the way out of one fold leads into the next.
         """
-        layers, resolver, before = self._below[name].values(), self.resolvers[name], done.vertices
-        n_cut = torch.stack([layer.find_cuts(before) for layer in layers])
+        partings = [layer.parting for layer in self._below[name].values()]
+        resolver, before = self.resolvers[name], done.vertices
+        n_cut = torch.stack([parting.find(before) for parting in partings])
         for round_ in range(self._settings.partings):
             if self._is_serial and not int(n_cut.sum()):
                 break
-            cut_by = [one.parting for one, n in zip(layers, n_cut, strict=True) if not self._is_serial or int(n)]
+            cut_by = [one for one, n in zip(partings, n_cut, strict=True) if not self._is_serial or int(n)]
             vertices = done.vertices
             for parting in cut_by:
                 vertices = parting.level(vertices)
@@ -204,7 +205,7 @@ class ContactStage:
                 vertices = parting.part(vertices)
             vertices = before + torch.renorm(vertices - before, 2, 0, self._settings.parting_most)
             parted = resolver(vertices, self.sdf, None, margin=margin)
-            n_left = torch.stack([layer.find_cuts(parted.vertices) for layer in layers])
+            n_left = torch.stack([parting.find(parted.vertices) for parting in partings])
             is_better = n_left.sum() < n_cut.sum()
             done = Resolution(*(torch.where(is_better, new, old) for new, old in zip(parted, done, strict=True)))
             n_cut = torch.where(is_better, n_left, 0)  # nothing is fewer than none: the end, on a GPU, too
