@@ -114,25 +114,12 @@ class ObservedCloth:
         how = self._settings
         own = self._points.numpy()
         rows = np.flatnonzero(within(measured.points, own.min(0) - how.reach, own.max(0) + how.reach))
-        n, points = len(rows), measured.points[rows]
-        face, height = np.empty(n, np.int32), np.empty(n, np.float32)
-        weight, normal = np.empty((2, n, 3), np.float32)
+        points = wp.array(measured.points[rows], dtype=wp.vec3, device="cpu")
         seen = wp.vec3() if eye is None else wp.vec3(*eye.tolist())
-        wp.launch(
-            match_kernel,
-            n,
-            [
-                wp.array(points, dtype=wp.vec3, device="cpu", copy=False),
-                *(self._mesh.id, skin.id, self._rim, how.reach, how.slack, eye is not None, seen),
-            ],
-            [
-                wp.array(face, dtype=wp.int32, device="cpu", copy=False),
-                wp.array(weight, dtype=wp.vec3, device="cpu", copy=False),
-                wp.array(normal, dtype=wp.vec3, device="cpu", copy=False),
-                wp.array(height, dtype=wp.float32, device="cpu", copy=False),
-            ],
-            device="cpu",
-        )
+        inputs = [points, self._mesh.id, skin.id, self._rim, how.reach, how.slack, eye is not None, seen]
+        outputs = [wp.empty(len(rows), dtype=kind, device="cpu") for kind in (wp.int32, wp.vec3, wp.vec3, wp.float32)]
+        wp.launch(match_kernel, len(rows), inputs, outputs, device="cpu")
+        face, weight, normal, height = (one.numpy() for one in outputs)
         on = np.flatnonzero(face >= 0)
         return Matches(measured.say[rows[on]], face[on], weight[on], normal[on], height[on])
 

@@ -85,9 +85,7 @@ def dress(
 
 def scale_of(wearable: Wearable, drape: Drape, person: int) -> float | VertexScale:
     """α of one of the persons, as `refu_core.contact` takes it."""
-    if wearable.refu is None:
-        return 1.0
-    return wearable.refu.of_body(None if drape.feature is None else drape.feature[person])
+    return 1.0 if wearable.refu is None or drape.feature is None else wearable.refu.of_body(drape.feature[person])
 
 
 def _drape(

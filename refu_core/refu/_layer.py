@@ -26,12 +26,7 @@ class Refu(nn.Module):
     """
 
     def __init__(
-        self,
-        n_vertices: int,
-        *,
-        least: float,
-        scale: ScaleSettings | None = REALTIME,
-        margin: float = DEFAULT_MARGIN,
+        self, n_vertices: int, *, least: float, scale: ScaleSettings | None = REALTIME, margin: float = DEFAULT_MARGIN
     ) -> None:
         """A layer for garments of `n_vertices` N.
 

@@ -59,13 +59,7 @@ class ScaleNet(nn.Module):
     the garment. A network that hasn't been trained answers α ≈ 1 everywhere, the paper's fixed scale.
     """
 
-    def __init__(
-        self,
-        n_vertices: int,
-        *,
-        least: float,
-        settings: ScaleSettings = REALTIME,
-    ) -> None:
+    def __init__(self, n_vertices: int, *, least: float, settings: ScaleSettings = REALTIME) -> None:
         """Networks for garments of `n_vertices` N.
 
         `least` is the lower end of α's range: 1 with an accurate distance, so that no pushed vertex stays inside; 0
@@ -132,19 +126,11 @@ class ScaleNet(nn.Module):
         """α as `Resolver` asks for it, for the one body whose feature is z, shape (M,) or (1, M)."""
         row = z.reshape(1, -1)
         k = self.k if self.settings.kind == "vertex" else None
-        if isinstance(k, _CompactLatent):
-            return self._of_body_compact(k, row)
-
-        def scale(vertex: Tensor, distance: Tensor) -> Tensor:
-            alpha: Tensor = self(row, torch.zeros_like(vertex), vertex, distance)
-            return alpha
-
-        return scale
-
-    def _of_body_compact(self, k: _CompactLatent, z: Tensor) -> VertexScale:
-        """The same of a compact k, in half the time: z's factor of k goes into g's first layer, once a body."""
+        if not isinstance(k, _CompactLatent):
+            return lambda vertex, distance: self(row, torch.zeros_like(vertex), vertex, distance)
+        # Half the time: z's factor of a compact k goes into g's first layer, once a body.
         first, bias, last, last_bias = self.g.parameters()
-        inputs = torch.cat((k.projection(z), z.new_full((1, 1), 1 / _DISTANCE_UNIT)), dim=1)
+        inputs = torch.cat((k.projection(row), z.new_full((1, 1), 1 / _DISTANCE_UNIT)), dim=1)
         weight = (first * inputs).T
 
         def scale(vertex: Tensor, distance: Tensor) -> Tensor:
