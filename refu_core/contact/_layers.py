@@ -20,21 +20,14 @@ from refu_core.mesh import Connectivity
 
 
 class Layer:
-    """Brings one garment to the outer side of another one that is worn below it.
+    """Brings one garment to the outer side of another one that is worn below it (docs/architecture.md).
 
-    The repulsion is ReFU's (paper, Eq. 2) with a sheet in the place of the body, which the paper doesn't treat. Where
-    the height f of a vertex over the sheet is less than the gap ε, x' = x - (f - ε) n. The sheet's normal n is
-    interpolated at the closest point. Neighbours give way as they do on the skin (`Blend.spread`). Unlike a body, a
-    sheet has no inside: only cloth that faces the way the sheet does belongs above it. Beyond an open rim the sheet is
-    felt less and less.
+    The repulsion is ReFU's (paper, Eq. 2) with a sheet in the place of the body, which the paper doesn't treat: where
+    the height f of a vertex over the sheet is less than the gap ε, x' = x - (f - ε) n, and neighbours give way. Unlike
+    a body, a sheet has no inside: only cloth that faces the way the sheet does belongs above it.
 
-    The closest point is searched downhill, from the nearest of a few places around what was closest at rest. Cloth
-    slides by a few edges only, so that takes half the time of a tree. On a folded sheet the search may end in the wrong
-    fold, and in another one in the next frame. So a vertex also looks at what its neighbours found; and one that ends
-    more than a centimetre below the sheet asks a tree.
-
-    What isn't near the sheet at rest (a sleeve beside shorts) is a stranger to it, and asks the tree where it comes
-    there: its outside may face the sheet's.
+    The closest point is searched downhill, from the nearest of a few places around what was closest at rest, in half
+    the time of a tree. What isn't near the sheet at rest (a sleeve beside shorts) is a stranger, and asks the tree.
     """
 
     def __init__(
@@ -75,11 +68,8 @@ class Layer:
     def __call__(self, above: Tensor, below: Tensor, *, goes_on: bool = False) -> tuple[Tensor, Tensor]:
         """The outer garment, (V, 3) [m], off the inner one, (U, 3), and how many of its vertices were below the gap.
 
-        The number is an int32 of shape (1,), on the garments' device: a GPU isn't waited for, and makes the launches
-        for those below the gap where there are none, too. Not differentiable.
-
-        A call that `goes_on` is for the same inner garment as the last one: whoever is where it was left, and needn't
-        be moved from there, isn't looked at.
+        The number is an int32 of shape (1,), on the garments' device: a GPU isn't waited for. A call that `goes_on` is
+        for the same inner garment as the last one, and looks at nobody who is where it was left. Not differentiable.
         """
         with torch_stream(self.device):
             if not goes_on:

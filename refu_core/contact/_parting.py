@@ -20,14 +20,9 @@ from refu_core.sdf._crossing_kernels import BLOCK
 class Parting:
     """Parts one garment from another one that is worn below it, where their triangles cut each other.
 
-    Three steps, which the caller calls in this order, and the body has the last word after them. Faces that cut are
-    found, exactly. Around them the outer garment is levelled: a fold that went through the sheet between its vertices,
-    or deep into a crease where there is no room, is drawn back to the cloth around it. What still cuts is brought
-    apart, each face by the shortest way along the normal of the sheet that clears what it cuts deepest. The sheet stays
-    where it is.
-
-    All is done by one thread a face or vertex, which gathers what others have found: the order plays no role, and a
-    vertex that isn't near a cut is left as it is. A CPU is told when there is none; a GPU isn't waited for.
+    Three steps, which the caller calls in this order, and the body has the last word after them: faces that cut are
+    found, exactly; around them the outer garment is levelled; what still cuts is brought apart, each face by the
+    shortest way along the normal of the sheet that clears what it cuts deepest. The sheet stays where it is.
     """
 
     def __init__(self, mesh: Connectivity, rest: Tensor, sheet: Sheet, *, settings: ContactSettings) -> None:

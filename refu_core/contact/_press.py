@@ -62,14 +62,10 @@ class LimbMeshes:
 
 
 class Press:
-    """Keeps a garment between the skin that it lies on and the limbs that it doesn't lie on.
+    """Keeps a garment between the skin that it lies on and the limbs that it doesn't lie on (docs/architecture.md).
 
-    A hand that hangs beside a thigh goes through a wide skirt. Along the gradient half of the cloth in it would leave
-    in front and half behind, with edges through the hand between them. So a vertex is looked at from the skin that it
-    lies on: where another limb comes in between, it is drawn back to this side of it, and neighbours with it.
-
-    All of it is continuous: a limb that comes up beside the way to a vertex draws it back the farther the nearer it is
-    to that way, and how far a vertex goes is a maximum over the cloth around, which falls off along its edges.
+    Where another limb comes between a vertex and its skin, the vertex is drawn back to this side of it, and neighbours
+    with it. All of it is continuous: the farther back, the nearer the limb is to the way from skin to vertex.
     """
 
     def __init__(
@@ -133,10 +129,7 @@ class Press:
 
     @torch.no_grad()
     def __call__(self, points: Tensor, skin: Tensor) -> Tensor:
-        """The garment (N, 3) [m], pressed to `skin` (N, 3) [m], which it lies on, by the limbs as they are.
-
-        Not differentiable; a GPU isn't waited for.
-        """
+        """The garment (N, 3) [m], pressed to `skin` (N, 3) [m], which it lies on, by the limbs as they are."""
         self._points.copy_(points)
         self._skin.copy_(skin)
         self._counts.zero_()

@@ -57,15 +57,10 @@ class Resolver:
 
     The steps: where an approximate distance has missed the closest face, a neighbour names it; vertices nearer than the
     margin are pushed along the gradient (ReFU, paper, Eq. 2); their neighbours give way; edges that still run too low
-    are raised. Nothing in it knows of limbs: a body that doesn't run through itself (`Collider`) has room around each.
-
-    Memory and launches are prepared once. Each step lists the vertices for the next one, so a step costs what the
-    vertices at the skin do. What depends on other vertices is finished for all of them by one launch before the next
-    begins, so their order plays no role.
+    are raised. What depends on other vertices is one launch, so their order plays no role.
 
     On a CPU, steps that concern no vertex are left out. A GPU would have to be waited for to know, so it gets the same
-    launches in every frame, as a CUDA graph needs them. For the same reason the numbers of a `Resolution` stay on the
-    device until they are read.
+    launches in every frame, as a CUDA graph needs them, and the numbers of a `Resolution` stay there.
     """
 
     def __init__(self, faces: Tensor, n_vertices: int, *, settings: ContactSettings = DEFAULT_CONTACT) -> None:

@@ -16,9 +16,6 @@ from refu_core.mesh import Connectivity
 class StrainLimit:
     """Draws the ends of edges together that contact has made longer than a multiple of their rest length.
 
-    Vertices that are deep in a limb may leave it on another side than their neighbours do, which tears the cloth. Drawn
-    together, they are pushed off the skin anew, on the side where most of them are.
-
     Jacobi sweeps of position-based dynamics (Müller et al. 2007): edges pull by half of what they are too long, and a
     vertex goes by the mean of its edges. The result is continuous in the vertices, and edges within the limit stay.
     """
@@ -49,8 +46,7 @@ class StrainLimit:
     def __call__(self, points: Tensor, before: Tensor, rest: Tensor) -> Tensor:
         """The garment (N, 3) [m] with no tear in it; on a CPU the very points where there was none.
 
-        `before` (N, 3) [m] are its vertices before contact, and `rest` (N, 3) [m] those of the wearer's garment in the
-        rest pose. Not differentiable; a GPU isn't waited for.
+        `before` (N, 3) [m] are its vertices before contact, `rest` (N, 3) [m] those of the wearer's garment at rest.
         """
         self._points.copy_(points)
         self._before.copy_(before)

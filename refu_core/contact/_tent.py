@@ -69,14 +69,10 @@ class Shins:
 
 
 class Tent:
-    """Keeps cloth that hangs behind the legs at rest behind the shins in any pose.
+    """Keeps cloth that hangs behind the legs at rest behind the shins in any pose (docs/architecture.md).
 
-    The back of a skirt follows the thighs. A heel that goes up behind meets it, and networks leave it centimetres
-    inside the calf, from where the gradient leads to one side in one frame and to the other in the next. So before
-    cloth is brought off anything it goes backwards, out of a tent over each shin, by the shortest way out of both.
-
-    It is a continuous function of the pose. The tent is as wide as the shin. Cloth that is farther behind the bone than
-    that at rest goes by `tent_share`, other cloth by less, and none at rest.
+    It goes backwards, out of a tent over each shin, by the shortest way out of both: by `tent_share` where at rest it
+    is farther behind the bone than the tent is wide, other cloth by less, and none at rest.
     """
 
     def __init__(self, garment: GarmentTemplate, shins: Shins, *, settings: ContactSettings = DEFAULT_CONTACT) -> None:

@@ -22,10 +22,7 @@ from refu_core.garments import GarmentTemplate
 
 
 class Unfold:
-    """Levels one garment where it has folded over.
-
-    In a deep squat the shorts are predicted with a bulge at the crotch that overhangs, and in the crease of the hip
-    both sides of the fold run through each other. Such a sheet has no outer side that another one could be brought to.
+    """Levels one garment where it has folded over: such a sheet has no outer side to bring another one to.
 
     Where cloth faces is known without its folds: its normal at rest, turned as skinning turns the vertex. The farther
     the normal has left that, the more a vertex gives way to its neighbours, and these less and less around it. All of
@@ -77,10 +74,7 @@ class Unfold:
 
     @torch.no_grad()
     def __call__(self, points: Tensor, rotation: Tensor) -> Tensor:
-        """The garment (V, 3) [m], unfolded, of a body posed by `rotation`, shape (24, 3, 3), in the same axes.
-
-        Vertices go no farther than any may. Not differentiable; a GPU isn't waited for.
-        """
+        """The garment (V, 3) [m], unfolded, of a body posed by `rotation`, shape (24, 3, 3), in the same axes."""
         with torch_stream(self._device):
             self._points.copy_(points)
             self._rotation.copy_(rotation)

@@ -14,14 +14,10 @@ from refu_core.sdf import Winding
 
 
 class WayOut:
-    """Takes vertices that are inside a posed body to the closest skin that is outside of it.
+    """Takes vertices that are inside a posed body, by winding number, to the closest skin that is outside of it.
 
-    A distance has a sign by the face that is closest. An approximate distance may have missed that face, and where the
-    body still overlaps itself the closest face may lie inside: then a vertex is believed to be outside. A winding
-    number is right in both cases. So it is asked about every vertex at the end. Faces with an interior above them are
-    covered by another part of the body, and don't count as skin. As a face may be covered in part, who is inside after
-    that goes to a vertex or to the middle of a face that is known to be open.
-
+    Faces with an interior above them are covered by another part of the body, and don't count. As a face may be covered
+    in part, who is inside after that goes to a vertex or to the middle of a face that is known to be open.
     In most frames nobody is inside, and the winding numbers are all that this costs.
     """
 

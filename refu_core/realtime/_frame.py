@@ -157,10 +157,8 @@ class FrameStep:
     def unpacked(self, packed: NDArray[np.float32]) -> Iterator[list[NDArray[np.float32]]]:
         """Of each person the collider, the skin, the shift, then of each garment its vertices, raw ones and numbers.
 
-        Vertices are [m], shape (V, 3), in the world's axes; nothing is copied.
-
-        Raises:
-            MeshError: they aren't finite. A graph can't be interrupted to say so earlier.
+        Vertices are [m], shape (V, 3), in the world's axes; nothing is copied. Raises `MeshError` for what isn't
+        finite: a graph can't be interrupted to say so earlier.
         """
         if not np.isfinite(packed.sum(dtype=np.float64)):
             bad = int((~np.isfinite(packed)).any(axis=1).sum())

@@ -19,11 +19,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class RootTurn:
-    """Turns one person about their root.
+    """Turns one person about their root: they are dressed as the root sees them, whichever way they face or lie.
 
-    A person is dressed as the root sees them, so grids, tables and thresholds are the same whichever way the person
-    faces or lies. In world axes a turn would move vertices by millimetres at a fold, and by centimetres where limbs run
-    into each other: the approximate distance would look up other guides, and rounding would decide thresholds anew.
+    In world axes a turn would move vertices by millimetres at a fold, and by centimetres where limbs run into each
+    other: the approximate distance would look up other guides, and rounding would decide thresholds anew.
     """
 
     rotation: Tensor
