@@ -6,7 +6,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import cache, lru_cache, partial
 from numbers import Real
 from types import NoneType
 from typing import TYPE_CHECKING, NoReturn, overload
@@ -279,16 +279,18 @@ class GarmentPipeline:
             told["up"] = torch.as_tensor(np.stack([frame.up for frame in frames]))
         if self._graphs is not None and adjust is None:
             packed = self._graphs({"pose": pose, **told, **wearer.tensors()}, margins)
-            outputs = [self._unpacked(frame, parts) for frame, parts in zip(frames, step.unpacked(packed), strict=True)]
+            persons = step.unpacked(packed)
+            outputs = [self._output(frame, person, {}) for frame, person in zip(frames, persons, strict=True)]
             clocks[0].lap("step")
             took = {"step": clocks[0].stages["step"] / len(frames)}
             return [replace(one, stats=replace(one.stats, stage_ms=took)) for one in outputs]
         told = {name: tensor.to(self.body.device) for name, tensor in told.items()}
-        persons = step(pose.to(self.body.device), wearer, margins, clocks, adjust, **told)
-        return [
-            self._output(frame, person, clock, skipped)
-            for frame, person, clock, (_, skipped) in zip(frames, persons, clocks, found, strict=True)
-        ]
+        outputs = []
+        done = step(pose.to(self.body.device), wearer, margins, clocks, adjust, **told)
+        for frame, person, clock, (_, skipped) in zip(frames, done, clocks, found, strict=True):
+            n_clipped = sum(int(worn.n_clipped) for worn in person.garments.values())
+            outputs.append(self._output(frame, person, {**skipped, "band": n_clipped}, clock))
+        return outputs
 
     def _wearer(self, frame: SmplFrame) -> tuple[Wearer, dict[str, int]]:
         """What depends on the person's (β, γ), and how much of it was known."""
@@ -307,39 +309,24 @@ class GarmentPipeline:
         self._wearers[key] = wearer
         return wearer, {}
 
-    def _output(self, frame: SmplFrame, person: Person, clock: StageClock, skipped: dict[str, int]) -> PipelineOutput:
-        meshes, stats, n_clipped = {}, {}, 0
+    def _output(
+        self, frame: SmplFrame, person: Person, skipped: Mapping[str, int], clock: StageClock | None = None
+    ) -> PipelineOutput:
+        turn, meshes, stats = person.turn, {}, {}
+
+        def on_host(points: Tensor) -> NDArray[np.float32]:
+            made: NDArray[np.float32] = turn(points).cpu().numpy()
+            return made
+
         for name in self.outfit.wearables:
-            worn = person.garments[name]
-            meshes[name] = GarmentMesh(
-                person.turn.to_host(worn.vertices), person.turn.later(worn.raw), self._faces[name], frame.transl
-            )
-            stats[name] = GarmentStats.of(worn.numbers.tolist(), ms=clock.garments[name])
-            n_clipped += int(worn.n_clipped)
-        took = self._stats(frame, clock.stages, stats, {**skipped, "band": n_clipped}, person.shift.tolist())
-        return PipelineOutput(meshes, person.turn.later(person.body), person.turn.later(person.skin), took)
-
-    def _unpacked(self, frame: SmplFrame, parts: list[NDArray[np.float32]]) -> PipelineOutput:
-        body, skin, shift, *rest = parts
-        meshes, stats = {}, {}
-        for i, name in enumerate(self.outfit.wearables):
-            vertices, raw, numbers = rest[3 * i : 3 * i + 3]
-            meshes[name] = GarmentMesh(vertices, partial(np.asarray, raw), self._faces[name], frame.transl)
-            stats[name] = GarmentStats.of(numbers.tolist())
-        took = self._stats(frame, {}, stats, {}, shift.tolist())
-        return PipelineOutput(meshes, partial(np.asarray, body), partial(np.asarray, skin), took)
-
-    def _stats(
-        self,
-        frame: SmplFrame,
-        stage_ms: Mapping[str, float],
-        garments: Mapping[str, GarmentStats],
-        skipped: Mapping[str, int],
-        shift: Sequence[float],
-    ) -> FrameStats:
-        moved = SkinShift.of(shift)
-        promised = within_promise(frame) and not moved.n_held
-        return FrameStats(stage_ms, garments, self._is_certified, promised, skipped, moved)
+            vertices, raw, numbers, _ = person.garments[name]
+            later = cache(partial(on_host, raw))
+            meshes[name] = GarmentMesh(on_host(vertices), later, self._faces[name], frame.transl)
+            stats[name] = GarmentStats.of(numbers.tolist(), ms=0.0 if clock is None else clock.garments[name])
+        shift, stage_ms = SkinShift.of(person.shift.tolist()), {} if clock is None else clock.stages
+        promised = within_promise(frame) and not shift.n_held
+        took = FrameStats(stage_ms, stats, self._is_certified, promised, skipped, shift)
+        return PipelineOutput(meshes, cache(partial(on_host, person.body)), cache(partial(on_host, person.skin)), took)
 
 
 def _past(frames: Sequence[SmplFrame]) -> Tensor:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -51,7 +49,3 @@ class RootTurn:
         """The same as an array."""
         seen: NDArray[np.float32] = self(points).cpu().numpy()
         return seen
-
-    def later(self, points: Tensor) -> Callable[[], NDArray[np.float32]]:
-        """`to_host`, computed when it is first asked for; the points must not be written to."""
-        return functools.cache(functools.partial(self.to_host, points))
