@@ -29,27 +29,35 @@ class Outer:
 
 
 @wp.func
-def corner(face: int, k: int, outer: Outer) -> wp.vec3:
-    return outer.points[outer.cut.faces[face, k]]
+def corners(face: int, points: wp.array[wp.vec3], faces: wp.array2d[int]) -> wp.mat33:
+    """A triangle, a row a corner."""
+    return wp.matrix_from_rows(points[faces[face, 0]], points[faces[face, 1]], points[faces[face, 2]])
 
 
 @wp.func
-def cut_each_other(face: int, outer: Outer, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> bool:
-    """Whether a face cuts triangle abc of another mesh."""
-    i = outer.cut.faces[face, 0]
-    j = outer.cut.faces[face, 1]
-    k = outer.cut.faces[face, 2]
-    own = wp.vec3i(i, j, k)
+def lowest(triangle: wp.mat33) -> wp.vec3:
+    return wp.min(wp.min(triangle[0], triangle[1]), triangle[2])
+
+
+@wp.func
+def highest(triangle: wp.mat33) -> wp.vec3:
+    return wp.max(wp.max(triangle[0], triangle[1]), triangle[2])
+
+
+@wp.func
+def cut_each_other(face: int, own: wp.mat33, other: wp.mat33, faces: wp.array2d[int]) -> bool:
+    """Whether a face cuts the triangle of another mesh."""
     # The other's edges are looked at from one face alone: any order of their ends will do.
+    order = wp.vec3i(faces[face, 0], faces[face, 1], faces[face, 2])
     edges = meeting_edges(
-        own,
-        double(outer.points[i]),
-        double(outer.points[j]),
-        double(outer.points[k]),
-        own,
-        double(a),
-        double(b),
-        double(c),
+        order,
+        double(own[0]),
+        double(own[1]),
+        double(own[2]),
+        order,
+        double(other[0]),
+        double(other[1]),
+        double(other[2]),
         False,
     )
     return edges > 0
@@ -65,16 +73,11 @@ def find_kernel(below: Below, outer: Outer) -> None:
     lows = Corners()
     highs = Corners()
     for n in range(first, end):
-        face = outer.order[n]
-        a = corner(face, 0, outer)
-        b = corner(face, 1, outer)
-        c = corner(face, 2, outer)
-        low = wp.min(wp.min(a, b), c)
-        high = wp.max(wp.max(a, b), c)
-        lows[n - first] = low
-        highs[n - first] = high
-        lower = wp.min(lower, low)
-        upper = wp.max(upper, high)
+        own = corners(outer.order[n], outer.points, outer.cut.faces)
+        lows[n - first] = lowest(own)
+        highs[n - first] = highest(own)
+        lower = wp.min(lower, lowest(own))
+        upper = wp.max(upper, highest(own))
     lower = wp.max(lower, below.extent[0])
     upper = wp.min(upper, below.extent[1])
     if lower[0] > upper[0] or lower[1] > upper[1] or lower[2] > upper[2]:
@@ -82,11 +85,9 @@ def find_kernel(below: Below, outer: Outer) -> None:
     query = wp.mesh_query_aabb(below.tree, lower, upper)
     other = int(0)
     while wp.mesh_query_aabb_next(query, other):
-        p = wp.mesh_get_point(below.tree, 3 * other)
-        q = wp.mesh_get_point(below.tree, 3 * other + 1)
-        r = wp.mesh_get_point(below.tree, 3 * other + 2)
-        low = wp.min(wp.min(p, q), r)
-        high = wp.max(wp.max(p, q), r)
+        sheet = corners(other, below.points, below.cut.faces)
+        low = lowest(sheet)
+        high = highest(sheet)
         for n in range(first, end):
             i = n - first
             if lows[i, 0] > high[0] or lows[i, 1] > high[1] or lows[i, 2] > high[2]:
@@ -94,7 +95,7 @@ def find_kernel(below: Below, outer: Outer) -> None:
             if highs[i, 0] < low[0] or highs[i, 1] < low[1] or highs[i, 2] < low[2]:
                 continue
             face = outer.order[n]
-            if cut_each_other(face, outer, p, q, r):
+            if cut_each_other(face, corners(face, outer.points, outer.cut.faces), sheet, outer.cut.faces):
                 wp.atomic_add(outer.count, 0, 1)
                 for k in range(3):
                     outer.marked[outer.cut.faces[face, k]] = 1.0
@@ -107,8 +108,11 @@ def turned(n: wp.vec3, a: wp.vec3, b: wp.vec3) -> float:
 
 
 @wp.func
-def shadow(p: wp.vec3, n: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.vec3:
-    """Barycentrics in triangle abc of where p is, seen along n; negative ones where abc is seen from its edge."""
+def shadow(p: wp.vec3, n: wp.vec3, triangle: wp.mat33) -> wp.vec3:
+    """Barycentrics in a triangle of where p is, seen along n; negative ones where it is seen from its edge."""
+    a = triangle[0]
+    b = triangle[1]
+    c = triangle[2]
     area = turned(n, b - a, c - a)
     w_b = turned(n, p - a, c - a) / area
     w_c = turned(n, b - a, p - a) / area
@@ -121,27 +125,23 @@ def is_in(w: wp.vec3) -> bool:
 
 
 @wp.func
-def depth_below(
-    n: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3, p: wp.vec3, q: wp.vec3, r: wp.vec3
-) -> tuple[float, wp.vec3]:
-    """How far triangle abc has to go along n to be above pqr, and which place of it that is, in barycentrics.
+def depth_below(n: wp.vec3, own: wp.mat33, other: wp.mat33) -> tuple[float, wp.vec3]:
+    """How far a triangle has to go along n to be above the other, and which place of it that is, in barycentrics.
 
     Over what both cover, seen along n, the difference of their heights is linear: it is largest at a corner of that.
     """
-    own = wp.matrix_from_rows(a, b, c)
-    other = wp.matrix_from_rows(p, q, r)
     most = float(0.0)
     place = wp.vec3()
     for k in range(3):
         corner = other[k]
-        w = shadow(corner, n, a, b, c)
-        depth = wp.dot(n, corner - (w[0] * a + w[1] * b + w[2] * c))
+        w = shadow(corner, n, own)
+        depth = wp.dot(n, corner - (w[0] * own[0] + w[1] * own[1] + w[2] * own[2]))
         if is_in(w) and depth > most:
             most = depth
             place = w
         corner = own[k]
-        w = shadow(corner, n, p, q, r)
-        depth = wp.dot(n, w[0] * p + w[1] * q + w[2] * r - corner)
+        w = shadow(corner, n, other)
+        depth = wp.dot(n, w[0] * other[0] + w[1] * other[1] + w[2] * other[2] - corner)
         if is_in(w) and depth > most:
             most = depth
             place = wp.vec3()
@@ -179,23 +179,19 @@ def measure_kernel(below: Below, outer: Outer, gap: float, most: float) -> None:
     if is_marked == 0.0:
         return
     outer.place[face] = wp.vec3()
-    a = corner(face, 0, outer)
-    b = corner(face, 1, outer)
-    c = corner(face, 2, outer)
+    own = corners(face, outer.points, outer.cut.faces)
     deepest = float(0.0)
-    query = wp.mesh_query_aabb(below.tree, wp.min(wp.min(a, b), c), wp.max(wp.max(a, b), c))
+    query = wp.mesh_query_aabb(below.tree, lowest(own), highest(own))
     other = int(0)
     while wp.mesh_query_aabb_next(query, other):
-        p = wp.mesh_get_point(below.tree, 3 * other)
-        q = wp.mesh_get_point(below.tree, 3 * other + 1)
-        r = wp.mesh_get_point(below.tree, 3 * other + 2)
-        if cut_each_other(face, outer, p, q, r):
+        sheet = corners(other, below.points, below.cut.faces)
+        if cut_each_other(face, own, sheet, outer.cut.faces):
             n = wp.normalize(
                 below.normals[below.cut.faces[other, 0]]
                 + below.normals[below.cut.faces[other, 1]]
                 + below.normals[below.cut.faces[other, 2]]
             )
-            depth, w = depth_below(n, a, b, c, p, q, r)
+            depth, w = depth_below(n, own, sheet)
             if depth > deepest:
                 deepest = depth
                 outer.place[face] = w

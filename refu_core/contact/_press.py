@@ -76,10 +76,7 @@ class Press:
         knows_arms: bool = False,
         settings: ContactSettings = DEFAULT_CONTACT,
     ) -> None:
-        """For a garment and the limbs of the body that it is worn on, on one device.
-
-        Whether what predicts it `knows_arms` is as in `Wearable`.
-        """
+        """For a garment, and the limbs of the body that it is worn on; `knows_arms` is as in `Wearable`."""
         self._settings = settings
         self._limbs = limbs  # their memory is read
         n, self.device = garment.n_vertices, garment.v_template.device
@@ -120,7 +117,7 @@ class Press:
             "look": (kernels.look_kernel, len(fabric.start) - 1, [fabric, limbs.bundles, feel]),
             "press all": (kernels.press_all_kernel, 1, [fabric, meshes, feel, slope, sweeps, near]),
             "press": (kernels.press_kernel, n, [fabric, meshes, feel]),
-            "lower": (kernels.lower_kernel, n, [fabric, feel, (fabric.cut, fabric.spread)[sweeps % 2]]),
+            "lower": (kernels.lower_kernel, n, [fabric, feel]),
         }
         for sweep in range(sweeps):
             fields = [fabric.cut, fabric.spread] if sweep % 2 == 0 else [fabric.spread, fabric.cut]

@@ -146,12 +146,12 @@ def spread_kernel(fabric: Fabric, slope: float, cut: wp.array[float], wider: wp.
 
 
 @wp.func
-def lower(v: int, fabric: Fabric, feel: Feel, cut: wp.array[float]) -> None:
+def lower(v: int, fabric: Fabric, feel: Feel) -> None:
     """Draws a vertex back towards the skin, of which it keeps half the room off if it was."""
-    if cut[v] > 0.0:
+    if fabric.cut[v] > 0.0:
         way = fabric.points[v] - fabric.skin[v]
         height = wp.length(way)
-        left = wp.max(height - cut[v], wp.min(height, 0.5 * feel.room))
+        left = wp.max(height - fabric.cut[v], wp.min(height, 0.5 * feel.room))
         fabric.points[v] = fabric.skin[v] + (left / wp.max(height, 1.0e-9)) * way
 
 
@@ -164,9 +164,9 @@ def press_kernel(fabric: Fabric, limbs: wp.array[wp.uint64], feel: Feel) -> None
 
 
 @wp.kernel
-def lower_kernel(fabric: Fabric, feel: Feel, cut: wp.array[float]) -> None:
+def lower_kernel(fabric: Fabric, feel: Feel) -> None:
     """`lower` of one vertex a thread."""
-    lower(wp.tid(), fabric, feel, cut)
+    lower(wp.tid(), fabric, feel)
 
 
 @wp.kernel
@@ -203,7 +203,7 @@ def press_all_kernel(
         first = after
         n_front = n_next
     for i in range(fabric.counts[PRESSED]):
-        lower(fabric.rows[i], fabric, feel, fabric.cut)
+        lower(fabric.rows[i], fabric, feel)
     for i in range(fabric.counts[PRESSED]):
         v = fabric.rows[i]
         fabric.in_front[v] = 0

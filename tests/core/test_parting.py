@@ -23,7 +23,8 @@ Array = NDArray[np.float64]
 
 @wp.kernel
 def _depth_kernel(corners: wp.array[wp.vec3], n: wp.vec3, depth: wp.array[float], place: wp.array[wp.vec3]) -> None:
-    found, w = depth_below(n, corners[0], corners[1], corners[2], corners[3], corners[4], corners[5])
+    own = wp.matrix_from_rows(corners[0], corners[1], corners[2])
+    found, w = depth_below(n, own, wp.matrix_from_rows(corners[3], corners[4], corners[5]))
     depth[0] = found
     place[0] = w
 
