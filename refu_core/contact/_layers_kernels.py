@@ -89,6 +89,25 @@ def normal_at(v: int, points: wp.array[wp.vec3], cut: Cut) -> wp.vec3:
 
 
 @wp.func
+def gather(n: int, rounds: int, cut: Cut, rows: wp.array[int], is_listed: wp.array[int]) -> int:
+    """Lists after the first n `rows` who is up to so many edges away, and gives how many they are all together."""
+    first = int(0)
+    last = int(n)
+    found = int(n)
+    for _ in range(rounds):
+        for k in range(first, last):
+            for r in range(cut.ring_start[rows[k]], cut.ring_start[rows[k] + 1]):
+                j = cut.ring[r]
+                if is_listed[j] == 0:
+                    is_listed[j] = 1
+                    rows[found] = j
+                    found += 1
+        first = last
+        last = found
+    return found
+
+
+@wp.func
 def heaviest(w: wp.vec3) -> int:
     """The corner of a face that weighs most."""
     return wp.where(w[0] >= w[1] and w[0] >= w[2], 0, wp.where(w[1] >= w[2], 1, 2))
@@ -308,17 +327,7 @@ def move_all_kernel(above: Above, rounds: int) -> None:
             above.is_reached[i] = 1
             above.reached[n] = i
             n += 1
-    first = int(0)
-    for _ in range(rounds):
-        last = int(n)
-        for k in range(first, last):
-            for r in range(above.cut.ring_start[above.reached[k]], above.cut.ring_start[above.reached[k] + 1]):
-                j = above.cut.ring[r]
-                if above.is_reached[j] == 0:
-                    above.is_reached[j] = 1
-                    above.reached[n] = j
-                    n += 1
-        first = last
+    n = gather(n, rounds, above.cut, above.reached, above.is_reached)
     for sweep in range(rounds):
         for k in range(n):
             if sweep % 2 == 0:

@@ -3,7 +3,7 @@
 import warp as wp
 
 from refu_core.body._pose_kernels import turned
-from refu_core.contact._layers_kernels import Cut
+from refu_core.contact._layers_kernels import Cut, gather
 from refu_core.contact._level_kernels import levelled, widest
 from refu_core.contact._state import bounded
 
@@ -88,20 +88,10 @@ def unfold_all_kernel(fold: Fold, fade: float, reach: int, rounds: int, most: fl
 
     `rounds` are even.
     """
-    n = fold.count[0]
-    for r in range(n):
+    for r in range(fold.count[0]):
         fold.is_listed[fold.rows[r]] = 1
-    first = int(0)
+    n = gather(fold.count[0], reach, fold.cut, fold.rows, fold.is_listed)
     for _ in range(reach):
-        last = int(n)
-        for r in range(first, last):
-            for s in range(fold.cut.ring_start[fold.rows[r]], fold.cut.ring_start[fold.rows[r] + 1]):
-                j = fold.cut.ring[s]
-                if fold.is_listed[j] == 0 and fold.share[j] > 0.0:
-                    fold.is_listed[j] = 1
-                    fold.rows[n] = j
-                    n += 1
-        first = last
         for r in range(n):
             fold.wider[r] = widest(fold.rows[r], fold.weight, fold.share, fold.cut, fade)
         for r in range(n):
