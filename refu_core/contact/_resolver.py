@@ -255,7 +255,7 @@ class Resolver:
         steps["spread1"] = (_round_kernels.spread_kernel, [state, cloth, short_step, state.smoother, state.field])
         steps["lift"] = (_round_kernels.lift_kernel, [state, skin, rules])
         low, lower = self._low
-        of_edges = {
+        of_edges: dict[str, tuple[Any, list[Any]]] = {
             name: (_round_kernels.measure_kernel, [state, cloth, skin, rules, 0, source, target])
             for name, source, target in (
                 ("measure", state.suspects, low),

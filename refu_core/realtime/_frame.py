@@ -161,7 +161,7 @@ class FrameStep:
             msg = f"vertices must be finite, got NaN or infinite ones of {bad} of {len(packed)} persons"
             raise MeshError(msg)
         for row in torch.from_numpy(packed):
-            body, skin, shift, *parts = row.split(self._sizes)
+            body, skin, shift, *parts = torch.split(row, self._sizes)
             garments = {
                 name: Worn(parts[3 * i].view(-1, 3), parts[3 * i + 1].view(-1, 3), parts[3 * i + 2], torch.zeros(()))
                 for i, name in enumerate(self.outfit.wearables)
