@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
@@ -51,6 +52,18 @@ _start_quietly()
 def as_warp(tensor: Tensor, dtype: Any) -> Any:
     """A Warp array over the memory of a contiguous `tensor`: nothing is copied, no gradient is carried."""
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
+
+
+def ints(values: Any, device: Any) -> Any:
+    """Whole numbers as a Warp array."""
+    return wp.array(np.ascontiguousarray(values, np.int32), dtype=wp.int32, device=str(device))
+
+
+def recorded(kernel: Any, dim: int, inputs: Sequence[Any], device: Any) -> Any:
+    """A launch to be made again and again, on what its arrays hold by then."""
+    command = wp.launch(kernel, dim, inputs, device=str(device), record_cmd=True)
+    command.kept = inputs  # it knows addresses
+    return command
 
 
 class Repeated(threading.local):

@@ -12,16 +12,8 @@ GARMENT_FILE = "garment_{}.npz"
 """How a garment's file is called in a folder of them."""
 PAPER_GARMENTS: tuple[str, ...] = ("shirt-male", "tshirt-male", "short-pant-male", "skirt-female")
 """The garments of the paper's tables; trained weights of these ship."""
-BUILTIN_GARMENTS: tuple[str, ...] = (
-    *PAPER_GARMENTS,
-    *sorted(
-        {
-            path.stem.removeprefix("garment_")
-            for path in (Path(__file__).parent / "assets").glob(GARMENT_FILE.format("*"))
-        }
-        - set(PAPER_GARMENTS)
-    ),
-)
+_FILES = (Path(__file__).parent / "assets").glob(GARMENT_FILE.format("*"))
+BUILTIN_GARMENTS = (*PAPER_GARMENTS, *sorted({p.stem.removeprefix("garment_") for p in _FILES} - set(PAPER_GARMENTS)))
 """Garments that ship."""
 DEFAULT_GARMENTS: tuple[str, ...] = ("tshirt-male", "short-pant-male")
 """What a person wears of whom nothing else is said."""

@@ -5,8 +5,8 @@ from refu_core.contact._layers import Layer as Layer
 from refu_core.contact._parting import Parting as Parting
 from refu_core.contact._press import LimbMeshes as LimbMeshes
 from refu_core.contact._press import Press as Press
-from refu_core.contact._resolution import Resolution as Resolution
 from refu_core.contact._resolver import ASKED_FROM as ASKED_FROM
+from refu_core.contact._resolver import Resolution as Resolution
 from refu_core.contact._resolver import Resolver as Resolver
 from refu_core.contact._settings import DEFAULT_CONTACT as DEFAULT_CONTACT
 from refu_core.contact._settings import ContactSettings as ContactSettings

@@ -18,16 +18,11 @@ _STEPS = DEFAULT_CONTACT.blend_steps * DEFAULT_CONTACT.blend_pairs
 
 @dataclass(frozen=True, eq=False)
 class Blend:
-    """Spreads the pushes of some vertices over the garment's mesh.
+    """Spreads the pushes of some vertices over the garment's mesh, so that folds stay.
 
-    Vertices pushed to the margin one by one lie flat on it and are torn from neighbours that were just outside. Folds
-    are lost, and the edges between cut through the skin. So the displacement is made smooth, while every vertex goes at
-    least as far along its gradient as it has to: a few sweeps of averaging towards the smoothest field with nᵢᵀdᵢ ≥ pᵢ.
-    This is the smoothness term of DRAPE's optimisation (Guan et al. 2012) at the price of a few averages.
-
-    The field begins with the predicted scale, which may lead beyond the margin, but the bound pᵢ is no more than the
-    way to the margin. α differs from neighbour to neighbour by a twentieth: as a bound it would print millimetres of
-    noise into the cloth.
+    A few sweeps average towards the smoothest displacements d with nᵢᵀdᵢ ≥ pᵢ, the smoothness term of DRAPE (Guan et
+    al. 2012). They begin with the predicted scale, which may lead beyond the margin, but the bound pᵢ is no more than
+    the way to the margin: α differs from neighbour to neighbour, and would print noise into the cloth.
     """
 
     neighbours: Tensor

@@ -5,6 +5,8 @@ import warp as wp
 from refu_core.contact._state import BESIDE, CUTTING, NEAR, RAISED, SHIFTED, Cloth, Rules, State, bounded, keep
 from refu_core.sdf import Skin, query_skin
 
+wp.set_module_options({"enable_backward": False})
+
 
 @wp.func
 def middle_deficit(edge: int, state: State, cloth: Cloth, skin: Skin, rules: Rules) -> tuple[float, wp.vec3]:
@@ -19,7 +21,7 @@ def middle_deficit(edge: int, state: State, cloth: Cloth, skin: Skin, rules: Rul
     return lack * wp.clamp(2.0 - lack / rules.through, 0.0, 1.0), gradient
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def suspect_kernel(each: int, state: State, cloth: Cloth, rules: Rules) -> None:
     """Lists the edges whose middle may be closer to the skin than half the margin (`_raise_edges`)."""
     if state.counts[NEAR] + state.counts[SHIFTED] == 0:
@@ -47,16 +49,7 @@ def suspect_kernel(each: int, state: State, cloth: Cloth, rules: Rules) -> None:
 
 
 @wp.func
-def measure(
-    edge: int,
-    rounds: int,
-    state: State,
-    cloth: Cloth,
-    skin: Skin,
-    rules: Rules,
-    # output
-    low: wp.array[int],
-) -> None:
+def measure(edge: int, rounds: int, state: State, cloth: Cloth, skin: Skin, rules: Rules, low: wp.array[int]) -> None:
     """Whether a suspected edge is too low, and by how much; after the first of the `rounds`, if it was moved."""
     a = cloth.edges[edge, 0]
     b = cloth.edges[edge, 1]
@@ -97,7 +90,7 @@ def lift(i: int, state: State, skin: Skin, rules: Rules) -> None:
         state.moved[i] = 1
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def raise_edges_kernel(state: State, cloth: Cloth, skin: Skin, rules: Rules) -> None:
     """All rounds by one thread; those that stay low take the places of those before them in the list of suspects."""
     n = int(state.counts[CUTTING])

@@ -11,32 +11,23 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from refu_core._warp import as_warp, torch_stream
+from refu_core._warp import as_warp, ints, recorded, torch_stream
 from refu_core.contact import _layers_kernels as kernels
-from refu_core.contact import _layers_move_kernels as moving
 from refu_core.contact._parting import Parting
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
-from refu_core.contact._sheet import Sheet, ints
-from refu_core.errors import MeshError
+from refu_core.contact._sheet import Sheet
 from refu_core.mesh import Connectivity
 
 
 class Layer:
-    """Brings one garment to the outer side of another one that is worn below it.
+    """Brings one garment to the outer side of another one that is worn below it (docs/architecture.md).
 
-    The repulsion is ReFU's (paper, Eq. 2) with a sheet in the place of the body, which the paper doesn't treat. Where
-    the height f of a vertex over the sheet is less than the gap ε, x' = x - (f - ε) n. The sheet's normal n is
-    interpolated at the closest point. Neighbours give way as they do on the skin (`Blend.spread`). Unlike a body, a
-    sheet has no inside: only cloth that faces the way the sheet does belongs above it. Beyond an open rim the sheet is
-    felt less and less.
+    The repulsion is ReFU's (paper, Eq. 2) with a sheet in the place of the body, which the paper doesn't treat: where
+    the height f of a vertex over the sheet is less than the gap ε, x' = x - (f - ε) n, and neighbours give way. Unlike
+    a body, a sheet has no inside: only cloth that faces the way the sheet does belongs above it.
 
-    The closest point is searched downhill, from the nearest of a few places around what was closest at rest. Cloth
-    slides by a few edges only, so that takes half the time of a tree. On a folded sheet the search may end in the wrong
-    fold, and in another one in the next frame. So a vertex also looks at what its neighbours found; and one that ends
-    more than a centimetre below the sheet asks a tree.
-
-    What isn't near the sheet at rest (a sleeve beside shorts) is a stranger to it, and asks the tree where it comes
-    there: its outside may face the sheet's.
+    The closest point is searched downhill, from the nearest of a few places around what was closest at rest, in half
+    the time of a tree. What isn't near the sheet at rest (a sleeve beside shorts) is a stranger, and asks the tree.
     """
 
     def __init__(
@@ -50,40 +41,36 @@ class Layer:
     ) -> None:
         """For two garments, by faces (F, 3) and vertices in the rest pose (V, 3) [m], counter-clockwise from outside.
 
-        Raises:
-            MeshError: faces that aren't triangles of these vertices, or a gap that is negative or beyond the reach.
+        Raises `MeshError` for faces that aren't triangles of these vertices.
         """
-        gap, farthest = settings.layer_gap, settings.layer_reach
-        if not 0 <= gap < farthest:
-            msg = f"the gap between garments must be at least 0 and less than {farthest} m, got {gap}"
-            raise MeshError(msg)
         self._settings = settings
         self.device = above.device
         self._is_serial = self.device.type == "cpu"
-        self._above = above.detach().to(torch.float32, copy=True).contiguous()
-        above_mesh = Connectivity.of(above_faces.cpu(), len(above))
         self._below = Sheet(Connectivity.of(below_faces.cpu(), len(below)), below)
-        self.parting = Parting(above_mesh, self._above, self._below, settings=settings)
-        """What is done where triangles cut each other after all."""
-        self._given, self._push, *self._fields = torch.zeros(4, *self._above.shape, device=self.device)
-        self._moved = torch.zeros(len(above), dtype=torch.int32, device=self.device)
+        mesh = Connectivity.of(above_faces.cpu(), len(above))
+        self.parting = Parting(mesh, above, self._below, settings=settings)
+        """What is done where triangles of this garment and the inner one of the last call cut each other after all."""
+        n = len(above)
+        self._given, self._points, self._push, *self._fields = torch.zeros(5, n, 3, device=self.device)
         self._count = torch.zeros(1, dtype=torch.int32, device=self.device)
-        self._commands: dict[str, Any] = {}
-        self._record(self._above.cpu().numpy(), self._below.vertices.cpu().numpy())
+        data = kernels.Above()
+        data.given, data.points, data.push, data.field, data.smoother = (
+            as_warp(rows, wp.vec3) for rows in (self._given, self._points, self._push, *self._fields)
+        )
+        data.cut, data.count = self.parting.cut, as_warp(self._count, wp.int32)
+        rest, rest_below = (one.detach().cpu().numpy() for one in (above, below))
+        data.start, data.near = (ints(one, self.device) for one in _starts(rest, rest_below, settings))
+        for name in ("looks", "found", "moved", "reached", "is_reached"):
+            setattr(data, name, wp.zeros(n, dtype=wp.int32, device=str(self.device)))
+        self._commands = self._recorded(data, _rules(settings, rest_below[self._below.mesh.edges]))
 
     @torch.no_grad()
     def __call__(self, above: Tensor, below: Tensor, *, goes_on: bool = False) -> tuple[Tensor, Tensor]:
         """The outer garment, (V, 3) [m], off the inner one, (U, 3), and how many of its vertices were below the gap.
 
-        The number is an int32 of shape (1,), on the garments' device: a GPU isn't waited for, and makes the launches
-        for those below the gap where there are none, too. Not differentiable.
-
-        A call that `goes_on` is for the same inner garment as the last one: whoever is where it was left, and needn't
-        be moved from there, isn't looked at.
-
-        Raises `MeshError` for garments of other sizes than these were made for.
+        The number is an int32 of shape (1,), on the garments' device: a GPU isn't waited for. A call that `goes_on` is
+        for the same inner garment as the last one, and looks at nobody who is where it was left. Not differentiable.
         """
-        self._check(above, below)
         with torch_stream(self.device):
             if not goes_on:
                 self._below.take(below)
@@ -93,69 +80,39 @@ class Layer:
             self._commands["look again" if goes_on else "look"].launch()
             self._commands["lift"].launch()
             n_low = self._count.clone()
-            if self._is_serial and not int(n_low):
-                return above, n_low
-            self._move()
-        return self._above.clone(), n_low
+            if self._is_serial:
+                if not int(n_low):
+                    return above, n_low
+                self._commands["move all"].launch()
+            else:
+                self._fields[0].copy_(self._push)
+                for round_ in range(self._settings.around):
+                    self._commands[f"spread{round_ % 2}"].launch()
+                self._commands["move"].launch()
+        return self._points.clone(), n_low
 
-    def find_cuts(self, above: Tensor) -> Tensor:
-        """How many pairs of faces of the outer garment, (V, 3) [m], and the inner one of the last call cut each other.
-
-        An int32 of shape (1,). `parting` goes on from what was found.
-        """
-        self.parting.find(above)
-        return self.parting.n_cut.clone()
-
-    def _check(self, above: Tensor, below: Tensor) -> None:
-        if above.shape != self._above.shape or below.shape != self._below.vertices.shape:
-            msg = (
-                f"wanted garments of {len(self._above)} and {len(self._below.vertices)} vertices, "
-                f"got the shapes {tuple(above.shape)} and {tuple(below.shape)}"
-            )
-            raise MeshError(msg)
-
-    def _move(self) -> None:
-        """Pushes those with their neighbourhood."""
-        if self._is_serial:
-            self._commands["move all"].launch()
-            return
-        self._fields[0].copy_(self._push)
-        for round_ in range(self._settings.around):
-            self._commands[f"spread{round_ % 2}"].launch()
-        self._commands["move"].launch()
-
-    def _record(self, rest: NDArray[np.float32], rest_below: NDArray[np.float32]) -> None:
-        """Records the launches of a frame: each of them is shorter than what Python makes of its arguments."""
-        n, device, sheet, rounds = len(rest), str(self.device), self._below, self._settings.around
+    def _recorded(self, data: Any, rules: Any) -> dict[str, Any]:
+        """The launches of a frame: each of them is shorter than what Python makes of its arguments."""
+        n, sheet = len(self._points), self._below.data
         n_strips, each = (1, n) if self._is_serial else (n, 1)
-        edges = rest_below[sheet.mesh.edges]
-        longest = float(np.linalg.norm(edges[:, 0] - edges[:, 1], axis=1).max(initial=0.0))
-        rules = _rules(self._settings, longest)
-        starts = [ints(values, self.device) for values in _starts(rest, rest_below, self._settings)]
-        given, above, push, *fields = (
-            as_warp(rows, wp.vec3) for rows in (self._given, self._above, self._push, *self._fields)
-        )
-        moved = as_warp(self._moved, wp.int32)
-        looks, found, *reached = (wp.zeros(n, dtype=wp.int32, device=device) for _ in range(4))
-        count, cut = as_warp(self._count, wp.int32), self.parting.cut
-        search = [given, sheet.places, sheet.cut, *starts, above, moved, looks, found]
-        below = [sheet.tree, sheet.places, sheet.normals, sheet.cut, sheet.extent]
-        for name, kernel, size, arguments in (
-            ("look", kernels.search_kernel, n_strips, [each, False, *search]),
-            ("look again", kernels.search_kernel, n_strips, [each, True, *search]),
-            ("lift", kernels.lift_kernel, n_strips, [each, *below, above, cut, looks, found, rules, push, count]),
-            ("spread0", moving.spread_kernel, n, [push, cut, *fields]),
-            ("spread1", moving.spread_kernel, n, [push, cut, *reversed(fields)]),
-            ("move", moving.move_kernel, n, [fields[0], above, moved]),
-            ("move all", moving.move_all_kernel, 1, [push, cut, rounds, *reached, *fields, above, moved]),
-        ):
-            self._commands[name] = wp.launch(kernel, size, arguments, device=device, record_cmd=True)
+        launches: dict[str, tuple[Any, int, list[Any]]] = {
+            "look": (kernels.search_kernel, n_strips, [each, False, sheet, data]),
+            "look again": (kernels.search_kernel, n_strips, [each, True, sheet, data]),
+            "lift": (kernels.lift_kernel, n_strips, [each, sheet, data, rules]),
+            "spread0": (kernels.spread_kernel, n, [data, data.field, data.smoother]),
+            "spread1": (kernels.spread_kernel, n, [data, data.smoother, data.field]),
+            "move": (kernels.move_kernel, n, [data]),
+            "move all": (kernels.move_all_kernel, 1, [data, self._settings.around]),
+        }
+        return {name: recorded(*launch, self.device) for name, launch in launches.items()}
 
 
-def _rules(settings: ContactSettings, longest: float) -> Any:
+def _rules(settings: ContactSettings, edges: NDArray[np.float32]) -> Any:
+    """For a sheet whose edges have these ends at rest [m], (E, 2, 3)."""
     rules = kernels.LayerRules()
     rules.gap, rules.reach = settings.layer_gap, settings.layer_reach
-    rules.agreement, rules.doubt, rules.longest = settings.layer_agreement, settings.layer_doubt, longest
+    rules.agreement, rules.doubt = settings.layer_agreement, settings.layer_doubt
+    rules.longest = float(np.linalg.norm(edges[:, 0] - edges[:, 1], axis=1).max(initial=0.0))
     return rules
 
 

@@ -1,8 +1,10 @@
-"""How far one garment's vertices are from the outer side of another one's sheet: one code for CPU and CUDA."""
+"""Brings one garment's vertices to the outer side of another one's sheet: one code for CPU and CUDA."""
 
 import warp as wp
 
 from refu_core.sdf._closest_kernels import closest_on_face, mean_normal
+
+wp.set_module_options({"enable_backward": False})
 
 # Nothing is so far from where it was at rest; it is a limit to what a sheet crumpled into itself may take.
 MOST_STEPS = wp.constant(64)
@@ -22,7 +24,51 @@ class Cut:
     ring: wp.array[wp.int32]
     """Its neighbours, likewise."""
     rim: wp.array[wp.int32]
-    """Bit k of a face's number is set where its feature k is on an open rim."""
+    """Bit k of a face's number is set where its feature k (as `closest_on_triangle` numbers them) is on an open rim."""
+
+
+@wp.struct
+class Below:
+    """A sheet in a pose."""
+
+    points: wp.array[wp.vec3]
+    """[m]"""
+    normals: wp.array[wp.vec3]
+    """Unit normals of its vertices."""
+    extent: wp.array[wp.vec3]
+    """Two corners of the box around it [m]."""
+    tree: wp.uint64
+    """Warp's handle of a tree of its faces."""
+    cut: Cut
+
+
+@wp.struct
+class Above:
+    """The garment above a sheet, and memory to bring it off in."""
+
+    given: wp.array[wp.vec3]
+    """Its vertices [m]."""
+    points: wp.array[wp.vec3]
+    """Where they go [m]."""
+    cut: Cut
+    start: wp.array[wp.int32]
+    near: wp.array[wp.int32]
+    """Vertex i looks from the sheet's vertices `near[start[i]:start[i + 1]]`."""
+    looks: wp.array[wp.int32]
+    """Whether a vertex has to be looked at in this call."""
+    found: wp.array[wp.int32]
+    """The vertex of the sheet that each has come to, or `STRANGER`."""
+    moved: wp.array[wp.int32]
+    """Whether the last call has moved it."""
+    push: wp.array[wp.vec3]
+    """What brings it to the gap above the sheet [m]."""
+    field: wp.array[wp.vec3]
+    smoother: wp.array[wp.vec3]
+    reached: wp.array[wp.int32]
+    is_reached: wp.array[wp.int32]
+    """Of a CPU: zero between launches, but for `reached`."""
+    count: wp.array[wp.int32]
+    """How many have a push."""
 
 
 @wp.struct
@@ -43,21 +89,40 @@ def normal_at(v: int, points: wp.array[wp.vec3], cut: Cut) -> wp.vec3:
 
 
 @wp.func
+def gather(n: int, rounds: int, cut: Cut, rows: wp.array[int], is_listed: wp.array[int]) -> int:
+    """Lists after the first n `rows` who is up to so many edges away, and gives how many they are all together."""
+    first = int(0)
+    last = int(n)
+    found = int(n)
+    for _ in range(rounds):
+        for k in range(first, last):
+            for r in range(cut.ring_start[rows[k]], cut.ring_start[rows[k] + 1]):
+                j = cut.ring[r]
+                if is_listed[j] == 0:
+                    is_listed[j] = 1
+                    rows[found] = j
+                    found += 1
+        first = last
+        last = found
+    return found
+
+
+@wp.func
 def heaviest(w: wp.vec3) -> int:
     """The corner of a face that weighs most."""
     return wp.where(w[0] >= w[1] and w[0] >= w[2], 0, wp.where(w[1] >= w[2], 1, 2))
 
 
 @wp.func
-def nearest_vertex(p: wp.vec3, start: int, points: wp.array[wp.vec3], cut: Cut) -> int:
+def nearest_vertex(p: wp.vec3, start: int, below: Below) -> int:
     """The vertex downhill from `start`: none of its neighbours is nearer to p."""
     v = int(start)
-    squared = wp.length_sq(points[v] - p)
+    squared = wp.length_sq(below.points[v] - p)
     for _step in range(MOST_STEPS):
         best = int(v)
-        for r in range(cut.ring_start[v], cut.ring_start[v + 1]):
-            u = cut.ring[r]
-            other = wp.length_sq(points[u] - p)
+        for r in range(below.cut.ring_start[v], below.cut.ring_start[v + 1]):
+            u = below.cut.ring[r]
+            other = wp.length_sq(below.points[u] - p)
             if other < squared:
                 squared = other
                 best = u
@@ -68,7 +133,7 @@ def nearest_vertex(p: wp.vec3, start: int, points: wp.array[wp.vec3], cut: Cut) 
 
 
 @wp.func
-def nearest_face(p: wp.vec3, start: int, points: wp.array[wp.vec3], cut: Cut) -> int:
+def nearest_face(p: wp.vec3, start: int, below: Below) -> int:
     """The face closest to p downhill from the fan of vertex `start`."""
     v = int(start)
     squared = float(wp.inf)
@@ -76,9 +141,9 @@ def nearest_face(p: wp.vec3, start: int, points: wp.array[wp.vec3], cut: Cut) ->
     w = wp.vec3(1.0, 0.0, 0.0)
     for _step in range(MOST_STEPS):
         last = face
-        for k in range(cut.fan_start[v], cut.fan_start[v + 1]):
-            f = cut.fan_face[k]
-            f_w, _feature, f_offset = closest_on_face(p, f, points, cut.faces)
+        for k in range(below.cut.fan_start[v], below.cut.fan_start[v + 1]):
+            f = below.cut.fan_face[k]
+            f_w, _feature, f_offset = closest_on_face(p, f, below.points, below.cut.faces)
             other = wp.length_sq(f_offset)
             if other < squared:
                 squared = other
@@ -86,9 +151,9 @@ def nearest_face(p: wp.vec3, start: int, points: wp.array[wp.vec3], cut: Cut) ->
                 w = f_w
         # The closest vertex isn't always a corner of the closest face: on, at the corner that weighs most.
         corner = heaviest(w)
-        if face == last or cut.faces[face, corner] == v:
+        if face == last or below.cut.faces[face, corner] == v:
             break
-        v = cut.faces[face, corner]
+        v = below.cut.faces[face, corner]
     return face
 
 
@@ -100,76 +165,57 @@ def is_within(p: wp.vec3, extent: wp.array[wp.vec3], room: float) -> bool:
     return wp.min(wp.min(above_low), wp.min(below_high)) >= -room
 
 
-@wp.kernel(enable_backward=False)
-def normals_kernel(
-    points: wp.array[wp.vec3],
-    cut: Cut,
-    # output
-    normals: wp.array[wp.vec3],
-) -> None:
+@wp.kernel
+def normals_kernel(points: wp.array[wp.vec3], cut: Cut, normals: wp.array[wp.vec3]) -> None:
     """Unit normals of a garment's vertices."""
     v = wp.tid()
     normals[v] = normal_at(v, points, cut)
 
 
-@wp.kernel(enable_backward=False)
-def search_kernel(
-    each: int,
-    goes_on: bool,
-    given: wp.array[wp.vec3],
-    below: wp.array[wp.vec3],
-    below_cut: Cut,
-    near_start: wp.array[int],
-    near: wp.array[int],
-    # outputs; a call that goes on begins with the last one's
-    above: wp.array[wp.vec3],
-    moved: wp.array[int],
-    looks: wp.array[int],
-    found: wp.array[int],
-) -> None:
-    """Takes over what is `given`, and finds the vertex of the sheet below that each vertex comes to, downhill.
+@wp.kernel
+def search_kernel(each: int, goes_on: bool, below: Below, above: Above) -> None:
+    """Takes over what is given, and finds the vertex of the sheet that each vertex comes to, downhill.
 
-    From the nearest of those to look from, which are `near[near_start[i]:near_start[i + 1]]`; `STRANGER` where there
-    are none. A call that goes on looks only at what isn't where it was left, or was `moved` there, from what it found.
-    `each` vertices a thread (`strips`).
+    From the nearest of those to look from. A call that goes on looks only at what isn't where it was left, or was moved
+    there, from what it found. `each` vertices a thread (`strips`).
     """
     first = wp.tid() * each
     for i in range(first, first + each):
-        p = given[i]
-        looks[i] = wp.where(goes_on and moved[i] == 0 and p == above[i], 0, 1)
-        above[i] = p
-        moved[i] = 0
-        if looks[i] == 0:
+        p = above.given[i]
+        above.looks[i] = wp.where(goes_on and above.moved[i] == 0 and p == above.points[i], 0, 1)
+        above.points[i] = p
+        above.moved[i] = 0
+        if above.looks[i] == 0:
             continue
-        if near_start[i] == near_start[i + 1]:
-            found[i] = STRANGER
+        if above.start[i] == above.start[i + 1]:
+            above.found[i] = STRANGER
             continue
-        v = int(near[near_start[i]])
+        v = int(above.near[above.start[i]])
         if goes_on:
-            v = found[i]
+            v = above.found[i]
         else:
             squared = float(wp.inf)
-            for n in range(near_start[i], near_start[i + 1]):
-                other = wp.length_sq(below[near[n]] - p)
+            for n in range(above.start[i], above.start[i + 1]):
+                other = wp.length_sq(below.points[above.near[n]] - p)
                 if other < squared:
                     squared = other
-                    v = near[n]
-        found[i] = nearest_vertex(p, v, below, below_cut)
+                    v = above.near[n]
+        above.found[i] = nearest_vertex(p, v, below)
 
 
 @wp.func
-def normal_on(face: int, w: wp.vec3, normals: wp.array[wp.vec3], cut: Cut) -> wp.vec3:
-    """Unit normal of a garment at a place on a face, between those of its vertices."""
-    a = cut.faces[face, 0]
-    b = cut.faces[face, 1]
-    c = cut.faces[face, 2]
-    return wp.normalize(w[0] * normals[a] + w[1] * normals[b] + w[2] * normals[c])
+def normal_on(face: int, w: wp.vec3, below: Below) -> wp.vec3:
+    """Unit normal of the sheet at a place on a face, between those of its vertices."""
+    a = below.cut.faces[face, 0]
+    b = below.cut.faces[face, 1]
+    c = below.cut.faces[face, 2]
+    return wp.normalize(w[0] * below.normals[a] + w[1] * below.normals[b] + w[2] * below.normals[c])
 
 
 @wp.func
-def closest_of_all(tree: wp.uint64, p: wp.vec3, reach: float) -> int:
+def closest_of_all(p: wp.vec3, reach: float, below: Below) -> int:
     """The closest face of the whole sheet, -1 where none is within reach."""
-    hit = wp.mesh_query_point_no_sign(tree, p, reach)
+    hit = wp.mesh_query_point_no_sign(below.tree, p, reach)
     face = int(-1)
     if hit.result:
         face = hit.face
@@ -177,96 +223,121 @@ def closest_of_all(tree: wp.uint64, p: wp.vec3, reach: float) -> int:
 
 
 @wp.func
-def lift_off(
-    i: int,
-    face: int,
-    below: wp.array[wp.vec3],
-    below_normals: wp.array[wp.vec3],
-    below_cut: Cut,
-    above: wp.array[wp.vec3],
-    above_cut: Cut,
-    faces_it: bool,
-    rules: LayerRules,
-    # outputs
-    push: wp.array[wp.vec3],
-    count: wp.array[int],
-) -> None:
+def lift_off(i: int, face: int, faces_it: bool, below: Below, above: Above, rules: LayerRules) -> None:
     """What brings vertex i to the gap above the face of the sheet that is closest to it, if any is."""
     if face < 0:
         return
-    w, feature, offset = closest_on_face(above[i], face, below, below_cut.faces)
-    normal = normal_on(face, w, below_normals, below_cut)
+    w, feature, offset = closest_on_face(above.points[i], face, below.points, below.cut.faces)
+    normal = normal_on(face, w, below)
     height = wp.dot(offset, normal)
     far = wp.length(offset)
     if height >= rules.gap or far > rules.reach:
         return
-    agreement = wp.dot(normal_at(i, above, above_cut), normal)
+    agreement = wp.dot(normal_at(i, above.points, above.cut), normal)
     # A stranger's outside may face the sheet's: a sleeve that hangs beside shorts.
     agreement = wp.where(faces_it, wp.abs(agreement), agreement)
     share = wp.clamp(agreement / rules.agreement, 0.0, 1.0)
     # Whatever ends does so gradually, or cloth would jump from frame to frame.
     share *= wp.min(1.0, 4.0 * (1.0 - far / rules.reach))
-    if (below_cut.rim[face] >> feature) & 1 != 0:
+    if (below.cut.rim[face] >> feature) & 1 != 0:
         share *= wp.max(0.0, 1.0 - wp.length(offset - height * normal) / rules.reach)
     lift = share * (rules.gap - height) * normal
     if wp.length_sq(lift) > 0.0:
-        push[i] = lift
-        wp.atomic_add(count, 0, 1)
+        above.push[i] = lift
+        wp.atomic_add(above.count, 0, 1)
 
 
-@wp.kernel(enable_backward=False)
-def lift_kernel(
-    each: int,
-    # the garment below
-    tree: wp.uint64,
-    below: wp.array[wp.vec3],
-    below_normals: wp.array[wp.vec3],
-    below_cut: Cut,
-    extent: wp.array[wp.vec3],
-    # the garment above
-    above: wp.array[wp.vec3],
-    above_cut: Cut,
-    looks: wp.array[int],
-    found: wp.array[int],
-    rules: LayerRules,
-    # outputs
-    push: wp.array[wp.vec3],
-    count: wp.array[int],
-) -> None:
-    """What brings each vertex that `looks` to the gap above the sheet, and how many they are that lack something.
+@wp.kernel
+def lift_kernel(each: int, below: Below, above: Above, rules: LayerRules) -> None:
+    """What brings each vertex that is looked at to the gap above the sheet, and how many they are that lack something.
 
-    A fold that one vertex's search ended in is seldom in the way of its neighbours': what these `found` is looked at,
+    A fold that one vertex's search ended in is seldom in the way of its neighbours': what these found is looked at,
     too. Strangers, and whoever is far below the sheet, ask a tree. `each` vertices a thread (`strips`).
     """
     first = wp.tid() * each
     for i in range(first, first + each):
-        push[i] = wp.vec3(0.0, 0.0, 0.0)
-        if looks[i] == 0:
+        above.push[i] = wp.vec3(0.0, 0.0, 0.0)
+        if above.looks[i] == 0:
             continue
-        p = above[i]
-        v = int(found[i])
+        p = above.points[i]
+        v = int(above.found[i])
         if v == STRANGER:
-            if is_within(p, extent, rules.gap):
-                face = closest_of_all(tree, p, rules.reach)
-                lift_off(i, face, below, below_normals, below_cut, above, above_cut, True, rules, push, count)
+            if is_within(p, below.extent, rules.gap):
+                lift_off(i, closest_of_all(p, rules.reach, below), True, below, above, rules)
             continue
-        squared = wp.length_sq(below[v] - p)
+        squared = wp.length_sq(below.points[v] - p)
         # As near as that, it is the right fold.
         if 4.0 * squared > rules.longest * rules.longest:
-            for r in range(above_cut.ring_start[i], above_cut.ring_start[i + 1]):
-                beside = found[above_cut.ring[r]]
+            for r in range(above.cut.ring_start[i], above.cut.ring_start[i + 1]):
+                beside = above.found[above.cut.ring[r]]
                 if beside != STRANGER and beside != v:
-                    other = wp.length_sq(below[beside] - p)
+                    other = wp.length_sq(below.points[beside] - p)
                     if other < squared:
                         squared = other
                         v = beside
-            if v != found[i]:
-                v = nearest_vertex(p, v, below, below_cut)
+            if v != above.found[i]:
+                v = nearest_vertex(p, v, below)
         # No point of a face is farther from its closest corner than from the middle of three edges of its longest one.
-        if wp.length(below[v] - p) <= rules.reach + 0.578 * rules.longest:
-            face = nearest_face(p, v, below, below_cut)
-            w, _feature, offset = closest_on_face(p, face, below, below_cut.faces)
-            is_low = wp.dot(offset, normal_on(face, w, below_normals, below_cut)) < rules.gap
+        if wp.length(below.points[v] - p) <= rules.reach + 0.578 * rules.longest:
+            face = nearest_face(p, v, below)
+            w, _feature, offset = closest_on_face(p, face, below.points, below.cut.faces)
+            is_low = wp.dot(offset, normal_on(face, w, below)) < rules.gap
             if is_low and wp.length(offset) > rules.doubt:
-                face = closest_of_all(tree, p, rules.reach)
-            lift_off(i, face, below, below_normals, below_cut, above, above_cut, False, rules, push, count)
+                face = closest_of_all(p, rules.reach, below)
+            lift_off(i, face, False, below, above, rules)
+
+
+@wp.func
+def spread(i: int, above: Above, field: wp.array[wp.vec3], smoother: wp.array[wp.vec3]) -> None:
+    """One round of `Blend.spread`."""
+    start = above.cut.ring_start[i]
+    end = above.cut.ring_start[i + 1]
+    total = wp.vec3(0.0, 0.0, 0.0)
+    for r in range(start, end):
+        total += field[above.cut.ring[r]]
+    mean = total / float(wp.max(end - start, 1))
+    length = wp.length(above.push[i])
+    if length > 0.0:
+        way = above.push[i] / length
+        mean += wp.max(0.0, length - wp.dot(mean, way)) * way
+    smoother[i] = mean
+
+
+@wp.kernel
+def spread_kernel(above: Above, field: wp.array[wp.vec3], smoother: wp.array[wp.vec3]) -> None:
+    """`spread` of one vertex a thread."""
+    spread(wp.tid(), above, field, smoother)
+
+
+@wp.kernel
+def move_kernel(above: Above) -> None:
+    """Moves the vertices."""
+    i = wp.tid()
+    above.points[i] += above.field[i]
+    above.moved[i] = wp.where(wp.length_sq(above.field[i]) > 0.0, 1, 0)
+
+
+@wp.kernel
+def move_all_kernel(above: Above, rounds: int) -> None:
+    """All rounds, and the move, by one thread: of the pushed, and of those that so many rounds reach from there."""
+    n = int(0)
+    for i in range(above.push.shape[0]):
+        if wp.length_sq(above.push[i]) > 0.0:
+            above.field[i] = above.push[i]
+            above.is_reached[i] = 1
+            above.reached[n] = i
+            n += 1
+    n = gather(n, rounds, above.cut, above.reached, above.is_reached)
+    for sweep in range(rounds):
+        for k in range(n):
+            if sweep % 2 == 0:
+                spread(above.reached[k], above, above.field, above.smoother)
+            else:
+                spread(above.reached[k], above, above.smoother, above.field)
+    for k in range(n):
+        i = above.reached[k]
+        above.points[i] += above.field[i]
+        above.moved[i] = 1
+        above.is_reached[i] = 0
+        above.field[i] = wp.vec3()
+        above.smoother[i] = wp.vec3()

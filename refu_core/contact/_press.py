@@ -10,7 +10,7 @@ import warp as wp
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from refu_core._warp import as_warp, torch_stream
+from refu_core._warp import as_warp, ints, recorded, torch_stream
 from refu_core.body import ARMS, LEGS, SmplBody, joints_of, part_of_faces, weight_of_parts
 from refu_core.body._bundle_kernels import bound_kernel, enclose_kernel
 from refu_core.body._bundles import bundled
@@ -37,15 +37,12 @@ class LimbMeshes:
         limb_of = part_of_faces(body.weights, body.faces, _LIMBS).cpu().numpy()
         faces = body.faces.cpu().numpy()
         of_limbs = [faces[limb_of == k].astype(np.int32) for k in range(len(_LIMBS))]
-        self.meshes = [wp.Mesh(points, wp.array(one.ravel(), dtype=wp.int32, device=self._device)) for one in of_limbs]
+        self.meshes = [wp.Mesh(points, ints(one.ravel(), self._device)) for one in of_limbs]
         self.bundles = bundled(body.v_template.cpu().numpy(), of_limbs, body.device)
         """Boxes around what is near together of them."""
         self._fit = [
-            wp.launch(kernel, dim, inputs, device=self._device, record_cmd=True)
-            for kernel, dim, inputs in (
-                (bound_kernel, len(self.bundles.low), [points, self.bundles]),
-                (enclose_kernel, len(self.meshes), [self.bundles]),
-            )
+            recorded(bound_kernel, len(self.bundles.low), [points, self.bundles], self._device),
+            recorded(enclose_kernel, len(self.meshes), [self.bundles], self._device),
         ]
 
     def update(self, body: Tensor) -> None:
@@ -65,14 +62,10 @@ class LimbMeshes:
 
 
 class Press:
-    """Keeps a garment between the skin that it lies on and the limbs that it doesn't lie on.
+    """Keeps a garment between the skin that it lies on and the limbs that it doesn't lie on (docs/architecture.md).
 
-    A hand that hangs beside a thigh goes through a wide skirt. Along the gradient half of the cloth in it would leave
-    in front and half behind, with edges through the hand between them. So a vertex is looked at from the skin that it
-    lies on: where another limb comes in between, it is drawn back to this side of it, and neighbours with it.
-
-    All of it is continuous: a limb that comes up beside the way to a vertex draws it back the farther the nearer it is
-    to that way, and how far a vertex goes is a maximum over the cloth around, which falls off along its edges.
+    Where another limb comes between a vertex and its skin, the vertex is drawn back to this side of it, and neighbours
+    with it. All of it is continuous: the farther back, the nearer the limb is to the way from skin to vertex.
     """
 
     def __init__(
@@ -83,19 +76,14 @@ class Press:
         knows_arms: bool = False,
         settings: ContactSettings = DEFAULT_CONTACT,
     ) -> None:
-        """For a garment and the limbs of the body that it is worn on, on one device.
-
-        Whether what predicts it `knows_arms` is as in `Wearable`.
-        """
+        """For a garment, and the limbs of the body that it is worn on; `knows_arms` is as in `Wearable`."""
         self._settings = settings
-        self._beside = garment.edge_length if knows_arms else settings.press_beside
         self._limbs = limbs  # their memory is read
         n, self.device = garment.n_vertices, garment.v_template.device
         self._is_serial = self.device.type == "cpu"
         self._skin, self._points = torch.zeros(2, n, 3, device=self.device)
         self._cut = torch.zeros(2, n, device=self.device)
         self._counts = torch.zeros(kernels.N_COUNTS, dtype=torch.int32, device=self.device)
-        self._commands: dict[str, Any] = {}
         own = weight_of_parts(garment.weights, _LIMBS) > settings.own_weight
         foreign = (~own).cpu().numpy() @ (1 << np.arange(len(_LIMBS)))
         # Cloth that lies on the skin gives way as one piece: of its vertices a few are asked, and others follow those.
@@ -104,7 +92,7 @@ class Press:
         is_asked = is_loose | garment.mesh.independent()
         order, ring = grouped(rest), garment.mesh.ring
         order = order[is_asked[order]]
-        self._fabric = fabric = kernels.Fabric()
+        fabric = kernels.Fabric()
         fabric.skin, fabric.points = as_warp(self._skin, wp.vec3), as_warp(self._points, wp.vec3)
         fabric.cut, fabric.spread = (as_warp(one, wp.float32) for one in self._cut)
         fabric.counts = as_warp(self._counts, wp.int32)
@@ -118,69 +106,48 @@ class Press:
             "front": np.zeros(2 * n),
         } | dict.fromkeys(("boxed", "near", "in_front"), np.zeros(n))
         for name, values in lists.items():
-            setattr(fabric, name, wp.array(np.asarray(values, np.int32), dtype=wp.int32, device=str(self.device)))
+            setattr(fabric, name, ints(values, self.device))
+        feel = kernels.Feel()
+        feel.room, feel.flat, feel.looks = settings.press_room, settings.press_flat, settings.press_looks
+        feel.beside = garment.edge_length if knows_arms else settings.press_beside
+        feel.lies = wp.vec2(*settings.press_lies)
+        meshes = wp.array([mesh.id for mesh in limbs.meshes], dtype=wp.uint64, device=str(self.device))
+        slope, sweeps, near = settings.press_slope, settings.around, settings.near
+        launches: dict[str, tuple[Any, int, list[Any]]] = {
+            "look": (kernels.look_kernel, len(fabric.start) - 1, [fabric, limbs.bundles, feel]),
+            "press all": (kernels.press_all_kernel, 1, [fabric, meshes, feel, slope, sweeps, near]),
+            "press": (kernels.press_kernel, n, [fabric, meshes, feel]),
+            "lower": (kernels.lower_kernel, n, [fabric, feel]),
+        }
+        for sweep in range(sweeps):
+            fields = [fabric.cut, fabric.spread] if sweep % 2 == 0 else [fabric.spread, fabric.cut]
+            launches[f"spread {sweep}"] = kernels.spread_kernel, n, [fabric, 0.0 if sweep < near else slope, *fields]
+        self._commands = {name: recorded(*launch, self.device) for name, launch in launches.items()}
 
     @torch.no_grad()
     def __call__(self, points: Tensor, skin: Tensor) -> Tensor:
-        """The garment (N, 3) [m], pressed to `skin` (N, 3) [m], which it lies on, by the limbs as they are.
-
-        Not differentiable; a GPU isn't waited for.
-        """
+        """The garment (N, 3) [m], pressed to `skin` (N, 3) [m], which it lies on, by the limbs as they are."""
         self._points.copy_(points)
         self._skin.copy_(skin)
         self._counts.zero_()
         with torch_stream(self.device):
-            self._run("look")
+            self._commands["look"].launch()
             wanted = int(self._counts[kernels.WANTED]) if self._is_serial else -1
             if not wanted:
                 return points
             self._limbs.pose(wanted)
             if self._is_serial:
-                self._run("press all")
+                self._commands["press all"].launch()
                 if not self._counts[kernels.PRESSED]:
                     return points
             else:
                 self._cut.zero_()
-                self._run("press")
+                self._commands["press"].launch()
                 for sweep in range(self._settings.around):
-                    self._run(f"spread {sweep}")
-                self._run("lower")
+                    self._commands[f"spread {sweep}"].launch()
+                self._commands["lower"].launch()
         pressed: Tensor = self._points.clone()
         return pressed
-
-    def _run(self, name: str) -> None:
-        if name not in self._commands:
-            self._commands |= self._record()
-        self._commands[name].launch()
-
-    def _record(self) -> dict[str, Any]:
-        how, fabric, n = self._settings, self._fabric, len(self._points)
-        device = str(self.device)
-        limbs = wp.array([mesh.id for mesh in self._limbs.meshes], dtype=wp.uint64, device=device)
-        cut = [fabric.cut, fabric.spread]
-        sweeps, feel = how.around, self._feel()
-        look = (kernels.look_kernel, len(fabric.start) - 1, [fabric, self._limbs.bundles, feel])
-        steps: dict[str, tuple[Any, int, list[Any]]] = {"look": look}
-        if self._is_serial:
-            numbers = [feel, how.press_slope, sweeps, how.near]
-            steps["press all"] = (kernels.press_all_kernel, 1, [fabric, limbs, *numbers])
-        else:
-            steps["press"] = (kernels.press_kernel, n, [fabric, limbs, feel])
-            for sweep in range(sweeps):
-                slope = 0.0 if sweep < how.near else how.press_slope
-                fields = [cut[sweep % 2], cut[1 - sweep % 2]]
-                steps[f"spread {sweep}"] = (kernels.spread_kernel, n, [fabric, slope, *fields])
-            steps["lower"] = (kernels.lower_kernel, n, [fabric, 0.5 * how.press_room, cut[sweeps % 2]])
-        return {
-            name: wp.launch(kernel, dim, inputs, device=device, record_cmd=True)
-            for name, (kernel, dim, inputs) in steps.items()
-        }
-
-    def _feel(self) -> Any:
-        how, feel = self._settings, kernels.Feel()
-        feel.room, feel.beside, feel.flat = how.press_room, self._beside, how.press_flat
-        feel.lies, feel.looks, feel.step = wp.vec2(*how.press_lies), how.press_looks, how.press_room
-        return feel
 
 
 _PIECE = 32

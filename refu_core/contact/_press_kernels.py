@@ -21,7 +21,6 @@ class Feel:
     flat: wp.float32
     lies: wp.vec2
     looks: wp.int32
-    step: wp.float32
 
 
 @wp.struct
@@ -60,9 +59,10 @@ def beside(height: float, feel: Feel) -> float:
     return wp.min(feel.beside, height * height / feel.flat)
 
 
-@wp.func
-def find_near(i: int, fabric: Fabric, bundles: Bundles, feel: Feel) -> None:
-    """Lists the vertices of piece i that may feel a limb, by boxes."""
+@wp.kernel
+def look_kernel(fabric: Fabric, bundles: Bundles, feel: Feel) -> None:
+    """Lists the vertices of one piece a thread that may feel a limb, by boxes."""
+    i = wp.tid()
     first = fabric.start[i]
     last = fabric.start[i + 1]
     low = fabric.points[fabric.vertex[first]]
@@ -121,7 +121,7 @@ def press(v: int, fabric: Fabric, limbs: wp.array[wp.uint64], feel: Feel) -> Non
                 if hit.result:
                     off = wp.min(off, wp.length(wp.mesh_eval_position(limbs[k], hit.face, hit.u, hit.v) - here))
                     least = wp.min(least, at + (whole - at) * off / aside)
-                at += wp.max(off, feel.step)
+                at += wp.max(off, feel.room)
                 if at >= least:
                     break
     if least < whole:
@@ -134,9 +134,10 @@ def press(v: int, fabric: Fabric, limbs: wp.array[wp.uint64], feel: Feel) -> Non
             fabric.rows[wp.atomic_add(fabric.counts, PRESSED, 1)] = v
 
 
-@wp.func
-def spread(v: int, fabric: Fabric, slope: float, cut: wp.array[float], wider: wp.array[float]) -> None:
+@wp.kernel
+def spread_kernel(fabric: Fabric, slope: float, cut: wp.array[float], wider: wp.array[float]) -> None:
     """A vertex is drawn back as far as a neighbour of it, but for what `slope` gives for the way from there."""
+    v = wp.tid()
     most = cut[v]
     for k in range(fabric.ring_start[v], fabric.ring_start[v + 1]):
         w = fabric.ring[k]
@@ -145,19 +146,13 @@ def spread(v: int, fabric: Fabric, slope: float, cut: wp.array[float], wider: wp
 
 
 @wp.func
-def lower(v: int, fabric: Fabric, kept: float, cut: wp.array[float]) -> None:
-    """Draws a vertex back towards the skin, of which it keeps `kept` [m] off if it was."""
-    if cut[v] > 0.0:
+def lower(v: int, fabric: Fabric, feel: Feel) -> None:
+    """Draws a vertex back towards the skin, of which it keeps half the room off if it was."""
+    if fabric.cut[v] > 0.0:
         way = fabric.points[v] - fabric.skin[v]
         height = wp.length(way)
-        left = wp.max(height - cut[v], wp.min(height, kept))
+        left = wp.max(height - fabric.cut[v], wp.min(height, 0.5 * feel.room))
         fabric.points[v] = fabric.skin[v] + (left / wp.max(height, 1.0e-9)) * way
-
-
-@wp.kernel
-def look_kernel(fabric: Fabric, bundles: Bundles, feel: Feel) -> None:
-    """`find_near` of one piece a thread."""
-    find_near(wp.tid(), fabric, bundles, feel)
 
 
 @wp.kernel
@@ -169,15 +164,9 @@ def press_kernel(fabric: Fabric, limbs: wp.array[wp.uint64], feel: Feel) -> None
 
 
 @wp.kernel
-def spread_kernel(fabric: Fabric, slope: float, cut: wp.array[float], wider: wp.array[float]) -> None:
-    """`spread` of one vertex a thread."""
-    spread(wp.tid(), fabric, slope, cut, wider)
-
-
-@wp.kernel
-def lower_kernel(fabric: Fabric, kept: float, cut: wp.array[float]) -> None:
+def lower_kernel(fabric: Fabric, feel: Feel) -> None:
     """`lower` of one vertex a thread."""
-    lower(wp.tid(), fabric, kept, cut)
+    lower(wp.tid(), fabric, feel)
 
 
 @wp.kernel
@@ -214,7 +203,7 @@ def press_all_kernel(
         first = after
         n_front = n_next
     for i in range(fabric.counts[PRESSED]):
-        lower(fabric.rows[i], fabric, 0.5 * feel.room, fabric.cut)
+        lower(fabric.rows[i], fabric, feel)
     for i in range(fabric.counts[PRESSED]):
         v = fabric.rows[i]
         fabric.in_front[v] = 0

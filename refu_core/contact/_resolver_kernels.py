@@ -22,6 +22,8 @@ from refu_core.contact._state import (
 )
 from refu_core.sdf import Skin, query_skin
 
+wp.set_module_options({"enable_backward": False})
+
 
 @wp.func
 def push_on(
@@ -59,7 +61,7 @@ def suspect(i: int, state: State) -> None:
         state.reached[wp.atomic_add(state.counts, SUSPECTS, 1)] = i
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def begin_kernel(each: int, state: State) -> None:
     """Everybody where it is; `each` vertices a thread, here and where else all are gone through (`strips`)."""
     first = wp.tid() * each
@@ -70,7 +72,7 @@ def begin_kernel(each: int, state: State) -> None:
             state.gradient[i] = wp.vec3()  # beyond a band nothing is known
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def go_on_kernel(each: int, reach: float, state: State, skin: Skin) -> None:
     """From where the last call ended: who was moved since, and may have come within `reach`, is asked."""
     first = wp.tid() * each
@@ -92,7 +94,7 @@ def go_on_kernel(each: int, reach: float, state: State, skin: Skin) -> None:
         state.first_face[i] = state.face[i]
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def compare_kernel(each: int, state: State, cloth: Cloth, rules: Rules) -> None:
     """Lists the ends of edges at the skin along which distances contradict each other."""
     first = wp.tid() * each
@@ -105,50 +107,43 @@ def compare_kernel(each: int, state: State, cloth: Cloth, rules: Rules) -> None:
                     suspect(j, state)
 
 
-@wp.func
-def retry(i: int, state: State, cloth: Cloth, skin: Skin, rules: Rules) -> None:
-    """From the faces of neighbours that are nearer to theirs, a nearer one than the vertex's own may be found."""
-    nearest = wp.abs(state.distance[i])
-    for k in range(cloth.ring_start[i], cloth.ring_start[i + 1]):
-        j = cloth.ring[k]
-        if wp.abs(state.distance[j]) < wp.abs(state.distance[i]) and contradict(i, j, state, rules):
-            distance, gradient, face = query_skin(skin, state.origin[i], state.face[j])
-            if wp.abs(distance) < nearest:
-                nearest = wp.abs(distance)
-                state.first[i] = distance
-                state.first_gradient[i] = gradient
-                state.first_face[i] = face
-
-
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def retry_kernel(each: int, state: State, cloth: Cloth, skin: Skin, rules: Rules) -> None:
-    """`retry` for a list, `each` of it a thread."""
+    """From the faces of neighbours that are nearer to theirs, a nearer one than a suspect's own may be found.
+
+    `each` of a list a thread, here and below.
+    """
     begin = wp.tid() * each
-    for k in range(begin, wp.min(begin + each, length(SUSPECTS, state))):
-        retry(state.reached[k], state, cloth, skin, rules)
+    for n in range(begin, wp.min(begin + each, length(SUSPECTS, state))):
+        i = state.reached[n]
+        nearest = wp.abs(state.distance[i])
+        for k in range(cloth.ring_start[i], cloth.ring_start[i + 1]):
+            j = cloth.ring[k]
+            if wp.abs(state.distance[j]) < wp.abs(state.distance[i]) and contradict(i, j, state, rules):
+                distance, gradient, face = query_skin(skin, state.origin[i], state.face[j])
+                if wp.abs(distance) < nearest:
+                    nearest = wp.abs(distance)
+                    state.first[i] = distance
+                    state.first_gradient[i] = gradient
+                    state.first_face[i] = face
 
 
-@wp.func
-def adopt(i: int, state: State, cloth: Cloth) -> None:
-    """Takes over what was found, and suspects the neighbours of what changed."""
-    if state.first[i] == state.distance[i]:
-        return
-    wp.atomic_add(state.counts, CHANGED, 1)
-    state.fresh[i] = 1
-    keep(i, state.origin[i], state.first[i], state.first_gradient[i], state.first_face[i], state)
-    for k in range(cloth.ring_start[i], cloth.ring_start[i + 1]):
-        suspect(cloth.ring[k], state)
-
-
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def adopt_kernel(each: int, state: State, cloth: Cloth) -> None:
-    """`adopt` for a list, `each` of it a thread."""
+    """Takes over what was found, and suspects the neighbours of what changed."""
     begin = wp.tid() * each
-    for k in range(begin, wp.min(begin + each, length(SUSPECTS, state))):
-        adopt(state.reached[k], state, cloth)
+    for n in range(begin, wp.min(begin + each, length(SUSPECTS, state))):
+        i = state.reached[n]
+        if state.first[i] == state.distance[i]:
+            continue
+        wp.atomic_add(state.counts, CHANGED, 1)
+        state.fresh[i] = 1
+        keep(i, state.origin[i], state.first[i], state.first_gradient[i], state.first_face[i], state)
+        for k in range(cloth.ring_start[i], cloth.ring_start[i + 1]):
+            suspect(cloth.ring[k], state)
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def list_near_kernel(each: int, state: State, rules: Rules) -> None:
     """Lists who is nearer than the margin, of those who were moved."""
     first = wp.tid() * each
@@ -158,33 +153,73 @@ def list_near_kernel(each: int, state: State, rules: Rules) -> None:
             state.near[wp.atomic_add(state.counts, NEAR, 1)] = i
 
 
-@wp.func
-def scale(k: int, state: State, rules: Rules) -> None:
-    """How far each near vertex goes, for predicted scales: at least until it is outside."""
-    i = state.near[k]
-    distance = state.distance[i]
-    deficit = rules.margin - distance
-    # Where α is below 1, the distance was predicted to exaggerate; its sign is trusted all the same.
-    scale = wp.max(state.alpha[k], (wp.min(rules.tolerance, rules.margin) - distance) / deficit)
-    way = wp.min(scale * deficit, rules.max_displacement)
-    state.goal[i] = wp.min(distance + scale * deficit, rules.margin)
-    state.way[i] = wp.min(way, deficit)
-    state.field[i] = way * state.gradient[i]
-    state.mark[i] = SOURCE
-    state.reached[wp.atomic_add(state.counts, REACHED, 1)] = i
-
-
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def scale_kernel(each: int, state: State, rules: Rules) -> None:
-    """`scale` for a list, `each` of it a thread."""
+    """How far each near vertex goes, for predicted scales: at least until it is outside."""
     begin = wp.tid() * each
     for k in range(begin, wp.min(begin + each, length(NEAR, state))):
-        scale(k, state, rules)
+        i = state.near[k]
+        distance = state.distance[i]
+        deficit = rules.margin - distance
+        # Where α is below 1, the distance was predicted to exaggerate; its sign is trusted all the same.
+        scale = wp.max(state.alpha[k], (wp.min(rules.tolerance, rules.margin) - distance) / deficit)
+        way = wp.min(scale * deficit, rules.max_displacement)
+        state.goal[i] = wp.min(distance + scale * deficit, rules.margin)
+        state.way[i] = wp.min(way, deficit)
+        state.field[i] = way * state.gradient[i]
+        state.mark[i] = SOURCE
+        state.reached[wp.atomic_add(state.counts, REACHED, 1)] = i
+
+
+@wp.func
+def reach(i: int, state: State, cloth: Cloth) -> None:
+    """Lists the neighbours of a vertex, unless they are."""
+    for k in range(cloth.ring_start[i], cloth.ring_start[i + 1]):
+        j = cloth.ring[k]
+        if state.mark[j] == 0 and wp.atomic_max(state.mark, j, BESIDE) == 0:
+            state.reached[wp.atomic_add(state.counts, REACHED, 1)] = j
+
+
+@wp.func
+def spread(
+    i: int, state: State, cloth: Cloth, step: float, field: wp.array[wp.vec3], smoother: wp.array[wp.vec3]
+) -> None:
+    """A step towards the mean of the neighbours, but no less than a vertex has to go."""
+    first = cloth.ring_start[i]
+    last = cloth.ring_start[i + 1]
+    mean = wp.vec3()
+    for k in range(first, last):
+        mean += field[cloth.ring[k]]
+    if last > first:
+        mean = mean * (1.0 / float(last - first))
+    here = field[i]
+    here += step * (mean - here)
+    if state.mark[i] == SOURCE:
+        lack = state.way[i] - wp.dot(here, state.gradient[i])
+        here += wp.max(lack, 0.0) * state.gradient[i]
+    smoother[i] = here
+
+
+@wp.kernel
+def blend_kernel(state: State, cloth: Cloth, rings: int, pairs: int, long_step: float, short_step: float) -> None:
+    """All sweeps, in pairs, by one thread: the lists are short, and a launch costs what hundreds of steps do."""
+    first = int(0)
+    for _ring in range(rings):
+        last = int(state.counts[REACHED])
+        for k in range(first, last):
+            reach(state.reached[k], state, cloth)
+        first = last
+    n = int(state.counts[REACHED])
+    for _pair in range(pairs):
+        for k in range(n):
+            spread(state.reached[k], state, cloth, long_step, state.field, state.smoother)
+        for k in range(n):
+            spread(state.reached[k], state, cloth, short_step, state.smoother, state.field)
 
 
 @wp.func
 def settle(i: int, state: State, skin: Skin, rules: Rules) -> None:
-    """Takes vertices along, and pushes on those that aren't clear yet. Leaves fields and marks empty."""
+    """Takes a vertex along, and pushes it on if it isn't clear yet. Leaves fields and marks empty."""
     shift = state.field[i]
     mark = state.mark[i]
     state.field[i] = wp.vec3()
@@ -219,7 +254,7 @@ def settle(i: int, state: State, skin: Skin, rules: Rules) -> None:
     push_on(i, here, distance, gradient, (goal - distance) / (rules.margin - distance), state, skin, rules)
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def settle_kernel(each: int, state: State, skin: Skin, rules: Rules) -> None:
     """`settle` for a list, `each` of it a thread."""
     begin = wp.tid() * each
@@ -227,21 +262,16 @@ def settle_kernel(each: int, state: State, skin: Skin, rules: Rules) -> None:
         settle(state.reached[k], state, skin, rules)
 
 
-@wp.func
-def tally(i: int, state: State) -> None:
-    """Counts who was inside, who was moved, and who is inside."""
-    way = state.place[i] - state.origin[i]
-    if way[0] != 0.0 or way[1] != 0.0 or way[2] != 0.0:
-        wp.atomic_add(state.counts, MOVED, 1)
-    if state.first[i] < 0.0:
-        wp.atomic_add(state.counts, INSIDE, 1)
-    if state.distance[i] < 0.0:
-        wp.atomic_add(state.counts, STUCK, 1)
-
-
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def tally_kernel(each: int, state: State) -> None:
-    """`tally` for a list, `each` of it a thread."""
+    """Counts who was inside, who was moved, and who is inside."""
     begin = wp.tid() * each
     for k in range(begin, wp.min(begin + each, length(NEAR, state))):
-        tally(state.near[k], state)
+        i = state.near[k]
+        way = state.place[i] - state.origin[i]
+        if way[0] != 0.0 or way[1] != 0.0 or way[2] != 0.0:
+            wp.atomic_add(state.counts, MOVED, 1)
+        if state.first[i] < 0.0:
+            wp.atomic_add(state.counts, INSIDE, 1)
+        if state.distance[i] < 0.0:
+            wp.atomic_add(state.counts, STUCK, 1)

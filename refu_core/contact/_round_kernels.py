@@ -3,19 +3,21 @@
 import warp as wp
 
 from refu_core.contact._edge_kernels import choose, lift, measure
-from refu_core.contact._spread_kernels import reach, spread
+from refu_core.contact._resolver_kernels import reach, spread
 from refu_core.contact._state import CUTTING, RAISED, REACHED, Cloth, Rules, State, listed
 from refu_core.sdf import Skin
 
+wp.set_module_options({"enable_backward": False})
 
-@wp.kernel(enable_backward=False)
+
+@wp.kernel
 def close_kernel(state: State, which: int) -> None:
     """From now on launches go through a list as long as it is now, whatever is added to it meanwhile."""
     state.begins[which] = state.ends[which]
     state.ends[which] = state.counts[which]
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def reach_kernel(state: State, cloth: Cloth) -> None:
     """Lists the neighbours of those that came to the list last."""
     i = listed(state.begins[REACHED] + wp.tid(), REACHED, state.reached, state)
@@ -23,14 +25,9 @@ def reach_kernel(state: State, cloth: Cloth) -> None:
         reach(i, state, cloth)
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def spread_kernel(
-    state: State,
-    cloth: Cloth,
-    step: float,
-    field: wp.array[wp.vec3],
-    # output
-    smoother: wp.array[wp.vec3],
+    state: State, cloth: Cloth, step: float, field: wp.array[wp.vec3], smoother: wp.array[wp.vec3]
 ) -> None:
     """One sweep of `Blend.spread`."""
     i = listed(wp.tid(), REACHED, state.reached, state)
@@ -38,16 +35,9 @@ def spread_kernel(
         spread(i, state, cloth, step, field, smoother)
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def measure_kernel(
-    state: State,
-    cloth: Cloth,
-    skin: Skin,
-    rules: Rules,
-    rounds: int,
-    suspects: wp.array[int],
-    # output
-    low: wp.array[int],
+    state: State, cloth: Cloth, skin: Skin, rules: Rules, rounds: int, suspects: wp.array[int], low: wp.array[int]
 ) -> None:
     """Lists those of the edges that are low."""
     edge = listed(wp.tid(), CUTTING + rounds, suspects, state)
@@ -55,7 +45,7 @@ def measure_kernel(
         measure(edge, rounds, state, cloth, skin, rules, low)
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def choose_kernel(state: State, cloth: Cloth, rounds: int, low: wp.array[int]) -> None:
     """Lists their ends."""
     k = wp.tid()
@@ -63,7 +53,7 @@ def choose_kernel(state: State, cloth: Cloth, rounds: int, low: wp.array[int]) -
         choose(k, state, cloth, low)
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def lift_kernel(state: State, skin: Skin, rules: Rules) -> None:
     """Raises these."""
     i = listed(wp.tid(), RAISED, state.reached, state)

@@ -4,17 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from refu_core.errors import RefuError
 from refu_core.refu import MAX_DISPLACEMENT
-
-MOST_PUSHES = 16
 
 
 @dataclass(frozen=True, kw_only=True)
 class ContactSettings:
     """How a garment is brought off the body and off the garments below it.
-
-    Raises `RefuError` for more pushes than are counted.
 
     Each number says what it is for. `benchmarks/contact.py` measures what half and twice of it do on recorded motion.
     """
@@ -24,7 +19,7 @@ class ContactSettings:
     """No vertex moves farther than this, however wrong its distance is [m]."""
     max_pushes: int = 4
     """Pushes of a vertex, rounds of raised edges, and how many edges far a search goes from the rim of a patch of wrong
-    closest faces into it; up to 16."""
+    closest faces into it."""
     tolerance: float = 2e-4
     """What may be missing to the margin, how far apart triangles that cut each other are brought, and by how much more
     than their edge is long distances at its ends may differ before one of them is doubted [m]."""
@@ -131,11 +126,6 @@ class ContactSettings:
     """How often triangles are brought apart, before the body has its word. Eight leave 5 of 116 cut, twelve 3."""
     partings: int = 3
     """How often all of that is done, while any cut. Once leaves 6 of 116 cut, twice 4; four times no fewer."""
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.max_pushes <= MOST_PUSHES:
-            msg = f"max_pushes: wanted 0 to {MOST_PUSHES}, got {self.max_pushes}"
-            raise RefuError(msg)
 
 
 DEFAULT_CONTACT = ContactSettings()

@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 import torch
 import warp as wp
-from numpy.typing import NDArray
 from torch import Tensor
 
-from refu_core._warp import as_warp, torch_stream
+from refu_core._warp import as_warp, ints, recorded, torch_stream
 from refu_core.contact import _layers_kernels as kernels
 from refu_core.mesh import Connectivity
 
@@ -21,28 +20,21 @@ class Sheet:
     def __init__(self, mesh: Connectivity, rest: Tensor) -> None:
         """For a mesh with vertices (U, 3) [m] in the rest pose."""
         self.mesh = mesh
-        self.cut = cut_of(mesh, rest.device)
         self.vertices = rest.detach().to(torch.float32, copy=True).contiguous()
         """[m], shape (U, 3)."""
         self._normals = torch.empty_like(self.vertices)
         self._extent = torch.zeros(2, 3, device=rest.device)
-        self.places, self.normals, self.extent = (
+        self.data = data = kernels.Below()
+        """As kernels read it; `fit` its tree first."""
+        data.points, data.normals, data.extent = (
             as_warp(tensor, wp.vec3) for tensor in (self.vertices, self._normals, self._extent)
         )
-        self._tree = wp.Mesh(self.places, self.cut.faces.flatten())
+        data.cut = cut_of(mesh, rest.device)
+        self._tree = wp.Mesh(data.points, data.cut.faces.flatten())
+        data.tree = self._tree.id
         self._is_late = True
-        self._point_out = wp.launch(
-            kernels.normals_kernel,
-            len(self.vertices),
-            [self.places, self.cut, self.normals],
-            device=str(rest.device),
-            record_cmd=True,
-        )
-
-    @property
-    def tree(self) -> Any:
-        """Warp's handle of its faces; `fit` it first."""
-        return self._tree.id
+        arrays = [data.points, data.cut, data.normals]
+        self._point_out = recorded(kernels.normals_kernel, len(self.vertices), arrays, rest.device)
 
     def take(self, vertices: Tensor) -> None:
         """Takes over a pose, (U, 3) [m]."""
@@ -62,21 +54,11 @@ class Sheet:
 
 def cut_of(mesh: Connectivity, device: torch.device) -> Any:
     """A mesh as the kernels read it."""
+    open_edge = (mesh.n_faces_of_edge == 1)[mesh.edge_of_corner]
+    open_vertex = np.isin(mesh.faces, mesh.boundary)
     cut = kernels.Cut()
-    cut.faces, cut.rim = ints(mesh.faces, device), ints(_rim(mesh), device)
+    cut.faces = ints(mesh.faces, device)
+    cut.rim = ints(np.concatenate((open_vertex, open_edge), axis=1) @ (1 << np.arange(1, 7)), device)
     cut.fan_start, cut.fan_face = (ints(array, device) for array in mesh.fan)
     cut.ring_start, cut.ring = (ints(array, device) for array in mesh.ring)
     return cut
-
-
-def ints(values: NDArray[Any], device: torch.device) -> Any:
-    """As Warp's integers."""
-    return wp.array(values.astype(np.int32), dtype=wp.int32, device=str(device))
-
-
-def _rim(mesh: Connectivity) -> NDArray[np.int64]:
-    """A bit for each feature (as `closest_on_triangle` numbers them) of each face, (F, 3), that is on an open rim."""
-    open_edge = (mesh.n_faces_of_edge == 1)[mesh.edge_of_corner]
-    open_vertex = np.isin(mesh.faces, mesh.boundary)
-    rim: NDArray[np.int64] = np.concatenate((open_vertex, open_edge), axis=1) @ (1 << np.arange(1, 7))
-    return rim

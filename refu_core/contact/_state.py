@@ -1,4 +1,4 @@
-"""What the steps of `resolve` read and write: a garment, a frame of it, and numbers.
+"""What the steps of a `Resolver` read and write: a garment, a frame of it, and numbers.
 
 Lists of vertices are filled by kernels: `counts[NAME]` says how many they are. On a CPU they are in order, on a GPU in
 any; nothing depends on it. On a CPU one thread goes through a list. To know how long it is a GPU would have to be
@@ -6,8 +6,6 @@ waited for: there a launch is as long as any list can be, and what is beyond its
 """
 
 import warp as wp
-
-from refu_core.contact._settings import MOST_PUSHES
 
 # What a kernel counts.
 NEAR = wp.constant(0)  # vertices nearer than the margin, which are pushed
@@ -19,8 +17,7 @@ STUCK = wp.constant(5)  # inside after all
 RAISED = wp.constant(6)  # ends of edges that cut the skin
 CHANGED = wp.constant(7)  # distances that were replaced
 SHIFTED = wp.constant(8)  # vertices that were moved since the last call
-CUTTING = wp.constant(9)  # such edges; a number for each round follows
-N_COUNTS = 10 + MOST_PUSHES
+CUTTING = wp.constant(9)  # such edges; a number for each of `max_pushes` rounds follows
 
 # A vertex reached by pushes, or pushed itself.
 BESIDE = wp.constant(1)
@@ -51,25 +48,20 @@ class Rules:
     through: wp.float32
 
 
-RULES = tuple(name for name in Rules.vars if name != "margin")  # type: ignore[attr-defined]  # Warp's own
-
-
 @wp.struct
 class State:
     """A garment in one frame, by vertex; lengths in metres."""
 
     origin: wp.array[wp.vec3]
-    """Before."""
+    """Before; there it has this distance:"""
     first: wp.array[wp.float32]
     first_gradient: wp.array[wp.vec3]
     first_face: wp.array[wp.int32]
-    """Distance there."""
     place: wp.array[wp.vec3]
-    """The best place so far."""
+    """The best place so far; there it has this distance:"""
     distance: wp.array[wp.float32]
     gradient: wp.array[wp.vec3]
     face: wp.array[wp.int32]
-    """Distance there."""
     way: wp.array[wp.float32]
     """How far a vertex has to go along the gradient."""
     goal: wp.array[wp.float32]

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import as_warp, torch_stream
+from refu_core._warp import as_warp, recorded, torch_stream
 from refu_core.contact import _strain_kernels as kernels
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
+from refu_core.contact._sheet import cut_of
 from refu_core.mesh import Connectivity
 
 
 class StrainLimit:
     """Draws the ends of edges together that contact has made longer than a multiple of their rest length.
-
-    Vertices that are deep in a limb may leave it on another side than their neighbours do, which tears the cloth. Drawn
-    together, they are pushed off the skin anew, on the side where most of them are.
 
     Jacobi sweeps of position-based dynamics (Müller et al. 2007): edges pull by half of what they are too long, and a
     vertex goes by the mean of its edges. The result is continuous in the vertices, and edges within the limit stay.
@@ -29,23 +26,19 @@ class StrainLimit:
         """For garments of this mesh."""
         self._settings, self._device = settings, device
         self._is_serial = device.type == "cpu"
-        n, name = mesh.n_vertices, str(device)
+        n = mesh.n_vertices
         self._rest, self._before, self._points, self._other = torch.zeros(4, n, 3, device=device)
         self._count = torch.zeros(1, dtype=torch.int32, device=device)
         net = kernels.Net()
+        net.cut = cut_of(mesh, device)
         net.rest, net.before, net.points, net.other = (
             as_warp(one, wp.vec3) for one in (self._rest, self._before, self._points, self._other)
         )
-        lower, higher = mesh.edges.T
-        lists = (*mesh.ring, np.searchsorted(lower, np.arange(n + 1)), higher)
-        net.ring_start, net.ring, net.edge_start, net.edge_end = (
-            wp.array(np.ascontiguousarray(one, np.int32), dtype=wp.int32, device=name) for one in lists
-        )
         net.limit, net.count = settings.strain_limit, as_warp(self._count, wp.int32)
-        net.rows, net.is_listed = (wp.zeros(n, dtype=wp.int32, device=name) for _ in range(2))
-        self._limit = wp.launch(kernels.limit_kernel, 1, [net, settings.strain_sweeps], device=name, record_cmd=True)
+        net.rows, net.is_listed = (wp.zeros(n, dtype=wp.int32, device=str(device)) for _ in range(2))
+        self._limit = recorded(kernels.limit_kernel, 1, [net, settings.strain_sweeps], device)
         self._sweeps = [
-            wp.launch(kernels.sweep_kernel, n, [net, *places], device=name, record_cmd=True)
+            recorded(kernels.sweep_kernel, n, [net, *places], device)
             for places in ((net.points, net.other), (net.other, net.points))
         ]
 
@@ -53,8 +46,7 @@ class StrainLimit:
     def __call__(self, points: Tensor, before: Tensor, rest: Tensor) -> Tensor:
         """The garment (N, 3) [m] with no tear in it; on a CPU the very points where there was none.
 
-        `before` (N, 3) [m] are its vertices before contact, and `rest` (N, 3) [m] those of the wearer's garment in the
-        rest pose. Not differentiable; a GPU isn't waited for.
+        `before` (N, 3) [m] are its vertices before contact, `rest` (N, 3) [m] those of the wearer's garment at rest.
         """
         self._points.copy_(points)
         self._before.copy_(before)

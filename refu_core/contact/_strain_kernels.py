@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from refu_core.contact._layers_kernels import Cut
+
 wp.set_module_options({"enable_backward": False})
 
 
@@ -16,11 +18,7 @@ class Net:
     points: wp.array[wp.vec3]
     other: wp.array[wp.vec3]
     """Vertices [m], and the same a sweep later."""
-    ring_start: wp.array[int]
-    ring: wp.array[int]
-    edge_start: wp.array[int]
-    edge_end: wp.array[int]
-    """The edges of vertex v to those of higher number are to `edge_end[edge_start[v]:edge_start[v + 1]]`."""
+    cut: Cut
     limit: float
     """How many times their rest length edges may be, unless they were longer before contact."""
     rows: wp.array[int]
@@ -48,13 +46,13 @@ def drawn(v: int, points: wp.array[wp.vec3], net: Net) -> wp.vec3:
     Edges that aren't too long count, too: so a vertex that was thrown comes back, and its neighbours hardly follow it.
     """
     total = wp.vec3()
-    for r in range(net.ring_start[v], net.ring_start[v + 1]):
-        w = net.ring[r]
+    for r in range(net.cut.ring_start[v], net.cut.ring_start[v + 1]):
+        w = net.cut.ring[r]
         way = points[w] - points[v]
         ratio = longest_squared(v, w, net) / wp.max(wp.length_sq(way), 1.0e-18)
         if ratio < 1.0:
             total += (0.5 - 0.5 * wp.sqrt(ratio)) * way
-    return points[v] + total / float(wp.max(net.ring_start[v + 1] - net.ring_start[v], 1))
+    return points[v] + total / float(wp.max(net.cut.ring_start[v + 1] - net.cut.ring_start[v], 1))
 
 
 @wp.func
@@ -76,18 +74,19 @@ def sweep_kernel(net: Net, points: wp.array[wp.vec3], other: wp.array[wp.vec3]) 
 def limit_kernel(net: Net, sweeps: int) -> None:
     """All sweeps, by one thread: over the ends of edges that are too long, and of those that become it."""
     for v in range(net.points.shape[0]):
-        for e in range(net.edge_start[v], net.edge_start[v + 1]):
-            if is_long(v, net.edge_end[e], net.points, net):
+        for r in range(net.cut.ring_start[v], net.cut.ring_start[v + 1]):
+            w = net.cut.ring[r]
+            if w > v and is_long(v, w, net.points, net):
                 enlist(v, net)
-                enlist(net.edge_end[e], net)
+                enlist(w, net)
     for _ in range(sweeps):
         i = int(0)
         while i < net.count[0]:
             v = net.rows[i]
             net.other[v] = drawn(v, net.points, net)
-            for r in range(net.ring_start[v], net.ring_start[v + 1]):
-                if net.is_listed[net.ring[r]] == 0 and is_long(v, net.ring[r], net.points, net):
-                    enlist(net.ring[r], net)
+            for r in range(net.cut.ring_start[v], net.cut.ring_start[v + 1]):
+                if net.is_listed[net.cut.ring[r]] == 0 and is_long(v, net.cut.ring[r], net.points, net):
+                    enlist(net.cut.ring[r], net)
             i += 1
         for i in range(net.count[0]):
             net.points[net.rows[i]] = net.other[net.rows[i]]

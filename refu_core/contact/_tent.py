@@ -8,7 +8,7 @@ import warp as wp
 from numpy.typing import NDArray
 from torch import Tensor
 
-from refu_core._warp import as_warp, strips, torch_stream
+from refu_core._warp import as_warp, ints, recorded, strips, torch_stream
 from refu_core.body import LEGS, SmplBody, weight_of_parts
 from refu_core.contact import _tent_kernels as kernels
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
@@ -44,13 +44,13 @@ class Shins:
         name = str(self._device)
         self.data = data = kernels.Shins()
         """As kernels read it."""
-        data.start = wp.array(np.cumsum([0, *map(len, of_legs)]), dtype=wp.int32, device=name)
-        data.vertex = wp.array(np.concatenate(of_legs), dtype=wp.int32, device=name)
+        data.start = ints(np.cumsum([0, *map(len, of_legs)]), name)
+        data.vertex = ints(np.concatenate(of_legs), name)
         data.share = wp.array2d(np.concatenate(shares), dtype=wp.float32, device=name)
         data.radius = wp.array(self.radius, dtype=wp.float32, device=name)
         data.places = wp.zeros((kernels.N_LEGS, kernels.N_PLACES), dtype=wp.vec3, device=name)
         points = as_warp(self._vertices, wp.vec3)
-        self._stand = wp.launch(kernels.stand_kernel, kernels.N_LEGS, [points, data], device=name, record_cmd=True)
+        self._stand = recorded(kernels.stand_kernel, kernels.N_LEGS, [points, data], name)
 
     def update(self, body: Tensor) -> None:
         """Takes over a pose: vertices (V, 3) [m]."""
@@ -69,14 +69,10 @@ class Shins:
 
 
 class Tent:
-    """Keeps cloth that hangs behind the legs at rest behind the shins in any pose.
+    """Keeps cloth that hangs behind the legs at rest behind the shins in any pose (docs/architecture.md).
 
-    The back of a skirt follows the thighs. A heel that goes up behind meets it, and networks leave it centimetres
-    inside the calf, from where the gradient leads to one side in one frame and to the other in the next. So before
-    cloth is brought off anything it goes backwards, out of a tent over each shin, by the shortest way out of both.
-
-    It is a continuous function of the pose. The tent is as wide as the shin. Cloth that is farther behind the bone than
-    that at rest goes by `tent_share`, other cloth by less, and none at rest.
+    It goes backwards, out of a tent over each shin, by the shortest way out of both: by `tent_share` where at rest it
+    is farther behind the bone than the tent is wide, other cloth by less, and none at rest.
     """
 
     def __init__(self, garment: GarmentTemplate, shins: Shins, *, settings: ContactSettings = DEFAULT_CONTACT) -> None:
@@ -89,13 +85,13 @@ class Tent:
         (rows,) = np.nonzero(weight.max(1))
         name = str(self._device)
         hanging = kernels.Hanging()
-        hanging.vertex = wp.array(rows, dtype=wp.int32, device=name)
+        hanging.vertex = ints(rows, name)
         hanging.at_rest = wp.array2d(at_rest[rows], dtype=wp.float32, device=name)
         hanging.weight = wp.array2d(weight[rows], dtype=wp.float32, device=name)
         self._cloth = torch.zeros_like(garment.v_template, dtype=torch.float32)
         n_strips, each = strips(len(rows), self._device)
         inputs = [hanging, shins.data, int(each), as_warp(self._cloth, wp.vec3)]
-        self._pitch = wp.launch(kernels.tent_kernel, n_strips, inputs, device=name, record_cmd=True)
+        self._pitch = recorded(kernels.tent_kernel, n_strips, inputs, name)
 
     @torch.no_grad()
     def __call__(self, points: Tensor) -> Tensor:

@@ -27,9 +27,10 @@ class Shins:
     """Of each leg [m]."""
 
 
-@wp.func
-def find_places(leg: int, body: wp.array[wp.vec3], shins: Shins) -> None:
-    """Knee, ankle, and the way backwards, a unit vector square to the bone."""
+@wp.kernel
+def stand_kernel(body: wp.array[wp.vec3], shins: Shins) -> None:
+    """Knee, ankle, and the way backwards, a unit vector square to the bone, of one leg a thread."""
+    leg = wp.tid()
     knee = wp.vec3()
     ankle = wp.vec3()
     behind = wp.vec3()
@@ -82,12 +83,6 @@ def least_way(left: wp.vec3, n_left: float, right: wp.vec3, n_right: float) -> w
         return n_right * right
     square = 1.0 - both * both
     return ((n_left - both * n_right) * left + (n_right - both * n_left) * right) / square
-
-
-@wp.kernel
-def stand_kernel(body: wp.array[wp.vec3], shins: Shins) -> None:
-    """`find_places` of one leg a thread."""
-    find_places(wp.tid(), body, shins)
 
 
 @wp.struct

@@ -3,160 +3,113 @@
 import warp as wp
 
 from refu_core.body._pose_kernels import turned
-from refu_core.contact._layers_kernels import Cut
-from refu_core.contact._level_kernels import levelled
+from refu_core.contact._layers_kernels import Cut, gather
+from refu_core.contact._level_kernels import levelled, widest
 from refu_core.contact._state import bounded
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.struct
-class Upright:
-    """Where the cloth of a garment faces without its folds: its normals at rest, and the joints that turn them."""
+class Fold:
+    """A garment, and memory to level it in."""
 
+    cut: Cut
     normal: wp.array[wp.vec3]
+    """Where its vertices face at rest."""
     start: wp.array[int]
     joint: wp.array[int]
-    weight: wp.array[float]
-    """Of the joints `joint[start[v]:start[v + 1]]` at vertex v."""
+    weight_of_joint: wp.array[float]
+    """Of the joints `joint[start[v]:start[v + 1]]`, which turn vertex v."""
+    rotation: wp.array[wp.mat33]
+    """Of the joints."""
     may: wp.array[int]
     """The vertices that may give way."""
     share: wp.array[float]
     """How much each vertex may, 0 to 1."""
+    weight: wp.array[float]
+    """How much each vertex does."""
+    wider: wp.array[float]
+    origin: wp.array[wp.vec3]
+    points: wp.array[wp.vec3]
+    leveller: wp.array[wp.vec3]
+    """The garment before, now, and a sweep later [m]."""
+    rows: wp.array[int]
+    count: wp.array[int]
+    """The vertices that give way, and how many they are."""
+    is_listed: wp.array[int]
+    """Zero between launches."""
 
 
 @wp.func
-def facing(i: int, points: wp.array[wp.vec3], cut: Cut, way: wp.vec3) -> float:
+def facing(i: int, fold: Fold, way: wp.vec3) -> float:
     """Mean cosine between `way` and the faces around a vertex, by their areas.
 
     That is the cosine of its normal where they are in a plane; where they fold the normal leaps, and this doesn't.
     """
     along = float(0.0)
     area = float(0.0)
-    for k in range(cut.fan_start[i], cut.fan_start[i + 1]):
-        face = cut.fan_face[k]
-        a = points[cut.faces[face, 0]]
-        normal = wp.cross(points[cut.faces[face, 1]] - a, points[cut.faces[face, 2]] - a)
+    for k in range(fold.cut.fan_start[i], fold.cut.fan_start[i + 1]):
+        face = fold.cut.fan_face[k]
+        a = fold.points[fold.cut.faces[face, 0]]
+        normal = wp.cross(fold.points[fold.cut.faces[face, 1]] - a, fold.points[fold.cut.faces[face, 2]] - a)
         along += wp.dot(normal, way)
         area += wp.length(normal)
     return wp.where(area > 0.0, along / area, 0.0)
 
 
 @wp.kernel
-def fold_kernel(
-    each: int,
-    points: wp.array[wp.vec3],
-    rotation: wp.array[wp.mat33],
-    cut: Cut,
-    upright: Upright,
-    flat: float,
-    folded: float,
-    # outputs
-    weight: wp.array[float],
-    rows: wp.array[int],
-    count: wp.array[int],
-) -> None:
+def fold_kernel(each: int, fold: Fold, flat: float, folded: float) -> None:
     """How far each vertex has folded over, 0 to its share: by where it is `facing`, and where it should be.
 
-    Those that have are listed in `rows`. `each` vertices a thread (`strips`).
+    Those that have are listed. `each` vertices a thread (`strips`).
     """
     first = wp.tid() * each
     for k in range(first, first + each):
-        i = upright.may[k]
-        way = turned(i, upright.start, upright.joint, upright.weight, rotation, upright.normal)
-        cosine = facing(i, points, cut, way)
-        fold = upright.share[i] * wp.clamp((flat - cosine) / (flat - folded), 0.0, 1.0)
-        weight[i] = fold
-        if fold > 0.0:
-            rows[wp.atomic_add(count, 0, 1)] = i
-
-
-@wp.func
-def widest(i: int, weight: wp.array[float], share: wp.array[float], cut: Cut, fade: float) -> float:
-    """The weight of a vertex, or what is left of the largest of its neighbours'."""
-    most = float(0.0)
-    for r in range(cut.ring_start[i], cut.ring_start[i + 1]):
-        most = wp.max(most, weight[cut.ring[r]])
-    return wp.max(weight[i], wp.min(fade * most, share[i]))
+        i = fold.may[k]
+        way = turned(i, fold.start, fold.joint, fold.weight_of_joint, fold.rotation, fold.normal)
+        cosine = facing(i, fold, way)
+        weight = fold.share[i] * wp.clamp((flat - cosine) / (flat - folded), 0.0, 1.0)
+        fold.weight[i] = weight
+        if weight > 0.0:
+            fold.rows[wp.atomic_add(fold.count, 0, 1)] = i
 
 
 @wp.kernel
-def widen_kernel(
-    weight: wp.array[float],
-    share: wp.array[float],
-    cut: Cut,
-    fade: float,
-    # output
-    wider: wp.array[float],
-) -> None:
-    """`widest` of one vertex a thread."""
+def bound_kernel(fold: Fold, most: float) -> None:
+    """Draws what was levelled back to within `most` [m] of its origin."""
     i = wp.tid()
-    wider[i] = widest(i, weight, share, cut, fade)
+    fold.points[i] = bounded(fold.points[i], fold.origin[i], most)
 
 
 @wp.kernel
-def bound_kernel(origin: wp.array[wp.vec3], most: float, points: wp.array[wp.vec3]) -> None:
-    """Draws what was levelled back to within `most` [m] of its origin; what wasn't stays to the bit."""
-    i = wp.tid()
-    if wp.length_sq(points[i] - origin[i]) > 0.0:
-        points[i] = bounded(points[i], origin[i], most)
-
-
-@wp.kernel
-def unfold_all_kernel(
-    share: wp.array[float],
-    cut: Cut,
-    fade: float,
-    reach: int,
-    rounds: int,
-    most: float,
-    # memory; `is_listed` is zero between launches
-    rows: wp.array[int],
-    count: wp.array[int],
-    is_listed: wp.array[int],
-    wider: wp.array[float],
-    origin: wp.array[wp.vec3],
-    leveller: wp.array[wp.vec3],
-    # outputs
-    weight: wp.array[float],
-    points: wp.array[wp.vec3],
-) -> None:
+def unfold_all_kernel(fold: Fold, fade: float, reach: int, rounds: int, most: float) -> None:
     """All that follows on `fold_kernel`, by one thread: of those that have folded over, and of who is `reach` around.
 
-    `reach` and `rounds` are even.
+    `rounds` are even.
     """
-    n = count[0]
-    for r in range(n):
-        is_listed[rows[r]] = 1
-    first = int(0)
+    for r in range(fold.count[0]):
+        fold.is_listed[fold.rows[r]] = 1
+    n = gather(fold.count[0], reach, fold.cut, fold.rows, fold.is_listed)
     for _ in range(reach):
-        last = int(n)
-        for r in range(first, last):
-            for s in range(cut.ring_start[rows[r]], cut.ring_start[rows[r] + 1]):
-                j = cut.ring[s]
-                if is_listed[j] == 0 and share[j] > 0.0:
-                    is_listed[j] = 1
-                    rows[n] = j
-                    n += 1
-        first = last
         for r in range(n):
-            wider[r] = widest(rows[r], weight, share, cut, fade)
+            fold.wider[r] = widest(fold.rows[r], fold.weight, fold.share, fold.cut, fade)
         for r in range(n):
-            weight[rows[r]] = wider[r]
+            fold.weight[fold.rows[r]] = fold.wider[r]
     for r in range(n):
-        i = rows[r]
-        origin[i] = points[i]
-        leveller[i] = points[i]
-        for s in range(cut.ring_start[i], cut.ring_start[i + 1]):
-            leveller[cut.ring[s]] = points[cut.ring[s]]
+        i = fold.rows[r]
+        fold.origin[i] = fold.points[i]
+        fold.leveller[i] = fold.points[i]
+        for s in range(fold.cut.ring_start[i], fold.cut.ring_start[i + 1]):
+            fold.leveller[fold.cut.ring[s]] = fold.points[fold.cut.ring[s]]
     for k in range(rounds):
         for r in range(n):
-            i = rows[r]
+            i = fold.rows[r]
             if k % 2 == 0:
-                leveller[i] = levelled(i, points, weight[i], cut.ring_start, cut.ring)
+                fold.leveller[i] = levelled(i, fold.points, fold.weight[i], fold.cut)
             else:
-                points[i] = levelled(i, leveller, weight[i], cut.ring_start, cut.ring)
+                fold.points[i] = levelled(i, fold.leveller, fold.weight[i], fold.cut)
     for r in range(n):
-        i = rows[r]
-        points[i] = bounded(points[i], origin[i], most)
-        is_listed[i] = 0
+        i = fold.rows[r]
+        fold.points[i] = bounded(fold.points[i], fold.origin[i], most)
+        fold.is_listed[i] = 0

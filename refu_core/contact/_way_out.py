@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import as_warp, torch_stream
+from refu_core._warp import as_warp, ints, recorded, torch_stream
 from refu_core.contact import _way_out_kernels as kernels
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
 from refu_core.mesh import Connectivity
@@ -15,14 +14,10 @@ from refu_core.sdf import Winding
 
 
 class WayOut:
-    """Takes vertices that are inside a posed body to the closest skin that is outside of it.
+    """Takes vertices that are inside a posed body, by winding number, to the closest skin that is outside of it.
 
-    A distance has a sign by the face that is closest. An approximate distance may have missed that face, and where the
-    body still overlaps itself the closest face may lie inside: then a vertex is believed to be outside. A winding
-    number is right in both cases. So it is asked about every vertex at the end. Faces with an interior above them are
-    covered by another part of the body, and don't count as skin. As a face may be covered in part, who is inside after
-    that goes to a vertex or to the middle of a face that is known to be open.
-
+    Faces with an interior above them are covered by another part of the body, and don't count. As a face may be covered
+    in part, who is inside after that goes to a vertex or to the middle of a face that is known to be open.
     In most frames nobody is inside, and the winding numbers are all that this costs.
     """
 
@@ -35,23 +30,13 @@ class WayOut:
         self._is_serial = body.device.type == "cpu"
         self._winding = Winding(faces)
         self._body = torch.zeros_like(body, dtype=torch.float32).copy_(body)
-        mesh = Connectivity.of(faces.cpu(), len(body))
-        name, n_places = str(body.device), len(body) + len(faces)
+        mesh, n_places = Connectivity.of(faces.cpu(), len(body)), len(body) + len(faces)
         self._points = as_warp(self._body, wp.vec3)
-        self._faces, fan_start, fan = (
-            wp.array(np.ascontiguousarray(one, np.int32), dtype=wp.int32, device=name)
-            for one in (mesh.faces, *mesh.fan)
-        )
+        self._faces, fan_start, fan = (ints(one, body.device) for one in (mesh.faces, *mesh.fan))
         self._tree = wp.Mesh(self._points, self._faces.flatten())
         self._above = torch.zeros(n_places, 3, device=body.device)
-        self._lift = wp.launch(
-            kernels.above_kernel,
-            n_places,
-            [settings.tolerance, self._points, self._faces, fan_start, fan],
-            [as_warp(self._above, wp.vec3)],
-            device=name,
-            record_cmd=True,
-        )
+        inputs = [settings.tolerance, self._points, self._faces, fan_start, fan, as_warp(self._above, wp.vec3)]
+        self._lift = recorded(kernels.above_kernel, n_places, inputs, body.device)
 
     def update(self, body: Tensor) -> None:
         """Takes over a pose: the body's vertices (V, 3) [m]."""

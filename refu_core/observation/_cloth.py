@@ -10,9 +10,8 @@ import torch
 import warp as wp
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
-from torch import Tensor
 
-from refu_core._warp import as_warp
+from refu_core._warp import as_warp, ints
 from refu_core.mesh import vertex_normals
 from refu_core.observation._estimate import Estimate
 from refu_core.observation._match_kernels import match_kernel
@@ -56,12 +55,13 @@ class ObservedCloth:
         self._settings = settings
         self._faces = garment.mesh.faces
         n = garment.n_vertices
-        modes = smooth_modes(garment, min(settings.modes, n // 8)).up_to(settings.finest)
+        fields, wave = smooth_modes(garment, min(settings.modes, n // 8))
+        kept = wave <= settings.finest
         rest = garment.v_template.detach().cpu().double().numpy()
         self._out = vertex_normals(rest, self._faces).astype(np.float32)
-        falls = 1 / (1 + (modes.wave / settings.wave) ** 2)
+        falls = 1 / (1 + (wave[kept] / settings.wave) ** 2)
         std = settings.amplitude * falls / np.sqrt((falls**2).sum())
-        self._fields = modes.fields * std.astype(np.float32)
+        self._fields = np.ascontiguousarray(fields[:, kept]) * std.astype(np.float32)
         """How far vertices move along the normal with each number [m], shape (V, K)."""
         directions = [garment.shapedirs] if garment.styledirs is None else [garment.styledirs, garment.shapedirs]
         self._cut = np.concatenate([d.detach().cpu().numpy().reshape(n, 3, -1) for d in directions], 2)
@@ -76,12 +76,10 @@ class ObservedCloth:
         self.reset()
         on_rim = garment.mesh.n_faces_of_edge[garment.mesh.edge_of_corner] == 1
         # Bit k says that the edge across from weight k is on the boundary, in the kernel's order of weights.
-        bits = (on_rim[:, [1, 2, 0]] * np.array([2, 4, 1])).sum(1).astype(np.int32)
-        self._rim = wp.array(bits, dtype=wp.int32, device="cpu")
+        bits = (on_rim[:, [1, 2, 0]] * np.array([2, 4, 1])).sum(1)
+        self._rim = ints(bits, "cpu")
         self._points = garment.v_template.detach().cpu().float().clone()
-        self._mesh = wp.Mesh(
-            as_warp(self._points, wp.vec3), wp.array(self._faces.ravel(), dtype=wp.int32, device="cpu")
-        )
+        self._mesh = wp.Mesh(as_warp(self._points, wp.vec3), ints(self._faces.ravel(), "cpu"))
 
     def reset(self) -> None:
         """Forgets what was measured."""
@@ -116,25 +114,12 @@ class ObservedCloth:
         how = self._settings
         own = self._points.numpy()
         rows = np.flatnonzero(within(measured.points, own.min(0) - how.reach, own.max(0) + how.reach))
-        n, points = len(rows), measured.points[rows]
-        face, height = np.empty(n, np.int32), np.empty(n, np.float32)
-        weight, normal = np.empty((2, n, 3), np.float32)
+        points = wp.array(measured.points[rows], dtype=wp.vec3, device="cpu")
         seen = wp.vec3() if eye is None else wp.vec3(*eye.tolist())
-        wp.launch(
-            match_kernel,
-            n,
-            [
-                wp.array(points, dtype=wp.vec3, device="cpu", copy=False),
-                *(self._mesh.id, skin.id, self._rim, how.reach, how.slack, eye is not None, seen),
-            ],
-            [
-                wp.array(face, dtype=wp.int32, device="cpu", copy=False),
-                wp.array(weight, dtype=wp.vec3, device="cpu", copy=False),
-                wp.array(normal, dtype=wp.vec3, device="cpu", copy=False),
-                wp.array(height, dtype=wp.float32, device="cpu", copy=False),
-            ],
-            device="cpu",
-        )
+        inputs = [points, self._mesh.id, skin.id, self._rim, how.reach, how.slack, eye is not None, seen]
+        outputs = [wp.empty(len(rows), dtype=kind, device="cpu") for kind in (wp.int32, wp.vec3, wp.vec3, wp.float32)]
+        wp.launch(match_kernel, len(rows), inputs, outputs, device="cpu")
+        face, weight, normal, height = (one.numpy() for one in outputs)
         on = np.flatnonzero(face >= 0)
         return Matches(measured.say[rows[on]], face[on], weight[on], normal[on], height[on])
 
@@ -173,10 +158,3 @@ def averaged(points: F32, settings: ObservationSettings) -> Measured:
     _, of_point, count = np.unique(key, return_inverse=True, return_counts=True)
     means = np.stack([np.bincount(of_point, values) for values in points.T], 1) / count[:, None]
     return Measured(means.astype(np.float32), (count / (count + settings.enough)).astype(np.float32))
-
-
-def skin_mesh(vertices: Tensor, faces: Tensor) -> tuple[Tensor, wp.Mesh]:
-    """A mesh over memory that poses are copied to, and that memory (V, 3)."""
-    points = torch.zeros_like(vertices, dtype=torch.float32).copy_(vertices)
-    indices = wp.array(faces.numpy().astype(np.int32).ravel(), dtype=wp.int32, device="cpu")
-    return points, wp.Mesh(as_warp(points, wp.vec3), indices)

@@ -60,8 +60,7 @@ class Estimate:
 
 
 def _inverse(matrix: F64) -> F64:
-    """Of a symmetric positive definite matrix (D, D), which is written over: half the work of solving for each unit
-    vector, and symmetric."""
+    """Of a symmetric positive definite matrix (D, D), which is written over, by half the work of `inv`; symmetric."""
     factor, _ = cho_factor(matrix.T, lower=True, overwrite_a=True, check_finite=False)
     found, failed = dpotri(factor, lower=True, overwrite_c=True)
     if failed:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,23 +24,11 @@ _LOWEST = 1e-3
 """Added to the Laplacian, so that it can be inverted."""
 
 
-@dataclass(frozen=True, eq=False)
-class Modes:
-    """K orthogonal fields, the smoothest first."""
+def smooth_modes(garment: GarmentTemplate, count: int) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """The lowest fields of a garment's Laplacian, or nearly those: computed in seconds once, and then recalled.
 
-    fields: NDArray[np.float32]
-    """Of a mean square of one over the vertices, shape (V, K)."""
-    wave: NDArray[np.float64]
-    """Wave number of each [rad/m], shape (K,)."""
-
-    def up_to(self, wave: float) -> Modes:
-        """Those of longer waves than this [rad/m]."""
-        kept = self.wave <= wave
-        return Modes(np.ascontiguousarray(self.fields[:, kept]), self.wave[kept])
-
-
-def smooth_modes(garment: GarmentTemplate, count: int) -> Modes:
-    """The lowest fields of a garment's Laplacian, or nearly those: computed in seconds once, and then recalled."""
+    Orthogonal, the smoothest first, of a mean square of one over the vertices (V, K); and wave numbers [rad/m], (K,).
+    """
     digest = hashlib.sha256(garment.mesh.faces.tobytes()).hexdigest()[:16]
     name = f"modes-{_VERSION}-{digest}-{garment.n_vertices}-{count}"
     known = recall(name, keys=("fields", "value"))
@@ -53,7 +40,7 @@ def smooth_modes(garment: GarmentTemplate, count: int) -> Modes:
     a, b = rest[garment.mesh.edges].transpose(1, 0, 2)
     square = float(np.median(((a - b) ** 2).sum(1)))
     # Of a mesh of even triangles, six around a vertex, the graph's Laplacian is 3/2 edge² times the surface's.
-    return Modes(known["fields"], np.sqrt(np.maximum(known["value"], 0) / (1.5 * square)))
+    return known["fields"], np.sqrt(np.maximum(known["value"], 0) / (1.5 * square))
 
 
 def _subspace(garment: GarmentTemplate, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -6,11 +6,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
+from refu_core._warp import as_warp, ints
 from refu_core.body import blend_transforms
 from refu_core.errors import FrameError
-from refu_core.observation._cloth import Measured, ObservedCloth, averaged, skin_mesh, within
+from refu_core.observation._cloth import Measured, ObservedCloth, averaged, within
 from refu_core.observation._settings import DEFAULT_OBSERVATION, ObservationSettings
 
 if TYPE_CHECKING:
@@ -40,7 +42,8 @@ class Observer:
         self._pipeline, self._settings = pipeline, settings
         self._cloths = {name: ObservedCloth(garment, settings) for name, garment in pipeline.garments.items()}
         body = pipeline.body
-        self._skin, self._skin_mesh = skin_mesh(body.v_template.detach().cpu(), body.faces.cpu())
+        self._skin = body.v_template.detach().cpu().float().clone()
+        self._skin_mesh = wp.Mesh(as_warp(self._skin, wp.vec3), ints(body.faces.cpu().ravel(), "cpu"))
         self._stamp_ns: int | None = None
         self.matched: dict[str, int] = {}
         """How many places each garment was brought to in the last frame: cells of space with points of it in them."""

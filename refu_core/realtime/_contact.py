@@ -25,7 +25,7 @@ from refu_core.contact import (
     Unfold,
     WayOut,
 )
-from refu_core.garments import inner_first
+from refu_core.garments import GarmentTemplate, inner_first
 from refu_core.modes import SdfMode
 from refu_core.realtime._wearer import Outfit
 from refu_core.refu import VertexScale
@@ -40,18 +40,7 @@ class Worn(NamedTuple):
     raw: Tensor
     """The same before collision handling [m], shape (V, 3)."""
     numbers: Tensor
-    """As `Resolved.numbers`."""
-    n_clipped: Tensor
-    """As `Resolved.n_clipped`."""
-
-
-class Resolved(NamedTuple):
-    """A garment off the body and off the garments below it, and the numbers of a `GarmentStats`."""
-
-    vertices: Tensor
-    """[m], shape (V, 3)."""
-    numbers: Tensor
-    """`n_inside`, `n_pushed`, `n_unresolved`, `max_depth` and `n_layered`, float32, shape (5,)."""
+    """`n_inside`, `n_pushed`, `n_unresolved`, `max_depth` and `n_layered` of a `GarmentStats`, float32, shape (5,)."""
     n_clipped: Tensor
     """Vertices that weren't asked for their distance, since they are far off, shape ()."""
 
@@ -77,48 +66,36 @@ class ContactStage:
         Where it is to `certify`, vertices that winding numbers find inside leave, and those without a way out are
         counted.
         """
+        self._outfit, self._settings = outfit, settings
         body, garments = outfit.body, {name: one.template for name, one in outfit.wearables.items()}
+        self._is_serial = body.device.type == "cpu"
         self.sdf: MeshSdf = exact_sdf(body, uses_band=uses_band) if sdf is SdfMode.ACCURATE else ApproxSdf(body)
         self.way_out = WayOut(body.faces, body.v_template, settings=settings) if certify else None
         self.order = inner_first(garments)
         """Names from the skin outwards."""
-        self._asked = {name: self.sdf.of_garment(one) for name, one in garments.items()}
-        self.resolvers = {
-            name: Resolver(one.faces, one.n_vertices, settings=settings) for name, one in garments.items()
-        }
-        self._strain = {name: StrainLimit(one.mesh, body.device, settings=settings) for name, one in garments.items()}
-        self._limbs, self._tents, self._press, self._off_skin = None, {}, {}, {}
-        if outfit.collider is not None:  # or there is no room
-            self._shins = shins = Shins(body)
-            self._tents = {name: Tent(one, shins, settings=settings) for name, one in garments.items()}
-            self._limbs = limbs = LimbMeshes(body)
+        self._has_room = outfit.collider is not None
+        """For cloth beside limbs."""
+        if outfit.collider is not None:
+            self._shins, self._limbs = Shins(body), LimbMeshes(body)
+            self._skin = Sheet(outfit.collider.anatomy.mesh, body.v_template)
+            self._tents = {name: Tent(one, self._shins, settings=settings) for name, one in garments.items()}
             self._press = {
-                name: Press(one.template, limbs, knows_arms=one.knows_arms, settings=settings)
+                name: Press(one.template, self._limbs, knows_arms=one.knows_arms, settings=settings)
                 for name, one in outfit.wearables.items()
             }
-            self._skin = skin = Sheet(outfit.collider.anatomy.mesh, body.v_template)
             self._off_skin = {
-                name: Parting(one.mesh, one.v_template, skin, settings=settings) for name, one in garments.items()
+                name: Parting(one.mesh, one.v_template, self._skin, settings=settings) for name, one in garments.items()
             }
+        self._asked = {name: self.sdf.of_garment(one) for name, one in garments.items()}
+        self.resolvers = {n: Resolver(one.faces, one.n_vertices, settings=settings) for n, one in garments.items()}
+        self._strain = {name: StrainLimit(one.mesh, body.device, settings=settings) for name, one in garments.items()}
         self._unfold = {
             name: Unfold(one, [other for other in garments.values() if other is not one], settings=settings)
             for name, one in garments.items()
             if len(garments) > 1
         }
-        self._is_serial = body.device.type == "cpu"
-        self._outfit, self._farthest, self._kept = outfit, settings.max_displacement, settings.layer_margin
-        self._partings, self._part_most = settings.partings, settings.parting_most
         self._below = {
-            name: {
-                inner: Layer(
-                    garments[name].faces,
-                    garments[name].v_template,
-                    garments[inner].faces,
-                    garments[inner].v_template,
-                    settings=settings,
-                )
-                for inner in self.order[:i]
-            }
+            name: {inner: _layer(garments[name], garments[inner], settings) for inner in self.order[:i]}
             for i, name in enumerate(self.order)
         }
 
@@ -129,13 +106,13 @@ class ContactStage:
         """
         self._body = body
         # Where skin has given way as far as it may, there may be less room than cloth needs. A GPU isn't asked.
-        self._is_tight = bool(self._off_skin) and (not self._is_serial or bool(n_held > 0))
+        self._is_tight = self._has_room and (not self._is_serial or bool(n_held > 0))
         if self._is_tight:
             self._skin.take(body)
         self.sdf.update(body)
         if self.way_out is not None:
             self.way_out.update(body)
-        if self._limbs is not None:
+        if self._has_room:
             self._limbs.update(body)
             self._shins.update(body)
 
@@ -145,7 +122,7 @@ class ContactStage:
 
     def press(self, name: str, vertices: Tensor) -> Tensor:
         """Vertices (V, 3) [m] behind the shins, then between where they are and the skin they lie on, before limbs."""
-        if name not in self._press:
+        if not self._has_room:
             return vertices
         vertices = self._tents[name](vertices)
         return self._press[name](vertices, self._outfit.below[name](self._body[None])[0])
@@ -176,7 +153,7 @@ class ContactStage:
         margin: float,
         scale: float | VertexScale,
         n_layered: Tensor,
-    ) -> Resolved:
+    ) -> Worn:
         """Vertices (V, 3) [m] off the body, which has the last word, and within reach of where limbs `pressed` them.
 
         `raw` (V, 3) [m] are the vertices as they were predicted, `rest` (V, 3) [m] those of the wearer's garment in the
@@ -190,7 +167,7 @@ class ContactStage:
         numbers, kept = done.numbers, margin
         if worn:
             vertices, _ = self.lift(name, done.vertices, worn, goes_on=True)
-            kept = self._kept * margin
+            kept = self._settings.layer_margin * margin
             done = resolver(vertices, self.sdf, None, margin=kept)
         vertices = self._strain[name](done.vertices, raw, rest)
         was_torn = vertices is not done.vertices
@@ -202,22 +179,23 @@ class ContactStage:
         if self._is_tight:
             vertices = self._off_skin[name].parted(vertices)
         if was_torn or worn or self._is_tight:  # Each step goes no farther than that; together they may.
-            vertices = pressed + torch.renorm(vertices - pressed, 2, 0, self._farthest)
+            vertices = pressed + torch.renorm(vertices - pressed, 2, 0, self._settings.max_displacement)
         if self.way_out is not None:
             vertices, numbers[_N_UNRESOLVED] = self.way_out(vertices, pressed, margin)
-        return Resolved(vertices, torch.cat((numbers, n_layered)), n_clipped)
+        return Worn(vertices, raw, torch.cat((numbers, n_layered)), n_clipped)
 
     def _part(self, name: str, done: Resolution, worn: Mapping[str, Worn], *, margin: float) -> Resolution:
         """A garment off the body, off the `worn` inner ones where triangles cut each other after all.
 
         As often as that leaves fewer cuts: in a crease without room the way out of one fold leads into the next.
         """
-        layers, resolver, before = self._below[name].values(), self.resolvers[name], done.vertices
-        n_cut = torch.stack([layer.find_cuts(before) for layer in layers])
-        for round_ in range(self._partings):
+        partings = [layer.parting for layer in self._below[name].values()]
+        resolver, before = self.resolvers[name], done.vertices
+        n_cut = torch.stack([parting.find(before) for parting in partings])
+        for round_ in range(self._settings.partings):
             if self._is_serial and not int(n_cut.sum()):
                 break
-            cut_by = [one.parting for one, n in zip(layers, n_cut, strict=True) if not self._is_serial or int(n)]
+            cut_by = [one for one, n in zip(partings, n_cut, strict=True) if not self._is_serial or int(n)]
             vertices = done.vertices
             for parting in cut_by:
                 vertices = parting.level(vertices)
@@ -225,18 +203,14 @@ class ContactStage:
                 vertices, _ = self.lift(name, vertices, worn, goes_on=True)
             for parting in cut_by:
                 vertices = parting.part(vertices)
-            vertices = before + torch.renorm(vertices - before, 2, 0, self._part_most)
+            vertices = before + torch.renorm(vertices - before, 2, 0, self._settings.parting_most)
             parted = resolver(vertices, self.sdf, None, margin=margin)
-            n_left = torch.stack([layer.find_cuts(parted.vertices) for layer in layers])
+            n_left = torch.stack([parting.find(parted.vertices) for parting in partings])
             is_better = n_left.sum() < n_cut.sum()
-            vertices, distance, numbers = (
-                torch.where(is_better, new, old)
-                for new, old in (
-                    (parted.vertices, done.vertices),
-                    (parted.distance, done.distance),
-                    (parted.numbers, done.numbers),
-                )
-            )
-            done = Resolution(vertices, distance, numbers)
+            done = Resolution(*(torch.where(is_better, new, old) for new, old in zip(parted, done, strict=True)))
             n_cut = torch.where(is_better, n_left, 0)  # nothing is fewer than none: the end, on a GPU, too
         return done
+
+
+def _layer(above: GarmentTemplate, below: GarmentTemplate, settings: ContactSettings) -> Layer:
+    return Layer(above.faces, above.v_template, below.faces, below.v_template, settings=settings)

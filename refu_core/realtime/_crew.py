@@ -10,16 +10,15 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cached_property, partial
 from itertools import pairwise
 from queue import Empty, LifoQueue
-from typing import TypeVar
 
 import torch
 
 from refu_core.errors import RefuError
+from refu_core.frames import SmplFrame
 from refu_core.realtime._frame import FrameStep
+from refu_core.realtime._outputs import PipelineOutput
 
-In = TypeVar("In")
-Out = TypeVar("Out")
-
+Work = Callable[[FrameStep, Sequence[SmplFrame]], list[PipelineOutput]]
 _ON_GPU = threading.Lock()
 """Shared by all pipelines on a GPU: the stream that Warp works on is the device's, not the thread's."""
 
@@ -32,7 +31,7 @@ class Crew:
         self._process, self._free = os.getpid(), LifoQueue[FrameStep]()  # the one used last has its memory in the cache
         for step in steps:
             self._free.put(step)
-        self._device_lock = _ON_GPU if on_gpu else None
+        self._device: contextlib.AbstractContextManager[object] = _ON_GPU if on_gpu else contextlib.nullcontext()
 
     @contextlib.contextmanager
     def turn(self) -> Iterator[FrameStep]:
@@ -43,24 +42,19 @@ class Crew:
             msg = "this pipeline was busy when its process was forked: load one in each process, after the fork"
             raise RefuError(msg) from error
         try:
-            if self._device_lock is None:
+            with self._device:
                 yield step
-            else:
-                with self._device_lock:
-                    yield step
         finally:
             self._free.put(step)
 
-    def share(
-        self, step: FrameStep, work: Callable[[FrameStep, Sequence[In]], list[Out]], items: Sequence[In]
-    ) -> list[Out]:
-        """`work` on items with a step, and beside it on some of them with each step that is free."""
+    def share(self, step: FrameStep, work: Work, frames: Sequence[SmplFrame]) -> list[PipelineOutput]:
+        """`work` on frames with a step, and beside it on some of them with each step that is free."""
         steps = [step]
         with contextlib.suppress(Empty):
-            while len(steps) < len(items) and os.getpid() == self._process:
+            while len(steps) < len(frames) and os.getpid() == self._process:
                 steps.append(self._free.get_nowait())
-        ends = [len(items) * i // len(steps) for i in range(len(steps) + 1)]
-        own, *others = (items[start:end] for start, end in pairwise(ends))
+        ends = [len(frames) * i // len(steps) for i in range(len(steps) + 1)]
+        own, *others = (frames[start:end] for start, end in pairwise(ends))
         started = [self._pool.submit(work, *pair) for pair in zip(steps[1:], others, strict=True)]
         try:
             done = work(step, own)

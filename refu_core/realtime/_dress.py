@@ -19,10 +19,6 @@ Lap = Callable[[str, str | None], None]
 """Called at the end of a stage, with its name and the garment's, if it was for one."""
 
 
-def _no_lap(stage: str, garment: str | None) -> None:
-    """Nobody wants to know."""
-
-
 class Drape(NamedTuple):
     """One garment on a batch of bodies."""
 
@@ -53,7 +49,7 @@ class Dressed(NamedTuple):
 
 
 def dress(
-    pose: Tensor, wearer: Wearer, *, past: Tensor | None = None, up: Tensor | None = None, lap: Lap = _no_lap
+    pose: Tensor, wearer: Wearer, *, past: Tensor | None = None, up: Tensor | None = None, lap: Lap = lambda *_: None
 ) -> Dressed:
     """Bodies in poses (B, 24, 3) [rad], dressed by the backbones: posed as g = T(θ, β)(t(β, γ) + D(θ, β, γ)).
 
@@ -89,9 +85,7 @@ def dress(
 
 def scale_of(wearable: Wearable, drape: Drape, person: int) -> float | VertexScale:
     """α of one of the persons, as `refu_core.contact` takes it."""
-    if wearable.refu is None:
-        return 1.0
-    return wearable.refu.of_body(None if drape.feature is None else drape.feature[person])
+    return 1.0 if wearable.refu is None or drape.feature is None else wearable.refu.of_body(drape.feature[person])
 
 
 def _drape(
@@ -111,5 +105,5 @@ def _drape(
         unposed, on_mean = unposed + displacement, on_mean + displacement
     z = None
     if wearable.refu is not None:
-        z = wearable.refu.feature(garment.betas, pose, style, predicted.feature)
+        z = wearable.refu.feature(garment.betas, pose, style)
     return Drape(wearable.template.pose(unposed, transforms), unposed, on_mean, z)

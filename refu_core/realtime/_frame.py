@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -16,7 +15,6 @@ from refu_core.body import Collider
 from refu_core.errors import MeshError
 from refu_core.realtime._contact import N_NUMBERS, ContactStage, Worn
 from refu_core.realtime._dress import Dressed, dress, scale_of
-from refu_core.realtime._turn import RootTurn
 from refu_core.realtime._wearer import Outfit, Wearer
 
 if TYPE_CHECKING:
@@ -33,10 +31,10 @@ _MOVED = 1e-4
 class Person(NamedTuple):
     """One person of a frame."""
 
-    turn: RootTurn
-    """To the world's axes."""
+    turn: Callable[[Tensor], Tensor]
+    """Brings what follows to the world's axes."""
     body: Tensor
-    """The collider as the root sees it [m], shape (V, 3)."""
+    """The collider [m], shape (V, 3)."""
     skin: Tensor
     """The posed body before its overlaps were pulled apart [m], shape (V, 3)."""
     shift: Tensor
@@ -78,10 +76,9 @@ class FrameStep:
         """Without `contact` nothing is done about collisions. One call at a time: both have memory to work in."""
         self.outfit, self.contact = outfit, contact
         self._order = list(outfit.wearables) if contact is None else contact.order
-        sizes = [outfit.body.n_vertices * 3] * 2 + [N_SHIFT]
+        self._sizes = [outfit.body.n_vertices * 3] * 2 + [N_SHIFT]
         for one in outfit.wearables.values():
-            sizes += [one.template.n_vertices * 3] * 2 + [N_NUMBERS]
-        self._ends = np.cumsum([0, *sizes]).tolist()
+            self._sizes += [one.template.n_vertices * 3] * 2 + [N_NUMBERS]
 
     @torch.no_grad()
     def __call__(
@@ -117,15 +114,16 @@ class FrameStep:
             garments: dict[str, Worn] = {}
             for name in self._order:
                 drape = dressed.drapes[name]
-                raw = vertices = drape.vertices[person]
-                numbers, n_clipped = raw.new_zeros(N_NUMBERS), raw.new_zeros(())
-                if self.contact is not None:
+                raw = drape.vertices[person]
+                if self.contact is None:
+                    garments[name] = Worn(raw, raw, raw.new_zeros(N_NUMBERS), raw.new_zeros(()))
+                else:
                     flat = self.contact.unfold(name, raw, dressed.transforms.rotation[person])
                     pressed = self.contact.press(name, flat)
                     vertices, n_layered = self.contact.lift(name, pressed, garments)
                     if len(self._order) > 1:
                         clock.lap("layers", name)
-                    vertices, numbers, n_clipped = self.contact.resolve(
+                    garments[name] = self.contact.resolve(
                         name,
                         vertices,
                         garments,
@@ -137,7 +135,6 @@ class FrameStep:
                         scale=scale_of(self.outfit.wearables[name], drape, person),
                         n_layered=n_layered,
                     )
-                garments[name] = Worn(vertices, raw, numbers, n_clipped)
                 clock.lap("refu", name)
             persons.append(Person(turn, body, skin, shifts[person], garments))
         return persons
@@ -154,21 +151,22 @@ class FrameStep:
             rows.append(torch.cat([part.flatten() for part in parts]))
         return torch.stack(rows)
 
-    def unpacked(self, packed: NDArray[np.float32]) -> Iterator[list[NDArray[np.float32]]]:
-        """Of each person the collider, the skin, the shift, then of each garment its vertices, raw ones and numbers.
+    def unpacked(self, packed: NDArray[np.float32]) -> Iterator[Person]:
+        """The persons that were packed, who have been turned; nothing is copied.
 
-        Vertices are [m], shape (V, 3), in the world's axes; nothing is copied.
-
-        Raises:
-            MeshError: they aren't finite. A graph can't be interrupted to say so earlier.
+        Raises `MeshError` for what isn't finite: a graph can't be interrupted to say so earlier.
         """
         if not np.isfinite(packed.sum(dtype=np.float64)):
             bad = int((~np.isfinite(packed)).any(axis=1).sum())
             msg = f"vertices must be finite, got NaN or infinite ones of {bad} of {len(packed)} persons"
             raise MeshError(msg)
-        for row in packed:
-            parts = [row[start:end] for start, end in pairwise(self._ends)]
-            yield [part if len(part) in (N_SHIFT, N_NUMBERS) else part.reshape(-1, 3) for part in parts]
+        for row in torch.from_numpy(packed):
+            body, skin, shift, *parts = torch.split(row, self._sizes)
+            garments = {
+                name: Worn(parts[3 * i].view(-1, 3), parts[3 * i + 1].view(-1, 3), parts[3 * i + 2], torch.zeros(()))
+                for i, name in enumerate(self.outfit.wearables)
+            }
+            yield Person(lambda points: points, body.view(-1, 3), skin.view(-1, 3), shift, garments)
 
 
 def _shift(dressed: Dressed, collider: Collider | None) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -22,19 +22,8 @@ _WARM_UPS = 2
 """Before a capture: kernels are loaded, and libraries get their memory, which a graph can't do."""
 
 
-class Captured(Protocol):
-    """Work that can be done again, on what its inputs hold by then."""
-
-    output: Tensor
-    """Where it leaves its result."""
-
-    def replay(self) -> None:
-        """Does it."""
-        ...
-
-
 class CudaCapture:
-    """A `torch.cuda.CUDAGraph`, with the launches of Warp's kernels in it."""
+    """A `torch.cuda.CUDAGraph`, with the launches of Warp's kernels in it; it leaves its result in `output`."""
 
     def __init__(self, run: Callable[[], Tensor], device: torch.device) -> None:
         """Runs it a few times, then captures it. Raises `RuntimeError` where that can't be done."""
@@ -67,7 +56,7 @@ class StepGraphs:
         step: Callable[[Mapping[str, Tensor], tuple[float, ...]], Tensor],
         device: torch.device,
         *,
-        capture: Callable[[Callable[[], Tensor], torch.device], Captured] = CudaCapture,
+        capture: Callable[[Callable[[], Tensor], torch.device], Any] = CudaCapture,
         most: int = MOST_GRAPHS,
     ) -> None:
         """For a step that never waits for the device, which gives float32; the graphs used last are kept."""
@@ -104,7 +93,7 @@ class StepGraphs:
 class _Graph:
     """A captured step, the tensors that it reads, and the memory on the host that its result goes to."""
 
-    def __init__(self, held: Mapping[str, Tensor], captured: Captured) -> None:
+    def __init__(self, held: Mapping[str, Tensor], captured: Any) -> None:
         self._held, self._captured = held, captured
         self._given: dict[str, Tensor] = {}
         output = captured.output

@@ -49,10 +49,14 @@ def load_outfit(
     elif betas_from is not None:
         fit = load_fit(betas_from, betas_from=True, device=device)
     wearer = load_body(_cut_for(templates), device=device) if fit is None else fit.body
-    wearables = {
-        name: _wearable(template, fit, backbone=backbone, mode=mode, weights=weights, device=device)
-        for name, template in templates.items()
-    }
+    wearables = {}
+    for name, template in templates.items():
+        stored = backbone_weights(backbone, name, mode=mode, folder=weights_folder(name, weights))
+        if stored is None:
+            wearables[name] = Wearable(worn_on(template, fit), Skinned(), None, DEFAULT_MARGIN)
+        else:
+            worn = wearable_of(stored, template, fit, device=device)
+            wearables[name] = replace(worn, backbone=with_dynamics(backbone, worn.backbone, stored))
     return Outfit(wearer, wearables, Collider(wearer) if collider else None, fit)
 
 
@@ -83,22 +87,6 @@ def _cut_for(templates: Mapping[str, GarmentTemplate]) -> str:
     return bodies.pop()
 
 
-def _wearable(
-    template: GarmentTemplate,
-    fit: BodyFit | None,
-    *,
-    backbone: str,
-    mode: str,
-    weights: str | PathLike[str] | None,
-    device: torch.device,
-) -> Wearable:
-    stored = backbone_weights(backbone, template.name, mode=mode, folder=weights_folder(template.name, weights))
-    if stored is None:
-        return Wearable(worn_on(template, fit), Skinned(), None, DEFAULT_MARGIN)
-    worn = wearable_of(stored, template, fit, device=device)
-    return replace(worn, backbone=with_dynamics(backbone, worn.backbone, stored))
-
-
 def wearable_of(
     stored: Weights, template: GarmentTemplate, fit: BodyFit | None, *, device: str | torch.device = "cpu"
 ) -> Wearable:
@@ -124,6 +112,6 @@ def wearable_of(
             f"{hint}train some with `refu train {template.name} --body`"
         )
         raise WeightsError(msg)
-    margin = DEFAULT_MARGIN if refu is None else float(refu.margin)
+    margin = DEFAULT_MARGIN if refu is None else refu.margin
     feels_arms = all(joint in template.card.joints for arm in ARMS for joint in arm[:2])  # shoulders and elbows
     return Wearable(worn, network, refu, margin, betas, feels_arms and stored.card.get("knows_limbs") is True)

@@ -5,21 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
     from refu_core.frames import SmplFrame
-
-T = TypeVar("T")
-
-
-def itself(value: T) -> T:
-    """For what isn't made when it is asked for, since it is there already."""
-    return value
-
 
 SKIPS: Mapping[str, str] = {
     "band": "distances of vertices that are farther off the skin than they matter (accurate)",
@@ -47,7 +40,7 @@ class SkinShift:
     def of(cls, numbers: Sequence[float]) -> SkinShift:
         """Of the four, in this order."""
         n_moved, largest, mean, n_held = numbers
-        return cls(int(n_moved), float(largest), float(mean), int(n_held))
+        return cls(int(n_moved), largest, mean, int(n_held))
 
 
 @dataclass(frozen=True)
@@ -119,7 +112,7 @@ class GarmentMesh:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copied or pickled with all arrays made."""
-        return GarmentMesh, (self.local, partial(itself, self.raw), self.faces, self.transl)
+        return GarmentMesh, (self.local, partial(np.asarray, self.raw), self.faces, self.transl)
 
     def __repr__(self) -> str:
         return f"GarmentMesh({len(self.local)} vertices, {len(self.faces)} faces)"
@@ -169,7 +162,7 @@ class PipelineOutput(Mapping[str, GarmentMesh]):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copied or pickled with all arrays made."""
-        made = partial(itself, self.body), partial(itself, self.skin)
+        made = partial(np.asarray, self.body), partial(np.asarray, self.skin)
         return PipelineOutput, (self.garments, *made, self.stats)
 
     def __repr__(self) -> str:

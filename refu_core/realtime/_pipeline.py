@@ -6,7 +6,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, lru_cache, partial
 from numbers import Real
 from types import NoneType
 from typing import TYPE_CHECKING, NoReturn, overload
@@ -17,10 +17,9 @@ from torch import Tensor
 
 from refu_core._device import checked_device
 from refu_core.backbones import Skinned
-from refu_core.body import BodyFit, SmplBody
 from refu_core.contact import DEFAULT_CONTACT, ContactSettings
 from refu_core.errors import FrameError, GarmentError, RefuError, require_type
-from refu_core.frames import LAGS, MAX_COEFFICIENT, N_PAST, N_STYLES, SmplFrame, checked_numbers
+from refu_core.frames import LAGS, MAX_COEFFICIENT, N_BETAS, N_PAST, N_STYLES, SmplFrame, checked_numbers
 from refu_core.garments import GarmentTemplate
 from refu_core.modes import MAX_MARGIN, BackboneName, SdfMode
 from refu_core.realtime._contact import ContactStage
@@ -28,7 +27,7 @@ from refu_core.realtime._crew import Crew
 from refu_core.realtime._frame import FrameStep, StageClock
 from refu_core.realtime._graph import StepGraphs
 from refu_core.realtime._load import load_outfit
-from refu_core.realtime._outputs import SKIPS, FrameStats, GarmentMesh, GarmentStats, PipelineOutput, SkinShift, itself
+from refu_core.realtime._outputs import SKIPS, FrameStats, GarmentMesh, GarmentStats, PipelineOutput, SkinShift
 from refu_core.realtime._promise import within_promise
 from refu_core.realtime._wearer import Wearer
 from refu_core.sdf import require_outward
@@ -38,6 +37,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike, NDArray
 
+    from refu_core.body import SmplBody
     from refu_core.realtime._frame import Adjust, Person
 
 _MOST_WEARERS = 64
@@ -70,6 +70,20 @@ class GarmentPipeline:
         self._steps = steps
         self.outfit = outfit = steps[0].outfit
         """The body model, the garments and their networks."""
+        self.body = outfit.body
+        """The body model that the garments are worn on."""
+        self.fit = outfit.fit
+        """How well the built-in mesh lies on a body that was named; None where none was."""
+        self.warnings: list[str] = [] if self.fit is None else self.fit.warnings
+        """What there is to warn of before anything is dressed, for people."""
+        self.garments = {name: one.template for name, one in outfit.wearables.items()}
+        """The loaded garments by name."""
+        self.untrained = tuple(n for n, one in outfit.wearables.items() if isinstance(one.backbone, Skinned))
+        """Names of the garments that no network drapes: they follow the skin."""
+        self.heeds_past = any(one.backbone.heeds_past for one in outfit.wearables.values())
+        """Whether frames should tell their past (`PoseHistory`): with the backbone `dynamic`."""
+        self.threads = len(steps)
+        """How many calls may run at the same time."""
         self._margin = margin
         self._style = style
         self._skips = frozenset(SKIPS) - frozenset(no_skip)
@@ -84,33 +98,9 @@ class GarmentPipeline:
         for faces in self._faces.values():
             faces.flags.writeable = False  # all frames share them
         self._wearers: OrderedDict[bytes, Wearer] = OrderedDict()
-        self._batches: OrderedDict[tuple[Wearer, ...], Wearer] = OrderedDict()
+        self._together = lru_cache(self.threads)(Wearer.together)
+        """One wearer of all persons of a call; that of the last calls for the same ones."""
         self._last: tuple[float | None, dict[bytes, PipelineOutput]] = margin, {}
-
-    @property
-    def body(self) -> SmplBody:
-        """The body model that the garments are worn on."""
-        return self.outfit.body
-
-    @property
-    def heeds_past(self) -> bool:
-        """Whether frames should tell their past (`PoseHistory`): with the backbone `dynamic`."""
-        return self.outfit.heeds_past
-
-    @property
-    def fit(self) -> BodyFit | None:
-        """How well the built-in mesh lies on a body that was named; None where none was."""
-        return self.outfit.fit
-
-    @property
-    def warnings(self) -> list[str]:
-        """What there is to warn of before anything is dressed, for people."""
-        return [] if self.fit is None else self.fit.warnings
-
-    @property
-    def threads(self) -> int:
-        """How many calls may run at the same time."""
-        return len(self._steps)
 
     @property
     def margin(self) -> float | None:
@@ -207,9 +197,7 @@ class GarmentPipeline:
         gamma = None if style is None else _style(style, torch_device)
         if gamma is not None:
             for one in outfit.wearables.values():
-                one.template.rest(
-                    gamma.new_zeros(1, 10), gamma
-                )  # says now, not in the first frame, if it has no styles
+                one.template.rest(gamma.new_zeros(1, N_BETAS), gamma)  # says now if it has no styles
         steps = []
         for k in range(threads if torch_device.type == "cpu" else 1):
             own = outfit.beside() if k else outfit
@@ -218,16 +206,6 @@ class GarmentPipeline:
                 stage = ContactStage(own, sdf=mode, uses_band="band" not in no_skip, certify=certify, settings=contact)
             steps.append(FrameStep(own, stage))
         return cls(steps, margin=margin, style=gamma, no_skip=no_skip, graph=graph)
-
-    @property
-    def garments(self) -> dict[str, GarmentTemplate]:
-        """The loaded garments by name."""
-        return {name: wearable.template for name, wearable in self.outfit.wearables.items()}
-
-    @property
-    def untrained(self) -> tuple[str, ...]:
-        """Names of the garments that no network drapes: they follow the skin."""
-        return tuple(name for name, one in self.outfit.wearables.items() if isinstance(one.backbone, Skinned))
 
     @overload
     def __call__(self, frames: SmplFrame) -> PipelineOutput: ...
@@ -301,16 +279,18 @@ class GarmentPipeline:
             told["up"] = torch.as_tensor(np.stack([frame.up for frame in frames]))
         if self._graphs is not None and adjust is None:
             packed = self._graphs({"pose": pose, **told, **wearer.tensors()}, margins)
-            outputs = [self._unpacked(frame, parts) for frame, parts in zip(frames, step.unpacked(packed), strict=True)]
+            persons = step.unpacked(packed)
+            outputs = [self._output(frame, person, {}) for frame, person in zip(frames, persons, strict=True)]
             clocks[0].lap("step")
             took = {"step": clocks[0].stages["step"] / len(frames)}
             return [replace(one, stats=replace(one.stats, stage_ms=took)) for one in outputs]
         told = {name: tensor.to(self.body.device) for name, tensor in told.items()}
-        persons = step(pose.to(self.body.device), wearer, margins, clocks, adjust, **told)
-        return [
-            self._output(frame, person, clock, skipped)
-            for frame, person, clock, (_, skipped) in zip(frames, persons, clocks, found, strict=True)
-        ]
+        outputs = []
+        done = step(pose.to(self.body.device), wearer, margins, clocks, adjust, **told)
+        for frame, person, clock, (_, skipped) in zip(frames, done, clocks, found, strict=True):
+            n_clipped = sum(int(worn.n_clipped) for worn in person.garments.values())
+            outputs.append(self._output(frame, person, {**skipped, "band": n_clipped}, clock))
+        return outputs
 
     def _wearer(self, frame: SmplFrame) -> tuple[Wearer, dict[str, int]]:
         """What depends on the person's (β, γ), and how much of it was known."""
@@ -329,47 +309,24 @@ class GarmentPipeline:
         self._wearers[key] = wearer
         return wearer, {}
 
-    def _together(self, wearers: tuple[Wearer, ...]) -> Wearer:
-        """One wearer of all; that of the last calls for the same persons."""
-        known = self._batches.pop(wearers, None)
-        while len(self._batches) >= self.threads:
-            self._batches.popitem(last=False)
-        self._batches[wearers] = known or Wearer.together(wearers)
-        return self._batches[wearers]
+    def _output(
+        self, frame: SmplFrame, person: Person, skipped: Mapping[str, int], clock: StageClock | None = None
+    ) -> PipelineOutput:
+        turn, meshes, stats = person.turn, {}, {}
 
-    def _output(self, frame: SmplFrame, person: Person, clock: StageClock, skipped: dict[str, int]) -> PipelineOutput:
-        meshes, stats, n_clipped = {}, {}, 0
+        def on_host(points: Tensor) -> NDArray[np.float32]:
+            made: NDArray[np.float32] = turn(points).cpu().numpy()
+            return made
+
         for name in self.outfit.wearables:
-            worn = person.garments[name]
-            meshes[name] = GarmentMesh(
-                person.turn.to_host(worn.vertices), person.turn.later(worn.raw), self._faces[name], frame.transl
-            )
-            stats[name] = GarmentStats.of(worn.numbers.tolist(), ms=clock.garments[name])
-            n_clipped += int(worn.n_clipped)
-        took = self._stats(frame, clock.stages, stats, {**skipped, "band": n_clipped}, person.shift.tolist())
-        return PipelineOutput(meshes, person.turn.later(person.body), person.turn.later(person.skin), took)
-
-    def _unpacked(self, frame: SmplFrame, parts: list[NDArray[np.float32]]) -> PipelineOutput:
-        body, skin, shift, *rest = parts
-        meshes, stats = {}, {}
-        for i, name in enumerate(self.outfit.wearables):
-            vertices, raw, numbers = rest[3 * i : 3 * i + 3]
-            meshes[name] = GarmentMesh(vertices, partial(itself, raw), self._faces[name], frame.transl)
-            stats[name] = GarmentStats.of(numbers.tolist())
-        took = self._stats(frame, {}, stats, {}, shift.tolist())
-        return PipelineOutput(meshes, partial(itself, body), partial(itself, skin), took)
-
-    def _stats(
-        self,
-        frame: SmplFrame,
-        stage_ms: Mapping[str, float],
-        garments: Mapping[str, GarmentStats],
-        skipped: Mapping[str, int],
-        shift: Sequence[float],
-    ) -> FrameStats:
-        moved = SkinShift.of(shift)
-        promised = within_promise(frame) and not moved.n_held
-        return FrameStats(stage_ms, garments, self._is_certified, promised, skipped, moved)
+            vertices, raw, numbers, _ = person.garments[name]
+            later = cache(partial(on_host, raw))
+            meshes[name] = GarmentMesh(on_host(vertices), later, self._faces[name], frame.transl)
+            stats[name] = GarmentStats.of(numbers.tolist(), ms=0.0 if clock is None else clock.garments[name])
+        shift, stage_ms = SkinShift.of(person.shift.tolist()), {} if clock is None else clock.stages
+        promised = within_promise(frame) and not shift.n_held
+        took = FrameStats(stage_ms, stats, self._is_certified, promised, skipped, shift)
+        return PipelineOutput(meshes, cache(partial(on_host, person.body)), cache(partial(on_host, person.skin)), took)
 
 
 def _past(frames: Sequence[SmplFrame]) -> Tensor:

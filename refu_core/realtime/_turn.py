@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -19,11 +17,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class RootTurn:
-    """Turns one person about their root.
+    """Turns one person about their root: they are dressed as the root sees them, whichever way they face or lie.
 
-    A person is dressed as the root sees them, so grids, tables and thresholds are the same whichever way the person
-    faces or lies. In world axes a turn would move vertices by millimetres at a fold, and by centimetres where limbs run
-    into each other: the approximate distance would look up other guides, and rounding would decide thresholds anew.
+    In world axes a turn would move vertices by millimetres at a fold, and by centimetres where limbs run into each
+    other: the approximate distance would look up other guides, and rounding would decide thresholds anew.
     """
 
     rotation: Tensor
@@ -52,7 +49,3 @@ class RootTurn:
         """The same as an array."""
         seen: NDArray[np.float32] = self(points).cpu().numpy()
         return seen
-
-    def later(self, points: Tensor) -> Callable[[], NDArray[np.float32]]:
-        """`to_host`, computed when it is first asked for; the points must not be written to."""
-        return functools.cache(functools.partial(self.to_host, points))

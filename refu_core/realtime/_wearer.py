@@ -52,11 +52,6 @@ class Outfit:
     fit: BodyFit | None = None
     """What a body that isn't the garments' own has to do with the built-in ones."""
 
-    @property
-    def heeds_past(self) -> bool:
-        """Whether a garment wants to know how people move."""
-        return any(one.backbone.heeds_past for one in self.wearables.values())
-
     @cached_property
     def below(self) -> Mapping[str, SkinBelow]:
         """The skin that each garment lies on, by name."""

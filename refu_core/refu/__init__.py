@@ -1,6 +1,5 @@
 """The paper's layer: the Repulsive Force Unit, its scale networks, and their weights."""
 
-from refu_core.refu._files import Trained as Trained
 from refu_core.refu._files import refu_from_weights as refu_from_weights
 from refu_core.refu._files import refu_tensors as refu_tensors
 from refu_core.refu._files import trained_from_weights as trained_from_weights

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
@@ -22,23 +20,17 @@ def refu_tensors(refu: Refu, *, half: bool = True) -> dict[str, Tensor]:
     return {_PREFIX + name: t.half() if half else t for name, t in refu.state_dict().items()}
 
 
-class Trained(NamedTuple):
-    """What training made."""
-
-    backbone: Backbone
-    refu: Refu | None
-    """None where it was trained without."""
-
-
-def trained_from_weights(weights: Weights, garment: GarmentTemplate, *, device: str | torch.device = "cpu") -> Trained:
-    """The backbone and the layer in `weights`, ready for use.
+def trained_from_weights(
+    weights: Weights, garment: GarmentTemplate, *, device: str | torch.device = "cpu"
+) -> tuple[Backbone, Refu | None]:
+    """The backbone and the layer (None where it was trained without) in `weights`, ready for use.
 
     Raises:
         WeightsError: of another version or garment, or the basis beside them is missing, damaged or another one.
     """
     backbone: Backbone = backbone_from_weights(weights, garment, device=device).requires_grad_(False)
     refu = refu_from_weights(weights, device=device)
-    return Trained(backbone, None if refu is None else refu.eval().requires_grad_(False))
+    return backbone, None if refu is None else refu.eval().requires_grad_(False)
 
 
 def refu_from_weights(weights: Weights, *, device: str | torch.device = "cpu") -> Refu | None:
@@ -49,8 +41,8 @@ def refu_from_weights(weights: Weights, *, device: str | torch.device = "cpu") -
     tensors = {k[len(_PREFIX) :]: v.float() for k, v in weights.tensors.items() if k.startswith(_PREFIX)}
     try:
         refu = build_for(tensors, lambda: Refu.from_config(config))
-        if not 0 <= float(refu.margin) <= MAX_MARGIN or not 0 <= refu.config["least"] <= 1:
-            got = f"{float(refu.margin):g} m and {refu.config['least']:g}"
+        if not 0 <= refu.margin <= MAX_MARGIN or not 0 <= refu.config["least"] <= 1:
+            got = f"{refu.margin:g} m and {refu.config['least']:g}"
             msg = f"wanted a margin of 0 to {MAX_MARGIN} m and a least scale of 0 to 1, got {got}; train it again"
             raise WeightsError(msg)
     except WeightsError as error:

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from refu_core.errors import MeshError, WeightsError
 from refu_core.modes import DEFAULT_MARGIN
 from refu_core.refu._scale import REALTIME, ScaleNet, ScaleSettings, VertexScale
-from refu_core.refu._unit import MAX_DISPLACEMENT, pushed_rows, repulse
+from refu_core.refu._unit import pushed_rows, repulse
 from refu_core.sdf import SdfSample, require_tensor
 from refu_core.weights import config_of_card
 
@@ -26,14 +26,7 @@ class Refu(nn.Module):
     """
 
     def __init__(
-        self,
-        n_vertices: int,
-        *,
-        least: float,
-        scale: ScaleSettings | None = REALTIME,
-        margin: float = DEFAULT_MARGIN,
-        learn_margin: bool = False,
-        feature_size: int | None = None,
+        self, n_vertices: int, *, least: float, scale: ScaleSettings | None = REALTIME, margin: float = DEFAULT_MARGIN
     ) -> None:
         """A layer for garments of `n_vertices` N.
 
@@ -42,40 +35,27 @@ class Refu(nn.Module):
             least: lower end of α's range: 1 with an accurate distance, 0 with an approximate one (paper, Sec. 3.1).
             scale: sizes of the networks that predict α; None fixes it at 1.
             margin: ε > 0 [m], or 0 for the paper's.
-            learn_margin: whether ε is trained, too, from `margin` on.
-            feature_size: M of a backbone that gives z; None where h is to compute it.
 
         Raises:
-            MeshError: a margin that is negative, or zero and to be learned.
+            MeshError: a margin that is negative or not finite.
         """
         super().__init__()
-        if not (margin >= 0 and math.isfinite(margin)) or (learn_margin and margin == 0):
-            msg = f"wanted a margin of 0 m or more (above 0 where it is learned), got {margin}"
+        if not 0 <= margin < math.inf:
+            msg = f"wanted a margin of 0 m or more, got {margin}"
             raise MeshError(msg)
         self.config: dict[str, Any] = {
             "n_vertices": n_vertices,
             "least": least,
             "scale": None if scale is None else asdict(scale),
             "margin": margin,
-            "learn_margin": learn_margin,
-            "feature_size": feature_size,
         }
         """What the layer was made with, for a weights' card; `from_config` takes it."""
-        self.n_vertices = n_vertices
-        self.scale = (
-            None if scale is None else ScaleNet(n_vertices, least=least, settings=scale, feature_size=feature_size)
-        )
-        self._fixed_margin = margin
-        # A logarithm keeps it positive, and Adam's steps relative.
-        self.log_margin = nn.Parameter(torch.tensor(math.log(margin))) if learn_margin else None
+        self.n_vertices, self.margin = n_vertices, margin
+        self.scale = None if scale is None else ScaleNet(n_vertices, least=least, settings=scale)
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Refu:
-        """The layer, untrained, that `config` describes.
-
-        Raises:
-            WeightsError: that isn't such a description.
-        """
+        """The layer, untrained, that `config` describes. Raises `WeightsError` where that isn't such a description."""
         try:
             scale = config["scale"]
             return cls(
@@ -83,41 +63,26 @@ class Refu(nn.Module):
                 least=float(config["least"]),
                 scale=None if scale is None else config_of_card(ScaleSettings, scale),
                 margin=float(config["margin"]),
-                learn_margin=bool(config["learn_margin"]),
-                feature_size=config["feature_size"],
             )
         except (KeyError, TypeError, ValueError, OverflowError, RuntimeError) as error:
             msg = f"not the description of a ReFU layer ({error!r}): train it anew with this version"
             raise WeightsError(msg) from error
 
-    @property
-    def margin(self) -> float | Tensor:
-        """ε [m]; a tensor of shape () where it is learned."""
-        return self._fixed_margin if self.log_margin is None else self.log_margin.exp()
-
-    def feature(self, betas: Tensor, pose: Tensor, style: Tensor | None, given: Tensor | None = None) -> Tensor | None:
+    def feature(self, betas: Tensor, pose: Tensor, style: Tensor | None) -> Tensor | None:
         """z of some bodies, shape (B, M), as `ScaleNet.feature`; None where α is fixed."""
-        return None if self.scale is None else self.scale.feature(betas, pose, style, given)
+        return None if self.scale is None else self.scale.feature(betas, pose, style)
 
     def of_body(self, z: Tensor | None) -> float | VertexScale:
         """α as `Resolver` takes it, for the one body with the feature z, shape (M,) or (1, M)."""
         return 1.0 if self.scale is None or z is None else self.scale.of_body(z)
 
-    def forward(
-        self,
-        points: Tensor,
-        sample: SdfSample,
-        z: Tensor | None = None,
-        *,
-        max_displacement: float = MAX_DISPLACEMENT,
-    ) -> Tensor:
+    def forward(self, points: Tensor, sample: SdfSample, z: Tensor | None = None) -> Tensor:
         """Pushes garments [m], shape (B, N, 3), of which `sample` has distances (B, N) and gradients (B, N, 3).
 
         Args:
             points: Garment vertices [m].
             sample: Their signed distances to their own bodies.
             z: Features of the bodies, shape (B, M), as `feature` gives them.
-            max_displacement: Bound on each vertex's movement [m].
 
         Raises:
             MeshError: Another number of vertices than N, shapes that don't belong together, or no z for learned scales.
@@ -136,5 +101,5 @@ class Refu(nn.Module):
             rows = pushed_rows(flat.distance, self.margin)
             pushed = self.scale(z, rows // self.n_vertices, rows % self.n_vertices, flat.distance[rows])
             alpha = torch.ones_like(flat.distance).index_copy(0, rows, pushed.to(flat.distance))
-        moved = repulse(points.reshape(-1, 3), flat, scale=alpha, margin=self.margin, max_displacement=max_displacement)
+        moved = repulse(points.reshape(-1, 3), flat, scale=alpha, margin=self.margin)
         return moved.view_as(points)

@@ -12,7 +12,6 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from refu_core.body import rotvec_to_rotmat
-from refu_core.errors import WeightsError
 from refu_core.frames import N_BETAS, N_JOINTS, N_STYLES
 
 ScaleKind = Literal["vertex", "shared", "distance"]
@@ -54,34 +53,22 @@ SCALE_PRESETS: dict[str, ScaleSettings] = {"paper": PAPER, "realtime": REALTIME}
 
 
 class ScaleNet(nn.Module):
-    """α_i = g(k(z)_i, f(x_i)) for z = h(β, θ, γ), or for the feature z that a backbone gives (Eq. 5, 6).
+    """α_i = g(k(z)_i, f(x_i)) for z = h(β, θ, γ) (Eq. 5, 6).
 
     k and g are evaluated for the vertices asked for, and no others: in a frame those are the pushed ones, a tenth of
     the garment. A network that hasn't been trained answers α ≈ 1 everywhere, the paper's fixed scale.
     """
 
-    def __init__(
-        self,
-        n_vertices: int,
-        *,
-        least: float,
-        settings: ScaleSettings = REALTIME,
-        feature_size: int | None = None,
-    ) -> None:
+    def __init__(self, n_vertices: int, *, least: float, settings: ScaleSettings = REALTIME) -> None:
         """Networks for garments of `n_vertices` N.
 
-        Args:
-            n_vertices: N.
-            least: lower end of α's range: 1 with an accurate distance, so that no pushed vertex stays inside; 0 with an
-                approximate one, which may have to be corrected downwards.
-            settings: sizes.
-            feature_size: M of a backbone that gives its own feature z; there is no h then.
+        `least` is the lower end of α's range: 1 with an accurate distance, so that no pushed vertex stays inside; 0
+        with an approximate one, which may have to be corrected downwards.
         """
         super().__init__()
         self.n_vertices, self.least, self.settings = n_vertices, least, settings
-        self.has_encoder = feature_size is None and settings.kind != "distance"
-        m, d = feature_size or settings.feature_size, settings.latent_size
-        if self.has_encoder:
+        m, d = settings.feature_size, settings.latent_size
+        if settings.kind != "distance":
             self.h = nn.Sequential(
                 nn.Linear(N_INPUTS, settings.hidden_size),
                 nn.ReLU(),
@@ -106,21 +93,12 @@ class ScaleNet(nn.Module):
         nn.init.zeros_(last.bias)
         self.g = nn.Sequential(nn.Linear(latent + 1, d), nn.ReLU(), last)
 
-    def feature(self, betas: Tensor, pose: Tensor, style: Tensor | None, given: Tensor | None = None) -> Tensor:
-        """z, shape (B, M), of betas (B, 10), pose (B, 24, 3) [rad] and style (B, 4); `given` where a backbone has one.
-
-        Raises:
-            WeightsError: the network was built for a backbone that gives its own feature, and it gave none.
-        """
-        if self.has_encoder:
-            z: Tensor = self.h(scale_inputs(betas, pose, style))
-            return z
+    def feature(self, betas: Tensor, pose: Tensor, style: Tensor | None) -> Tensor:
+        """z, shape (B, M), of betas (B, 10), pose (B, 24, 3) [rad] and style (B, 4)."""
         if self.settings.kind == "distance":
             return betas[:, :0]
-        if given is None:
-            msg = "these weights read the backbone's feature z, and the backbone gave none: load the one they belong to"
-            raise WeightsError(msg)
-        return given
+        z: Tensor = self.h(scale_inputs(betas, pose, style))
+        return z
 
     def forward(self, z: Tensor, body: Tensor, vertex: Tensor, distance: Tensor) -> Tensor:
         """α, shape (R,), of vertices number `vertex` (R,) of bodies number `body` (R,) with features z (B, M).
@@ -148,19 +126,11 @@ class ScaleNet(nn.Module):
         """α as `Resolver` asks for it, for the one body whose feature is z, shape (M,) or (1, M)."""
         row = z.reshape(1, -1)
         k = self.k if self.settings.kind == "vertex" else None
-        if isinstance(k, _CompactLatent):
-            return self._of_body_compact(k, row)
-
-        def scale(vertex: Tensor, distance: Tensor) -> Tensor:
-            alpha: Tensor = self(row, torch.zeros_like(vertex), vertex, distance)
-            return alpha
-
-        return scale
-
-    def _of_body_compact(self, k: _CompactLatent, z: Tensor) -> VertexScale:
-        """The same of a compact k, in half the time: z's factor of k goes into g's first layer, once a body."""
+        if not isinstance(k, _CompactLatent):
+            return lambda vertex, distance: self(row, torch.zeros_like(vertex), vertex, distance)
+        # Half the time: z's factor of a compact k goes into g's first layer, once a body.
         first, bias, last, last_bias = self.g.parameters()
-        inputs = torch.cat((k.projection(z), z.new_full((1, 1), 1 / _DISTANCE_UNIT)), dim=1)
+        inputs = torch.cat((k.projection(row), z.new_full((1, 1), 1 / _DISTANCE_UNIT)), dim=1)
         weight = (first * inputs).T
 
         def scale(vertex: Tensor, distance: Tensor) -> Tensor:

@@ -19,23 +19,22 @@ def repulse(
     sample: SdfSample,
     *,
     scale: float | Tensor = 1.0,
-    margin: float | Tensor = 0.0,
+    margin: float = 0.0,
     max_displacement: float = MAX_DISPLACEMENT,
-    fallback: Tensor | None = None,
 ) -> Tensor:
     """ReFU: the points [m], shape (N, 3), with those closer to the body than `margin` moved along the gradient.
 
     x' = x - α (f(x) - ε) ∇f/|∇f| where f(x) < ε, and x elsewhere: the paper's Eq. 2 to 4, with f - ε in the place of f.
-    Differentiable with respect to the points, the sample, the scale and the margin. At f = ε the derivative is that of
-    the outer branch.
+    Differentiable with respect to the points, the sample and the scale. At f = ε the derivative is that of the outer
+    branch.
 
     Args:
         points: Garment vertices [m], shape (N, 3).
-        sample: Signed distance and gradient at the points; the gradient needs no unit length.
+        sample: Signed distance and gradient at the points; the gradient needs no unit length, and up stands in for one
+            that is zero or not finite.
         scale: α, one number or shape (N,); 1 is the paper's "fixed scale".
-        margin: ε ≥ 0 [m]; a tensor of shape () where it is learned.
+        margin: ε ≥ 0 [m].
         max_displacement: Bound on each point's movement [m].
-        fallback: Direction where the gradient is zero or not finite, shape (3,) or (N, 3); up by default.
 
     Raises:
         MeshError: Arrays whose shapes don't belong together, or a negative margin or bound.
@@ -47,31 +46,26 @@ def repulse(
     deficit = margin - sample.distance[rows]
     alpha = scale[rows] if isinstance(scale, Tensor) and scale.ndim else scale
     offset = (alpha * deficit).clamp(-max_displacement, max_displacement)
-    if fallback is None:
-        fallback = points.new_tensor(_UP)
-    direction = unit_direction(sample.gradient[rows], fallback[rows] if fallback.ndim == 2 else fallback)
-    pushed: Tensor = points.index_add(0, rows, offset[:, None] * direction)
+    pushed: Tensor = points.index_add(0, rows, offset[:, None] * unit_direction(sample.gradient[rows]))
     return pushed
 
 
-def pushed_rows(distance: Tensor, margin: float | Tensor) -> Tensor:
+def pushed_rows(distance: Tensor, margin: float) -> Tensor:
     """Which points a push moves, int64, shape (R,): those with f < ε."""
     return torch.nonzero(distance.detach() < margin)[:, 0]
 
 
-def unit_direction(gradient: Tensor, fallback: Tensor) -> Tensor:
-    """∇f/|∇f| (paper, Eq. 3), shape (N, 3); `fallback` where that isn't defined. Finite, and so are its derivatives."""
+def unit_direction(gradient: Tensor) -> Tensor:
+    """∇f/|∇f| (paper, Eq. 3), shape (N, 3); up where that isn't defined. Finite, and so are its derivatives."""
     length = torch.linalg.vector_norm(gradient.detach(), dim=-1, keepdim=True)
     defined = torch.isfinite(length) & (length > torch.finfo(gradient.dtype).tiny ** 0.5)
     # Normalising the stand-in, too, keeps NaN out of the branch that isn't taken and so out of its derivative.
-    usable = torch.where(defined, gradient, fallback)
+    usable = torch.where(defined, gradient, gradient.new_tensor(_UP))
     direction: Tensor = usable / torch.linalg.vector_norm(usable, dim=-1, keepdim=True)
     return direction
 
 
-def _check(
-    points: Tensor, sample: SdfSample, scale: float | Tensor, margin: float | Tensor, max_displacement: float
-) -> None:
+def _check(points: Tensor, sample: SdfSample, scale: float | Tensor, margin: float, max_displacement: float) -> None:
     require_tensor("points", points)
     n = len(points)
     if points.shape != (n, 3) or sample.distance.shape != (n,) or sample.gradient.shape != (n, 3):
@@ -83,7 +77,6 @@ def _check(
     if isinstance(scale, Tensor) and scale.shape not in ((), (n,)):
         msg = f"scale must be one number or have the shape ({n},), got {tuple(scale.shape)}"
         raise MeshError(msg)
-    epsilon = float(margin.detach()) if isinstance(margin, Tensor) else margin
-    if not (epsilon >= 0 and max_displacement >= 0):
-        msg = f"margin and max_displacement must not be negative, got {epsilon} and {max_displacement}"
+    if not (margin >= 0 and max_displacement >= 0):
+        msg = f"margin and max_displacement must not be negative, got {margin} and {max_displacement}"
         raise MeshError(msg)

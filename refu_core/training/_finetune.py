@@ -68,7 +68,6 @@ class FinetuneSettings:
     """What α is predicted from: see `refu_core.refu.ScaleSettings`."""
     margin: float = DEFAULT_MARGIN
     """ε [m]."""
-    learn_margin: bool = False
     is_blended: bool = True
     """Whether pushed vertices take their neighbourhood along in training, as they do at run time."""
     is_mirrored: bool = True
@@ -245,7 +244,6 @@ def _layer(mode: str, settings: FinetuneSettings, n_vertices: int) -> Refu | Non
         least=_MODES[mode].least,
         scale=None if settings.scale is None else replace(SCALE_PRESETS[settings.scale], kind=settings.scale_kind),
         margin=settings.margin,
-        learn_margin=settings.learn_margin,
     )
 
 

@@ -185,7 +185,7 @@ class Predictor:
             pushed = self._setup.blend.follow(points[None], pushed, refu.margin - batch.distance)
         done = pushed[0]
         ms["refu"] = 1e3 * (time.perf_counter() - start)
-        rows = torch.nonzero(sample.distance < float(refu.margin))[:, 0]
+        rows = torch.nonzero(sample.distance < refu.margin)[:, 0]
         scale, f = refu.of_body(z), sample.distance[rows]
         exact, _ = scene.sdf("accurate")
         return MethodOutput(
@@ -209,8 +209,8 @@ def _with_margin(refu: Refu, margin: float | None) -> Refu:
     """The layer with another ε; itself for None."""
     if margin is None:
         return refu
-    other = Refu.from_config({**refu.config, "margin": margin, "learn_margin": False})
-    other.load_state_dict({name: t for name, t in refu.state_dict().items() if name != "log_margin"})
+    other = Refu.from_config({**refu.config, "margin": margin})
+    other.load_state_dict(refu.state_dict())
     return other.eval()
 
 

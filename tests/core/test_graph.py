@@ -319,16 +319,16 @@ def test_packed_and_unpacked() -> None:
     people = frames(0, 1)
     step = pipeline._steps[0]
     packed = step.packed(step_inputs(pipeline, people), (0.0, 0.0)).numpy()
-    for (body, skin, shift, *parts), old in zip(step.unpacked(packed), pipeline(people), strict=True):
-        assert np.shares_memory(body, packed)
-        np.testing.assert_array_equal(body, old.body)
-        np.testing.assert_array_equal(skin, old.skin)
-        assert SkinShift.of(shift.tolist()) == old.stats.shift
-        for i, (name, mesh) in enumerate(old.items()):
-            vertices, raw, numbers = parts[3 * i : 3 * i + 3]
-            np.testing.assert_array_equal(vertices, mesh.local)
-            np.testing.assert_array_equal(raw, mesh.raw)
-            assert GarmentStats.of(numbers.tolist()) == replace(old.stats.garments[name], ms=0.0)
+    for person, old in zip(step.unpacked(packed), pipeline(people), strict=True):
+        assert np.shares_memory(person.body.numpy(), packed)
+        np.testing.assert_array_equal(person.body, old.body)
+        np.testing.assert_array_equal(person.skin, old.skin)
+        assert SkinShift.of(person.shift.tolist()) == old.stats.shift
+        for name, mesh in old.items():
+            worn = person.garments[name]
+            np.testing.assert_array_equal(worn.vertices, mesh.local)
+            np.testing.assert_array_equal(worn.raw, mesh.raw)
+            assert GarmentStats.of(worn.numbers.tolist()) == replace(old.stats.garments[name], ms=0.0)
     packed[1, 7] = np.inf
     with pytest.raises(MeshError, match="of 1 of 2 persons"):
         list(step.unpacked(packed))

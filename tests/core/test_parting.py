@@ -23,7 +23,8 @@ Array = NDArray[np.float64]
 
 @wp.kernel
 def _depth_kernel(corners: wp.array[wp.vec3], n: wp.vec3, depth: wp.array[float], place: wp.array[wp.vec3]) -> None:
-    found, w = depth_below(n, corners[0], corners[1], corners[2], corners[3], corners[4], corners[5])
+    own = wp.matrix_from_rows(corners[0], corners[1], corners[2])
+    found, w = depth_below(n, own, wp.matrix_from_rows(corners[3], corners[4], corners[5]))
     depth[0] = found
     place[0] = w
 
@@ -90,7 +91,7 @@ def test_what_cuts_is_found_and_levelled(seed: int, height: float) -> None:
     checker = SheetChecker(below_faces.numpy())
     checker.update(low.numpy())
     pairs = checker.with_other(high.numpy(), faces.numpy())
-    assert int(layer.find_cuts(high)) == len(pairs)
+    assert int(layer.parting.find(high)) == len(pairs)
     cut = np.unique(pairs[:, 0])
     ring, weight = ring_of(faces, len(high)), np.zeros(len(high))
     weight[faces.numpy()[cut].ravel()] = 1
@@ -105,10 +106,10 @@ def test_what_cuts_is_found_and_levelled(seed: int, height: float) -> None:
 def test_sheets_that_cut_are_parted_and_nothing_else_is_moved(seed: int, height: float) -> None:
     layer, high, faces, low, below_faces = over(seed, height, 0.006)
     layer(high, low)
-    n_cut = layer.find_cuts(high)
+    n_cut = layer.parting.find(high)
     level = found = layer.parting.level(high)
     calls = 0
-    while calls < 2 and layer.find_cuts(found) > 0:  # as a frame does, which allows three
+    while calls < 2 and layer.parting.find(found) > 0:  # as a frame does, which allows three
         calls += 1
         found = layer.parting.part(found)
     if not n_cut:
@@ -135,12 +136,12 @@ def test_a_ridge_through_the_middle_of_a_face_is_cleared() -> None:
     checker.update(ridge.numpy())
     assert n_low == 0
     assert len(checker.with_other(lifted.numpy(), above_faces.numpy())) > 0
-    assert layer.find_cuts(lifted)
+    assert layer.parting.find(lifted)
     found = layer.parting.part(lifted)
     assert len(checker.with_other(found.numpy(), above_faces.numpy())) == 0
     moved = (found - above).norm(dim=1)
     assert moved.max() < 0.006
-    assert not layer.find_cuts(found)
+    assert not layer.parting.find(found)
 
 
 @pytest.mark.parametrize("also_deep", [False, True])

@@ -191,7 +191,7 @@ def test_layer_is_the_papers_equation(kind: str | None) -> None:
 
 @pytest.mark.parametrize("kind", SMALL)
 def test_gradcheck_of_inputs_and_weights(kind: str) -> None:
-    refu, points, sample, z = random_layer(kind, learn_margin=True, least=1.0)
+    refu, points, sample, z = random_layer(kind, least=1.0)
     assert z is not None
     names = [name for name, _ in refu.named_parameters() if not name.startswith("scale.h")]
     weights = [dict(refu.named_parameters())[name].detach().clone().requires_grad_() for name in names]
@@ -265,24 +265,15 @@ def test_finite_in_finite_out(magnitude: float, seed: int) -> None:
 
 
 def test_config_makes_the_same_layer() -> None:
-    for refu in (Refu(N, least=1.0, learn_margin=True), Refu(N, least=0.0, scale=None, margin=0.002)):
+    for refu in (Refu(N, least=1.0), Refu(N, least=0.0, scale=None, margin=0.002)):
         again = Refu.from_config(refu.config)
         again.load_state_dict(refu.state_dict())
         assert again.config == refu.config
-        torch.testing.assert_close(torch.as_tensor(again.margin), torch.as_tensor(refu.margin))
+        assert again.margin == refu.margin
     with pytest.raises(WeightsError, match="description of a ReFU layer"):
         Refu.from_config({"n_vertices": 3})
     with pytest.raises(WeightsError, match="description of a ReFU layer"):
         Refu.from_config({**Refu(3, least=0.0).config, "scale": {"colour": "blue"}})
-
-
-def test_backbones_feature_stands_in_for_h() -> None:
-    refu = Refu(N, least=0.0, scale=SMALL["compact"], feature_size=17)
-    assert not any(name.startswith("scale.h") for name, _ in refu.named_parameters())
-    given_ = torch.randn(2, 17)
-    assert refu.feature(*random_bodies(2), given=given_) is given_
-    with pytest.raises(WeightsError, match="backbone gave none"):
-        refu.feature(*random_bodies(2))
 
 
 def test_refuses_what_does_not_belong_together() -> None:
@@ -293,5 +284,3 @@ def test_refuses_what_does_not_belong_together() -> None:
         refu(points, sample, None)
     with pytest.raises(MeshError, match="margin"):
         Refu(8, least=0.0, margin=-0.001)
-    with pytest.raises(MeshError, match="above 0"):
-        Refu(8, least=0.0, margin=0.0, learn_margin=True)
