@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from refu_core.sdf import ExactSdf
 from refu_core.simulation._mesh import ClothTopology
-from refu_core.simulation._pairs import farthest_move, find_candidates, near_pairs
-from refu_core.simulation._solver import refresh_points, stale_points, substep
+from refu_core.simulation._pairs import find_candidates, near_pairs
+from refu_core.simulation._solver import refresh_points, substep
 
 F32 = NDArray[np.float32]
 I32 = NDArray[np.int32]
@@ -70,6 +70,19 @@ class _Skin:
         self.normal: F32 = np.zeros((n, 3), np.float32)
         self.asked_at: F32 = np.full((n, 3), 1e6, np.float32)  # far away: everything is stale
         self.distance: F32 = np.zeros(n, np.float32)
+
+    def stale(self, points: F32) -> I32:
+        """Which of the points (N, 3) must be asked for again: those that have moved too far since the last time."""
+        near, slide = np.float32(_NEAR), np.float32(_SLIDE)
+        allowed = np.where(self.distance > near + slide, self.distance - near, slide)
+        return np.flatnonzero(_squared_way(points, self.asked_at) > allowed * allowed).astype(np.int32)
+
+
+def _squared_way(points: F32, before: F32) -> F32:
+    """The square of how far each point has gone [m²], shape (N,)."""
+    way = points - before
+    squared: F32 = (way * way).sum(1)
+    return squared
 
 
 class SimulatedCloth:
@@ -229,7 +242,7 @@ class SimulatedCloth:
     def _pairs(self) -> tuple[I32, I32, F32]:
         """Vertices near a face of the same cloth that isn't near it in the rest shape, the face, and the side of it."""
         faces, reach = self.topology.mesh.faces, np.float32(_PAIR_REACH + 0.85 * self._edge_length)
-        if farthest_move(self.positions, self._searched_at) > _PAIR_SLACK / 2:
+        if float(np.sqrt(_squared_way(self.positions, self._searched_at).max())) > _PAIR_SLACK / 2:
             self._candidates = find_candidates(
                 self.positions,
                 faces,
@@ -241,16 +254,14 @@ class SimulatedCloth:
         return near_pairs(self.positions, faces, *self._candidates, np.float32(_PAIR_REACH))
 
     def _contacts(self, body: F32, motion: F32 | None, *, everything: bool) -> _Contacts:
-        stale = stale_points(
-            self.positions, self._skin.asked_at, self._skin.distance, np.float32(_NEAR), np.float32(_SLIDE), everything
-        )
+        stale = self._skin.stale(self.positions) if not everything else np.arange(len(self.positions), dtype=np.int32)
         return self._touch(self._skin, self.positions, stale, body, motion)
 
     def _edge_contacts(self, body: F32, motion: F32 | None) -> _Contacts:
         edges, skin = self.topology.mesh.edges, self._middles
         near = self._skin.distance[edges].max(1) < _NEAR
         middle = self.positions[edges].mean(1)
-        stale = stale_points(middle, skin.asked_at, skin.distance, np.float32(_NEAR), np.float32(_SLIDE), False)
+        stale = skin.stale(middle)
         which, point, direction, moved = self._touch(skin, middle, stale[near[stale]], body, motion)
         kept = near[which]
         return edges[which[kept]], point[kept], direction[kept], moved[kept]

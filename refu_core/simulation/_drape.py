@@ -118,8 +118,6 @@ class SettledDrape:
     """Root mean square speed that is left [m/s]."""
     stretch: float
     """99.9th percentile of the edges' length over their rest length."""
-    n_frames: int
-    """Simulated frames."""
 
 
 class Draper:
@@ -147,7 +145,7 @@ class Draper:
         )
         self.waist = self._waists()
         self._comfort = comfort_poses()
-        self._canonical: tuple[bytes, F32, F32, float] | None = None
+        self._canonical: tuple[bytes, F32, F32] | None = None
 
     def _waists(self) -> NDArray[np.intp] | None:
         """Vertices of the bands that hold garments at the waist; None where all hang from the shoulders."""
@@ -178,10 +176,9 @@ class Draper:
         key = np.concatenate((betas, style)).astype(np.float32).tobytes()
         if self._canonical is None or self._canonical[0] != key:
             self._canonical = (key, *self._settle_canonical(betas, style))
-        _, positions, body, _ = self._canonical
-        return positions, body
+        return self._canonical[1:]
 
-    def _settle_canonical(self, betas: NDArray[np.floating], style: NDArray[np.floating]) -> tuple[F32, F32, float]:
+    def _settle_canonical(self, betas: NDArray[np.floating], style: NDArray[np.floating]) -> tuple[F32, F32]:
         # Dressed in the T-pose that it was cut in: lowered by skinning, an armpit would start out folded into itself.
         s = self.settings
         rest = self.rest(betas, style)
@@ -194,12 +191,11 @@ class Draper:
         for after in self.bodies(pose_path(np.zeros((N_JOINTS, 3)), canonical_pose(), s.lower_frames), betas):
             self.cloth.frame(body, after, gravity=gravity, drag=s.drag[1])
             body = after
-        speed = np.inf
         for k in range(s.canonical_frames):
             speed = self.cloth.frame(body, body, gravity=gravity, drag=s.drag[2])
             if k > 8 and speed < s.rest_speed / 2:
                 break
-        return self.cloth.positions.copy(), body, speed
+        return self.cloth.positions.copy(), body
 
     def begin(self, positions: F32, betas: NDArray[np.floating], style: NDArray[np.floating], body: F32) -> None:
         """Puts the cloth of a shape and style at `positions` (N, 3), at rest, for the body's vertices (V, 3) [m]."""
@@ -242,21 +238,14 @@ class Draper:
             gravity = Rotation.from_rotvec(tilt[0]).inv().apply(down).astype(np.float32)
             self.cloth.frame(body, after, gravity=gravity, drag=s.drag[1])
             body = after
-        speed = np.inf
-        settled = 0
-        while settled < s.settle_frames[1] - s.careful_frames:
+        fewest, most = (n - s.careful_frames for n in s.settle_frames)
+        for settled in range(1, most + 1):
             speed = self.cloth.frame(body, body, gravity=gravity, drag=s.drag[2])
-            settled += 1
-            if speed < s.rest_speed and settled >= s.settle_frames[0] - s.careful_frames:
+            if speed < s.rest_speed and settled >= fewest:
                 break
         for _ in range(s.careful_frames):
             speed = self.cloth.frame(body, body, gravity=gravity, drag=s.drag[2], careful=True)
-        return SettledDrape(
-            self._with_root(self.cloth.positions, root, betas),
-            speed,
-            self.stretch(),
-            n + settled + s.careful_frames,
-        )
+        return SettledDrape(self._with_root(self.cloth.positions, root, betas), speed, self.stretch())
 
     def stretch(self, vertices: F32 | None = None) -> float:
         """99.9th percentile of the last drape's stretch; with its vertices (N, 3) [m] elsewhere, if given."""

@@ -19,14 +19,14 @@ from refu_core.errors import SimulationError
 from refu_core.frames import N_BETAS
 from refu_core.garments import N_STYLES
 from refu_core.simulation._cloth import F32
-from refu_core.simulation._drape import GRAVITY, SettledDrape
+from refu_core.simulation._drape import GRAVITY
 from refu_core.simulation._motion import FPS, STEPS, DrawnMotion, draw_motion
 from refu_core.simulation._plan import TEST, TRAIN, names_of, truncated_normal
 from refu_core.simulation._poses import Clip, as_clips, split_clips
 from refu_core.simulation._produce import Progress, produce
 from refu_core.simulation._selection import CAUSES
-from refu_core.simulation._store import DONE, SEQUENCES, SequenceShard, dequantise, quantise
-from refu_core.simulation._summary import summarise_sequences
+from refu_core.simulation._store import DONE, SEQUENCES, dequantise, quantise
+from refu_core.simulation._summary import summarise
 from refu_core.simulation._worker import SimulationSettings, Simulator
 
 
@@ -103,7 +103,6 @@ class SequenceSimulator(Simulator):
     """Simulates whole sequences."""
 
     kind = SEQUENCES
-    rows = SequenceShard
     plan: SequencePlan
     settings: SequenceSettings
 
@@ -169,14 +168,11 @@ class SequenceSimulator(Simulator):
                 t = k // STEPS
                 vertices[t] = quantise(cloth.positions)
                 stretch[t], speed[t] = self._draper.stretch(), now
-                cause[t] = self._examine(dequantise(vertices[t]), body, float(stretch[t]))
+                read = dequantise(vertices[t])  # rounding included, as for samples; a moving cloth may be fast
+                worst = max(float(stretch[t]), self._draper.stretch(read))
+                found = self._selector.cause(read, body, stretch=worst)
+                cause[t] = 0 if found is None else 1 + CAUSES.index(found)
         return vertices, cause, stretch, speed
-
-    def _examine(self, stored: F32, body: F32, stretch: float) -> int:
-        """0, or 1 and above for the cause why a frame isn't in the set; a moving cloth may be fast."""
-        worst = max(stretch, self._draper.stretch(stored))  # rounding included, as for samples
-        cause = self._selector.cause(stored, body, SettledDrape(stored, 0.0, worst, 1))
-        return 0 if cause is None else 1 + CAUSES.index(cause)
 
 
 def simulate_sequences(
@@ -225,4 +221,4 @@ def simulate_sequences(
     clips = split_clips(as_clips(motions))
     make = partial(SequenceSimulator, plan, clips, settings or SequenceSettings(), body)
     produce(make, Path(output), engine=engine, progress=progress, fps=FPS)
-    return summarise_sequences(output)
+    return summarise(output)
