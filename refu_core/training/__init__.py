@@ -17,7 +17,6 @@ from refu_core.training._finetune import FINETUNE_MODES as FINETUNE_MODES
 from refu_core.training._finetune import FinetuneSettings as FinetuneSettings
 from refu_core.training._finetune import finetune as finetune
 from refu_core.training._loop import LoopSettings as LoopSettings
-from refu_core.training._losses import Losses as Losses
 from refu_core.training._losses import collision_loss as collision_loss
 from refu_core.training._losses import reconstruction_loss as reconstruction_loss
 from refu_core.training._losses import refu_loss as refu_loss

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from refu_core.backbones import BasisDecoder, style_shape
-from refu_core.body import SmplBody, load_body
+from refu_core.body import Collider, SmplBody, load_body
 from refu_core.errors import RefuError
-from refu_core.garments import GarmentTemplate, load_garment
+from refu_core.garments import GarmentTemplate, SkinBelow, load_garment
+from refu_core.realtime import RootTurn
 from refu_core.simulation import GarmentDataset, GarmentSequences, SamplePlan, open_dataset
 from refu_core.training._mirror import Mirror, mirror_pose
-from refu_core.training._taken_along import TakenAlong
 
 _FEWEST = 2
 """Samples that anything can be learnt from; hundreds are needed to learn it well."""
@@ -105,6 +105,35 @@ class TrainingSet:
         return "gap" in self.rows.card.get("settings", {}).get("drape", {})
 
 
+class TakenAlong:
+    """How far `refu_core.realtime.dress` takes cloth along with skin that gives way, in unposed displacements.
+
+    No network has to say that.
+    """
+
+    def __init__(self, body: SmplBody, garment: GarmentTemplate) -> None:
+        self._body, self._garment = body, garment
+        self._collider, self._below = Collider(body), SkinBelow.of(garment, body)
+
+    def without(self, displacement: Tensor, betas: Tensor, pose: Tensor, style: Tensor) -> Tensor:
+        """Of displacements that were simulated (B, N, 3) [m] what a network has to say."""
+        return self._moved(displacement, betas, pose, style, -1.0)
+
+    def with_it(self, displacement: Tensor, betas: Tensor, pose: Tensor, style: Tensor) -> Tensor:
+        """The inverse."""
+        return self._moved(displacement, betas, pose, style, 1.0)
+
+    @torch.no_grad()
+    def _moved(self, displacement: Tensor, betas: Tensor, pose: Tensor, style: Tensor, sign: float) -> Tensor:
+        garment, shape = self._garment, self._body.shape(betas)
+        _, at_root = RootTurn.taken_off(pose, shape.joints)
+        posed = self._body.posed(at_root, shape)
+        shift = self._below(self._collider(posed.vertices, posed.transforms) - posed.vertices)
+        rest = garment.rest(betas, garment.own(style))
+        vertices = garment.pose(rest + displacement, posed.transforms) + sign * shift
+        return garment.unpose(vertices, posed.transforms) - rest
+
+
 def in_chunks(of: Callable[..., Tensor], *values: Any, size: int = 64) -> Tensor:
     """`of` these arrays, some rows at a time, which bounds the memory; all have N rows, the result too."""
     starts = range(0, max(len(values[0]), 1), size)
@@ -119,7 +148,7 @@ def read_samples(
     Raises:
         RefuError: the set is of another garment or body, or the split has no finished sample.
     """
-    check_dataset(dataset, body, garment)
+    _check(dataset, body, garment)
     rows = np.flatnonzero(dataset.train if split == "train" else dataset.test)
     if not len(rows):
         msg = f"the set of {garment.name} has no finished sample to {split} on: let `refu simulate` run longer"
@@ -212,12 +241,8 @@ def principal_components(values: Tensor, *, rank: int) -> tuple[Tensor, Tensor]:
     return mean, components[:, :rank].T.contiguous()
 
 
-def check_dataset(dataset: GarmentDataset | GarmentSequences, body: SmplBody, garment: GarmentTemplate) -> None:
-    """Checks that a set was simulated for this garment on this body.
-
-    Raises:
-        RefuError: it wasn't.
-    """
+def _check(dataset: GarmentDataset | GarmentSequences, body: SmplBody, garment: GarmentTemplate) -> None:
+    """Raises `RefuError` for a set that wasn't simulated for this garment on this body."""
     for what, wanted, of_set in (
         ("garment", garment.name, dataset.parts),
         ("body_fingerprint", body.fingerprint, [dataset.card.get("body_fingerprint")]),

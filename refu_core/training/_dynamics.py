@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,7 +23,6 @@ from refu_core.training._figures import posed_errors
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, start_parallel
 from refu_core.training._mirror import Mirror, mirror_pose
 from refu_core.training._pretrain import CodeLoss
-from refu_core.training._progress import TrainingLog
 from refu_core.weights import load_weights
 
 
@@ -72,14 +70,11 @@ def train_dynamics(
     Interrupted, the same call goes on from the last checkpoint.
 
     Args:
-        garment: name of a built-in garment, or a template.
         dataset: simulated sequences (`refu simulate --sequences`).
         folder: holds tailornet-<mode> and its basis, which are left as they are.
         mode: whose tailornet; modes that share one share the dynamics, too.
         settings: the default ones if not given.
-        body: the body that the set was simulated on; the garment's built-in one if not given.
-        device: `cpu` or `cuda`.
-        quiet: show no progress.
+        garment, body, device, quiet: as in `pretrain`.
 
     Returns:
         The card: what was trained on what, and its figures on test sequences, beside those of the tailornet alone.
@@ -120,10 +115,11 @@ def train_dynamics(
     loop = Loop(
         dynamics,
         settings.loop,
-        checkpoint=folder / "dynamics.checkpoint",
-        identity=json.dumps([described, asdict(dynamics.config)], sort_keys=True, default=str),
-        log=TrainingLog(folder, name="dynamics", quiet=quiet) if is_writer else None,
+        folder=folder,
+        name="dynamics",
+        identity=[described, asdict(dynamics.config)],
         device=torch_device,
+        quiet=quiet,
     )
     dynamics.to(torch_device)
 
@@ -140,7 +136,7 @@ def train_dynamics(
     card = {**described, "dataset": opened.card, "figures": figures}
     if is_writer:
         save_dynamics(folder, dynamics, card)
-        (folder / "dynamics.checkpoint").unlink(missing_ok=True)
+        loop.checkpoint.unlink(missing_ok=True)
     return card
 
 

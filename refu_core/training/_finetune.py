@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -18,17 +17,14 @@ from refu_core.garments import GarmentTemplate
 from refu_core.modes import DEFAULT_MARGIN
 from refu_core.refu import SCALE_PRESETS, Refu, ScaleKind, refu_from_weights, refu_tensors
 from refu_core.simulation import GarmentDataset, GarmentSequences
-from refu_core.training._data import TrainingSamples, TrainingSet, mirrored, split_validation
+from refu_core.training._data import TakenAlong, TrainingSamples, TrainingSet, in_chunks, mirrored, split_validation
 from refu_core.training._dresser import Dresser, Sdf
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, start_parallel
 from refu_core.training._losses import COLLISION_WEIGHT, RECONSTRUCTION_WEIGHT, refu_loss
 from refu_core.training._mirror import Mirror
 from refu_core.training._pretrain import PretrainSettings, basis_of, pivots_of, stages
-from refu_core.training._progress import TrainingLog
-from refu_core.training._taken_along import TakenAlong
 from refu_core.weights import load_weights
 
-_CHUNK = 64
 _UNIT = 1e3
 """What the loss is multiplied by, so that its curves are numbers to read. Adam doesn't see it."""
 
@@ -68,7 +64,6 @@ class FinetuneSettings:
     """What α is predicted from: see `refu_core.refu.ScaleSettings`."""
     margin: float = DEFAULT_MARGIN
     """ε [m]."""
-    learn_margin: bool = False
     is_blended: bool = True
     """Whether pushed vertices take their neighbourhood along in training, as they do at run time."""
     is_mirrored: bool = True
@@ -110,19 +105,14 @@ def finetune(
     Interrupted, the same call goes on from the last checkpoint. Under `torchrun` all processes make one training.
 
     Args:
-        garment: name of a built-in garment, or a template.
-        dataset: simulated set (`refu simulate`), of garments at rest or of sequences.
         weights: folder with <backbone>-none and its basis, as `pretrain` wrote them; None to train from scratch, as the
             supplement does with the gcnn.
         output: folder of the weights, of the checkpoint while it is needed, and of the loss curves; may be `weights`.
         mode: one of `FINETUNE_MODES`.
         backbone: `tailornet`, `mlp` or `gcnn`.
         preset: `realtime` or `paper`, of ReFU and of a backbone from scratch.
-        settings: the backbone's own in the preset if not given.
         goes_on: start from <backbone>-<mode> in `weights` with its ReFU, in place of <backbone>-none.
-        body: the body that the set was simulated on; the garment's built-in one if not given.
-        device: `cpu` or `cuda`.
-        quiet: show no progress.
+        garment, dataset, settings, body, device, quiet: as in `pretrain`.
 
     Returns:
         The card: what was trained on what.
@@ -184,22 +174,18 @@ def finetune(
         is_blended=settings.is_blended,
     ).to(torch_device)
     name = f"{backbone}-{mode}"
-    loop = Loop(
-        dresser,
-        settings.loop,
-        checkpoint=output / f"{name}.checkpoint",
-        identity=json.dumps(described, sort_keys=True, default=str),
-        log=TrainingLog(output, name=name, quiet=quiet) if is_writer else None,
-        device=torch_device,
-    )
+    loop = Loop(dresser, settings.loop, folder=output, name=name, identity=described, device=torch_device, quiet=quiet)
 
     def loss(dressed: Tensor, truth: Tensor) -> Tensor:
         """Of garments with their distance, (B, N, 4), and the true garments, (B, N, 3) [m]."""
-        first, second = settings.reconstruction_weight, settings.collision_weight
-        losses = refu_loss(
-            dressed[..., :3], truth, dressed[..., 3], reconstruction_weight=first, collision_weight=second
+        total = refu_loss(
+            dressed[..., :3],
+            truth,
+            dressed[..., 3],
+            reconstruction_weight=settings.reconstruction_weight,
+            collision_weight=settings.collision_weight,
         )
-        return _UNIT * losses.total
+        return _UNIT * total
 
     objective = Objective([dresser], dresser, loss)
     data = [_tensors(part, body, template) for part in (train, validation)]
@@ -214,24 +200,22 @@ def finetune(
     if is_writer:
         others = None if refu is None else refu_tensors(refu, half=preset != "paper")
         save_backbone(output / name, network, card, others=others, half=preset != "paper")
-        (output / f"{name}.checkpoint").unlink(missing_ok=True)
+        loop.checkpoint.unlink(missing_ok=True)
     return card
 
 
+@torch.no_grad()
 def _tensors(samples: TrainingSamples, body: SmplBody, garment: GarmentTemplate) -> tuple[Tensor, ...]:
     """What the loop draws from: β, θ, γ and the posed true garments [m], shape (N, V, 3)."""
-    posed = torch.empty_like(samples.displacement)
-    style, along = garment.own(samples.style), TakenAlong(body, garment)
-    with torch.no_grad():
-        for start in range(0, len(samples), _CHUNK):
-            chunk = slice(start, start + _CHUNK)
-            rest = garment.rest(samples.betas[chunk], None if style is None else style[chunk])
-            transforms = body(samples.pose[chunk], samples.betas[chunk]).transforms
-            whole = along.with_it(
-                samples.displacement[chunk], samples.betas[chunk], samples.pose[chunk], samples.style[chunk]
-            )
-            posed[chunk] = garment.pose(rest + whole, transforms)
-    return samples.betas, samples.pose, samples.style, posed
+    along = TakenAlong(body, garment)
+
+    def posed(displacement: Tensor, betas: Tensor, pose: Tensor, style: Tensor) -> Tensor:
+        rest = garment.rest(betas, garment.own(style))
+        whole = along.with_it(displacement, betas, pose, style)
+        return garment.pose(rest + whole, body(pose, betas).transforms)
+
+    inputs = samples.betas, samples.pose, samples.style
+    return *inputs, in_chunks(posed, samples.displacement, *inputs)
 
 
 def _layer(mode: str, settings: FinetuneSettings, n_vertices: int) -> Refu | None:
@@ -245,7 +229,6 @@ def _layer(mode: str, settings: FinetuneSettings, n_vertices: int) -> Refu | Non
         least=_MODES[mode].least,
         scale=None if settings.scale is None else replace(SCALE_PRESETS[settings.scale], kind=settings.scale_kind),
         margin=settings.margin,
-        learn_margin=settings.learn_margin,
     )
 
 

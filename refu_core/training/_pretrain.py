@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -41,7 +40,6 @@ from refu_core.training._data import (
 from refu_core.training._figures import backbone_figures
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, start_parallel
 from refu_core.training._mirror import Mirror
-from refu_core.training._progress import TrainingLog
 
 MANY = 4000
 """Samples from which on a tailornet is trained longer and held back less. On validation samples of shorts' 6,000 the
@@ -152,20 +150,16 @@ def pretrain(
         torch.manual_seed(settings.loop.seed)
         model = build_backbone(config, template, basis=basis, pivots=pivots_of(samples, opened.n_pivots))
     mean = samples.displacement.mean(0)
-    described = {
-        **identity,
-        "backbone": backbone,
-        "preset": preset,
-        "settings": asdict(settings),
-        "samples": len(train),
-    }
+    described = {**identity, "backbone": backbone, "preset": preset}
+    described |= {"settings": asdict(settings), "samples": len(train)}
     loop = Loop(
         model,
         settings.loop,
-        checkpoint=output / f"{backbone}-none.checkpoint",
-        identity=json.dumps([described, asdict(config)], sort_keys=True, default=str),
-        log=TrainingLog(output, name=f"{backbone}-none", quiet=quiet) if is_writer else None,
+        folder=output,
+        name=f"{backbone}-none",
+        identity=[described, asdict(config)],
         device=torch_device,
+        quiet=quiet,
     )
     found = stages(model, train, validation, template, settings)
     model.to(torch_device)
@@ -181,7 +175,7 @@ def pretrain(
     }
     if is_writer:
         save_backbone(output / f"{backbone}-none", model, card, half=preset != "paper")
-        (output / f"{backbone}-none.checkpoint").unlink(missing_ok=True)
+        loop.checkpoint.unlink(missing_ok=True)
     return card
 
 

@@ -39,7 +39,7 @@ from refu_core.simulation._plan import TEST
 from refu_core.simulation._selection import Selector
 from refu_core.simulation._store import SEQUENCES, TO_DO, Rows
 from refu_core.training import read_samples
-from refu_core.training._taken_along import TakenAlong
+from refu_core.training._data import TakenAlong
 from refu_lab.cli import main
 
 GARMENT = "short-pant-male"

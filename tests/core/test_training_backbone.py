@@ -48,8 +48,7 @@ from refu_core.training import (
     split_validation,
 )
 from refu_core.training import _loop as loop_module
-from refu_core.training._data import mirrored
-from refu_core.training._taken_along import TakenAlong
+from refu_core.training._data import TakenAlong, mirrored
 from refu_core.weights import load_weights
 
 GARMENT = "short-pant-male"
