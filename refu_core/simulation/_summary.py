@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from refu_core.frames import N_JOINTS
 from refu_core.simulation._motion import FPS
 from refu_core.simulation._plan import TEST, TRAIN
 from refu_core.simulation._selection import CAUSES
@@ -83,7 +84,7 @@ def _unseen(column: dict[str, NDArray[Any]], count: int) -> NDArray[np.float32]:
     unseen = np.full(count, np.nan, np.float32)
     kept = column["state"] == DONE
     train, test = (kept & (column["split"] == split) for split in (TRAIN, TEST))
-    parameters = np.concatenate([column["pose"].reshape(len(kept), -1), column["betas"], column["style"]], 1)
+    parameters = np.concatenate([column["pose"].reshape(len(kept), 3 * N_JOINTS), column["betas"], column["style"]], 1)
     if train.any():
         for row in np.flatnonzero(test):
             unseen[column["slot"][row]] = np.sqrt(((parameters[train] - parameters[row]) ** 2).sum(1).min())
