@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
-from scipy.sparse.csgraph import breadth_first_order, connected_components
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from refu_core.errors import GarmentError
@@ -224,30 +224,21 @@ def _partners(mesh: SurfaceMesh) -> tuple[Ints, int]:
 
 
 def _oriented(f: Ints, pairs: Ints, notes: list[str]) -> NDArray[np.bool_]:
-    """Which faces have to be turned over for each piece to face one way, shape (F,)."""
-    start = f.ravel()[pairs]
+    """Which faces have to be turned over for each piece to face one way, as most of its faces do, shape (F,)."""
+    start, n = f.ravel()[pairs], len(f)
     agrees = start[:, 0] != start[:, 1]  # the shared edge is run through in opposite directions
+    # Each face is there twice, as it is (k) and turned over (n + k), and tied to what faces the same way beside it.
     a, b = (pairs // 3).T
-    n = len(f)
-    graph = coo_array((np.ones(2 * len(a)), (np.r_[a, b], np.r_[b, a])), shape=(n, n)).tocsr()
-    sign_of = {}
-    for x, y, good in zip(a.tolist(), b.tolist(), agrees.tolist(), strict=True):
-        sign_of[x, y] = sign_of[y, x] = 1 if good else -1
-    sign = np.zeros(n, np.int64)
-    for seed in range(n):
-        if sign[seed]:
-            continue
-        sign[seed] = 1
-        reached, before = breadth_first_order(graph, seed, directed=True)
-        for face in reached[1:].tolist():
-            sign[face] = sign[before[face]] * sign_of[face, int(before[face])]
-        turned = int((sign[reached] < 0).sum())
-        if 2 * turned > len(reached):  # as most of them were
-            sign[reached] *= -1
-    if (sign[a] * sign[b] != np.where(agrees, 1, -1)).any():
+    same, other = np.where(agrees, b, b + n), np.where(agrees, b + n, b)
+    links = np.concatenate((a, a + n)), np.concatenate((same, other))
+    _, label = connected_components(coo_array((np.ones(2 * len(a)), links), shape=(2 * n, 2 * n)), directed=False)
+    as_is, turned = label[:n], label[n:]
+    if (as_is == turned).any():
         msg = "the mesh has one side only: following it round (a Möbius strip), inside becomes outside; cut it open"
         raise GarmentError(msg)
-    flipped: NDArray[np.bool_] = sign < 0
+    votes = np.bincount(as_is, minlength=label.max() + 1)
+    # Of as many either way, the piece's first face stays: labels count up from the first face on.
+    flipped: NDArray[np.bool_] = (votes[as_is] < votes[turned]) | ((votes[as_is] == votes[turned]) & (as_is > turned))
     if flipped.any():
         notes.append(f"{int(flipped.sum())} faces faced the other way than their neighbours and were turned over")
     return flipped

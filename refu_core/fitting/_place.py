@@ -68,7 +68,7 @@ class Placing:
     def __post_init__(self) -> None:
         """Raises `GarmentError` for what is no unit, no axis or no pose."""
         is_unit = self.unit is None or (isinstance(self.unit, (int, float)) and 0 < self.unit < math.inf)
-        if not is_unit or self.up not in (None, "y", "z"):
+        if not is_unit or self.up not in (None, *UP_AXES):
             msg = f"wanted a unit in metres (0.01 for cm) and y or z up, got {self.unit!r} and {self.up!r}"
             raise GarmentError(msg)
         if self.pose is not None and np.shape(self.pose) != (N_JOINTS, 3):
@@ -116,9 +116,6 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
     Raises:
         GarmentError: in no unit is it as large as a garment, or it surrounds the body nowhere.
     """
-    if placing.up not in (None, *UP_AXES):
-        msg = f"no axis {placing.up!r} that is up: wanted {' or '.join(UP_AXES)}, or None to find out"
-        raise GarmentError(msg)
     samples = sample(mesh, _N_POINTS)
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     units = [placing.unit] if placing.unit else [u for u in UNITS.values() if _SIZES[0] <= u * extent <= _SIZES[1]]
