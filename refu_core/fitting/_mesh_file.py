@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import os
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +46,16 @@ class SurfaceMesh:
             _check(self)
         except (TypeError, ValueError) as error:
             raise GarmentError(str(error)) from error
+
+    def only(self, kept: NDArray[np.bool_]) -> SurfaceMesh:
+        """The mesh of some of its faces, a mask (F,)."""
+        uv = None if self.uv is None else replace(self.uv, faces=self.uv.faces[kept])
+        return SurfaceMesh(self.vertices, self.faces[kept], uv)
+
+    def compact(self, faces: NDArray[np.int64] | None = None) -> SurfaceMesh:
+        """The mesh without vertices that no face uses; with `faces` (F, 3) of its vertices, those if given."""
+        used, local = np.unique(self.faces if faces is None else faces, return_inverse=True)
+        return replace(self, vertices=self.vertices[used], faces=local.reshape(-1, 3).astype(np.int64))
 
 
 def read_surface(path: str | os.PathLike[str]) -> SurfaceMesh:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -53,10 +51,8 @@ def without_bodies(mesh: SurfaceMesh, posed: PosedBody) -> tuple[SurfaceMesh, li
     if not kept.any():
         msg = "it is a body with head, hands and feet, and no garment: wanted clothes (--body says who wears them)"
         raise GarmentError(msg)
-    used, local = np.unique(mesh.faces[kept], return_inverse=True)
-    uv = None if mesh.uv is None else replace(mesh.uv, faces=mesh.uv.faces[kept])
     note = "a piece with head, hands and feet was taken for the wearer's body and left out"
-    return SurfaceMesh(mesh.vertices[used], local.reshape(-1, 3).astype(np.int64), uv), [note] * int(is_body.sum())
+    return mesh.only(kept).compact(), [note] * int(is_body.sum())
 
 
 def unsewn(mesh: SurfaceMesh) -> list[str]:
