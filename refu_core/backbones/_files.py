@@ -50,17 +50,12 @@ def save_backbone(
     others: Mapping[str, Tensor] | None = None,
     half: bool = True,
 ) -> Path:
-    """Writes a backbone, without its basis, and its card.
+    """Writes a backbone, without its basis, and its card: `stem` with suffixes; the basis lies in the same folder.
 
-    Args:
-        stem: path without suffix; the basis of a low-rank head lies in the same folder.
-        backbone: what was trained.
-        card: `garment`, `body_fingerprint`, and whatever else is known.
-        others: tensors that belong with it, the ReFU layer's for instance; their names start with another prefix.
-        half: store the parameters in half precision.
+    The card says `garment`, `body_fingerprint`, and whatever else is known. `others` are tensors that belong with it,
+    the ReFU layer's for instance, with another prefix. By `half` the parameters are stored in half precision.
 
-    Raises:
-        WeightsError: the weights aren't finite, can't be written, or the basis in the folder is another one.
+    Raises `WeightsError` for weights that aren't finite or can't be written, and for another basis in the folder.
     """
     parameters = dict(backbone.named_parameters())
     state = {k: v for k, v in backbone.state_dict().items() if not k.startswith("decoder.")}
@@ -79,8 +74,7 @@ def save_backbone(
 def backbone_from_weights(weights: Weights, garment: GarmentTemplate, *, device: str | torch.device = "cpu") -> Network:
     """The backbone in `weights`, with the basis beside them, in float32 and ready for use (`eval`).
 
-    Raises:
-        WeightsError: of another version or garment, or the basis is missing, damaged or another one.
+    Raises `WeightsError`: of another version or garment, or the basis is missing, damaged or another one.
     """
     card, template = weights.card, garment.to(device="cpu")
     config = config_from_card(str(card.get("backbone")), card.get("config"))
@@ -121,8 +115,8 @@ def save_dynamics(folder: Path, dynamics: Dynamics, card: Mapping[str, Any]) -> 
 def with_dynamics(name: str, network: Backbone, weights: Weights) -> Backbone:
     """What the backbone `name` is: what was made of `weights`, with the dynamics beside them where it wants those.
 
-    Raises:
-        WeightsError: they aren't of a tailornet, or there are no dynamics, damaged ones, or some for another basis.
+    Raises `WeightsError`: they aren't of a tailornet, or there are no dynamics, damaged ones, or some for another
+    basis.
     """
     there = weights.path.with_name("dynamics.json").exists()
     if name != BackboneName.DYNAMIC and not (name == BackboneName.AUTO and there):

@@ -30,8 +30,7 @@ def clean(mesh: SurfaceMesh) -> tuple[SurfaceMesh, list[str]]:
     Vertices that no face uses are left out. Seams along which UVs cut a mesh open are closed; its UVs stay as they are.
     Where more than two faces meet at an edge, the two that continue each other stay together.
 
-    Raises:
-        GarmentError: no surface is left, or it has one side only (a Möbius strip).
+    Raises `GarmentError`: no surface is left, or it has one side only (a Möbius strip).
     """
     notes: list[str] = []
     mesh = _without_double_faces(_without_strays(mesh, notes), notes)

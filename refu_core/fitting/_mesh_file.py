@@ -61,8 +61,7 @@ class SurfaceMesh:
 def read_surface(path: str | os.PathLike[str]) -> SurfaceMesh:
     """The mesh of a Wavefront OBJ (polygons become triangles), or of what trimesh reads: PLY, STL, OFF, GLB, glTF.
 
-    Raises:
-        GarmentError: the file can't be read, or holds no mesh.
+    Raises `GarmentError`: the file can't be read, or holds no mesh.
     """
     source = Path(path)
     suffix = source.suffix.lower()

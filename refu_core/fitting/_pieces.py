@@ -35,8 +35,7 @@ def without_bodies(mesh: SurfaceMesh, posed: PosedBody) -> tuple[SurfaceMesh, li
     Characters come in one file with their clothes. A piece is a body if it has a head, hands and feet and lies on the
     skin.
 
-    Raises:
-        GarmentError: nothing else is left.
+    Raises `GarmentError`: nothing else is left.
     """
     n_pieces, label = components(mesh.faces, len(mesh.vertices))
     joint = posed.body.weights.argmax(1).numpy()[posed.body.faces[:, 0].numpy()]

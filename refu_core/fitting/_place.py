@@ -113,8 +113,7 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
     As it is, if it surrounds the body like that, or in another unit, with another axis up, standing on the floor, in an
     A-pose. Else it is moved until it does; and if that doesn't help, scaled by what is no unit.
 
-    Raises:
-        GarmentError: in no unit is it as large as a garment, or it surrounds the body nowhere.
+    Raises `GarmentError`: in no unit is it as large as a garment, or it surrounds the body nowhere.
     """
     samples = sample(mesh, _N_POINTS)
     extent = float(np.ptp(mesh.vertices, axis=0).max())

@@ -97,8 +97,7 @@ class GarmentTemplate:
     def rest(self, betas: Tensor, style: Tensor | None = None) -> Tensor:
         """The template t(β, γ) in the T-pose [m], shape (B, V, 3), for betas (B, 10) and style (B, 4) or None.
 
-        Raises:
-            GarmentError: a style was asked of a garment that has one style only.
+        Raises `GarmentError`: a style was asked of a garment that has one style only.
         """
         require_type(betas, Tensor, _TENSOR, error=GarmentError)
         offset = betas @ self.shapedirs.T

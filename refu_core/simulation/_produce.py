@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -33,8 +32,6 @@ class Progress:
     """Slots (samples, or whole sequences) that are finished."""
     total: int
     """Slots of the set."""
-    seconds_left: float
-    """By the pace of this run; infinite before its first slot."""
     dropped: dict[str, int]
     """What failed in the finished slots, by cause: attempts at a sample, frames of a sequence."""
 
@@ -52,19 +49,10 @@ def produce(
     progress: Callable[[Progress], None] | None,
     **card: Any,
 ) -> None:
-    """Simulates what is left of the set in `output`.
+    """Simulates what is left of the set in `output`, whose card says `card` besides. Raises as `simulate_dataset`.
 
-    Rows are written here alone, whoever has simulated them: other machines need not see the folder.
-
-    Args:
-        make: makes a process's simulator; it is sent to each process, so it is small.
-        output: directory of the set.
-        engine: who simulates; None for this process.
-        progress: called after each slot.
-        card: what the set's card says besides.
-
-    Raises:
-        SimulationError: see `simulate_dataset`.
+    `make` makes a process's simulator; it is sent to each process, so it is small. Rows are written here alone, whoever
+    has simulated them: other machines need not see the folder.
     """
     # Made here although workers make their own: a body or garment that won't do is refused before anything is written.
     simulator = make()
@@ -86,7 +74,7 @@ def produce(
             left = [[slot] for block in left for slot in block]
         left = [block for block in left if block]
         # A whole block goes to one process, for the sake of its common canonical drape.
-        started, done, total, lost = time.monotonic(), 0, sum(map(len, left)), 0
+        done, total, lost = 0, sum(map(len, left)), 0
         for index, made in engine.run(make_block, left):
             if isinstance(made, Lost):
                 lost += len(left[index])
@@ -95,10 +83,8 @@ def produce(
                 rows.write(row_of[slot], values)
             done += len(made)
             if progress is not None:
-                pace = (time.monotonic() - started) / done
                 dropped = rows.arrays["dropped"][state != TO_DO].sum(0, dtype=np.int64).tolist()
-                causes = dict(zip(CAUSES, dropped, strict=True))
-                progress(Progress(len(slots) - total + done, len(slots), pace * (total - done), causes))
+                progress(Progress(len(slots) - total + done, len(slots), dict(zip(CAUSES, dropped, strict=True))))
         if lost:
             msg = f"{lost} of {total} slots were lost with their processes (out of memory?): "
             msg += "finished samples are kept, run the same command to go on"
@@ -202,12 +188,9 @@ def simulate_dataset(
         MeshError: the body isn't watertight.
         BodyError, GarmentError: no such body or garment.
     """
-    output = Path(output)
-    clips: tuple[list[Clip], list[Clip]] = ([], [])
+    clips: tuple[list[Clip], list[Clip]] = ([], []) if motions is None else split_clips(as_clips(motions))
     recorded_share = 0.0 if motions is None else recorded_share
     plan = SamplePlan(garment, count, seed=seed, test_share=test_share, recorded_share=recorded_share, pivots=pivots)
-    if motions is not None:
-        clips = split_clips(as_clips(motions))
     make = partial(SlotSimulator, plan, clips, settings or SimulationSettings(), body)
-    produce(make, output, engine=engine, progress=progress)
+    produce(make, Path(output), engine=engine, progress=progress)
     return summarise(output)

@@ -37,11 +37,8 @@ class Selector:
     def cause(self, vertices: F32, body: F32, *, stretch: float = 1.0, speed: float = 0.0) -> str | None:
         """One of `CAUSES`, or None for a drape with nothing against it.
 
-        Args:
-            vertices: the garment as it will be read back [m], shape (N, 3).
-            body: the vertices of what it lies on [m], shape (V, 3).
-            stretch: 99.9th percentile of its edges' length over their rest length.
-            speed: root mean square speed that is left [m/s].
+        `vertices` (N, 3) are the garment's as they will be read back, `body` (V, 3) those of what it lies on [m];
+        `stretch` and `speed` are what `SettledDrape` calls so.
         """
         self._body.update(body)
         if not self._body.check(vertices, self._garment_faces).is_free:

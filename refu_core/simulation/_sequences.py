@@ -191,28 +191,11 @@ def simulate_sequences(
 ) -> dict[str, Any]:
     """Simulates a set of `count` sequences of a built-in garment, or goes on with one that was interrupted.
 
-    What holds for `simulate_dataset` holds here; the unit that is finished or not is a whole sequence.
+    What holds for `simulate_dataset` holds here; the unit that is finished or not is a whole sequence. Best make
+    `count` a multiple of `shapes`, the body shapes in the set. `motions` must be there, of `seconds` or more each: that
+    is the length of a sequence.
 
-    Args:
-        garment: `tshirt-male` or another garment, or several that are worn together.
-        count: sequences in the set, training and test together; best a multiple of `shapes`.
-        output: directory of the set; it is made, or must hold the beginning of the same set.
-        motions: a folder of motion files, or what `load_clips` has read, two at least, of `seconds` or more.
-        shapes: body shapes in the set.
-        seconds: length of each sequence.
-        body: name or file of a body; None for the one the garment was cut for.
-        seed: of everything that is drawn.
-        engine: what shares the work among processes (`refu_lab.fleet.open_engine`); None for this one alone.
-        settings: of simulation and selection.
-        progress: called in this process after each sequence.
-
-    Returns:
-        The card of the set, as it stands in `card.json`.
-
-    Raises:
-        SimulationError: as `simulate_dataset`, and for motions that are too short.
-        MeshError: the body isn't watertight.
-        BodyError, GarmentError: no such body or garment.
+    Raises as `simulate_dataset`, and `SimulationError` for motions that are too short.
     """
     if motions is None:
         msg = f"sequences need recorded motion: give a folder of motion files, of {seconds:g} s or more each"

@@ -45,10 +45,7 @@ class Simulator(ABC):
     ) -> None:
         """For the clips of the training and of the test set, on a body or (None) the one the garment is cut for.
 
-        On another one the garments are transferred to it (`refu_core.garments.worn_on`).
-
-        Raises `SimulationError` for garments of different bodies; `BodyError` or `GarmentError` where there is no such
-        body or garment; `MeshError` as `Draper`.
+        Raises `SimulationError` for garments of different bodies, others as loaders and `Draper` do.
         """
         self.plan = plan
         self.settings = settings

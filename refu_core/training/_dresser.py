@@ -38,16 +38,10 @@ class Dresser(nn.Module):
         in_loss: Sdf,
         is_blended: bool = True,
     ) -> None:
-        """For one garment on one body model.
+        """For one garment on its body, both on one device; without `refu` the garment stays as it is predicted.
 
-        Args:
-            backbone: a module.
-            refu: the layer; None for the raw garment.
-            garment: the template.
-            body: its body, on the garment's device.
-            in_refu: the distance that ReFU sees.
-            in_loss: the distance that is returned.
-            is_blended: whether pushed vertices take their neighbourhood along.
+        `in_refu` is the distance that ReFU sees, `in_loss` the one that is returned. Blended, pushed vertices take
+        their neighbourhood along.
         """
         super().__init__()
         self.backbone, self.refu = backbone, refu  # modules, whose weights are this one's, too

@@ -21,14 +21,8 @@ def refu_loss(
     """L = λ₁ L_r + λ₂ L_c of garments after ReFU (paper, Eq. 7), shape ().
 
     L_r is `reconstruction_loss`, L_c `collision_loss`. With positions in metres both are about 1e-4 for a good
-    backbone, which is what the paper's weights balance.
-
-    Args:
-        vertices: Garments after ReFU [m], shape (B, N, 3).
-        truth: The true ones [m], shape (B, N, 3).
-        distance: Signed distance of `vertices` [m], shape (B, N).
-        reconstruction_weight: λ₁.
-        collision_weight: λ₂.
+    backbone, which is what the paper's weights balance. `vertices` and `truth` are garments [m], shape (B, N, 3),
+    `distance` the signed distance of `vertices` [m], (B, N); the weights are λ₁ and λ₂.
     """
     return reconstruction_weight * reconstruction_loss(vertices, truth) + collision_weight * collision_loss(distance)
 

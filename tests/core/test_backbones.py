@@ -41,8 +41,7 @@ from refu_core.backbones import (
     tilt_rotvec,
     up_in_root,
 )
-from refu_core.backbones._gcnn import UpConv
-from refu_core.backbones._graph import MeshGraph
+from refu_core.backbones._gcnn import MeshGraph, UpConv
 from refu_core.backbones._perceptron import StackedPerceptrons
 from refu_core.body import rotvec_to_rotmat
 from refu_core.errors import RefuError
