@@ -7,7 +7,6 @@ import os
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -201,18 +200,12 @@ def _by_trimesh(content: bytes, suffix: str) -> SurfaceMesh:
     if not parts:
         msg = "it has no faces"
         raise ValueError(msg)
-    vertices, faces, coordinates, start = [], [], [], 0
-    for part in parts:
-        vertices.append(np.asarray(part.vertices, dtype=np.float64))
-        faces.append(np.asarray(part.faces, dtype=np.int64) + start)
-        coordinates.append(_uv_of(part))
-        start += len(part.vertices)
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    faces = np.concatenate(
+        [np.asarray(part.faces, np.int64) + start for part, start in zip(parts, starts, strict=False)]
+    )
+    found = [getattr(part.visual, "uv", None) for part in parts]
     uv = None
-    if all(one is not None for one in coordinates):
-        uv = UvMap(np.concatenate(coordinates).astype(np.float32), np.concatenate(faces))  # type: ignore[arg-type]
-    return SurfaceMesh(np.concatenate(vertices), np.concatenate(faces), uv)
-
-
-def _uv_of(part: Any) -> NDArray[np.float64] | None:
-    found = getattr(part.visual, "uv", None)
-    return None if found is None or len(found) != len(part.vertices) else np.asarray(found, dtype=np.float64)[:, :2]
+    if all(one is not None and len(one) == count for one, count in zip(found, counts, strict=True)):
+        uv = UvMap(np.concatenate([np.asarray(one, np.float64)[:, :2] for one in found]).astype(np.float32), faces)
+    return SurfaceMesh(np.concatenate([part.vertices for part in parts]), faces, uv)

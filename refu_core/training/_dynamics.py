@@ -20,7 +20,7 @@ from refu_core.history import PoseHistory
 from refu_core.simulation import GarmentDataset, GarmentSequences
 from refu_core.training._data import TrainingSamples, TrainingSet, in_chunks, mirrored, read_samples, split_validation
 from refu_core.training._figures import posed_errors
-from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, start_parallel
+from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, start_parallel
 from refu_core.training._mirror import Mirror, mirror_pose
 from refu_core.training._pretrain import CodeLoss
 from refu_core.weights import load_weights
@@ -96,7 +96,7 @@ def train_dynamics(
         msg = f"{stored.path}: wanted a tailornet, got {type(still).__name__}"
         raise RefuError(msg)
     settings = DynamicsSettings() if settings is None else settings
-    is_writer, torch_device = start_parallel(torch.device(device))
+    torch_device = start_parallel(device)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.loop.seed)
         dynamics = Dynamics(DynamicsConfig(template.card.joints), still)
@@ -134,7 +134,7 @@ def train_dynamics(
     dynamics.to("cpu").eval()
     figures = _figures(still, dynamics, test, _known(still, test, _pasts(rows, rows.test)), body, template)
     card = {**described, "dataset": opened.card, "figures": figures}
-    if is_writer:
+    if is_writer():
         save_dynamics(folder, dynamics, card)
         loop.checkpoint.unlink(missing_ok=True)
     return card

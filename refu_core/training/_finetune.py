@@ -19,7 +19,7 @@ from refu_core.refu import SCALE_PRESETS, Refu, ScaleKind, refu_from_weights, re
 from refu_core.simulation import GarmentDataset, GarmentSequences
 from refu_core.training._data import TakenAlong, TrainingSamples, TrainingSet, in_chunks, mirrored, split_validation
 from refu_core.training._dresser import Dresser, Sdf
-from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, start_parallel
+from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, start_parallel
 from refu_core.training._losses import COLLISION_WEIGHT, RECONSTRUCTION_WEIGHT, refu_loss
 from refu_core.training._mirror import Mirror
 from refu_core.training._pretrain import PretrainSettings, basis_of, pivots_of, stages
@@ -129,7 +129,7 @@ def finetune(
         settings = FinetuneSettings.of(backbone, preset)
     opened = TrainingSet.of(garment, dataset, body)
     template, body, samples, identity = opened.garment, opened.body, opened.samples, opened.identity
-    is_writer, torch_device = start_parallel(torch.device(device))
+    torch_device = start_parallel(device)
     output = Path(output)
     train, validation = split_validation(samples, share=settings.validation_share, seed=settings.loop.seed)
     if settings.is_mirrored:
@@ -142,14 +142,14 @@ def finetune(
             config = backbone_config(backbone, template, preset=preset)
             basis = None
             if uses_basis(config, preset):
-                basis = basis_of(output, opened, None, PretrainSettings().rank, is_writer=is_writer)
+                basis = basis_of(output, opened, None, PretrainSettings().rank)
             network = fresh = build_backbone(config, template, basis=basis, pivots=pivots_of(samples, opened.n_pivots))
             # For the scale of inputs and outputs, which it sets; the stages themselves aren't run.
             stages(fresh, train, validation, template, PretrainSettings())
         else:
             stored = load_weights(Path(weights) / f"{backbone}-{mode if goes_on else 'none'}", expect=identity)
             network = backbone_from_weights(stored, template)
-            _bring_basis(Path(weights), output, is_writer=is_writer)
+            _bring_basis(Path(weights), output)
         refu = _layer(mode, settings, template.n_vertices)
         if stored is not None and goes_on:
             refu = refu_from_weights(stored)
@@ -197,7 +197,7 @@ def finetune(
         "dataset": opened.card,
         "knows_limbs": opened.knows_limbs,
     }
-    if is_writer:
+    if is_writer():
         others = None if refu is None else refu_tensors(refu, half=preset != "paper")
         save_backbone(output / name, network, card, others=others, half=preset != "paper")
         loop.checkpoint.unlink(missing_ok=True)
@@ -232,9 +232,9 @@ def _layer(mode: str, settings: FinetuneSettings, n_vertices: int) -> Refu | Non
     )
 
 
-def _bring_basis(source: Path, target: Path, *, is_writer: bool) -> None:
+def _bring_basis(source: Path, target: Path) -> None:
     """Copies the output basis beside the weights that will need it."""
-    if not is_writer or source.resolve() == target.resolve() or not (source / "basis.json").exists():
+    if not is_writer() or source.resolve() == target.resolve() or not (source / "basis.json").exists():
         return
     target.mkdir(parents=True, exist_ok=True)
     for name in ("basis.safetensors", "basis.json"):

@@ -89,7 +89,7 @@ class Loop:
         """
         self.checkpoint = folder / f"{name}.checkpoint"
         self._model, self._settings, self._device = model, settings, device
-        self._log = TrainingLog(folder, name=name, quiet=quiet, is_writer=ranks()[0] == 0)
+        self._log = TrainingLog(folder, name=name, quiet=quiet, is_writer=is_writer())
         self._identity = json.dumps(identity, sort_keys=True, default=str)
         self._done: list[str] = []
         self._resumed: dict[str, Any] | None = None
@@ -195,22 +195,27 @@ class Loop:
     def _save(self, stage: dict[str, Any] | None) -> None:
         # One process' word is enough: after a step all have the same weights. Its random state is its own, though, so
         # a resumed parallel run is sound but not the same bit for bit.
-        if ranks()[0] == 0:
+        if is_writer():
             state = {"identity": self._identity, "done": self._done, "stage": stage, "model": self._model.state_dict()}
             save_checkpoint(self.checkpoint, state)
 
 
-def start_parallel(device: torch.device) -> tuple[bool, torch.device]:
-    """Joins the other processes of a `torchrun`; whether this one writes files, and the device that is its own."""
-    world = int(os.environ.get("WORLD_SIZE", "1"))
-    if world == 1:
-        return True, device
-    if device.type == "cuda":
-        device = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
-        torch.cuda.set_device(device)
+def start_parallel(device: str) -> torch.device:
+    """Joins the other processes of a `torchrun`; the device that is this one's own."""
+    own = torch.device(device)
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
+        return own
+    if own.type == "cuda":
+        own = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
+        torch.cuda.set_device(own)
     if not dist.is_initialized():
-        dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
-    return dist.get_rank() == 0, device
+        dist.init_process_group("nccl" if own.type == "cuda" else "gloo")
+    return own
+
+
+def is_writer() -> bool:
+    """Whether this process is the one that writes files."""
+    return ranks()[0] == 0
 
 
 def ranks() -> tuple[int, int]:

@@ -38,7 +38,7 @@ from refu_core.training._data import (
     split_validation,
 )
 from refu_core.training._figures import backbone_figures
-from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, start_parallel
+from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, start_parallel
 from refu_core.training._mirror import Mirror
 
 MANY = 4000
@@ -136,12 +136,12 @@ def pretrain(
     config = backbone_config(backbone, template, preset=preset) if config is None else config
     if settings.dropout is not None and isinstance(config, TailorNetConfig):
         config = replace(config, dropout=settings.dropout, high_dropout=2 * settings.dropout)
-    is_writer, torch_device = start_parallel(torch.device(device))
+    torch_device = start_parallel(device)
     output = Path(output)
 
     basis, mirror = None, Mirror.of(template) if settings.is_mirrored else None
     if uses_basis(config, preset):
-        basis = basis_of(output, opened, mirror, settings.rank, is_writer=is_writer)
+        basis = basis_of(output, opened, mirror, settings.rank)
     # Which pairs are held out mustn't depend on what is made of the samples afterwards.
     train, validation = split_validation(samples, share=settings.validation_share, seed=settings.loop.seed)
     if mirror is not None:
@@ -173,13 +173,13 @@ def pretrain(
         "knows_limbs": opened.knows_limbs,
         "figures": backbone_figures(model, test, body, template, mean=mean),
     }
-    if is_writer:
+    if is_writer():
         save_backbone(output / f"{backbone}-none", model, card, half=preset != "paper")
         loop.checkpoint.unlink(missing_ok=True)
     return card
 
 
-def basis_of(folder: Path, opened: TrainingSet, mirror: Mirror | None, rank: int, *, is_writer: bool) -> BasisDecoder:
+def basis_of(folder: Path, opened: TrainingSet, mirror: Mirror | None, rank: int) -> BasisDecoder:
     """The folder's basis, made if it isn't there."""
     if (folder / "basis.json").exists():
         return load_basis(folder, opened.garment, expect=opened.identity)[0]
@@ -187,7 +187,7 @@ def basis_of(folder: Path, opened: TrainingSet, mirror: Mirror | None, rank: int
     if mirror is not None:
         displacement = torch.cat((displacement, mirrored(opened.samples, mirror).displacement))
     basis = output_basis(displacement, rank=rank)
-    if is_writer:
+    if is_writer():
         save_basis(folder, basis, {**opened.identity, "samples": len(displacement), "set": len(opened.rows)})
     return basis
 

@@ -19,7 +19,7 @@ from refu_core.sdf import SDF_PRESETS, ExactSdf, SdfNetwork, body_frame, query_b
 from refu_core.simulation import GarmentDataset
 from refu_core.training._checkpoint import load_checkpoint, save_checkpoint
 from refu_core.training._data import drawn_pairs
-from refu_core.training._loop import cosine, ranks, start_parallel
+from refu_core.training._loop import cosine, is_writer, ranks, start_parallel
 from refu_core.training._progress import TrainingLog
 
 VALUE_WEIGHT, NORMAL_WEIGHT, EIKONAL_WEIGHT = 2.0, 1.0, 0.1
@@ -214,7 +214,7 @@ def train_sdf(
     """
     settings = settings or SdfSettings()
     name = f"sdf-{settings.preset}"
-    is_writer, where = start_parallel(torch.device(device))
+    where = start_parallel(device)
     rank, world = ranks()
     if settings.batch_size % world:
         msg = f"a batch of {settings.batch_size} bodies can't be shared evenly by {world} processes"
@@ -239,7 +239,7 @@ def train_sdf(
     module: nn.Module = _Step(network)
     if world > 1:
         module = nn.parallel.DistributedDataParallel(module)
-    log = TrainingLog(output, name=name, quiet=quiet, is_writer=is_writer)
+    log = TrainingLog(output, name=name, quiet=quiet, is_writer=is_writer())
     log.begin("sdf", step=step, steps=settings.steps)
     while step < settings.steps:
         generator = torch.Generator().manual_seed((settings.seed * 1_000_003 + step) * world + rank)
@@ -259,7 +259,7 @@ def train_sdf(
             if not math.isfinite(lost := float(loss.detach())):
                 msg = f"the loss of the distance network is {lost} at step {step}: try a smaller learning rate"
                 raise RefuError(msg)
-            if is_writer:
+            if is_writer():
                 found = sdf_figures(network, checks["validation"])
                 log.check("sdf", step, absolute=found["absolute_mm"], near_skin=found["near_mm"])
                 state = {"network": network.state_dict(), "optimiser": optimiser.state_dict()}
@@ -272,7 +272,7 @@ def train_sdf(
         "figures": {part: sdf_figures(network, batch) for part, batch in checks.items()},
     }
     log.end()
-    if is_writer:
+    if is_writer():
         save_sdf_network(output / name, network, card)
     return card
 
