@@ -200,10 +200,9 @@ def _by_trimesh(content: bytes, suffix: str) -> SurfaceMesh:
     if not parts:
         msg = "it has no faces"
         raise ValueError(msg)
-    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
-    faces = np.concatenate(
-        [np.asarray(part.faces, np.int64) + start for part, start in zip(parts, starts, strict=False)]
-    )
+    counts = [len(part.vertices) for part in parts]
+    starts = np.cumsum(counts) - counts
+    faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=True)])
     found = [getattr(part.visual, "uv", None) for part in parts]
     uv = None
     if all(one is not None and len(one) == count for one, count in zip(found, counts, strict=True)):
