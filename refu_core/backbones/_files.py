@@ -144,9 +144,7 @@ def load_backbone(
     garment: str | GarmentTemplate,
     *,
     mode: str = "none",
-    body_fingerprint: str | None = None,
     folder: Path | None = None,
-    device: str | torch.device = "cpu",
 ) -> Backbone:
     """The trained backbone `name` of a garment.
 
@@ -155,25 +153,20 @@ def load_backbone(
             `skinned`.
         garment: name of a garment, or a template.
         mode: what it was trained with: `none`, `approx`, `accurate` or `hybrid`.
-        body_fingerprint: `SmplBody.fingerprint` of the body that wears it; weights for another body are refused.
         folder: where its files lie; the shipped weights if not given.
-        device: where it computes.
 
     Raises:
         GarmentError: there is no such garment.
-        WeightsError: there is no such backbone or mode, no weights of it, or they are for another body.
+        WeightsError: there is no such backbone or mode, or no weights of it.
     """
     template = load_garment(garment) if isinstance(garment, str) else garment
-    weights = backbone_weights(name, template.name, mode=mode, body_fingerprint=body_fingerprint, folder=folder)
+    weights = backbone_weights(name, template.name, mode=mode, folder=folder)
     if weights is None:
         return Skinned()
-    network = backbone_from_weights(weights, template, device=device).requires_grad_(False)
-    return with_dynamics(name, network, weights)
+    return with_dynamics(name, backbone_from_weights(weights, template).requires_grad_(False), weights)
 
 
-def backbone_weights(
-    name: str, garment: str, *, mode: str, body_fingerprint: str | None = None, folder: Path | None = None
-) -> Weights | None:
+def backbone_weights(name: str, garment: str, *, mode: str, folder: Path | None = None) -> Weights | None:
     """What `load_backbone` makes its backbone of, None for `skinned`, and `auto` where none ship. Raises as it does."""
     kind = BackboneName.of(name, "backbone", error=WeightsError)
     mode = SdfMode.of(mode, "mode of a backbone", error=WeightsError)
@@ -184,7 +177,4 @@ def backbone_weights(
         return None
     if kind in (BackboneName.AUTO, BackboneName.DYNAMIC):  # which is one, and more
         kind = BackboneName.TAILORNET
-    expect = {"garment": garment}
-    if body_fingerprint is not None:
-        expect["body_fingerprint"] = body_fingerprint
-    return load_weights(folder / f"{kind}-{mode}", expect=expect)
+    return load_weights(folder / f"{kind}-{mode}", expect={"garment": garment})

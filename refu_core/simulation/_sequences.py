@@ -127,30 +127,23 @@ class SequenceSimulator(Simulator):
         betas, style = plan.style_shape(slot)
         row: dict[str, Any] = {"slot": slot, "shape": slot % plan.shapes, "split": split, "betas": betas}
         motion = plan.motion(slot, self.clips[split == TEST])
-        vertices, cause, stretch, speed = self._play(motion.poses, motion.acceleration(), betas, style)
-        row |= {"style": style, "vertices": vertices, "cause": cause, "stretch": stretch, "speed": speed}
-        row |= {"pose": motion.poses[::STEPS], "transl": motion.transl[::STEPS]}
+        played = self._play(motion, betas, style)
+        row |= {"style": style, **played, "pose": motion.poses[::STEPS], "transl": motion.transl[::STEPS]}
         row |= {"clip": motion.clip, "start": motion.start, "mirrored": motion.mirrored}
-        row |= {"dropped": np.bincount(cause, minlength=len(CAUSES) + 1)[1:], "state": DONE}
+        row |= {"dropped": np.bincount(played["cause"], minlength=len(CAUSES) + 1)[1:], "state": DONE}
         return row | {"seconds": time.perf_counter() - started}
 
-    def _play(
-        self,
-        poses: NDArray[np.float32],
-        acceleration: NDArray[np.float64],
-        betas: NDArray[np.float32],
-        style: NDArray[np.float32],
-    ) -> tuple[NDArray[np.int16], NDArray[np.uint8], F32, F32]:
-        """Garments (T, N, 3), causes, stretch and speed (T,) of a motion of n simulated frames.
+    def _play(self, motion: DrawnMotion, betas: F32, style: F32) -> dict[str, NDArray[Any]]:
+        """Garments (T, N, 3), causes, stretch and speed (T,) of a motion, by the names of their columns.
 
         The cloth lives in a frame of reference that goes with the root and doesn't turn: there, the body's acceleration
         is a gravity of the other sign, and the air is still. It starts at rest in the first pose.
         """
-        s, cloth = self.settings, self._draper.cloth
+        s, cloth, poses = self.settings, self._draper.cloth, motion.poses
         drape = self._draper.drape(poses[0], betas, style)
         bodies = np.concatenate([self._draper.bodies(poses[k : k + 50], betas) for k in range(0, len(poses), 50)])
         self._draper.begin(drape.vertices, betas, style, bodies[0])
-        gravity = (np.array([0, -GRAVITY, 0]) - acceleration).astype(np.float32)
+        gravity = (np.array([0, -GRAVITY, 0]) - motion.acceleration()).astype(np.float32)
         n = len(poses[::STEPS])
         vertices = np.zeros((n, *drape.vertices.shape), np.int16)
         cause = np.full(n, 1 + CAUSES.index("unsettled"), np.uint8)
@@ -172,7 +165,7 @@ class SequenceSimulator(Simulator):
                 worst = max(float(stretch[t]), self._draper.stretch(read))
                 found = self._selector.cause(read, body, stretch=worst)
                 cause[t] = 0 if found is None else 1 + CAUSES.index(found)
-        return vertices, cause, stretch, speed
+        return {"vertices": vertices, "cause": cause, "stretch": stretch, "speed": speed}
 
 
 def simulate_sequences(

@@ -12,16 +12,7 @@ from refu_core.frames import N_JOINTS
 from refu_core.simulation._motion import FPS
 from refu_core.simulation._plan import TEST, TRAIN
 from refu_core.simulation._selection import CAUSES
-from refu_core.simulation._store import (
-    DONE,
-    FORMAT,
-    GIVEN_UP,
-    SEQUENCES,
-    Rows,
-    read_card,
-    write_card,
-    write_unseen,
-)
+from refu_core.simulation._store import DONE, FORMAT, GIVEN_UP, SEQUENCES, Rows, read_card, write_card, write_unseen
 
 
 def summarise(output: str | Path) -> dict[str, Any]:

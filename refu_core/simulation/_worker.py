@@ -79,10 +79,8 @@ class SlotSimulator(Simulator):
 
     def simulate(self, slot: int) -> dict[str, Any]:
         """The columns of a slot's row (see `_store`)."""
-        start = time.perf_counter()
-        plan = self.plan
-        split = plan.split_of(slot)
-        pair = plan.pair_of(slot)
+        start, plan = time.perf_counter(), self.plan
+        split, pair = plan.split_of(slot), plan.pair_of(slot)
         betas, style = plan.style_shape(pair)
         dropped = np.zeros(len(CAUSES), np.uint8)
         row: dict[str, Any] = {"slot": slot, "pair": pair, "split": split, "betas": betas, "style": style}

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from refu_core import WeightsError, load_body, load_garment
+from refu_core import WeightsError, load_garment
 from refu_core.backbones import (
     TRAINABLE,
     BasisDecoder,
@@ -497,7 +497,7 @@ def test_saved_and_loaded_it_predicts_the_same(
     tmp_path: Path, nets: dict[str, torch.nn.Module], basis: BasisDecoder, name: str
 ) -> None:
     path = write(tmp_path, nets[name], None if name == "gcnn" else basis, mode="hybrid")
-    loaded = load_backbone(name, GARMENT, mode="hybrid", body_fingerprint=IDENTITY["body_fingerprint"], folder=tmp_path)
+    loaded = load_backbone(name, GARMENT, mode="hybrid", folder=tmp_path)
     with torch.no_grad():
         got, wanted = loaded(*bodies(2)), nets[name](*bodies(2))
     torch.testing.assert_close(got.displacement, wanted.displacement, atol=5e-3, rtol=0)  # half precision
@@ -522,12 +522,10 @@ def test_modes_share_the_basis_and_no_other(
         load_backbone("tailornet", GARMENT, folder=tmp_path)
 
 
-def test_weights_of_another_body_are_refused(
+def test_weights_of_another_mode_or_garment_are_refused(
     tmp_path: Path, nets: dict[str, torch.nn.Module], basis: BasisDecoder
 ) -> None:
     write(tmp_path, nets["mlp"], basis)
-    with pytest.raises(WeightsError, match="refu train"):
-        load_backbone("mlp", GARMENT, body_fingerprint=load_body("male").fingerprint, folder=tmp_path)
     with pytest.raises(WeightsError, match="refu train"):
         load_backbone("mlp", GARMENT, mode="hybrid", folder=tmp_path)
     with pytest.raises(WeightsError, match="garment is tshirt-male"):
