@@ -25,7 +25,6 @@ from refu_core.backbones import (
     uses_basis,
 )
 from refu_core.body import SmplBody
-from refu_core.errors import RefuError
 from refu_core.garments import GarmentTemplate
 from refu_core.simulation import GarmentDataset, GarmentSequences
 from refu_core.training._data import (
@@ -45,7 +44,6 @@ MANY = 4000
 """Samples from which on a tailornet is trained longer and held back less. On validation samples of shorts' 6,000 the
 error is 7.61 mm with weight decay 1 and twice the steps, 7.21 with 0.3, 7.18 with half the dropout, 7.04 with 0.1 (on
 the test split 6.68, 6.43, 6.39 and 6.36); a T-shirt's 2,580 gain nothing (test: 9.5, with 0.3 9.6)."""
-PIVOT_TRAINING: tuple[str, ...] = ("joint", "separate")
 
 
 @dataclass(frozen=True)
@@ -60,26 +58,21 @@ class PretrainSettings:
     steps: int = 3000
     """Of the last stage; of the only one for backbones other than the tailornet. On test samples half of these and of
     the low-frequency net's steps leave 11.3 mm, all 11.1 (a T-shirt's 980 samples)."""
-    pivots: str = "joint"
-    """`joint`: the high-frequency nets are trained through the mixture, on all samples and together with the
-    low-frequency net. `separate`: each on its own pivot's samples, as in the original."""
+    is_joint: bool = True
+    """Whether the high-frequency nets are trained through the mixture, on all samples and together with the
+    low-frequency net, or each on its own pivot's samples, as in the original."""
     joint_rate: float = 0.3
-    """Learning rate of the last stage with `joint` pivots, relative: the low-frequency net is only tuned there."""
+    """Learning rate of a joint last stage, relative: the low-frequency net is only tuned there."""
     dropout: float | None = None
     """Of a tailornet's low-frequency net, half that of its high-frequency nets; None for the configuration's."""
     is_mirrored: bool = True
     validation_share: float = 0.08
 
-    def __post_init__(self) -> None:
-        if self.pivots not in PIVOT_TRAINING:
-            msg = f"pivots are trained {' or '.join(PIVOT_TRAINING)}, got {self.pivots!r}"
-            raise RefuError(msg)
-
     @classmethod
     def paper(cls) -> PretrainSettings:
         """TailorNet's own settings."""
         loop = LoopSettings(batch_size=32, learning_rate=1e-4, weight_decay=1e-6, check_every=1000)
-        return cls(loop, style_shape_steps=100_000, low_steps=300_000, steps=300_000, pivots="separate")
+        return cls(loop, style_shape_steps=100_000, low_steps=300_000, steps=300_000, is_joint=False)
 
     @classmethod
     def of(cls, backbone: str, preset: str = "realtime", *, samples: int = 0) -> PretrainSettings:
@@ -235,7 +228,7 @@ def stages(
         TrainingStage("style-shape", Objective([shape_net], shape_net, loss), settings.style_shape_steps, *drape),
         TrainingStage("low", Objective([model.low], model.low_code, loss), settings.low_steps, *low),
     ]
-    if settings.pivots == "joint":
+    if settings.is_joint:
         joint = Objective([model.low, model.high], model.code, loss)
         return [*found, TrainingStage("joint", joint, settings.steps, *both, rate=settings.joint_rate)]
     fine = []

@@ -29,6 +29,7 @@ from refu_core.backbones import (
     PoseFeatures,
     TailorNet,
     TailorNetConfig,
+    _frequency,
     backbone_config,
     backbone_from_weights,
     build_backbone,
@@ -375,8 +376,9 @@ def test_a_basis_that_does_not_fit_is_refused() -> None:
 # Smoothing
 
 
-def test_smoothing_is_what_a_loop_does(garment: GarmentTemplate) -> None:
-    steps, size = 3, 0.15
+def test_smoothing_is_what_a_loop_does(garment: GarmentTemplate, monkeypatch: pytest.MonkeyPatch) -> None:
+    steps, size = 3, _frequency.STEP_SIZE
+    monkeypatch.setattr(_frequency, "STEPS", steps)
     faces = garment.faces.numpy()
     count: dict[tuple[int, int], int] = {}
     for face in faces:
@@ -392,7 +394,7 @@ def test_smoothing_is_what_a_loop_does(garment: GarmentTemplate) -> None:
     x = garment.v_template.double().numpy().copy()
     for _ in range(steps):
         x = np.stack([v + size * (x[sorted(neighbours[i])].mean(0) - v) for i, v in enumerate(x)])
-    smooth = LaplacianSmoothing(garment, steps=steps, step_size=size)
+    smooth = LaplacianSmoothing(garment)
     torch.testing.assert_close(smooth(garment.v_template), torch.as_tensor(x).float(), atol=1e-6, rtol=0)
 
 
