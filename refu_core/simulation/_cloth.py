@@ -89,12 +89,7 @@ class SimulatedCloth:
     """The simulated garment. Positions are relative to the body's root, in SMPL axes [m]; one thread, deterministic."""
 
     def __init__(
-        self,
-        topology: ClothTopology,
-        sdf: ExactSdf,
-        *,
-        piece: NDArray[np.intp],
-        settings: ClothSettings,
+        self, topology: ClothTopology, sdf: ExactSdf, *, piece: NDArray[np.intp], settings: ClothSettings
     ) -> None:
         """A garment of this topology against the body behind `sdf`.
 
@@ -109,15 +104,12 @@ class SimulatedCloth:
         self._body_faces = sdf.faces.cpu().numpy().astype(np.int32)
         n = topology.n_vertices
         # Bends first: in each sweep the stiffer edges have the last word.
-        ends = np.concatenate((topology.bends[topology.bend_order], topology.mesh.edges[topology.stretch_order]))
+        ends = np.concatenate((topology.bends, topology.edges))
         self._ends = ends.astype(np.uint32)  # without a sign no index has to be asked whether it counts from the end
-        h2 = self.settings.substep**2
-        self._softness = np.concatenate(
-            (
-                np.full(len(topology.bends), self.settings.bend_compliance / h2, np.float32),
-                np.full(len(topology.mesh.edges), self.settings.stretch_compliance / h2, np.float32),
-            )
+        compliance = np.repeat(
+            (settings.bend_compliance, settings.stretch_compliance), (len(topology.bends), len(topology.edges))
         )
+        self._softness: F32 = (compliance / settings.substep**2).astype(np.float32)
         self._piece = piece
         self.positions: F32 = np.zeros((n, 3), np.float32)
         self.velocities: F32 = np.zeros((n, 3), np.float32)
@@ -248,10 +240,8 @@ class SimulatedCloth:
             self._body_faces, body, body if motion is None else motion, motion is not None, np.float32(_NEAR),
         )  # fmt: skip
 
-    def stretch(self, positions: F32 | None = None) -> F32:
-        """Length of each edge over its rest length, shape (E,); of vertices at `positions` if given, (N, 3) [m]."""
-        ends = (self.positions if positions is None else positions)[self.topology.mesh.edges]
-        order = self.topology.stretch_order
-        ratio = np.empty(len(order), np.float32)
-        ratio[order] = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)[order] / self._longest[-len(order) :]
-        return ratio
+    def stretch(self, positions: F32 | None = None) -> float:
+        """99.9th percentile of the edges' length over their rest length; of vertices elsewhere (N, 3) [m], if given."""
+        edges = slice(-len(self.topology.edges), None)
+        length = self._lengths(self.positions if positions is None else positions)[edges]
+        return float(np.percentile(length / self._longest[edges], 99.9))

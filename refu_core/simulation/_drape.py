@@ -247,11 +247,7 @@ class Draper:
                 break
         for _ in range(s.careful_frames):
             speed = self.cloth.frame(body, body, gravity=gravity, drag=s.drag[2], careful=True)
-        return SettledDrape(self._with_root(self.cloth.positions, root, betas), speed, self.stretch())
-
-    def stretch(self, vertices: F32 | None = None) -> float:
-        """99.9th percentile of the last drape's stretch; with its vertices (N, 3) [m] elsewhere, if given."""
-        return float(np.percentile(self.cloth.stretch(vertices), 99.9))
+        return SettledDrape(self._with_root(self.cloth.positions, root, betas), speed, self.cloth.stretch())
 
     def _with_root(self, points: F32, root: Rotation, betas: NDArray[np.floating]) -> F32:
         pelvis = self.body.rest_joints(_alone(betas))[0, 0].numpy()

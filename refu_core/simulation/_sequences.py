@@ -160,9 +160,9 @@ class SequenceSimulator(Simulator):
             if k % STEPS == 0:
                 t = k // STEPS
                 vertices[t] = quantise(cloth.positions)
-                stretch[t], speed[t] = self._draper.stretch(), now
+                stretch[t], speed[t] = cloth.stretch(), now
                 read = dequantise(vertices[t])  # rounding included, as for samples; a moving cloth may be fast
-                worst = max(float(stretch[t]), self._draper.stretch(read))
+                worst = max(float(stretch[t]), cloth.stretch(read))
                 found = self._selector.cause(read, body, stretch=worst)
                 cause[t] = 0 if found is None else 1 + CAUSES.index(found)
         return {"vertices": vertices, "cause": cause, "stretch": stretch, "speed": speed}

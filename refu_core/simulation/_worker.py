@@ -105,5 +105,5 @@ class SlotSimulator(Simulator):
         body = self._draper.bodies(pose[None], betas)[0]
         # What is checked is what will be read, rounding included.
         read = dequantise(stored)
-        stretch = max(drape.stretch, self._draper.stretch(read))
+        stretch = max(drape.stretch, self._draper.cloth.stretch(read))
         return self._selector.cause(read, body, stretch=stretch, speed=drape.speed), stored
