@@ -240,7 +240,7 @@ class Draper:
             gravity = Rotation.from_rotvec(tilt[0]).inv().apply(down).astype(np.float32)
             self.cloth.frame(body, after, gravity=gravity, drag=s.drag[1])
             body = after
-        fewest, most = (n - s.careful_frames for n in s.settle_frames)
+        fewest, most = (count - s.careful_frames for count in s.settle_frames)
         for settled in range(1, most + 1):
             speed = self.cloth.frame(body, body, gravity=gravity, drag=s.drag[2])
             if speed < s.rest_speed and settled >= fewest:

@@ -8,9 +8,16 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from refu_core.backbones import backbone_config, backbone_from_weights, build_backbone, save_backbone, uses_basis
+from refu_core.backbones import (
+    Network,
+    backbone_config,
+    backbone_from_weights,
+    build_backbone,
+    save_backbone,
+    uses_basis,
+)
 from refu_core.body import SmplBody
 from refu_core.errors import RefuError
 from refu_core.garments import GarmentTemplate
@@ -20,7 +27,7 @@ from refu_core.simulation import GarmentDataset, GarmentSequences
 from refu_core.training._data import TakenAlong, TrainingSamples, TrainingSet, in_chunks, mirrored, split_validation
 from refu_core.training._dresser import Dresser, Sdf
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, start_parallel
-from refu_core.training._losses import COLLISION_WEIGHT, RECONSTRUCTION_WEIGHT, refu_loss
+from refu_core.training._losses import refu_loss
 from refu_core.training._mirror import Mirror
 from refu_core.training._pretrain import PretrainSettings, basis_of, pivots_of, stages
 from refu_core.weights import load_weights
@@ -56,8 +63,6 @@ class FinetuneSettings:
         default_factory=lambda: LoopSettings(batch_size=16, learning_rate=2e-4, weight_decay=0.1, check_every=100)
     )
     steps: int = 1000
-    reconstruction_weight: float = RECONSTRUCTION_WEIGHT
-    collision_weight: float = COLLISION_WEIGHT
     scale: str | None = "realtime"
     """Preset of the scale networks; None fixes α at 1."""
     scale_kind: ScaleKind = "vertex"
@@ -134,7 +139,7 @@ def finetune(
     train, validation = split_validation(samples, share=settings.validation_share, seed=settings.loop.seed)
     if settings.is_mirrored:
         train = train.joined(mirrored(train, Mirror.of(template)))
-    network: nn.Module
+    network: Network
     stored = None
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.loop.seed)
@@ -143,9 +148,9 @@ def finetune(
             basis = None
             if uses_basis(config, preset):
                 basis = basis_of(output, opened, None, PretrainSettings().rank)
-            network = fresh = build_backbone(config, template, basis=basis, pivots=pivots_of(samples, opened.n_pivots))
+            network = build_backbone(config, template, basis=basis, pivots=pivots_of(samples, opened.n_pivots))
             # For the scale of inputs and outputs, which it sets; the stages themselves aren't run.
-            stages(fresh, train, validation, template, PretrainSettings())
+            stages(network, train, validation, template, PretrainSettings())
         else:
             stored = load_weights(Path(weights) / f"{backbone}-{mode if goes_on else 'none'}", expect=identity)
             network = backbone_from_weights(stored, template)
@@ -178,14 +183,7 @@ def finetune(
 
     def loss(dressed: Tensor, truth: Tensor) -> Tensor:
         """Of garments with their distance, (B, N, 4), and the true garments, (B, N, 3) [m]."""
-        total = refu_loss(
-            dressed[..., :3],
-            truth,
-            dressed[..., 3],
-            reconstruction_weight=settings.reconstruction_weight,
-            collision_weight=settings.collision_weight,
-        )
-        return _UNIT * total
+        return _UNIT * refu_loss(dressed[..., :3], truth, dressed[..., 3])
 
     objective = Objective([dresser], dresser, loss)
     data = [_tensors(part, body, template) for part in (train, validation)]
