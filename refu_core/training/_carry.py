@@ -41,7 +41,7 @@ from refu_core.training._data import (
     principal_components,
     read_samples,
 )
-from refu_core.training._figures import backbone_figures, posed_errors
+from refu_core.training._figures import backbone_figures, mpve
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage
 from refu_core.training._mirror import Mirror, OnSurface
 from refu_core.training._pretrain import CodeLoss
@@ -208,7 +208,7 @@ def carry_over(
         "dataset": opened.card,
         "figures": {
             **backbone_figures(model, test, body, template, mean=samples.displacement.mean(0)),
-            "carried_mm": round(float(posed_errors(carried(test.betas, test.pose), test, body, template).mean()), 3),
+            "carried_mm": mpve(carried(test.betas, test.pose), test, body, template),
             "borne_out": round(float(share.mean()), 3),
         },
     }

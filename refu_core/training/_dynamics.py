@@ -19,7 +19,7 @@ from refu_core.garments import GarmentTemplate
 from refu_core.history import PoseHistory
 from refu_core.simulation import GarmentDataset, GarmentSequences
 from refu_core.training._data import TrainingSamples, TrainingSet, in_chunks, mirrored, read_samples, split_validation
-from refu_core.training._figures import posed_errors
+from refu_core.training._figures import mpve
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, start_parallel
 from refu_core.training._mirror import Mirror, mirror_pose
 from refu_core.training._pretrain import CodeLoss
@@ -185,17 +185,11 @@ def _figures(
 ) -> dict[str, Any]:
     """MPVE on the test sequences [mm]: with dynamics, without, and the least that the basis allows."""
 
-    def mpve(owed: Tensor) -> float:
-        return round(float(posed_errors(predicted(owed), test, body, garment).mean()), 3)
-
-    def predicted(owed: Tensor) -> Tensor:
-        return in_chunks(
-            lambda pose, s, code: still.decoder(still.code(still.features(pose), s) + code),
-            test.pose,
-            known.style_shape,
-            owed,
-        )
+    def predicted(pose: Tensor, style_shape: Tensor, owed: Tensor) -> Tensor:
+        displacement: Tensor = still.decoder(still.code(still.features(pose), style_shape) + owed)
+        return displacement
 
     moved = in_chunks(dynamics, *known[:3])
-    figures = {"samples": len(test), "mpve_mm": mpve(moved), "still_mm": mpve(torch.zeros_like(moved))}
-    return figures | {"basis_mm": mpve(known.code)}
+    owed = {"mpve_mm": moved, "still_mm": torch.zeros_like(moved), "basis_mm": known.code}
+    garments = {name: in_chunks(predicted, test.pose, known.style_shape, code) for name, code in owed.items()}
+    return {"samples": len(test), **{name: mpve(one, test, body, garment) for name, one in garments.items()}}
