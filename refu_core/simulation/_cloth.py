@@ -148,7 +148,8 @@ class SimulatedCloth:
     def _lengths(self, shape: F32) -> F32:
         """Of what the distance constraints are between, in a shape (N, 3)."""
         ends = shape[self._ends]
-        return np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).astype(np.float32)
+        length: F32 = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).astype(np.float32)
+        return length
 
     def _anchor_points(self, body: F32) -> F32:
         face, weights, offset = self._anchors

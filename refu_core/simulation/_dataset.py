@@ -182,12 +182,6 @@ class GarmentDataset(_Finished):
         self._check("slot", 0, count)
         self._unseen = read_unseen(self._path, count)
 
-    def column(self, name: str) -> NDArray[Any]:
-        """A column of all samples, shape (M, ...): also `unseen`, which is kept by slot."""
-        if name == "unseen":
-            return np.asarray(self._unseen[super().column("slot")])
-        return super().column(name)
-
     def sample(self, index: int) -> GarmentSample:
         """The sample of this index, -M to M - 1; its arrays are copies.
 

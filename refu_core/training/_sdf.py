@@ -251,7 +251,7 @@ def train_sdf(
         for group in optimiser.param_groups:
             group["lr"] = settings.rate(step)
         optimiser.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()
         optimiser.step()
         step += 1
         log.step(step)
