@@ -184,13 +184,8 @@ class Gcnn(WithoutWearerCode, nn.Module):
         self.features = PoseFeatures(config.joints, config.encoding)
         self.feature_size = graph.sizes[-1] * config.channels[0]
         """M, the size of z."""
-        self.head = Perceptron(
-            self.features.size + N_STYLE_SHAPE,
-            config.hidden,
-            self.feature_size,
-            activation=config.activation,
-            dropout=config.dropout,
-        )
+        n, m = self.features.size + N_STYLE_SHAPE, self.feature_size
+        self.head = Perceptron(n, config.hidden, m, activation=config.activation, dropout=config.dropout)
         ends = (*config.channels[1:], 3)
         self.layers = nn.ModuleList(
             UpConv(up, a, b, bases=config.bases, residual=config.residual)
