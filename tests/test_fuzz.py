@@ -17,7 +17,7 @@ from msg_adapters import BagError, BagReader, BagWriter, EncodeError, MarkerMesh
 from refu_core import BodyError, WeightsError, load_body
 from refu_core.options import SettingsError
 from refu_core.simulation import SimulationError, load_clips
-from refu_core.simulation._store import Shard
+from refu_core.simulation._store import FORMAT, Rows
 from refu_core.training import TrainingLog, load_checkpoint, save_checkpoint
 from refu_ros._settings import NodeSettings
 from tests.fuzz.containers import join_mcap, mcap_chunk, split_mcap
@@ -124,12 +124,12 @@ def test_things_that_are_no_arrays() -> None:
 
 
 def test_a_column_that_was_cut_short_is_not_lengthened(tmp_path: Path) -> None:
-    Shard.create(tmp_path / "shard-0-of-1", np.arange(4, dtype=np.int32), (9, 3))
+    Rows.create(tmp_path, FORMAT, np.arange(4, dtype=np.int32), (9, 3))
     path = tmp_path / "shard-0-of-1" / "vertices.npy"
     path.write_bytes(path.read_bytes()[:-50])
     size = path.stat().st_size
     with pytest.raises(SimulationError, match=r"takes 216 bytes, the file has 166"):
-        Shard(path.parent, mode="r+")
+        Rows(tmp_path, FORMAT, mode="r+")
     assert path.stat().st_size == size
 
 

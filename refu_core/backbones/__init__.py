@@ -2,13 +2,10 @@
 
 from refu_core.backbones._controls import Controls as Controls
 from refu_core.backbones._decoder import BasisDecoder as BasisDecoder
-from refu_core.backbones._decoder import Decoder as Decoder
 from refu_core.backbones._decoder import DenseDecoder as DenseDecoder
 from refu_core.backbones._dynamics import Dynamic as Dynamic
 from refu_core.backbones._dynamics import Dynamics as Dynamics
 from refu_core.backbones._dynamics import DynamicsConfig as DynamicsConfig
-from refu_core.backbones._features import ENCODINGS as ENCODINGS
-from refu_core.backbones._features import N_STYLE_SHAPE as N_STYLE_SHAPE
 from refu_core.backbones._features import PoseFeatures as PoseFeatures
 from refu_core.backbones._features import style_shape as style_shape
 from refu_core.backbones._features import tilt_rotvec as tilt_rotvec

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 from scipy.sparse.linalg import splu
@@ -48,12 +47,13 @@ class Controls:
     @classmethod
     def spread(cls, garment: GarmentTemplate, count: int) -> Controls:
         """`count` of them, each new one where the way along the cloth to all before it is longest."""
-        points, edges = garment.v_template.cpu().double().numpy(), garment.mesh.edges
-        graph = _matrix(edges, np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1), len(points))
-        chosen, way = [0], _ways(graph, 0)
+        points, (first, second) = garment.v_template.cpu().double().numpy(), garment.mesh.edges.T
+        length = np.linalg.norm(points[first] - points[second], axis=1)
+        graph = sparse.csr_array((length, (first, second)), (len(points), len(points)))
+        chosen, way = [0], np.full(len(points), np.inf)
         while len(chosen) < min(count, len(points)):
+            way = np.minimum(way, dijkstra(graph, directed=False, indices=chosen[-1]))
             chosen.append(int(way.argmax()))
-            way = np.minimum(way, _ways(graph, chosen[-1]))
         return cls(garment.mesh, torch.tensor(chosen, dtype=torch.int32))
 
     def __call__(self, values: Tensor) -> Tensor:
@@ -78,16 +78,3 @@ class Controls:
     def matrix(self) -> Tensor:
         """What each control is worth at each vertex, shape (V, C)."""
         return self(torch.eye(len(self.vertices))[None])[0]
-
-
-def _matrix(edges: NDArray[np.int32], values: NDArray[np.float64], n: int) -> sparse.csr_matrix:
-    """Symmetric, with a value an edge, shape (n, n)."""
-    first, second = edges.T
-    rows, columns = np.concatenate((first, second)), np.concatenate((second, first))
-    return sparse.csr_matrix((np.concatenate((values, values)), (rows, columns)), (n, n))
-
-
-def _ways(graph: sparse.csr_matrix, start: int) -> NDArray[np.float64]:
-    """How far all vertices are from one along the cloth [m]; those of other pieces farther than any."""
-    way: NDArray[np.float64] = np.nan_to_num(dijkstra(graph, indices=[start])[0], posinf=1e9)
-    return way

@@ -91,8 +91,7 @@ class BasisDecoder(nn.Module):
     def of_tensors(cls, tensors: Mapping[str, Tensor], garment: GarmentTemplate | None = None) -> BasisDecoder:
         """Of what a basis file holds: the inverse of `tensors`. One at controls is that of a `garment`.
 
-        Raises:
-            WeightsError: something is missing, or parts don't fit each other or the garment.
+        Raises `WeightsError` where something is missing, or parts don't fit each other or the garment.
         """
         missing = [name for name in ("mean", "components") if name not in tensors]
         if missing:

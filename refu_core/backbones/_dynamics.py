@@ -46,13 +46,8 @@ class Dynamics(nn.Module):
         self.groups = torch.from_numpy(np.concatenate((now, np.tile(now.max() + 1 + columns // 9, len(LAGS)))))
         """Which inputs belong together, as `PoseFeatures.groups`: of all lags those of a joint."""
         n_past = len(LAGS) * len(columns)
-        self.net = Perceptron(
-            still.features.size + N_STYLE_SHAPE + n_past,
-            config.hidden,
-            still.decoder.size,
-            activation=config.activation,
-            dropout=config.dropout,
-        )
+        n, m = still.features.size + N_STYLE_SHAPE + n_past, still.decoder.size
+        self.net = Perceptron(n, config.hidden, m, activation=config.activation, dropout=config.dropout)
         self.register_buffer("reach", torch.zeros(n_past))
         self.reach: Tensor
 

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from refu_core.backbones._decoder import BasisDecoder
 from refu_core.backbones._dynamics import Dynamic, Dynamics, DynamicsConfig
-from refu_core.backbones._presets import Network, backbone_name, build_backbone, config_from_card, config_to_card
+from refu_core.backbones._gcnn import Gcnn
+from refu_core.backbones._presets import Network, backbone_name, build_backbone, config_from_card
 from refu_core.backbones._protocol import MAX_OFFSET, Backbone, Skinned
 from refu_core.backbones._tailornet import TailorNet
 from refu_core.errors import WeightsError
@@ -25,20 +27,12 @@ _PREFIX = "backbone."
 
 
 def save_basis(folder: Path, basis: BasisDecoder, card: Mapping[str, Any]) -> Path:
-    """Writes the output basis of a garment, `folder`/basis.
-
-    Raises:
-        WeightsError: it isn't finite, or can't be written.
-    """
+    """Writes the output basis of a garment, `folder`/basis. Raises `WeightsError` where that can't be done."""
     return save_weights(folder / "basis", basis.tensors(), {**card, "rank": basis.size})
 
 
 def load_basis(folder: Path, garment: GarmentTemplate, *, expect: Mapping[str, Any]) -> tuple[BasisDecoder, str]:
-    """The output basis of a garment and its hash.
-
-    Raises:
-        WeightsError: missing, damaged, or not as expected (`refu_core.weights.load_weights`).
-    """
+    """The output basis of a garment and its hash. Raises `WeightsError` as `refu_core.weights.load_weights`."""
     weights = load_weights(folder / "basis", expect=expect)
     try:
         basis = BasisDecoder.of_tensors(weights.tensors, garment)
@@ -50,35 +44,28 @@ def load_basis(folder: Path, garment: GarmentTemplate, *, expect: Mapping[str, A
 
 def save_backbone(
     stem: Path,
-    backbone: nn.Module,
+    backbone: Network,
     card: Mapping[str, Any],
     *,
     others: Mapping[str, Tensor] | None = None,
     half: bool = True,
 ) -> Path:
-    """Writes a backbone, without its basis, and its card.
+    """Writes a backbone, without its basis, and its card: `stem` with suffixes; the basis lies in the same folder.
 
-    Args:
-        stem: path without suffix; the basis of a low-rank head lies in the same folder.
-        backbone: a `TailorNet`, `Mlp` or `Gcnn`.
-        card: `garment`, `body_fingerprint`, and whatever else is known.
-        others: tensors that belong with it, the ReFU layer's for instance; their names start with another prefix.
-        half: store the parameters in half precision.
+    The card says `garment`, `body_fingerprint`, and whatever else is known. `others` are tensors that belong with it,
+    the ReFU layer's for instance, with another prefix. By `half` the parameters are stored in half precision.
 
-    Raises:
-        WeightsError: the weights aren't finite, can't be written, or the basis in the folder is another one.
+    Raises `WeightsError` for weights that aren't finite or can't be written, and for another basis in the folder.
     """
     parameters = dict(backbone.named_parameters())
     state = {k: v for k, v in backbone.state_dict().items() if not k.startswith("decoder.")}
     # Buffers (pivots, standardisation) stay exact: the kernel of the mixture is narrow.
     tensors = {_PREFIX + k: v.half() if half and k in parameters else v for k, v in state.items()}
-    config = getattr(backbone, "config", None)
-    described: dict[str, Any] = {"backbone": backbone_name(backbone), "config": config_to_card(config)}  # type: ignore[arg-type]
-    decoder = getattr(backbone, "decoder", None)
-    if isinstance(decoder, BasisDecoder):
+    described: dict[str, Any] = {"backbone": backbone_name(backbone.config), "config": asdict(backbone.config)}
+    if not isinstance(backbone, Gcnn) and isinstance(backbone.decoder, BasisDecoder):
         stored = load_weights(stem.parent / "basis", expect={"garment": card["garment"]})
         described["basis_sha256"] = str(stored.card["sha256"])
-        if not decoder.is_stored_as(stored.tensors):
+        if not backbone.decoder.is_stored_as(stored.tensors):
             msg = f"{stem}: the basis in this folder isn't the one that the backbone was trained with; use a new folder"
             raise WeightsError(msg)
     return save_weights(stem, {**tensors, **(others or {})}, {**described, **card})
@@ -87,26 +74,21 @@ def save_backbone(
 def backbone_from_weights(weights: Weights, garment: GarmentTemplate, *, device: str | torch.device = "cpu") -> Network:
     """The backbone in `weights`, with the basis beside them, in float32 and ready for use (`eval`).
 
-    Raises:
-        WeightsError: of another version or garment, or the basis is missing, damaged or another one.
+    Raises `WeightsError`: of another version or garment, or the basis is missing, damaged or another one.
     """
-    card = weights.card
-    config = config_from_card(str(card.get("backbone")), card.get("config") or {})
+    card, template = weights.card, garment.to(device="cpu")
+    config = config_from_card(str(card.get("backbone")), card.get("config"))
     basis = None
     if "basis_sha256" in card:
         identity = {key: card[key] for key in ("garment", "body_fingerprint") if key in card}
-        basis, digest = load_basis(weights.path.parent, garment.to(device="cpu"), expect=identity)
+        basis, digest = load_basis(weights.path.parent, template, expect=identity)
         if digest != card["basis_sha256"]:
             msg = f"{weights.path}: made for another basis than the one beside it; get both files again"
             raise WeightsError(msg)
     tensors = {k[len(_PREFIX) :]: v for k, v in weights.tensors.items() if k.startswith(_PREFIX)}
-    template = garment.to(device="cpu")
+    build = partial(build_backbone, config, template, basis=basis, pivots=tensors.get("pivots"))
     try:
-        module = build_for(
-            tensors,
-            lambda: build_backbone(config, template, basis=basis, pivots=tensors.get("pivots")),
-            shared="decoder.",
-        )
+        module = build_for(tensors, build, shared="decoder.")
     except WeightsError as error:
         msg = f"{weights.path}: doesn't fit {garment.name}: {error}"
         raise WeightsError(msg) from error
@@ -122,11 +104,7 @@ def backbone_from_weights(weights: Weights, garment: GarmentTemplate, *, device:
 
 
 def save_dynamics(folder: Path, dynamics: Dynamics, card: Mapping[str, Any]) -> Path:
-    """Writes what a garment owes to motion, `folder`/dynamics, for the basis that is there.
-
-    Raises:
-        WeightsError: it isn't finite, can't be written, or there is no basis.
-    """
+    """Writes what a garment owes to motion, `folder`/dynamics. Raises `WeightsError`, too, where there is no basis."""
     basis = load_weights(folder / "basis", expect={"garment": card["garment"]})
     described = {"config": asdict(dynamics.config), "basis_sha256": str(basis.card["sha256"])}
     parameters = dict(dynamics.named_parameters())
@@ -137,8 +115,8 @@ def save_dynamics(folder: Path, dynamics: Dynamics, card: Mapping[str, Any]) -> 
 def with_dynamics(name: str, network: Backbone, weights: Weights) -> Backbone:
     """What the backbone `name` is: what was made of `weights`, with the dynamics beside them where it wants those.
 
-    Raises:
-        WeightsError: they aren't of a tailornet, or there are no dynamics, damaged ones, or some for another basis.
+    Raises `WeightsError`: they aren't of a tailornet, or there are no dynamics, damaged ones, or some for another
+    basis.
     """
     there = weights.path.with_name("dynamics.json").exists()
     if name != BackboneName.DYNAMIC and not (name == BackboneName.AUTO and there):
@@ -166,9 +144,7 @@ def load_backbone(
     garment: str | GarmentTemplate,
     *,
     mode: str = "none",
-    body_fingerprint: str | None = None,
     folder: Path | None = None,
-    device: str | torch.device = "cpu",
 ) -> Backbone:
     """The trained backbone `name` of a garment.
 
@@ -177,39 +153,28 @@ def load_backbone(
             `skinned`.
         garment: name of a garment, or a template.
         mode: what it was trained with: `none`, `approx`, `accurate` or `hybrid`.
-        body_fingerprint: `SmplBody.fingerprint` of the body that wears it; weights for another body are refused.
         folder: where its files lie; the shipped weights if not given.
-        device: where it computes.
 
     Raises:
         GarmentError: there is no such garment.
-        WeightsError: there is no such backbone or mode, no weights of it, or they are for another body.
+        WeightsError: there is no such backbone or mode, or no weights of it.
     """
     template = load_garment(garment) if isinstance(garment, str) else garment
-    weights = backbone_weights(name, template.name, mode=mode, body_fingerprint=body_fingerprint, folder=folder)
+    weights = backbone_weights(name, template.name, mode=mode, folder=folder)
     if weights is None:
         return Skinned()
-    network = backbone_from_weights(weights, template, device=device).requires_grad_(False)
-    return with_dynamics(name, network, weights)
+    return with_dynamics(name, backbone_from_weights(weights, template).requires_grad_(False), weights)
 
 
-def backbone_weights(
-    name: str, garment: str, *, mode: str, body_fingerprint: str | None = None, folder: Path | None = None
-) -> Weights | None:
+def backbone_weights(name: str, garment: str, *, mode: str, folder: Path | None = None) -> Weights | None:
     """What `load_backbone` makes its backbone of, None for `skinned`, and `auto` where none ship. Raises as it does."""
     kind = BackboneName.of(name, "backbone", error=WeightsError)
     mode = SdfMode.of(mode, "mode of a backbone", error=WeightsError)
-    if kind is BackboneName.SKINNED:
-        return None
     shipped = weights_folder(garment)
     folder = shipped if folder is None else folder
-    if kind is BackboneName.AUTO:
-        if folder == shipped and not shipped.exists():  # weights that were named have to be there
-            return None
+    nothing_ships = folder == shipped and not shipped.exists()  # weights that were named have to be there
+    if kind is BackboneName.SKINNED or (kind is BackboneName.AUTO and nothing_ships):
+        return None
+    if kind in (BackboneName.AUTO, BackboneName.DYNAMIC):  # which is one, and more
         kind = BackboneName.TAILORNET
-    if kind is BackboneName.DYNAMIC:  # which is one, and more
-        kind = BackboneName.TAILORNET
-    expect = {"garment": garment}
-    if body_fingerprint is not None:
-        expect["body_fingerprint"] = body_fingerprint
-    return load_weights(folder / f"{kind}-{mode}", expect=expect)
+    return load_weights(folder / f"{kind}-{mode}", expect={"garment": garment})

@@ -21,9 +21,8 @@ class LaplacianSmoothing:
     of displacements and can be applied to a basis of them instead of to every sample.
     """
 
-    def __init__(self, garment: GarmentTemplate, *, steps: int = STEPS, step_size: float = STEP_SIZE) -> None:
-        self._map = _one_step(garment.mesh, step_size)
-        self._steps = steps
+    def __init__(self, garment: GarmentTemplate) -> None:
+        self._map = _one_step(garment.mesh)
 
     def __call__(self, vertices: Tensor) -> Tensor:
         """Smoothed vertices [m] of the same shape (..., V, 3)."""
@@ -38,12 +37,12 @@ class LaplacianSmoothing:
 
     def _apply(self, matrix: sparse.csr_array, columns: Tensor) -> Tensor:
         x = columns.double().numpy().reshape(len(columns), -1)
-        for _ in range(self._steps):
+        for _ in range(STEPS):
             x = matrix @ x
         return torch.as_tensor(x).view(columns.shape)
 
 
-def _one_step(mesh: Connectivity, step_size: float) -> sparse.csr_array:
+def _one_step(mesh: Connectivity) -> sparse.csr_array:
     n_vertices = mesh.n_vertices
     border = np.zeros(n_vertices, bool)
     border[mesh.boundary] = True
@@ -54,4 +53,4 @@ def _one_step(mesh: Connectivity, step_size: float) -> sparse.csr_array:
     mean = sparse.diags_array(1 / np.maximum(links.sum(1), 1)) @ links
     eye = sparse.eye_array(n_vertices)
     listens = sparse.diags_array((links.sum(1) > 0).astype(float))
-    return sparse.csr_array(eye + step_size * (mean - listens))
+    return sparse.csr_array(eye + STEP_SIZE * (mean - listens))

@@ -5,16 +5,19 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy import sparse
 from torch import Tensor, nn
 from torch.nn import functional
 
 from refu_core.backbones._features import N_STYLE_SHAPE, PoseFeatures, style_shape
-from refu_core.backbones._graph import MeshGraph, Neighbours
 from refu_core.backbones._perceptron import Perceptron
 from refu_core.backbones._protocol import Prediction, WithoutWearerCode
 from refu_core.errors import WeightsError
 from refu_core.garments import GarmentTemplate
+from refu_core.mesh import Connectivity
 
 _MOST_STRIDE, _MOST_LEVELS = 8, 8
 
@@ -49,6 +52,82 @@ class GcnnConfig:
     def paper(cls, joints: tuple[int, ...]) -> GcnnConfig:
         """The decoder half of the original's `10_conv_res`."""
         return cls(joints, "rotvec", (1024, 1024), (9, 128, 64, 32), bases=17, activation="relu", dropout=0.2)
+
+
+@dataclass(frozen=True, eq=False)
+class Neighbours:
+    """For each vertex of one graph, some vertices of another one or of the same."""
+
+    index: NDArray[np.int64]
+    """Shape (V_out, n); where there are fewer than n, the last ones are repeated and not valid."""
+    valid: NDArray[np.bool_]
+    """Shape (V_out, n)."""
+
+    @property
+    def mean_count(self) -> float:
+        """Mean number of neighbours."""
+        return float(self.valid.sum(1).mean())
+
+    @staticmethod
+    def of(links: sparse.csr_array) -> Neighbours:
+        """The non-zero columns of each row of `links`, (V_out, V_in); every row needs one."""
+        count = np.diff(links.indptr)
+        slots = np.minimum(np.arange(count.max())[None], count[:, None] - 1)
+        index = links.indices[links.indptr[:-1, None] + slots].astype(np.int64)
+        return Neighbours(index, np.arange(count.max())[None] < count[:, None])
+
+
+@dataclass(frozen=True, eq=False)
+class MeshGraph:
+    """A mesh's vertices and what is left of them after each sampling, finest first."""
+
+    sizes: tuple[int, ...]
+    """Vertices of each of the L + 1 levels."""
+    ups: tuple[Neighbours, ...]
+    """From level l + 1 to level l: the coarse vertices that a fine one hears, shape (V_l, n)."""
+
+    @staticmethod
+    def of(mesh: Connectivity, *, levels: int, stride: int = 2) -> MeshGraph:
+        """Samples the vertex graph of a mesh `levels` times."""
+        links = mesh.adjacency_matrix()
+        sizes, ups = [mesh.n_vertices], []
+        for _ in range(levels):
+            kept = _sample(links, stride)
+            # A fine vertex is within stride - 1 links of a kept one; one more link blends between several.
+            ups.append(Neighbours.of(_within(links, stride)[:, kept]))
+            # Kept vertices that cover neighbouring vertices are neighbours.
+            links = _within(links, 2 * stride - 1)[kept][:, kept]
+            sizes.append(len(kept))
+        return MeshGraph(tuple(sizes), tuple(ups))
+
+
+def _sample(links: sparse.csr_array, stride: int) -> NDArray[np.int64]:
+    """Greedily kept vertices: every vertex is fewer than `stride` links from one of them, and no two are that close."""
+    near = _within(links, stride - 1)
+    covered = np.zeros(links.shape[0], bool)
+    kept = []
+    for vertex in range(len(covered)):
+        if not covered[vertex]:
+            kept.append(vertex)
+            covered[near.indices[near.indptr[vertex] : near.indptr[vertex + 1]]] = True
+    return np.array(kept, np.int64)
+
+
+def _within(links: sparse.csr_array, hops: int) -> sparse.csr_array:
+    """Pairs of vertices at most `hops` links apart, each with itself."""
+    step = _binary(links + sparse.eye_array(links.shape[0], format="csr"))
+    reach = step
+    for _ in range(hops - 1):
+        reach = _binary(reach @ step)
+    return reach
+
+
+def _binary(links: sparse.csr_array) -> sparse.csr_array:
+    links = sparse.csr_array(links)
+    links.sum_duplicates()
+    links.sort_indices()
+    links.data = np.ones_like(links.data)
+    return links
 
 
 class UpConv(nn.Module):
@@ -105,13 +184,8 @@ class Gcnn(WithoutWearerCode, nn.Module):
         self.features = PoseFeatures(config.joints, config.encoding)
         self.feature_size = graph.sizes[-1] * config.channels[0]
         """M, the size of z."""
-        self.head = Perceptron(
-            self.features.size + N_STYLE_SHAPE,
-            config.hidden,
-            self.feature_size,
-            activation=config.activation,
-            dropout=config.dropout,
-        )
+        n, m = self.features.size + N_STYLE_SHAPE, self.feature_size
+        self.head = Perceptron(n, config.hidden, m, activation=config.activation, dropout=config.dropout)
         ends = (*config.channels[1:], 3)
         self.layers = nn.ModuleList(
             UpConv(up, a, b, bases=config.bases, residual=config.residual)

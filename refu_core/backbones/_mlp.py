@@ -37,13 +37,8 @@ class Mlp(WithoutWearerCode, nn.Module):
         self.config = config
         self.decoder = decoder
         self.features = PoseFeatures(config.joints, config.encoding)
-        self.net = Perceptron(
-            self.features.size + N_STYLE_SHAPE,
-            config.hidden,
-            decoder.size,
-            activation=config.activation,
-            dropout=config.dropout,
-        )
+        n = self.features.size + N_STYLE_SHAPE
+        self.net = Perceptron(n, config.hidden, decoder.size, activation=config.activation, dropout=config.dropout)
 
     def forward(
         self,

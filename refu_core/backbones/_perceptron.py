@@ -13,13 +13,14 @@ ACTIVATIONS = {"relu": functional.relu, "silu": functional.silu}
 
 
 class _Standardised(nn.Module):
-    """What brings its inputs to one size."""
+    """What brings its inputs to one size; they are left as they are until `standardise`."""
 
     shift: Tensor
     scale: Tensor
 
-    def register_standard(self, inputs: int) -> None:
-        """Inputs are left as they are until `standardise`."""
+    def __init__(self, inputs: int, activation: str, dropout: float) -> None:
+        super().__init__()
+        self.activation, self.dropout = ACTIVATIONS[activation], dropout
         self.register_buffer("shift", torch.zeros(inputs))
         self.register_buffer("scale", torch.ones(inputs))
 
@@ -38,14 +39,10 @@ class Perceptron(_Standardised):
     """Linear layers with an activation and dropout between them, on standardised input."""
 
     def __init__(
-        self, inputs: int, hidden: Sequence[int], outputs: int, *, activation: str = "relu", dropout: float = 0.0
+        self, inputs: int, hidden: Sequence[int], outputs: int, *, activation: str, dropout: float = 0.0
     ) -> None:
-        super().__init__()
-        sizes = (inputs, *hidden, outputs)
-        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(sizes))
-        self.activation = ACTIVATIONS[activation]
-        self.dropout = dropout
-        self.register_standard(inputs)
+        super().__init__(inputs, activation, dropout)
+        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise((inputs, *hidden, outputs)))
 
     def forward(self, x: Tensor) -> Tensor:
         """Shape (B, I) -> (B, O)."""
@@ -62,26 +59,15 @@ class StackedPerceptrons(_Standardised):
     """K perceptrons of one shape on one input, and their weighted sum."""
 
     def __init__(
-        self,
-        count: int,
-        inputs: int,
-        hidden: Sequence[int],
-        outputs: int,
-        *,
-        activation: str = "relu",
-        dropout: float = 0.0,
+        self, count: int, inputs: int, hidden: Sequence[int], outputs: int, *, activation: str, dropout: float = 0.0
     ) -> None:
-        super().__init__()
-        self.activation = ACTIVATIONS[activation]
-        self.dropout = dropout
-        sizes = (inputs, *hidden, outputs)
+        super().__init__(inputs, activation, dropout)
         self.weights = nn.ParameterList()
         self.biases = nn.ParameterList()
-        for a, b in pairwise(sizes):
+        for a, b in pairwise((inputs, *hidden, outputs)):
             bound = a**-0.5  # as nn.Linear
             self.weights.append(nn.Parameter(torch.empty(count, a, b).uniform_(-bound, bound)))
             self.biases.append(nn.Parameter(torch.empty(count, b).uniform_(-bound, bound)))
-        self.register_standard(inputs)
 
     def forward(self, x: Tensor, mixture: Tensor) -> Tensor:
         """Σ_k mixture[:, k] · perceptron_k(x), shape (B, O), of x (B, I) and mixture (B, K)."""

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict
 from typing import Any
 
-from torch import Tensor, nn
+from torch import Tensor
 
 from refu_core.backbones._decoder import BasisDecoder, Decoder, DenseDecoder
 from refu_core.backbones._gcnn import Gcnn, GcnnConfig
@@ -33,11 +31,7 @@ Network = TailorNet | Mlp | Gcnn
 
 
 def backbone_config(name: str, garment: GarmentTemplate, *, preset: str = "realtime") -> BackboneConfig:
-    """The configuration of the backbone `name` for a garment.
-
-    Raises:
-        WeightsError: no such backbone, or no such preset.
-    """
+    """The configuration of the backbone `name` for a garment. Raises `WeightsError` for no such name or preset."""
     if name not in _CONFIGS:
         msg = f"no backbone {name!r} that could be trained: wanted {', '.join(TRAINABLE)}"
         raise WeightsError(msg)
@@ -60,16 +54,10 @@ def build_backbone(
     basis: BasisDecoder | None = None,
     pivots: Tensor | None = None,
 ) -> Network:
-    """An untrained backbone.
+    """An untrained backbone for a garment.
 
-    Args:
-        config: from `backbone_config`, or one's own.
-        garment: the template that it is for.
-        basis: output basis of low-rank heads; dense heads without one. The gcnn has no head and takes none.
-        pivots: (β, γ) of the pivots of a tailornet, shape (K, 14).
-
-    Raises:
-        WeightsError: a tailornet without pivots.
+    Heads are low-rank with an output basis, dense without one; the gcnn has no head. A tailornet needs the (β, γ) of
+    its pivots, shape (K, 14), and raises `WeightsError` without.
     """
     if isinstance(config, GcnnConfig):
         return Gcnn(config, garment)
@@ -82,23 +70,13 @@ def build_backbone(
     return TailorNet(config, garment, decoder, pivots)
 
 
-def backbone_name(module: nn.Module) -> str:
-    """The name of a backbone."""
-    names: Mapping[type[nn.Module], str] = {TailorNet: "tailornet", Mlp: "mlp", Gcnn: "gcnn"}
-    return names[type(module)]
+def backbone_name(config: BackboneConfig) -> str:
+    """The name of the backbone of such a configuration."""
+    return next(name for name, kind in _CONFIGS.items() if isinstance(config, kind))
 
 
-def config_to_card(config: BackboneConfig) -> dict[str, Any]:
-    """What a card says of a configuration."""
-    return asdict(config)
-
-
-def config_from_card(name: str, values: Mapping[str, Any]) -> BackboneConfig:
-    """The inverse of `config_to_card`.
-
-    Raises:
-        WeightsError: the card doesn't describe such a backbone.
-    """
+def config_from_card(name: str, values: Any) -> BackboneConfig:
+    """The configuration that a card has as `values`. Raises `WeightsError` for none of the backbone `name`."""
     if name not in _CONFIGS:
         msg = f"a card of a backbone {name[:80]!r} that this version doesn't know; train it again"
         raise WeightsError(msg)

@@ -56,18 +56,12 @@ class TailorNet(nn.Module):
         self.decoder = decoder
         self.features = PoseFeatures(config.joints, config.encoding)
         activation = config.activation
-        self.low = Perceptron(
-            self.features.size + N_STYLE_SHAPE, config.low, decoder.size, activation=activation, dropout=config.dropout
-        )
+        n_pose, n_code = self.features.size, decoder.size
+        self.low = Perceptron(n_pose + N_STYLE_SHAPE, config.low, n_code, activation=activation, dropout=config.dropout)
         self.high = StackedPerceptrons(
-            len(pivots),
-            self.features.size,
-            config.high,
-            decoder.size,
-            activation=activation,
-            dropout=config.high_dropout,
+            len(pivots), n_pose, config.high, n_code, activation=activation, dropout=config.high_dropout
         )
-        self.style_shape = Perceptron(N_STYLE_SHAPE, config.style_shape, decoder.size, activation=config.activation)
+        self.style_shape = Perceptron(N_STYLE_SHAPE, config.style_shape, n_code, activation=activation)
         self.register_buffer("pivots", pivots.clone())
         self.register_buffer("_directions", decoder.directions(garment), persistent=False)
         self.pivots: Tensor
@@ -99,11 +93,8 @@ class TailorNet(nn.Module):
 
         Computed in the type of `s`.
         """
-        if s.dtype == self._directions.dtype:
-            code = self.style_shape(s)
-        else:
-            tensors = {name: tensor.to(s.dtype) for name, tensor in self.style_shape.state_dict().items()}
-            code = functional_call(self.style_shape, tensors, s)
+        tensors = {name: tensor.to(s.dtype) for name, tensor in self.style_shape.state_dict().items()}
+        code = functional_call(self.style_shape, tensors, s)
         drape = s @ self._directions.to(s.dtype)
         drape[:, : code.shape[1]] += code
         return drape

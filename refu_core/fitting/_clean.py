@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
-from scipy.sparse.csgraph import breadth_first_order, connected_components
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from refu_core.errors import GarmentError
@@ -30,14 +30,10 @@ def clean(mesh: SurfaceMesh) -> tuple[SurfaceMesh, list[str]]:
     Vertices that no face uses are left out. Seams along which UVs cut a mesh open are closed; its UVs stay as they are.
     Where more than two faces meet at an edge, the two that continue each other stay together.
 
-    Raises:
-        GarmentError: no surface is left, or it has one side only (a Möbius strip).
+    Raises `GarmentError`: no surface is left, or it has one side only (a Möbius strip).
     """
     notes: list[str] = []
     mesh = _without_double_faces(_without_strays(mesh, notes), notes)
-    if not len(mesh.faces):
-        msg = "the mesh has no faces that enclose an area"
-        raise GarmentError(msg)
     mesh = _welded(mesh, notes)
     partner, n_crowded = _partners(mesh)
     mesh = turned_over(mesh, _oriented(mesh.faces, partner, notes))
@@ -52,7 +48,11 @@ def clean(mesh: SurfaceMesh) -> tuple[SurfaceMesh, list[str]]:
 
 def components(faces: Ints, n: int) -> tuple[int, Ints]:
     """The number of pieces, and the piece of each of the n vertices."""
-    pairs = np.concatenate((faces[:, :2], faces[:, 1:]))
+    return _linked(np.concatenate((faces[:, :2], faces[:, 1:])), n)
+
+
+def _linked(pairs: Ints, n: int) -> tuple[int, Ints]:
+    """How many groups links (L, 2) make of n things, and the group of each, numbered from the first thing on."""
     graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
     count, label = connected_components(graph, directed=False)
     return count, label.astype(np.int64)
@@ -66,9 +66,8 @@ def face_normals(v: NDArray[np.float64], f: Ints) -> NDArray[np.float64]:
 
 def rim_of(f: Ints) -> Ints:
     """Vertices of edges of one face."""
-    pairs = np.sort(np.stack((f, np.roll(f, -1, 1)), -1).reshape(-1, 2), 1)
-    edges, count = np.unique(pairs, axis=0, return_counts=True)
-    return np.unique(edges[count == 1])
+    edges, of_corner = _edges(f)
+    return np.unique(edges[np.bincount(of_corner.ravel()) == 1])
 
 
 def split_long_edges(mesh: SurfaceMesh, longest: float) -> SurfaceMesh:
@@ -144,24 +143,20 @@ def _without_strays(mesh: SurfaceMesh, notes: list[str]) -> SurfaceMesh:
     if kept.all():
         return mesh
     notes.append(f"{int((~kept).sum())} faces far off all others were left out")
-    uv = None if mesh.uv is None else replace(mesh.uv, faces=mesh.uv.faces[kept])
-    return replace(mesh, faces=mesh.faces[kept], uv=uv)
+    return mesh.only(kept)
 
 
 def _groups_of_place(v: NDArray[np.float64]) -> Ints:
     """The first vertex at the same place as each, shape (V,)."""
     extent = float(np.linalg.norm(np.ptp(v, axis=0)))
-    pairs = cKDTree(v).query_pairs(_SAME_PLACE * extent, output_type="ndarray")
-    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(v), len(v)))
-    _, label = connected_components(graph, directed=False)
+    _, label = _linked(cKDTree(v).query_pairs(_SAME_PLACE * extent, output_type="ndarray"), len(v))
     _, first = np.unique(label, return_index=True)
     found: Ints = first[label].astype(np.int64)
     return found
 
 
 def _without_double_faces(mesh: SurfaceMesh, notes: list[str]) -> SurfaceMesh:
-    used, local = np.unique(mesh.faces, return_inverse=True)
-    mesh = replace(mesh, vertices=mesh.vertices[used], faces=local.reshape(-1, 3).astype(np.int64))
+    mesh = mesh.compact()
     place = _groups_of_place(mesh.vertices)[mesh.faces]
     extent = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
     is_flat = (place == np.roll(place, 1, 1)).any(1)
@@ -175,15 +170,12 @@ def _without_double_faces(mesh: SurfaceMesh, notes: list[str]) -> SurfaceMesh:
         notes.append(f"{n_double} faces were there twice and are there once")
     if is_flat.any():
         notes.append(f"{int(is_flat.sum())} faces without area were left out")
-    uv = None if mesh.uv is None else replace(mesh.uv, faces=mesh.uv.faces[kept])
-    return SurfaceMesh(mesh.vertices, mesh.faces[kept], uv)
+    return mesh.only(kept)
 
 
 def _welded(mesh: SurfaceMesh, notes: list[str]) -> SurfaceMesh:
     """Vertices of open edges that are at one place become one; sheets that only touch stay apart."""
-    edges, of_corner = _edges(mesh.faces)
-    n_faces = np.bincount(of_corner.ravel(), minlength=len(edges))
-    on_rim = np.unique(edges[n_faces == 1])
+    on_rim = rim_of(mesh.faces)
     target = np.arange(len(mesh.vertices))
     if len(on_rim):
         # Places are found among the rim's vertices alone, by the whole mesh's extent.
@@ -194,8 +186,7 @@ def _welded(mesh: SurfaceMesh, notes: list[str]) -> SurfaceMesh:
     n_welded = int((target != np.arange(len(target))).sum())
     if n_welded:
         notes.append(f"{n_welded} vertices lay on others, along seams, and were welded to them")
-    used, local = np.unique(target[mesh.faces], return_inverse=True)
-    return replace(mesh, vertices=mesh.vertices[used], faces=local.reshape(-1, 3).astype(np.int64))
+    return mesh.compact(target[mesh.faces])
 
 
 def _partners(mesh: SurfaceMesh) -> tuple[Ints, int]:
@@ -224,30 +215,20 @@ def _partners(mesh: SurfaceMesh) -> tuple[Ints, int]:
 
 
 def _oriented(f: Ints, pairs: Ints, notes: list[str]) -> NDArray[np.bool_]:
-    """Which faces have to be turned over for each piece to face one way, shape (F,)."""
-    start = f.ravel()[pairs]
+    """Which faces have to be turned over for each piece to face one way, as most of its faces do, shape (F,)."""
+    start, n = f.ravel()[pairs], len(f)
     agrees = start[:, 0] != start[:, 1]  # the shared edge is run through in opposite directions
+    # Each face is there twice, as it is (k) and turned over (n + k), and tied to what faces the same way beside it.
     a, b = (pairs // 3).T
-    n = len(f)
-    graph = coo_array((np.ones(2 * len(a)), (np.r_[a, b], np.r_[b, a])), shape=(n, n)).tocsr()
-    sign_of = {}
-    for x, y, good in zip(a.tolist(), b.tolist(), agrees.tolist(), strict=True):
-        sign_of[x, y] = sign_of[y, x] = 1 if good else -1
-    sign = np.zeros(n, np.int64)
-    for seed in range(n):
-        if sign[seed]:
-            continue
-        sign[seed] = 1
-        reached, before = breadth_first_order(graph, seed, directed=True)
-        for face in reached[1:].tolist():
-            sign[face] = sign[before[face]] * sign_of[face, int(before[face])]
-        turned = int((sign[reached] < 0).sum())
-        if 2 * turned > len(reached):  # as most of them were
-            sign[reached] *= -1
-    if (sign[a] * sign[b] != np.where(agrees, 1, -1)).any():
+    same, other = np.where(agrees, b, b + n), np.where(agrees, b + n, b)
+    _, label = _linked(np.concatenate((np.stack((a, same), 1), np.stack((a + n, other), 1))), 2 * n)
+    as_is, turned = label[:n], label[n:]
+    if (as_is == turned).any():
         msg = "the mesh has one side only: following it round (a Möbius strip), inside becomes outside; cut it open"
         raise GarmentError(msg)
-    flipped: NDArray[np.bool_] = sign < 0
+    votes = np.bincount(as_is, minlength=label.max() + 1)
+    # Of as many either way, the piece's first face stays: labels count up from the first face on.
+    flipped: NDArray[np.bool_] = (votes[as_is] < votes[turned]) | ((votes[as_is] == votes[turned]) & (as_is > turned))
     if flipped.any():
         notes.append(f"{int(flipped.sum())} faces faced the other way than their neighbours and were turned over")
     return flipped
@@ -271,8 +252,7 @@ def _cut_apart(mesh: SurfaceMesh, pairs: Ints) -> SurfaceMesh:
     one, other = pairs.T
     # Oriented alike, an edge begins in one face where it ends in the other.
     links = np.concatenate((np.stack((one, following[other]), 1), np.stack((following[one], other), 1)))
-    graph = coo_array((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(n, n))
-    count, label = connected_components(graph, directed=False)
+    count, label = _linked(links, n)
     vertices = np.empty((count, 3))
     vertices[label] = mesh.vertices[f.ravel()]
     order = np.full(count, n, np.int64)

@@ -10,14 +10,7 @@ from numpy.typing import NDArray
 
 from refu_core.body import BUILTIN_BODIES, JOINT_NAMES, SmplBody, blend_transforms, unapply_transforms
 from refu_core.errors import GarmentError, require_type
-from refu_core.fitting._clean import (
-    MAX_VERTICES,
-    clean,
-    components,
-    face_normals,
-    split_long_edges,
-    turned_over,
-)
+from refu_core.fitting._clean import MAX_VERTICES, clean, components, face_normals, split_long_edges, turned_over
 from refu_core.fitting._mesh_file import SurfaceMesh
 from refu_core.fitting._pieces import apart, unsewn, without_bodies
 from refu_core.fitting._place import NO_OPENING, Place, Placing, find_places
@@ -120,22 +113,22 @@ def fit_garment(
         msg = f"it has {len(cleaned.vertices)} vertices, at most {MAX_VERTICES} are worn: decimate the mesh"
         raise GarmentError(msg)
     _require_worn(cleaned)
-    fault: GarmentError | None = None
-    makeshift: tuple[SurfaceMesh, list[str]] | None = None
+    faults: list[GarmentError] = []
+    makeshifts: list[tuple[SurfaceMesh, list[str]]] = []
     for place in find_places(cleaned, body, replace(placing or Placing(), held_at=details.held_at)):
         try:
             mesh, found, moved = _put_on(cleaned, place, body, longest_edge)
         except GarmentError as error:  # a limb goes through it there: is there another place?
-            fault = fault or error
+            faults.append(error)
             continue
         if moved <= _FARTHEST:
             return _bound(mesh, body, name, details, notes + found)
         doubt = f"it reached {1e3 * moved:.0f} mm into the body: does it lie as it is worn? --up or --pose may help"
-        makeshift = makeshift or (mesh, [*found, doubt])
-    if makeshift is not None:
-        return _bound(makeshift[0], body, name, details, notes + makeshift[1])
-    assert fault is not None  # there is a place, or `find_places` has said that there is none
-    raise fault
+        makeshifts.append((mesh, [*found, doubt]))
+    if not makeshifts:
+        raise faults[0]  # there is a place, or `find_places` has said that there is none
+    mesh, found = makeshifts[0]
+    return _bound(mesh, body, name, details, notes + found)
 
 
 def _require_worn(mesh: SurfaceMesh) -> None:
@@ -218,18 +211,17 @@ def _shapedirs(body: SmplBody) -> F64:
 def _outward(mesh: SurfaceMesh, body: PosedBody) -> SurfaceMesh:
     """With faces that are counter-clockwise from outside: away from the body, or out of a closed piece."""
     v, f = mesh.vertices, mesh.faces
-    n_pieces, label = components(f, len(v))
-    connectivity = Connectivity.of(f, len(v))
-    is_open = np.isin(np.arange(n_pieces), label[connectivity.boundary])
+    _, label = components(f, len(v))
+    piece = label[f[:, 0]]
+    is_open = np.isin(piece, label[Connectivity.of(f, len(v)).boundary])
     normals = face_normals(v, f)
     centres = v[f].mean(1)
     distance, gradient = body(centres)
     # Cloth near the skin says more: of a wide hem either side may be nearer to a leg.
-    vote = np.where(is_open[label[f[:, 0]]], (normals * gradient).sum(1) / (0.02 + np.abs(distance)), 0)
-    vote += np.where(is_open[label[f[:, 0]]], 0, (normals * (centres - v.mean(0))).sum(1))
-    side = np.bincount(label[f[:, 0]], vote, n_pieces)
-    flipped: NDArray[np.bool_] = side[label[f[:, 0]]] < 0
-    return turned_over(mesh, flipped)
+    from_body = (normals * gradient).sum(1) / (0.02 + np.abs(distance))
+    from_middle = (normals * (centres - v.mean(0))).sum(1)
+    side = np.bincount(piece, np.where(is_open, from_body, from_middle))
+    return turned_over(mesh, side[piece] < 0)
 
 
 def _unposed(mesh: SurfaceMesh, posed: PosedBody) -> F64:

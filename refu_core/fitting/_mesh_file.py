@@ -5,9 +5,8 @@ from __future__ import annotations
 import io
 import os
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,12 +46,21 @@ class SurfaceMesh:
         except (TypeError, ValueError) as error:
             raise GarmentError(str(error)) from error
 
+    def only(self, kept: NDArray[np.bool_]) -> SurfaceMesh:
+        """The mesh of some of its faces, a mask (F,)."""
+        uv = None if self.uv is None else replace(self.uv, faces=self.uv.faces[kept])
+        return SurfaceMesh(self.vertices, self.faces[kept], uv)
+
+    def compact(self, faces: NDArray[np.int64] | None = None) -> SurfaceMesh:
+        """The mesh without vertices that no face uses; with `faces` (F, 3) of its vertices, those if given."""
+        used, local = np.unique(self.faces if faces is None else faces, return_inverse=True)
+        return replace(self, vertices=self.vertices[used], faces=local.reshape(-1, 3).astype(np.int64))
+
 
 def read_surface(path: str | os.PathLike[str]) -> SurfaceMesh:
     """The mesh of a Wavefront OBJ (polygons become triangles), or of what trimesh reads: PLY, STL, OFF, GLB, glTF.
 
-    Raises:
-        GarmentError: the file can't be read, or holds no mesh.
+    Raises `GarmentError`: the file can't be read, or holds no mesh.
     """
     source = Path(path)
     suffix = source.suffix.lower()
@@ -192,18 +200,11 @@ def _by_trimesh(content: bytes, suffix: str) -> SurfaceMesh:
     if not parts:
         msg = "it has no faces"
         raise ValueError(msg)
-    vertices, faces, coordinates, start = [], [], [], 0
-    for part in parts:
-        vertices.append(np.asarray(part.vertices, dtype=np.float64))
-        faces.append(np.asarray(part.faces, dtype=np.int64) + start)
-        coordinates.append(_uv_of(part))
-        start += len(part.vertices)
+    counts = [len(part.vertices) for part in parts]
+    starts = np.cumsum(counts) - counts
+    faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=True)])
+    found = [getattr(part.visual, "uv", None) for part in parts]
     uv = None
-    if all(one is not None for one in coordinates):
-        uv = UvMap(np.concatenate(coordinates).astype(np.float32), np.concatenate(faces))  # type: ignore[arg-type]
-    return SurfaceMesh(np.concatenate(vertices), np.concatenate(faces), uv)
-
-
-def _uv_of(part: Any) -> NDArray[np.float64] | None:
-    found = getattr(part.visual, "uv", None)
-    return None if found is None or len(found) != len(part.vertices) else np.asarray(found, dtype=np.float64)[:, :2]
+    if all(one is not None and len(one) == count for one, count in zip(found, counts, strict=True)):
+        uv = UvMap(np.concatenate([np.asarray(one, np.float64)[:, :2] for one in found]).astype(np.float32), faces)
+    return SurfaceMesh(np.concatenate([part.vertices for part in parts]), faces, uv)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -37,8 +35,7 @@ def without_bodies(mesh: SurfaceMesh, posed: PosedBody) -> tuple[SurfaceMesh, li
     Characters come in one file with their clothes. A piece is a body if it has a head, hands and feet and lies on the
     skin.
 
-    Raises:
-        GarmentError: nothing else is left.
+    Raises `GarmentError`: nothing else is left.
     """
     n_pieces, label = components(mesh.faces, len(mesh.vertices))
     joint = posed.body.weights.argmax(1).numpy()[posed.body.faces[:, 0].numpy()]
@@ -53,10 +50,8 @@ def without_bodies(mesh: SurfaceMesh, posed: PosedBody) -> tuple[SurfaceMesh, li
     if not kept.any():
         msg = "it is a body with head, hands and feet, and no garment: wanted clothes (--body says who wears them)"
         raise GarmentError(msg)
-    used, local = np.unique(mesh.faces[kept], return_inverse=True)
-    uv = None if mesh.uv is None else replace(mesh.uv, faces=mesh.uv.faces[kept])
     note = "a piece with head, hands and feet was taken for the wearer's body and left out"
-    return SurfaceMesh(mesh.vertices[used], local.reshape(-1, 3).astype(np.int64), uv), [note] * int(is_body.sum())
+    return mesh.only(kept).compact(), [note] * int(is_body.sum())
 
 
 def unsewn(mesh: SurfaceMesh) -> list[str]:

@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,7 +68,7 @@ class Placing:
     def __post_init__(self) -> None:
         """Raises `GarmentError` for what is no unit, no axis or no pose."""
         is_unit = self.unit is None or (isinstance(self.unit, (int, float)) and 0 < self.unit < math.inf)
-        if not is_unit or self.up not in (None, "y", "z"):
+        if not is_unit or self.up not in (None, *UP_AXES):
             msg = f"wanted a unit in metres (0.01 for cm) and y or z up, got {self.unit!r} and {self.up!r}"
             raise GarmentError(msg)
         if self.pose is not None and np.shape(self.pose) != (N_JOINTS, 3):
@@ -90,11 +90,28 @@ class Place:
     fit: Fit
     top: float
     """How high the mesh reaches [m]."""
+    kind: str
+    """How it came there: as it is (empty), from a `floor`, or `searched`."""
     notes: list[str] = field(default_factory=list)
 
     def is_like(self, other: Place) -> bool:
-        """Whether it has the same unit and axes."""
-        return self.unit == other.unit and bool(np.array_equal(self.turn, other.turn))
+        """Whether it has the same unit and axes, and came there likewise."""
+        is_as_large = (self.unit, self.kind) == (other.unit, other.kind)
+        return is_as_large and bool(np.array_equal(self.turn, other.turn))
+
+    @property
+    def is_sideways(self) -> bool:
+        """Whether the mesh would have been modelled facing x, as nobody does."""
+        return _is_sideways(self.turn)
+
+    def cost(self, extent: float) -> float:
+        """As a share of the garment's size, or the smallest one would always be the nearest to the skin.
+
+        What nobody would do without need counts, too: to model a garment sideways, with spread legs or hanging arms.
+        """
+        arms, legs = self.pose[RIGHT_SHOULDER, 2], self.pose[LEFT_HIP, 2]
+        without_need = 0.02 * self.is_sideways + 0.1 * abs(legs) + 0.005 * abs(arms)
+        return float(self.fit.cost / (self.unit * extent) + without_need)
 
     def __call__(self, vertices: F64) -> F64:
         """Vertices (V, 3) on the body [m]."""
@@ -113,74 +130,62 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
     As it is, if it surrounds the body like that, or in another unit, with another axis up, standing on the floor, in an
     A-pose. Else it is moved until it does; and if that doesn't help, scaled by what is no unit.
 
-    Raises:
-        GarmentError: in no unit is it as large as a garment, or it surrounds the body nowhere.
+    Raises `GarmentError`: in no unit is it as large as a garment, or it surrounds the body nowhere.
     """
-    if placing.up not in (None, *UP_AXES):
-        msg = f"no axis {placing.up!r} that is up: wanted {' or '.join(UP_AXES)}, or None to find out"
-        raise GarmentError(msg)
-    samples = sample(mesh, _N_POINTS)
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     units = [placing.unit] if placing.unit else [u for u in UNITS.values() if _SIZES[0] <= u * extent <= _SIZES[1]]
     if not units or (placing.unit and not _SIZES[0] <= placing.unit * extent <= _SIZES[1]):
         size = f"{extent:.3g} units" + (f" = {placing.unit * extent:.3g} m" if placing.unit else "")
         msg = f"the mesh is {size} large: wanted a garment of {_SIZES[0]} to {_SIZES[1]} m; say its unit (--unit)"
         raise GarmentError(msg)
+    search = _Search(mesh, body, placing, extent)
     poses = [placing.pose] if placing.pose is not None else [standing_pose(arms) for arms in _ARMS]
     bodies = [PosedBody(body, pose) for pose in poses]
     turns = _turns(placing.up, mesh, is_placed=placing.is_placed)
     found = [
-        _Candidate(_at(samples, unit, turn, shift, here), kind, here)
+        _at(search.samples, unit, turn, shift, here, kind)
         for here, turn, unit in itertools.product(bodies, turns, units)
         for kind, shift in _shifts(here, is_placed=placing.is_placed)
     ]
-    if placing.held_at == "waist":
-        found = [one for one in found if not one.is_above_arms]
-    good = [one for one in found if one.place.fit.is_plain]
+    found = [one for one in found if one.top <= search.highest]
+    good = [one for one in found if one.fit.is_plain]
     if good:
         least = min(one.cost(extent) for one in good)
         chosen = next(one for one in good if one.cost(extent) < least + _TOLERANCE)  # what says least is asked first
         if placing.pose is None:
-            likes = [one for one in found if one.kind == chosen.kind and one.place.is_like(chosen.place)]
-            likes.sort(key=lambda one: one.cost(extent))
-            refined = [
-                one._replace(place=_refined(one, samples, placing, moves=False, scales=False)) for one in likes[:2]
-            ]
+            likes = sorted((one for one in found if one.is_like(chosen)), key=lambda one: one.cost(extent))
+            refined = [search.refined(one, moves=False, scales=False) for one in likes[:2]]
             other = min(refined, key=lambda one: one.cost(extent))
-            if other.cost(extent) < chosen.cost(extent) - _POSE_TOLERANCE or chosen.here.pose.any():
+            if other.cost(extent) < chosen.cost(extent) - _POSE_TOLERANCE or chosen.pose.any():
                 chosen = other
-        yield _told(chosen.place, chosen.kind)
-    found.sort(key=lambda one: (not one.place.fit.is_good, one.cost(extent)))
+        yield _told(chosen)
+    found.sort(key=lambda one: (not one.fit.is_good, one.cost(extent)))
     tiers = found[:1]
     for one in tiers:
-        fit = one.place.fit
-        if fit.is_good and max(fit.inside, fit.distance / 6) < _NOTHING and not one.is_sideways:
-            yield _told(one.place, one.kind)  # of gloves much faces other fingers
+        if one.fit.is_good and max(one.fit.inside, one.fit.distance / 6) < _NOTHING and not one.is_sideways:
+            yield _told(one)  # of gloves much faces other fingers
     for tried in [None] if placing.unit else [None, [size / extent for size in _TRIED_SIZES]]:
         if not placing.is_placed:
-            tiers += _searched(mesh, samples, bodies, turns, tried or units, placing, scales=tried is not None)
+            tiers += search.along(bodies, turns, tried or units, scales=tried is not None)
     # What was modelled by convention, or else in a known unit, unless it fits much worse.
     handicap = [
-        (k > 0) * _TOLERANCE + (k > 1 or one.place.fit.inside > _NOTHING) * _UNIT_TOLERANCE
-        for k, one in enumerate(tiers)
+        (k > 0) * _TOLERANCE + (k > 1 or one.fit.inside > _NOTHING) * _UNIT_TOLERANCE for k, one in enumerate(tiers)
     ]
     ranked = sorted(range(len(tiers)), key=lambda k: tiers[k].cost(extent) + handicap[k])
-    order = [tiers[k] for k in ranked if tiers[k].place.fit.is_good]
-    tight = [one for one in found if one.place.fit.is_tight and not one.place.fit.is_good and not one.is_sideways]
+    order = [tiers[k] for k in ranked if tiers[k].fit.is_good]
+    tight = [one for one in found if one.fit.is_tight and not one.fit.is_good and not one.is_sideways]
     if tight and not good and abs(np.log2(extent) - round(np.log2(extent))) > _OF_NO_UNIT:
         # A sleeve that no arm is in costs less and faces the wrong way.
-        best = min(tight, key=lambda one: one.cost(extent) + 4 * (1 - one.place.fit.facing))
+        best = min(tight, key=lambda one: one.cost(extent) + 4 * (1 - one.fit.facing))
         # Who models in metres and close to the skin means no garment that is a sixth larger, and none that lies.
-        known = [any(np.isclose(one.place.unit, unit) for unit in units) for one in order]
-        upright = [np.array_equal(one.place.turn, best.place.turn) for one in order]
-        first_of_all = [one for one, *is_so in zip(order, known, upright, strict=True) if all(is_so)]
-        order = [*first_of_all, best, *(one for one, is_known in zip(order, known, strict=True) if not is_known)]
+        known = [one for one in order if np.isclose(one.unit, units).any()]
+        first_of_all = [one for one in known if np.array_equal(one.turn, best.turn)]
+        order = [*first_of_all, best, *(one for one in order if one not in known)]
     for one in order:
-        yield _told(one.place, one.kind)
-    if good or order or any(one.place.fit.is_good for one in tiers):
+        yield _told(one)
+    if good or order or any(one.fit.is_good for one in tiers):
         return
-    place = min((one.place for one in tiers), key=lambda one: one.fit.cost)
-    fit = place.fit
+    fit = min((one.fit for one in tiers), key=lambda fit: fit.cost)
     msg = (
         f"the mesh doesn't surround the body {body.name}: where it fits best, {100 * fit.inside:.0f} % of it is "
         f"inside the body, it is {1e3 * fit.distance:.0f} mm off on average, and {100 * fit.facing:.0f} % of it faces "
@@ -191,67 +196,71 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
     raise GarmentError(msg)
 
 
-class _Candidate(NamedTuple):
-    place: Place
-    kind: str
-    here: PosedBody
+class _Search:
+    """Looks for places of a mesh that isn't where it belongs."""
 
-    @property
-    def is_above_arms(self) -> bool:
-        """Whether the mesh reaches up between the arms."""
-        shoulders = self.here.body.joint_template[[LEFT_SHOULDER, RIGHT_SHOULDER], 1]
-        return self.place.top > float(shoulders.mean()) - _UNDER_ARMS
+    def __init__(self, mesh: SurfaceMesh, body: SmplBody, placing: Placing, extent: float) -> None:
+        self._mesh, self._body, self._placing, self._extent = mesh, body, placing, extent
+        self.samples = sample(mesh, _N_POINTS)
+        under_arms = float(body.joint_template[[LEFT_SHOULDER, RIGHT_SHOULDER], 1].mean()) - _UNDER_ARMS
+        self.highest = under_arms if placing.held_at == "waist" else math.inf
+        """What is higher reaches up between the arms [m]."""
 
-    @property
-    def is_sideways(self) -> bool:
-        """Whether the mesh would have been modelled facing x, as nobody does."""
-        return _is_sideways(self.place.turn)
+    def along(self, bodies: list[PosedBody], turns: list[F64], units: list[float], *, scales: bool) -> list[Place]:
+        """The best of all heights along the body, moved on from there; none of no heights."""
+        few = Samples(*(array[::4] for array in self.samples))  # type: ignore[arg-type]
+        few = few._replace(area=4 * few.area)
+        if scales:  # there is much to try: what nobody does isn't
+            bodies, turns = bodies[:3], [turn for turn in turns if not _is_sideways(turn)]
+        found = [
+            _at(few, unit, turn, shift, here, "searched")
+            for here, turn, unit in itertools.product(bodies[::2], turns, units)
+            for shift in _heights(unit * self._mesh.vertices @ turn.T, here)
+        ]
+        found = [one for one in found if one.top <= self.highest]
+        found.sort(key=lambda one: one.cost(self._extent))
+        refined = [self.refined(one, moves=True, scales=scales) for one in found[:_N_REFINED]]
+        return sorted(refined, key=lambda one: (not one.fit.is_good, one.cost(self._extent)))[:1]
 
-    def cost(self, extent: float) -> float:
-        """As a share of the garment's size, or the smallest one would always be the nearest to the skin.
+    def refined(self, start: Place, *, moves: bool, scales: bool) -> Place:
+        """The best place near one, by a simplex over pose, and place and size if wanted."""
+        body, samples, turn = PosedBody(self._body, start.pose), self.samples, start.turn
+        is_posed = self._placing.pose is not None
+        x0 = np.array([0.0, 0.0, 0.0, 0.0, float(start.pose[RIGHT_SHOULDER, 2]), 0.02])
+        steps = np.array([0.06 * scales, *(0.03 * moves,) * 3, *((0, 0) if is_posed else (0.1, 0.06))])
+        free = np.flatnonzero(steps)
+        middle = samples.points.mean(0) @ turn.T
+        floor = float(body.vertices[:, 1].min())
+        extent = float(np.ptp(samples.points, axis=0).max())
 
-        What nobody would do without need counts, too: to model a garment sideways, with spread legs or hanging arms.
-        """
-        place = self.place
-        arms, legs = place.pose[RIGHT_SHOULDER, 2], place.pose[LEFT_HIP, 2]
-        without_need = 0.02 * self.is_sideways + 0.1 * abs(legs) + 0.005 * abs(arms)
-        return float(place.fit.cost / (place.unit * extent) + without_need)
+        def at(values: F64) -> Place:
+            full = x0.copy()
+            full[free] += values * steps[free]
+            size, *shift, lowered, spread = full
+            if not is_posed:
+                body.move(standing_pose(float(np.clip(lowered, -0.2, 1.3)), float(np.clip(spread, 0.0, 0.35))))
+            unit = min(start.unit * float(np.exp(np.clip(size, -0.5, 0.5))), _SIZES[1] / extent)
+            moved = start.shift + np.array(shift) + (start.unit - unit) * middle  # the middle stays as the size changes
+            if start.kind == "floor":  # which is where the feet of this pose are
+                moved[1] += float(body.vertices[:, 1].min()) - floor
+            return _at(samples, unit, turn, moved, body, start.kind)
 
+        def cost(values: F64) -> float:
+            place = at(values)
+            return place.cost(extent) + (place.top > self.highest)
 
-def _searched(
-    mesh: SurfaceMesh,
-    samples: Samples,
-    bodies: list[PosedBody],
-    turns: list[F64],
-    units: list[float],
-    placing: Placing,
-    *,
-    scales: bool,
-) -> list[_Candidate]:
-    """The best of all heights along the body, moved on from there; none of no heights."""
-    extent = float(np.ptp(mesh.vertices, axis=0).max())
-    few = Samples(*(array[::4] for array in samples))  # type: ignore[arg-type]
-    few = few._replace(area=4 * few.area)
-    if scales:  # there is much to try: what nobody does isn't
-        bodies, turns = bodies[:3], [turn for turn in turns if not _is_sideways(turn)]
-    found = [
-        _Candidate(_at(few, unit, turn, shift, here), "searched", here)
-        for here, turn, unit in itertools.product(bodies[::2], turns, units)
-        for shift in _heights(unit * mesh.vertices @ turn.T, here)
-    ]
-    is_at_waist = placing.held_at == "waist"
-    found = [one for one in found if not (is_at_waist and one.is_above_arms)]
-    found.sort(key=lambda one: one.cost(extent))
-    refined = [
-        one._replace(place=_refined(one, samples, placing, moves=True, scales=scales)) for one in found[:_N_REFINED]
-    ]
-    return sorted(refined, key=lambda one: (not one.place.fit.is_good, one.cost(extent)))[:1]
+        if not len(free):
+            return start
+        simplex = np.concatenate((np.zeros((1, len(free))), np.eye(len(free))))
+        options: Any = {"initial_simplex": simplex, "maxfev": 30 * len(free), "xatol": 0.02, "fatol": 1e-5}
+        found = minimize(cost, np.zeros(len(free)), method="Nelder-Mead", options=options)
+        return at(found.x)
 
 
-def _at(samples: Samples, unit: float, turn: F64, shift: F64, body: PosedBody) -> Place:
+def _at(samples: Samples, unit: float, turn: F64, shift: F64, body: PosedBody, kind: str) -> Place:
     turned = samples._replace(normals=samples.normals @ turn.T, area=unit**2 * samples.area)
     points = unit * samples.points @ turn.T + shift
-    return Place(unit, turn, shift, body.pose, fit_of(points, turned, body), float(points[:, 1].max()))
+    return Place(unit, turn, shift, body.pose, fit_of(points, turned, body), float(points[:, 1].max()), kind)
 
 
 def _turns(up: str | None, mesh: SurfaceMesh, *, is_placed: bool) -> list[F64]:
@@ -308,47 +317,7 @@ def _heights(vertices: F64, body: PosedBody) -> list[F64]:
     return found
 
 
-def _refined(start: _Candidate, samples: Samples, placing: Placing, *, moves: bool, scales: bool) -> Place:
-    """The best place near one, by a simplex over pose, and place and size if wanted."""
-    here = start.here
-    body = PosedBody(here.body, here.pose)
-    arms = float(here.pose[RIGHT_SHOULDER, 2])
-    turn, place = start.place.turn, start.place
-    x0 = np.array([0.0, 0.0, 0.0, 0.0, arms, 0.02])
-    steps = np.array([0.06 * scales, *(0.03 * moves,) * 3, 0.1, 0.06])
-    if placing.pose is not None:
-        steps[4:] = 0
-    free = np.flatnonzero(steps)
-    middle = samples.points.mean(0) @ turn.T
-    floor = float(here.vertices[:, 1].min())
-    extent = float(np.ptp(samples.points, axis=0).max())
-
-    def at(values: F64) -> Place:
-        full = x0.copy()
-        full[free] += values * steps[free]
-        size, *shift, lowered, spread = full
-        if placing.pose is None:
-            body.move(standing_pose(float(np.clip(lowered, -0.2, 1.3)), float(np.clip(spread, 0.0, 0.35))))
-        unit = min(place.unit * float(np.exp(np.clip(size, -0.5, 0.5))), _SIZES[1] / extent)
-        moved = place.shift + np.array(shift) + (place.unit - unit) * middle  # the middle stays as the size changes
-        if start.kind == "floor":  # which is where the feet of this pose are
-            moved[1] += float(body.vertices[:, 1].min()) - floor
-        return _at(samples, unit, turn, moved, body)
-
-    if not len(free):
-        return place
-    simplex = np.concatenate((np.zeros((1, len(free))), np.eye(len(free))))
-
-    def cost(values: F64) -> float:
-        one = start._replace(place=at(values))
-        return one.cost(extent) + (placing.held_at == "waist" and one.is_above_arms)
-
-    options: Any = {"initial_simplex": simplex, "maxfev": 30 * len(free), "xatol": 0.02, "fatol": 1e-5}
-    found = minimize(cost, np.zeros(len(free)), method="Nelder-Mead", options=options)
-    return at(found.x)
-
-
-def _told(place: Place, kind: str) -> Place:
+def _told(place: Place) -> Place:
     """With what was found out, in words."""
     notes = []
     name = next((name for name, unit in UNITS.items() if np.isclose(unit, place.unit)), None)
@@ -362,7 +331,7 @@ def _told(place: Place, kind: str) -> Place:
         askew = np.degrees(np.arccos(min(1.0, abs(front[axis]))))
         about = f"{askew:.0f}° off " if askew > 1 else ""
         notes.append(f"{up} is up and {about}{'+' if front[axis] > 0 else '-'}{'xyz'[axis]} is in front")
-    if kind == "floor":
+    if place.kind == "floor":
         notes.append("it stood with the floor at 0 and was moved to the body's feet")
     elif np.abs(place.shift).max() > 1e-3:
         notes.append("moved by ({:.0f}, {:.0f}, {:.0f}) mm".format(*(1e3 * place.shift)))

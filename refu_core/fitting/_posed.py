@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from refu_core.body import JOINT_NAMES, RigidTransforms, SmplBody
+from refu_core.body import JOINT_NAMES, SmplBody
 from refu_core.frames import N_JOINTS
 from refu_core.sdf import ExactSdf
 
@@ -20,12 +20,9 @@ class PosedBody:
     """A body of mean shape in some pose, and how far from it things are."""
 
     def __init__(self, body: SmplBody, pose: F64) -> None:
-        self.body, self.pose = body, pose
-        posed = body(torch.as_tensor(pose, dtype=torch.float32)[None])
-        self.vertices = posed.vertices[0]
-        self.transforms: RigidTransforms = posed.transforms
+        self.body = body
         self._sdf = ExactSdf(body.faces)
-        self._sdf.update(self.vertices)
+        self.move(pose)
 
     def move(self, pose: F64) -> None:
         """Takes another pose."""

@@ -75,12 +75,7 @@ def card_to_json(card: GarmentCard) -> str:
 
 
 def json_to_card(text: bytes | str) -> GarmentCard:
-    """The inverse of `card_to_json`.
-
-    Raises:
-        ValueError: not JSON, other fields than a card's, or values that make no garment.
-        RecursionError: JSON nested too deeply.
-    """
+    """The inverse of `card_to_json`. Raises `ValueError` for what is no card, `RecursionError` for JSON too deep."""
     values = parse_json(text.encode() if isinstance(text, str) else text)
     wanted = [field.name for field in fields(GarmentCard)]
     if not isinstance(values, dict) or sorted(values) != sorted(wanted):

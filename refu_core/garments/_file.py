@@ -45,8 +45,8 @@ def garment_files() -> dict[str, Path]:
     return found
 
 
-_ARRAYS = ("v_template", "f", "weights", "shapedirs")
-_UV = ("uv", "uv_f")
+_NEEDED = ("v_template", "f", "weights", "shapedirs", "body", "card")
+_OPTIONAL = ("styledirs", "uv", "uv_f")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 
 
@@ -82,11 +82,8 @@ def _unknown(garment: str, known: list[str]) -> str:
         return f"{garment} is a mesh, wanted a garment: make one of it first, by refu garment add {garment}"
     like = [name for name in known if name.startswith(f"{garment.lower()}-") or name == garment.lower()]
     like = like or get_close_matches(garment, known)
-    return (
-        f"no garment {garment!r}: wanted {' or '.join(like)}"
-        if like
-        else f"no garment {garment!r}: wanted one of {', '.join(known)}, or the path of an .npz"
-    )
+    wanted = " or ".join(like) if like else f"one of {', '.join(known)}, or the path of an .npz"
+    return f"no garment {garment!r}: wanted {wanted}"
 
 
 def garment_name(garment: str | os.PathLike[str]) -> str:
@@ -109,9 +106,7 @@ def _read(path: Path, device: str | torch.device, dtype: torch.dtype) -> Garment
     except GarmentError as error:
         msg = f"{path}: a garment has its file's name; {error}"
         raise GarmentError(msg) from error
-    data = read_npz(
-        path, keys=(*_ARRAYS, "styledirs", *_UV, "body", "card"), error=GarmentError, wanted="a garment, as an .npz"
-    )
+    data = read_npz(path, keys=(*_NEEDED, *_OPTIONAL), error=GarmentError, wanted="a garment, as an .npz")
     try:
         card = _check(data)
     except (ValueError, RecursionError, MeshError) as error:
@@ -140,11 +135,7 @@ def save_garment(template: GarmentTemplate, path: str | os.PathLike[str]) -> Pat
 
     Lengths are kept to a micrometre and shares to a hundred-thousandth, which halves the file.
 
-    Returns:
-        The file.
-
-    Raises:
-        GarmentError: the path doesn't end in `.npz`, or can't be written.
+    Returns the file. Raises `GarmentError` for a path that doesn't end in `.npz`, or can't be written.
     """
     require_type(template, GarmentTemplate, "a GarmentTemplate, such as load_garment gives", error=GarmentError)
     target = Path(path)
@@ -185,7 +176,7 @@ def _rounded(tensor: torch.Tensor, bits: int) -> NDArray[np.float32]:
 
 def _check(data: dict[str, NDArray[Any]]) -> GarmentCard:
     """The card of a garment's file. Raises `ValueError` or `MeshError` where file and card make no garment."""
-    missing = [key for key in (*_ARRAYS, "body", "card") if key not in data]
+    missing = [key for key in _NEEDED if key not in data]
     if missing:
         msg = f"it has no {missing[0]}"
         raise ValueError(msg)

@@ -84,21 +84,14 @@ class GarmentTemplate:
 
     def to(self, *, device: str | torch.device | None = None, dtype: torch.dtype | None = None) -> GarmentTemplate:
         """The same garment on another device or in another precision."""
-        styledirs = None if self.styledirs is None else self.styledirs.to(device=device, dtype=dtype)
-        return replace(
-            self,
-            faces=self.faces.to(device=device),
-            weights=self.weights.to(device=device, dtype=dtype),
-            v_template=self.v_template.to(device=device, dtype=dtype),
-            shapedirs=self.shapedirs.to(device=device, dtype=dtype),
-            styledirs=styledirs,
-        )
+        own = {name: getattr(self, name) for name in ("weights", "v_template", "shapedirs", "styledirs")}
+        moved = {name: None if one is None else one.to(device=device, dtype=dtype) for name, one in own.items()}
+        return replace(self, faces=self.faces.to(device=device), **moved)
 
     def rest(self, betas: Tensor, style: Tensor | None = None) -> Tensor:
         """The template t(β, γ) in the T-pose [m], shape (B, V, 3), for betas (B, 10) and style (B, 4) or None.
 
-        Raises:
-            GarmentError: a style was asked of a garment that has one style only.
+        Raises `GarmentError`: a style was asked of a garment that has one style only.
         """
         require_type(betas, Tensor, _TENSOR, error=GarmentError)
         offset = betas @ self.shapedirs.T

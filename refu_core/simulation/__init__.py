@@ -25,5 +25,4 @@ from refu_core.simulation._sequences import SequencePlan as SequencePlan
 from refu_core.simulation._sequences import SequenceSettings as SequenceSettings
 from refu_core.simulation._sequences import simulate_sequences as simulate_sequences
 from refu_core.simulation._summary import summarise as summarise
-from refu_core.simulation._summary import summarise_sequences as summarise_sequences
 from refu_core.simulation._worker import SimulationSettings as SimulationSettings

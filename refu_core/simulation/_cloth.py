@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from refu_core.sdf import ExactSdf
 from refu_core.simulation._mesh import ClothTopology
-from refu_core.simulation._pairs import farthest_move, find_candidates, near_pairs
-from refu_core.simulation._solver import refresh_points, stale_points, substep
+from refu_core.simulation._pairs import find_candidates, near_pairs
+from refu_core.simulation._solver import refresh_points, substep
 
 F32 = NDArray[np.float32]
 I32 = NDArray[np.int32]
@@ -71,17 +71,25 @@ class _Skin:
         self.asked_at: F32 = np.full((n, 3), 1e6, np.float32)  # far away: everything is stale
         self.distance: F32 = np.zeros(n, np.float32)
 
+    def stale(self, points: F32) -> I32:
+        """Which of the points (N, 3) must be asked for again: those that have moved too far since the last time."""
+        near, slide = np.float32(_NEAR), np.float32(_SLIDE)
+        allowed = np.where(self.distance > near + slide, self.distance - near, slide)
+        return np.flatnonzero(_squared_way(points, self.asked_at) > allowed * allowed).astype(np.int32)
+
+
+def _squared_way(points: F32, before: F32) -> F32:
+    """The square of how far each point has gone [m²], shape (N,)."""
+    way = points - before
+    squared: F32 = (way * way).sum(1)
+    return squared
+
 
 class SimulatedCloth:
     """The simulated garment. Positions are relative to the body's root, in SMPL axes [m]; one thread, deterministic."""
 
     def __init__(
-        self,
-        topology: ClothTopology,
-        sdf: ExactSdf,
-        *,
-        piece: NDArray[np.intp],
-        settings: ClothSettings | None = None,
+        self, topology: ClothTopology, sdf: ExactSdf, *, piece: NDArray[np.intp], settings: ClothSettings
     ) -> None:
         """A garment of this topology against the body behind `sdf`.
 
@@ -90,46 +98,25 @@ class SimulatedCloth:
         `sdf` must have its BVH built on the same vertices whenever the same drape is simulated, and must not rebuild it
         by itself: the tree decides which of two equally close faces is found, and with it the last bit of the result.
         """
-        self.settings = settings or ClothSettings()
+        self.settings = settings
         self.topology = topology
         self._sdf = sdf
         self._body_faces = sdf.faces.cpu().numpy().astype(np.int32)
         n = topology.n_vertices
         # Bends first: in each sweep the stiffer edges have the last word.
-        ends = np.concatenate((topology.bends[topology.bend_order], topology.mesh.edges[topology.stretch_order]))
+        ends = np.concatenate((topology.bends, topology.edges))
         self._ends = ends.astype(np.uint32)  # without a sign no index has to be asked whether it counts from the end
-        h2 = self.settings.substep**2
-        self._softness = np.concatenate(
-            (
-                np.full(len(topology.bends), self.settings.bend_compliance / h2, np.float32),
-                np.full(len(topology.mesh.edges), self.settings.stretch_compliance / h2, np.float32),
-            )
+        compliance = np.repeat(
+            (settings.bend_compliance, settings.stretch_compliance), (len(topology.bends), len(topology.edges))
         )
+        self._softness: F32 = (compliance / settings.substep**2).astype(np.float32)
         self._piece = piece
         self.positions: F32 = np.zeros((n, 3), np.float32)
         self.velocities: F32 = np.zeros((n, 3), np.float32)
         self._previous: F32 = np.zeros((n, 3), np.float32)
-        self._anchors: tuple[NDArray[np.int32], NDArray[np.int32], F32, F32] | None = None
-        self._dress(np.zeros((n, 3), np.float32))
-
-    def _dress(self, rest: F32) -> None:
-        n = self.topology.n_vertices
-        self._rest = rest
-        self._told_apart: F32 = rest + np.float32(_APART) * self._piece[:, None].astype(np.float32)
-        self._skin = _Skin(n)
-        self._middles = _Skin(len(self.topology.mesh.edges))
-        self._searched_at: F32 = np.full((n, 3), 1e6, np.float32)  # far away: nothing that was found holds
-        none = np.zeros(0, np.int32)
-        self._candidates: tuple[I32, I32] = (none, none)
 
     def start(
-        self,
-        rest: F32,
-        positions: F32,
-        *,
-        eased: Sequence[F32] = (),
-        waist: NDArray[np.intp] | None = None,
-        body_rest: F32 | None = None,
+        self, rest: F32, positions: F32, *, eased: Sequence[F32], waist: NDArray[np.intp], body_rest: F32
     ) -> None:
         """Puts the cloth at `positions` (N, 3), at rest, with the rest lengths and masses of `rest` (N, 3).
 
@@ -138,43 +125,34 @@ class SimulatedCloth:
         `waist` vertices are held at the place of the skin that they have in the rest pose: the body at rest is
         `body_rest` (V, 3).
         """
-        self._dress(np.ascontiguousarray(rest, dtype=np.float32))
+        n, n_edges = self.topology.n_vertices, len(self.topology.mesh.edges)
+        self._told_apart: F32 = rest + np.float32(_APART) * self._piece[:, None].astype(np.float32)
+        self._skin, self._middles = _Skin(n), _Skin(n_edges)
+        self._searched_at: F32 = np.full((n, 3), 1e6, np.float32)  # far away: nothing that was found holds
         self.positions[:] = positions
         self.velocities[:] = 0
-        ends = self._rest[self._ends]
-        self._shortest: F32 = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).astype(np.float32)
-        self._longest = self._shortest
-        for shape in eased:
-            ends = shape[self._ends]
-            self._longest = np.maximum(
-                self._longest, np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).astype(np.float32)
-            )
+        self._shortest = self._lengths(rest)
+        self._longest = np.maximum.reduce([self._shortest, *(self._lengths(shape) for shape in eased)])
         self._longest = np.minimum(self._longest, self._shortest * np.float32(1 + self.settings.most_ease))
-        self._edge_length = float(np.median(self._shortest[-len(self.topology.mesh.edges) :]))
-        area = self.topology.vertex_areas(self._rest)
+        self._edge_length = float(np.median(self._shortest[-n_edges:]))
+        area = self.topology.vertex_areas(rest)
         # Slivers would get next to no mass and soak up every correction of their neighbours.
         area = np.maximum(area, 0.25 * np.median(area))
         self._inverse_mass: F32 = (1 / (self.settings.density * area)).astype(np.float32)
-        self._anchors = None
-        if waist is not None and len(waist):
-            assert body_rest is not None
-            self._anchors = self._anchor(waist, body_rest)
-
-    def _anchor(self, waist: NDArray[np.intp], body_rest: F32) -> tuple[NDArray[np.int32], NDArray[np.int32], F32, F32]:
         self._sdf.update(torch.from_numpy(body_rest))
-        points = self._rest[waist]
-        found = self._sdf.closest(torch.from_numpy(points))
+        found = self._sdf.closest(torch.from_numpy(rest[waist]))
         offset = np.maximum(found.distance.numpy() * found.sign.numpy(), self.settings.margin + 0.002)
-        return (
-            waist.astype(np.int32),
-            found.face.numpy(),
-            found.barycentrics.numpy(),
-            offset[:, None].astype(np.float32),
-        )
+        self._anchored = waist.astype(np.int32)
+        self._anchors = found.face.numpy(), found.barycentrics.numpy(), offset[:, None].astype(np.float32)
+
+    def _lengths(self, shape: F32) -> F32:
+        """Of what the distance constraints are between, in a shape (N, 3)."""
+        ends = shape[self._ends]
+        length: F32 = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).astype(np.float32)
+        return length
 
     def _anchor_points(self, body: F32) -> F32:
-        assert self._anchors is not None
-        _, face, weights, offset = self._anchors
+        face, weights, offset = self._anchors
         a, b, c = body[self._body_faces[face]].transpose(1, 0, 2)
         normal = np.cross(b - a, c - a)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True) + 1e-12
@@ -199,19 +177,13 @@ class SimulatedCloth:
         refresh = s.refresh if moving or careful else s.substeps
         h = np.float32(s.substep)
         motion = (body_to - body_from) / np.float32(s.substeps) if moving else None
-        empty3 = np.zeros((0, 3), np.float32)
-        anchor_vertex, anchor, anchor_motion = np.zeros(0, np.int32), empty3, empty3
-        if self._anchors is not None:
-            anchor_vertex = self._anchors[0]
-            anchor = np.ascontiguousarray(self._anchor_points(body_from))
-            target = self._anchor_points(body_to) if moving else anchor
-            anchor_motion = np.ascontiguousarray((target - anchor) / np.float32(s.substeps))
+        anchor = np.ascontiguousarray(self._anchor_points(body_from))
+        anchor_motion = np.ascontiguousarray((self._anchor_points(body_to) - anchor) / np.float32(s.substeps))
+        none = np.zeros((0, 3), np.float32)
         for first in range(0, s.substeps, refresh):
             body = body_from if motion is None else body_from + np.float32(first) * motion
             contacts = self._contacts(body, motion, everything=moving and first == 0)
-            edges = (
-                self._edge_contacts(body, motion) if careful else (np.zeros((0, 2), np.int32), empty3, empty3, empty3)
-            )
+            edges = self._edge_contacts(body, motion) if careful else (np.zeros((0, 2), np.int32), none, none, none)
             pairs = self._pairs()
             for _ in range(min(refresh, s.substeps - first)):
                 substep(
@@ -219,7 +191,7 @@ class SimulatedCloth:
                     self._ends, self._shortest, self._longest, self._softness,
                     h, gravity, np.float32(np.exp(-drag * s.substep)),
                     *contacts, np.float32(s.margin), np.float32(s.friction),
-                    anchor_vertex, anchor, anchor_motion, np.float32(s.anchor_stiffness),
+                    self._anchored, anchor, anchor_motion, np.float32(s.anchor_stiffness),
                     *pairs, np.float32(s.thickness),
                     *edges, np.float32(s.edge_margin),  # type: ignore[arg-type]  # mypy loses count after two unpackings
                     s.iterations, np.float32(_MAX_SPEED * s.substep),
@@ -229,7 +201,7 @@ class SimulatedCloth:
     def _pairs(self) -> tuple[I32, I32, F32]:
         """Vertices near a face of the same cloth that isn't near it in the rest shape, the face, and the side of it."""
         faces, reach = self.topology.mesh.faces, np.float32(_PAIR_REACH + 0.85 * self._edge_length)
-        if farthest_move(self.positions, self._searched_at) > _PAIR_SLACK / 2:
+        if float(np.sqrt(_squared_way(self.positions, self._searched_at).max())) > _PAIR_SLACK / 2:
             self._candidates = find_candidates(
                 self.positions,
                 faces,
@@ -241,16 +213,14 @@ class SimulatedCloth:
         return near_pairs(self.positions, faces, *self._candidates, np.float32(_PAIR_REACH))
 
     def _contacts(self, body: F32, motion: F32 | None, *, everything: bool) -> _Contacts:
-        stale = stale_points(
-            self.positions, self._skin.asked_at, self._skin.distance, np.float32(_NEAR), np.float32(_SLIDE), everything
-        )
+        stale = self._skin.stale(self.positions) if not everything else np.arange(len(self.positions), dtype=np.int32)
         return self._touch(self._skin, self.positions, stale, body, motion)
 
     def _edge_contacts(self, body: F32, motion: F32 | None) -> _Contacts:
         edges, skin = self.topology.mesh.edges, self._middles
         near = self._skin.distance[edges].max(1) < _NEAR
         middle = self.positions[edges].mean(1)
-        stale = stale_points(middle, skin.asked_at, skin.distance, np.float32(_NEAR), np.float32(_SLIDE), False)
+        stale = skin.stale(middle)
         which, point, direction, moved = self._touch(skin, middle, stale[near[stale]], body, motion)
         kept = near[which]
         return edges[which[kept]], point[kept], direction[kept], moved[kept]
@@ -271,10 +241,8 @@ class SimulatedCloth:
             self._body_faces, body, body if motion is None else motion, motion is not None, np.float32(_NEAR),
         )  # fmt: skip
 
-    def stretch(self, positions: F32 | None = None) -> F32:
-        """Length of each edge over its rest length, shape (E,); of vertices at `positions` if given, (N, 3) [m]."""
-        ends = (self.positions if positions is None else positions)[self.topology.mesh.edges]
-        order = self.topology.stretch_order
-        ratio = np.empty(len(order), np.float32)
-        ratio[order] = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)[order] / self._longest[-len(order) :]
-        return ratio
+    def stretch(self, positions: F32 | None = None) -> float:
+        """99.9th percentile of the edges' length over their rest length; of vertices elsewhere (N, 3) [m], if given."""
+        edges = slice(-len(self.topology.edges), None)
+        length = self._lengths(self.positions if positions is None else positions)[edges]
+        return float(np.percentile(length / self._longest[edges], 99.9))

@@ -9,27 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from refu_core._files import read_json
 from refu_core.errors import SimulationError
+from refu_core.simulation._joined import slices_of
 from refu_core.simulation._motion import FPS
 from refu_core.simulation._plan import TEST
 from refu_core.simulation._selection import CAUSES
-from refu_core.simulation._store import (
-    DONE,
-    FORMAT,
-    SEQUENCES,
-    SequenceShard,
-    Shard,
-    check_rows,
-    clip_names,
-    dequantise,
-    gather,
-    parts_of,
-    read_by_slot,
-    read_card,
-    rows_of,
-    shards_of,
-)
+from refu_core.simulation._store import DONE, FORMAT, SEQUENCES, Rows, dequantise, read_card, read_unseen
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,34 +87,57 @@ class GarmentSequence:
         return dequantise(np.asarray(self._units[frames]))
 
 
-class _Rows:
+class _Finished:
     """The finished rows of a set, in the order of their slots, memory-mapped and read-only.
 
-    Shards that are still being written may be read: those rows are there that were finished when the set was opened.
+    A set that is still being written may be read: those rows are there that were finished when it was opened.
     """
 
-    def __init__(self, path: Path, kind: str, shard: type[Shard], *, first_clip: int) -> None:
-        self.card: dict[str, Any] = read_card(path, kind)
+    def __init__(self, path: str | Path, kind: str, *, first_clip: int) -> None:
+        self._path = Path(path)
+        self.card: dict[str, Any] = read_card(self._path, kind)
         """What the set is: plan, settings, versions, and counts and yield once it is summarised."""
-        self._shards = shards_of(path, shard)
-        shapes = {shard.arrays["vertices"].shape[1:] for shard in self._shards}
-        if len(shapes) > 1:
-            msg = f"{path}: wanted shards of one garment, got rows of the shapes {sorted(shapes)}"
-            raise SimulationError(msg)
-        self.parts = parts_of(path, self.card, shapes.pop()[-2])
+        stored = Rows(self._path, kind)
+        self._columns, self._rows = stored.arrays, stored.finished(DONE)
+        self.parts = self._parts(self._columns["vertices"].shape[-2])
         """Which of a row's vertices are each garment's: several where garments were simulated together."""
-        self._where, self._rows = rows_of(self._shards, (DONE,))
-        self._clips = clip_names(self.card)
-        self._check(split=(0, 2))
-        is_test = self.column("split") == TEST
-        self._check(clip=(first_clip, np.where(is_test, len(self._clips["test"]), len(self._clips["train"]))))
-        self.train: NDArray[np.bool_] = ~is_test
-        """Which rows are for training, shape (M,)."""
-        self.test: NDArray[np.bool_] = is_test
+        self._clips = self._clip_names()
+        self._check("split", 0, 2)
+        self.test: NDArray[np.bool_] = self.column("split") == TEST
         """Which rows are kept for the test, shape (M,)."""
+        self.train: NDArray[np.bool_] = ~self.test
+        """Which rows are for training, shape (M,)."""
+        self._check("clip", first_clip, np.where(self.test, len(self._clips["test"]), len(self._clips["train"])))
 
-    def _check(self, **bounds: tuple[int, Any]) -> None:
-        check_rows(self._shards, self._where, self._rows, bounds)
+    def _parts(self, n_vertices: int) -> dict[str, slice]:
+        """Raises `SimulationError` for a card whose garments don't have that many vertices."""
+        garment = str(self.card.get("garment"))
+        parts = self.card.get("parts", {garment: n_vertices})
+        is_whole = isinstance(parts, dict) and all(type(count) is int and count > 0 for count in parts.values())
+        if not is_whole or sum(parts.values()) != n_vertices or list(parts) != garment.split("+"):
+            msg = f"{self._path}: wanted a card whose parts are the {n_vertices} vertices of {garment[:80]} by "
+            msg += f"garment, got {str(parts)[:80]}"
+            raise SimulationError(msg)
+        return slices_of(parts)
+
+    def _clip_names(self) -> dict[str, list[str]]:
+        """Names of the motions, by split. Raises `SimulationError` for a card that doesn't have them."""
+        clips = self.card.get("clips")
+        names = {split: clips.get(split) for split in ("train", "test")} if isinstance(clips, dict) else {}
+        if not names or not all(isinstance(value, list) for value in names.values()):
+            msg = f"wanted a card with the names of the motions in clips.train and clips.test, got {str(clips)[:80]}"
+            raise SimulationError(msg)
+        return {split: [str(name) for name in value or ()] for split, value in names.items()}
+
+    def _check(self, name: str, low: int, high: Any) -> None:
+        """Raises `SimulationError` where a column of whole numbers is below `low`, or not below `high`."""
+        values = self.column(name)
+        high = np.broadcast_to(high, values.shape)
+        bad = np.flatnonzero((values < low) | (values >= high))
+        if bad.size:
+            msg = f"{self._path}: damaged: {name} is {values.flat[bad[0]]}, "
+            msg += f"wanted {low} to {high.flat[bad[0]] - 1}; simulate it again"
+            raise SimulationError(msg)
 
     def __len__(self) -> int:
         """Finished rows."""
@@ -142,48 +150,37 @@ class _Rows:
 
         Raises `SimulationError` for a name that is no column.
         """
-        columns = self._shards[0].arrays
-        if name not in columns:
-            msg = f"wanted one of the columns {', '.join(sorted(columns))}, got {name!r}"
+        if name not in self._columns:
+            msg = f"wanted one of the columns {', '.join(sorted(self._columns))}, got {name!r}"
             raise SimulationError(msg)
-        return gather(self._shards, self._where, self._rows, name)
+        found: NDArray[Any] = self._columns[name][self._rows]
+        return found
 
     def _row(self, index: int) -> tuple[dict[str, Any], str]:
         """The columns of one row, and its split. Raises `SimulationError` when there is no such row."""
         if not -len(self) <= index < len(self):
             msg = f"the set has {len(self)} finished rows, there is none of the index {index}"
             raise SimulationError(msg)
-        arrays = self._shards[self._where[index]].arrays
-        row = {name: values[self._rows[index]] for name, values in arrays.items()}
+        row = {name: values[self._rows[index]] for name, values in self._columns.items()}
         return row, "test" if row["split"] == TEST else "train"
 
 
-class GarmentDataset(_Rows):
+class GarmentDataset(_Finished):
     """The finished samples of a set, in the order of their slots, memory-mapped and read-only.
 
-    Shards that are still being written may be read: those samples are there that were finished when the set was opened.
+    A set that is still being made may be read: those samples are there that were finished when it was opened.
     """
 
     def __init__(self, path: str | Path) -> None:
-        """Opens all shards in the directory `path`.
-
-        Raises `SimulationError` when there is no set, no shard, a damaged one, or shards of different garments.
-        """
-        path = Path(path)
-        super().__init__(path, FORMAT, Shard, first_clip=-1)
+        """Opens the set in the directory `path`. Raises `SimulationError` when there is none, or a damaged one."""
+        super().__init__(path, FORMAT, first_clip=-1)
         plan = self.card.get("plan")
         count = plan.get("count") if isinstance(plan, dict) else None
         if not isinstance(count, int) or not 0 <= count < 2**31:
             msg = f"{path}: wanted a card with the number of samples in plan.count, got {str(count)[:80]}"
             raise SimulationError(msg)
-        self._check(slot=(0, count))
-        self._unseen = read_by_slot(path, "unseen", (count,))
-
-    def column(self, name: str) -> NDArray[Any]:
-        """A column of all samples, shape (M, ...): also `unseen`, which is kept by slot."""
-        if name == "unseen":
-            return np.asarray(self._unseen[super().column("slot")])
-        return super().column(name)
+        self._check("slot", 0, count)
+        self._unseen = read_unseen(self._path, count)
 
     def sample(self, index: int) -> GarmentSample:
         """The sample of this index, -M to M - 1; its arrays are copies.
@@ -206,16 +203,13 @@ class GarmentDataset(_Rows):
         )
 
 
-class GarmentSequences(_Rows):
+class GarmentSequences(_Finished):
     """The finished sequences of a set, in the order of their numbers, memory-mapped and read-only."""
 
     def __init__(self, path: str | Path) -> None:
-        """Opens all shards in the directory `path`, also while they are being written.
-
-        Raises `SimulationError` when there is no set of sequences, no shard, or a damaged one.
-        """
-        super().__init__(Path(path), SEQUENCES, SequenceShard, first_clip=0)
-        self._check(cause=(0, len(CAUSES) + 1))
+        """Opens the set in the directory `path`. Raises `SimulationError` when there is none, or a damaged one."""
+        super().__init__(path, SEQUENCES, first_clip=0)
+        self._check("cause", 0, len(CAUSES) + 1)
 
     def sequence(self, index: int) -> GarmentSequence:
         """The sequence of this index, -S to S - 1.
@@ -242,14 +236,6 @@ class GarmentSequences(_Rows):
 
 
 def open_dataset(path: str | Path) -> GarmentDataset | GarmentSequences:
-    """Opens the set in the directory `path`: garments at rest, or sequences.
-
-    Raises:
-        SimulationError: there is no set, no shard, or a damaged one.
-    """
-    path = Path(path)
-    try:
-        kind = read_json(path / "card.json", error=SimulationError, wanted="a card")["format"]
-    except (SimulationError, KeyError, TypeError):
-        kind = None  # the reader of sets of garments says what is wrong
-    return GarmentSequences(path) if kind == SEQUENCES else GarmentDataset(path)
+    """Opens the set in the directory `path`: garments at rest, or sequences. Raises `SimulationError` as they do."""
+    is_sequences = read_card(Path(path), FORMAT, SEQUENCES)["format"] == SEQUENCES
+    return GarmentSequences(path) if is_sequences else GarmentDataset(path)

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from refu_core.body import DEFAULT_GAP, Collider, SmplBody
-from refu_core.frames import N_BETAS, N_JOINTS
-from refu_core.garments import N_STYLES, GarmentTemplate
+from refu_core.frames import N_JOINTS
+from refu_core.garments import GarmentTemplate
 from refu_core.realtime._turn import RootTurn
 from refu_core.sdf import ExactSdf
 from refu_core.simulation._cloth import F32, ClothSettings, SimulatedCloth
@@ -95,13 +95,18 @@ def comfort_poses() -> NDArray[np.float32]:
     return np.stack((hang, bend, raised, spread))
 
 
+def _alone(values: NDArray[np.floating]) -> torch.Tensor:
+    """Coefficients (K,) as a batch of one body, (1, K)."""
+    return torch.as_tensor(values, dtype=torch.float32)[None]
+
+
 @torch.no_grad()
 def colliders(body: SmplBody, collider: Collider, poses: NDArray[np.floating], betas: NDArray[np.floating]) -> F32:
     """The colliders of a body in poses (P, 24, 3) [rad] and a shape (10,), root rotation included [m], (P, V, 3).
 
     Overlaps are pulled apart as the root sees them, as `refu_core.realtime.dress` does it: the root only turns.
     """
-    shape = torch.as_tensor(betas, dtype=torch.float32).view(1, N_BETAS)
+    shape = _alone(betas)
     turns, at_root = RootTurn.taken_off(torch.as_tensor(poses, dtype=torch.float32), body.rest_joints(shape))
     posed = body(at_root, shape)
     found = collider(posed.vertices, posed.transforms)
@@ -118,8 +123,6 @@ class SettledDrape:
     """Root mean square speed that is left [m/s]."""
     stretch: float
     """99.9th percentile of the edges' length over their rest length."""
-    n_frames: int
-    """Simulated frames."""
 
 
 class Draper:
@@ -145,28 +148,25 @@ class Draper:
         self.cloth = SimulatedCloth(
             self.topology, sdf, piece=self.outfit.number_of_vertex, settings=self.settings.cloth
         )
-        self.waist = self._waists()
+        self._waist = self._waists()
         self._comfort = comfort_poses()
-        self._canonical: tuple[bytes, F32, F32, float] | None = None
+        self._canonical: tuple[bytes, F32, F32] | None = None
 
-    def _waists(self) -> NDArray[np.intp] | None:
-        """Vertices of the bands that hold garments at the waist; None where all hang from the shoulders."""
+    def _waists(self) -> NDArray[np.intp]:
+        """Vertices of the bands that hold garments at the waist; none where all hang from the shoulders."""
         vertices, loops = self.garment.v_template.numpy(), self.topology.boundary_loops()
-        found = []
+        found = [np.zeros(0, np.intp)]
         for garment in self.outfit.garments:
             if garment.card.held_at_waist:
                 part = self.outfit.parts[garment.name]
                 rims = [rim for rim in loops if part.start <= rim[0] < part.stop]
                 loop = max(rims, key=lambda rim: float(vertices[rim, 1].mean()))
                 found.append(np.flatnonzero(self.topology.distance_from(vertices, loop) < self.settings.waistband))
-        return np.concatenate(found) if found else None
+        return np.concatenate(found)
 
     def rest(self, betas: NDArray[np.floating], style: NDArray[np.floating]) -> F32:
         """The garment cut for this shape and style [m], shape (N, 3): its edges are the cloth's rest lengths."""
-        gamma = (
-            None if self.garment.styledirs is None else torch.as_tensor(style, dtype=torch.float32).view(1, N_STYLES)
-        )
-        rest: F32 = self.garment.rest(torch.as_tensor(betas, dtype=torch.float32).view(1, N_BETAS), gamma)[0].numpy()
+        rest: F32 = self.garment.rest(_alone(betas), self.garment.own(_alone(style)))[0].numpy()
         return rest
 
     def bodies(self, poses: NDArray[np.floating], betas: NDArray[np.floating]) -> F32:
@@ -178,10 +178,9 @@ class Draper:
         key = np.concatenate((betas, style)).astype(np.float32).tobytes()
         if self._canonical is None or self._canonical[0] != key:
             self._canonical = (key, *self._settle_canonical(betas, style))
-        _, positions, body, _ = self._canonical
-        return positions, body
+        return self._canonical[1:]
 
-    def _settle_canonical(self, betas: NDArray[np.floating], style: NDArray[np.floating]) -> tuple[F32, F32, float]:
+    def _settle_canonical(self, betas: NDArray[np.floating], style: NDArray[np.floating]) -> tuple[F32, F32]:
         # Dressed in the T-pose that it was cut in: lowered by skinning, an armpit would start out folded into itself.
         s = self.settings
         rest = self.rest(betas, style)
@@ -194,23 +193,22 @@ class Draper:
         for after in self.bodies(pose_path(np.zeros((N_JOINTS, 3)), canonical_pose(), s.lower_frames), betas):
             self.cloth.frame(body, after, gravity=gravity, drag=s.drag[1])
             body = after
-        speed = np.inf
         for k in range(s.canonical_frames):
             speed = self.cloth.frame(body, body, gravity=gravity, drag=s.drag[2])
             if k > 8 and speed < s.rest_speed / 2:
                 break
-        return self.cloth.positions.copy(), body, speed
+        return self.cloth.positions.copy(), body
 
     def begin(self, positions: F32, betas: NDArray[np.floating], style: NDArray[np.floating], body: F32) -> None:
         """Puts the cloth of a shape and style at `positions` (N, 3), at rest, for the body's vertices (V, 3) [m]."""
         rest = self.rest(betas, style)
-        shape = torch.as_tensor(betas, dtype=torch.float32).view(1, N_BETAS)
+        shape = _alone(betas)
         transforms = self.body(self._comfort, shape).transforms
         eased = self.garment.pose(torch.from_numpy(rest).expand(len(self._comfort), -1, -1), transforms).numpy()
         body_rest = self.body.rest_vertices(shape)[0].numpy()
         self._sdf.update(torch.from_numpy(body_rest))
         self._sdf.rebuild()
-        self.cloth.start(rest, positions, eased=list(eased), waist=self.waist, body_rest=body_rest)
+        self.cloth.start(rest, positions, eased=list(eased), waist=self._waist, body_rest=body_rest)
         self.rebuild(body)
 
     def rebuild(self, body: F32) -> None:
@@ -242,27 +240,16 @@ class Draper:
             gravity = Rotation.from_rotvec(tilt[0]).inv().apply(down).astype(np.float32)
             self.cloth.frame(body, after, gravity=gravity, drag=s.drag[1])
             body = after
-        speed = np.inf
-        settled = 0
-        while settled < s.settle_frames[1] - s.careful_frames:
+        fewest, most = (count - s.careful_frames for count in s.settle_frames)
+        for settled in range(1, most + 1):
             speed = self.cloth.frame(body, body, gravity=gravity, drag=s.drag[2])
-            settled += 1
-            if speed < s.rest_speed and settled >= s.settle_frames[0] - s.careful_frames:
+            if speed < s.rest_speed and settled >= fewest:
                 break
         for _ in range(s.careful_frames):
             speed = self.cloth.frame(body, body, gravity=gravity, drag=s.drag[2], careful=True)
-        return SettledDrape(
-            self._with_root(self.cloth.positions, root, betas),
-            speed,
-            self.stretch(),
-            n + settled + s.careful_frames,
-        )
-
-    def stretch(self, vertices: F32 | None = None) -> float:
-        """99.9th percentile of the last drape's stretch; with its vertices (N, 3) [m] elsewhere, if given."""
-        return float(np.percentile(self.cloth.stretch(vertices), 99.9))
+        return SettledDrape(self._with_root(self.cloth.positions, root, betas), speed, self.cloth.stretch())
 
     def _with_root(self, points: F32, root: Rotation, betas: NDArray[np.floating]) -> F32:
-        pelvis = self.body.rest_joints(torch.as_tensor(betas, dtype=torch.float32).view(1, N_BETAS))[0, 0].numpy()
+        pelvis = self.body.rest_joints(_alone(betas))[0, 0].numpy()
         turned: F32 = np.ascontiguousarray(root.apply(points.astype(np.float64) - pelvis) + pelvis, dtype=np.float32)
         return turned

@@ -19,19 +19,15 @@ class ClothTopology:
     """What constraints on a garment of N vertices are between."""
 
     mesh: Connectivity
+    edges: NDArray[np.int32]
+    """Those of the mesh by colour, shape (E, 2): no two neighbours in the list share a vertex, which keeps a
+    processor's pipeline full."""
     bends: NDArray[np.int32]
-    """The two vertices opposite each inner edge, shape (B, 2)."""
-    stretch_order: NDArray[np.intp]
-    """`mesh.edges` by colour: no two neighbours in the list share a vertex, which keeps a processor's pipeline full."""
-    bend_order: NDArray[np.intp]
-    """The same for `bends`."""
+    """The two vertices opposite each inner edge, by colour, too, shape (B, 2)."""
 
     @staticmethod
     def of(mesh: Connectivity) -> ClothTopology:
-        """The topology of a garment.
-
-        Raises `MeshError` when an edge has more than two faces.
-        """
+        """The topology of a garment. Raises `MeshError` when an edge has more than two faces."""
         opposite = mesh.faces[:, [2, 0, 1]].reshape(-1)
         count = mesh.n_faces_of_edge
         if count.max(initial=0) > 2:
@@ -41,7 +37,7 @@ class ClothTopology:
         first = np.concatenate(([0], np.cumsum(count)))[:-1]
         inner = count == 2
         bends = np.stack((by_edge[first[inner]], by_edge[first[inner] + 1]), 1)
-        return ClothTopology(mesh, bends, _colour_order(mesh.edges), _colour_order(bends))
+        return ClothTopology(mesh, _by_colour(mesh.edges), _by_colour(bends))
 
     @property
     def n_vertices(self) -> int:
@@ -74,8 +70,8 @@ class ClothTopology:
         )
 
 
-def _colour_order(pairs: NDArray[np.int32]) -> NDArray[np.intp]:
-    """An order in which pairs of one colour (no shared vertex) follow each other; greedy, deterministic."""
+def _by_colour(pairs: NDArray[np.int32]) -> NDArray[np.int32]:
+    """The pairs in an order in which those of one colour (no shared vertex) follow each other; greedy."""
     taken: dict[int, int] = {}  # bit mask of the colours around a vertex
     colour = np.empty(len(pairs), np.int64)
     for k, (i, j) in enumerate(pairs.tolist()):
@@ -84,4 +80,5 @@ def _colour_order(pairs: NDArray[np.int32]) -> NDArray[np.intp]:
         taken[i] = taken.get(i, 0) | bit
         taken[j] = taken.get(j, 0) | bit
         colour[k] = bit.bit_length()
-    return np.argsort(colour, kind="stable")
+    found: NDArray[np.int32] = pairs[np.argsort(colour, kind="stable")]
+    return found

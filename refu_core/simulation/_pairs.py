@@ -108,16 +108,3 @@ def near_pairs(x: _Floats, faces: _Ints, vertex: _Ints, face: _Ints, reach: floa
             side[count] = 1.0 if height >= 0 else -1.0
             count += 1
     return vertex[which[:count]], faces[face[which[:count]]], side[:count]
-
-
-@numba.njit(cache=True)
-def farthest_move(x: _Floats, before: _Floats) -> float:
-    """The longest way that a vertex has gone [m]."""
-    longest2 = np.float32(0.0)
-    for i in range(x.shape[0]):
-        moved2 = np.float32(0.0)
-        for k in range(3):
-            d = x[i, k] - before[i, k]
-            moved2 += d * d
-        longest2 = max(longest2, moved2)
-    return float(np.sqrt(longest2))

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import platform
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -19,7 +19,7 @@ from refu_core.errors import SimulationError
 from refu_core.simulation._plan import SamplePlan
 from refu_core.simulation._poses import Clip, as_clips, split_clips
 from refu_core.simulation._selection import CAUSES
-from refu_core.simulation._store import QUANTUM, TO_DO, locked, read_card, write_card
+from refu_core.simulation._store import QUANTUM, TO_DO, Rows, has_rows, locked, read_card, write_card
 from refu_core.simulation._summary import summarise
 from refu_core.simulation._worker import SimulationSettings, Simulator, SlotSimulator
 
@@ -32,30 +32,13 @@ class Progress:
     """Slots (samples, or whole sequences) that are finished."""
     total: int
     """Slots of the set."""
-    seconds_left: float
-    """By the pace of this run; infinite before its first slot."""
     dropped: dict[str, int]
     """What failed in the finished slots, by cause: attempts at a sample, frames of a sequence."""
 
 
-ROWS = "shard-0-of-1"
-"""Folder of the rows. Sets of former versions may have several, of which each has a part."""
-
-
-@dataclass
-class _RowMaker:
-    """Makes a process's function from slots to their rows."""
-
-    make: Callable[[], Simulator]
-    _made: Simulator | None = None
-
-    def __call__(self) -> Callable[[list[int]], list[dict[str, Any]]]:
-        simulator = self._made or self.make()
-        return lambda slots: [simulator.simulate(slot) for slot in slots]
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Another process makes its own: what it is made of is small."""
-        return _RowMaker, (self.make,)
+def _block_maker(make: Callable[[], Simulator]) -> Callable[[list[int]], list[dict[str, Any]]]:
+    """A process's function from slots to their rows; what it is made of is small enough to be sent there."""
+    return make().block
 
 
 def produce(
@@ -65,42 +48,34 @@ def produce(
     engine: Engine | None,
     progress: Callable[[Progress], None] | None,
     **card: Any,
-) -> Simulator:
-    """Simulates what is left of the set in `output`; returns this process's simulator.
+) -> None:
+    """Simulates what is left of the set in `output`, whose card says `card` besides. Raises as `simulate_dataset`.
 
-    Rows are written here alone, whoever has simulated them: other machines need not see the folder.
-
-    Args:
-        make: makes a process's simulator; it is sent to each process, so it is small.
-        output: directory of the set.
-        engine: who simulates; None for this process.
-        progress: called after each slot.
-        card: what the set's card says besides.
-
-    Raises:
-        SimulationError: see `simulate_dataset`.
+    `make` makes a process's simulator; it is sent to each process, so it is small. Rows are written here alone, whoever
+    has simulated them: other machines need not see the folder.
     """
     # Made here although workers make their own: a body or garment that won't do is refused before anything is written.
     simulator = make()
     blocks = [list(block) for block in simulator.plan.blocks()]
     slots = np.array([slot for block in blocks for slot in block], np.int32)
     _open_set(output, _card_of(simulator) | card)
-    directory = output / ROWS
-    if not directory.exists():
-        simulator.rows.create(directory, slots, simulator.shape)
-    with locked(directory):
-        rows = simulator.rows(directory, mode="r+")
+    if not has_rows(output):
+        Rows.create(output, simulator.kind, slots, simulator.shape)
+    with locked(output):
+        rows = Rows(output, simulator.kind, mode="r+")
         if not np.array_equal(rows.arrays["slot"], slots):
-            msg = f"{directory}: holds other slots than this plan's; give another output directory"
+            msg = f"{output}: holds other slots than this plan's; give another output directory"
             raise SimulationError(msg)
         state, row_of = rows.arrays["state"], {int(slot): row for row, slot in enumerate(slots)}
         left = [[slot for slot in block if state[row_of[slot]] == TO_DO] for block in blocks]
+        make_block: Callable[[], Callable[[list[int]], list[dict[str, Any]]]] = partial(_block_maker, make)
         if engine is None or isinstance(engine, InProcess):  # a slot at a time is on disk soonest
+            engine, make_block = InProcess(), lambda: simulator.block
             left = [[slot] for block in left for slot in block]
         left = [block for block in left if block]
         # A whole block goes to one process, for the sake of its common canonical drape.
-        started, done, total, lost = time.monotonic(), 0, sum(map(len, left)), 0
-        for index, made in (engine or InProcess()).run(_RowMaker(make, simulator), left):
+        done, total, lost = 0, sum(map(len, left)), 0
+        for index, made in engine.run(make_block, left):
             if isinstance(made, Lost):
                 lost += len(left[index])
                 continue
@@ -108,17 +83,12 @@ def produce(
                 rows.write(row_of[slot], values)
             done += len(made)
             if progress is not None:
-                pace = (time.monotonic() - started) / done
                 dropped = rows.arrays["dropped"][state != TO_DO].sum(0, dtype=np.int64).tolist()
-                causes = dict(zip(CAUSES, dropped, strict=True))
-                progress(Progress(len(slots) - total + done, len(slots), pace * (total - done), causes))
+                progress(Progress(len(slots) - total + done, len(slots), dict(zip(CAUSES, dropped, strict=True))))
         if lost:
-            msg = (
-                f"{lost} of {total} slots were lost with their processes (out of memory?): finished samples are kept, "
-            )
-            msg += "run the same command to go on"
+            msg = f"{lost} of {total} slots were lost with their processes (out of memory?): "
+            msg += "finished samples are kept, run the same command to go on"
             raise SimulationError(msg)
-    return simulator
 
 
 def _card_of(simulator: Simulator) -> dict[str, Any]:
@@ -167,20 +137,11 @@ def _open_set(output: Path, card: dict[str, Any]) -> None:
     except OSError as error:
         msg = f"{output}: can't be written: {error}"
         raise SimulationError(msg) from error
-    there = read_card(output, card["format"])
-    differing = [key for key in _MUST_AGREE if _plain(there.get(key)) != _plain(card[key])]
+    there, wanted = read_card(output, card["format"]), json.loads(json.dumps(card))
+    differing = [key for key in _MUST_AGREE if there.get(key) != wanted[key]]
     if differing:
         msg = f"{output}: holds another set ({', '.join(differing)} differ); give another output directory"
         raise SimulationError(msg)
-
-
-def _plain(value: Any) -> Any:
-    """As JSON has it: tuples are lists."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    return value
 
 
 def simulate_dataset(
@@ -227,12 +188,9 @@ def simulate_dataset(
         MeshError: the body isn't watertight.
         BodyError, GarmentError: no such body or garment.
     """
-    output = Path(output)
-    clips: tuple[list[Clip], list[Clip]] = ([], [])
+    clips: tuple[list[Clip], list[Clip]] = ([], []) if motions is None else split_clips(as_clips(motions))
     recorded_share = 0.0 if motions is None else recorded_share
     plan = SamplePlan(garment, count, seed=seed, test_share=test_share, recorded_share=recorded_share, pivots=pivots)
-    if motions is not None:
-        clips = split_clips(as_clips(motions))
     make = partial(SlotSimulator, plan, clips, settings or SimulationSettings(), body)
-    produce(make, output, engine=engine, progress=progress)
+    produce(make, Path(output), engine=engine, progress=progress)
     return summarise(output)

@@ -9,7 +9,6 @@ import numpy as np
 
 from refu_core.metrics import CollisionChecker, SheetChecker
 from refu_core.simulation._cloth import F32
-from refu_core.simulation._drape import SettledDrape
 
 CAUSES = ("body_collision", "self_intersection", "stretch", "unsettled")
 """Why a sample isn't taken, in the order of the checks."""
@@ -35,13 +34,11 @@ class Selector:
         self._body = CollisionChecker(body_faces)
         self._itself = SheetChecker(garment_faces)
 
-    def cause(self, vertices: F32, body: F32, drape: SettledDrape | None = None) -> str | None:
+    def cause(self, vertices: F32, body: F32, *, stretch: float = 1.0, speed: float = 0.0) -> str | None:
         """One of `CAUSES`, or None for a drape with nothing against it.
 
-        Args:
-            vertices: the garment as it will be read back [m], shape (N, 3).
-            body: the vertices of what it lies on [m], shape (V, 3).
-            drape: how it settled; without it only collisions are looked for.
+        `vertices` (N, 3) are the garment's as they will be read back, `body` (V, 3) those of what it lies on [m];
+        `stretch` and `speed` are what `SettledDrape` calls so.
         """
         self._body.update(body)
         if not self._body.check(vertices, self._garment_faces).is_free:
@@ -49,8 +46,6 @@ class Selector:
         self._itself.update(vertices)
         if len(self._itself.with_itself()):
             return "self_intersection"
-        if drape is not None and drape.stretch > self.settings.stretch:
+        if stretch > self.settings.stretch:
             return "stretch"
-        if drape is not None and drape.speed > self.settings.speed:
-            return "unsettled"
-        return None
+        return "unsettled" if speed > self.settings.speed else None

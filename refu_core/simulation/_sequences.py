@@ -19,14 +19,14 @@ from refu_core.errors import SimulationError
 from refu_core.frames import N_BETAS
 from refu_core.garments import N_STYLES
 from refu_core.simulation._cloth import F32
-from refu_core.simulation._drape import GRAVITY, SettledDrape
+from refu_core.simulation._drape import GRAVITY
 from refu_core.simulation._motion import FPS, STEPS, DrawnMotion, draw_motion
 from refu_core.simulation._plan import TEST, TRAIN, names_of, truncated_normal
 from refu_core.simulation._poses import Clip, as_clips, split_clips
 from refu_core.simulation._produce import Progress, produce
 from refu_core.simulation._selection import CAUSES
-from refu_core.simulation._store import DONE, SEQUENCES, SequenceShard, dequantise, quantise
-from refu_core.simulation._summary import summarise_sequences
+from refu_core.simulation._store import DONE, SEQUENCES, dequantise, quantise
+from refu_core.simulation._summary import summarise
 from refu_core.simulation._worker import SimulationSettings, Simulator
 
 
@@ -103,7 +103,6 @@ class SequenceSimulator(Simulator):
     """Simulates whole sequences."""
 
     kind = SEQUENCES
-    rows = SequenceShard
     plan: SequencePlan
     settings: SequenceSettings
 
@@ -128,30 +127,23 @@ class SequenceSimulator(Simulator):
         betas, style = plan.style_shape(slot)
         row: dict[str, Any] = {"slot": slot, "shape": slot % plan.shapes, "split": split, "betas": betas}
         motion = plan.motion(slot, self.clips[split == TEST])
-        vertices, cause, stretch, speed = self._play(motion.poses, motion.acceleration(), betas, style)
-        row |= {"style": style, "vertices": vertices, "cause": cause, "stretch": stretch, "speed": speed}
-        row |= {"pose": motion.poses[::STEPS], "transl": motion.transl[::STEPS]}
+        played = self._play(motion, betas, style)
+        row |= {"style": style, **played, "pose": motion.poses[::STEPS], "transl": motion.transl[::STEPS]}
         row |= {"clip": motion.clip, "start": motion.start, "mirrored": motion.mirrored}
-        row |= {"dropped": np.bincount(cause, minlength=len(CAUSES) + 1)[1:], "state": DONE}
+        row |= {"dropped": np.bincount(played["cause"], minlength=len(CAUSES) + 1)[1:], "state": DONE}
         return row | {"seconds": time.perf_counter() - started}
 
-    def _play(
-        self,
-        poses: NDArray[np.float32],
-        acceleration: NDArray[np.float64],
-        betas: NDArray[np.float32],
-        style: NDArray[np.float32],
-    ) -> tuple[NDArray[np.int16], NDArray[np.uint8], F32, F32]:
-        """Garments (T, N, 3), causes, stretch and speed (T,) of a motion of n simulated frames.
+    def _play(self, motion: DrawnMotion, betas: F32, style: F32) -> dict[str, NDArray[Any]]:
+        """Garments (T, N, 3), causes, stretch and speed (T,) of a motion, by the names of their columns.
 
         The cloth lives in a frame of reference that goes with the root and doesn't turn: there, the body's acceleration
         is a gravity of the other sign, and the air is still. It starts at rest in the first pose.
         """
-        s, cloth = self.settings, self._draper.cloth
+        s, cloth, poses = self.settings, self._draper.cloth, motion.poses
         drape = self._draper.drape(poses[0], betas, style)
         bodies = np.concatenate([self._draper.bodies(poses[k : k + 50], betas) for k in range(0, len(poses), 50)])
         self._draper.begin(drape.vertices, betas, style, bodies[0])
-        gravity = (np.array([0, -GRAVITY, 0]) - acceleration).astype(np.float32)
+        gravity = (np.array([0, -GRAVITY, 0]) - motion.acceleration()).astype(np.float32)
         n = len(poses[::STEPS])
         vertices = np.zeros((n, *drape.vertices.shape), np.int16)
         cause = np.full(n, 1 + CAUSES.index("unsettled"), np.uint8)
@@ -168,15 +160,12 @@ class SequenceSimulator(Simulator):
             if k % STEPS == 0:
                 t = k // STEPS
                 vertices[t] = quantise(cloth.positions)
-                stretch[t], speed[t] = self._draper.stretch(), now
-                cause[t] = self._examine(dequantise(vertices[t]), body, float(stretch[t]))
-        return vertices, cause, stretch, speed
-
-    def _examine(self, stored: F32, body: F32, stretch: float) -> int:
-        """0, or 1 and above for the cause why a frame isn't in the set; a moving cloth may be fast."""
-        worst = max(stretch, self._draper.stretch(stored))  # rounding included, as for samples
-        cause = self._selector.cause(stored, body, SettledDrape(stored, 0.0, worst, 1))
-        return 0 if cause is None else 1 + CAUSES.index(cause)
+                stretch[t], speed[t] = cloth.stretch(), now
+                read = dequantise(vertices[t])  # rounding included, as for samples; a moving cloth may be fast
+                worst = max(float(stretch[t]), cloth.stretch(read))
+                found = self._selector.cause(read, body, stretch=worst)
+                cause[t] = 0 if found is None else 1 + CAUSES.index(found)
+        return {"vertices": vertices, "cause": cause, "stretch": stretch, "speed": speed}
 
 
 def simulate_sequences(
@@ -195,28 +184,11 @@ def simulate_sequences(
 ) -> dict[str, Any]:
     """Simulates a set of `count` sequences of a built-in garment, or goes on with one that was interrupted.
 
-    What holds for `simulate_dataset` holds here; the unit that is finished or not is a whole sequence.
+    What holds for `simulate_dataset` holds here; the unit that is finished or not is a whole sequence. Best make
+    `count` a multiple of `shapes`, the body shapes in the set. `motions` must be there, of `seconds` or more each: that
+    is the length of a sequence.
 
-    Args:
-        garment: `tshirt-male` or another garment, or several that are worn together.
-        count: sequences in the set, training and test together; best a multiple of `shapes`.
-        output: directory of the set; it is made, or must hold the beginning of the same set.
-        motions: a folder of motion files, or what `load_clips` has read, two at least, of `seconds` or more.
-        shapes: body shapes in the set.
-        seconds: length of each sequence.
-        body: name or file of a body; None for the one the garment was cut for.
-        seed: of everything that is drawn.
-        engine: what shares the work among processes (`refu_lab.fleet.open_engine`); None for this one alone.
-        settings: of simulation and selection.
-        progress: called in this process after each sequence.
-
-    Returns:
-        The card of the set, as it stands in `card.json`.
-
-    Raises:
-        SimulationError: as `simulate_dataset`, and for motions that are too short.
-        MeshError: the body isn't watertight.
-        BodyError, GarmentError: no such body or garment.
+    Raises as `simulate_dataset`, and `SimulationError` for motions that are too short.
     """
     if motions is None:
         msg = f"sequences need recorded motion: give a folder of motion files, of {seconds:g} s or more each"
@@ -225,4 +197,4 @@ def simulate_sequences(
     clips = split_clips(as_clips(motions))
     make = partial(SequenceSimulator, plan, clips, settings or SequenceSettings(), body)
     produce(make, Path(output), engine=engine, progress=progress, fps=FPS)
-    return summarise_sequences(output)
+    return summarise(output)

@@ -206,28 +206,6 @@ def _separate_pairs(
 
 
 @numba.njit(cache=True)
-def stale_points(
-    x: _Floats, asked_at: _Floats, asked_distance: _Floats, near: float, slide: float, everything: bool
-) -> _Ints:
-    """Points whose distance to the skin must be asked again: those that moved too far since the last time."""
-    n = x.shape[0]
-    out = np.empty(n, np.int32)
-    count = 0
-    for i in range(n):
-        moved2 = np.float32(0.0)
-        for k in range(3):
-            d = x[i, k] - asked_at[i, k]
-            moved2 += d * d
-        allowed = slide
-        if asked_distance[i] > near + slide:
-            allowed = asked_distance[i] - near
-        if everything or moved2 > allowed * allowed:
-            out[count] = i
-            count += 1
-    return out[:count]
-
-
-@numba.njit(cache=True)
 def refresh_points(
     x: _Floats,
     face: _Ints,

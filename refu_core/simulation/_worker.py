@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -17,7 +17,7 @@ from refu_core.simulation._joined import JoinedGarments
 from refu_core.simulation._plan import TEST, SamplePlan, garments_of
 from refu_core.simulation._poses import Clip
 from refu_core.simulation._selection import CAUSES, SelectionSettings, Selector
-from refu_core.simulation._store import DONE, FORMAT, GIVEN_UP, Shard, dequantise, quantise
+from refu_core.simulation._store import DONE, FORMAT, GIVEN_UP, dequantise, quantise
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,6 @@ class Simulator(ABC):
 
     kind: ClassVar[str]
     """Format of the set."""
-    rows: ClassVar[type[Shard]]
-    """The kind of shard that the rows go to."""
 
     def __init__(
         self,
@@ -47,10 +45,7 @@ class Simulator(ABC):
     ) -> None:
         """For the clips of the training and of the test set, on a body or (None) the one the garment is cut for.
 
-        On another one the garments are transferred to it (`refu_core.garments.worn_on`).
-
-        Raises `SimulationError` for garments of different bodies; `BodyError` or `GarmentError` where there is no such
-        body or garment; `MeshError` as `Draper`.
+        Raises `SimulationError` for garments of different bodies, others as loaders and `Draper` do.
         """
         self.plan = plan
         self.settings = settings
@@ -67,6 +62,10 @@ class Simulator(ABC):
         """Of a row's garment."""
         return (self.garment.n_vertices, 3)
 
+    def block(self, slots: list[int]) -> list[dict[str, Any]]:
+        """The rows of some slots."""
+        return [self.simulate(slot) for slot in slots]
+
     @abstractmethod
     def simulate(self, slot: int) -> dict[str, Any]:
         """The columns of a slot's row (see `_store`)."""
@@ -76,15 +75,12 @@ class SlotSimulator(Simulator):
     """Simulates samples."""
 
     kind = FORMAT
-    rows = Shard
     plan: SamplePlan
 
     def simulate(self, slot: int) -> dict[str, Any]:
         """The columns of a slot's row (see `_store`)."""
-        start = time.perf_counter()
-        plan = self.plan
-        split = plan.split_of(slot)
-        pair = plan.pair_of(slot)
+        start, plan = time.perf_counter(), self.plan
+        split, pair = plan.split_of(slot), plan.pair_of(slot)
         betas, style = plan.style_shape(pair)
         dropped = np.zeros(len(CAUSES), np.uint8)
         row: dict[str, Any] = {"slot": slot, "pair": pair, "split": split, "betas": betas, "style": style}
@@ -109,5 +105,5 @@ class SlotSimulator(Simulator):
         body = self._draper.bodies(pose[None], betas)[0]
         # What is checked is what will be read, rounding included.
         read = dequantise(stored)
-        judged = replace(drape, stretch=max(drape.stretch, self._draper.stretch(read)))
-        return self._selector.cause(read, body, judged), stored
+        stretch = max(drape.stretch, self._draper.cloth.stretch(read))
+        return self._selector.cause(read, body, stretch=stretch, speed=drape.speed), stored

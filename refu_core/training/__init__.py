@@ -10,14 +10,12 @@ from refu_core.training._data import read_samples as read_samples
 from refu_core.training._data import split_validation as split_validation
 from refu_core.training._dynamics import DynamicsSettings as DynamicsSettings
 from refu_core.training._dynamics import train_dynamics as train_dynamics
-from refu_core.training._figures import backbone_figures as backbone_figures
 from refu_core.training._figures import displacements as displacements
 from refu_core.training._figures import posed_errors as posed_errors
 from refu_core.training._finetune import FINETUNE_MODES as FINETUNE_MODES
 from refu_core.training._finetune import FinetuneSettings as FinetuneSettings
 from refu_core.training._finetune import finetune as finetune
 from refu_core.training._loop import LoopSettings as LoopSettings
-from refu_core.training._losses import Losses as Losses
 from refu_core.training._losses import collision_loss as collision_loss
 from refu_core.training._losses import reconstruction_loss as reconstruction_loss
 from refu_core.training._losses import refu_loss as refu_loss

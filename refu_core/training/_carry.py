@@ -7,13 +7,14 @@ the samples bear that out. What is left, the samples say, as a linear function o
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from refu_core.backbones import (
@@ -22,16 +23,16 @@ from refu_core.backbones import (
     TailorNet,
     TailorNetConfig,
     build_backbone,
+    load_backbone,
     save_backbone,
     save_basis,
 )
-from refu_core.body import SmplBody
+from refu_core.body import SmplBody, load_fit
 from refu_core.errors import RefuError
 from refu_core.frames import N_BETAS
-from refu_core.garments import N_STYLES, GarmentTemplate, load_garment
+from refu_core.garments import N_STYLES, GarmentTemplate, load_garment, worn_on
 from refu_core.modes import SdfMode
 from refu_core.simulation import GarmentDataset, GarmentSequences, random_pose
-from refu_core.training._carried import Carried
 from refu_core.training._data import (
     TrainingSamples,
     TrainingSet,
@@ -40,13 +41,13 @@ from refu_core.training._data import (
     principal_components,
     read_samples,
 )
-from refu_core.training._figures import backbone_figures, posed_errors
+from refu_core.training._figures import backbone_figures, mpve
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage
-from refu_core.training._mirror import Mirror
+from refu_core.training._mirror import Mirror, OnSurface
 from refu_core.training._pretrain import CodeLoss
-from refu_core.training._progress import TrainingLog
 from refu_core.weights import load_weights, save_weights
 
+_CHUNK = 32
 _DOUBT = 0.1
 """Where less than this share of the mean is carried over, nothing is said for it."""
 BASE = SdfMode.HYBRID
@@ -85,6 +86,64 @@ class CarrySettings:
             raise RefuError(msg)
 
 
+class Carried:
+    """What the networks of one garment predict, on another.
+
+    Cloth is moved and posed as what it lies near, with the skinning weights that this has there: a displacement is
+    worth what its garment's weights make of it. With a garment's own weights a hem that hangs 100 mm off a person who
+    bends would be elsewhere, in the reach of the hands.
+    """
+
+    def __init__(
+        self, related: GarmentTemplate, garment: GarmentTemplate, body: SmplBody, settings: CarrySettings
+    ) -> None:
+        """For `garment` on its `body`, near which `related` lies once it is worn on the same body.
+
+        Raises `WeightsError` when no networks of `related` ship.
+        """
+        self.network = load_backbone("tailornet", related, mode=SdfMode.HYBRID)
+        fit = None if garment.body == related.body else load_fit(garment.body)
+        self._betas = None if fit is None else fit.difference(related.body).betas
+        worn = worn_on(related, fit)
+        vertices = garment.v_template.double().numpy()
+        nearest, place, distance = OnSurface.nearest(worn, vertices)
+        share = _smooth((settings.reach + settings.fade - distance) / settings.fade)
+        # Trousers go on where shorts end: a hem that swings there would be a step in them.
+        ends = _from_rim(worn, place)
+        goes_on = _smooth((_from_rim(garment, vertices) - ends) / settings.hem)
+        share *= 1 - goes_on * _smooth(1 - ends / settings.hem)
+        self._mixed = OnSurface(nearest.corners, nearest.weights * torch.as_tensor(share)[:, None])
+        self._garment, self._body = garment, body
+        kept = torch.as_tensor(1 - share, dtype=torch.float32)[:, None]
+        self._posed_as = replace(garment, weights=self._mixed(worn.weights[None])[0] + kept * garment.weights)
+
+    @torch.no_grad()
+    def __call__(self, betas: Tensor, pose: Tensor) -> Tensor:
+        """Displacements of the other garment [m], (B, V, 3), for its betas (B, 10) and poses (B, 24, 3) [rad]."""
+
+        def one(betas: Tensor, pose: Tensor) -> Tensor:
+            known = betas if self._betas is None else self._betas(betas).float()
+            there = self.network(known, pose, None).displacement
+            assert there is not None  # a network was asked for
+            rest, transforms = self._garment.rest(betas), self._body(pose, betas).transforms
+            posed = self._posed_as.pose(rest + self._mixed(there), transforms)
+            return self._garment.unpose(posed, transforms) - rest
+
+        return in_chunks(one, betas, pose, size=_CHUNK)
+
+
+def _smooth(share: NDArray[np.float64]) -> NDArray[np.float64]:
+    """From 0 to 1, level at both ends, for shares cut off there."""
+    cut: NDArray[np.float64] = np.clip(share, 0, 1)
+    return cut * cut * (3 - 2 * cut)
+
+
+def _from_rim(garment: GarmentTemplate, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How far `points` (P, 3) are from the nearest hem of a garment [m], shape (P,)."""
+    hem = garment.v_template.double().numpy()[np.unique(garment.mesh.boundary)]
+    return np.asarray(cKDTree(hem).query(points)[0])
+
+
 def carry_over(
     garment: str | GarmentTemplate,
     dataset: str | Path | GarmentDataset | GarmentSequences,
@@ -98,13 +157,12 @@ def carry_over(
     """Makes a garment's networks of those of a related one and few samples; writes `output`/basis and all modes.
 
     Args:
-        garment: name of a built-in garment, or a template; on its own body.
-        dataset: simulated set of it (`refu simulate`); fifty samples are worth it.
+        garment: as in `pretrain`; on its own body.
+        dataset: as in `pretrain`; fifty samples are worth it.
         output: folder of the weights.
         like: name of the related garment, one whose networks ship.
-        settings: how.
-        body: the body that the set was simulated on; the garment's built-in one if not given.
-        quiet: show no progress.
+        settings: the default ones if not given.
+        body, quiet: as in `pretrain`.
 
     Returns:
         The card: what was made of what, and its figures on the test split.
@@ -150,7 +208,7 @@ def carry_over(
         "dataset": opened.card,
         "figures": {
             **backbone_figures(model, test, body, template, mean=samples.displacement.mean(0)),
-            "carried_mm": round(float(posed_errors(carried(test.betas, test.pose), test, body, template).mean()), 3),
+            "carried_mm": mpve(carried(test.betas, test.pose), test, body, template),
             "borne_out": round(float(share.mean()), 3),
         },
     }
@@ -221,14 +279,15 @@ def _learn_carried(
     loop = Loop(
         model,
         settings.loop,
-        checkpoint=output / "carried.checkpoint",
-        identity=json.dumps([identity, asdict(settings)], sort_keys=True, default=str),
-        log=TrainingLog(output, name="carried", quiet=quiet),
+        folder=output,
+        name="carried",
+        identity=[identity, asdict(settings)],
         device=torch.device("cpu"),
+        quiet=quiet,
     )
     objective = Objective([model.low], model.low_code, CodeLoss(model))
     loop.run(TrainingStage("carried", objective, settings.steps, *parts))
-    (output / "carried.checkpoint").unlink(missing_ok=True)
+    loop.checkpoint.unlink(missing_ok=True)
 
 
 @torch.no_grad()

@@ -21,8 +21,7 @@ _MAX_BYTES = 16 << 30
 def save_checkpoint(path: Path, state: Mapping[str, Any]) -> None:
     """Writes tensors and plain values; the file is never half written.
 
-    Raises:
-        WeightsError: the disk can't be written.
+    Raises `WeightsError`: the disk can't be written.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

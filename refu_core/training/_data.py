@@ -13,15 +13,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from refu_core.backbones import BasisDecoder, style_shape
-from refu_core.body import SmplBody, load_body
+from refu_core.body import Collider, SmplBody, load_body
 from refu_core.errors import RefuError
-from refu_core.garments import GarmentTemplate, load_garment
+from refu_core.garments import GarmentTemplate, SkinBelow, load_garment
+from refu_core.realtime import RootTurn
 from refu_core.simulation import GarmentDataset, GarmentSequences, SamplePlan, open_dataset
 from refu_core.training._mirror import Mirror, mirror_pose
-from refu_core.training._taken_along import TakenAlong
 
-_FEWEST = 2
-"""Samples that anything can be learnt from; hundreds are needed to learn it well."""
 _SPARE = 32
 """Components that a randomised decomposition finds besides: the last ones that it finds are the least accurate."""
 _SWEEPS = 4
@@ -105,6 +103,35 @@ class TrainingSet:
         return "gap" in self.rows.card.get("settings", {}).get("drape", {})
 
 
+class TakenAlong:
+    """How far `refu_core.realtime.dress` takes cloth along with skin that gives way, in unposed displacements.
+
+    No network has to say that.
+    """
+
+    def __init__(self, body: SmplBody, garment: GarmentTemplate) -> None:
+        self._body, self._garment = body, garment
+        self._collider, self._below = Collider(body), SkinBelow.of(garment, body)
+
+    def without(self, displacement: Tensor, betas: Tensor, pose: Tensor, style: Tensor) -> Tensor:
+        """Of displacements that were simulated (B, N, 3) [m] what a network has to say."""
+        return self._moved(displacement, betas, pose, style, -1.0)
+
+    def with_it(self, displacement: Tensor, betas: Tensor, pose: Tensor, style: Tensor) -> Tensor:
+        """The inverse."""
+        return self._moved(displacement, betas, pose, style, 1.0)
+
+    @torch.no_grad()
+    def _moved(self, displacement: Tensor, betas: Tensor, pose: Tensor, style: Tensor, sign: float) -> Tensor:
+        garment, shape = self._garment, self._body.shape(betas)
+        _, at_root = RootTurn.taken_off(pose, shape.joints)
+        posed = self._body.posed(at_root, shape)
+        shift = self._below(self._collider(posed.vertices, posed.transforms) - posed.vertices)
+        rest = garment.rest(betas, garment.own(style))
+        vertices = garment.pose(rest + displacement, posed.transforms) + sign * shift
+        return garment.unpose(vertices, posed.transforms) - rest
+
+
 def in_chunks(of: Callable[..., Tensor], *values: Any, size: int = 64) -> Tensor:
     """`of` these arrays, some rows at a time, which bounds the memory; all have N rows, the result too."""
     starts = range(0, max(len(values[0]), 1), size)
@@ -116,15 +143,18 @@ def read_samples(
 ) -> TrainingSamples:
     """The samples of one split, `train` or `test`, with the poses that were simulated; of sequences, the good frames.
 
-    Raises:
-        RefuError: the set is of another garment or body, or the split has no finished sample.
+    Raises `RefuError`: the set is of another garment or body, or the split has no finished sample.
     """
-    check_dataset(dataset, body, garment)
+    _check(dataset, body, garment)
     rows = np.flatnonzero(dataset.train if split == "train" else dataset.test)
     if not len(rows):
         msg = f"the set of {garment.name} has no finished sample to {split} on: let `refu simulate` run longer"
         raise RefuError(msg)
-    stored = _frames(dataset, rows) if isinstance(dataset, GarmentSequences) else _columns(dataset, rows)
+    names = ("vertices", "pose", "betas", "style", "pair")
+    if isinstance(dataset, GarmentSequences):
+        stored = _frames(dataset, rows)
+    else:
+        stored = {name: dataset.column(name)[rows] for name in names}
     vertices = stored.pop("vertices")[:, dataset.parts[garment.name]]
     column = {name: torch.as_tensor(values) for name, values in stored.items()}
 
@@ -138,10 +168,6 @@ def read_samples(
     with torch.no_grad():
         found = in_chunks(displacement, vertices, column["pose"], column["betas"], column["style"])
     return TrainingSamples(column["pose"], column["betas"], column["style"], found, column["pair"].long())
-
-
-def _columns(dataset: GarmentDataset, rows: NDArray[np.intp]) -> dict[str, NDArray[Any]]:
-    return {name: dataset.column(name)[rows] for name in ("vertices", "pose", "betas", "style", "pair")}
 
 
 def _frames(dataset: GarmentSequences, rows: NDArray[np.intp]) -> dict[str, NDArray[Any]]:
@@ -195,12 +221,11 @@ def output_basis(displacement: Tensor, *, rank: int) -> BasisDecoder:
 def principal_components(values: Tensor, *, rank: int) -> tuple[Tensor, Tensor]:
     """The mean (V, 3) and the `rank` principal components (R, 3 V) of `values` (N, V, 3); of N of them there are N - 1.
 
-    Raises:
-        RefuError: there are fewer than two samples.
+    Raises `RefuError` for fewer than two.
     """
     n = len(values)
-    if n < _FEWEST:
-        msg = f"an output basis needs {_FEWEST} samples at least, got {n}: simulate more"
+    if n < 2:  # hundreds are needed to learn it well
+        msg = f"an output basis needs 2 samples at least, got {n}: simulate more"
         raise RefuError(msg)
     rank = min(rank, n - 1)
     mean = values.mean(0)
@@ -212,16 +237,13 @@ def principal_components(values: Tensor, *, rank: int) -> tuple[Tensor, Tensor]:
     return mean, components[:, :rank].T.contiguous()
 
 
-def check_dataset(dataset: GarmentDataset | GarmentSequences, body: SmplBody, garment: GarmentTemplate) -> None:
-    """Checks that a set was simulated for this garment on this body.
-
-    Raises:
-        RefuError: it wasn't.
-    """
-    for what, wanted, of_set in (
-        ("garment", garment.name, dataset.parts),
-        ("body_fingerprint", body.fingerprint, [dataset.card.get("body_fingerprint")]),
-    ):
+def _check(dataset: GarmentDataset | GarmentSequences, body: SmplBody, garment: GarmentTemplate) -> None:
+    """Raises `RefuError` for a set that wasn't simulated for this garment on this body."""
+    checks = {
+        "garment": (garment.name, dataset.parts),
+        "body_fingerprint": (body.fingerprint, [dataset.card.get("body_fingerprint")]),
+    }
+    for what, (wanted, of_set) in checks.items():
         if wanted not in of_set:
             got = dataset.card.get(what)
             msg = f"wanted a set whose {what} is {wanted}, got {got}: simulate one with `refu simulate {garment.name}`"

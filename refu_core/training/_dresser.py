@@ -37,26 +37,18 @@ class Dresser(nn.Module):
         in_refu: Sdf,
         in_loss: Sdf,
         is_blended: bool = True,
-        collider: bool = True,
     ) -> None:
-        """For one garment on one body model.
+        """For one garment on its body, both on one device; without `refu` the garment stays as it is predicted.
 
-        Args:
-            backbone: a module.
-            refu: the layer; None for the raw garment.
-            garment: the template.
-            body: its body, on the garment's device.
-            in_refu: the distance that ReFU sees.
-            in_loss: the distance that is returned.
-            is_blended: whether pushed vertices take their neighbourhood along.
-            collider: whether distances are to the body with its overlaps pulled apart, or to the posed body.
+        `in_refu` is the distance that ReFU sees, `in_loss` the one that is returned. Blended, pushed vertices take
+        their neighbourhood along.
         """
         super().__init__()
         self.backbone, self.refu = backbone, refu  # modules, whose weights are this one's, too
         self._garment = garment
         self._network = _InPrecision(backbone)
         wearable = Wearable(garment, self._network, refu, 0.0)
-        self._outfit = Outfit(body, {garment.name: wearable}, Collider(body) if collider else None)
+        self._outfit = Outfit(body, {garment.name: wearable}, Collider(body))
         self._blend = Blend.of_faces(garment.faces, garment.n_vertices) if is_blended else None
         made = {name: _Distances(name, garment, body) for name in {in_refu, in_loss}}
         self._in_refu, self._in_loss = made[in_refu], made[in_loss]

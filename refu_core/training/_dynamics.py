@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,11 +19,10 @@ from refu_core.garments import GarmentTemplate
 from refu_core.history import PoseHistory
 from refu_core.simulation import GarmentDataset, GarmentSequences
 from refu_core.training._data import TrainingSamples, TrainingSet, in_chunks, mirrored, read_samples, split_validation
-from refu_core.training._figures import posed_errors
-from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, start_parallel
+from refu_core.training._figures import mpve
+from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, start_parallel
 from refu_core.training._mirror import Mirror, mirror_pose
 from refu_core.training._pretrain import CodeLoss
-from refu_core.training._progress import TrainingLog
 from refu_core.weights import load_weights
 
 
@@ -72,14 +70,11 @@ def train_dynamics(
     Interrupted, the same call goes on from the last checkpoint.
 
     Args:
-        garment: name of a built-in garment, or a template.
         dataset: simulated sequences (`refu simulate --sequences`).
         folder: holds tailornet-<mode> and its basis, which are left as they are.
         mode: whose tailornet; modes that share one share the dynamics, too.
         settings: the default ones if not given.
-        body: the body that the set was simulated on; the garment's built-in one if not given.
-        device: `cpu` or `cuda`.
-        quiet: show no progress.
+        garment, body, device, quiet: as in `pretrain`.
 
     Returns:
         The card: what was trained on what, and its figures on test sequences, beside those of the tailornet alone.
@@ -101,7 +96,7 @@ def train_dynamics(
         msg = f"{stored.path}: wanted a tailornet, got {type(still).__name__}"
         raise RefuError(msg)
     settings = DynamicsSettings() if settings is None else settings
-    is_writer, torch_device = start_parallel(torch.device(device))
+    torch_device = start_parallel(device)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.loop.seed)
         dynamics = Dynamics(DynamicsConfig(template.card.joints), still)
@@ -120,10 +115,11 @@ def train_dynamics(
     loop = Loop(
         dynamics,
         settings.loop,
-        checkpoint=folder / "dynamics.checkpoint",
-        identity=json.dumps([described, asdict(dynamics.config)], sort_keys=True, default=str),
-        log=TrainingLog(folder, name="dynamics", quiet=quiet) if is_writer else None,
+        folder=folder,
+        name="dynamics",
+        identity=[described, asdict(dynamics.config)],
         device=torch_device,
+        quiet=quiet,
     )
     dynamics.to(torch_device)
 
@@ -138,9 +134,9 @@ def train_dynamics(
     dynamics.to("cpu").eval()
     figures = _figures(still, dynamics, test, _known(still, test, _pasts(rows, rows.test)), body, template)
     card = {**described, "dataset": opened.card, "figures": figures}
-    if is_writer:
+    if is_writer():
         save_dynamics(folder, dynamics, card)
-        (folder / "dynamics.checkpoint").unlink(missing_ok=True)
+        loop.checkpoint.unlink(missing_ok=True)
     return card
 
 
@@ -189,17 +185,11 @@ def _figures(
 ) -> dict[str, Any]:
     """MPVE on the test sequences [mm]: with dynamics, without, and the least that the basis allows."""
 
-    def mpve(owed: Tensor) -> float:
-        return round(float(posed_errors(predicted(owed), test, body, garment).mean()), 3)
-
-    def predicted(owed: Tensor) -> Tensor:
-        return in_chunks(
-            lambda pose, s, code: still.decoder(still.code(still.features(pose), s) + code),
-            test.pose,
-            known.style_shape,
-            owed,
-        )
+    def predicted(pose: Tensor, style_shape: Tensor, owed: Tensor) -> Tensor:
+        displacement: Tensor = still.decoder(still.code(still.features(pose), style_shape) + owed)
+        return displacement
 
     moved = in_chunks(dynamics, *known[:3])
-    figures = {"samples": len(test), "mpve_mm": mpve(moved), "still_mm": mpve(torch.zeros_like(moved))}
-    return figures | {"basis_mm": mpve(known.code)}
+    owed = {"mpve_mm": moved, "still_mm": torch.zeros_like(moved), "basis_mm": known.code}
+    garments = {name: in_chunks(predicted, test.pose, known.style_shape, code) for name, code in owed.items()}
+    return {"samples": len(test), **{name: mpve(one, test, body, garment) for name, one in garments.items()}}

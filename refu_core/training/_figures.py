@@ -38,6 +38,11 @@ def posed_errors(predicted: Tensor, samples: TrainingSamples, body: SmplBody, ga
     return in_chunks(error, predicted, samples.displacement, samples.pose, samples.betas, size=_CHUNK)
 
 
+def mpve(predicted: Tensor, samples: TrainingSamples, body: SmplBody, garment: GarmentTemplate) -> float:
+    """Their mean [mm]."""
+    return round(float(posed_errors(predicted, samples, body, garment).mean()), 3)
+
+
 def backbone_figures(
     backbone: Backbone, samples: TrainingSamples, body: SmplBody, garment: GarmentTemplate, *, mean: Tensor
 ) -> dict[str, Any]:
@@ -47,17 +52,12 @@ def backbone_figures(
     the output basis allows.
     """
 
-    def mpve(predicted: Tensor, of: TrainingSamples) -> float:
-        return round(float(posed_errors(predicted, of, body, garment).mean()), 3)
-
-    truth = samples.displacement
-    figures: dict[str, Any] = {
-        "samples": len(samples),
-        "mpve_mm": mpve(displacements(backbone, samples), samples),
-        "skinned_mm": mpve(torch.zeros_like(truth), samples),
-        "mean_mm": mpve(mean.expand_as(truth), samples),
+    truth, decoder = samples.displacement, getattr(backbone, "decoder", None)
+    shown = {
+        "mpve_mm": displacements(backbone, samples),
+        "skinned_mm": torch.zeros_like(truth),
+        "mean_mm": mean.expand_as(truth),
     }
-    decoder = getattr(backbone, "decoder", None)
     if isinstance(decoder, BasisDecoder):
-        figures["basis_mm"] = mpve(decoder(decoder.encode(truth)), samples)
-    return figures
+        shown["basis_mm"] = decoder(decoder.encode(truth))
+    return {"samples": len(samples), **{name: mpve(one, samples, body, garment) for name, one in shown.items()}}

@@ -2,33 +2,36 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from refu_core.backbones import backbone_config, backbone_from_weights, build_backbone, save_backbone, uses_basis
+from refu_core.backbones import (
+    Network,
+    backbone_config,
+    backbone_from_weights,
+    build_backbone,
+    save_backbone,
+    uses_basis,
+)
 from refu_core.body import SmplBody
 from refu_core.errors import RefuError
 from refu_core.garments import GarmentTemplate
 from refu_core.modes import DEFAULT_MARGIN
 from refu_core.refu import SCALE_PRESETS, Refu, ScaleKind, refu_from_weights, refu_tensors
 from refu_core.simulation import GarmentDataset, GarmentSequences
-from refu_core.training._data import TrainingSamples, TrainingSet, mirrored, split_validation
+from refu_core.training._data import TakenAlong, TrainingSamples, TrainingSet, in_chunks, mirrored, split_validation
 from refu_core.training._dresser import Dresser, Sdf
-from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, start_parallel
-from refu_core.training._losses import COLLISION_WEIGHT, RECONSTRUCTION_WEIGHT, refu_loss
+from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, start_parallel
+from refu_core.training._losses import refu_loss
 from refu_core.training._mirror import Mirror
 from refu_core.training._pretrain import PretrainSettings, basis_of, pivots_of, stages
-from refu_core.training._progress import TrainingLog
-from refu_core.training._taken_along import TakenAlong
 from refu_core.weights import load_weights
 
-_CHUNK = 64
 _UNIT = 1e3
 """What the loss is multiplied by, so that its curves are numbers to read. Adam doesn't see it."""
 
@@ -60,8 +63,6 @@ class FinetuneSettings:
         default_factory=lambda: LoopSettings(batch_size=16, learning_rate=2e-4, weight_decay=0.1, check_every=100)
     )
     steps: int = 1000
-    reconstruction_weight: float = RECONSTRUCTION_WEIGHT
-    collision_weight: float = COLLISION_WEIGHT
     scale: str | None = "realtime"
     """Preset of the scale networks; None fixes α at 1."""
     scale_kind: ScaleKind = "vertex"
@@ -109,19 +110,14 @@ def finetune(
     Interrupted, the same call goes on from the last checkpoint. Under `torchrun` all processes make one training.
 
     Args:
-        garment: name of a built-in garment, or a template.
-        dataset: simulated set (`refu simulate`), of garments at rest or of sequences.
         weights: folder with <backbone>-none and its basis, as `pretrain` wrote them; None to train from scratch, as the
             supplement does with the gcnn.
         output: folder of the weights, of the checkpoint while it is needed, and of the loss curves; may be `weights`.
         mode: one of `FINETUNE_MODES`.
         backbone: `tailornet`, `mlp` or `gcnn`.
         preset: `realtime` or `paper`, of ReFU and of a backbone from scratch.
-        settings: the backbone's own in the preset if not given.
         goes_on: start from <backbone>-<mode> in `weights` with its ReFU, in place of <backbone>-none.
-        body: the body that the set was simulated on; the garment's built-in one if not given.
-        device: `cpu` or `cuda`.
-        quiet: show no progress.
+        garment, dataset, settings, body, device, quiet: as in `pretrain`.
 
     Returns:
         The card: what was trained on what.
@@ -138,12 +134,12 @@ def finetune(
         settings = FinetuneSettings.of(backbone, preset)
     opened = TrainingSet.of(garment, dataset, body)
     template, body, samples, identity = opened.garment, opened.body, opened.samples, opened.identity
-    is_writer, torch_device = start_parallel(torch.device(device))
+    torch_device = start_parallel(device)
     output = Path(output)
     train, validation = split_validation(samples, share=settings.validation_share, seed=settings.loop.seed)
     if settings.is_mirrored:
         train = train.joined(mirrored(train, Mirror.of(template)))
-    network: nn.Module
+    network: Network
     stored = None
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.loop.seed)
@@ -151,14 +147,14 @@ def finetune(
             config = backbone_config(backbone, template, preset=preset)
             basis = None
             if uses_basis(config, preset):
-                basis = basis_of(output, opened, None, PretrainSettings().rank, is_writer=is_writer)
-            network = fresh = build_backbone(config, template, basis=basis, pivots=pivots_of(samples, opened.n_pivots))
+                basis = basis_of(output, opened, None, PretrainSettings().rank)
+            network = build_backbone(config, template, basis=basis, pivots=pivots_of(samples, opened.n_pivots))
             # For the scale of inputs and outputs, which it sets; the stages themselves aren't run.
-            stages(fresh, train, validation, template, PretrainSettings())
+            stages(network, train, validation, template, PretrainSettings())
         else:
             stored = load_weights(Path(weights) / f"{backbone}-{mode if goes_on else 'none'}", expect=identity)
             network = backbone_from_weights(stored, template)
-            _bring_basis(Path(weights), output, is_writer=is_writer)
+            _bring_basis(Path(weights), output)
         refu = _layer(mode, settings, template.n_vertices)
         if stored is not None and goes_on:
             refu = refu_from_weights(stored)
@@ -183,22 +179,11 @@ def finetune(
         is_blended=settings.is_blended,
     ).to(torch_device)
     name = f"{backbone}-{mode}"
-    loop = Loop(
-        dresser,
-        settings.loop,
-        checkpoint=output / f"{name}.checkpoint",
-        identity=json.dumps(described, sort_keys=True, default=str),
-        log=TrainingLog(output, name=name, quiet=quiet) if is_writer else None,
-        device=torch_device,
-    )
+    loop = Loop(dresser, settings.loop, folder=output, name=name, identity=described, device=torch_device, quiet=quiet)
 
     def loss(dressed: Tensor, truth: Tensor) -> Tensor:
         """Of garments with their distance, (B, N, 4), and the true garments, (B, N, 3) [m]."""
-        first, second = settings.reconstruction_weight, settings.collision_weight
-        losses = refu_loss(
-            dressed[..., :3], truth, dressed[..., 3], reconstruction_weight=first, collision_weight=second
-        )
-        return _UNIT * losses.total
+        return _UNIT * refu_loss(dressed[..., :3], truth, dressed[..., 3])
 
     objective = Objective([dresser], dresser, loss)
     data = [_tensors(part, body, template) for part in (train, validation)]
@@ -210,27 +195,25 @@ def finetune(
         "dataset": opened.card,
         "knows_limbs": opened.knows_limbs,
     }
-    if is_writer:
+    if is_writer():
         others = None if refu is None else refu_tensors(refu, half=preset != "paper")
         save_backbone(output / name, network, card, others=others, half=preset != "paper")
-        (output / f"{name}.checkpoint").unlink(missing_ok=True)
+        loop.checkpoint.unlink(missing_ok=True)
     return card
 
 
+@torch.no_grad()
 def _tensors(samples: TrainingSamples, body: SmplBody, garment: GarmentTemplate) -> tuple[Tensor, ...]:
     """What the loop draws from: β, θ, γ and the posed true garments [m], shape (N, V, 3)."""
-    posed = torch.empty_like(samples.displacement)
-    style, along = garment.own(samples.style), TakenAlong(body, garment)
-    with torch.no_grad():
-        for start in range(0, len(samples), _CHUNK):
-            chunk = slice(start, start + _CHUNK)
-            rest = garment.rest(samples.betas[chunk], None if style is None else style[chunk])
-            transforms = body(samples.pose[chunk], samples.betas[chunk]).transforms
-            whole = along.with_it(
-                samples.displacement[chunk], samples.betas[chunk], samples.pose[chunk], samples.style[chunk]
-            )
-            posed[chunk] = garment.pose(rest + whole, transforms)
-    return samples.betas, samples.pose, samples.style, posed
+    along = TakenAlong(body, garment)
+
+    def posed(displacement: Tensor, betas: Tensor, pose: Tensor, style: Tensor) -> Tensor:
+        rest = garment.rest(betas, garment.own(style))
+        whole = along.with_it(displacement, betas, pose, style)
+        return garment.pose(rest + whole, body(pose, betas).transforms)
+
+    inputs = samples.betas, samples.pose, samples.style
+    return *inputs, in_chunks(posed, samples.displacement, *inputs)
 
 
 def _layer(mode: str, settings: FinetuneSettings, n_vertices: int) -> Refu | None:
@@ -247,9 +230,9 @@ def _layer(mode: str, settings: FinetuneSettings, n_vertices: int) -> Refu | Non
     )
 
 
-def _bring_basis(source: Path, target: Path, *, is_writer: bool) -> None:
+def _bring_basis(source: Path, target: Path) -> None:
     """Copies the output basis beside the weights that will need it."""
-    if not is_writer or source.resolve() == target.resolve() or not (source / "basis.json").exists():
+    if not is_writer() or source.resolve() == target.resolve() or not (source / "basis.json").exists():
         return
     target.mkdir(parents=True, exist_ok=True)
     for name in ("basis.safetensors", "basis.json"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 from collections.abc import Callable, Sequence
@@ -72,22 +73,27 @@ class Loop:
         model: nn.Module,
         settings: LoopSettings,
         *,
-        checkpoint: Path,
-        identity: str,
-        log: TrainingLog | None,
+        folder: Path,
+        name: str,
+        identity: Any,
         device: torch.device,
+        quiet: bool,
     ) -> None:
-        """`identity` says what is trained how and on what: a checkpoint of anything else is refused.
+        """Keeps a checkpoint and loss curves, `folder`/`name` with suffixes of their own.
+
+        `identity` says what is trained how and on what: a checkpoint of anything else is refused.
 
         Raises:
             RefuError: the checkpoint there is of another training.
             WeightsError: it is damaged.
         """
-        self._model, self._settings, self._path, self._log, self._device = model, settings, checkpoint, log, device
-        self._identity = identity
+        self.checkpoint = folder / f"{name}.checkpoint"
+        self._model, self._settings, self._device = model, settings, device
+        self._log = TrainingLog(folder, name=name, quiet=quiet, is_writer=is_writer())
+        self._identity = json.dumps(identity, sort_keys=True, default=str)
         self._done: list[str] = []
         self._resumed: dict[str, Any] | None = None
-        saved = load_checkpoint(checkpoint, identity)
+        saved = load_checkpoint(self.checkpoint, self._identity)
         if saved is not None:
             model.load_state_dict(saved["model"])
             self._done = list(saved["done"])
@@ -121,8 +127,7 @@ class Loop:
             order.set_state(saved["order"])
             torch.set_rng_state(saved["rng"])
             step, best, best_state, since = saved["step"], saved["best"], saved["best_state"], saved["since"]
-        if self._log is not None:
-            self._log.begin(stage.name, step=step, steps=stage.steps)
+        self._log.begin(stage.name, step=step, steps=stage.steps)
         stepper: nn.Module = objective
         if world > 1:
             stepper = nn.parallel.DistributedDataParallel(objective, find_unused_parameters=True)
@@ -139,8 +144,7 @@ class Loop:
             optimiser.step()
             losses.append(loss.detach())
             step += 1
-            if self._log is not None:
-                self._log.step(step)
+            self._log.step(step)
             if step % settings.check_every == 0 or step == stage.steps:
                 mean_loss = torch.stack(losses).mean()
                 losses.clear()
@@ -158,9 +162,8 @@ class Loop:
                     best_state = {k: v.detach().clone() for k, v in objective.state_dict().items()}
                 if held_out is None:
                     since = 0
-                if self._log is not None:
-                    shown = {} if held_out is None else {"validation": held_out}
-                    self._log.check(stage.name, step, train=train_loss, **shown)
+                shown = {} if held_out is None else {"validation": held_out}
+                self._log.check(stage.name, step, train=train_loss, **shown)
                 self._save(
                     {
                         "name": stage.name,
@@ -175,8 +178,7 @@ class Loop:
                 )
         if best_state is not None:
             objective.load_state_dict(best_state)
-        if self._log is not None:
-            self._log.end()
+        self._log.end()
 
     @torch.no_grad()
     def _validate(self, stage: TrainingStage) -> float | None:
@@ -193,22 +195,27 @@ class Loop:
     def _save(self, stage: dict[str, Any] | None) -> None:
         # One process' word is enough: after a step all have the same weights. Its random state is its own, though, so
         # a resumed parallel run is sound but not the same bit for bit.
-        if ranks()[0] == 0:
+        if is_writer():
             state = {"identity": self._identity, "done": self._done, "stage": stage, "model": self._model.state_dict()}
-            save_checkpoint(self._path, state)
+            save_checkpoint(self.checkpoint, state)
 
 
-def start_parallel(device: torch.device) -> tuple[bool, torch.device]:
-    """Joins the other processes of a `torchrun`; whether this one writes files, and the device that is its own."""
-    world = int(os.environ.get("WORLD_SIZE", "1"))
-    if world == 1:
-        return True, device
-    if device.type == "cuda":
-        device = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
-        torch.cuda.set_device(device)
+def start_parallel(device: str) -> torch.device:
+    """Joins the other processes of a `torchrun`; the device that is this one's own."""
+    own = torch.device(device)
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
+        return own
+    if own.type == "cuda":
+        own = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
+        torch.cuda.set_device(own)
     if not dist.is_initialized():
-        dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
-    return dist.get_rank() == 0, device
+        dist.init_process_group("nccl" if own.type == "cuda" else "gloo")
+    return own
+
+
+def is_writer() -> bool:
+    """Whether this process is the one that writes files."""
+    return ranks()[0] == 0
 
 
 def ranks() -> tuple[int, int]:

@@ -2,22 +2,12 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 from torch import Tensor
 
 RECONSTRUCTION_WEIGHT = 1.5
 """λ₁ of the paper (Sec. 4.2)."""
 COLLISION_WEIGHT = 0.5
 """λ₂ of the paper."""
-
-
-class Losses(NamedTuple):
-    """The loss of a batch and its terms, each of shape ()."""
-
-    total: Tensor
-    reconstruction: Tensor
-    collision: Tensor
 
 
 def refu_loss(
@@ -27,22 +17,14 @@ def refu_loss(
     *,
     reconstruction_weight: float = RECONSTRUCTION_WEIGHT,
     collision_weight: float = COLLISION_WEIGHT,
-) -> Losses:
-    """L = λ₁ L_r + λ₂ L_c of garments after ReFU (paper, Eq. 7).
+) -> Tensor:
+    """L = λ₁ L_r + λ₂ L_c of garments after ReFU (paper, Eq. 7), shape ().
 
     L_r is `reconstruction_loss`, L_c `collision_loss`. With positions in metres both are about 1e-4 for a good
-    backbone, which is what the paper's weights balance.
-
-    Args:
-        vertices: Garments after ReFU [m], shape (B, N, 3).
-        truth: The true ones [m], shape (B, N, 3).
-        distance: Signed distance of `vertices` [m], shape (B, N).
-        reconstruction_weight: λ₁.
-        collision_weight: λ₂.
+    backbone, which is what the paper's weights balance. `vertices` and `truth` are garments [m], shape (B, N, 3),
+    `distance` the signed distance of `vertices` [m], (B, N); the weights are λ₁ and λ₂.
     """
-    reconstruction = reconstruction_loss(vertices, truth)
-    collision = collision_loss(distance)
-    return Losses(reconstruction_weight * reconstruction + collision_weight * collision, reconstruction, collision)
+    return reconstruction_weight * reconstruction_loss(vertices, truth) + collision_weight * collision_loss(distance)
 
 
 def reconstruction_loss(vertices: Tensor, truth: Tensor) -> Tensor:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import trimesh
+from numpy.typing import NDArray
 from torch import Tensor
 
 from refu_core.body import MIRRORED_JOINTS
@@ -15,6 +16,33 @@ from refu_core.garments import GarmentTemplate
 
 MAX_ASYMMETRY = 5e-3
 """A template that is farther from its own mirror image anywhere has none [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class OnSurface:
+    """Places on a garment: each lies in a triangle, and takes a mixture of its three corners."""
+
+    corners: Tensor
+    """Vertices of the triangles, shape (P, 3), int64."""
+    weights: Tensor
+    """How much each of them counts, shape (P, 3)."""
+
+    @staticmethod
+    def nearest(
+        garment: GarmentTemplate, points: NDArray[np.float64]
+    ) -> tuple[OnSurface, NDArray[np.float64], NDArray[np.float64]]:
+        """Those nearest to points (P, 3) [m]; where they are [m], (P, 3), and how far off, (P,)."""
+        vertices, faces = garment.v_template.cpu().double().numpy(), garment.faces.cpu().numpy()
+        mesh = trimesh.Trimesh(vertices, faces, process=False)
+        places, distance, triangle = trimesh.proximity.closest_point(mesh, points)
+        barycentrics = trimesh.triangles.points_to_barycentric(vertices[faces[triangle]], places)
+        return OnSurface(torch.as_tensor(faces[triangle]), torch.as_tensor(barycentrics)), places, distance
+
+    def __call__(self, values: Tensor) -> Tensor:
+        """Of values at the garment's vertices (B, V, K) those at the places, shape (B, P, K)."""
+        weights = self.weights.to(values.dtype)
+        corners = (weights[:, k, None] * values[:, self.corners[:, k]] for k in range(3))
+        return sum(corners, start=torch.zeros(()))
 
 
 def mirror_pose(pose: Tensor) -> Tensor:
@@ -30,39 +58,19 @@ class Mirror:
     mixture of its three corners. The body and the bases of shape and style are symmetric, so β and γ stay.
     """
 
-    corners: Tensor
-    """Triangle of each mirrored vertex, shape (V, 3), int64."""
-    barycentrics: Tensor
-    """Its place there, shape (V, 3)."""
-    asymmetry: float
-    """Largest distance of a mirrored vertex to the surface [m]."""
+    image: OnSurface
 
     @staticmethod
     def of(garment: GarmentTemplate) -> Mirror:
-        """The mirror image of a garment.
-
-        Raises:
-            GarmentError: the garment isn't symmetric.
-        """
-        vertices, faces = garment.v_template.cpu().double().numpy(), garment.faces.cpu().numpy()
-        mirrored = vertices * np.array((-1.0, 1.0, 1.0))
-        mesh = trimesh.Trimesh(vertices, faces, process=False)
-        nearest, distance, triangle = trimesh.proximity.closest_point(mesh, mirrored)
-        asymmetry = float(distance.max())
-        if asymmetry > MAX_ASYMMETRY:
-            msg = f"{garment.name} is off its mirror image by {1e3 * asymmetry:.1f} mm; train it without mirroring"
+        """The mirror image of a garment. Raises `GarmentError` where it isn't symmetric."""
+        mirrored = garment.v_template.cpu().double().numpy() * np.array((-1.0, 1.0, 1.0))
+        image, _, distance = OnSurface.nearest(garment, mirrored)
+        if distance.max() > MAX_ASYMMETRY:
+            msg = f"{garment.name} is off its mirror image by {1e3 * distance.max():.1f} mm; train it without mirroring"
             raise GarmentError(msg)
-        barycentrics = trimesh.triangles.points_to_barycentric(vertices[faces[triangle]], nearest)
-        return Mirror(
-            corners=torch.as_tensor(faces[triangle]),
-            barycentrics=torch.as_tensor(barycentrics, dtype=torch.float32),
-            asymmetry=asymmetry,
-        )
+        return Mirror(image)
 
     def displacement(self, displacement: Tensor) -> Tensor:
         """Displacements of the mirrored garment, of `displacement`; both (B, V, 3) [m]."""
-        mixed = sum(
-            (self.barycentrics[:, k, None] * displacement[:, self.corners[:, k]] for k in range(3)),
-            start=torch.zeros(()),
-        )
+        mixed = self.image(displacement)
         return mixed * mixed.new_tensor((-1.0, 1.0, 1.0))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -26,7 +25,6 @@ from refu_core.backbones import (
     uses_basis,
 )
 from refu_core.body import SmplBody
-from refu_core.errors import RefuError
 from refu_core.garments import GarmentTemplate
 from refu_core.simulation import GarmentDataset, GarmentSequences
 from refu_core.training._data import (
@@ -39,15 +37,13 @@ from refu_core.training._data import (
     split_validation,
 )
 from refu_core.training._figures import backbone_figures
-from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, start_parallel
+from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, start_parallel
 from refu_core.training._mirror import Mirror
-from refu_core.training._progress import TrainingLog
 
 MANY = 4000
 """Samples from which on a tailornet is trained longer and held back less. On validation samples of shorts' 6,000 the
 error is 7.61 mm with weight decay 1 and twice the steps, 7.21 with 0.3, 7.18 with half the dropout, 7.04 with 0.1 (on
 the test split 6.68, 6.43, 6.39 and 6.36); a T-shirt's 2,580 gain nothing (test: 9.5, with 0.3 9.6)."""
-PIVOT_TRAINING: tuple[str, ...] = ("joint", "separate")
 
 
 @dataclass(frozen=True)
@@ -62,26 +58,21 @@ class PretrainSettings:
     steps: int = 3000
     """Of the last stage; of the only one for backbones other than the tailornet. On test samples half of these and of
     the low-frequency net's steps leave 11.3 mm, all 11.1 (a T-shirt's 980 samples)."""
-    pivots: str = "joint"
-    """`joint`: the high-frequency nets are trained through the mixture, on all samples and together with the
-    low-frequency net. `separate`: each on its own pivot's samples, as in the original."""
+    is_joint: bool = True
+    """Whether the high-frequency nets are trained through the mixture, on all samples and together with the
+    low-frequency net, or each on its own pivot's samples, as in the original."""
     joint_rate: float = 0.3
-    """Learning rate of the last stage with `joint` pivots, relative: the low-frequency net is only tuned there."""
+    """Learning rate of a joint last stage, relative: the low-frequency net is only tuned there."""
     dropout: float | None = None
     """Of a tailornet's low-frequency net, half that of its high-frequency nets; None for the configuration's."""
     is_mirrored: bool = True
     validation_share: float = 0.08
 
-    def __post_init__(self) -> None:
-        if self.pivots not in PIVOT_TRAINING:
-            msg = f"pivots are trained {' or '.join(PIVOT_TRAINING)}, got {self.pivots!r}"
-            raise RefuError(msg)
-
     @classmethod
     def paper(cls) -> PretrainSettings:
         """TailorNet's own settings."""
         loop = LoopSettings(batch_size=32, learning_rate=1e-4, weight_decay=1e-6, check_every=1000)
-        return cls(loop, style_shape_steps=100_000, low_steps=300_000, steps=300_000, pivots="separate")
+        return cls(loop, style_shape_steps=100_000, low_steps=300_000, steps=300_000, is_joint=False)
 
     @classmethod
     def of(cls, backbone: str, preset: str = "realtime", *, samples: int = 0) -> PretrainSettings:
@@ -138,12 +129,12 @@ def pretrain(
     config = backbone_config(backbone, template, preset=preset) if config is None else config
     if settings.dropout is not None and isinstance(config, TailorNetConfig):
         config = replace(config, dropout=settings.dropout, high_dropout=2 * settings.dropout)
-    is_writer, torch_device = start_parallel(torch.device(device))
+    torch_device = start_parallel(device)
     output = Path(output)
 
     basis, mirror = None, Mirror.of(template) if settings.is_mirrored else None
     if uses_basis(config, preset):
-        basis = basis_of(output, opened, mirror, settings.rank, is_writer=is_writer)
+        basis = basis_of(output, opened, mirror, settings.rank)
     # Which pairs are held out mustn't depend on what is made of the samples afterwards.
     train, validation = split_validation(samples, share=settings.validation_share, seed=settings.loop.seed)
     if mirror is not None:
@@ -152,20 +143,16 @@ def pretrain(
         torch.manual_seed(settings.loop.seed)
         model = build_backbone(config, template, basis=basis, pivots=pivots_of(samples, opened.n_pivots))
     mean = samples.displacement.mean(0)
-    described = {
-        **identity,
-        "backbone": backbone,
-        "preset": preset,
-        "settings": asdict(settings),
-        "samples": len(train),
-    }
+    described = {**identity, "backbone": backbone, "preset": preset}
+    described |= {"settings": asdict(settings), "samples": len(train)}
     loop = Loop(
         model,
         settings.loop,
-        checkpoint=output / f"{backbone}-none.checkpoint",
-        identity=json.dumps([described, asdict(config)], sort_keys=True, default=str),
-        log=TrainingLog(output, name=f"{backbone}-none", quiet=quiet) if is_writer else None,
+        folder=output,
+        name=f"{backbone}-none",
+        identity=[described, asdict(config)],
         device=torch_device,
+        quiet=quiet,
     )
     found = stages(model, train, validation, template, settings)
     model.to(torch_device)
@@ -179,13 +166,13 @@ def pretrain(
         "knows_limbs": opened.knows_limbs,
         "figures": backbone_figures(model, test, body, template, mean=mean),
     }
-    if is_writer:
+    if is_writer():
         save_backbone(output / f"{backbone}-none", model, card, half=preset != "paper")
-        (output / f"{backbone}-none.checkpoint").unlink(missing_ok=True)
+        loop.checkpoint.unlink(missing_ok=True)
     return card
 
 
-def basis_of(folder: Path, opened: TrainingSet, mirror: Mirror | None, rank: int, *, is_writer: bool) -> BasisDecoder:
+def basis_of(folder: Path, opened: TrainingSet, mirror: Mirror | None, rank: int) -> BasisDecoder:
     """The folder's basis, made if it isn't there."""
     if (folder / "basis.json").exists():
         return load_basis(folder, opened.garment, expect=opened.identity)[0]
@@ -193,7 +180,7 @@ def basis_of(folder: Path, opened: TrainingSet, mirror: Mirror | None, rank: int
     if mirror is not None:
         displacement = torch.cat((displacement, mirrored(opened.samples, mirror).displacement))
     basis = output_basis(displacement, rank=rank)
-    if is_writer:
+    if is_writer():
         save_basis(folder, basis, {**opened.identity, "samples": len(displacement), "set": len(opened.rows)})
     return basis
 
@@ -241,7 +228,7 @@ def stages(
         TrainingStage("style-shape", Objective([shape_net], shape_net, loss), settings.style_shape_steps, *drape),
         TrainingStage("low", Objective([model.low], model.low_code, loss), settings.low_steps, *low),
     ]
-    if settings.pivots == "joint":
+    if settings.is_joint:
         joint = Objective([model.low, model.high], model.code, loss)
         return [*found, TrainingStage("joint", joint, settings.steps, *both, rate=settings.joint_rate)]
     fine = []

@@ -2,37 +2,36 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
-import math
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
-from refu_core._files import MAX_JSON_BYTES, read_file, replacing
+from refu_core._files import MAX_JSON_BYTES, parse_json, read_file, replacing
 from refu_core.errors import RefuError
 
 
 class TrainingLog:
-    """Loss curves of the stages of a training, as a JSON lines file and a picture.
+    """Loss curves of the stages of a training, as a JSON lines file and a picture."""
 
-    Used by one process; the others of a parallel training pass `None` where a log is wanted.
-    """
+    def __init__(self, folder: Path, *, name: str, quiet: bool = False, is_writer: bool = True) -> None:
+        """Writes `folder`/`name`.jsonl and `folder`/`name`.png; what an earlier run wrote is continued.
 
-    def __init__(self, folder: Path, *, name: str, quiet: bool = False) -> None:
-        """Writes `folder`/`name`.jsonl and `folder`/`name`.png; what an earlier run wrote is continued."""
+        Of the processes of a parallel training one `is_writer`; the others say nothing.
+        """
         self._lines = folder / f"{name}.jsonl"
         self.picture = folder / f"{name}.png"
         """Where the picture is."""
-        self._quiet = quiet
+        self._is_writer, self._is_shown = is_writer, is_writer and not quiet
         self._bar: Any = None
-        self._entries: list[dict[str, Any]] = []
         folder.mkdir(parents=True, exist_ok=True)
         self._entries = _entries(self._lines)
 
     def begin(self, stage: str, *, step: int, steps: int) -> None:
         """A stage of `steps` steps goes on at `step`; entries after it are of an interrupted run and dropped."""
         self._entries = [e for e in self._entries if e["stage"] != stage or e["step"] <= step]
-        if not self._quiet:
+        if self._is_shown:
             from tqdm import tqdm
 
             self._bar = tqdm(total=steps, initial=step, desc=stage, unit="step", leave=True)
@@ -44,6 +43,8 @@ class TrainingLog:
 
     def check(self, stage: str, step: int, **values: float) -> None:
         """Losses at a step, by name [mm]."""
+        if not self._is_writer:
+            return
         self._entries.append({"stage": stage, "step": step, **{k: round(v, 5) for k, v in values.items()}})
         # Under another name first: a training that is killed leaves the curves of the check before, and no half line.
         with replacing(self._lines) as file:
@@ -66,7 +67,7 @@ class TrainingLog:
         stages: dict[str, list[dict[str, Any]]] = defaultdict(list)
         for entry in self._entries:
             stages[entry["stage"]].append(entry)
-        if not stages:
+        if not stages or not self._is_writer:
             return
         figure = Figure(figsize=(4.2 * len(stages), 3.2), layout="constrained")
         FigureCanvasAgg(figure)
@@ -86,18 +87,14 @@ def _entries(path: Path) -> list[dict[str, Any]]:
     """The entries of an earlier run; a log is no reason not to go on, so what isn't one is left out."""
     entries = []
     try:
-        text = read_file(path, most=MAX_JSON_BYTES, error=RefuError, wanted="the log of a training")
+        lines = read_file(path, most=MAX_JSON_BYTES, error=RefuError, wanted="the log of a training").splitlines()
     except RefuError:
         return []
-    for line in text.splitlines():
-        try:
-            entry = json.loads(line)
-        except (ValueError, RecursionError):
-            continue
-        if isinstance(entry, dict) and isinstance(entry.get("stage"), str) and _is_number(entry.get("step")):
-            entries.append({key: value for key, value in entry.items() if key == "stage" or _is_number(value)})
+    for line in lines:
+        with contextlib.suppress(ValueError, RecursionError):
+            entry = parse_json(line)
+            if not isinstance(entry, dict) or "step" not in entry or not isinstance(entry.get("stage"), str):
+                continue
+            if all(isinstance(value, (int, float)) for name, value in entry.items() if name != "stage"):
+                entries.append(entry)
     return entries
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and abs(value) < math.inf

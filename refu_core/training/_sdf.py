@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ from refu_core.sdf import SDF_PRESETS, ExactSdf, SdfNetwork, body_frame, query_b
 from refu_core.simulation import GarmentDataset
 from refu_core.training._checkpoint import load_checkpoint, save_checkpoint
 from refu_core.training._data import drawn_pairs
-from refu_core.training._loop import cosine, ranks, start_parallel
+from refu_core.training._loop import cosine, is_writer, ranks, start_parallel
 from refu_core.training._progress import TrainingLog
 
 VALUE_WEIGHT, NORMAL_WEIGHT, EIKONAL_WEIGHT = 2.0, 1.0, 0.1
@@ -215,7 +214,7 @@ def train_sdf(
     """
     settings = settings or SdfSettings()
     name = f"sdf-{settings.preset}"
-    is_writer, where = start_parallel(torch.device(device))
+    where = start_parallel(device)
     rank, world = ranks()
     if settings.batch_size % world:
         msg = f"a batch of {settings.batch_size} bodies can't be shared evenly by {world} processes"
@@ -232,13 +231,16 @@ def train_sdf(
         {**asdict(settings), "body": body.fingerprint, "garment": garment.name, "samples": len(splits["train"])}
     )
     checkpoint = output / f"{name}.checkpoint"
-    step = _resume(checkpoint, identity, network, optimiser)
-    module: Callable[[SdfBatch], Tensor] = _Step(network)
+    saved, step = load_checkpoint(checkpoint, identity), 0
+    if saved is not None:
+        network.load_state_dict(saved["network"])
+        optimiser.load_state_dict(saved["optimiser"])
+        step = int(saved["step"])
+    module: nn.Module = _Step(network)
     if world > 1:
-        module = nn.parallel.DistributedDataParallel(_Step(network))
-    log = TrainingLog(output, name=name, quiet=quiet) if is_writer else None
-    if log is not None:
-        log.begin("sdf", step=step, steps=settings.steps)
+        module = nn.parallel.DistributedDataParallel(module)
+    log = TrainingLog(output, name=name, quiet=quiet, is_writer=is_writer())
+    log.begin("sdf", step=step, steps=settings.steps)
     while step < settings.steps:
         generator = torch.Generator().manual_seed((settings.seed * 1_000_003 + step) * world + rank)
         batch = samplers["train"].draw(
@@ -249,17 +251,15 @@ def train_sdf(
         for group in optimiser.param_groups:
             group["lr"] = settings.rate(step)
         optimiser.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()
         optimiser.step()
         step += 1
-        if log is not None:
-            log.step(step)
+        log.step(step)
         if step % settings.check_every == 0 or step == settings.steps:
-            if not math.isfinite(float(loss.detach())):
-                lost = float(loss.detach())
+            if not math.isfinite(lost := float(loss.detach())):
                 msg = f"the loss of the distance network is {lost} at step {step}: try a smaller learning rate"
                 raise RefuError(msg)
-            if log is not None:
+            if is_writer():
                 found = sdf_figures(network, checks["validation"])
                 log.check("sdf", step, absolute=found["absolute_mm"], near_skin=found["near_mm"])
                 state = {"network": network.state_dict(), "optimiser": optimiser.state_dict()}
@@ -271,8 +271,8 @@ def train_sdf(
         "settings": asdict(settings),
         "figures": {part: sdf_figures(network, batch) for part, batch in checks.items()},
     }
-    if log is not None:
-        log.end()
+    log.end()
+    if is_writer():
         save_sdf_network(output / name, network, card)
     return card
 
@@ -296,12 +296,3 @@ def _fixed_batch(sampler: SdfSampler, settings: SdfSettings) -> SdfBatch:
     generator = torch.Generator().manual_seed(settings.seed + 1)
     rows = sampler.rows[torch.linspace(0, len(sampler.rows) - 1, min(32, len(sampler.rows))).long()]
     return sampler.around(rows, generator, points=settings.points, noise=settings.noise)
-
-
-def _resume(path: Path, identity: str, network: SdfNetwork, optimiser: torch.optim.Optimizer) -> int:
-    saved = load_checkpoint(path, identity)
-    if saved is None:
-        return 0
-    network.load_state_dict(saved["network"])
-    optimiser.load_state_dict(saved["optimiser"])
-    return int(saved["step"])

@@ -39,7 +39,6 @@ from refu_core.simulation import (
     GarmentSample,
     Progress,
     SamplePlan,
-    SettledDrape,
     SimulationError,
     SimulationSettings,
     _produce,
@@ -52,7 +51,7 @@ from refu_core.simulation import (
 from refu_core.simulation._drape import canonical_pose, comfort_poses
 from refu_core.simulation._plan import TEST, TRAIN
 from refu_core.simulation._selection import Selector
-from refu_core.simulation._store import DONE, QUANTUM, TO_DO, Shard, dequantise, locked, quantise
+from refu_core.simulation._store import DONE, FORMAT, QUANTUM, TO_DO, Rows, dequantise, locked, quantise
 from refu_lab.cli import main
 from refu_lab.contact_sheet import contact_sheet
 from refu_lab.fleet import open_engine
@@ -83,24 +82,10 @@ def simulate(output: Path, clips: Path, **options: Any) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory, clips: Path) -> Path:
+def simulated(tmp_path_factory: pytest.TempPathFactory, clips: Path) -> Path:
     """A set made by one process."""
     output = tmp_path_factory.mktemp("sets") / "whole"
     simulate(output, clips)
-    return output
-
-
-@pytest.fixture(scope="module")
-def simulated(tmp_path_factory: pytest.TempPathFactory, whole: Path) -> Path:
-    """The same set in two shards, as former versions made them."""
-    output = tmp_path_factory.mktemp("sets") / "in-shards"
-    shutil.copytree(whole, output)
-    shard = output / "shard-0-of-1"
-    for i in range(2):
-        (output / f"shard-{i}-of-2").mkdir()
-        for file in shard.glob("*.npy"):
-            np.save(output / f"shard-{i}-of-2" / file.name, np.load(file)[i::2])
-    shutil.rmtree(shard)
     return output
 
 
@@ -216,7 +201,7 @@ def test_selector_names_the_cause(samples: list[GarmentSample]) -> None:
 
     def cause(vertices: NDArray[Any], *, speed: float = 0.0, stretch: float = 1.0) -> str | None:
         vertices = vertices.astype(np.float32)
-        return selector.cause(vertices, posed, SettledDrape(vertices, speed, stretch, 1))
+        return selector.cause(vertices, posed, stretch=stretch, speed=speed)
 
     assert cause(sample.vertices) is None
     assert cause(sample.vertices + np.array((0.02, 0, 0))) == "body_collision"
@@ -246,7 +231,7 @@ def test_verifier_finds_nothing_in_a_set_and_every_fault(verifier: Any, simulate
     assert (report["garments"], report["bad"]) == (COUNT, [])
     assert 0 < report["smallest_clearance_mm"] < 4
     path = shutil.copytree(simulated, tmp_path / "spoilt")
-    vertices = Shard(path / "shard-0-of-2", mode="r+").arrays["vertices"]
+    vertices = Rows(path, FORMAT, mode="r+").arrays["vertices"]
     vertices[0, :, 0] += round(0.02 / QUANTUM)
     vertices[1] = np.rint(vertices[1] * 1.3)
     faces = load_garment(GARMENT).faces.numpy()
@@ -292,13 +277,13 @@ def test_self_intersection_is_that_of_fcl(samples: list[GarmentSample]) -> None:
 
 
 def columns(path: Path) -> dict[str, NDArray[Any]]:
-    """All rows of all shards by slot; without the seconds, which no two runs share."""
-    shards = [Shard(directory).arrays for directory in sorted(path.glob("shard-*-of-*"))]
-    order = np.argsort(np.concatenate([shard["slot"] for shard in shards]), kind="stable")
-    return {name: np.concatenate([s[name] for s in shards])[order] for name in shards[0] if name != "seconds"}
+    """All rows by slot; without the seconds, which no two runs share."""
+    arrays = Rows(path, FORMAT).arrays
+    order = np.argsort(arrays["slot"])
+    return {name: array[order] for name, array in arrays.items() if name != "seconds"}
 
 
-def test_two_shards_are_all_slots(simulated: Path) -> None:
+def test_a_set_has_all_slots(simulated: Path) -> None:
     np.testing.assert_array_equal(columns(simulated)["slot"], np.arange(COUNT))
     assert (columns(simulated)["state"] == DONE).all()
 
@@ -312,7 +297,7 @@ def test_interrupted_run_goes_on_to_the_same_samples(simulated: Path, clips: Pat
 
     with pytest.raises(KeyboardInterrupt):
         simulate(output, clips, progress=stop)
-    shard = Shard(output / "shard-0-of-1", mode="r+")
+    shard = Rows(output, FORMAT, mode="r+")
     survivors = np.asarray(shard.arrays["state"] == DONE)
     assert survivors.sum() == 2
     half_written = int(np.flatnonzero(shard.arrays["state"] == TO_DO)[0])
@@ -407,7 +392,7 @@ def test_dataset_reads_what_was_written(
         assert sample.clip in ({"test": "wave", "train": "walk"}[sample.split], None)
         assert (sample.frame is None) == (sample.clip is None)
     with pytest.raises(ValueError, match="read-only"):
-        dataset._shards[0].arrays["pose"][0] = 0
+        dataset._columns["pose"][0] = 0
 
 
 def test_unseen_distance_is_to_the_nearest_training_sample(samples: list[GarmentSample]) -> None:
@@ -426,7 +411,7 @@ def test_unseen_distance_is_to_the_nearest_training_sample(samples: list[Garment
 def test_only_finished_samples_are_read(simulated: Path, samples: list[GarmentSample], tmp_path: Path) -> None:
     path = shutil.copytree(simulated, tmp_path / "partial")
     (path / "unseen.npy").unlink()
-    shard = Shard(path / "shard-0-of-2", mode="r+")
+    shard = Rows(path, FORMAT, mode="r+")
     missing = int(shard.arrays["slot"][0])
     shard.arrays["state"][0] = TO_DO
     shard.arrays["state"].flush()
@@ -439,32 +424,6 @@ def test_only_finished_samples_are_read(simulated: Path, samples: list[GarmentSa
         partial.column("colour")
 
 
-def test_slot_of_two_divisions_is_read_once(simulated: Path, tmp_path: Path) -> None:
-    path = shutil.copytree(simulated, tmp_path / "both")
-    shutil.copytree(path / "shard-0-of-2", path / "shard-0-of-1")
-    assert len(GarmentDataset(path)) == COUNT
-
-
-def test_slot_of_two_divisions_counts_once(simulated: Path, tmp_path: Path) -> None:
-    """Also where one division has finished it and the other hasn't."""
-    path = shutil.copytree(simulated, tmp_path / "both")
-    (path / "shard-0-of-1").mkdir()
-    both = [Shard(path / f"shard-{i}-of-2").arrays for i in range(2)]
-    for name in both[0]:
-        np.save(path / "shard-0-of-1" / f"{name}.npy", np.concatenate([shard[name] for shard in both]))
-    before = summarise(simulated)
-    after = summarise(path)
-    assert {key: after[key] for key in ("counts", "yield")} == {key: before[key] for key in ("counts", "yield")}
-    assert after["figures"] == pytest.approx(before["figures"])
-    shard = Shard(path / "shard-0-of-1", mode="r+")
-    shard.arrays["state"][:] = TO_DO
-    shard.arrays["dropped"][:] = 7
-    shard.arrays["state"].flush()
-    assert summarise(path)["counts"] == before["counts"]
-    assert summarise(path)["yield"] == before["yield"]
-    np.testing.assert_array_equal(GarmentDataset(path).column("vertices"), GarmentDataset(simulated).column("vertices"))
-
-
 def test_damaged_sets_are_refused(simulated: Path, tmp_path: Path) -> None:
     with pytest.raises(SimulationError, match="card"):
         GarmentDataset(tmp_path)
@@ -474,9 +433,9 @@ def test_damaged_sets_are_refused(simulated: Path, tmp_path: Path) -> None:
     for damage in ("missing", "shape", "unseen"):
         path = shutil.copytree(simulated, tmp_path / damage)
         if damage == "missing":
-            (path / "shard-1-of-2" / "betas.npy").unlink()
+            (path / "shard-0-of-1" / "betas.npy").unlink()
         elif damage == "shape":
-            np.save(path / "shard-1-of-2" / "betas.npy", np.zeros((3, 9), np.float32))
+            np.save(path / "shard-0-of-1" / "betas.npy", np.zeros((COUNT, 9), np.float32))
         else:
             (path / "unseen.npy").write_bytes(b"not an array")
         with pytest.raises(SimulationError, match=r"betas|unseen"):
@@ -666,10 +625,10 @@ def test_other_set_in_the_directory_is_left_alone(simulated: Path, clips: Path, 
     assert {path: path.read_bytes() for path in simulated.rglob("*.npy")} == before
 
 
-def test_set_is_written_by_one_run_at_a_time(whole: Path, clips: Path) -> None:
-    with locked(whole / "shard-0-of-1"), pytest.raises(SimulationError, match="another run"):
-        simulate(whole, clips)
-    simulate(whole, clips)  # free again
+def test_set_is_written_by_one_run_at_a_time(simulated: Path, clips: Path) -> None:
+    with locked(simulated), pytest.raises(SimulationError, match="another run"):
+        simulate(simulated, clips)
+    simulate(simulated, clips)  # free again
 
 
 def test_full_disk_is_said_before_anything_is_simulated(

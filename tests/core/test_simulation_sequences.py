@@ -31,15 +31,15 @@ from refu_core.simulation import (
     open_dataset,
     simulate_sequences,
     split_clips,
-    summarise_sequences,
+    summarise,
 )
 from refu_core.simulation._drape import canonical_pose
 from refu_core.simulation._motion import FPS, STEPS, draw_motion, n_steps
 from refu_core.simulation._plan import TEST
 from refu_core.simulation._selection import Selector
-from refu_core.simulation._store import TO_DO, SequenceShard
+from refu_core.simulation._store import SEQUENCES, TO_DO, Rows
 from refu_core.training import read_samples
-from refu_core.training._taken_along import TakenAlong
+from refu_core.training._data import TakenAlong
 from refu_lab.cli import main
 
 GARMENT = "short-pant-male"
@@ -146,7 +146,7 @@ def test_frames_in_the_set_are_free_and_others_are_marked(sequences: list[Garmen
                 assert found is None
             elif sequence.cause[t] in ("body_collision", "self_intersection"):
                 assert found == sequence.cause[t]
-    counts = summarise_sequences(simulated)["counts"]
+    counts = summarise(simulated)["counts"]
     assert counts["frames"] == 2 * FRAMES
     assert counts["frames_kept"] == sum(int(s.kept.sum()) for s in sequences)
 
@@ -167,13 +167,13 @@ def test_cloth_moves_on_and_lags(sequences: list[GarmentSequence]) -> None:
 
 
 def arrays(path: Path) -> dict[str, NDArray[Any]]:
-    shards = [SequenceShard(directory).arrays for directory in sorted(path.glob("shard-*-of-*"))]
-    order = np.argsort(np.concatenate([shard["slot"] for shard in shards]))
-    return {name: np.concatenate([s[name] for s in shards])[order] for name in shards[0] if name != "seconds"}
+    found = Rows(path, SEQUENCES).arrays
+    order = np.argsort(found["slot"])
+    return {name: array[order] for name, array in found.items() if name != "seconds"}
 
 
 def test_interrupted_run_goes_on_to_the_same_bytes(simulated: Path, clips: Path, tmp_path: Path) -> None:
-    """A whole set in one shard, stopped after a sequence; its other one begun and not finished."""
+    """A whole set, stopped after a sequence; its other one begun and not finished."""
     output = tmp_path / "again"
 
     def stop(_: Progress) -> None:
@@ -181,7 +181,7 @@ def test_interrupted_run_goes_on_to_the_same_bytes(simulated: Path, clips: Path,
 
     with pytest.raises(KeyboardInterrupt):
         simulate(output, clips, progress=stop)
-    shard = SequenceShard(output / "shard-0-of-1", mode="r+")
+    shard = Rows(output, SEQUENCES, mode="r+")
     half_written = int(np.flatnonzero(shard.arrays["state"] == TO_DO)[0])
     shard.arrays["vertices"][half_written, :3] = 12345
     del shard

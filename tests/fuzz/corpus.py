@@ -20,7 +20,7 @@ import msg_adapters as adapters
 from refu_core import SmplFrame, load_body, load_garment
 from refu_core.backbones import BasisDecoder, MlpConfig, TailorNetConfig, build_backbone, save_backbone, save_basis
 from refu_core.refu import Refu, refu_tensors
-from refu_core.simulation._store import SEQUENCES, sample_columns, sequence_columns
+from refu_core.simulation._store import SEQUENCES, columns_of
 from tests.fuzz.containers import join_mcap, mcap_bombs, mcap_chunk, npy_bytes, pack_zip, split_mcap
 
 if TYPE_CHECKING:
@@ -271,7 +271,7 @@ def set_files(kind: str) -> dict[str, bytes]:
     """The files of a data set of three rows."""
     rows, n, frames = 3, 5, 4
     is_sequences = kind == SEQUENCES
-    columns = sequence_columns((frames, n, 3)) if is_sequences else sample_columns((n, 3))
+    columns = columns_of(kind, (frames, n, 3) if is_sequences else (n, 3))
     files = {}
     for name, (shape, dtype) in columns.items():
         array = np.zeros((rows, *shape), dtype)

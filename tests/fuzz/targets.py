@@ -240,7 +240,6 @@ def _read_set(folder: Path, kind: str) -> None:
     dataset = GarmentDataset(folder)
     for i in range(min(len(dataset), MOST_READ)):
         assert np.isfinite(dataset.sample(i).vertices).all(), "a garment that isn't finite"
-    dataset.column("unseen")
 
 
 def _checkpoint(folder: Path) -> Reader:

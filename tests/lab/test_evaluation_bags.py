@@ -20,7 +20,7 @@ from refu_core.body import Collider
 from refu_core.metrics import CollisionChecker, SheetChecker
 from refu_core.simulation import GarmentDataset, GarmentSequences, SequencePlan
 from refu_core.simulation._drape import colliders
-from refu_core.simulation._store import DONE, FORMAT, QUANTUM, SEQUENCES, SequenceShard, Shard, quantise, write_card
+from refu_core.simulation._store import DONE, FORMAT, QUANTUM, SEQUENCES, Rows, quantise, write_card
 from refu_lab.cli import main
 from refu_lab.truth import GroundTruth
 
@@ -99,11 +99,11 @@ def card(kind: str) -> dict[str, Any]:
     return {"format": kind, "garment": GARMENT, "quantum_m": QUANTUM, "clips": clips, "plan": plan}
 
 
-def rows(directory: Path, kind: type[Shard], shape: tuple[int, ...], **columns: Any) -> None:
+def rows(directory: Path, kind: str, shape: tuple[int, ...], **columns: Any) -> None:
     """A set of 12 rows, made up: the cut of each row's style, all done, half of them for the test."""
     n = 12
-    kind.create(directory / "shard-0-of-1", np.arange(n, dtype=np.int32), shape)
-    arrays = kind(directory / "shard-0-of-1", mode="r+").arrays
+    Rows.create(directory, kind, np.arange(n, dtype=np.int32), shape)
+    arrays = Rows(directory, kind, mode="r+").arrays
     rng = np.random.default_rng(0)
     arrays["betas"][:] = rng.normal(size=(n, 10))
     arrays["style"][:] = rng.normal(size=(n, 4))
@@ -119,7 +119,7 @@ def test_samples_are_spread_over_the_test_split(script: Any, tmp_path: Path) -> 
     directory.mkdir()
     write_card(directory, card(FORMAT))
     pose = np.random.default_rng(1).normal(0, 0.1, (12, 24, 3))
-    rows(directory, Shard, (load_garment(GARMENT).n_vertices, 3), pose=pose, clip=np.tile((0, -1), 6))
+    rows(directory, FORMAT, (load_garment(GARMENT).n_vertices, 3), pose=pose, clip=np.tile((0, -1), 6))
     dataset = GarmentDataset(directory)
     for seed in range(5):
         chosen = script.spread_samples(dataset, 4, seed)
@@ -145,7 +145,7 @@ def test_sequence_has_truth_in_each_third_frame_of_the_set(script: Any, tmp_path
     cause = np.zeros((12, 7), np.uint8)
     cause[:, 3] = 2
     transl = np.linspace(0, 1, 7)[None, :, None] * np.ones((12, 1, 3))
-    rows(directory, SequenceShard, (7, load_garment(GARMENT).n_vertices, 3), cause=cause, transl=transl)
+    rows(directory, SEQUENCES, (7, load_garment(GARMENT).n_vertices, 3), cause=cause, transl=transl)
     sequences = GarmentSequences(directory)
     bag = tmp_path / "eval_short_pant_male_sequence"
     assert script.write_bag(bag, sequences.parts, script.sequence_moments(sequences, seconds=0.1)) == (7, 2)
