@@ -42,7 +42,7 @@ def test_an_unknown_pose_is_refused() -> None:
 
 @pytest.mark.usefixtures("little_light")
 def test_sheet_has_a_column_a_pose() -> None:
-    script = runpy.run_path(str(Path(__file__).parents[2] / "scripts" / "make_collider_picture.py"))
+    script = runpy.run_path(str(Path(__file__).parents[2] / "scripts" / "make_pictures.py"))
     sheet = script["collider_sheet"](garments=["short-pant-male"], poses=["prayer", "squat"], size=(30, 40), samples=1)
     assert sheet.shape == (120, 60, 3)
     skin, collider, dressed = sheet[:40].astype(int), sheet[40:80].astype(int), sheet[80:].astype(int)
