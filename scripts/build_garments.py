@@ -30,12 +30,8 @@ from asset_tools.surfaces import (
     attach,
     boundary_loops,
     compact,
-    corner_angles,
     directed_edges,
-    edge_lengths,
-    self_intersections,
     smoothing_matrix,
-    vertex_normals,
 )
 from build_bodies import PEOPLE
 from numpy.typing import NDArray
@@ -247,7 +243,7 @@ def main() -> None:
             body=np.array(garment.body),
             card=np.array(card_to_json(garment.card).encode()),
         )
-        report(garment, template, body)
+        print(f"{garment.name}: {len(template.vertices)} vertices, {len(template.faces)} faces")
 
 
 @dataclass(frozen=True, eq=False)
@@ -406,34 +402,6 @@ def _few_influences(weights: NDArray[np.float64]) -> NDArray[np.float64]:
     np.put_along_axis(weights, np.argsort(-weights, axis=1)[:, INFLUENCES:], 0.0, axis=1)
     weights[weights < 1e-3] = 0.0
     return weights / weights.sum(1, keepdims=True)
-
-
-def report(garment: Garment, template: Template, body: SmplBody) -> None:
-    """Prints what the tests check, and what the documentation says."""
-    v, f = template.vertices, template.faces
-    edges = edge_lengths(v, f) * 1e3
-    angles = corner_angles(v, f)
-    pairs = np.unique(np.sort(directed_edges(f), 1), axis=0)
-    distance = BodyDistance(body)
-    clearance, middle = distance(v)[0].min() * 1e3, distance(v[pairs].mean(1))[0].min() * 1e3
-    two = []
-    for k in range(N_BETAS):
-        for sign in (2, -2):
-            betas = sign * np.eye(N_BETAS)[k]
-            two.append(BodyDistance(body, betas)(v + template.shapedirs @ betas)[0].min() * 1e3)
-    turns = []
-    for loop in boundary_loops(f):
-        step = np.roll(v[loop], -1, 0) - v[loop]
-        step /= np.linalg.norm(step, axis=1, keepdims=True)
-        turns.append(np.degrees(np.arccos(np.clip((step * np.roll(step, 1, 0)).sum(1), -1, 1))).max())
-    inward = np.einsum("vk,vk->v", vertex_normals(v, f), distance(v)[1])
-    print(
-        f"{garment.name}: {len(v)} vertices, {len(f)} faces, {len(turns)} edges of cloth that turn by at most "
-        f"{max(turns):.0f} degrees, edges {edges.min():.1f}/{edges.mean():.1f}/{edges.max():.1f} mm, least angle "
-        f"{angles.min():.1f}, {len(self_intersections(v, f))} intersections, {np.mean(inward > 0):.3f} outward\n"
-        f"  clearance {clearance:.1f} mm at vertices, {middle:.1f} at edges, mean {distance(v)[0].mean() * 1e3:.1f}; "
-        f"at +-2 of the betas {min(two):.1f}; {np.count_nonzero(template.weights, axis=1).max()} influences"
-    )
 
 
 if __name__ == "__main__":
