@@ -25,6 +25,7 @@ from refu_core import SmplFrame
 from refu_lab.commands.replay import ReplayOptions
 from refu_lab.fleet import FleetOptions, find_recordings, open_engine, replay_fleet
 from refu_lab.replay import replay
+from refu_lab.stress import resident_mb
 
 ROOT = Path(__file__).parents[1]
 
@@ -110,7 +111,7 @@ def _long(folder: Path, frames: list[SmplFrame], count: int, garments: tuple[str
         while not done.wait(30):
             size = out.stat().st_size / 1e6 if out.exists() else 0.0
             with log.open("a") as file:
-                file.write(f"{time.perf_counter() - start:.0f} s, bag {size:.0f} MB, memory {_resident():.1f} MB\n")
+                file.write(f"{time.perf_counter() - start:.0f} s, bag {size:.0f} MB, memory {resident_mb():.1f} MB\n")
 
     watcher = threading.Thread(target=watch, daemon=True)
     watcher.start()
@@ -119,13 +120,7 @@ def _long(folder: Path, frames: list[SmplFrame], count: int, garments: tuple[str
     watcher.join()
     took = time.perf_counter() - start
     with log.open("a") as file:
-        file.write(f"{len(result.latencies_ms)} frames in {took:.0f} s, memory {_resident():.1f} MB at the end\n")
-
-
-def _resident() -> float:
-    """Memory of this process [MB]."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+        file.write(f"{len(result.latencies_ms)} frames in {took:.0f} s, memory {resident_mb():.1f} MB at the end\n")
 
 
 def main() -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import time
 import zlib
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,7 @@ _SOAK_SHARE = 0.3
 
 @dataclass(frozen=True, kw_only=True)
 class StressResult:
-    """What came of it."""
+    """What came of all checks and soaks."""
 
     tallies: list[Tally] = field(default_factory=list)
     soaks: list[SoakResult] = field(default_factory=list)
@@ -52,10 +52,8 @@ class StressResult:
         return {"rows": [row.as_dict() for row in self._all], "left_out": self.left_out, "failures": self.failures}
 
 
-def run_stress(
-    options: StressOptions, *, progress: bool, report: Callable[[StressResult], object] = id
-) -> StressResult:
-    """Tries all that was asked for; `report` gets what there is so far, every minute of a soak.
+def run_stress(options: StressOptions, *, progress: bool) -> StressResult:
+    """Tries all that was asked for.
 
     Raises:
         StressError: there is nothing to try: no such part, or no weights of any garment.
@@ -67,25 +65,20 @@ def run_stress(
     checks = [check for check in CHECKS.values() if check.part in options.parts]
     has_soak = "soak" in options.parts
     with one_thread():
-        subjects = {
-            wardrobe: Subject(wardrobe, weights=options.weights, collider=options.collider) for wardrobe in wardrobes
-        }
-        pairs = [
-            (check, subject) for check in checks for subject in subjects.values() if check.holds_for(subject.wardrobe)
-        ]
+        subjects = [Subject(one, weights=options.weights, collider=options.collider) for one in wardrobes]
+        pairs = [(check, one) for check in checks for one in subjects if check.holds_for(one.wardrobe)]
         result.tallies.extend(_run_checks(options, pairs, seconds * (1 - _SOAK_SHARE * has_soak), progress=progress))
-        for wardrobe, subject in subjects.items() if has_soak else ():
+        for subject in subjects if has_soak else ():
             share = _SOAK_SHARE if checks else 1.0
             with tqdm(total=options.n_frames, unit="frame", disable=not progress, leave=False, mininterval=1) as bar:
                 done = soak(
                     subject.pipeline,
-                    mode=f"{wardrobe.mode} {', '.join(wardrobe.garments)}",
+                    mode=f"{subject.wardrobe.mode} {', '.join(subject.wardrobe.garments)}",
                     frames=options.n_frames,
                     persons=options.persons,
                     seconds=share * seconds / len(wardrobes) if options.hours is not None else math.inf,
                     seed=options.seed,
                     tick=bar.update,
-                    report=lambda so_far: report(replace(result, soaks=[*result.soaks, so_far])),
                 )
             result.soaks.append(done)
     if options.output is not None:
@@ -114,14 +107,17 @@ def _wardrobes(options: StressOptions) -> tuple[list[Wardrobe], list[str]]:
 def _run_checks(
     options: StressOptions, pairs: Sequence[tuple[Check, Subject]], seconds: float, *, progress: bool
 ) -> list[Tally]:
-    """Tries all, round after round; what is drawn depends on the seed, the check and the round alone.
+    """Tries all, whole rounds first, then until the time is over; one tally a check and mode, in the checks' order.
 
-    One tally a check and mode, in the checks' order.
+    What is drawn depends on the seed, the check and the round alone.
     """
     tallies: dict[tuple[str, str], Tally] = {}
     total = options.n_rounds * len(pairs) if options.hours is None else None
+    start = time.monotonic()
     with tqdm(total=total, unit="check", disable=not progress, leave=False) as bar:
-        for round_, (check, subject) in _turns(pairs, options.n_rounds, seconds):
+        for round_, (check, subject) in ((n, pair) for n in count() for pair in pairs) if pairs else ():
+            if round_ >= options.n_rounds and time.monotonic() - start >= seconds:
+                break
             wardrobe = subject.wardrobe
             tally = tallies.setdefault((check.name, wardrobe.mode), Tally(check.name, wardrobe.mode))
             key = zlib.crc32(f"{check.name} {wardrobe.garments}".encode())
@@ -133,20 +129,7 @@ def _run_checks(
     return list(tallies.values())
 
 
-def _turns(
-    pairs: Sequence[tuple[Check, Subject]], rounds: int, seconds: float
-) -> Iterator[tuple[int, tuple[Check, Subject]]]:
-    """Whose turn it is, with the number of the round; whole rounds first, then until the time is over."""
-    start = time.monotonic()
-    for round_ in count() if pairs else ():
-        for pair in pairs:
-            if round_ >= rounds and time.monotonic() - start >= seconds:
-                return
-            yield round_, pair
-
-
 def _save_worst(tallies: Sequence[Tally], folder: Path) -> list[Path]:
-    """Writes the worst trial of each tally as `folder`/<check>-<mode>.npz."""
     written = []
     for tally in tallies:
         if tally.worst_trial is not None and tally.worst_trial[1].frames:
