@@ -202,11 +202,3 @@ def _dressing(paper: PaperStructure, name: str) -> Callable[[Sequence[SmplFrame]
         return outputs
 
     return dress
-
-
-OF_MAIN_GARMENT: Mapping[str, Callable[[Section, Pipelines], None]] = {
-    "persons": measure_persons,
-    "unchanged": measure_still,
-    "paper": measure_paper,
-}
-"""What is measured of the first garment alone, on every device."""

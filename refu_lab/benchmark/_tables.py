@@ -166,15 +166,11 @@ def write_results(result: BenchmarkResult, folder: Path) -> list[Path]:
 def conditions(result: BenchmarkResult) -> str:
     """The machine, and what else it was doing."""
     machine = result.machine
-    pinned = "" if machine.get("core") is None else f", pinned to core {machine['core']}"
-    text = f"{machine['processor']}, {machine['cores']} cores, one thread{pinned}; torch {machine['torch']}"
+    text = f"{machine['processor']}, {machine['cores']} cores, one thread, pinned to core {machine['core']}; "
+    text += f"torch {machine['torch']}"
     if "gpu" in machine:
         text += f"; {machine['gpu']}"
-    load = [machine.get("load_before"), machine.get("load_after")]
-    if None not in load:
-        text += f"; load average {load[0]:.1f} before, {load[1]:.1f} after"
-    if result.interrupted:
-        text += "; interrupted before everything was measured"
+    text += f"; load average {machine['load_before']:.1f} before, {machine['load_after']:.1f} after"
     return (
         f"{text}. Times are the processor's, medians and quartiles of contenders taken in turn; ratios are to "
         "refitting a BVH and asking it for every vertex (the plain query), taken in turn with them."

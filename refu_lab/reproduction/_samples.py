@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -36,8 +35,6 @@ class SampleSet:
 
     garment: str
     count: int
-    key: str
-    """What tells these samples from others."""
     shapes: int | None
     """Body shapes of a set of sequences; None for a set of poses."""
     read: Callable[[int], Sample]
@@ -49,9 +46,7 @@ class SampleSet:
     def thinned(self, most: int) -> SampleSet:
         """At most so many of these samples, evenly spread."""
         rows = np.unique(np.linspace(0, self.count - 1, min(most, self.count)).round().astype(int))
-        return replace(
-            self, count=len(rows), key=f"{self.key} {most}", read=lambda number: self.read(int(rows[number]))
-        )
+        return replace(self, count=len(rows), read=lambda number: self.read(int(rows[number])))
 
     @classmethod
     def open(cls, path: Path, *, every: int = 1) -> SampleSet:
@@ -75,8 +70,7 @@ def _of_poses(dataset: GarmentDataset, every: int) -> SampleSet:
         sample = dataset.sample(int(rows[number]))
         return Sample(sample.vertices, sample.pose, sample.betas, sample.style, sample.unseen)
 
-    key = _key(dataset.column("slot")[rows], dataset.column("pose")[rows])
-    return SampleSet(str(dataset.card["garment"]), len(rows), key, None, read)
+    return SampleSet(str(dataset.card["garment"]), len(rows), None, read)
 
 
 def _of_sequences(dataset: GarmentSequences, every: int) -> SampleSet:
@@ -87,13 +81,5 @@ def _of_sequences(dataset: GarmentSequences, every: int) -> SampleSet:
         sequence, t = sequences[frames[number][0]], frames[number][1]
         return Sample(sequence.vertices(t), sequence.pose[t], sequence.betas, sequence.style, float("nan"))
 
-    key = _key(np.array(frames), np.array([sequence.number for sequence in sequences]))
     plan = dataset.card["plan"]
-    return SampleSet(str(plan["garment"]), len(frames), key, int(plan["shapes"]), read)
-
-
-def _key(*arrays: NDArray[np.generic]) -> str:
-    digest = hashlib.sha256()
-    for array in arrays:
-        digest.update(array.tobytes())
-    return digest.hexdigest()
+    return SampleSet(str(plan["garment"]), len(frames), int(plan["shapes"]), read)

@@ -69,7 +69,7 @@ class SoakResult:
 
     @property
     def failures(self) -> int:
-        """How many of these have failed: memory, latency (of many calls, by the clock and by the yardstick), numbers."""
+        """How many have failed of memory, latency (of many calls, by the clock and by the yardstick) and numbers."""
         times, is_judged = 1 + self.slowdown, self.frames >= JUDGED_FROM * self.persons
         slower = is_judged and is_slower(times, times, 1 + self.machine_slowdown)
         return (self.growth > TOLERANCE) + slower + (self.nan > 0)
