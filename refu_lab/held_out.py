@@ -62,16 +62,10 @@ class HeldOut(NamedTuple):
 
 
 def held_out(bag: Path, garment: str, *, every: int = 1, weights: Path | None = None) -> HeldOut:
-    """Predicts the frames of a bag that have their truth.
+    """Predicts every so-many-th of the frames of a bag that have a garment's truth.
 
-    Args:
-        bag: with ground truth.
-        garment: whose.
-        every: takes every so-many-th of these frames.
-        weights: a folder of one's own; those that ship by default.
-
-    Raises:
-        RefuError: the bag can't be read or has no truth of this garment, or there is no such garment.
+    `weights` is a folder of one's own, in place of those that ship. Raises `RefuError` for a bag that can't be read or
+    has no truth of this garment, and where there is no such garment.
     """
     pipeline = GarmentPipeline.load([garment], weights=weights)
     (template,) = pipeline.garments.values()
