@@ -28,11 +28,10 @@ from refu_core.metrics import CollisionChecker, Figures, GarmentMetrics
 from refu_core.modes import BackboneName
 from refu_core.realtime import PipelineOutput
 from refu_core.recordings import FASTEST, LONGEST_TURN, axis_of, upright_share
-from refu_lab.bodies import body_facts
 from refu_lab.commands._common import require_apart
 from refu_lab.commands.replay import ReplayOptions
 from refu_lab.dressed_bag import DressedBag, garment_encoder
-from refu_lab.sources import Source, open_source
+from refu_lab.sources import Source, body_facts, open_source
 from refu_lab.truth import GroundTruth
 
 When = Literal["before", "after"]

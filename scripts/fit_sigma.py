@@ -17,7 +17,7 @@ import numpy as np
 
 from refu_core import RefuError
 from refu_core.outputs import fit_sigma, save_sigma
-from refu_lab.held_out import cross_checked, held_out
+from refu_lab.truth import cross_checked, held_out
 
 
 def main() -> None:

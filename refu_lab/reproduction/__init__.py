@@ -15,8 +15,8 @@ from refu_lab.reproduction._motion import motion_table as motion_table
 from refu_lab.reproduction._paper import PAPER as PAPER
 from refu_lab.reproduction._paper import paper_figure as paper_figure
 from refu_lab.reproduction._paper import published_modes as published_modes
-from refu_lab.reproduction._pictures import picture_garments as picture_garments
 from refu_lab.reproduction._plots import PLOTS as PLOTS
+from refu_lab.reproduction._plots import picture_garments as picture_garments
 from refu_lab.reproduction._runs import MethodRun as MethodRun
 from refu_lab.reproduction._runs import Study as Study
 from refu_lab.reproduction._runs import run_methods as run_methods

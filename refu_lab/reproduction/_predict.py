@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from refu_core.backbones import Skinned
-from refu_core.body import BodyFit, Collider, RigidTransforms, SmplBody, load_body
+from refu_core.body import BodyFit, Collider, SmplBody, load_body
 from refu_core.contact import Blend
 from refu_core.errors import WeightsError
 from refu_core.frames import SmplFrame
@@ -60,33 +60,20 @@ class GarmentSetup:
         return self.rest_faces.under(unposed[None], betas, self.template.shapedirs)[0]
 
 
-@dataclass(eq=False)
 class SampleScene:
     """One sample's body, posed; the distances to it are made ready when the first method asks."""
 
-    setup: GarmentSetup
-    pose: Tensor
-    """θ [rad], shape (1, 24, 3)."""
-    betas: Tensor
-    """β, shape (1, 10)."""
-    style: Tensor
-    """γ, shape (1, 4)."""
-    vertices: Tensor = field(init=False)
-    """The collider [m], shape (V, 3)."""
-    transforms: RigidTransforms = field(init=False)
-    _update_ms: dict[str, float] = field(default_factory=dict, init=False)
-
-    def __post_init__(self) -> None:
-        bare = Outfit(self.setup.body, {}, self.setup.collider)
-        dressed = dress(self.pose, Wearer.of(bare, self.betas))
-        self.vertices = dressed.turns[0](dressed.body[0])
-        self.transforms = self.setup.body(self.pose, self.betas).transforms
-
-    @classmethod
-    def of(cls, setup: GarmentSetup, pose: ArrayLike, betas: ArrayLike, style: ArrayLike) -> SampleScene:
-        """A scene of a pose (24, 3) [rad], betas (10,) and style (4,)."""
-        values = (torch.from_numpy(np.asarray(value, np.float32))[None] for value in (pose, betas, style))
-        return cls(setup, *values)
+    def __init__(self, setup: GarmentSetup, pose: ArrayLike, betas: ArrayLike, style: ArrayLike) -> None:
+        """Of a pose (24, 3) [rad], betas (10,) and style (4,)."""
+        self.setup = setup
+        self.pose, self.betas, self.style = (
+            torch.from_numpy(np.asarray(value, np.float32))[None] for value in (pose, betas, style)
+        )
+        dressed = dress(self.pose, Wearer.of(Outfit(setup.body, {}, setup.collider), self.betas))
+        self.vertices: Tensor = dressed.turns[0](dressed.body[0])
+        """The collider [m], shape (V, 3)."""
+        self.transforms = setup.body(self.pose, self.betas).transforms
+        self._update_ms: dict[str, float] = {}
 
     def sdf(self, name: str) -> tuple[BodySdf, float]:
         """The distance of that name to this body, and how long it took to take over the body [ms]."""

@@ -195,7 +195,7 @@ def _run_samples(
     metrics = {name: GarmentMetrics(faces) for name in predictors}
     runs = {name: MethodRun(garment, name) for name in predictors}
     for sample in samples:
-        scene = SampleScene.of(setup, sample.pose, sample.betas, sample.style)
+        scene = SampleScene(setup, sample.pose, sample.betas, sample.style)
         checker.update(scene.vertices)
         colliding = dict.fromkeys(METHODS, np.zeros(setup.template.n_vertices, np.bool_))
         for name, predict in predictors.items():

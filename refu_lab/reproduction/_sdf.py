@@ -111,7 +111,7 @@ def sdf_table(sets: Sequence[SampleSet], *, library: Library, progress: bool = F
         bodies: dict[bytes, Sample] = {}
         numbers = tqdm(range(len(samples)), desc=f"sdf, {garment}", unit="sample", disable=None if progress else True)
         for sample in map(samples.read, numbers):
-            scene = SampleScene.of(setup, sample.pose, sample.betas, sample.style)
+            scene = SampleScene(setup, sample.pose, sample.betas, sample.style)
             questions.ask(scene, torch.from_numpy(sample.vertices))
             bodies.setdefault(sample.betas.tobytes(), sample)
         for name, asked in questions.answers().items():
@@ -120,7 +120,7 @@ def sdf_table(sets: Sequence[SampleSet], *, library: Library, progress: bool = F
         for title in FOLDED_POSES:
             pose = touching_pose(title)
             for sample in list(bodies.values())[:_FOLDED_SHAPES]:
-                scene = SampleScene.of(setup, pose, sample.betas, sample.style)
+                scene = SampleScene(setup, pose, sample.betas, sample.style)
                 unposed = setup.template.rest(scene.betas, scene.style)
                 questions.ask(scene, setup.template.pose(unposed, scene.transforms)[0])
             for name, asked in questions.answers().items():

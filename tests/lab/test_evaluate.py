@@ -16,7 +16,7 @@ import msg_adapters as adapters
 from refu_core import SmplFrame, load_body, load_garment
 from refu_lab import quick
 from refu_lab.cli import main
-from refu_lab.reproduction import Library, SampleSet, Study, _pictures, _runs, run_methods
+from refu_lab.reproduction import Library, SampleSet, Study, _plots, _runs, run_methods
 from refu_lab.truth import TOPIC
 
 BAGS = Path(__file__).parents[2] / "bags"
@@ -90,7 +90,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_tables_of_a_data_set(
     dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(_pictures, "_SIZE", (60, 80))
+    monkeypatch.setattr(_plots, "_SHOT", (60, 80))
     out, file = tmp_path / "results", tmp_path / "rows.json"
     assert run("--data", dataset, "--table", "comparison", "--output", out, "--json", file) == 0
     printed = capsys.readouterr().out

@@ -27,7 +27,7 @@ from refu_core.modes import DEFAULT_GARMENTS
 from refu_core.realtime import Wearable
 from refu_core.refu import SCALE_PRESETS, Refu
 from refu_lab import reproduction as rp
-from refu_lab.reproduction import _build, _pictures, _runs, _tables
+from refu_lab.reproduction import _build, _plots, _runs, _tables
 from refu_lab.tables import RESULT_TABLES
 
 GARMENT = "short-pant-male"
@@ -248,7 +248,7 @@ def test_plots_of_the_same_figures_are_the_same_files(study: rp.Study, tmp_path:
 
 @pytest.mark.usefixtures("little_light")
 def test_pictures(study: rp.Study, samples: rp.SampleSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_pictures, "_SIZE", (60, 80))
+    monkeypatch.setattr(_plots, "_SHOT", (60, 80))
     ((file, caption),) = rp.picture_garments(study, [samples], tmp_path, library=Emulated())
     assert (tmp_path / file).read_bytes().startswith(b"\x89PNG")
     assert "ReFU, hybrid" in caption
