@@ -37,7 +37,7 @@ def _frames() -> list[SmplFrame]:
 
 def _write(path: Path, frames: list[SmplFrame], count: int, first: int) -> None:
     encode = adapters.encoder_for("multiarray")
-    with adapters.BagWriter(path) as writer:
+    with adapters.BagWriter(path, overwrite=True) as writer:
         writer.add_topic("/smpl_params", adapters.INPUT_TYPES["multiarray"])
         for i, frame in enumerate(itertools.islice(itertools.cycle(frames), first, first + count)):
             writer.write("/smpl_params", encode(frame), log_time_ns=10**18 + i * 33_333_333)
@@ -91,8 +91,7 @@ def _convert(folder: Path, frames: list[SmplFrame], rounds: int) -> None:
 
 def _long(folder: Path, frames: list[SmplFrame], count: int, garments: tuple[str, ...], *, with_body: bool) -> None:
     """Converts a recording of so many frames; its log memory.txt gets a line each half minute."""
-    encode, log = adapters.encoder_for("multiarray"), folder / "memory.txt"
-    out = folder / "long-out.mcap"
+    log, out = folder / "memory.txt", folder / "long-out.mcap"
     options = ReplayOptions(
         input=folder / "long.mcap",
         output=out,
@@ -101,10 +100,7 @@ def _long(folder: Path, frames: list[SmplFrame], count: int, garments: tuple[str
         overwrite=True,
         with_body=with_body,
     )
-    with adapters.BagWriter(options.input, overwrite=True) as writer:
-        writer.add_topic("/smpl_params", adapters.INPUT_TYPES["multiarray"])
-        for i in range(count):
-            writer.write("/smpl_params", encode(frames[i % len(frames)]), log_time_ns=10**18 + i * 33_333_333)
+    _write(options.input, frames, count, 0)
     start, done = time.perf_counter(), threading.Event()
 
     def watch() -> None:

@@ -57,7 +57,6 @@ class Recording:
         return struct.pack("<4sQ", b"\0\1\0\0", i) + rng.randbytes(rng.choice((100, 2_000, 60_000, 300_000)))
 
     def begin(self, folder: Path) -> None:
-        """Records until it is killed."""
         from msg_adapters import QosProfile
         from msg_adapters.bags import Recorder
 
@@ -120,7 +119,6 @@ class Simulation:
         self.longest_s = 1.2 * (time.monotonic() - started)
 
     def begin(self, folder: Path) -> None:
-        """Simulates what is left."""
         from refu_core.simulation import simulate_dataset
 
         simulate_dataset(GARMENT, self.count, folder)
@@ -182,7 +180,6 @@ class Training:
         self.longest_s = 1.2 * (time.monotonic() - started)
 
     def begin(self, folder: Path) -> None:
-        """Trains what is left."""
         from refu_core.training import pretrain
 
         torch.manual_seed(os.getpid())  # must not matter

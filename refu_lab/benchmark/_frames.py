@@ -76,17 +76,14 @@ class FrameRunner:
         laps.append(time.perf_counter())
         if not given[0].is_jump:
             decode, _, encode = 1e3 * np.diff(laps)
-            own = _summed([output.stats.stage_ms for output in outputs])
+            spent = [output.stats.stage_ms for output in outputs]
+            own = {stage: sum(one[stage] for one in spent) for stage in spent[0]}
             self.stages.append({"decode": float(decode), **own, "encode": float(encode)})
         return data
 
     def stage_times(self) -> dict[str, NDArray[np.float64]]:
         """Times of each stage [ms]."""
         return {stage: np.array([one[stage] for one in self.stages]) for stage in self.stages[0]}
-
-
-def _summed(stages: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    return {stage: sum(one[stage] for one in stages) for stage in stages[0]}
 
 
 def load_pipelines(

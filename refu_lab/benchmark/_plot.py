@@ -32,7 +32,9 @@ def plot_time_against_error(result: BenchmarkResult, folder: Path) -> Path | Non
     figure, axes = new_axes(1, len(_METRICS), size=(12.6, 4.6))
     for ax, (name, label) in zip(axes, _METRICS, strict=True):
         for row in shown:
-            ax.errorbar(row.ms_median, row.figures[name], xerr=_spread(row), **_style(row))
+            low, high = row.ms_q1 or row.ms_median, row.ms_q3 or row.ms_median
+            spread = [[row.ms_median - low], [high - row.ms_median]]
+            ax.errorbar(row.ms_median, row.figures[name], xerr=spread, **_style(row))
         for mode, one in published_modes().items():
             label_of = f"paper, {mode}, on a V100*"
             ax.plot(one["ms"], one[name], "D", mfc="none", mec=_COLOURS[mode], ms=6, label=label_of)
@@ -65,11 +67,6 @@ def _style(row: BenchmarkRow) -> dict[str, Any]:
         "ms": _SIZES.get(row.mode, 6),
         "lw": 1,
     }
-
-
-def _spread(row: BenchmarkRow) -> list[list[float]]:
-    low, high = row.ms_q1 or row.ms_median, row.ms_q3 or row.ms_median
-    return [[row.ms_median - low], [high - row.ms_median]]
 
 
 def _marks(result: BenchmarkResult) -> list[tuple[float, str]]:

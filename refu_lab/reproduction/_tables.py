@@ -117,8 +117,7 @@ class ResultTable:
 
     def value(self, garment: str, method: str, metric: str) -> float | None:
         """The figure measured; None where there is none."""
-        found = (row.value for row in self.rows if row[1:4] == (garment, method, metric))
-        return next(found, None)
+        return next((row.value for row in self.rows if row[1:4] == (garment, method, metric)), None)
 
     def label(self, method: str) -> str:
         """A row's name for people."""
@@ -240,13 +239,12 @@ def write_summary(folder: Path) -> Path:
         f"- not made yet: `refu evaluate --table {name}`" if table is None else f"- [{table.title}]({name}.md)"
         for name, table in tables.items()
     ]
-    for file, title in (
-        ("performance.md", "Run time: `refu benchmark`"),
-        ("collider.md", "The collider: what each number does"),
-        ("contact.md", "Collision handling: what each number does"),
-    ):
-        if (folder / file).exists():
-            links.append(f"- [{title}]({file})")
+    others = {
+        "performance.md": "Run time: `refu benchmark`",
+        "collider.md": "The collider: what each number does",
+        "contact.md": "Collision handling: what each number does",
+    }
+    links += [f"- [{title}]({file})" for file, title in others.items() if (folder / file).exists()]
     about = folder / "about.txt"
     parts = [
         "# Results",
@@ -285,14 +283,8 @@ def weighted(values: Iterable[tuple[float | None, int]]) -> float | None:
     """
     pairs = list(values)
     total = sum(count for _, count in pairs)
-    if not total:
-        return None
-    result = 0.0
-    for value, count in pairs:
-        if value is None:
-            return None
-        result += value * count / total
-    return result
+    known = [(value, count) for value, count in pairs if value is not None]
+    return sum(value * count / total for value, count in known) if total and len(known) == len(pairs) else None
 
 
 def _kind(metric: str) -> str:
