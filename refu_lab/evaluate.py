@@ -28,7 +28,6 @@ def _command(options: EvaluateOptions, table: str) -> str:
         parts += [f"--motion-every {options.motion_every}"] if options.motion_every > 1 else []
     else:
         parts += [f"--data {' '.join(f'data/{path.resolve().name}' for path in options.data)}"]
-        parts += [f"--every {options.every}"] if options.every > 1 else []
     parts += [f"--body {Path(options.body).name}"] if options.body is not None else []
     parts += [] if options.collider else ["--no-collider"]
     parts += [f"--weights {path.resolve().name}" for path in options.weights]
@@ -48,7 +47,7 @@ def evaluate(options: EvaluateOptions, *, progress: bool, engine: Engine | None 
         need = "--motions DIR" if options.table == "motion" else "--data DIR"
         msg = f"nothing to evaluate: the table {options.table} needs {need}"
         raise RefuError(msg)
-    sets = [rp.SampleSet.open(path, every=options.every) for path in options.data]
+    sets = [rp.SampleSet.open(path) for path in options.data]
     _check_sets(sets)
     posed = [samples for samples in sets if samples.shapes is None]
     moving = [samples for samples in sets if samples.shapes is not None]

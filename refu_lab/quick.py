@@ -26,7 +26,7 @@ BAGS = Path("bags")
 REFERENCE = Path("docs/results/quick.json")
 TOLERANCES: dict[str, float] = {"mpve_mm": 0.3, "vfcp_percent": 0.02, "cfmp_percent": 7.0, "max_depth_mm": 1.0}
 """How much worse a figure may be than its reference: what other processors and releases of torch make of the same
-weights, far less than what a worse method does. Those of a reference file are in the file."""
+weights, far less than what a worse method does."""
 _FRAMES = 15
 """Frames of a bag, at most."""
 _MODES = (("skinned", "accurate"), ("auto", "hybrid"))
@@ -103,7 +103,7 @@ def quick_check(
     """
     file = reference or REFERENCE
     bags = [one.source for one in find_recordings(data or [str(BAGS)])]
-    known, tolerances = ({}, TOLERANCES) if renew else _read(file)
+    known = {} if renew else _read(file)
     figures: dict[int, list[tuple[FigureKey, float]]] = {}
     with tqdm(total=len(bags), unit="bag", disable=None if progress else True) as bar:
         for index, rows in engine.run(run_function(_measure), bags):
@@ -116,10 +116,10 @@ def quick_check(
     if renew:
         about = "refu evaluate --quick holds its figures against these; written by --set-reference"
         kept = [{**key._asdict(), "value": value} for key, value in found.items()]
-        write_json(file, {"about": about, "tolerances": TOLERANCES, "rows": kept})
+        write_json(file, {"about": about, "rows": kept})
         known = found
     keys = dict.fromkeys([*known, *found])
-    compared = [Comparison(key, found.get(key), known.get(key), tolerances[key.metric]) for key in keys]
+    compared = [Comparison(key, found.get(key), known.get(key), TOLERANCES[key.metric]) for key in keys]
     return QuickResult(compared, file, is_renewed=renew)
 
 
@@ -165,16 +165,17 @@ def _true_garments(bag: Path) -> tuple[str, ...]:
     return tuple(names)
 
 
-def _read(file: Path) -> tuple[dict[FigureKey, float], dict[str, float]]:
-    """The reference's figures, and its tolerances."""
+def _read(file: Path) -> dict[FigureKey, float]:
+    """The reference's figures."""
     if not file.exists():
         msg = f"{file}: no reference there; write one with --set-reference, or name another with --reference"
         raise RefuError(msg)
     try:
         content = read_json(file, error=RefuError, wanted="a reference, as --set-reference writes it")
-        tolerances = {**TOLERANCES, **{str(k): float(v) for k, v in content["tolerances"].items()}}
         figures = {FigureKey(*(str(r[name]) for name in FigureKey._fields)): float(r["value"]) for r in content["rows"]}
-        return figures, {metric: tolerances[metric] for metric in {*TOLERANCES, *(key.metric for key in figures)}}
-    except (RefuError, ValueError, KeyError, TypeError, AttributeError) as error:
+        if unknown := {key.metric for key in figures} - TOLERANCES.keys():
+            raise KeyError(*unknown)
+    except (RefuError, ValueError, KeyError, TypeError) as error:
         msg = f"{file}: not a reference of refu evaluate --quick ({error!r}); write one with --set-reference"
         raise RefuError(msg) from error
+    return figures

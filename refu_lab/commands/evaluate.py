@@ -23,7 +23,6 @@ class EvaluateOptions:
         None, "folder of AMASS-style .npz files, for motion", parse=cli.in_path, metavar="DIR"
     )
     output: Path = setting(Path("docs/results"), "where the pages go", parse=cli.out_folder, metavar="DIR")
-    every: int = setting(1, "every N-th test sample", parse=cli.positive, metavar="N")
     motion_every: int = setting(1, "every N-th frame of a motion", parse=cli.positive, metavar="N")
     body: str | None = cli.worn_by()
     collider: bool = cli.off_collider()

@@ -49,22 +49,22 @@ class SampleSet:
         return replace(self, count=len(rows), read=lambda number: self.read(int(rows[number])))
 
     @classmethod
-    def open(cls, path: Path, *, every: int = 1) -> SampleSet:
-        """Every `every`-th test sample of the set in the folder `path`, finished so far.
+    def open(cls, path: Path) -> SampleSet:
+        """The test samples of the set in the folder `path`, finished so far.
 
         Raises:
             RefuError: no such set, a damaged one, or one without a finished test sample.
         """
         dataset = open_dataset(path)
-        samples = _of_sequences(dataset, every) if isinstance(dataset, GarmentSequences) else _of_poses(dataset, every)
+        samples = _of_sequences(dataset) if isinstance(dataset, GarmentSequences) else _of_poses(dataset)
         if not samples.count:
             msg = f"{path}: no test sample in it is finished yet"
             raise RefuError(msg)
         return samples
 
 
-def _of_poses(dataset: GarmentDataset, every: int) -> SampleSet:
-    rows = np.flatnonzero(dataset.test)[::every]
+def _of_poses(dataset: GarmentDataset) -> SampleSet:
+    rows = np.flatnonzero(dataset.test)
 
     def read(number: int) -> Sample:
         sample = dataset.sample(int(rows[number]))
@@ -73,9 +73,9 @@ def _of_poses(dataset: GarmentDataset, every: int) -> SampleSet:
     return SampleSet(str(dataset.card["garment"]), len(rows), None, read)
 
 
-def _of_sequences(dataset: GarmentSequences, every: int) -> SampleSet:
+def _of_sequences(dataset: GarmentSequences) -> SampleSet:
     sequences = [dataset.sequence(int(row)) for row in np.flatnonzero(dataset.test)]
-    frames = [(k, int(t)) for k, sequence in enumerate(sequences) for t in np.flatnonzero(sequence.kept)][::every]
+    frames = [(k, int(t)) for k, sequence in enumerate(sequences) for t in np.flatnonzero(sequence.kept)]
 
     def read(number: int) -> Sample:
         sequence, t = sequences[frames[number][0]], frames[number][1]

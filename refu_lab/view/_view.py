@@ -63,9 +63,6 @@ def view(
         say(f"{film.title}{what} at {url} (Ctrl-C ends it)")
         if options.browser and _has_display():
             webbrowser.open(url)
-        elif "SSH_CONNECTION" in os.environ and options.host == "localhost":
-            port = server.get_port()
-            say(f"from your own machine: ssh -L {port}:localhost:{port} {socket.gethostname()}, then open {url} there")
         player.run(until=until)
     except KeyboardInterrupt:
         say("viewer closed")
