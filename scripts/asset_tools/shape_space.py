@@ -163,12 +163,12 @@ class TPose:
         return rotations
 
 
-def build_shape_spaces(mesh: BaseMesh, *, count: int, seed: int = 0) -> dict[str, ShapeSpace]:
+def build_shape_spaces(mesh: BaseMesh, *, count: int) -> dict[str, ShapeSpace]:
     """Shape spaces of `count` men, of as many women, and (`neutral`) of all of them."""
     to_tpose = TPose(mesh)
     samples, joints = {}, {}
     for gender in ("male", "female"):
-        people = mesh.people(count, gender=gender, seed=seed)
+        people = mesh.people(count, gender=gender)
         joints[gender] = np.empty((count, len(JOINT_NAMES), 3))
         for i in range(count):  # in place: a gender's samples are 160 MB
             people[i], joints[gender][i] = to_tpose(people[i])
