@@ -154,8 +154,7 @@ def add(commands: Any) -> None:
         "in one process on one core, and write a page, a JSON file and a plot.",
     )
     cli.add_options(parser, BenchmarkOptions)
-    cli.add_common(parser)
-    parser.set_defaults(run=run)
+    cli.add_common(parser, run)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -64,8 +64,7 @@ def add(commands: Any) -> None:
     )
     parser.add_argument("--set-reference", action="store_true", help="write that file instead of comparing with it")
     cli.add_cluster(parser)
-    cli.add_common(parser)
-    parser.set_defaults(run=run)
+    cli.add_common(parser, run)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -54,11 +54,9 @@ def add(commands: Any) -> None:
     )
     adding.add_argument("mesh", type=cli.in_path, metavar="MESH", help="the mesh's file")
     cli.add_options(adding, AddOptions)
-    cli.add_common(adding)
-    adding.set_defaults(run=run_add)
+    cli.add_common(adding, run_add)
     listing = actions.add_parser("list", help="the garments that have a name", description="The garments by name.")
-    cli.add_common(listing)
-    listing.set_defaults(run=run_list)
+    cli.add_common(listing, run_list)
 
 
 def run_add(args: argparse.Namespace) -> int:

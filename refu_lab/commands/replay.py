@@ -103,8 +103,7 @@ def add(commands: Any) -> None:
     )
     parser.add_argument("--again", action="store_true", help="of several inputs: also those that are finished")
     cli.add_cluster(parser)
-    cli.add_common(parser)
-    parser.set_defaults(run=run)
+    cli.add_common(parser, run)
 
 
 def run(args: argparse.Namespace) -> int:

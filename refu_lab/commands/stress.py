@@ -80,8 +80,7 @@ def add(commands: Any) -> None:
     )
     cli.add_options(parser, StressOptions)
     parser.add_argument("--replay", type=cli.in_path, metavar="FILE", help="try one of them again, and nothing else")
-    cli.add_common(parser)
-    parser.set_defaults(run=run)
+    cli.add_common(parser, run)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -127,7 +127,7 @@ def picture_garments(
 
 def _draw(samples: SampleSet, number: int, methods: Sequence[str], path: Path, library: Library) -> None:
     """What each method makes of a sample, and the truth, side by side."""
-    setup, sample = GarmentSetup.of(samples.garment, collider=library.collider, fit=library.fit), samples.read(number)
+    setup, sample = GarmentSetup(samples.garment, library), samples.read(number)
     scene = SampleScene(setup, sample.pose, sample.betas, sample.style)
     shots = [Predictor(METHODS[name], setup, library)(scene).vertices.numpy() for name in methods]
     body, faces = RenderMesh(scene.vertices.numpy(), setup.body.faces.numpy()), setup.template.faces.numpy()

@@ -126,7 +126,7 @@ def run_methods(
     """
     garment = samples.garment
     study.n_samples[garment] = len(samples)
-    setup = GarmentSetup.of(garment, collider=library.collider, fit=library.fit)
+    setup = GarmentSetup(garment, library)
     ready: dict[str, Predictor] = {}
     bases = [METHODS[name].base for name in methods]
     for name in dict.fromkeys([*bases, *methods]):  # their Laplacian errors are measured against the bases'
@@ -165,7 +165,7 @@ class _Runner:
 
     def __call__(self) -> Callable[[list[Sample]], dict[str, MethodRun]]:
         if self.made is None:
-            setup = GarmentSetup.of(self.garment, collider=self.library.collider, fit=self.library.fit)
+            setup = GarmentSetup(self.garment, self.library)
             self.made = setup, {name: Predictor(METHODS[name], setup, self.library) for name in self.methods}
         return partial(_run_samples, *self.made, self.garment)
 

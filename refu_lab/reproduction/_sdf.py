@@ -99,7 +99,7 @@ def sdf_table(sets: Sequence[SampleSet], *, library: Library, progress: bool = F
     )
     for samples in sets:
         garment = samples.garment
-        setup = GarmentSetup.of(garment, collider=library.collider, fit=library.fit)
+        setup = GarmentSetup(garment, library)
         sdfs: dict[str, BodySdf] = {"approx": setup.approx}
         try:
             sdfs["neural"] = library.load_neural_sdf("paper", garment, setup.body)
