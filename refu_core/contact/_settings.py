@@ -16,7 +16,7 @@ class ContactSettings:
 
     Raises `RefuError` for more pushes than are counted.
 
-    Each number says what it is for. `benchmarks/sensitivity.py` measures what half and twice of it do on recorded motion.
+    Each number says what it is for. `benchmarks/sensitivity.py` measures what half and twice of it do.
     """
 
     # Pushes along the gradient

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import product
@@ -12,10 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import msg_adapters as adapters
-from refu_core import GarmentPipeline, SmplFrame, WeightsError
-from refu_core.garments import GarmentTemplate
+from refu_core import GarmentPipeline, WeightsError
 from refu_core.history import PoseHistory
-from refu_core.realtime import PipelineOutput
 from refu_lab.benchmark._inputs import Moment
 from refu_lab.commands.benchmark import BenchmarkOptions
 
@@ -26,18 +24,10 @@ BACKBONES = ("tailornet", "skinned")
 class FrameRunner:
     """Decodes, dresses and encodes; a frame of several persons is one message a person in, and one out."""
 
-    def __init__(
-        self,
-        dress: Callable[[Sequence[SmplFrame]], Sequence[PipelineOutput]],
-        garments: Mapping[str, GarmentTemplate],
-        *,
-        persons: int = 1,
-        history: PoseHistory | None = None,
-    ) -> None:
-        """`dress` gives a pipeline's output for each frame, which `history` tells its past; `garments` are its own."""
-        self._dress = dress
+    def __init__(self, pipeline: GarmentPipeline, *, persons: int = 1) -> None:
+        self._pipeline, self._persons = pipeline, range(persons)
         self._decode = adapters.decoder_for("multiarray").from_bytes
-        self._persons, self._history = range(persons), history
+        self._history = PoseHistory() if pipeline.heeds_past else None
         meshes = [
             adapters.MarkerMesh(
                 ns=adapters.garment_namespace(name, f"p{person}" if persons > 1 else ""),
@@ -45,17 +35,11 @@ class FrameRunner:
                 n_vertices=garment.n_vertices,
             )
             for person in self._persons
-            for name, garment in garments.items()
+            for name, garment in pipeline.garments.items()
         ]
         self._encoder = adapters.MarkerArrayEncoder(meshes)
         self.stages: list[dict[str, float]] = []
         """What each stage took in each frame that wasn't a jump, by the clock that `time.perf_counter` is [ms]."""
-
-    @classmethod
-    def of(cls, pipeline: GarmentPipeline, *, persons: int = 1) -> FrameRunner:
-        """Of a pipeline."""
-        history = PoseHistory() if pipeline.heeds_past else None
-        return cls(lambda frames: pipeline(frames), pipeline.garments, persons=persons, history=history)
 
     def __call__(self, moments: Moment | Sequence[Moment]) -> bytes:
         """The message that goes out."""
@@ -66,7 +50,7 @@ class FrameRunner:
             stamped = [replace(frame, stamp_ns=given[i].frame.stamp_ns) for i, frame in enumerate(frames)]
             frames = [self._history(frame, str(i)) for i, frame in enumerate(stamped)]
         laps.append(time.perf_counter())
-        outputs = self._dress(frames)
+        outputs = self._pipeline(frames)
         laps.append(time.perf_counter())
         data = self._encoder.encode(
             [mesh.local for output in outputs for mesh in output.values()],

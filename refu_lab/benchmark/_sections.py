@@ -11,7 +11,6 @@ import numpy as np
 import torch
 
 from refu_core import GarmentPipeline, SmplFrame, load_garment
-from refu_core.realtime import FrameStats, GarmentMesh, PipelineOutput
 from refu_lab.benchmark._frames import FrameRunner
 from refu_lab.benchmark._inputs import Moment, Window
 from refu_lab.benchmark._measure import Timing, measure, processor_clock
@@ -70,7 +69,7 @@ def _of_sdf(ask: Callable[[SdfFrame], object]) -> Callable[[Moment], object]:
     return lambda moment: ask(moment.sdf)
 
 
-def _of_frame(pipeline: GarmentPipeline) -> Callable[[Moment], object]:
+def _of_frame(pipeline: Callable[[SmplFrame], object]) -> Callable[[Moment], object]:
     return lambda moment: pipeline(moment.frame)
 
 
@@ -119,12 +118,12 @@ def measure_frames(
 def frame_runners(section: Section, pipelines: Pipelines) -> dict[tuple[str, str, str | None], FrameRunner]:
     """Of every pipeline, by backbone, mode and, of a GPU, method: the main ones are measured without graphs, too."""
     on_gpu, backbone = section.device == "cuda", _backbone(pipelines)
-    runners = {(*key, GRAPH if on_gpu else None): FrameRunner.of(pipeline) for key, pipeline in pipelines.items()}
+    runners = {(*key, GRAPH if on_gpu else None): FrameRunner(pipeline) for key, pipeline in pipelines.items()}
     for mode in MAIN_MODES if on_gpu else ():
         pipeline = section.options.load_pipeline(
             section.garment, mode=mode, backbone=backbone, device=section.device, graph=False
         )
-        runners[backbone, mode, LAUNCHES] = FrameRunner.of(pipeline)
+        runners[backbone, mode, LAUNCHES] = FrameRunner(pipeline)
     return runners
 
 
@@ -139,7 +138,7 @@ def measure_persons(section: Section, pipelines: Pipelines) -> None:
     plain = section.plain()
     contenders: dict[str, Callable[[Any], object]] = {PLAIN_QUERY: lambda moments: plain(moments[0])}
     for mode in MAIN_MODES:
-        contenders |= {f"{mode} {n}": FrameRunner.of(pipelines[backbone, mode], persons=n) for n in counts}
+        contenders |= {f"{mode} {n}": FrameRunner(pipelines[backbone, mode], persons=n) for n in counts}
     times = section.measure(contenders, crowd)
     for mode in MAIN_MODES:
         for n in counts:
@@ -156,8 +155,8 @@ def measure_still(section: Section, pipelines: Pipelines) -> None:
         moving = pipelines[backbone, mode]
         # A pipeline of its own: one that moves would make the other's pose a new one.
         still = section.options.load_pipeline(section.garment, mode=mode, backbone=backbone, device=section.device)
-        contenders[f"{mode} moving"] = FrameRunner.of(moving)
-        contenders[f"{mode} still"] = _always(FrameRunner.of(still), held)
+        contenders[f"{mode} moving"] = FrameRunner(moving)
+        contenders[f"{mode} still"] = _always(FrameRunner(still), held)
         contenders[f"{mode} moving, pipeline"] = _of_frame(moving)
         contenders[f"{mode} still, pipeline"] = _always(_of_frame(still), held)
     times = section.measure(contenders, section.windows)
@@ -176,9 +175,8 @@ def measure_paper(section: Section, pipelines: Pipelines) -> None:
     for dtype in types:
         settings = PaperSettings(dtype=dtype) if full else PaperSettings(pivots=2, width=64, dtype=dtype)
         paper = PaperStructure(*section.options.on_body(section.garment, device=section.device), settings=settings)
-        runner = FrameRunner(_dressing(paper, section.garment), {section.garment: load_garment(section.garment)})
-        contenders: dict[str, Callable[[Moment], object]] = {PLAIN_QUERY: section.plain(), "paper": runner}
-        contenders |= {mode: FrameRunner.of(pipelines[_backbone(pipelines), mode]) for mode in MAIN_MODES}
+        contenders: dict[str, Callable[[Moment], object]] = {PLAIN_QUERY: section.plain(), "paper": _of_frame(paper)}
+        contenders |= {mode: FrameRunner(pipelines[_backbone(pipelines), mode]) for mode in MAIN_MODES}
         times = section.measure(contenders, section.windows[:2], slow={"paper"} if full else ())
         plain = times[PLAIN_QUERY]
         sizes = "dense, paper's sizes" if full else "dense, trial sizes"
@@ -186,19 +184,6 @@ def measure_paper(section: Section, pipelines: Pipelines) -> None:
         figures = {f"times_{mode}": times["paper"].median / times[mode].median for mode in MAIN_MODES}
         figures["parameters"] = float(paper.n_parameters)
         section.add("frame", "paper", times["paper"], plain, figures=figures, **facts)
-        for stage, ms in runner.stage_times().items():
+        for stage in paper.stages[0]:
+            ms = np.array([one[stage] for one in paper.stages])
             section.add(f"frame.{stage}", "paper", Timing(ms, ms), plain, **facts)
-
-
-def _dressing(paper: PaperStructure, name: str) -> Callable[[Sequence[SmplFrame]], Sequence[PipelineOutput]]:
-    faces = load_garment(name).faces.numpy()
-
-    def dress(frames: Sequence[SmplFrame]) -> list[PipelineOutput]:
-        outputs = []
-        for frame in frames:
-            vertices = paper(frame)
-            mesh = GarmentMesh(np.nan_to_num(vertices), lambda: np.empty((0, 3), np.float32), faces, frame.transl)
-            outputs.append(PipelineOutput({name: mesh}, mesh.before, mesh.before, FrameStats(paper.stage_ms)))
-        return outputs
-
-    return dress

@@ -214,7 +214,7 @@ def test_the_papers_structure_runs_and_counts_its_weights(dtype: torch.dtype) ->
     n = load_garment(SHORTS).n_vertices
     assert vertices.shape == (n, 3)
     assert np.isfinite(vertices).all()
-    assert list(paper.stage_ms) == ["body", "backbone", "sdf", "refu"]
+    assert list(paper.stages[0]) == ["body", "backbone", "sdf", "refu"]
     heads = 3 * n * (1024 + 1) * (1 + settings.pivots)  # of the low-frequency net and each high-frequency one
     assert paper.n_parameters > heads + 10 * n * (settings.width + 1)
 
