@@ -23,7 +23,8 @@ import numpy as np
 import msg_adapters as adapters
 from refu_core import SmplFrame
 from refu_lab.commands.replay import ReplayOptions
-from refu_lab.fleet import FleetOptions, find_recordings, open_engine, replay_fleet
+from refu_lab.fleet import find_recordings, open_engine
+from refu_lab.fleet.replay import FleetOptions, replay_fleet
 from refu_lab.replay import replay
 from refu_lab.stress import resident_mb
 

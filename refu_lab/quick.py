@@ -16,7 +16,8 @@ from refu_core._engine import Engine, Lost
 from refu_core._files import read_json
 from refu_core.modes import DEFAULT_GARMENTS
 from refu_lab.commands.replay import ReplayOptions
-from refu_lab.fleet import fetched, find_recordings, pipeline_for, run_function
+from refu_lab.fleet import fetched, find_recordings, run_function
+from refu_lab.fleet.replay import pipeline_for
 from refu_lab.replay import replay
 from refu_lab.reproduction import METRICS, format_value, label_of
 from refu_lab.tables import format_table, write_json

@@ -26,7 +26,6 @@ from refu_lab.reproduction._sdf import sdf_table as sdf_table
 from refu_lab.reproduction._tables import ALL as ALL
 from refu_lab.reproduction._tables import METRICS as METRICS
 from refu_lab.reproduction._tables import Missing as Missing
-from refu_lab.reproduction._tables import ResultRow as ResultRow
 from refu_lab.reproduction._tables import ResultTable as ResultTable
 from refu_lab.reproduction._tables import format_value as format_value
 from refu_lab.reproduction._tables import label_of as label_of
