@@ -5,15 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 import msg_adapters as adapters
 from refu_core import GarmentPipeline, WeightsError
-from refu_core.history import PoseHistory
 from refu_lab.benchmark._inputs import Moment
 from refu_lab.commands.benchmark import BenchmarkOptions
 
@@ -27,7 +24,6 @@ class FrameRunner:
     def __init__(self, pipeline: GarmentPipeline, *, persons: int = 1) -> None:
         self._pipeline, self._persons = pipeline, range(persons)
         self._decode = adapters.decoder_for("multiarray").from_bytes
-        self._history = PoseHistory() if pipeline.heeds_past else None
         meshes = [
             adapters.MarkerMesh(
                 ns=adapters.garment_namespace(name, f"p{person}" if persons > 1 else ""),
@@ -46,9 +42,6 @@ class FrameRunner:
         given = [moments] if isinstance(moments, Moment) else moments
         laps = [time.perf_counter()]
         frames = [self._decode(given[i].raw) for i in self._persons]
-        if self._history is not None:
-            stamped = [replace(frame, stamp_ns=given[i].frame.stamp_ns) for i, frame in enumerate(frames)]
-            frames = [self._history(frame, str(i)) for i, frame in enumerate(stamped)]
         laps.append(time.perf_counter())
         outputs = self._pipeline(frames)
         laps.append(time.perf_counter())
@@ -64,10 +57,6 @@ class FrameRunner:
             own = {stage: sum(one[stage] for one in spent) for stage in spent[0]}
             self.stages.append({"decode": float(decode), **own, "encode": float(encode)})
         return data
-
-    def stage_times(self) -> dict[str, NDArray[np.float64]]:
-        """Times of each stage [ms]."""
-        return {stage: np.array([one[stage] for one in self.stages]) for stage in self.stages[0]}
 
 
 def load_pipelines(

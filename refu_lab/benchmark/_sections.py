@@ -64,6 +64,12 @@ class Section:
         facts = {"garment": self.garment, "device": device, **facts}
         self.result.rows.append(BenchmarkRow.of(timing, plain, stage=stage, mode=mode, **facts))
 
+    def add_stages(self, stages: Sequence[Mapping[str, float]], mode: str, plain: Timing, **facts: Any) -> None:
+        """Adds a row a stage, of what it took in each frame [ms]."""
+        for stage in stages[0]:
+            ms = np.array([one[stage] for one in stages])
+            self.add(f"frame.{stage}", mode, Timing(ms, ms), plain, **facts)
+
 
 def _of_sdf(ask: Callable[[SdfFrame], object]) -> Callable[[Moment], object]:
     return lambda moment: ask(moment.sdf)
@@ -111,8 +117,7 @@ def measure_frames(
         section.add("frame", mode, times[name], plain, **facts)
     for (backbone, mode, method), runner in runners.items():
         if backbone == _backbone(pipelines) and mode in MAIN_MODES:
-            for stage, ms in runner.stage_times().items():
-                section.add(f"frame.{stage}", mode, Timing(ms, ms), plain, backbone=backbone, vertices=n, method=method)
+            section.add_stages(runner.stages, mode, plain, backbone=backbone, vertices=n, method=method)
 
 
 def frame_runners(section: Section, pipelines: Pipelines) -> dict[tuple[str, str, str | None], FrameRunner]:
@@ -184,6 +189,4 @@ def measure_paper(section: Section, pipelines: Pipelines) -> None:
         figures = {f"times_{mode}": times["paper"].median / times[mode].median for mode in MAIN_MODES}
         figures["parameters"] = float(paper.n_parameters)
         section.add("frame", "paper", times["paper"], plain, figures=figures, **facts)
-        for stage in paper.stages[0]:
-            ms = np.array([one[stage] for one in paper.stages])
-            section.add(f"frame.{stage}", "paper", Timing(ms, ms), plain, **facts)
+        section.add_stages(paper.stages, "paper", plain, **facts)
