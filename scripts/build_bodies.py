@@ -82,7 +82,7 @@ def main() -> None:
             shapedirs=_apply(topology.from_base, space.basis).astype(np.float32),
             posedirs=np.zeros((len(vertices), 3, 9 * (len(PARENTS) - 1)), np.float32),
         )
-        print(f"{name}: {len(vertices)} vertices, betas explain {100 * space.explained:.1f} %")
+        print(f"{name}: {len(vertices)} vertices, {len(topology.faces)} faces")
 
 
 def build_topology(mesh: BaseMesh, spaces: list[ShapeSpace], *, reference: Vertices) -> Topology:
