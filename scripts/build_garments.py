@@ -14,6 +14,7 @@ import argparse
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy.sparse
@@ -233,31 +234,14 @@ def main() -> None:
         if arguments.only not in (None, garment.name):
             continue
         body = load_body(arguments.assets / f"body_{garment.body}.npz")
-        template = build(garment, mesh, spaces[garment.body], body)
-        np.savez_compressed(
-            arguments.assets / f"garment_{garment.name}.npz",
-            v_template=template.vertices.astype(np.float32),
-            f=template.faces.astype(np.uint32),
-            weights=template.weights.astype(np.float32),
-            shapedirs=template.shapedirs.astype(np.float32),
-            body=np.array(garment.body),
-            card=np.array(card_to_json(garment.card).encode()),
-        )
-        print(f"{garment.name}: {len(template.vertices)} vertices, {len(template.faces)} faces")
+        arrays = build(garment, mesh, spaces[garment.body], body)
+        arrays |= {"body": np.array(garment.body), "card": np.array(card_to_json(garment.card).encode())}
+        np.savez_compressed(arguments.assets / f"garment_{garment.name}.npz", **arrays)
+        print(f"{garment.name}: {len(arrays['v_template'])} vertices, {len(arrays['f'])} faces")
 
 
-@dataclass(frozen=True, eq=False)
-class Template:
-    """A finished garment, the arrays of its file."""
-
-    vertices: Vertices
-    faces: Faces
-    weights: NDArray[np.float64]
-    shapedirs: NDArray[np.float64]
-
-
-def build(garment: Garment, mesh: BaseMesh, space: ShapeSpace, body: SmplBody) -> Template:
-    """Cuts, drapes, meshes and binds a garment to its body."""
+def build(garment: Garment, mesh: BaseMesh, space: ShapeSpace, body: SmplBody) -> dict[str, NDArray[Any]]:
+    """Cuts, drapes, meshes and binds a garment to its body: the arrays of its file."""
     used, source_faces = compact(mesh.triangles(garment.source))
     source = space.mean[used]
     fine = trimesh.Trimesh(source, source_faces, process=False).subdivide_loop(1)
@@ -291,7 +275,12 @@ def build(garment: Garment, mesh: BaseMesh, space: ShapeSpace, body: SmplBody) -
         basis = smooth @ basis
     shapedirs = basis.reshape(-1, 3, N_BETAS)
     final = keep_clear(final, faces, shapedirs, garment, body)
-    return Template(final, faces, weights, shapedirs)
+    return {
+        "v_template": final.astype(np.float32),
+        "f": faces.astype(np.uint32),
+        "weights": weights.astype(np.float32),
+        "shapedirs": shapedirs.astype(np.float32),
+    }
 
 
 def drape(v: Vertices, f: Faces, garment: Garment, body: SmplBody) -> Vertices:
