@@ -30,18 +30,8 @@ def contact_sheet(
 ) -> NDArray[np.uint8]:
     """Draws `count` random samples of a set, or all of a smaller one, each from the front and from behind.
 
-    Args:
-        dataset: with one finished sample at least.
-        count: samples in the picture.
-        seed: of their choice.
-        body: name or file of the body that the set was made for; None for the one that the garment was cut for.
-        garments: names or files of the set's garments; None for those that have the names which the set says.
-
-    Returns:
-        sRGB, shape (height, width, 3).
-
-    Raises:
-        SimulationError: the set was made for another body.
+    `body` is that which the set was made for, by name or file, `garments` its garments; None for those that the card
+    names. Returns sRGB, shape (height, width, 3). Raises `SimulationError` where the set was made for another body.
     """
     templates = {one.name: one for one in map(load_garment, dataset.parts if garments is None else garments)}
     model = load_body(next(iter(templates.values())).body if body is None else body)

@@ -90,14 +90,7 @@ class QuickResult:
 def quick_check(
     data: Sequence[str], *, reference: Path | None, renew: bool, progress: bool, engine: Engine
 ) -> QuickResult:
-    """Replays bags by every pipeline there are weights for, and compares with the reference or writes it.
-
-    Args:
-        data: Bags, folders and globs of bags, and URLs; `bags` if empty.
-        reference: File of figures that were measured before; `docs/results/quick.json` by default.
-        renew: Write that file instead.
-        progress: Show a bar.
-        engine: Who replays them, a bag a task.
+    """Replays bags (`bags` if none is named), a bag a task, and compares with the `reference` or writes it anew.
 
     Raises:
         RefuError: no bag, a bad one, or no reference.

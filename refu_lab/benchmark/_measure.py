@@ -93,10 +93,10 @@ def measure(
     """Times contenders on the same inputs, in turn, so that a machine that gets slower gets slower for all of them.
 
     Args:
-        contenders: What is timed, by name.
+        contenders: What is timed, by name. Their order moves on by one with each window.
         windows: Inputs that follow each other, two at least a window. The first of each is a jump for whoever
             remembers the last one; it warms up and isn't counted.
-        rounds: How often every window is gone through. The order of the contenders moves on by one each time.
+        rounds: How often every window is gone through.
         slow: Contenders that get one input of the first two windows alone, in the first round.
         on_gpu: Wait for the GPU before and after each call.
         progress: Called after every window of a contender.

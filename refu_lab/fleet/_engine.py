@@ -41,11 +41,7 @@ class FleetError(RefuError):
 
 @contextmanager
 def open_engine(jobs: int | None = None, scheduler: str | None = None) -> Iterator[Engine]:
-    """The engine for this many processes of this machine, or for a cluster.
-
-    Args:
-        jobs: processes of one thread each; None or 1: this one alone, without Dask.
-        scheduler: address of a Dask scheduler (`tcp://host:8786`), in the place of processes of this machine.
+    """The engine for `jobs` processes of this machine (None or 1: this one alone), or for a Dask scheduler's address.
 
     Raises:
         FleetError: Dask isn't installed, both were asked for, or there is no scheduler at the address.

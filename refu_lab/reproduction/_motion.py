@@ -66,11 +66,7 @@ def motion_table(
 ) -> ResultTable:
     """Collisions, jumps, stretch and crossings of each garment, and how far skin was moved, clip by clip.
 
-    Args:
-        clips: Recorded motions by name.
-        library: Where trained networks are.
-        every: Every so many frames one is dressed and judged; 1 for all.
-        progress: Whether to show a bar.
+    Of the recorded motions by name, `every` so many frames one is dressed and judged.
     """
     labels = {name: METHODS[name].label for name in MOTION_METHODS} | {_SKIN: "skin to collider"}
     table = ResultTable("motion", "Recorded motion", _ABOUT, labels=labels)

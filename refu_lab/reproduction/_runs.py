@@ -112,15 +112,9 @@ def run_methods(
     engine: Engine | None = None,
     progress: bool = False,
 ) -> None:
-    """Runs methods on the test samples of one garment, into `study`.
+    """Runs methods by name, and the base of each, on the test samples of one garment, into `study`.
 
-    Args:
-        study: What runs and reasons are added to.
-        samples: The garment's test samples.
-        methods: Names of methods; the base of each is run with it.
-        library: Where trained networks are.
-        engine: Who runs them, a block of samples a task; None for this process. Figures don't depend on it, times do.
-        progress: Whether to show a bar.
+    `engine` runs them, a block of samples a task; None for this process. Figures don't depend on it, times do.
 
     Raises `RefuError` where blocks are lost with their processes, or those are out of reach.
     """

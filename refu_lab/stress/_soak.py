@@ -101,17 +101,8 @@ def soak(
 ) -> SoakResult:
     """Runs the same motions over and over, until `frames` or `seconds` are over, and compares the tenths.
 
-    Args:
-        pipeline: What is to endure.
-        mode: Its name.
-        frames: How many to run, at most; each person of a call is one.
-        persons: In one call, each with a motion of their own.
-        seconds: For how long, at most.
-        seed: Of the motions.
-        tick: Called with a number of frames that are done.
-
-    Returns:
-        The tenths; those so far after an interrupt (Ctrl-C).
+    Each of the `persons` of a call has a motion of their own and is a frame; `tick` is called with how many are done.
+    After an interrupt (Ctrl-C) the tenths are those so far.
 
     Raises:
         StressError: fewer than ten calls, which have no tenths.
