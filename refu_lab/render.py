@@ -212,15 +212,15 @@ def render(
             ground_y,
             wp.vec2(float(centre[0]), float(centre[1])),
             radius,
-            wp.vec3(_to_linear(backdrop.ground)),
-            wp.vec3(_to_linear(backdrop.background)),
-            wp.vec3(to_sun),
+            _vec3(_to_linear(backdrop.ground)),
+            _vec3(_to_linear(backdrop.background)),
+            _vec3(to_sun),
             backdrop.sun,
             backdrop.sky,
-            wp.vec3(camera.eye),
-            wp.vec3(right),
-            wp.vec3(up),
-            wp.vec3(forward),
+            _vec3(camera.eye),
+            _vec3(right),
+            _vec3(up),
+            _vec3(forward),
             math.tan(math.radians(camera.vertical_fov) / 2),
             width,
             height,
@@ -266,6 +266,12 @@ def _array(value: ArrayLike, dtype: Any) -> Any:
     return wp.array(np.ascontiguousarray(value), dtype=dtype, device="cpu")
 
 
+def _vec3(value: ArrayLike) -> Any:
+    import warp as wp
+
+    return wp.vec3(*(float(x) for x in np.asarray(value)))
+
+
 def _light(
     mesh: Any,
     points: NDArray[np.float32],
@@ -280,7 +286,7 @@ def _light(
     from refu_lab._ray_kernels import light_kernel
 
     sun, sky = (wp.zeros(len(points), dtype=wp.float32, device="cpu") for _ in range(2))
-    rays = [wp.vec3(to_sun), _SUN_SPREAD, sun_rays, _SKY_RAYS, _SKY_REACH]
+    rays = [_vec3(to_sun), _SUN_SPREAD, sun_rays, _SKY_RAYS, _SKY_REACH]
     inputs = [mesh.id, _array(points, wp.vec3), _array(normals, wp.vec3), *rays]
     wp.launch(light_kernel, dim=len(points), inputs=inputs, outputs=[sun, sky], device="cpu")
     return sun.numpy(), sky.numpy()

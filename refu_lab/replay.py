@@ -254,7 +254,7 @@ def replay(
         source = open_source(options, lambda: load().body)  # whose faults are told at once
         options = replace(options, frame_id=options.frame_id or source.frame_id)
         pipeline = load()
-        pipeline(SmplFrame(pose=np.zeros((24, 3))))  # compiles kernels: the first frame's latency is a frame's
+        pipeline(SmplFrame(pose=np.zeros((24, 3), np.float32)))  # compiles kernels, or the first frame would be late
         result = ReplayResult(options, source.description, body=body_facts(pipeline))
         if options.backbone == BackboneName.AUTO:
             result.warnings += [f"{name} has no trained weights: worn by skinning" for name in pipeline.untrained]

@@ -42,7 +42,7 @@ def train(options: TrainOptions, *, progress: bool) -> dict[str, Any]:
     template = load_garment(options.garment)
     fit = load_fit(options.body or template.body)
     template, body = worn_on(template, fit), fit.body
-    steps = {} if options.steps is None else {"steps": options.steps}
+    steps: dict[str, Any] = {} if options.steps is None else {"steps": options.steps}
     common: dict[str, Any] = {"device": options.device, "quiet": not progress}
     if options.network == "sdf":
         to_sdf = replace(SdfSettings.of(options.preset), seed=options.seed, **steps)
