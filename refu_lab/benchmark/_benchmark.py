@@ -13,7 +13,6 @@ from tqdm import tqdm
 
 from refu_core import GarmentPipeline
 from refu_lab.benchmark import _sections as sections
-from refu_lab.benchmark._frames import load_pipelines
 from refu_lab.benchmark._inputs import moments, read_stretches
 from refu_lab.benchmark._measure import one_core
 from refu_lab.benchmark._rows import BenchmarkResult
@@ -46,7 +45,7 @@ def _measure(options: BenchmarkOptions, result: BenchmarkResult, progress: Calla
     stretches = read_stretches(options.motions, options.bags, count=sizes.windows, length=sizes.frames)
     for garment in options.worn:
         is_main = garment == options.worn[0]
-        pipelines, missing = load_pipelines(garment, options)
+        pipelines, missing = sections.load_pipelines(garment, options)
         result.missing.update(missing)
         windows = moments(stretches, next(iter(pipelines.values())))
         figures = accuracies(pipelines, garment, options.bags, frames=sizes.test_frames)
@@ -54,7 +53,7 @@ def _measure(options: BenchmarkOptions, result: BenchmarkResult, progress: Calla
             result.missing[f"{garment}: errors"] = f"the repository's evaluation bags in {options.bags.name}/"
         for device in options.devices:
             if device != "cpu":
-                pipelines, _ = load_pipelines(garment, options, device=device)
+                pipelines, _ = sections.load_pipelines(garment, options, device=device)
             section = sections.Section(
                 garment=garment, windows=windows, options=options, result=result, progress=progress, device=device
             )

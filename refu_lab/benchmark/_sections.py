@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
 import torch
 
-from refu_core import GarmentPipeline, SmplFrame, load_garment
-from refu_lab.benchmark._frames import FrameRunner
+import msg_adapters as adapters
+from refu_core import GarmentPipeline, SmplFrame, WeightsError, load_garment
 from refu_lab.benchmark._inputs import Moment, Window
 from refu_lab.benchmark._measure import Timing, measure, processor_clock
 from refu_lab.benchmark._paper import PaperSettings, PaperStructure
@@ -21,6 +23,8 @@ from refu_lab.commands.benchmark import BenchmarkOptions
 
 Pipelines = Mapping[tuple[str, str], GarmentPipeline]
 """By backbone and mode, the default backbone, or the one that is there, first."""
+BACKBONES = ("tailornet", "skinned")
+"""The default one, and the one that needs no weights."""
 MAIN_MODES = ("hybrid", "accurate")
 """Of which the stages and persons are measured."""
 GRAPH, LAUNCHES = "CUDA graph", "launch by launch"
@@ -69,6 +73,47 @@ class Section:
         for stage in stages[0]:
             ms = np.array([one[stage] for one in stages])
             self.add(f"frame.{stage}", mode, Timing(ms, ms), plain, **facts)
+
+
+class FrameRunner:
+    """Decodes, dresses and encodes; a frame of several persons is one message a person in, and one out."""
+
+    def __init__(self, pipeline: GarmentPipeline, *, persons: int = 1) -> None:
+        self._pipeline, self._persons = pipeline, range(persons)
+        self._decode = adapters.decoder_for("multiarray").from_bytes
+        meshes = [
+            adapters.MarkerMesh(
+                ns=adapters.garment_namespace(name, f"p{person}" if persons > 1 else ""),
+                faces=garment.faces.cpu().numpy(),
+                n_vertices=garment.n_vertices,
+            )
+            for person in self._persons
+            for name, garment in pipeline.garments.items()
+        ]
+        self._encoder = adapters.MarkerArrayEncoder(meshes)
+        self.stages: list[dict[str, float]] = []
+        """What each stage took in each frame that wasn't a jump, by the clock that `time.perf_counter` is [ms]."""
+
+    def __call__(self, moments: Moment | Sequence[Moment]) -> bytes:
+        """The message that goes out."""
+        given = [moments] if isinstance(moments, Moment) else moments
+        laps = [time.perf_counter()]
+        frames = [self._decode(given[i].raw) for i in self._persons]
+        laps.append(time.perf_counter())
+        outputs = self._pipeline(frames)
+        laps.append(time.perf_counter())
+        data = self._encoder.encode(
+            [mesh.local for output in outputs for mesh in output.values()],
+            stamp_ns=0,
+            transl=[mesh.transl for output in outputs for mesh in output.values()],
+        )
+        laps.append(time.perf_counter())
+        if not given[0].is_jump:
+            decode, _, encode = 1e3 * np.diff(laps)
+            spent = [output.stats.stage_ms for output in outputs]
+            own = {stage: sum(one[stage] for one in spent) for stage in spent[0]}
+            self.stages.append({"decode": float(decode), **own, "encode": float(encode)})
+        return data
 
 
 def _of_sdf(ask: Callable[[SdfFrame], object]) -> Callable[[Moment], object]:
@@ -190,3 +235,17 @@ def measure_paper(section: Section, pipelines: Pipelines) -> None:
         figures["parameters"] = float(paper.n_parameters)
         section.add("frame", "paper", times["paper"], plain, figures=figures, **facts)
         section.add_stages(paper.stages, "paper", plain, **facts)
+
+
+def load_pipelines(
+    garment: str, options: BenchmarkOptions, *, device: str = "cpu"
+) -> tuple[dict[tuple[str, str], GarmentPipeline], dict[str, str]]:
+    """The pipelines of a garment by (backbone, mode), the default backbone first; and what keeps others away."""
+    pipelines: dict[tuple[str, str], GarmentPipeline] = {}
+    missing: dict[str, str] = {}
+    for backbone, mode in product(BACKBONES, options.sizes.modes):
+        with suppress(WeightsError):
+            pipelines[backbone, mode] = options.load_pipeline(garment, mode=mode, backbone=backbone, device=device)
+            continue
+        missing[f"{garment}: {backbone}, {mode}"] = f"refu train {garment} --backbone {backbone} --mode {mode}"
+    return pipelines, missing

@@ -18,8 +18,7 @@ from refu_lab.reproduction._build import ENERGY_ZOOM, unseen_groups
 from refu_lab.reproduction._load import Library
 from refu_lab.reproduction._methods import METHODS
 from refu_lab.reproduction._predict import GarmentSetup, Predictor, SampleScene
-from refu_lab.reproduction._runs import RATIO_EDGES, MethodRun, Study
-from refu_lab.reproduction._samples import SampleSet
+from refu_lab.reproduction._runs import RATIO_EDGES, MethodRun, SampleSet, Study
 
 _SIZE = (8.4, 3.6)
 

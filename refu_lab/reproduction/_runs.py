@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,16 +15,87 @@ from tqdm import tqdm
 from refu_core._engine import Engine, InProcess, Lost
 from refu_core.errors import RefuError
 from refu_core.metrics import CollisionChecker, Figures, FrameMetrics, GarmentMetrics
+from refu_core.simulation import GarmentDataset, GarmentSequences, open_dataset
 from refu_lab.reproduction._load import Library
 from refu_lab.reproduction._methods import METHODS
 from refu_lab.reproduction._predict import GarmentSetup, MethodOutput, Predictor, SampleScene
-from refu_lab.reproduction._samples import Sample, SampleSet
 from refu_lab.reproduction._tables import Missing
 
 RATIO_EDGES: tuple[float, ...] = (0.0, 0.25, 0.75, 1.25, 1.75, 2.25, 2.75, 3.25, 3.75, 4.25, 4.75, float("inf"))
 """Groups of the ratio of approximate to accurate distance, as in the supplement's bar plot."""
 _BLOCK = 8
 """Samples of a task: some seconds' work."""
+
+
+class Sample(NamedTuple):
+    """One body and the garment that was simulated on it."""
+
+    vertices: NDArray[np.float32]
+    """The true garment [m], shape (N, 3)."""
+    pose: NDArray[np.float32]
+    """θ [rad], shape (24, 3)."""
+    betas: NDArray[np.float32]
+    """β, shape (10,)."""
+    style: NDArray[np.float32]
+    """γ, shape (4,)."""
+    unseen: float
+    """Distance to the nearest training sample in (θ, β, γ); NaN where it isn't known."""
+
+
+@dataclass(frozen=True, eq=False)
+class SampleSet:
+    """The test samples of one garment, read one at a time."""
+
+    garment: str
+    count: int
+    shapes: int | None
+    """Body shapes of a set of sequences; None for a set of poses."""
+    read: Callable[[int], Sample]
+    """The sample of a number from 0 to `count` - 1."""
+
+    def __len__(self) -> int:
+        return self.count
+
+    def thinned(self, most: int) -> SampleSet:
+        """At most so many of these samples, evenly spread."""
+        rows = np.unique(np.linspace(0, self.count - 1, min(most, self.count)).round().astype(int))
+        return replace(self, count=len(rows), read=lambda number: self.read(int(rows[number])))
+
+    @classmethod
+    def open(cls, path: Path) -> SampleSet:
+        """The test samples of the set in the folder `path`, finished so far.
+
+        Raises:
+            RefuError: no such set, a damaged one, or one without a finished test sample.
+        """
+        dataset = open_dataset(path)
+        samples = _of_sequences(dataset) if isinstance(dataset, GarmentSequences) else _of_poses(dataset)
+        if not samples.count:
+            msg = f"{path}: no test sample in it is finished yet"
+            raise RefuError(msg)
+        return samples
+
+
+def _of_poses(dataset: GarmentDataset) -> SampleSet:
+    rows = np.flatnonzero(dataset.test)
+
+    def read(number: int) -> Sample:
+        sample = dataset.sample(int(rows[number]))
+        return Sample(sample.vertices, sample.pose, sample.betas, sample.style, sample.unseen)
+
+    return SampleSet(str(dataset.card["garment"]), len(rows), None, read)
+
+
+def _of_sequences(dataset: GarmentSequences) -> SampleSet:
+    sequences = [dataset.sequence(int(row)) for row in np.flatnonzero(dataset.test)]
+    frames = [(k, int(t)) for k, sequence in enumerate(sequences) for t in np.flatnonzero(sequence.kept)]
+
+    def read(number: int) -> Sample:
+        sequence, t = sequences[frames[number][0]], frames[number][1]
+        return Sample(sequence.vertices(t), sequence.pose[t], sequence.betas, sequence.style, float("nan"))
+
+    plan = dataset.card["plan"]
+    return SampleSet(str(plan["garment"]), len(frames), int(plan["shapes"]), read)
 
 
 @dataclass(eq=False)

@@ -16,7 +16,7 @@ from refu_core.errors import WeightsError
 from refu_core.sdf import BodySdf
 from refu_lab.reproduction._load import Library
 from refu_lab.reproduction._predict import GarmentSetup, SampleScene
-from refu_lab.reproduction._samples import Sample, SampleSet
+from refu_lab.reproduction._runs import Sample, SampleSet
 from refu_lab.reproduction._tables import Missing, ResultRow, ResultTable
 from refu_lab.touching_poses import touching_pose
 
