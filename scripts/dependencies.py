@@ -33,7 +33,8 @@ USED_EXTRAS = ("", "ros", "lab", "train", "cluster")
 """What users install; `test` and `dev` are for those who work on the project."""
 ALLOWED = re.compile(
     r"apache|\bmit\b|\bbsd\b|\bisc\b|\bpsf\b|python software foundation|\bmpl[- ]?2|mozilla|\bhpnd\b"
-    r"|historical permission|unlicense|\bcc0\b|\b0bsd\b|\bzlib\b|public domain|\blgpl\b|lesser general public|boost|matplotlib|cnri"
+    r"|historical permission|unlicense|\bcc0\b|\b0bsd\b|\bzlib\b|public domain|\blgpl\b|lesser general public"
+    r"|boost|matplotlib|cnri"
 )
 """Licences that permit commercial use and ask nothing of the source of what merely uses the package."""
 REFUSED = re.compile(
