@@ -121,7 +121,6 @@ def _long(folder: Path, frames: list[SmplFrame], count: int, garments: tuple[str
 
 
 def main() -> None:
-    """Measures and prints."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--bags", type=int, default=20)
     parser.add_argument("--frames", type=int, default=60)

@@ -190,7 +190,6 @@ def write_contact(clips: list[Motion], every: int, folder: Path) -> None:
 
 
 def main() -> None:
-    """Writes the pages."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("collider", "contact"))
     parser.add_argument("motions", type=Path)

@@ -22,7 +22,6 @@ from refu_core.garments import BUILTIN_GARMENTS, load_garment
 
 
 def main() -> int:
-    """Returns the exit code."""
     assets = Path(__file__).parents[1] / "refu_core" / "assets"
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("garments", nargs="*", default=BUILTIN_GARMENTS, help="all of them if none is named")

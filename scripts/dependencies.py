@@ -234,7 +234,6 @@ def audit() -> int:
 
 
 def main() -> int:
-    """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("lock", "licences", "sbom", "audit"))
     parser.add_argument("file", type=Path, nargs="?", metavar="FILE", help="of the bill of materials")

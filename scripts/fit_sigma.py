@@ -21,7 +21,6 @@ from refu_lab.truth import cross_checked, held_out
 
 
 def main() -> None:
-    """Fit, check, and write."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument(
         "bag", type=Path, help="SMPL parameters and /ground_truth, as bags/make_evaluation_bags.py writes"

@@ -280,7 +280,6 @@ def _wait(child: int, seconds: float) -> int | None:
 
 
 def main() -> int:
-    """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--what", choices=[*WORKS, "all"], default="all", help="what is killed")
     parser.add_argument("--times", type=int, default=100, help="kills of each (100)")

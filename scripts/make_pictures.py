@@ -233,7 +233,6 @@ OF_SET = {"dataset": draw_dataset, "carried": draw_carried}
 
 
 def main() -> None:
-    """Draws one picture."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("picture", choices=(*OF_SHIPPED, *OF_SET))
     parser.add_argument("data", type=Path, nargs="?", help="the data set that it shows")

@@ -95,7 +95,6 @@ class Judge:
 
 
 def main() -> None:
-    """Find the gains and rewrite the weights."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path, help="a garment's weights")
     parser.add_argument("--data", type=Path, required=True, help="simulated samples")

@@ -214,7 +214,6 @@ def summary(found: list[Verdict]) -> dict[str, Any]:
 
 
 def main() -> int:
-    """Judges a set and says what was found."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("directory", type=Path)
     parser.add_argument("--body", help="name or file of the body, where it isn't the garment's own")
