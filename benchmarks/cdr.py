@@ -132,7 +132,6 @@ def rows(garment: SentGarment, repeat: int) -> list[dict[str, Any]]:
 
 
 def main() -> None:
-    """Measures and prints a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--garment", default="skirt-female")
     parser.add_argument("--repeat", type=int, default=200)

@@ -23,8 +23,10 @@ import numpy as np
 import msg_adapters as adapters
 from refu_core import SmplFrame
 from refu_lab.commands.replay import ReplayOptions
-from refu_lab.fleet import FleetOptions, find_recordings, open_engine, replay_fleet
+from refu_lab.fleet import find_recordings, open_engine
+from refu_lab.fleet.replay import FleetOptions, replay_fleet
 from refu_lab.replay import replay
+from refu_lab.stress import resident_mb
 
 ROOT = Path(__file__).parents[1]
 
@@ -36,7 +38,7 @@ def _frames() -> list[SmplFrame]:
 
 def _write(path: Path, frames: list[SmplFrame], count: int, first: int) -> None:
     encode = adapters.encoder_for("multiarray")
-    with adapters.BagWriter(path) as writer:
+    with adapters.BagWriter(path, overwrite=True) as writer:
         writer.add_topic("/smpl_params", adapters.INPUT_TYPES["multiarray"])
         for i, frame in enumerate(itertools.islice(itertools.cycle(frames), first, first + count)):
             writer.write("/smpl_params", encode(frame), log_time_ns=10**18 + i * 33_333_333)
@@ -90,8 +92,7 @@ def _convert(folder: Path, frames: list[SmplFrame], rounds: int) -> None:
 
 def _long(folder: Path, frames: list[SmplFrame], count: int, garments: tuple[str, ...], *, with_body: bool) -> None:
     """Converts a recording of so many frames; its log memory.txt gets a line each half minute."""
-    encode, log = adapters.encoder_for("multiarray"), folder / "memory.txt"
-    out = folder / "long-out.mcap"
+    log, out = folder / "memory.txt", folder / "long-out.mcap"
     options = ReplayOptions(
         input=folder / "long.mcap",
         output=out,
@@ -100,17 +101,14 @@ def _long(folder: Path, frames: list[SmplFrame], count: int, garments: tuple[str
         overwrite=True,
         with_body=with_body,
     )
-    with adapters.BagWriter(options.input, overwrite=True) as writer:
-        writer.add_topic("/smpl_params", adapters.INPUT_TYPES["multiarray"])
-        for i in range(count):
-            writer.write("/smpl_params", encode(frames[i % len(frames)]), log_time_ns=10**18 + i * 33_333_333)
+    _write(options.input, frames, count, 0)
     start, done = time.perf_counter(), threading.Event()
 
     def watch() -> None:
         while not done.wait(30):
             size = out.stat().st_size / 1e6 if out.exists() else 0.0
             with log.open("a") as file:
-                file.write(f"{time.perf_counter() - start:.0f} s, bag {size:.0f} MB, memory {_resident():.1f} MB\n")
+                file.write(f"{time.perf_counter() - start:.0f} s, bag {size:.0f} MB, memory {resident_mb():.1f} MB\n")
 
     watcher = threading.Thread(target=watch, daemon=True)
     watcher.start()
@@ -119,17 +117,10 @@ def _long(folder: Path, frames: list[SmplFrame], count: int, garments: tuple[str
     watcher.join()
     took = time.perf_counter() - start
     with log.open("a") as file:
-        file.write(f"{len(result.latencies_ms)} frames in {took:.0f} s, memory {_resident():.1f} MB at the end\n")
-
-
-def _resident() -> float:
-    """Memory of this process [MB]."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+        file.write(f"{len(result.latencies_ms)} frames in {took:.0f} s, memory {resident_mb():.1f} MB at the end\n")
 
 
 def main() -> None:
-    """Measures and prints."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--bags", type=int, default=20)
     parser.add_argument("--frames", type=int, default=60)

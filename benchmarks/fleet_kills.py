@@ -74,7 +74,6 @@ def _same(first: Path, second: Path) -> tuple[int, bool]:
 
 
 def main() -> None:
-    """Runs, kills and prints."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("garment")
     parser.add_argument("--folder", type=Path, required=True)

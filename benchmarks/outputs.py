@@ -35,7 +35,7 @@ from refu_core.outputs import (
     load_sigma,
     visible,
 )
-from refu_lab.held_out import Moment, coverage, cross_checked, held_out, moments_of
+from refu_lab.truth import Moment, coverage, cross_checked, held_out, moments_of
 
 BAGS = Path(__file__).parents[1] / "bags"
 GARMENTS = ("tshirt-male", "shirt-male", "short-pant-male", "skirt-female")
@@ -241,7 +241,6 @@ PARTS = {
 
 
 def main() -> None:
-    """Print what was asked for."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("parts", nargs="*", choices=[*PARTS, []], help=f"of {', '.join(PARTS)}; all by default")
     torch.set_num_threads(1)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csr_array, eye_array, kron
+from scipy.sparse import coo_array, eye_array, kron
 from scipy.sparse.linalg import cg
 from torch import Tensor
 
@@ -32,22 +30,13 @@ def push_naively(points: Tensor, sdf: BodySdf, *, near: Tensor | None = None) ->
     return repulse(points, sdf.query(points, near=near))
 
 
-@dataclass(frozen=True, eq=False)
 class PostProcess:
     """Post-processes by least squares for garments of one mesh, whose Laplacian is built once."""
 
-    laplacian: csr_array
-    """Uniform: x_i minus the mean of its neighbours, shape (N, N)."""
-
-    @classmethod
-    def of_faces(cls, faces: Tensor | NDArray[np.int64], n_vertices: int) -> PostProcess:
-        """For garments of these `faces`, shape (G, 3), and `n_vertices` N.
-
-        Raises:
-            MeshError: A face that names a vertex there isn't.
-        """
+    def __init__(self, faces: Tensor | NDArray[np.int64], n_vertices: int) -> None:
+        """For garments of these `faces`, shape (G, 3); raises `MeshError` for one that names a vertex there isn't."""
         mesh = Connectivity.of(faces.cpu() if isinstance(faces, Tensor) else faces, n_vertices)
-        return cls(mesh.uniform_laplacian())
+        self._laplacian = mesh.uniform_laplacian()  # x_i minus the mean of its neighbours, (N, N)
 
     @torch.no_grad()
     def optimise(
@@ -94,12 +83,12 @@ class PostProcess:
         damping: float,
     ) -> Tensor:
         """Displacement y - ỹ that solves one round, shape (N, 3)."""
-        n = self.laplacian.shape[0]
+        n = self._laplacian.shape[0]
         # nᵀ(y - b) - ε = nᵀu - (ε - f) for the displacement u: one row for each vertex inside, three columns each.
         columns = 3 * inside[:, None] + np.arange(3)
         rows = np.repeat(np.arange(len(inside)), 3)
         push = coo_array((normal.ravel(), (rows, columns.ravel())), shape=(len(inside), 3 * n)).tocsr()
-        smooth = self.laplacian.T @ self.laplacian * smoothness + damping * eye_array(n)
+        smooth = self._laplacian.T @ self._laplacian * smoothness + damping * eye_array(n)
         # Damping bounds the condition number by about 40: conjugate gradients need no factorisation.
         solution, failed = cg(push.T @ push + kron(smooth, eye_array(3)), push.T @ deficit, rtol=1e-8, maxiter=1000)
         assert not failed

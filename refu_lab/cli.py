@@ -48,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, _interrupt)  # a terminated replay closes its bag like an interrupted one
     try:
         args = _parser().parse_args(arguments)
-        for path in (getattr(args, name, None) for name in ("json", "output", "cache", "picture")):
+        for path in (getattr(args, name, None) for name in ("json", "output", "picture")):
             check_writable(path if isinstance(path, Path) else None)
         for given in _inputs(args) if getattr(args, "json", None) else ():
             require_apart(given, args.json)

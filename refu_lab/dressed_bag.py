@@ -72,14 +72,10 @@ class DressedBag:
         """Finishes the bag, also after an exception."""
         self._writer.__exit__(*error)
 
-    def add_input(self, record: FrameRecord) -> None:
-        """A message as it came."""
-        if record.raw or self._source.bag is not None:
-            self._writer.write(self._source.topic, record.raw, log_time_ns=record.log_time_ns)
-
     def add_skip(self, record: FrameRecord, reason: str) -> None:
-        """Why a message was not replayed."""
+        """A message as it came, and why it was not replayed."""
         self._skipped += 1
+        self._add_input(record)
         stamp_ns = min(record.stamp_ns, _LAST_STAMP_NS)  # it may be the very reason
         self._say(record, stamp_ns, [self._input(ERROR, reason)])
 
@@ -91,13 +87,18 @@ class DressedBag:
         garments: bytes,
         exact: Mapping[str, GarmentRecord] | None,
     ) -> None:
-        """A dressed frame: its garments as bytes, and what exact checks have found, where there were any."""
+        """A message as it came, its garments as bytes, and what exact checks have found, where there were any."""
+        self._add_input(record)
         self._writer.write(GARMENTS_TOPIC, garments, log_time_ns=record.log_time_ns)
         if self._body is not None:
             data = self._body.encode([output.body], stamp_ns=frame.stamp_ns, transl=frame.transl)
             self._writer.write(BODY_TOPIC, data, log_time_ns=record.log_time_ns)
         found = [self._garment(name, output, None if exact is None else exact[name]) for name in output]
         self._say(record, frame.stamp_ns, [self._input(OK, self._source.topic), *found])
+
+    def _add_input(self, record: FrameRecord) -> None:
+        if record.raw or self._source.bag is not None:
+            self._writer.write(self._source.topic, record.raw, log_time_ns=record.log_time_ns)
 
     def _say(self, record: FrameRecord, stamp_ns: int, statuses: list[adapters.DiagnosticStatus]) -> None:
         data = adapters.encode_diagnostics(statuses, stamp_ns=stamp_ns)

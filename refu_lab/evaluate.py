@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict
-from functools import cached_property
 from pathlib import Path
 from typing import Any
-
-from tqdm import tqdm
 
 import msg_adapters as adapters
 from refu_core import RefuError
@@ -32,7 +28,6 @@ def _command(options: EvaluateOptions, table: str) -> str:
         parts += [f"--motion-every {options.motion_every}"] if options.motion_every > 1 else []
     else:
         parts += [f"--data {' '.join(f'data/{path.resolve().name}' for path in options.data)}"]
-        parts += [f"--every {options.every}"] if options.every > 1 else []
     parts += [f"--body {Path(options.body).name}"] if options.body is not None else []
     parts += [] if options.collider else ["--no-collider"]
     parts += [f"--weights {path.resolve().name}" for path in options.weights]
@@ -48,100 +43,60 @@ def evaluate(options: EvaluateOptions, *, progress: bool, engine: Engine | None 
         RefuError: there is nothing to make them of, a data set or motion can't be read, or the results can't be
         written.
     """
-    maker = _Maker(options, progress, engine)
-    tables = [maker.make(name) for name in maker.wanted]
-    rp.write_summary(options.output)
-    return tables
-
-
-class _Maker:
-    """Makes tables of what was opened; methods are run when the first table needs them."""
-
-    def __init__(self, options: EvaluateOptions, progress: bool, engine: Engine | None) -> None:
-        self._engine = engine
-        self._options = options
-        self._progress = progress
-        if not options.data and (options.table not in ("all", "motion") or options.motions is None):
-            need = "--motions DIR" if options.table == "motion" else "--data DIR"
-            msg = f"nothing to evaluate: the table {options.table} needs {need}"
-            raise RefuError(msg)
-        sets = [rp.SampleSet.open(path, every=options.every) for path in options.data]
-        _check_sets(sets)
-        self._posed = [samples for samples in sets if samples.shapes is None]
-        self._moving = [samples for samples in sets if samples.shapes is not None]
-        self._library = rp.Library(options.weights, collider=options.collider, body=options.body)
-        self.wanted = [name for name in RESULT_TABLES if options.table in ("all", name) and self._has_data_for(name)]
-        if not self.wanted:
-            kind = "sequences (refu simulate --sequences)" if options.table == "sequence" else "poses"
-            need = "--motions DIR" if options.table == "motion" else f"a data set of {kind} in --data"
-            msg = f"the table {options.table} needs {need}"
-            raise RefuError(msg)
-
-    def _has_data_for(self, table: str) -> bool:
-        if table == "motion":
-            return self._options.motions is not None
-        return bool(self._moving if table == "sequence" else self._posed)
-
-    def make(self, name: str) -> rp.ResultTable:
-        """Makes a table, its plots and pictures, and writes them."""
-        output, n_samples = self._options.output, {samples.garment: len(samples) for samples in self._posed}
-        output.mkdir(parents=True, exist_ok=True)
-        if name == "sequence":
-            table = rp.sample_table(self._sequence_study, name)
-            n_samples = {f"{samples.garment}, {samples.shapes} shapes": len(samples) for samples in self._moving}
+    if not options.data and (options.table not in ("all", "motion") or options.motions is None):
+        need = "--motions DIR" if options.table == "motion" else "--data DIR"
+        msg = f"nothing to evaluate: the table {options.table} needs {need}"
+        raise RefuError(msg)
+    sets = [rp.SampleSet.open(path) for path in options.data]
+    _check_sets(sets)
+    posed = [samples for samples in sets if samples.shapes is None]
+    moving = [samples for samples in sets if samples.shapes is not None]
+    has_data = {name: bool(posed) for name in RESULT_TABLES}
+    has_data |= {"sequence": bool(moving), "motion": options.motions is not None}
+    wanted = [name for name in RESULT_TABLES if options.table in ("all", name) and has_data[name]]
+    if not wanted:
+        kind = "sequences (refu simulate --sequences)" if options.table == "sequence" else "poses"
+        need = "--motions DIR" if options.table == "motion" else f"a data set of {kind} in --data"
+        msg = f"the table {options.table} needs {need}"
+        raise RefuError(msg)
+    library = rp.Library(options.weights, collider=options.collider, body=options.body)
+    how: dict[str, Any] = {"library": library, "progress": progress}
+    output, n_posed = options.output, {samples.garment: len(samples) for samples in posed}
+    output.mkdir(parents=True, exist_ok=True)
+    study, tables = rp.Study(), []
+    of_study = [name for name in wanted if name in rp.SAMPLE_TABLES and name != "sequence"]
+    methods = list(dict.fromkeys(method for name in of_study for method in rp.SAMPLE_TABLES[name].methods))
+    for samples in posed if methods else ():
+        rp.run_methods(study, samples, methods, engine=engine, **how)
+    for name in wanted:
+        n_samples = n_posed
+        if name == "sequence":  # of several numbers of body shapes in one study, as each has methods of its own
+            in_motion = rp.Study()
+            for samples in moving:
+                own = [f"mlp-{samples.shapes}{refu}" for refu in ("", "-refu-approx")]
+                rp.run_methods(in_motion, samples, own, engine=engine, **how)
+            table = rp.sample_table(in_motion, name)
+            n_samples = {f"{samples.garment}, {samples.shapes} shapes": len(samples) for samples in moving}
         elif name == "motion":
-            table, n_samples = self._motion(), {}
+            table = rp.motion_table(read_clips(options.motions or Path()), every=options.motion_every, **how)
+            n_samples = {}
         elif name == "sdf":
-            with _bar(name, self._progress) as advance:
-                table = rp.sdf_table(self._posed, library=self._library, progress=advance)
-        elif name == "time":
-            study = self._time_study()
-            table, n_samples = rp.time_table(study), study.n_samples
+            table = rp.sdf_table(posed, **how)
+        elif name == "time":  # with nothing else in the same run
+            timed = rp.Study()
+            with one_thread():
+                for samples in posed:
+                    rp.run_methods(timed, samples.thinned(_TIMED), rp.TIMED_METHODS, **how)
+            table, n_samples = rp.time_table(timed), timed.n_samples
         else:
-            table = rp.sample_table(self._study, name)
-            if name in rp.PLOTS:
-                table.plots += rp.PLOTS[name](self._study, output)
+            table = rp.sample_table(study, name)
+            table.plots += rp.PLOTS[name](study, output) if name in rp.PLOTS else []
             if name == "comparison":
-                table.plots += rp.picture_garments(self._study, self._posed, output, library=self._library)
-        table.write(output, command=_command(self._options, name), n_samples=n_samples)
-        return table
-
-    @cached_property
-    def _study(self) -> rp.Study:
-        names = [name for name in self.wanted if name in rp.SAMPLE_TABLES and name != "sequence"]
-        methods = list(dict.fromkeys(method for name in names for method in rp.SAMPLE_TABLES[name].methods))
-        study = rp.Study()
-        for samples in self._posed:
-            self._run(study, samples, methods)
-        return study
-
-    @cached_property
-    def _sequence_study(self) -> rp.Study:
-        """Sets of several numbers of body shapes in one study, as each has methods of its own."""
-        study = rp.Study()
-        for samples in self._moving:
-            self._run(study, samples, [f"mlp-{samples.shapes}{refu}" for refu in ("", "-refu-approx")])
-        return study
-
-    def _run(self, study: rp.Study, samples: rp.SampleSet, methods: Sequence[str]) -> None:
-        options: dict[str, Any] = {"library": self._library, "cache_folder": self._options.cache}
-        with _bar(samples.garment, self._progress) as advance:
-            rp.run_methods(study, samples, methods, progress=advance, engine=self._engine, **options)
-
-    def _motion(self) -> rp.ResultTable:
-        clips = read_clips(self._options.motions or Path())
-        with _bar("motion", self._progress) as advance:
-            return rp.motion_table(clips, library=self._library, every=self._options.motion_every, progress=advance)
-
-    def _time_study(self) -> rp.Study:
-        """Measured now, never taken from a cache, with nothing else in the same run."""
-        study = rp.Study()
-        with one_thread():
-            for samples in self._posed:
-                few = samples.thinned(_TIMED)
-                with _bar(f"time, {samples.garment}", self._progress) as advance:
-                    rp.run_methods(study, few, rp.TIMED_METHODS, library=self._library, progress=advance)
-        return study
+                table.plots += rp.picture_garments(study, posed, output, library=library)
+        table.write(output, command=_command(options, name), n_samples=n_samples)
+        tables.append(table)
+    rp.write_summary(output)
+    return tables
 
 
 def _check_sets(sets: Sequence[rp.SampleSet]) -> None:
@@ -184,14 +139,3 @@ def read_clips(folder: Path) -> dict[str, adapters.Motion]:
         msg = f"{folder}: no motion in it, wanted AMASS-style .npz files"
         raise RefuError(msg)
     return {path.stem: adapters.read_motion(path) for path in paths}
-
-
-@contextmanager
-def _bar(title: str, progress: bool) -> Iterator[Callable[[int, int], None]]:
-    with tqdm(desc=title, unit="sample", disable=None if progress else True) as bar:
-
-        def advance(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
-        yield advance

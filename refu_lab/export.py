@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from itertools import islice
@@ -16,7 +16,7 @@ from refu_core.history import PoseHistory
 from refu_lab.render import SKIN
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
@@ -96,12 +96,9 @@ def write_meshes(meshes: Sequence[ExportMesh], path: Path, *, fps: float = 30.0)
 def export(
     options: RecordingOptions, path: Path, *, first: int, count: int, with_body: bool
 ) -> tuple[list[Path], list[str]]:
-    """What `refu export` does: some frames of a bag or motion file, dressed, as files.
+    """What `refu export` does: some frames of a bag or motion file, dressed, as files; and what there is to warn of.
 
     Frames are numbered as they were recorded; those that can't be read are left out, and said.
-
-    Returns:
-        The files, and what there is to warn of.
 
     Raises:
         RefuError: as `write_meshes`; options that make no pipeline, an input that can't be read, or no frame.
@@ -114,34 +111,27 @@ def export(
     source = open_source(options, lambda: load().body)
     pipeline = load()
     source.history = PoseHistory() if pipeline.heeds_past else None
-    frames, outputs, left_out = [], [], list[str]()
+    stamps, outputs, left_out = [], [], list[str]()
     for number, record in enumerate(islice(source.records, first + count)):
         if number < first:  # what comes of the rest depends on it: the past, and where keypoints were
             with suppress(RefuError):
                 source.frame_of(record)
             continue
-        with _left_out(number, left_out):
+        try:
             frame = source.frame_of(record)
             outputs.append(pipeline(frame))
-            frames.append(frame)
+        except RefuError as error:
+            left_out.append(f"frame {number} is left out: {error}")
+        else:
+            stamps.append(frame.stamp_ns)
     warnings = [*source.warnings(pipeline), *left_out]
-    if not frames:
+    if not outputs:
         why = f": {warnings[-1]}" if warnings else ""
         msg = f"{options.input}: has no frame that can be dressed from number {first} on{why}"
         raise RefuError(msg)
-    stamps = np.array([frame.stamp_ns for frame in frames])
     step = 1e-9 * float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
     fps = round(1 / step, 3) if step > 0 else 30.0
     return write_meshes(meshes_of(pipeline, outputs, with_body=with_body), path, fps=fps), warnings
-
-
-@contextmanager
-def _left_out(number: int, warnings: list[str]) -> Iterator[None]:
-    """Says of a frame that can't be read or dressed that it can't."""
-    try:
-        yield
-    except RefuError as error:
-        warnings.append(f"frame {number} is left out: {error}")
 
 
 def _glb(meshes: Sequence[ExportMesh], frame: int) -> bytes:

@@ -31,9 +31,6 @@ from refu_lab.commands.garment import AddOptions
 from refu_lab.render import Camera, RenderMesh, render, save_png
 from refu_lab.tables import format_table
 
-_TILE = (260, 400)
-"""Width and height of one picture [pixels]."""
-
 
 def _name_of(mesh: Path) -> str:
     """A name like the file's: `T-Shirt (1).obj` is `T-Shirt-1`."""
@@ -72,7 +69,12 @@ def add_garment(options: AddOptions) -> dict[str, Any]:
         body,
         name=name,
         placing=_placing(options),
-        details=_details(options),
+        details=GarmentDetails(
+            options.layer,
+            options.color or GarmentDetails().color,
+            options.held_at,
+            f"{options.source} ({options.mesh.name}), by refu garment add",
+        ),
         longest_edge=options.longest_edge,
     )
     worn = try_on(made)
@@ -95,13 +97,18 @@ def add_garment(options: AddOptions) -> dict[str, Any]:
     }
 
 
+def _number(text: str) -> float:
+    """NaN for what is none."""
+    try:
+        return float(text)
+    except ValueError:
+        return float("nan")
+
+
 def _placing(options: AddOptions) -> Placing:
     unit = None
     if options.unit is not None:
-        try:
-            unit = UNITS[options.unit] if options.unit in UNITS else float(options.unit)
-        except ValueError:
-            unit = float("nan")
+        unit = UNITS.get(options.unit) or _number(options.unit)
         if not 1e-6 < unit < 1e6:
             msg = f"no unit {options.unit!r}: wanted {', '.join(UNITS)}, or how many metres it is"
             raise GarmentError(msg)
@@ -112,27 +119,15 @@ def _pose(text: str | None) -> NDArray[np.float64] | None:
     """`t`, degrees that both arms hang down, or the first pose of a motion file."""
     if text is None:
         return None
-    if text == "t":
-        return standing_pose(0.0)
     if Path(text).suffix.lower() in SUFFIXES:
         pose = np.array(read_recording(text, error=GarmentError, fps=30.0).poses[0], np.float64).reshape(N_JOINTS, 3)
         pose[0] = 0  # the mesh stands upright; where it faces is --up's business
         return pose
-    try:
-        angle = float(text)
-    except ValueError:
-        angle = float("nan")
+    angle = 0.0 if text == "t" else _number(text)
     if not -90 <= angle <= 90:
         msg = f"no pose {text!r}: wanted t, the angle in degrees that the arms hang down (45), or a motion .npz"
         raise GarmentError(msg)
     return standing_pose(np.radians(angle))
-
-
-def _details(options: AddOptions) -> GarmentDetails:
-    plain = GarmentDetails()
-    red, green, blue = options.color or plain.color
-    source = f"{options.source} ({options.mesh.name}), by refu garment add"
-    return GarmentDetails(options.layer, (red, green, blue), options.held_at, source)
 
 
 def try_on(made: FittedGarment) -> dict[str, dict[str, Any]]:
@@ -149,8 +144,8 @@ def try_on(made: FittedGarment) -> dict[str, dict[str, Any]]:
     return found
 
 
-def picture(garments: Sequence[str], *, size: tuple[int, int] = _TILE, samples: int = 4) -> NDArray[np.uint8]:
-    """Garments worn together, a picture a pose; sRGB, shape (height, poses width, 3). Raises `RefuError`."""
+def picture(garments: Sequence[str], *, size: tuple[int, int] = (260, 400), samples: int = 4) -> NDArray[np.uint8]:
+    """Garments worn together, a picture of `size` (width, height) a pose: sRGB, shape (height, poses width, 3)."""
     pipeline = GarmentPipeline.load(garments)
     faces = pipeline.body.faces.numpy()
     views = []
@@ -185,13 +180,12 @@ def garments_table(rows: list[dict[str, Any]]) -> str:
     cells = []
     for row in rows:
         if "fault" in row:
-            cells.append((row["garment"], "-", "-", "-", "-", "-", "-", row["fault"]))
+            cells.append((row["garment"], *["-"] * 6, row["fault"]))
             continue
         networks = ", ".join(row["networks"]) or "none: worn by skinning"
         flags = ("yes" if row[key] else "no" for key in ("styles", "uv"))
-        cells.append(
-            (row["garment"], row["body"], str(row["layer"]), str(row["vertices"]), *flags, networks, row["from"])
-        )
+        numbers = (str(row[key]) for key in ("layer", "vertices"))
+        cells.append((row["garment"], row["body"], *numbers, *flags, networks, row["from"]))
     return format_table(("garment", "body", "layer", "vertices", "styles", "UVs", "networks", "from"), cells)
 
 

@@ -13,7 +13,7 @@ from refu_core.garments import garment_files, load_garment
 from refu_core.mesh import Connectivity
 from refu_core.modes import BackboneName, SdfMode
 from refu_core.weights import load_card, weights_folder
-from refu_lab.bodies import fit_facts
+from refu_lab.sources import fit_facts
 
 
 def _version(distribution: str) -> str:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,12 +12,12 @@ from tqdm import tqdm
 
 import msg_adapters as adapters
 from refu_core import RefuError
-from refu_core._engine import Engine, InProcess, Lost
+from refu_core._engine import Engine, Lost
 from refu_core._files import read_json
-from refu_core.metrics import Figures
 from refu_core.modes import DEFAULT_GARMENTS
 from refu_lab.commands.replay import ReplayOptions
-from refu_lab.fleet import fetched, find_recordings, pipeline_for, run_function
+from refu_lab.fleet import fetched, find_recordings, run_function
+from refu_lab.fleet.replay import pipeline_for
 from refu_lab.replay import replay
 from refu_lab.reproduction import METRICS, format_value, label_of
 from refu_lab.tables import format_table, write_json
@@ -26,7 +27,7 @@ BAGS = Path("bags")
 REFERENCE = Path("docs/results/quick.json")
 TOLERANCES: dict[str, float] = {"mpve_mm": 0.3, "vfcp_percent": 0.02, "cfmp_percent": 7.0, "max_depth_mm": 1.0}
 """How much worse a figure may be than its reference: what other processors and releases of torch make of the same
-weights, far less than what a worse method does. Those of a reference file are in the file."""
+weights, far less than what a worse method does."""
 _FRAMES = 15
 """Frames of a bag, at most."""
 _MODES = (("skinned", "accurate"), ("auto", "hybrid"))
@@ -56,10 +57,8 @@ class Comparison:
     @property
     def is_passed(self) -> bool:
         """Not worse than the reference by more than the tolerance; a figure that is gone has fallen."""
-        if self.reference is None:
-            return True
-        if self.value is None:
-            return False
+        if self.reference is None or self.value is None:
+            return self.reference is None
         loss = self.value - self.reference
         return (-loss if METRICS[self.key.metric].higher_is_better else loss) <= self.tolerance
 
@@ -70,7 +69,7 @@ class QuickResult:
 
     comparisons: list[Comparison]
     reference: Path
-    is_renewed: bool = False
+    is_renewed: bool
     """Whether the reference was written instead of compared with."""
 
     @property
@@ -89,31 +88,19 @@ class QuickResult:
 
 
 def quick_check(
-    data: Sequence[str | Path],
-    *,
-    reference: Path | None = None,
-    renew: bool = False,
-    progress: bool = False,
-    engine: Engine | None = None,
+    data: Sequence[str], *, reference: Path | None, renew: bool, progress: bool, engine: Engine
 ) -> QuickResult:
-    """Replays bags by every pipeline there are weights for, and compares with the reference or writes it.
-
-    Args:
-        data: Bags, folders and globs of bags, and URLs; `bags` if empty.
-        reference: File of figures that were measured before; `docs/results/quick.json` by default.
-        renew: Write that file instead.
-        progress: Show a bar.
-        engine: Who replays them, a bag a task; None for this process.
+    """Replays bags (`bags` if none is named), a bag a task, and compares with the `reference` or writes it anew.
 
     Raises:
         RefuError: no bag, a bad one, or no reference.
     """
     file = reference or REFERENCE
-    bags = [one.source for one in find_recordings([str(path) for path in data or [BAGS]])]
-    known, tolerances = ({}, TOLERANCES) if renew else _read(file)
+    bags = [one.source for one in find_recordings(data or [str(BAGS)])]
+    known = {} if renew else _read(file)
     figures: dict[int, list[tuple[FigureKey, float]]] = {}
     with tqdm(total=len(bags), unit="bag", disable=None if progress else True) as bar:
-        for index, rows in (engine or InProcess()).run(run_function(_measure), bags):
+        for index, rows in engine.run(run_function(_measure), bags):
             if isinstance(rows, Lost):
                 msg = f"{bags[index]}: lost: {rows.reason}"
                 raise RefuError(msg)
@@ -121,10 +108,12 @@ def quick_check(
             bar.update()
     found = {key: value for index in sorted(figures) for key, value in figures[index]}
     if renew:
-        _write(file, found)
+        about = "refu evaluate --quick holds its figures against these; written by --set-reference"
+        kept = [{**key._asdict(), "value": value} for key, value in found.items()]
+        write_json(file, {"about": about, "rows": kept})
         known = found
     keys = dict.fromkeys([*known, *found])
-    compared = [Comparison(key, found.get(key), known.get(key), tolerances[key.metric]) for key in keys]
+    compared = [Comparison(key, found.get(key), known.get(key), TOLERANCES[key.metric]) for key in keys]
     return QuickResult(compared, file, is_renewed=renew)
 
 
@@ -145,27 +134,20 @@ def quick_table(result: QuickResult) -> str:
 
 def _measure(source: str) -> list[tuple[FigureKey, float]]:
     """The figures of a bag."""
+    found = []
     with fetched(source) as bag:
-        return list(_figures(bag))
-
-
-def _figures(bag: Path) -> Iterator[tuple[FigureKey, float]]:
-    true = _true_garments(bag)
-    for backbone, sdf in _MODES:
-        options = ReplayOptions(
-            input=bag, garments=true or DEFAULT_GARMENTS, backbone=backbone, sdf=sdf, max_frames=_FRAMES
-        )
-        result = replay(options, pipeline=pipeline_for(options))
-        for garment in options.garments:
-            yield from _rows(bag.stem, garment, backbone, result.before[garment])
-            yield from _rows(bag.stem, garment, f"node, {backbone}, {sdf}", result.after[garment])
-
-
-def _rows(bag: str, garment: str, method: str, figures: Figures) -> Iterator[tuple[FigureKey, float]]:
-    for metric in TOLERANCES:
-        value = getattr(figures, metric)
-        if value is not None:
-            yield FigureKey(bag, garment, method, metric), value
+        true = _true_garments(bag)
+        for backbone, sdf in _MODES:
+            how: dict[str, Any] = {"garments": true or DEFAULT_GARMENTS, "backbone": backbone, "sdf": sdf}
+            options = ReplayOptions(input=bag, max_frames=_FRAMES, **how)
+            result = replay(options, pipeline=pipeline_for(options))
+            for garment in options.garments:
+                methods = {backbone: result.before[garment], f"node, {backbone}, {sdf}": result.after[garment]}
+                for (method, figures), metric in product(methods.items(), TOLERANCES):
+                    value = getattr(figures, metric)
+                    if value is not None:
+                        found.append((FigureKey(bag.stem, garment, method, metric), value))
+    return found
 
 
 def _true_garments(bag: Path) -> tuple[str, ...]:
@@ -177,29 +159,17 @@ def _true_garments(bag: Path) -> tuple[str, ...]:
     return tuple(names)
 
 
-def _read(file: Path) -> tuple[dict[FigureKey, float], dict[str, float]]:
-    """The reference's figures, and its tolerances."""
+def _read(file: Path) -> dict[FigureKey, float]:
+    """The reference's figures."""
+    if not file.exists():
+        msg = f"{file}: no reference there; write one with --set-reference, or name another with --reference"
+        raise RefuError(msg)
     try:
         content = read_json(file, error=RefuError, wanted="a reference, as --set-reference writes it")
-        tolerances = {**TOLERANCES, **{str(k): float(v) for k, v in content["tolerances"].items()}}
         figures = {FigureKey(*(str(r[name]) for name in FigureKey._fields)): float(r["value"]) for r in content["rows"]}
-    except (RefuError, ValueError, KeyError, TypeError, AttributeError) as error:
-        if not file.exists():
-            msg = f"{file}: no reference there; write one with --set-reference, or name another with --reference"
-            raise RefuError(msg) from error
+        if unknown := {key.metric for key in figures} - TOLERANCES.keys():
+            raise KeyError(*unknown)
+    except (RefuError, ValueError, KeyError, TypeError) as error:
         msg = f"{file}: not a reference of refu evaluate --quick ({error!r}); write one with --set-reference"
         raise RefuError(msg) from error
-    unknown = sorted({metric for *_, metric in figures} - set(TOLERANCES))
-    if unknown:
-        msg = f"{file}: unknown figures {', '.join(unknown)}; write the file anew with --set-reference"
-        raise RefuError(msg)
-    return figures, tolerances
-
-
-def _write(file: Path, figures: Mapping[FigureKey, float]) -> None:
-    content = {
-        "about": "refu evaluate --quick holds its figures against these; written by --set-reference",
-        "tolerances": TOLERANCES,
-        "rows": [{**key._asdict(), "value": value} for key, value in figures.items()],
-    }
-    write_json(file, content)
+    return figures

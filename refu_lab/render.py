@@ -20,8 +20,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from refu_core.errors import MeshError
-
 if TYPE_CHECKING:
     import os
     from collections.abc import Sequence
@@ -46,13 +44,12 @@ _CREASE = math.cos(math.radians(55.0))
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera in the world of the meshes."""
+    """A pinhole camera in the world of the meshes, upright."""
 
     eye: tuple[float, float, float]
     """Position [m]."""
     target: tuple[float, float, float]
     """Point in the middle of the picture [m]."""
-    up: tuple[float, float, float] = (0.0, 1.0, 0.0)
     vertical_fov: float = 26.0
     """Angle from the bottom to the top of the picture [degrees]."""
 
@@ -66,14 +63,9 @@ class Camera:
         pitch: float = 8.0,
         vertical_fov: float = 26.0,
     ) -> Camera:
-        """A camera `distance` metres from `target`, in front (+z) of it.
+        """A camera `distance` metres from `target` [m], shape (3,), in front (+z) of it.
 
-        Args:
-            target: point in the middle of the picture [m], shape (3,).
-            distance: from target to camera [m].
-            yaw: how far it has gone round towards the subject's left (+x) [degrees].
-            pitch: how far it looks down [degrees].
-            vertical_fov: angle from the bottom to the top of the picture [degrees].
+        It has gone round towards the subject's left (+x) by `yaw`, and looks down by `pitch` [degrees].
         """
         a, b = math.radians(yaw), math.radians(pitch)
         away = np.array([math.sin(a) * math.cos(b), math.sin(b), math.cos(a) * math.cos(b)])
@@ -102,31 +94,17 @@ class Camera:
         half = math.tan(math.radians(vertical_fov) / 2)
         centre = np.asarray(camera.target)
         for _ in range(3):  # centring moves the limits a little through perspective
-            offset = points - centre
-            x, y, depth = offset @ right, offset @ up, offset @ forward
+            x, y, depth = ((points - centre) @ axis for axis in (right, up, forward))
             reach = np.maximum(np.abs(y), np.abs(x) * size[1] / size[0]) * margin / half - depth
             distance = float(reach.max())
-            scale = distance / (distance + depth)
-            centre = (
-                centre
-                + right * ((x * scale).min() + (x * scale).max()) / 2
-                + up * ((y * scale).min() + (y * scale).max()) / 2
-            )
+            x, y = (one * distance / (distance + depth) for one in (x, y))
+            centre = centre + right * (x.min() + x.max()) / 2 + up * (y.min() + y.max()) / 2
         return cls.looking_at(centre, distance=distance, yaw=yaw, pitch=pitch, vertical_fov=vertical_fov)
 
     def axes(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Unit vectors to the right, up and forward of the picture, each of shape (3,).
-
-        Raises:
-            MeshError: the camera looks along its own `up`, or stands on its target.
-        """
-        forward = np.asarray(self.target, dtype=np.float64) - np.asarray(self.eye, dtype=np.float64)
-        right = np.cross(forward, np.asarray(self.up, dtype=np.float64))
-        if not np.linalg.norm(right) > 1e-9 * np.linalg.norm(forward) or not np.linalg.norm(forward) > 0:
-            msg = f"a camera must look past its own up: eye {self.eye}, target {self.target}, up {self.up}"
-            raise MeshError(msg)
-        forward /= np.linalg.norm(forward)
-        right /= np.linalg.norm(right)
+        """Unit vectors to the right, up and forward of the picture, each of shape (3,)."""
+        forward = _unit(np.asarray(self.target, dtype=np.float64) - np.asarray(self.eye, dtype=np.float64))
+        right = _unit(np.cross(forward, (0.0, 1.0, 0.0)))
         return right, np.cross(right, forward), forward
 
 
@@ -185,52 +163,24 @@ def render(
     samples: int = 9,
     backdrop: Backdrop | None = None,
 ) -> NDArray[np.uint8]:
-    """Draws meshes and returns sRGB, uint8, shape (height, width, 3).
+    """Draws meshes, one at least, and returns sRGB, uint8, shape (height, width, 3).
 
-    Args:
-        meshes: one at least.
-        camera: where from.
-        size: width and height [pixels].
-        samples: rays a pixel, rounded down to a square; more make smoother outlines.
-        backdrop: ground, background and sun.
-
-    Raises:
-        MeshError: no mesh, a mesh of the wrong shape or not finite, a size or number of samples below one.
+    `size` is width and height [pixels], `samples` rays a pixel, rounded down to a square: more make smoother outlines.
     """
     import warp as wp
 
     from refu_lab import _ray_kernels as shading
 
-    width, height = size
-    if width < 1 or height < 1 or samples < 1:
-        msg = f"size and samples must be at least 1, got {size} and {samples}"
-        raise MeshError(msg)
-    backdrop = backdrop or Backdrop()
-    scene = _Scene.of(meshes)
-    vertices, faces = scene.vertices, scene.faces
+    (width, height), backdrop = size, backdrop or Backdrop()
+    vertices, faces = _joined(meshes)
+    colours = [np.broadcast_to(_to_linear(one.colour), np.shape(one.vertices)) for one in meshes]
     corner_normals, vertex_normals = _normals(vertices, faces)
     right, up, forward = camera.axes()
-    to_sun = np.asarray(backdrop.to_sun, dtype=np.float64)
-    to_sun /= np.linalg.norm(to_sun)
-
-    def vec3(value: ArrayLike) -> Any:
-        return wp.vec3(*(float(x) for x in np.asarray(value)))
-
-    def array(value: ArrayLike, dtype: Any) -> Any:
-        return wp.array(np.ascontiguousarray(value), dtype=dtype, device="cpu")
-
-    faces_wp = array(faces.ravel().astype(np.int32), wp.int32)
-    mesh = wp.Mesh(array(vertices, wp.vec3), faces_wp)
-
-    def light(points: NDArray[np.float32], normals: NDArray[np.float32]) -> tuple[Any, Any]:
-        sun, sky = (wp.zeros(len(points), dtype=wp.float32, device="cpu") for _ in range(2))
-        rays = [vec3(to_sun), _SUN_SPREAD, _SUN_RAYS, _SKY_RAYS, _SKY_REACH]
-        inputs = [mesh.id, array(points, wp.vec3), array(normals, wp.vec3), *rays]
-        wp.launch(shading.light_kernel, dim=len(points), inputs=inputs, outputs=[sun, sky], device="cpu")
-        return sun, sky
-
-    sun, sky = (x.numpy() for x in light(vertices, vertex_normals))
-    on_vertices = [array(_uncovered(x, sky < _COVERED, faces), wp.float32) for x in (sun, sky)]
+    to_sun = _unit(np.asarray(backdrop.to_sun, dtype=np.float64))
+    faces_wp = _array(faces.ravel(), wp.int32)
+    mesh = wp.Mesh(_array(vertices, wp.vec3), faces_wp)
+    sun, sky = _light(mesh, vertices, vertex_normals, to_sun)
+    on_vertices = [_array(_uncovered(x, sky < _COVERED, faces), wp.float32) for x in (sun, sky)]
     low, high = vertices.min(0), vertices.max(0)
     ground_y = float(low[1]) if backdrop.ground_height is None else backdrop.ground_height
     # The grid reaches as far as the shadow does; beyond it the ground lies in full light.
@@ -244,7 +194,7 @@ def render(
     grid = np.stack(np.meshgrid(*[np.arange(cells)] * 2, indexing="ij"), -1).reshape(-1, 2) * step + grid_low
     ground = np.stack([grid[:, 0], np.full(len(grid), ground_y), grid[:, 1]], 1).astype(np.float32)
     upward = np.broadcast_to(np.array([0, 1, 0], np.float32), ground.shape)
-    ground_light = [x.reshape((cells, cells)) for x in light(ground, upward)]
+    ground_light = [wp.array(x.reshape(cells, cells), device="cpu") for x in _light(mesh, ground, upward, to_sun)]
 
     image = wp.zeros((height, width), dtype=wp.vec3, device="cpu")
     wp.launch(
@@ -253,8 +203,8 @@ def render(
         inputs=[
             mesh.id,
             faces_wp,
-            array(scene.colours, wp.vec3),
-            array(corner_normals.reshape(-1, 3), wp.vec3),
+            _array(np.concatenate(colours), wp.vec3),
+            _array(corner_normals.reshape(-1, 3), wp.vec3),
             *on_vertices,
             *ground_light,
             wp.vec2(float(grid_low[0]), float(grid_low[1])),
@@ -262,15 +212,15 @@ def render(
             ground_y,
             wp.vec2(float(centre[0]), float(centre[1])),
             radius,
-            vec3(_to_linear(backdrop.ground)),
-            vec3(_to_linear(backdrop.background)),
-            vec3(to_sun),
+            _vec3(_to_linear(backdrop.ground)),
+            _vec3(_to_linear(backdrop.background)),
+            _vec3(to_sun),
             backdrop.sun,
             backdrop.sky,
-            vec3(camera.eye),
-            vec3(right),
-            vec3(up),
-            vec3(forward),
+            _vec3(camera.eye),
+            _vec3(right),
+            _vec3(up),
+            _vec3(forward),
             math.tan(math.radians(camera.vertical_fov) / 2),
             width,
             height,
@@ -289,16 +239,10 @@ def sky_light(meshes: Sequence[tuple[NDArray[np.float32], NDArray[np.int64]]]) -
     """
     import warp as wp
 
-    from refu_lab import _ray_kernels as shading
-
-    scene = _Scene.of([RenderMesh(vertices, faces) for vertices, faces in meshes])
-    points = wp.array(scene.vertices, dtype=wp.vec3, device="cpu")
-    mesh = wp.Mesh(points, wp.array(scene.faces.ravel().astype(np.int32), dtype=wp.int32, device="cpu"))
-    normals = wp.array(_normals(scene.vertices, scene.faces)[1], dtype=wp.vec3, device="cpu")
-    sun, sky = (wp.zeros(len(scene.vertices), dtype=wp.float32, device="cpu") for _ in range(2))
-    inputs = [mesh.id, points, normals, wp.vec3(0.0, 1.0, 0.0), _SUN_SPREAD, 1, _SKY_RAYS, _SKY_REACH]
-    wp.launch(shading.light_kernel, dim=len(scene.vertices), inputs=inputs, outputs=[sun, sky], device="cpu")
-    found = _uncovered(sky.numpy(), sky.numpy() < _COVERED, scene.faces)
+    vertices, faces = _joined([RenderMesh(*mesh) for mesh in meshes])
+    mesh = wp.Mesh(_array(vertices, wp.vec3), _array(faces.ravel(), wp.int32))
+    _, sky = _light(mesh, vertices, _normals(vertices, faces)[1], np.array([0.0, 1.0, 0.0]), sun_rays=1)
+    found = _uncovered(sky, sky < _COVERED, faces)
     return np.split(found, np.cumsum([len(vertices) for vertices, _ in meshes])[:-1])
 
 
@@ -309,39 +253,43 @@ def save_png(image: NDArray[np.uint8], path: str | os.PathLike[str]) -> None:
     Image.fromarray(image).save(Path(path), format="PNG")
 
 
-@dataclass(frozen=True, eq=False)
-class _Scene:
-    """All meshes as one, the way the ray caster takes them."""
+def _joined(meshes: Sequence[RenderMesh]) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Vertices (V, 3) and faces (F, 3) of all meshes as one."""
+    starts = np.cumsum([0, *(len(np.asarray(mesh.vertices)) for mesh in meshes)])
+    faces = [np.asarray(mesh.faces, np.int64) + start for mesh, start in zip(meshes, starts, strict=False)]
+    return np.concatenate([np.asarray(mesh.vertices, np.float32) for mesh in meshes]), np.concatenate(faces)
 
-    vertices: NDArray[np.float32]
-    faces: NDArray[np.int64]
-    colours: NDArray[np.float32]
-    """Linear light, shape (V, 3)."""
 
-    @classmethod
-    def of(cls, meshes: Sequence[RenderMesh]) -> _Scene:
-        if not meshes:
-            msg = "nothing to draw: wanted one mesh at least"
-            raise MeshError(msg)
-        vertices, faces, colours, start = [], [], [], 0
-        for mesh in meshes:
-            v = np.asarray(mesh.vertices, dtype=np.float32)
-            f = np.asarray(mesh.faces).astype(np.int64)
-            colour = np.asarray(mesh.colour, dtype=np.float64)
-            if v.ndim != 2 or v.shape[1] != 3 or f.ndim != 2 or f.shape[1] != 3 or not len(f):
-                msg = f"a mesh to draw must have vertices (V, 3) and faces (F, 3), got {v.shape} and {f.shape}"
-                raise MeshError(msg)
-            if f.min() < 0 or f.max() >= len(v) or not np.isfinite(v).all():
-                msg = f"a mesh to draw must have finite vertices, and faces that index its {len(v)} vertices"
-                raise MeshError(msg)
-            if colour.shape not in ((3,), v.shape) or not ((colour >= 0) & (colour <= 1)).all():
-                msg = f"a colour must be sRGB in [0, 1], (3,) or {v.shape}, got the shape {colour.shape}"
-                raise MeshError(msg)
-            vertices.append(v)
-            faces.append(f + start)
-            colours.append(np.broadcast_to(_to_linear(colour), v.shape))
-            start += len(v)
-        return cls(np.concatenate(vertices), np.concatenate(faces), np.concatenate(colours).astype(np.float32))
+def _array(value: ArrayLike, dtype: Any) -> Any:
+    import warp as wp
+
+    return wp.array(np.ascontiguousarray(value), dtype=dtype, device="cpu")
+
+
+def _vec3(value: ArrayLike) -> Any:
+    import warp as wp
+
+    return wp.vec3(*(float(x) for x in np.asarray(value)))
+
+
+def _light(
+    mesh: Any,
+    points: NDArray[np.float32],
+    normals: NDArray[np.float32],
+    to_sun: NDArray[np.float64],
+    *,
+    sun_rays: int = _SUN_RAYS,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """What N points (N, 3) of these normals see of the sun and of the sky past a Warp mesh, each of shape (N,)."""
+    import warp as wp
+
+    from refu_lab._ray_kernels import light_kernel
+
+    sun, sky = (wp.zeros(len(points), dtype=wp.float32, device="cpu") for _ in range(2))
+    rays = [_vec3(to_sun), _SUN_SPREAD, sun_rays, _SKY_RAYS, _SKY_REACH]
+    inputs = [mesh.id, _array(points, wp.vec3), _array(normals, wp.vec3), *rays]
+    wp.launch(light_kernel, dim=len(points), inputs=inputs, outputs=[sun, sky], device="cpu")
+    return sun.numpy(), sky.numpy()
 
 
 def _normals(

@@ -26,13 +26,12 @@ from refu_core._device import one_thread
 from refu_core.history import PoseHistory
 from refu_core.metrics import CollisionChecker, Figures, GarmentMetrics
 from refu_core.modes import BackboneName
-from refu_core.realtime import PipelineOutput, SkinShift
+from refu_core.realtime import PipelineOutput
 from refu_core.recordings import FASTEST, LONGEST_TURN, axis_of, upright_share
-from refu_lab.bodies import body_facts
 from refu_lab.commands._common import require_apart
 from refu_lab.commands.replay import ReplayOptions
 from refu_lab.dressed_bag import DressedBag, garment_encoder
-from refu_lab.sources import Source, open_source
+from refu_lab.sources import Source, body_facts, open_source
 from refu_lab.truth import GroundTruth
 
 When = Literal["before", "after"]
@@ -71,7 +70,6 @@ class FrameResult:
     latency_ms: float
     """From input bytes to output bytes."""
     stage_ms: Mapping[str, float]
-    shift: SkinShift
     garments: Mapping[str, GarmentRecord]
 
     def total(self, when: When) -> Found:
@@ -112,6 +110,26 @@ class ReplayResult:
     interrupted: bool = False
     body: dict[str, Any] = field(default_factory=dict)
     """Who wore the garments, and how well the built-in mesh lies on that body."""
+
+    def add(
+        self,
+        frame: SmplFrame,
+        output: PipelineOutput,
+        latency_ms: float,
+        garments: Mapping[str, GarmentRecord] | None,
+    ) -> None:
+        """Takes in a frame, and what was found of its `garments` where it was evaluated."""
+        shift = output.stats.shift
+        self.latencies_ms.append(latency_ms)
+        self.shift_sum += shift.mean
+        self.shift_largest = max(self.shift_largest, shift.largest)
+        if garments is not None:
+            self.frames.append(FrameResult(frame, latency_ms, output.stats.stage_ms, garments))
+
+    def skip(self, reason: str) -> None:
+        """Counts a message that was not replayed."""
+        known = reason in self.skips or len(self.skips) < _MAX_REASONS
+        self.skips[reason if known else "other reasons"] += 1
 
     def latency_ms(self, garment: str | None = None) -> dict[str, float]:
         """Percentiles of the latency of a garment (the frame without the others' own stages), or of the frame [ms]."""
@@ -157,14 +175,13 @@ class ReplayResult:
 class Evaluator:
     """Exact metrics of every frame, before and after collision handling, against the collider and against the skin."""
 
-    def __init__(self, pipeline: GarmentPipeline, truth: GroundTruth | None = None) -> None:
+    def __init__(self, pipeline: GarmentPipeline, truth: GroundTruth) -> None:
         self._checker, self._skin = (CollisionChecker(pipeline.body.faces.cpu().numpy()) for _ in range(2))
-        faces = {name: garment.faces.cpu().numpy() for name, garment in pipeline.garments.items()}
-        self._faces = faces
-        self.truth = truth or GroundTruth()
-        self.before = {name: GarmentMetrics(f) for name, f in faces.items()}
-        self.after = {name: GarmentMetrics(f) for name, f in faces.items()}
-        self.on_skin = {name: GarmentMetrics(f) for name, f in faces.items()}
+        self._faces = {name: garment.faces.cpu().numpy() for name, garment in pipeline.garments.items()}
+        self._truth = truth
+        self._before, self._after, self._on_skin = (
+            {name: GarmentMetrics(faces) for name, faces in self._faces.items()} for _ in range(3)
+        )
 
     def add(self, frame: SmplFrame, output: PipelineOutput, latency_ms: float) -> dict[str, GarmentRecord]:
         """Measures one frame."""
@@ -175,16 +192,23 @@ class Evaluator:
         for name, mesh in output.items():
             raw = self._checker.check(mesh.raw, self._faces[name])
             done = self._checker.check(mesh.local, self._faces[name])
-            truth = self.truth.of(name, frame)
-            self.before[name].add(mesh.raw, raw, truth=truth)
-            self.after[name].add(mesh.local, done, truth=truth)
-            self.on_skin[name].add(mesh.local, self._skin.check(mesh.local, self._faces[name]))
+            truth = self._truth.of(name, frame)
+            self._before[name].add(mesh.raw, raw, truth=truth)
+            self._after[name].add(mesh.local, done, truth=truth)
+            self._on_skin[name].add(mesh.local, self._skin.check(mesh.local, self._faces[name]))
             records[name] = GarmentRecord(
                 latency_ms=latency_ms - sum(own_ms.values()) + own_ms[name],
                 before=Found(raw.n_inside, raw.n_pairs, raw.max_depth),
                 after=Found(done.n_inside, done.n_pairs, done.max_depth),
             )
         return records
+
+    def summarise(self, result: ReplayResult) -> None:
+        """Writes the figures over all frames into a result."""
+        result.before, result.after, result.on_skin = (
+            {name: metrics.summary() for name, metrics in of.items()}
+            for of in (self._before, self._after, self._on_skin)
+        )
 
 
 @contextmanager
@@ -202,69 +226,6 @@ def _undisturbed() -> Iterator[None]:
             signal.signal(kind, signal.SIG_DFL if handler is None else handler)
         for one in dict.fromkeys(came):
             signal.raise_signal(one)
-
-
-class _Replayer:
-    """The loop's parts, so that one frame is one call."""
-
-    def __init__(self, options: ReplayOptions, pipeline: GarmentPipeline, source: Source, result: ReplayResult) -> None:
-        self._options = options
-        self._pipeline = pipeline
-        self._source = source
-        source.history = PoseHistory() if pipeline.heeds_past else None
-        self._result = result
-        faces = {name: garment.faces.cpu().numpy() for name, garment in pipeline.garments.items()}
-        self._evaluator: Evaluator | None = None
-        if options.evaluate:
-            is_bag = source.bag is not None
-            truth = GroundTruth.of_bag(options.input, faces, axes=options.axes) if is_bag else None
-            self._evaluator = Evaluator(pipeline, truth)
-        self._encoder = garment_encoder(pipeline, options)
-
-    def run(self, record: FrameRecord, bag: DressedBag | None) -> None:
-        """Bytes to bytes (timed), then the metrics and the bag (not timed)."""
-        if bag is not None:
-            with _undisturbed():
-                bag.add_input(record)
-        start = time.perf_counter()
-        try:
-            frame = self._source.frame_of(record)
-            output = self._pipeline(frame)
-            data = self._encoder.encode(
-                [mesh.local for mesh in output.values()], stamp_ns=frame.stamp_ns, transl=frame.transl
-            )
-        except RefuError as error:  # no body, a body that nobody has, or what can't be written
-            self._skip(record, str(error), bag)
-            return
-        latency_ms = 1e3 * (time.perf_counter() - start)
-        result, shift = self._result, output.stats.shift
-        result.latencies_ms.append(latency_ms)
-        result.shift_sum += shift.mean
-        result.shift_largest = max(result.shift_largest, shift.largest)
-        garments = None
-        if self._evaluator is not None:
-            garments = self._evaluator.add(frame, output, latency_ms)
-            result.frames.append(FrameResult(frame, latency_ms, output.stats.stage_ms, shift, garments))
-        if bag is not None:
-            with _undisturbed():
-                bag.add_frame(record, frame, output, data, garments)
-
-    def _skip(self, record: FrameRecord, reason: str, bag: DressedBag | None) -> None:
-        if bag is not None:
-            with _undisturbed():
-                bag.add_skip(record, reason)
-        skips = self._result.skips
-        skips[reason if reason in skips or len(skips) < _MAX_REASONS else "other reasons"] += 1
-
-    def summarise(self) -> None:
-        """Completes the result."""
-        has_truth = self._evaluator is not None and bool(self._evaluator.truth.garments)  # of the built-in bodies
-        self._result.warnings += self._source.warnings(self._pipeline, betas_are_told=has_truth)
-        if self._evaluator is None:
-            return
-        self._result.before = {name: metrics.summary() for name, metrics in self._evaluator.before.items()}
-        self._result.after = {name: metrics.summary() for name, metrics in self._evaluator.after.items()}
-        self._result.on_skin = {name: metrics.summary() for name, metrics in self._evaluator.on_skin.items()}
 
 
 @one_thread()
@@ -293,24 +254,47 @@ def replay(
         source = open_source(options, lambda: load().body)  # whose faults are told at once
         options = replace(options, frame_id=options.frame_id or source.frame_id)
         pipeline = load()
-        pipeline(
-            SmplFrame(pose=np.zeros((24, 3), np.float32))
-        )  # compiles kernels, so that the first frame's latency is a frame's
+        pipeline(SmplFrame(pose=np.zeros((24, 3), np.float32)))  # compiles kernels, or the first frame would be late
         result = ReplayResult(options, source.description, body=body_facts(pipeline))
         if options.backbone == BackboneName.AUTO:
             result.warnings += [f"{name} has no trained weights: worn by skinning" for name in pipeline.untrained]
-        replayer = _Replayer(options, pipeline, source, result)
+        source.history = PoseHistory() if pipeline.heeds_past else None
+        truth = GroundTruth()
+        if options.evaluate and source.bag is not None:
+            faces = {name: garment.faces.cpu().numpy() for name, garment in pipeline.garments.items()}
+            truth = GroundTruth.of_bag(options.input, faces, axes=options.axes)
+        evaluator = Evaluator(pipeline, truth) if options.evaluate else None
+        encoder = garment_encoder(pipeline, options)
         bag = None if options.output is None else stack.enter_context(DressedBag(options, pipeline, source))
         records = itertools.islice(source.records, options.max_frames)
         total = source.count if options.max_frames is None else min(source.count or sys.maxsize, options.max_frames)
+        bar = None if progress and told is None else True
+        shown = tqdm(_paced(records, options.speed), total=total, unit="frame", disable=bar)
         try:
-            bar = None if progress and told is None else True
-            shown = tqdm(_paced(records, options.speed), total=total, unit="frame", disable=bar)
             for record in shown if told is None else _counted(shown, total or 0, told):
-                replayer.run(record, bag)
+                start = time.perf_counter()
+                try:
+                    frame = source.frame_of(record)
+                    output = pipeline(frame)
+                    garments = [mesh.local for mesh in output.values()]
+                    data = encoder.encode(garments, stamp_ns=frame.stamp_ns, transl=frame.transl)
+                except RefuError as error:  # no body, a body that nobody has, or what can't be written
+                    result.skip(str(error))
+                    with _undisturbed():
+                        if bag is not None:
+                            bag.add_skip(record, str(error))
+                    continue
+                latency_ms = 1e3 * (time.perf_counter() - start)
+                found = None if evaluator is None else evaluator.add(frame, output, latency_ms)
+                result.add(frame, output, latency_ms, found)
+                with _undisturbed():
+                    if bag is not None:
+                        bag.add_frame(record, frame, output, data, found)
         except KeyboardInterrupt:
             result.interrupted = True
-        replayer.summarise()
+        if evaluator is not None:
+            evaluator.summarise(result)
+        result.warnings += source.warnings(pipeline, betas_are_told=bool(truth.garments))  # of the built-in bodies
     result.warnings += _doubts(result, source)
     if not result.latencies_ms and not result.interrupted:
         reasons = "; ".join(f"{count} x {reason}" for reason, count in result.skips.most_common(3))

@@ -1,10 +1,11 @@
-"""Where a replay's frames come from: a bag of SMPL parameters or of keypoints, or a file of motion."""
+"""Where a replay's frames come from: a bag of SMPL parameters or of keypoints, a file of motion; and on which body."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,8 +14,7 @@ from msg_adapters.axes import up_of
 from refu_core import FrameError, RefuError
 from refu_core.history import PoseHistory
 from refu_core.modes import FOREIGN_BETAS, ONE_STYLE, BetasSource
-from refu_core.recordings import SUFFIXES, upright_turn
-from refu_lab.bodies import body_warnings
+from refu_core.recordings import GENDERS, SUFFIXES, upright_turn
 from refu_lab.commands.replay import RecordingOptions
 
 if TYPE_CHECKING:
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from msg_adapters import FrameRecord
     from refu_core import GarmentPipeline, SmplBody, SmplFrame
+    from refu_core.body import BodyFit
 
 INPUT_TOPIC = "/smpl_params"
 
@@ -185,3 +186,34 @@ def _follower(options: RecordingOptions, body: SmplBody) -> Callable[[bytes, int
         return replace(people[followed], up=up_of(frame_id))
 
     return decode
+
+
+def body_facts(pipeline: GarmentPipeline) -> dict[str, Any]:
+    """Plain values, ready for JSON; of a body that was named, how far the built-in mesh is from its surface [mm]."""
+    facts: dict[str, Any] = {"name": pipeline.body.name, "fingerprint": pipeline.body.fingerprint}
+    return facts if pipeline.fit is None else facts | fit_facts(pipeline.fit)
+
+
+def fit_facts(fit: BodyFit) -> dict[str, float]:
+    """How far the built-in mesh is from the body's surface, hands, feet and head left out [mm]."""
+    found = fit.registration
+    return {"fit_mean_mm": 1e3 * found.mean_distance, "fit_p99_mm": 1e3 * found.far_distance}
+
+
+def body_warnings(pipeline: GarmentPipeline, *, gender: str = "") -> list[str]:
+    """What there is to warn of, for a recording that says it is of a `gender`, or (empty) doesn't."""
+    warnings = pipeline.warnings
+    known = _gender_of(pipeline.body.name)
+    said = gender.strip().lower()
+    if said in ("male", "female") and known and said != known:
+        warnings.append(
+            f"the recording is of a {said} body and is dressed as {pipeline.body.name}: name a body (body, "
+            f"--body {said} or a file), and garments are transferred to it"
+        )
+    return warnings
+
+
+def _gender_of(body: str) -> str:
+    """Whose body it is by its name, as `SMPL_FEMALE` and `basicModel_f_lbs_10_207_0_v1.0.0` are; empty if unsaid."""
+    words = [word for word in re.split(r"[^a-z]+", body.lower()) if word in GENDERS]
+    return GENDERS[words[0]] if words else ""

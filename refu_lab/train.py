@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any
 
 from refu_core import RefuError, load_garment
 from refu_core._device import checked_device
@@ -12,9 +12,8 @@ from refu_core.backbones import PRESETS
 from refu_core.body import load_fit
 from refu_core.garments import worn_on
 from refu_core.options import check
-from refu_core.refu import ScaleKind
 from refu_core.sdf import SDF_PRESETS
-from refu_core.simulation import GarmentDataset, GarmentSequences, open_dataset
+from refu_core.simulation import GarmentDataset, open_dataset
 from refu_core.training import (
     CarrySettings,
     DynamicsSettings,
@@ -30,8 +29,6 @@ from refu_core.training import (
 from refu_lab.commands.train import TrainOptions
 from refu_lab.tables import format_table
 
-Settings = TypeVar("Settings", CarrySettings, DynamicsSettings)
-
 
 def train(options: TrainOptions, *, progress: bool) -> dict[str, Any]:
     """Trains; returns the card of what was trained last.
@@ -45,48 +42,44 @@ def train(options: TrainOptions, *, progress: bool) -> dict[str, Any]:
     template = load_garment(options.garment)
     fit = load_fit(options.body or template.body)
     template, body = worn_on(template, fit), fit.body
+    steps: dict[str, Any] = {} if options.steps is None else {"steps": options.steps}
     common: dict[str, Any] = {"device": options.device, "quiet": not progress}
     if options.network == "sdf":
-        return train_sdf(
-            GarmentDataset(options.data), body, template, options.folder, settings=_sdf_training(options), **common
-        )
-    dataset = open_dataset(options.data)
+        to_sdf = replace(SdfSettings.of(options.preset), seed=options.seed, **steps)
+        return train_sdf(GarmentDataset(options.data), body, template, options.folder, settings=to_sdf, **common)
+    dataset, common["body"] = open_dataset(options.data), body
+    given = template, dataset, options.folder
     if options.network == "dynamics":
-        return train_dynamics(
-            template,
-            dataset,
-            options.folder,
-            mode=options.mode,
-            settings=_asked(DynamicsSettings(), options),
-            body=body,
-            **common,
-        )
+        moving = _seeded(DynamicsSettings(), options, **steps)
+        return train_dynamics(*given, mode=options.mode, settings=moving, **common)
     if options.like is not None:
-        few = _asked(CarrySettings(), options)
-        return carry_over(
-            template, dataset, options.folder, like=options.like, settings=few, body=body, quiet=not progress
-        )
-    common |= {"backbone": options.backbone, "preset": options.preset, "body": body}
+        few = _seeded(CarrySettings(), options, **steps)
+        return carry_over(*given, like=options.like, settings=few, body=body, quiet=not progress)
+    common |= {"backbone": options.backbone, "preset": options.preset}
+    of_all = {} if options.steps is None else dict.fromkeys(("style_shape_steps", "low_steps", "steps"), options.steps)
+    first = PretrainSettings.of(options.backbone, options.preset, samples=int(dataset.train.sum()))
+    first = _seeded(first, options, **of_all)
     if options.mode == "none":
-        return pretrain(template, dataset, options.folder, settings=_pretraining(options, dataset), **common)
+        return pretrain(*given, settings=first, **common)
     source: Path | None = options.folder
     if options.start is not None:
         source = options.start
     elif options.backbone == "gcnn":
         source = None
     elif not (options.folder / f"{options.backbone}-none.json").exists():
-        pretrain(template, dataset, options.folder, settings=_pretraining(options, dataset), **common)
-    common |= {"settings": _finetuning(options), "goes_on": options.start is not None}
+        pretrain(*given, settings=first, **common)
+    changes: dict[str, Any] = {"scale": None} if options.scale == "fixed" else {"scale_kind": options.scale}
+    changes |= {} if options.margin is None else {"margin": options.margin}
+    changes |= {"is_blended": False} if options.unblended else {}
+    last = _seeded(FinetuneSettings.of(options.backbone, options.preset), options, **changes, **steps)
+    common |= {"settings": last, "goes_on": options.start is not None}
     return finetune(template, dataset, source, options.folder, mode=options.mode, **common)
 
 
 def _check(options: TrainOptions) -> None:
     checked_device(options.device)
-    if options.like is not None and (options.network, options.backbone, options.preset) != (
-        "garment",
-        "tailornet",
-        "realtime",
-    ):
+    is_plain = (options.network, options.backbone, options.preset) == ("garment", "tailornet", "realtime")
+    if options.like is not None and not is_plain:
         msg = "--like makes a tailornet of the preset realtime: leave --network, --backbone and --preset out"
         raise RefuError(msg)
     if options.start is not None and (options.mode == "none" or options.like is not None):
@@ -99,37 +92,8 @@ def _check(options: TrainOptions) -> None:
     check(options)
 
 
-def _sdf_training(options: TrainOptions) -> SdfSettings:
-    settings = replace(SdfSettings.of(options.preset), seed=options.seed)
-    return settings if options.steps is None else replace(settings, steps=options.steps)
-
-
-def _pretraining(options: TrainOptions, dataset: GarmentDataset | GarmentSequences) -> PretrainSettings:
-    settings = PretrainSettings.of(options.backbone, options.preset, samples=int(dataset.train.sum()))
-    settings = replace(settings, loop=replace(settings.loop, seed=options.seed))
-    if options.steps is None:
-        return settings
-    return replace(settings, style_shape_steps=options.steps, low_steps=options.steps, steps=options.steps)
-
-
-def _asked(settings: Settings, options: TrainOptions) -> Settings:
-    """The settings with the seed and the steps that were asked for."""
-    settings = replace(settings, loop=replace(settings.loop, seed=options.seed))
-    return settings if options.steps is None else replace(settings, steps=options.steps)
-
-
-def _finetuning(options: TrainOptions) -> FinetuneSettings:
-    settings = FinetuneSettings.of(options.backbone, options.preset)
-    settings = replace(settings, loop=replace(settings.loop, seed=options.seed))
-    if options.scale == "fixed":
-        settings = replace(settings, scale=None)
-    else:
-        settings = replace(settings, scale_kind=cast("ScaleKind", options.scale))
-    if options.margin is not None:
-        settings = replace(settings, margin=options.margin)
-    if options.unblended:
-        settings = replace(settings, is_blended=False)
-    return settings if options.steps is None else replace(settings, steps=options.steps)
+def _seeded(settings: Any, options: TrainOptions, **changes: Any) -> Any:
+    return replace(settings, loop=replace(settings.loop, seed=options.seed), **changes)
 
 
 def training_table(card: dict[str, Any], options: TrainOptions) -> str:

@@ -1,16 +1,23 @@
-"""Ground truth that a bag carries beside its body parameters: garments as markers on a topic of their own."""
+"""Ground truth that a bag carries beside its body parameters: garments as markers on a topic of their own.
+
+And predictions beside it that their network hasn't seen: what σ is fitted to, and checked against.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 import msg_adapters as adapters
-from refu_core import SmplFrame
+from refu_core import GarmentPipeline, GarmentTemplate, SmplFrame
+from refu_core.errors import GarmentError
+from refu_core.history import PoseHistory
+from refu_core.outputs import RADIUS_90, SigmaMap, bend_of, fit_sigma
 
 TOPIC = "/ground_truth"
 """A MarkerArray a frame, stamped as its body parameters are; a marker's `ns` is the garment's name.
@@ -62,3 +69,82 @@ def _vertices(marker: adapters.Marker, faces: NDArray[np.int64]) -> NDArray[np.f
         msg = f"{TOPIC}: wanted the {count} vertices of {marker.ns}, got points {marker.points.shape}"
         raise adapters.DecodeError(msg)
     return marker.points
+
+
+class Moment(NamedTuple):
+    """One frame whose truth is known."""
+
+    frame: SmplFrame
+    truth: NDArray[np.float64]
+    """The garment without the translation [m], shape (V, 3)."""
+    pair: int
+    """Number of the frame's style-shape pair."""
+
+
+def moments_of(bag: Path, garment: GarmentTemplate) -> list[Moment]:
+    """The frames of a bag that have the garment's truth.
+
+    Raises:
+        RefuError: the bag can't be read, or there is none of this garment.
+    """
+    truth = GroundTruth.of_bag(bag, {garment.name: garment.faces.cpu().numpy()})
+    found, history = [], PoseHistory()
+    with adapters.open_smpl_bag(bag) as opened:
+        for record in opened:
+            if record.frame is None:
+                continue
+            frame, true = history(record.frame), truth.of(garment.name, record.frame)
+            if true is not None:
+                found.append((frame, true))
+    if not found:
+        msg = f"{bag}: no ground truth of {garment.name} in it"
+        raise GarmentError(msg)
+    keys = [np.concatenate((one.betas, np.zeros(4) if one.style is None else one.style)) for one, _ in found]
+    _, pairs = np.unique(np.round(np.stack(keys), 4), axis=0, return_inverse=True)
+    return [Moment(*one, int(pair)) for one, pair in zip(found, pairs.reshape(-1), strict=True)]
+
+
+class HeldOut(NamedTuple):
+    """N samples of one garment."""
+
+    garment: GarmentTemplate
+    errors: NDArray[np.float64]
+    """Distance of each predicted vertex to the true one [m], shape (N, V)."""
+    poses: NDArray[np.float32]
+    """[rad], shape (N, 24, 3)."""
+    pairs: NDArray[np.intp]
+    """Number of each sample's style-shape pair, shape (N,)."""
+
+
+def held_out(bag: Path, garment: str, *, every: int = 1, weights: Path | None = None) -> HeldOut:
+    """Predicts every so-many-th of the frames of a bag that have a garment's truth.
+
+    `weights` is a folder of one's own, in place of those that ship. Raises `RefuError` for a bag that can't be read or
+    has no truth of this garment, and where there is no such garment.
+    """
+    pipeline = GarmentPipeline.load([garment], weights=weights)
+    (template,) = pipeline.garments.values()
+    moments = moments_of(bag, template)[::every]
+    errors = [np.linalg.norm(pipeline(one.frame)[template.name].local - one.truth, axis=1) for one in moments]
+    pairs = np.array([one.pair for one in moments])
+    return HeldOut(template, np.stack(errors), np.stack([one.frame.pose for one in moments]), pairs)
+
+
+def coverage(found: SigmaMap, samples: HeldOut) -> float:
+    """Share of the true vertices that are within the 90 % interval."""
+    held = [
+        np.mean(errors <= RADIUS_90 * found.at(float(bend)))
+        for errors, bend in zip(samples.errors, bend_of(samples.garment, samples.poses), strict=True)
+    ]
+    return float(np.mean(held))
+
+
+def cross_checked(samples: HeldOut) -> float:
+    """Share of true vertices within the 90 % interval: of each style-shape pair, with σ fitted to the others."""
+    shares: list[float] = []
+    for pair in np.unique(samples.pairs):
+        is_out = samples.pairs == pair
+        found = fit_sigma(samples.garment, samples.errors[~is_out], samples.poses[~is_out])
+        out = HeldOut(samples.garment, samples.errors[is_out], samples.poses[is_out], samples.pairs[is_out])
+        shares += [coverage(found, out)] * int(is_out.sum())
+    return float(np.mean(shares))

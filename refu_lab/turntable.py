@@ -14,7 +14,7 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -113,11 +113,7 @@ def turntable(meshes: Sequence[Mesh], frames: Sequence[Frame]) -> str:
             }
         )
     data = zlib.compress(b"".join(blocks), 9)
-    scene = {
-        "frames": told,
-        "colours": [mesh.color for mesh in meshes],
-        "counts": counts,
-    }
+    scene = {"frames": told, "colours": [mesh.color for mesh in meshes], "counts": counts}
     text = json.dumps(scene).replace("<", "\\u003c")  # a name can't end the element that it is in
     return f"""<div id="turntable"><canvas tabindex="0" role="img"
 aria-label="{html.escape(frames[0].title)}, to be turned with the mouse"></canvas><div></div><p class="note"></p></div>
@@ -126,8 +122,7 @@ aria-label="{html.escape(frames[0].title)}, to be turned with the mouse"></canva
 <script>{_SCRIPT.read_text(encoding="utf-8")}</script>"""
 
 
-@dataclass(frozen=True, eq=False)
-class _Quantised:
+class _Quantised(NamedTuple):
     places: NDArray[np.int64]
     """On the grid, shape (3, V)."""
     light: NDArray[np.uint8]
@@ -140,14 +135,12 @@ def _quantised(
     meshes: Sequence[Mesh], poses: Sequence[Pose], low: NDArray[np.float32], step: float
 ) -> list[_Quantised]:
     light = sky_light([(pose.vertices, mesh.faces) for mesh, pose in zip(meshes, poses, strict=True)])
-    return [
-        _Quantised(
-            places=np.rint((pose.vertices.T - low[:, None]) / step).astype(np.int64),
-            light=np.rint(255 * np.clip(sky, 0, 1)).astype(np.uint8),
-            red=np.zeros(len(pose.vertices), bool) if pose.colliding is None else pose.colliding,
-        )
-        for pose, sky in zip(poses, light, strict=True)
-    ]
+    found = []
+    for pose, sky in zip(poses, light, strict=True):
+        red = np.zeros(len(pose.vertices), bool) if pose.colliding is None else pose.colliding
+        places = np.rint((pose.vertices.T - low[:, None]) / step).astype(np.int64)
+        found.append(_Quantised(places, np.rint(255 * np.clip(sky, 0, 1)).astype(np.uint8), red))
+    return found
 
 
 def _signed(numbers: NDArray[np.int64]) -> bytes:

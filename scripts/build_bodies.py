@@ -27,9 +27,7 @@ from asset_tools.surfaces import (
     attach,
     boundary_loops,
     compact,
-    corner_angles,
     directed_edges,
-    edge_lengths,
     self_intersections,
     smoothing_matrix,
 )
@@ -84,7 +82,7 @@ def main() -> None:
             shapedirs=_apply(topology.from_base, space.basis).astype(np.float32),
             posedirs=np.zeros((len(vertices), 3, 9 * (len(PARENTS) - 1)), np.float32),
         )
-        report(name, space, topology, regressor)
+        print(f"{name}: {len(vertices)} vertices, {len(topology.faces)} faces")
 
 
 def build_topology(mesh: BaseMesh, spaces: list[ShapeSpace], *, reference: Vertices) -> Topology:
@@ -232,34 +230,6 @@ def _few_influences(weights: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _apply(matrix: scipy.sparse.csr_matrix, basis: NDArray[np.float64]) -> NDArray[np.float64]:
     return (matrix @ basis.reshape(len(basis), -1)).reshape(-1, 3, N_BETAS)
-
-
-def report(name: str, space: ShapeSpace, topology: Topology, regressor: NDArray[np.float64]) -> None:
-    """Prints what the tests check, and what the documentation says."""
-    v, f = topology.from_base @ space.mean, topology.faces
-    body = trimesh.Trimesh(v, f, process=False)
-    edges = edge_lengths(v, f) * 1e3
-    angles = corner_angles(v, f)
-    print(
-        f"{name}: {len(v)} vertices, {len(f)} faces, watertight {body.is_watertight}, Euler {body.euler_number}, "
-        f"{body.volume * 1e3:.1f} l, {np.ptp(v[:, 1]):.3f} m, edges {edges.min():.1f}/{edges.mean():.1f}/"
-        f"{edges.max():.1f} mm, least angle {angles.min():.1f} (1 % below {np.percentile(angles.min(1), 1):.1f}), "
-        f"betas explain {100 * space.explained:.1f} %"
-    )
-    pairs = self_intersections(v, f)
-    print(
-        f"  {len(pairs)} intersecting pairs of faces {v[f[pairs].reshape(-1)].mean(0).round(3) if len(pairs) else ''}"
-    )
-    held = space.samples[1::17]
-    error = [regressor @ (topology.from_base @ s.astype(np.float64)) for s in held] - space.joints[1::17]
-    error = np.linalg.norm(error, axis=2) * 1e3
-    worst = error.mean(0).argmax()
-    used = np.count_nonzero(regressor, axis=1)
-    print(
-        f"  joints: error {error.mean():.1f} mm on average, {error.mean(0).max():.1f} at {JOINT_NAMES[worst]}, "
-        f"{error.max():.1f} at most; {used.min()} to {used.max()} vertices a joint, "
-        f"weights {regressor.min():.3f} to {regressor.max():.3f}"
-    )
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ import argparse
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy.sparse
@@ -30,12 +31,8 @@ from asset_tools.surfaces import (
     attach,
     boundary_loops,
     compact,
-    corner_angles,
     directed_edges,
-    edge_lengths,
-    self_intersections,
     smoothing_matrix,
-    vertex_normals,
 )
 from build_bodies import PEOPLE
 from numpy.typing import NDArray
@@ -237,31 +234,14 @@ def main() -> None:
         if arguments.only not in (None, garment.name):
             continue
         body = load_body(arguments.assets / f"body_{garment.body}.npz")
-        template = build(garment, mesh, spaces[garment.body], body)
-        np.savez_compressed(
-            arguments.assets / f"garment_{garment.name}.npz",
-            v_template=template.vertices.astype(np.float32),
-            f=template.faces.astype(np.uint32),
-            weights=template.weights.astype(np.float32),
-            shapedirs=template.shapedirs.astype(np.float32),
-            body=np.array(garment.body),
-            card=np.array(card_to_json(garment.card).encode()),
-        )
-        report(garment, template, body)
+        arrays = build(garment, mesh, spaces[garment.body], body)
+        arrays |= {"body": np.array(garment.body), "card": np.array(card_to_json(garment.card).encode())}
+        np.savez_compressed(arguments.assets / f"garment_{garment.name}.npz", **arrays)
+        print(f"{garment.name}: {len(arrays['v_template'])} vertices, {len(arrays['f'])} faces")
 
 
-@dataclass(frozen=True, eq=False)
-class Template:
-    """A finished garment, the arrays of its file."""
-
-    vertices: Vertices
-    faces: Faces
-    weights: NDArray[np.float64]
-    shapedirs: NDArray[np.float64]
-
-
-def build(garment: Garment, mesh: BaseMesh, space: ShapeSpace, body: SmplBody) -> Template:
-    """Cuts, drapes, meshes and binds a garment to its body."""
+def build(garment: Garment, mesh: BaseMesh, space: ShapeSpace, body: SmplBody) -> dict[str, NDArray[Any]]:
+    """Cuts, drapes, meshes and binds a garment to its body: the arrays of its file."""
     used, source_faces = compact(mesh.triangles(garment.source))
     source = space.mean[used]
     fine = trimesh.Trimesh(source, source_faces, process=False).subdivide_loop(1)
@@ -295,7 +275,12 @@ def build(garment: Garment, mesh: BaseMesh, space: ShapeSpace, body: SmplBody) -
         basis = smooth @ basis
     shapedirs = basis.reshape(-1, 3, N_BETAS)
     final = keep_clear(final, faces, shapedirs, garment, body)
-    return Template(final, faces, weights, shapedirs)
+    return {
+        "v_template": final.astype(np.float32),
+        "f": faces.astype(np.uint32),
+        "weights": weights.astype(np.float32),
+        "shapedirs": shapedirs.astype(np.float32),
+    }
 
 
 def drape(v: Vertices, f: Faces, garment: Garment, body: SmplBody) -> Vertices:
@@ -406,34 +391,6 @@ def _few_influences(weights: NDArray[np.float64]) -> NDArray[np.float64]:
     np.put_along_axis(weights, np.argsort(-weights, axis=1)[:, INFLUENCES:], 0.0, axis=1)
     weights[weights < 1e-3] = 0.0
     return weights / weights.sum(1, keepdims=True)
-
-
-def report(garment: Garment, template: Template, body: SmplBody) -> None:
-    """Prints what the tests check, and what the documentation says."""
-    v, f = template.vertices, template.faces
-    edges = edge_lengths(v, f) * 1e3
-    angles = corner_angles(v, f)
-    pairs = np.unique(np.sort(directed_edges(f), 1), axis=0)
-    distance = BodyDistance(body)
-    clearance, middle = distance(v)[0].min() * 1e3, distance(v[pairs].mean(1))[0].min() * 1e3
-    two = []
-    for k in range(N_BETAS):
-        for sign in (2, -2):
-            betas = sign * np.eye(N_BETAS)[k]
-            two.append(BodyDistance(body, betas)(v + template.shapedirs @ betas)[0].min() * 1e3)
-    turns = []
-    for loop in boundary_loops(f):
-        step = np.roll(v[loop], -1, 0) - v[loop]
-        step /= np.linalg.norm(step, axis=1, keepdims=True)
-        turns.append(np.degrees(np.arccos(np.clip((step * np.roll(step, 1, 0)).sum(1), -1, 1))).max())
-    inward = np.einsum("vk,vk->v", vertex_normals(v, f), distance(v)[1])
-    print(
-        f"{garment.name}: {len(v)} vertices, {len(f)} faces, {len(turns)} edges of cloth that turn by at most "
-        f"{max(turns):.0f} degrees, edges {edges.min():.1f}/{edges.mean():.1f}/{edges.max():.1f} mm, least angle "
-        f"{angles.min():.1f}, {len(self_intersections(v, f))} intersections, {np.mean(inward > 0):.3f} outward\n"
-        f"  clearance {clearance:.1f} mm at vertices, {middle:.1f} at edges, mean {distance(v)[0].mean() * 1e3:.1f}; "
-        f"at +-2 of the betas {min(two):.1f}; {np.count_nonzero(template.weights, axis=1).max()} influences"
-    )
 
 
 if __name__ == "__main__":

@@ -141,7 +141,6 @@ def _run(command: list[str]) -> None:
 
 
 def main() -> int:
-    """Returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="where the package goes")
     folder = parser.parse_args().folder

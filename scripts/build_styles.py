@@ -22,7 +22,6 @@ from refu_core.garments import BUILTIN_GARMENTS, load_garment
 
 
 def main() -> int:
-    """Returns the exit code."""
     assets = Path(__file__).parents[1] / "refu_core" / "assets"
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("garments", nargs="*", default=BUILTIN_GARMENTS, help="all of them if none is named")
@@ -34,17 +33,12 @@ def main() -> int:
         if garment.styledirs is not None:
             print(f"{name}: has styles already; run build_garments.py first", file=sys.stderr)
             return 2
-        basis = build_styles(garment, load_body(garment.body))
         with np.load(assets / f"garment_{name}.npz", allow_pickle=False) as data:
             arrays = {key: data[key] for key in data.files}
-        arrays["v_template"] = basis.v_template
-        arrays["styledirs"] = basis.styledirs
-        arrays["tailoring_from_style"] = basis.tailoring_from_style
+        arrays |= build_styles(garment, load_body(garment.body))
         args.output.mkdir(parents=True, exist_ok=True)
         np.savez_compressed(args.output / f"garment_{name}.npz", **arrays)
-        shares = ", ".join(f"{100 * share:.0f} %" for share in basis.variance)
-        print(f"{name}: axes of the drapes {shares}; {100 * basis.linear:.0f} % of their variance linear in the cut")
-        print(np.round(basis.tailoring_from_style.T, 2), [p.name for p in basis.parameters])
+        print(name, np.round(arrays["tailoring_from_style"].T, 2), [one.name for one in garment.card.tailoring])
     return 0
 
 

@@ -17,11 +17,10 @@ import numpy as np
 
 from refu_core import RefuError
 from refu_core.outputs import fit_sigma, save_sigma
-from refu_lab.held_out import cross_checked, held_out
+from refu_lab.truth import cross_checked, held_out
 
 
 def main() -> None:
-    """Fit, check, and write."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument(
         "bag", type=Path, help="SMPL parameters and /ground_truth, as bags/make_evaluation_bags.py writes"

@@ -20,7 +20,6 @@ MODES = ("none", "approx", "accurate")
 
 
 def main() -> None:
-    """Rewrite the three modes in place; the base stays as it is."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path, help="a garment's weights, as refu train writes them")
     parser.add_argument("--share", nargs="*", default=[], choices=MODES, help="modes that take hybrid's backbone")

@@ -67,12 +67,6 @@ def _number(name: str, prefix: str) -> int:
     return int(rest.split(".")[0]) if found else -1
 
 
-def next_gains(gains: NDArray[np.float64], ratios: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Gains nearer to those whose bands have the energy of true ones; `ratios` is what `gains` gave, both (4,)."""
-    better: NDArray[np.float64] = np.maximum(gains * ratios**-0.6, 1.0)
-    return better
-
-
 class Judge:
     """What the pipeline makes of samples, against what was simulated."""
 
@@ -101,29 +95,25 @@ class Judge:
 
 
 def main() -> None:
-    """Find the gains and rewrite the weights."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path, help="a garment's weights")
     parser.add_argument("--data", type=Path, required=True, help="simulated samples")
     parser.add_argument("--count", type=int, help="as many of them (all)")
-    parser.add_argument("--target", type=float, default=1.0, help="energy of each band over the true one's (1)")
-    parser.add_argument("--gains", type=float, nargs=4, help="to begin with (1 1 1 1)")
     parser.add_argument("--rounds", type=int, default=10, help="tries until the gains are taken (10)")
-    parser.add_argument("--dry-run", action="store_true", help="write nothing")
     arguments = parser.parse_args()
     folder = arguments.folder
     judge = Judge(folder, arguments.data, arguments.count)
     basis, _ = load_basis(folder, judge.pipeline.garments[folder.name], expect={"garment": folder.name})
-    gains = np.array(arguments.gains or (1.0, 1.0, 1.0, 1.0))
+    gains = np.ones(4)
     print(f"{folder.name}, {len(judge.samples)} samples; bands finest first")
     for _ in range(arguments.rounds):
         ratios, error = judge(sharpened(basis, judge.bands, gains))
         print(f"gains {gains.round(3)}: energies {ratios.round(3)} of the true ones, error {error:.3f} mm", flush=True)
-        found, gains = gains, next_gains(gains, ratios / arguments.target)
-    if not arguments.dry_run:
-        rewrite(folder, basis, judge.bands, found)
-        ratios, error = Judge(folder, arguments.data, arguments.count)()
-        print(f"rewritten: energies {ratios.round(3)} of the true ones, error {error:.3f} mm")
+        # Nearer to the gains whose bands have the energy of true ones.
+        found, gains = gains, np.maximum(gains * ratios**-0.6, 1.0)
+    rewrite(folder, basis, judge.bands, found)
+    ratios, error = Judge(folder, arguments.data, arguments.count)()
+    print(f"rewritten: energies {ratios.round(3)} of the true ones, error {error:.3f} mm")
 
 
 def rewrite(folder: Path, basis: BasisDecoder, bands: FoldBands, gains: NDArray[np.float64]) -> None:

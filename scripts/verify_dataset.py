@@ -2,9 +2,9 @@
 """Judges every stored garment of a simulated set anew, by code that had no part in making it.
 
 Body and garment: python-fcl (pairs of triangles) and libigl (signed distance, its sign by winding number). The garment
-itself: edges against triangles in double precision. Stretch: edges of the stored garment against its cut.
+itself: python-fcl. Stretch: edges of the stored garment against its cut.
 
-    python scripts/verify_dataset.py data/tshirt-male --processes 2 --json report.json
+    python scripts/verify_dataset.py data/tshirt-male --processes 2 > report.json
 
 The set's files are read as docs/guide/data.md describes them, not through the project's own reader. Exit code 1 where a
 sample isn't what it should be.
@@ -28,7 +28,6 @@ import igl
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from tqdm import tqdm
 
 from refu_core.body import Collider, load_body
@@ -96,7 +95,7 @@ class Judge:
         return Verdict(
             place,
             slot,
-            body_pairs=len(_fcl_contacts(vertices, self._faces, body, self._body_faces)),
+            body_pairs=len(intersecting_pairs(vertices, self._faces, body, self._body_faces)),
             inside=int((distance[0] <= 0).sum()),
             clearance_mm=float(1e3 * distance[0].min()),
             self_pairs=self_intersections(vertices, self._faces),
@@ -117,7 +116,9 @@ class Judge:
         return self._lengths[1]
 
 
-def _fcl_contacts(first: F64, first_faces: Any, second: F64, second_faces: Any) -> list[Any]:
+def intersecting_pairs(first: F64, first_faces: Any, second: F64, second_faces: Any) -> NDArray[np.int64]:
+    """Triangles of two meshes that intersect, by fcl, shape (K, 2)."""
+
     def model(vertices: F64, faces: Any) -> Any:
         bvh = fcl.BVHModel()
         bvh.beginModel(len(vertices), len(faces))
@@ -128,47 +129,14 @@ def _fcl_contacts(first: F64, first_faces: Any, second: F64, second_faces: Any) 
     request = fcl.CollisionRequest(num_max_contacts=1_000_000, enable_contact=True)  # the default stops counting early
     result = fcl.CollisionResult()
     fcl.collide(model(first, first_faces), model(second, second_faces), request, result)
-    contacts: list[Any] = result.contacts
-    return contacts
+    pairs = [(contact.b1, contact.b2) for contact in result.contacts]
+    return np.unique(np.array(pairs, np.int64).reshape(-1, 2), axis=0)
 
 
 def self_intersections(vertices: F64, faces: NDArray[np.int64]) -> int:
-    """Pairs of triangles without a common vertex of which an edge of one pierces the other."""
-    corners = vertices[faces]
-    centre = corners.mean(1)
-    radius = np.linalg.norm(corners - centre[:, None], axis=2).max(1)
-    large = radius > 2 * np.median(radius)  # few; a search as wide as the largest would find far too many
-    small, few = np.flatnonzero(~large), np.flatnonzero(large)
-    tree = cKDTree(centre[small])
-    pairs = [small[tree.query_pairs(2 * radius[small].max(), output_type="ndarray")]]
-    for face in few:
-        near = np.flatnonzero(np.linalg.norm(centre - centre[face], axis=1) < radius + radius[face])
-        near = near[(near != face) & ~(large[near] & (near < face))]
-        pairs.append(np.stack((np.full(len(near), face), near), 1))
-    i, j = np.concatenate(pairs).T
-    low, high = corners.min(1), corners.max(1)
-    keep = ((low[i] <= high[j]) & (low[j] <= high[i])).all(1)
-    i, j = i[keep], j[keep]
-    keep = ~(faces[i][:, :, None] == faces[j][:, None, :]).any((1, 2))
-    i, j = i[keep], j[keep]
-    return int((_pierces(corners[i], corners[j]) | _pierces(corners[j], corners[i])).sum())
-
-
-def _pierces(first: F64, second: F64) -> NDArray[np.bool_]:
-    """Whether an edge of `first` (K, 3, 3) crosses the triangle `second` (K, 3, 3); shape (K,)."""
-    a, b, c = second.transpose(1, 0, 2)
-    normal = np.cross(b - a, c - a)
-    height = np.einsum("kec,kc->ke", first - a[:, None], normal)
-    out = np.zeros(len(first), np.bool_)
-    for start, end in ((0, 1), (1, 2), (2, 0)):
-        across = np.flatnonzero(height[:, start] * height[:, end] < 0)
-        p, q = first[across, start], first[across, end]
-        turns = [
-            np.einsum("kc,kc->k", np.cross(u[across] - p, v[across] - p), q - p) for u, v in ((a, b), (b, c), (c, a))
-        ]
-        signs = np.sign(turns)
-        out[across] |= (signs >= 0).all(0) | (signs <= 0).all(0)
-    return out
+    """Pairs of triangles without a common vertex that intersect."""
+    pairs = np.unique(np.sort(intersecting_pairs(vertices, faces, vertices, faces), axis=1), axis=0)
+    return int((~(faces[pairs[:, 0]][:, :, None] == faces[pairs[:, 1]][:, None]).any((1, 2))).sum())
 
 
 def places(directory: Path, card: dict[str, Any]) -> list[Place]:
@@ -246,19 +214,15 @@ def summary(found: list[Verdict]) -> dict[str, Any]:
 
 
 def main() -> int:
-    """Judges a set and says what was found."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("directory", type=Path)
     parser.add_argument("--body", help="name or file of the body, where it isn't the garment's own")
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--every", type=int, default=1, metavar="K", help="only every K-th garment")
-    parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     options = {"body": arguments.body, "processes": arguments.processes, "every": arguments.every}
     report = {"set": arguments.directory.name, **summary(list(verdicts(arguments.directory, **options)))}
     print(json.dumps(report, indent=1))
-    if arguments.json is not None:
-        arguments.json.write_text(json.dumps(report, indent=1) + "\n")
     return int(bool(report["bad"]))
 
 

@@ -37,7 +37,6 @@ PATHS = [
     ("simulate", "--output"),
     ("train", "--output"),
     ("evaluate", "--output"),
-    ("evaluate", "--cache"),
     ("benchmark", "--output"),
     ("stress", "--output"),
     ("info", "--json"),

@@ -32,7 +32,7 @@ FADE = 0.035
 
 @dataclass(frozen=True, kw_only=True)
 class ColliderSettings:
-    """How a body is pulled apart. `benchmarks/collider.py` measures what half and twice of each number do."""
+    """How a body is pulled apart. `benchmarks/sensitivity.py` measures what half and twice of each number do."""
 
     gap: float = DEFAULT_GAP
     """Room that is left between two parts [m]."""

@@ -8,10 +8,8 @@ from refu_lab.benchmark._measure import processor_clock as processor_clock
 from refu_lab.benchmark._paper import PaperSettings as PaperSettings
 from refu_lab.benchmark._paper import PaperStructure as PaperStructure
 from refu_lab.benchmark._rows import BenchmarkResult as BenchmarkResult
-from refu_lab.benchmark._rows import BenchmarkRow as BenchmarkRow
 from refu_lab.benchmark._sdfs import PLAIN_QUERY as PLAIN_QUERY
 from refu_lab.benchmark._sdfs import SdfFrame as SdfFrame
-from refu_lab.benchmark._sdfs import SdfMethod as SdfMethod
 from refu_lab.benchmark._sdfs import sdf_methods as sdf_methods
 from refu_lab.benchmark._tables import benchmark_text as benchmark_text
 from refu_lab.benchmark._tables import write_results as write_results

@@ -54,18 +54,16 @@ class Timing:
 
 
 @contextlib.contextmanager
-def one_core() -> Iterator[int | None]:
-    """One thread on one core, where the system lets a process choose; gives its number, None where it doesn't."""
-    allowed = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set()
-    core = max(allowed, default=None)
-    with one_thread():
-        try:
-            if core is not None:
-                os.sched_setaffinity(0, {core})
+def one_core() -> Iterator[int]:
+    """One thread on one core; gives its number."""
+    allowed = os.sched_getaffinity(0)
+    core = max(allowed)
+    os.sched_setaffinity(0, {core})
+    try:
+        with one_thread():
             yield core
-        finally:
-            if core is not None:
-                os.sched_setaffinity(0, allowed)
+    finally:
+        os.sched_setaffinity(0, allowed)
 
 
 @contextlib.contextmanager
@@ -95,17 +93,19 @@ def measure(
     """Times contenders on the same inputs, in turn, so that a machine that gets slower gets slower for all of them.
 
     Args:
-        contenders: What is timed, by name.
+        contenders: What is timed, by name. Their order moves on by one with each window.
         windows: Inputs that follow each other, two at least a window. The first of each is a jump for whoever
             remembers the last one; it warms up and isn't counted.
-        rounds: How often every window is gone through. The order of the contenders moves on by one each time.
+        rounds: How often every window is gone through.
         slow: Contenders that get one input of the first two windows alone, in the first round.
         on_gpu: Wait for the GPU before and after each call.
         progress: Called after every window of a contender.
     """
     times: dict[str, list[tuple[float, float]]] = {name: [] for name in contenders}
     names = list(contenders)
-    with _no_collection():
+    gc.collect()
+    gc.disable()  # the collector would strike some contender for what all have left
+    try:
         for turn in range(rounds * len(windows)):
             window = windows[turn % len(windows)]
             start = turn % len(names)
@@ -118,6 +118,8 @@ def measure(
                 for given in window[1:2] if name in slow else window[1:]:
                     times[name].append(_timed(run, given, on_gpu=on_gpu))
                 progress()
+    finally:
+        gc.enable()
     found = {name: np.array(pairs) for name, pairs in times.items()}
     return {name: Timing(pairs[:, 0], pairs[:, 1], on_gpu=on_gpu) for name, pairs in found.items()}
 
@@ -130,16 +132,3 @@ def _timed(run: Callable[[Input], object], given: Input, *, on_gpu: bool) -> tup
     if on_gpu:
         torch.cuda.synchronize()
     return 1e3 * (process_time() - cpu), 1e3 * (perf_counter() - wall)
-
-
-@contextlib.contextmanager
-def _no_collection() -> Iterator[None]:
-    """The collector would strike some contender for what all have left."""
-    was_enabled = gc.isenabled()
-    gc.collect()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_enabled:
-            gc.enable()

@@ -79,8 +79,8 @@ class PaperStructure:
         )
         self._scale = ScaleNet(n, least=0.0, settings=sizes).to(device, self._dtype).requires_grad_(False)
         self._k = nn.Linear(settings.width, n * PAPER.latent_size).to(device, self._dtype).requires_grad_(False)
-        self.stage_ms: dict[str, float] = {}
-        """Wall time of the stages of the last frame [ms]."""
+        self.stages: list[dict[str, float]] = []
+        """What each stage took in each frame, by the clock that `time.perf_counter` is [ms]."""
 
     @property
     def n_parameters(self) -> int:
@@ -104,7 +104,8 @@ class PaperStructure:
         pushed = repulse(points, sample, scale=self._alpha(betas, pose, sample.distance))
         vertices: NDArray[np.float32] = pushed.cpu().numpy()
         laps.append(time.perf_counter())
-        self.stage_ms = dict(zip(("body", "backbone", "sdf", "refu"), (1e3 * np.diff(laps)).tolist(), strict=True))
+        spent = (1e3 * np.diff(laps)).tolist()
+        self.stages.append(dict(zip(("body", "backbone", "sdf", "refu"), spent, strict=True)))
         return vertices
 
     def _sample(self, points: Tensor, betas: Tensor, pose: Tensor) -> SdfSample:

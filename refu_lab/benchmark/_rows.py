@@ -60,8 +60,6 @@ class BenchmarkResult:
 
     command: str
     quick: bool
-    interrupted: bool = False
-    """Whether it was ended before everything was measured."""
     machine: dict[str, Any] = field(default_factory=dict)
     rows: list[BenchmarkRow] = field(default_factory=list)
     missing: dict[str, str] = field(default_factory=dict)
@@ -80,7 +78,6 @@ class BenchmarkResult:
         return {
             "command": self.command,
             "quick": self.quick,
-            "interrupted": self.interrupted,
             "machine": self.machine,
             "rows": [row.as_dict() for row in self.rows],
             "missing": self.missing,

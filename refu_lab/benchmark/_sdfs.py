@@ -55,6 +55,10 @@ class SdfFrame:
     """Shape (10,)."""
 
 
+Ask = Callable[[SdfFrame], Any]
+"""Signed distances [m], shape (N,), the preparation for the pose included."""
+
+
 @dataclass(frozen=True, eq=False)
 class SdfMethod:
     """One way to the distances."""
@@ -62,8 +66,7 @@ class SdfMethod:
     name: str
     mode: str
     """The pipeline's mode that works this way, or `other`."""
-    ask: Callable[[SdfFrame], Array]
-    """Signed distances [m], shape (N,), the preparation for the pose included."""
+    ask: Ask
     is_slow: bool = False
     """Takes so long that few calls must do."""
 
@@ -98,10 +101,10 @@ def sdf_methods(
     return methods, missing
 
 
-def _plain(faces: NDArray[np.int32], rest: Array, device: str) -> Callable[[SdfFrame], Array]:
+def _plain(faces: NDArray[np.int32], rest: Array, device: str) -> Ask:
     mesh = wp.Mesh(wp.array(rest, dtype=wp.vec3, device=device), wp.array(faces.ravel(), dtype=wp.int32, device=device))
 
-    def ask(frame: SdfFrame) -> Array:
+    def ask(frame: SdfFrame) -> Any:
         mesh.points.assign(frame.body)
         mesh.refit()
         n = len(frame.garment)
@@ -109,43 +112,38 @@ def _plain(faces: NDArray[np.int32], rest: Array, device: str) -> Callable[[SdfF
         distance = wp.empty(n, dtype=float, device=device)
         gradient = wp.empty(n, dtype=wp.vec3, device=device)
         wp.launch(plain_kernel, n, [mesh.id, points], [distance, gradient], device=device)
-        answer: Array = distance.numpy()
-        return answer
+        return distance.numpy()
 
     return ask
 
 
-def _band(body: SmplBody, garment: GarmentTemplate) -> Callable[[SdfFrame], Array]:
+def _band(body: SmplBody, garment: GarmentTemplate) -> Ask:
     sdf = BandSdf(body.faces)
 
-    def ask(frame: SdfFrame) -> Array:
+    def ask(frame: SdfFrame) -> Any:
         sdf.update(torch.from_numpy(frame.body))
-        answer: Array = sdf.clipped(torch.from_numpy(frame.garment), garment.mesh.ring).distance.numpy()
-        return answer
+        return sdf.clipped(torch.from_numpy(frame.garment), garment.mesh.ring).distance.numpy()
 
     return ask
 
 
-def _ours(
-    sdf: BodySdf, body: SmplBody, device: str, *, rest_faces: RestFaces | None = None
-) -> Callable[[SdfFrame], Array]:
+def _ours(sdf: BodySdf, body: SmplBody, device: str, *, rest_faces: RestFaces | None = None) -> Ask:
     sdf.update(body.v_template.to(device), pose=torch.zeros(24, 3, device=device), betas=torch.zeros(10, device=device))
 
     @torch.no_grad()
-    def ask(frame: SdfFrame) -> Array:
+    def ask(frame: SdfFrame) -> Any:
         near = None if rest_faces is None else rest_faces(frame.unposed)
         sdf.update(torch.from_numpy(frame.body).to(device), pose=frame.pose.to(device), betas=frame.betas.to(device))
-        answer: Array = sdf.query(torch.from_numpy(frame.garment).to(device), near=near).distance.cpu().numpy()
-        return answer
+        return sdf.query(torch.from_numpy(frame.garment).to(device), near=near).distance.cpu().numpy()
 
     return ask
 
 
-def _libigl(faces: NDArray[np.int32]) -> Callable[[SdfFrame], Array]:
+def _libigl(faces: NDArray[np.int32]) -> Ask:
     igl: Any = importlib.import_module("igl")
     indices = faces.astype(np.int64)
 
-    def ask(frame: SdfFrame) -> Array:
+    def ask(frame: SdfFrame) -> Any:
         sign = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
         points, body = frame.garment.astype(np.float64), frame.body.astype(np.float64)
         distance, *_ = igl.signed_distance(points, body, indices, sign_type=sign)
@@ -154,23 +152,22 @@ def _libigl(faces: NDArray[np.int32]) -> Callable[[SdfFrame], Array]:
     return ask
 
 
-def _open3d(faces: NDArray[np.int32]) -> Callable[[SdfFrame], Array]:
+def _open3d(faces: NDArray[np.int32]) -> Ask:
     open3d: Any = importlib.import_module("open3d")
     core = open3d.core
 
-    def ask(frame: SdfFrame) -> Array:
+    def ask(frame: SdfFrame) -> Any:
         scene = open3d.t.geometry.RaycastingScene(nthreads=1)
         scene.add_triangles(core.Tensor(frame.body), core.Tensor(faces.astype(np.uint32)))
-        answer: Array = scene.compute_signed_distance(core.Tensor(frame.garment), nthreads=1).numpy()
-        return answer
+        return scene.compute_signed_distance(core.Tensor(frame.garment), nthreads=1).numpy()
 
     return ask
 
 
-def _trimesh(faces: NDArray[np.int32]) -> Callable[[SdfFrame], Array]:
+def _trimesh(faces: NDArray[np.int32]) -> Ask:
     trimesh: Any = importlib.import_module("trimesh")
 
-    def ask(frame: SdfFrame) -> Array:
+    def ask(frame: SdfFrame) -> Any:
         mesh = trimesh.Trimesh(frame.body, faces, process=False)
         closest, distance, face = trimesh.proximity.closest_point(mesh, frame.garment)
         outward = ((frame.garment - closest) * mesh.face_normals[face]).sum(1)
@@ -179,7 +176,7 @@ def _trimesh(faces: NDArray[np.int32]) -> Callable[[SdfFrame], Array]:
     return ask
 
 
-_Make = Callable[[NDArray[np.int32]], Callable[[SdfFrame], Array]]
+_Make = Callable[[NDArray[np.int32]], Ask]
 _OTHERS: tuple[tuple[str, str, str, _Make, bool], ...] = (
     ("libigl signed_distance, pseudo-normal", "igl", "libigl", _libigl, False),
     ("open3d RaycastingScene", "open3d", "open3d", _open3d, False),

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
 import torch
 
-from refu_core import GarmentPipeline, SmplFrame, load_garment
-from refu_core.realtime import FrameStats, GarmentMesh, PipelineOutput
-from refu_lab.benchmark._frames import FrameRunner
+import msg_adapters as adapters
+from refu_core import GarmentPipeline, SmplFrame, WeightsError, load_garment
 from refu_lab.benchmark._inputs import Moment, Window
 from refu_lab.benchmark._measure import Timing, measure, processor_clock
 from refu_lab.benchmark._paper import PaperSettings, PaperStructure
@@ -22,6 +23,8 @@ from refu_lab.commands.benchmark import BenchmarkOptions
 
 Pipelines = Mapping[tuple[str, str], GarmentPipeline]
 """By backbone and mode, the default backbone, or the one that is there, first."""
+BACKBONES = ("tailornet", "skinned")
+"""The default one, and the one that needs no weights."""
 MAIN_MODES = ("hybrid", "accurate")
 """Of which the stages and persons are measured."""
 GRAPH, LAUNCHES = "CUDA graph", "launch by launch"
@@ -65,12 +68,59 @@ class Section:
         facts = {"garment": self.garment, "device": device, **facts}
         self.result.rows.append(BenchmarkRow.of(timing, plain, stage=stage, mode=mode, **facts))
 
+    def add_stages(self, stages: Sequence[Mapping[str, float]], mode: str, plain: Timing, **facts: Any) -> None:
+        """Adds a row a stage, of what it took in each frame [ms]."""
+        for stage in stages[0]:
+            ms = np.array([one[stage] for one in stages])
+            self.add(f"frame.{stage}", mode, Timing(ms, ms), plain, **facts)
+
+
+class FrameRunner:
+    """Decodes, dresses and encodes; a frame of several persons is one message a person in, and one out."""
+
+    def __init__(self, pipeline: GarmentPipeline, *, persons: int = 1) -> None:
+        self._pipeline, self._persons = pipeline, range(persons)
+        self._decode = adapters.decoder_for("multiarray").from_bytes
+        meshes = [
+            adapters.MarkerMesh(
+                ns=adapters.garment_namespace(name, f"p{person}" if persons > 1 else ""),
+                faces=garment.faces.cpu().numpy(),
+                n_vertices=garment.n_vertices,
+            )
+            for person in self._persons
+            for name, garment in pipeline.garments.items()
+        ]
+        self._encoder = adapters.MarkerArrayEncoder(meshes)
+        self.stages: list[dict[str, float]] = []
+        """What each stage took in each frame that wasn't a jump, by the clock that `time.perf_counter` is [ms]."""
+
+    def __call__(self, moments: Moment | Sequence[Moment]) -> bytes:
+        """The message that goes out."""
+        given = [moments] if isinstance(moments, Moment) else moments
+        laps = [time.perf_counter()]
+        frames = [self._decode(given[i].raw) for i in self._persons]
+        laps.append(time.perf_counter())
+        outputs = self._pipeline(frames)
+        laps.append(time.perf_counter())
+        data = self._encoder.encode(
+            [mesh.local for output in outputs for mesh in output.values()],
+            stamp_ns=0,
+            transl=[mesh.transl for output in outputs for mesh in output.values()],
+        )
+        laps.append(time.perf_counter())
+        if not given[0].is_jump:
+            decode, _, encode = 1e3 * np.diff(laps)
+            spent = [output.stats.stage_ms for output in outputs]
+            own = {stage: sum(one[stage] for one in spent) for stage in spent[0]}
+            self.stages.append({"decode": float(decode), **own, "encode": float(encode)})
+        return data
+
 
 def _of_sdf(ask: Callable[[SdfFrame], object]) -> Callable[[Moment], object]:
     return lambda moment: ask(moment.sdf)
 
 
-def _of_frame(pipeline: GarmentPipeline) -> Callable[[Moment], object]:
+def _of_frame(pipeline: Callable[[SmplFrame], object]) -> Callable[[Moment], object]:
     return lambda moment: pipeline(moment.frame)
 
 
@@ -112,19 +162,18 @@ def measure_frames(
         section.add("frame", mode, times[name], plain, **facts)
     for (backbone, mode, method), runner in runners.items():
         if backbone == _backbone(pipelines) and mode in MAIN_MODES:
-            for stage, ms in runner.stage_times().items():
-                section.add(f"frame.{stage}", mode, Timing(ms, ms), plain, backbone=backbone, vertices=n, method=method)
+            section.add_stages(runner.stages, mode, plain, backbone=backbone, vertices=n, method=method)
 
 
 def frame_runners(section: Section, pipelines: Pipelines) -> dict[tuple[str, str, str | None], FrameRunner]:
     """Of every pipeline, by backbone, mode and, of a GPU, method: the main ones are measured without graphs, too."""
     on_gpu, backbone = section.device == "cuda", _backbone(pipelines)
-    runners = {(*key, GRAPH if on_gpu else None): FrameRunner.of(pipeline) for key, pipeline in pipelines.items()}
+    runners = {(*key, GRAPH if on_gpu else None): FrameRunner(pipeline) for key, pipeline in pipelines.items()}
     for mode in MAIN_MODES if on_gpu else ():
         pipeline = section.options.load_pipeline(
             section.garment, mode=mode, backbone=backbone, device=section.device, graph=False
         )
-        runners[backbone, mode, LAUNCHES] = FrameRunner.of(pipeline)
+        runners[backbone, mode, LAUNCHES] = FrameRunner(pipeline)
     return runners
 
 
@@ -139,7 +188,7 @@ def measure_persons(section: Section, pipelines: Pipelines) -> None:
     plain = section.plain()
     contenders: dict[str, Callable[[Any], object]] = {PLAIN_QUERY: lambda moments: plain(moments[0])}
     for mode in MAIN_MODES:
-        contenders |= {f"{mode} {n}": FrameRunner.of(pipelines[backbone, mode], persons=n) for n in counts}
+        contenders |= {f"{mode} {n}": FrameRunner(pipelines[backbone, mode], persons=n) for n in counts}
     times = section.measure(contenders, crowd)
     for mode in MAIN_MODES:
         for n in counts:
@@ -156,8 +205,8 @@ def measure_still(section: Section, pipelines: Pipelines) -> None:
         moving = pipelines[backbone, mode]
         # A pipeline of its own: one that moves would make the other's pose a new one.
         still = section.options.load_pipeline(section.garment, mode=mode, backbone=backbone, device=section.device)
-        contenders[f"{mode} moving"] = FrameRunner.of(moving)
-        contenders[f"{mode} still"] = _always(FrameRunner.of(still), held)
+        contenders[f"{mode} moving"] = FrameRunner(moving)
+        contenders[f"{mode} still"] = _always(FrameRunner(still), held)
         contenders[f"{mode} moving, pipeline"] = _of_frame(moving)
         contenders[f"{mode} still, pipeline"] = _always(_of_frame(still), held)
     times = section.measure(contenders, section.windows)
@@ -176,9 +225,8 @@ def measure_paper(section: Section, pipelines: Pipelines) -> None:
     for dtype in types:
         settings = PaperSettings(dtype=dtype) if full else PaperSettings(pivots=2, width=64, dtype=dtype)
         paper = PaperStructure(*section.options.on_body(section.garment, device=section.device), settings=settings)
-        runner = FrameRunner(_dressing(paper, section.garment), {section.garment: load_garment(section.garment)})
-        contenders: dict[str, Callable[[Moment], object]] = {PLAIN_QUERY: section.plain(), "paper": runner}
-        contenders |= {mode: FrameRunner.of(pipelines[_backbone(pipelines), mode]) for mode in MAIN_MODES}
+        contenders: dict[str, Callable[[Moment], object]] = {PLAIN_QUERY: section.plain(), "paper": _of_frame(paper)}
+        contenders |= {mode: FrameRunner(pipelines[_backbone(pipelines), mode]) for mode in MAIN_MODES}
         times = section.measure(contenders, section.windows[:2], slow={"paper"} if full else ())
         plain = times[PLAIN_QUERY]
         sizes = "dense, paper's sizes" if full else "dense, trial sizes"
@@ -186,27 +234,18 @@ def measure_paper(section: Section, pipelines: Pipelines) -> None:
         figures = {f"times_{mode}": times["paper"].median / times[mode].median for mode in MAIN_MODES}
         figures["parameters"] = float(paper.n_parameters)
         section.add("frame", "paper", times["paper"], plain, figures=figures, **facts)
-        for stage, ms in runner.stage_times().items():
-            section.add(f"frame.{stage}", "paper", Timing(ms, ms), plain, **facts)
+        section.add_stages(paper.stages, "paper", plain, **facts)
 
 
-def _dressing(paper: PaperStructure, name: str) -> Callable[[Sequence[SmplFrame]], Sequence[PipelineOutput]]:
-    faces = load_garment(name).faces.numpy()
-
-    def dress(frames: Sequence[SmplFrame]) -> list[PipelineOutput]:
-        outputs = []
-        for frame in frames:
-            vertices = paper(frame)
-            mesh = GarmentMesh(np.nan_to_num(vertices), lambda: np.empty((0, 3), np.float32), faces, frame.transl)
-            outputs.append(PipelineOutput({name: mesh}, mesh.before, mesh.before, FrameStats(paper.stage_ms)))
-        return outputs
-
-    return dress
-
-
-OF_MAIN_GARMENT: Mapping[str, Callable[[Section, Pipelines], None]] = {
-    "persons": measure_persons,
-    "unchanged": measure_still,
-    "paper": measure_paper,
-}
-"""What is measured of the first garment alone, on every device."""
+def load_pipelines(
+    garment: str, options: BenchmarkOptions, *, device: str = "cpu"
+) -> tuple[dict[tuple[str, str], GarmentPipeline], dict[str, str]]:
+    """The pipelines of a garment by (backbone, mode), the default backbone first; and what keeps others away."""
+    pipelines: dict[tuple[str, str], GarmentPipeline] = {}
+    missing: dict[str, str] = {}
+    for backbone, mode in product(BACKBONES, options.sizes.modes):
+        with suppress(WeightsError):
+            pipelines[backbone, mode] = options.load_pipeline(garment, mode=mode, backbone=backbone, device=device)
+            continue
+        missing[f"{garment}: {backbone}, {mode}"] = f"refu train {garment} --backbone {backbone} --mode {mode}"
+    return pipelines, missing

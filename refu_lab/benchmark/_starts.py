@@ -17,9 +17,6 @@ from refu_core.weights import load_weights, weights_folder
 from refu_lab.benchmark._rows import BenchmarkRow
 from refu_lab.commands.benchmark import BenchmarkOptions
 
-TWO = DEFAULT_GARMENTS
-"""The garments that are loaded together."""
-
 
 def start_row(
     options: BenchmarkOptions, *, mode: str, backbone: str, unit_ms: float, first_ever: bool = False
@@ -33,8 +30,14 @@ def start_row(
         RefuError: it failed.
     """
     sizes = _weights_mb(options, backbone, mode)
-    backbone = backbone if len(sizes) == len(TWO) else "skinned"
-    asked = {"garments": TWO, "sdf": mode, "backbone": backbone, "body": options.body, "collider": options.collider}
+    backbone = backbone if len(sizes) == len(DEFAULT_GARMENTS) else "skinned"
+    asked = {
+        "garments": DEFAULT_GARMENTS,
+        "sdf": mode,
+        "backbone": backbone,
+        "body": options.body,
+        "collider": options.collider,
+    }
     asked["weights"] = None if options.weights is None else str(options.weights)
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     with tempfile.TemporaryDirectory() as empty:
@@ -46,13 +49,12 @@ def start_row(
         last = (run.stderr.strip().splitlines() or ["no word about it"])[-1]
         msg = f"a process that was to dress one person failed: {last}"
         raise RefuError(msg)
-    said = json.loads(run.stdout.strip().splitlines()[-1])
-    found = {key: float(value) for key, value in said.items() if value is not None}
+    found: dict[str, float] = json.loads(run.stdout.strip().splitlines()[-1])
     ms = 1e3 * found.pop("first_mesh_cpu_s")
     return BenchmarkRow(
         stage="start",
         mode=mode,
-        garment=",".join(TWO),
+        garment=",".join(DEFAULT_GARMENTS),
         ms_median=ms,
         ratio=ms / unit_ms,
         wall_ms_median=1e3 * found.pop("first_mesh_s"),
@@ -65,7 +67,7 @@ def start_row(
 def _weights_mb(options: BenchmarkOptions, backbone: str, mode: str) -> dict[str, float]:
     """Size on disk of each garment's basis and networks [MB], by name; of those that there are."""
     sizes = {}
-    for garment in TWO:
+    for garment in DEFAULT_GARMENTS:
         folder = weights_folder(garment, options.weights)
         with suppress(WeightsError):
             files = [*load_weights(folder / f"{backbone}-{mode}").files, *load_weights(folder / "basis").files]

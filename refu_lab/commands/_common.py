@@ -149,8 +149,9 @@ def word(text: str) -> str:
     return text
 
 
-def add_common(parser: argparse.ArgumentParser) -> None:
-    """What every command has."""
+def add_common(parser: argparse.ArgumentParser, run: Callable[[argparse.Namespace], int]) -> None:
+    """What every command has; `run` does its work."""
+    parser.set_defaults(run=run)
     parser.add_argument("--json", type=out_file, metavar="FILE", help="write the results as JSON")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
 

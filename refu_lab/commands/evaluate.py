@@ -23,8 +23,6 @@ class EvaluateOptions:
         None, "folder of AMASS-style .npz files, for motion", parse=cli.in_path, metavar="DIR"
     )
     output: Path = setting(Path("docs/results"), "where the pages go", parse=cli.out_folder, metavar="DIR")
-    cache: Path | None = setting(None, "keep what was measured, and use it again", parse=cli.out_folder, metavar="DIR")
-    every: int = setting(1, "every N-th test sample", parse=cli.positive, metavar="N")
     motion_every: int = setting(1, "every N-th frame of a motion", parse=cli.positive, metavar="N")
     body: str | None = cli.worn_by()
     collider: bool = cli.off_collider()
@@ -66,8 +64,7 @@ def add(commands: Any) -> None:
     )
     parser.add_argument("--set-reference", action="store_true", help="write that file instead of comparing with it")
     cli.add_cluster(parser)
-    cli.add_common(parser)
-    parser.set_defaults(run=run)
+    cli.add_common(parser, run)
 
 
 def run(args: argparse.Namespace) -> int:

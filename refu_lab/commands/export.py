@@ -26,8 +26,7 @@ def add(commands: Any) -> None:
     parser.add_argument("--count", type=cli.positive, default=1, metavar="N", help="how many frames (1)")
     parser.add_argument("--no-body", dest="with_body", action="store_false", help="the garments alone")
     cli.add_options(parser, RecordingOptions)
-    cli.add_common(parser)
-    parser.set_defaults(run=run)
+    cli.add_common(parser, run)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -23,7 +23,9 @@ class AddOptions:
         None, "where it goes (default: NAME.npz in the user's folder)", parse=cli.out_file, metavar="FILE"
     )
     layer: int = setting(1, "0 under 1 under 2 …", parse=int, metavar="N")
-    color: tuple[float, ...] | None = setting(None, "sRGB, each from 0 to 1", parse=cli.numbers(3), metavar="R,G,B")
+    color: tuple[float, float, float] | None = setting(
+        None, "sRGB, each from 0 to 1", parse=cli.numbers(3), metavar="R,G,B"
+    )
     held_at: str | None = setting(
         None, "what holds it: waist or shoulders (default: as its place says)", choices=("waist", "shoulders")
     )
@@ -44,23 +46,17 @@ def add(commands: Any) -> None:
         description="Garments are files. Some ship; yours are in a folder, and anywhere by their path.",
     )
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-    _add_add(actions)
-    listing = actions.add_parser("list", help="the garments that have a name", description="The garments by name.")
-    cli.add_common(listing)
-    listing.set_defaults(run=run_list)
-
-
-def _add_add(actions: Any) -> None:
-    parser = actions.add_parser(
+    adding = actions.add_parser(
         "add",
         help="make a garment of a mesh",
         description="Make a garment of a mesh (OBJ, PLY, STL, OFF, GLB) that was modelled round a body: its unit, "
         "axes, place and pose are found out, unless they are given. It can be worn at once, simulated and trained.",
     )
-    parser.add_argument("mesh", type=cli.in_path, metavar="MESH", help="the mesh's file")
-    cli.add_options(parser, AddOptions)
-    cli.add_common(parser)
-    parser.set_defaults(run=run_add)
+    adding.add_argument("mesh", type=cli.in_path, metavar="MESH", help="the mesh's file")
+    cli.add_options(adding, AddOptions)
+    cli.add_common(adding, run_add)
+    listing = actions.add_parser("list", help="the garments that have a name", description="The garments by name.")
+    cli.add_common(listing, run_list)
 
 
 def run_add(args: argparse.Namespace) -> int:

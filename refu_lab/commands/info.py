@@ -13,8 +13,7 @@ def add(commands: Any) -> None:
         "info", help="what is installed, built in and usable", description="What is installed."
     )
     parser.add_argument("--body", metavar="FILE", help="say what a body model (.npz or official .pkl) holds instead")
-    cli.add_common(parser)
-    parser.set_defaults(run=run)
+    cli.add_common(parser, run)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -103,8 +103,7 @@ def add(commands: Any) -> None:
     )
     parser.add_argument("--again", action="store_true", help="of several inputs: also those that are finished")
     cli.add_cluster(parser)
-    cli.add_common(parser)
-    parser.set_defaults(run=run)
+    cli.add_common(parser, run)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -144,7 +143,8 @@ def _print_progress(done: int, total: int) -> None:
 
 
 def _replay_many(args: argparse.Namespace) -> int:
-    from refu_lab.fleet import FleetOptions, find_recordings, fleet_table, open_engine, replay_fleet
+    from refu_lab.fleet import find_recordings, fleet_table, open_engine
+    from refu_lab.fleet.replay import FleetOptions, replay_fleet
 
     recordings = find_recordings(args.input)
     each = ReplayOptions(**cli.given(args, ReplayOptions) | {"input": Path(), "output": None})

@@ -54,8 +54,7 @@ def add(commands: Any) -> None:
     parser.add_argument("--output", type=cli.out_folder, required=True, metavar="DIR", help="folder of the data set")
     cli.add_options(parser, SimulateOptions)
     cli.add_cluster(parser)
-    cli.add_common(parser)
-    parser.set_defaults(run=run)
+    cli.add_common(parser, run)
 
 
 def run(args: argparse.Namespace) -> int:

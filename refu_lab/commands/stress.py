@@ -80,21 +80,15 @@ def add(commands: Any) -> None:
     )
     cli.add_options(parser, StressOptions)
     parser.add_argument("--replay", type=cli.in_path, metavar="FILE", help="try one of them again, and nothing else")
-    cli.add_common(parser)
-    parser.set_defaults(run=run)
+    cli.add_common(parser, run)
 
 
 def run(args: argparse.Namespace) -> int:
     from refu_lab.stress import StressResult, replay_trial, run_stress, stress_table
-    from refu_lab.tables import write_json
-
-    def keep(so_far: StressResult) -> None:
-        if args.json is not None:
-            write_json(args.json, so_far.as_dict())
 
     options = StressOptions(**{"output": Path("stress")} | cli.given(args, StressOptions))
     if args.replay is not None:
         result = StressResult(tallies=[replay_trial(args.replay, weights=options.weights, collider=options.collider)])
     else:
-        result = run_stress(options, progress=not args.quiet, report=keep)
+        result = run_stress(options, progress=not args.quiet)
     return cli.tell(args, stress_table(result), result.as_dict(), code=cli.EXIT_CHECK_FAILED if result.failures else 0)

@@ -83,8 +83,7 @@ def add(commands: Any) -> None:
     parser.add_argument("garment", metavar="GARMENT", help="a garment's name (refu garment list), or its .npz")
     parser.add_argument("--data", type=cli.in_path, required=True, metavar="DIR", help="the garment's data set")
     cli.add_options(parser, TrainOptions)
-    cli.add_common(parser)
-    parser.set_defaults(run=run)
+    cli.add_common(parser, run)
 
 
 def run(args: argparse.Namespace) -> int:

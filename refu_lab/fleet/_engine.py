@@ -41,11 +41,7 @@ class FleetError(RefuError):
 
 @contextmanager
 def open_engine(jobs: int | None = None, scheduler: str | None = None) -> Iterator[Engine]:
-    """The engine for this many processes of this machine, or for a cluster.
-
-    Args:
-        jobs: processes of one thread each; None or 1: this one alone, without Dask.
-        scheduler: address of a Dask scheduler (`tcp://host:8786`), in the place of processes of this machine.
+    """The engine for `jobs` processes of this machine (None or 1: this one alone), or for a Dask scheduler's address.
 
     Raises:
         FleetError: Dask isn't installed, both were asked for, or there is no scheduler at the address.
@@ -59,12 +55,6 @@ def open_engine(jobs: int | None = None, scheduler: str | None = None) -> Iterat
     if find_spec("distributed") is None:
         msg = 'several processes are run by Dask, which isn\'t installed: pip install "refu-ros[cluster]"'
         raise FleetError(msg)
-    with ExitStack() as stack:
-        yield DaskEngine(stack.enter_context(_client(jobs, scheduler)))
-
-
-@contextmanager
-def _client(jobs: int | None, scheduler: str | None) -> Iterator[Client]:
     import dask
     from distributed import Client
 
@@ -72,30 +62,17 @@ def _client(jobs: int | None, scheduler: str | None) -> Iterator[Client]:
         "distributed.scheduler.allowed-failures": ALLOWED_FAILURES,
         "distributed.admin.log-format": "%(message)s",
     }
-    with dask.config.set(settings), _no_logs("distributed", "distributed.client"), ExitStack() as stack:
-        cluster: Any = scheduler
-        if scheduler is None:
-            cluster = stack.enter_context(_own_cluster(jobs))
+    # What goes wrong is said in one line by who gave the command; a scheduler that is gone would be a traceback.
+    for name in ("distributed", "distributed.client"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    with dask.config.set(settings), ExitStack() as stack:
+        cluster: Any = stack.enter_context(_own_cluster(jobs)) if scheduler is None else scheduler
         try:
             client = Client(cluster, timeout=CONNECT_S, set_as_default=False)
         except (OSError, ValueError, TimeoutError) as error:
             msg = f"no Dask scheduler at {scheduler}: {error or type(error).__name__}; start one with `dask scheduler`"
             raise FleetError(msg) from error
-        yield stack.enter_context(client)
-
-
-@contextmanager
-def _no_logs(*names: str) -> Iterator[None]:
-    """What goes wrong is said in one line by who gave the command; a scheduler that is gone would be a traceback."""
-    loggers = [logging.getLogger(name) for name in names]
-    before = [logger.level for logger in loggers]
-    for logger in loggers:
-        logger.setLevel(logging.CRITICAL)
-    try:
-        yield
-    finally:
-        for logger, level in zip(loggers, before, strict=True):
-            logger.setLevel(level)
+        yield DaskEngine(stack.enter_context(client))
 
 
 @contextmanager
@@ -205,17 +182,12 @@ def _work(packed: bytes, digest: str, task: bytes, version: str, folder: str) ->
     if digest not in _made:
         _made.clear()
         make = pickle.loads(packed)
-        _one_thread()
+        if "torch" in sys.modules:  # it takes seconds to import; what needs it has done so by now
+            import torch
+
+            torch.set_num_threads(1)  # processes are the parallelism, whoever started the worker
         _made[digest] = make()
     return _made[digest](pickle.loads(task))
-
-
-def _one_thread() -> None:
-    """Processes are the parallelism, also where who started the worker has said nothing of threads."""
-    if "torch" in sys.modules:  # it takes seconds to import; what needs it has done so by now
-        import torch
-
-        torch.set_num_threads(1)
 
 
 def run_function(function: Callable[[Task], Result]) -> Callable[[], Callable[[Task], Result]]:

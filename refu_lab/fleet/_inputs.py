@@ -39,7 +39,7 @@ def is_plain(inputs: Sequence[str]) -> bool:
         return False
     path = Path(inputs[0])
     if path.is_dir():
-        return list(_walk(inputs[0])) == [inputs[0].rstrip("/")] or not any(_walk(inputs[0]))
+        return list(_find(inputs[0])) in ([], [str(path)])
     return not _MAGIC.search(inputs[0]) or path.exists()
 
 
@@ -80,55 +80,37 @@ def find_data_sets(inputs: Sequence[str]) -> list[Path]:
 
 def _find(text: str) -> Iterator[str]:
     if is_url(text):
-        yield from _find_remote(text)
-    elif _MAGIC.search(text) and not Path(text).exists():
-        for match in sorted(glob.glob(text, recursive=True)):  # noqa: PTH207  (patterns are of the user, from anywhere)
-            yield from _walk(match) if Path(match).is_dir() else [match]
-    elif Path(text).is_dir():
-        yield from _walk(text)
-    elif Path(text).exists():
-        yield text
+        fs, path = filesystem(text)
+        try:
+            for match in sorted(map(str, fs.glob(path))) if _MAGIC.search(path) else [path]:
+                yield from map(fs.unstrip_protocol, _walk(fs.walk(match), match) if fs.isdir(match) else [match])
+        except OSError as error:
+            msg = f"{text}: can't be listed: {error}"
+            raise RefuError(msg) from error
+        return
+    is_glob = _MAGIC.search(text) and not Path(text).exists()
+    for match in sorted(glob.glob(text, recursive=True)) if is_glob else [text]:  # noqa: PTH207  (from anywhere)
+        if Path(match).is_dir():
+            yield from _walk(os.walk(match), match)
+        elif Path(match).exists():
+            yield match
 
 
-def _walk(folder: str) -> Iterator[str]:
-    """Recordings in a folder; itself where it is one."""
-    for place, folders, files in os.walk(folder):
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
-        mine, is_bag = _of_folder(Path(place).absolute().name, files)
-        if is_bag:
-            folders.clear()
-            yield place.rstrip("/")
+def _walk(steps: Iterable[tuple[str, Any, Iterable[str]]], folder: str) -> Iterator[str]:
+    """Recordings in a folder by what `os.walk` gives of it; the folder itself where it is one."""
+    bags: list[PurePosixPath] = []
+    for place, _, files in sorted((PurePosixPath(place), None, [*files]) for place, _, files in steps):
+        is_hidden = any(part.startswith(".") for part in place.relative_to(folder).parts)
+        if is_hidden or any(bag in place.parents for bag in bags):
+            continue
+        mine = sorted(name for name in files if name.endswith(SUFFIXES) and not name.startswith("."))
+        stems = [_SPLIT.fullmatch(Path(name).stem) if name.endswith(BAG_SUFFIXES) else None for name in mine]
+        of_one = [stem is not None and stem[1] == Path(place).absolute().name for stem in stems]
+        if _METADATA in files or (mine and all(of_one)):
+            bags.append(place)
+            yield str(place)
         else:
-            yield from (str(Path(place) / name) for name in mine)
-
-
-def _of_folder(folder: str, files: Iterable[str]) -> tuple[list[str], bool]:
-    """Names of a folder's recordings, and whether they are one bag."""
-    mine = sorted(name for name in files if name.endswith(SUFFIXES) and not name.startswith("."))
-    if _METADATA in files:
-        return mine, True
-    stems = [_SPLIT.fullmatch(Path(name).stem) if name.endswith(BAG_SUFFIXES) else None for name in mine]
-    return mine, bool(mine) and all(stem is not None and stem[1] == folder for stem in stems)
-
-
-def _find_remote(url: str) -> Iterator[str]:
-    fs, path = filesystem(url)
-    full: Any = fs.unstrip_protocol
-    try:
-        for match in sorted(map(str, fs.glob(path))) if _MAGIC.search(path) else [path]:
-            if not fs.isdir(match):
-                yield full(match)
-                continue
-            bags: list[str] = []
-            for place, _, files in sorted(fs.walk(match), key=lambda step: str(step[0])):
-                if any(place == bag or place.startswith(f"{bag}/") for bag in bags):
-                    continue
-                mine, is_bag = _of_folder(PurePosixPath(place).name, list(files))
-                bags += [place] if is_bag else []
-                yield from [full(place)] if is_bag else [full(f"{place}/{name}") for name in mine]
-    except OSError as error:
-        msg = f"{url}: can't be listed: {error}"
-        raise RefuError(msg) from error
+            yield from (str(place / name) for name in mine)
 
 
 def _named(sources: Iterable[str]) -> Iterator[Input]:
@@ -137,15 +119,12 @@ def _named(sources: Iterable[str]) -> Iterator[Input]:
         source: PurePosixPath(source.partition("://")[2] if is_url(source) else str(Path(source).absolute()))
         for source in sources
     }
-    shared = (
-        os.path.commonpath([path.parent for path in paths.values()])
-        if len({p.is_absolute() for p in paths.values()}) == 1
-        else ""
-    )
-    short = {}
-    for source, path in paths.items():
-        relative = path.relative_to(shared) if shared else PurePosixPath(*[part for part in path.parts if part != "/"])
-        short[source] = relative
+    one_root = len({path.is_absolute() for path in paths.values()}) == 1
+    shared = os.path.commonpath([path.parent for path in paths.values()]) if one_root else ""
+    short = {
+        source: path.relative_to(shared) if shared else PurePosixPath(*[part for part in path.parts if part != "/"])
+        for source, path in paths.items()
+    }
     bare = {s: r.with_suffix("") if r.suffix in SUFFIXES else r for s, r in short.items()}
     count = Counter(bare.values())
     for source in sources:

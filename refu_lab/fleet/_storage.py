@@ -30,14 +30,14 @@ def is_url(text: str) -> bool:
     return "://" in text
 
 
-def filesystem(url: str) -> tuple[Any, str]:
-    """fsspec's file system of a URL, and the path in it. Raises `RefuError` for a protocol that isn't installed."""
+def filesystem(place: str) -> tuple[Any, str]:
+    """fsspec's file system of a path or URL, and the path in it. Raises `RefuError` for a protocol that isn't there."""
     import fsspec
 
     try:
-        fs, path = fsspec.url_to_fs(url)
+        fs, path = fsspec.url_to_fs(place)
     except (ImportError, ValueError) as error:
-        msg = f"{url}: {error}"
+        msg = f"{place}: {error}"
         raise RefuError(msg) from error
     return fs, str(path)
 
@@ -72,7 +72,7 @@ class Folder:
     @contextmanager
     def scratch(self) -> Iterator[Path]:
         """An empty folder of this machine; what is left in it when the block is left is gone."""
-        with self._errors("written"):
+        with self._errors():
             if is_url(self.place):
                 own = Path(tempfile.mkdtemp(prefix="refu-"))
             else:
@@ -85,16 +85,12 @@ class Folder:
 
     def put(self, path: Path, name: str) -> None:
         """Puts a file or folder of `scratch` into its place; what was there is replaced."""
-        with self._errors("written"):
+        with self._errors():
             if is_url(self.place):
                 fs, there = filesystem(self.at(name))
                 fs.makedirs(fs._parent(there), exist_ok=True)
                 if path.is_dir():
-                    for file in sorted(path.rglob("*")):
-                        if file.is_file():
-                            target = f"{there}/{file.relative_to(path).as_posix()}"
-                            fs.makedirs(fs._parent(target), exist_ok=True)
-                            fs.put_file(str(file), target)
+                    fs.put(f"{path}/", f"{there}/", recursive=True)
                 else:
                     fs.put_file(str(path), there)
                 return
@@ -117,54 +113,52 @@ class Folder:
 
     def read_json(self, name: str) -> Any:
         """Plain values; None where there are none, or they can't be read."""
+        fs, path = filesystem(self.at(name))
         try:
-            if is_url(self.place):
-                fs, path = filesystem(self.at(name))
-                return parse_json(fs.cat_file(path))
-            return parse_json(Path(self.at(name)).read_bytes())
+            return parse_json(fs.cat_file(path))
         except (OSError, ValueError, RecursionError):
             return None
 
     def size(self, name: str) -> int | None:
         """Of a file [bytes]; None where there is none."""
+        fs, path = filesystem(self.at(name))
         try:
-            if is_url(self.place):
-                fs, path = filesystem(self.at(name))
-                return int(fs.size(path))
-            return Path(self.at(name)).stat().st_size
+            return int(fs.size(path))
         except OSError:
             return None
 
-    def tidy(self) -> None:
-        """Removes what runs that were killed have left unfinished."""
-        if not is_url(self.place):
-            shutil.rmtree(Path(self.place) / SCRATCH, ignore_errors=True)
-
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Keeps other runs out, of this machine's folders; the lock goes with the process, however that ends."""
+        """Keeps other runs out, of this machine's folders; the lock goes with the process, however that ends.
+
+        Afterwards what runs that were killed have left unfinished is removed.
+        """
         if is_url(self.place):
             yield
             return
         import fcntl
 
-        with self._errors("written"):
-            Path(self.place).mkdir(parents=True, exist_ok=True)
-            file = (Path(self.place) / ".lock").open("w")
+        folder = Path(self.place)
+        with self._errors():
+            folder.mkdir(parents=True, exist_ok=True)
+            file = (folder / ".lock").open("w")
         with file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError as error:
                 msg = f"{self.place}: another run writes into this folder; wait for it, or give another one"
                 raise RefuError(msg) from error
-            yield
+            try:
+                yield
+            finally:
+                shutil.rmtree(folder / SCRATCH, ignore_errors=True)
         with contextlib.suppress(OSError):
-            os.unlink(Path(self.place) / ".lock")  # noqa: PTH108
+            os.unlink(folder / ".lock")  # noqa: PTH108
 
     @contextmanager
-    def _errors(self, what: str) -> Iterator[None]:
+    def _errors(self) -> Iterator[None]:
         try:
             yield
         except OSError as error:
-            msg = f"{self.place}: can't be {what}: {error.strerror or error}"
+            msg = f"{self.place}: can't be written: {error.strerror or error}"
             raise RefuError(msg) from error

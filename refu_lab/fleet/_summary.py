@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 from urllib.parse import quote
@@ -62,8 +62,10 @@ class FleetResult:
         """The page over all of them, `index.html` of the reports' folder."""
         from refu_lab.report import STYLE
 
-        garments = html_table(REPLAY_HEADER, [[html.escape(cell) for cell in row] for row in _garment_rows(self)])
-        rows = [[self._link(row), *(html.escape(cell) for cell in _cells(row)[1:])] for row in self.rows]
+        garments = html_table(
+            REPLAY_HEADER, [[html.escape(cell) for cell in row] for row in replay_rows(self.garments())]
+        )
+        recordings = [[self._link(row), *(html.escape(cell) for cell in _cells(row)[1:])] for row in self.rows]
         worst = [
             [self._link(frame), *(html.escape(cell) for cell in _worst_cells(frame)[1:])] for frame in self.worst()
         ]
@@ -71,7 +73,7 @@ class FleetResult:
         left = f"; {self.n_left} not come to" if self.n_left else ""
         body = f"""<p class="note">{frames} frames; {len(self.failed)} recordings couldn't be replayed{left}.</p>
 <h2>Garments, over all frames</h2>{garments}
-<h2>Recordings</h2>{html_table(_HEADER, rows)}
+<h2>Recordings</h2>{html_table(_HEADER, recordings)}
 <p class="note">Free: frames in which no garment has a vertex inside the body or a triangle that cuts it.</p>
 <h2>Worst frames of all</h2>{html_table(_WORST_HEADER, worst)}"""
         return html_page(f"Replay of {len(self.rows)} recordings", body, style=STYLE)
@@ -84,7 +86,7 @@ class FleetResult:
 def fleet_table(result: FleetResult) -> str:
     """What `refu replay` prints of several recordings."""
     lines = [format_table(_HEADER, [_cells(row) for row in result.rows])] if result.rows else []
-    if garments := _garment_rows(result):
+    if garments := replay_rows(result.garments()):
         lines += ["", format_table(REPLAY_HEADER, garments)]
     if worst := [_worst_cells(frame) for frame in result.worst() if frame["n_inside"] or frame["n_pairs"]]:
         lines += ["", "worst frames", format_table(_WORST_HEADER, worst)]
@@ -100,7 +102,7 @@ def _cells(row: Mapping[str, Any]) -> tuple[str, ...]:
     if "error" in row:
         return (row["name"], *["-"] * (len(_HEADER) - 2), "failed")
     latency = [f"{row['latency_ms'][p]:.1f}" for p in ("p50", "p95")]
-    figures = [_number(row.get(name), digits) for name, digits in _FIGURES]
+    figures = ["-" if row.get(name) is None else f"{row[name]:.{digits}f}" for name, digits in _FIGURES]
     skipped = str(sum(row["skipped"].values()))
     return (row["name"], str(row["frames"]), skipped, *latency, *figures, "before" if row.get("kept") else "done")
 
@@ -108,17 +110,9 @@ def _cells(row: Mapping[str, Any]) -> tuple[str, ...]:
 _FIGURES = (("vfcp_percent", 3), ("free_percent", 1), ("max_depth_mm", 1))
 
 
-def _number(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
-
-
 def _worst_cells(frame: Mapping[str, Any]) -> tuple[str, ...]:
     counts = (str(frame["frame"]), f"{frame['time_s']:.2f}", str(frame["n_inside"]), str(frame["n_pairs"]))
     return (frame["name"], *counts, f"{frame['max_depth_mm']:.1f}")
-
-
-def _garment_rows(result: FleetResult) -> list[tuple[str, ...]]:
-    return replay_rows(result.garments())
 
 
 def _merged(parts: list[Mapping[str, Any]]) -> dict[str, Any]:
@@ -130,7 +124,7 @@ def _merged(parts: list[Mapping[str, Any]]) -> dict[str, Any]:
         elif name == "before":
             merged[name] = _merged([part[name] for part in parts])
         elif name != "n_frames":
-            values = list(_weighed(parts, name))
+            values = [(part[name], part["n_frames"]) for part in parts if part[name] is not None and part["n_frames"]]
             total = sum(n for _, n in values)
             if not values:
                 merged[name] = None
@@ -139,9 +133,3 @@ def _merged(parts: list[Mapping[str, Any]]) -> dict[str, Any]:
             else:
                 merged[name] = sum(value * n for value, n in values) / total
     return merged
-
-
-def _weighed(parts: list[Mapping[str, Any]], name: str) -> Iterator[tuple[float, int]]:
-    for part in parts:
-        if part[name] is not None and part["n_frames"]:
-            yield part[name], part["n_frames"]

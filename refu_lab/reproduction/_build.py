@@ -126,8 +126,7 @@ _ENERGY: Mapping[str, Callable[[np.ndarray], float]] = {
 
 
 def _energy_values(run: MethodRun) -> Values:
-    energy = run.values("energy")
-    return {metric: of(energy) for metric, of in _ENERGY.items()}
+    return {metric: of(run.values("energy")) for metric, of in _ENERGY.items()}
 
 
 def _unseen_values(run: MethodRun) -> Values:

@@ -7,7 +7,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from refu_core._files import read_json
 from refu_core.body import SmplBody, load_fit
 from refu_core.errors import WeightsError
 from refu_core.garments import load_garment
@@ -37,31 +36,10 @@ class Library:
         """Another process loads the body itself."""
         return partial(Library, collider=self.collider, body=self._named), (self._folders,)
 
-    @property
-    def body(self) -> str:
-        """Fingerprint of the body; empty for the garments' own."""
-        return "" if self.fit is None else self.fit.body.fingerprint
-
     def find(self, method: Method, garment: str) -> Path:
         """The weights' files without suffix. Raises `WeightsError` where there are none."""
         assert method.weights is not None
         return self._find(method.weights, garment)
-
-    def key(self, method: Method, garment: str) -> str:
-        """What tells these weights, and what is loaded with them, from others of the same name; empty for none."""
-        if method.weights is None:
-            return ""
-        try:
-            stem = self.find(method, garment)
-        except WeightsError:
-            return ""
-        # Weights that are stored as differences from others may be the same bytes for every garment.
-        cards = [stem.with_name(f"{name}.json") for name in (stem.name, "basis", "dynamics")]
-        found = [read_json(card, error=WeightsError, wanted="a card") for card in cards if card.exists()]
-        hashes = [
-            str(card.get(key, "")) for card in found if isinstance(card, dict) for key in ("sha256", "base_sha256")
-        ]
-        return " ".join(filter(None, hashes))
 
     def load(self, method: Method, garment: str) -> Wearable:
         """A method's networks. Raises `WeightsError` where they are missing, damaged or of another body."""

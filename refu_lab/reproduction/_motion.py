@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from msg_adapters import Motion
 from refu_core.errors import RefuError
@@ -61,20 +62,21 @@ def motion_table(
     *,
     library: Library,
     every: int,
-    progress: Callable[[int, int], None] | None = None,
+    progress: bool = False,
 ) -> ResultTable:
     """Collisions, jumps, stretch and crossings of each garment, and how far skin was moved, clip by clip.
 
-    Args:
-        clips: Recorded motions by name.
-        library: Where trained networks are.
-        every: Every so many frames one is dressed and judged; 1 for all.
-        progress: Called with (frames done, frames in all).
+    Of the recorded motions by name, `every` so many frames one is dressed and judged.
     """
     labels = {name: METHODS[name].label for name in MOTION_METHODS} | {_SKIN: "skin to collider"}
     table = ResultTable("motion", "Recorded motion", _ABOUT, labels=labels)
     indices = {name: range(0, len(clip) - _step(clip), every) for name, clip in clips.items()}
-    total, done = len(OUTFITS) * sum(map(len, indices.values())), 0
+    bar = tqdm(
+        total=len(OUTFITS) * sum(map(len, indices.values())),
+        desc="motion",
+        unit="frame",
+        disable=None if progress else True,
+    )
     found: dict[str, dict[tuple[str, str], list[Judged]]] = {}
     shifts: dict[str, dict[str, SkinShifts]] = {}
     for garments in OUTFITS:
@@ -98,11 +100,10 @@ def motion_table(
                 for (garment, method), one in judged.items():
                     found.setdefault(garment, {}).setdefault((name, method), []).append(one)
                 shift.add(way)
-                done += 1
-                if progress is not None:
-                    progress(done, total)
+                bar.update()
             if is_first:
                 of_body[name] = shift
+    bar.close()
     for garment, by_clip in found.items():
         for method in MOTION_METHODS:
             everything = [one for (_, of), ones in by_clip.items() if of == method for one in ones]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -13,11 +13,11 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from refu_core.backbones import Skinned
-from refu_core.body import BodyFit, Collider, RigidTransforms, SmplBody, load_body
+from refu_core.body import Collider, load_body
 from refu_core.contact import Blend
 from refu_core.errors import WeightsError
 from refu_core.frames import SmplFrame
-from refu_core.garments import GarmentTemplate, load_garment, worn_on
+from refu_core.garments import load_garment, worn_on
 from refu_core.realtime import GarmentPipeline, Outfit, Wearable, Wearer, dress
 from refu_core.refu import Refu
 from refu_core.sdf import ApproxSdf, BodySdf, ExactSdf, RestFaces, SdfSample
@@ -26,67 +26,39 @@ from refu_lab.reproduction._load import Library
 from refu_lab.reproduction._methods import Method
 
 
-@dataclass(eq=False)
 class GarmentSetup:
     """What all methods share for one garment: template, body, distances, and the hints that the fast one asks for."""
 
-    template: GarmentTemplate
-    body: SmplBody
-    collider: Collider | None
-    exact: ExactSdf
-    approx: ApproxSdf
-    rest_faces: RestFaces
-    post_process: PostProcess
-    blend: Blend
-
-    @classmethod
-    def of(cls, garment: str, *, collider: bool = True, fit: BodyFit | None = None) -> GarmentSetup:
-        """Prepares a built-in garment on its body or another, whose overlaps are pulled apart or not."""
-        template = worn_on(load_garment(garment), fit)
-        body = load_body(template.body) if fit is None else fit.body
-        return cls(
-            template,
-            body,
-            Collider(body) if collider else None,
-            ExactSdf(body.faces),
-            ApproxSdf(body),
-            RestFaces(body),
-            PostProcess.of_faces(template.faces, template.n_vertices),
-            Blend.of_faces(template.faces, template.n_vertices),
-        )
+    def __init__(self, garment: str, library: Library) -> None:
+        """Prepares a built-in garment on the library's body, whose overlaps are pulled apart or not."""
+        fit = library.fit
+        self.template = worn_on(load_garment(garment), fit)
+        self.body = load_body(self.template.body) if fit is None else fit.body
+        self.collider = Collider(self.body) if library.collider else None
+        self.exact, self.approx = ExactSdf(self.body.faces), ApproxSdf(self.body)
+        self.rest_faces = RestFaces(self.body)
+        self.post_process = PostProcess(self.template.faces, self.template.n_vertices)
+        self.blend = Blend.of_faces(self.template.faces, self.template.n_vertices)
 
     def near(self, unposed: Tensor, betas: Tensor) -> Tensor:
         """A body face near each vertex of an unposed garment [m], shape (N, 3), for betas (1, 10); shape (N,)."""
         return self.rest_faces.under(unposed[None], betas, self.template.shapedirs)[0]
 
 
-@dataclass(eq=False)
 class SampleScene:
     """One sample's body, posed; the distances to it are made ready when the first method asks."""
 
-    setup: GarmentSetup
-    pose: Tensor
-    """θ [rad], shape (1, 24, 3)."""
-    betas: Tensor
-    """β, shape (1, 10)."""
-    style: Tensor
-    """γ, shape (1, 4)."""
-    vertices: Tensor = field(init=False)
-    """The collider [m], shape (V, 3)."""
-    transforms: RigidTransforms = field(init=False)
-    _update_ms: dict[str, float] = field(default_factory=dict, init=False)
-
-    def __post_init__(self) -> None:
-        bare = Outfit(self.setup.body, {}, self.setup.collider)
-        dressed = dress(self.pose, Wearer.of(bare, self.betas))
-        self.vertices = dressed.turns[0](dressed.body[0])
-        self.transforms = self.setup.body(self.pose, self.betas).transforms
-
-    @classmethod
-    def of(cls, setup: GarmentSetup, pose: ArrayLike, betas: ArrayLike, style: ArrayLike) -> SampleScene:
-        """A scene of a pose (24, 3) [rad], betas (10,) and style (4,)."""
-        values = (torch.from_numpy(np.asarray(value, np.float32))[None] for value in (pose, betas, style))
-        return cls(setup, *values)
+    def __init__(self, setup: GarmentSetup, pose: ArrayLike, betas: ArrayLike, style: ArrayLike) -> None:
+        """Of a pose (24, 3) [rad], betas (10,) and style (4,)."""
+        self.setup = setup
+        self.pose, self.betas, self.style = (
+            torch.from_numpy(np.asarray(value, np.float32))[None] for value in (pose, betas, style)
+        )
+        dressed = dress(self.pose, Wearer.of(Outfit(setup.body, {}, setup.collider), self.betas))
+        self.vertices: Tensor = dressed.turns[0](dressed.body[0])
+        """The collider [m], shape (V, 3)."""
+        self.transforms = setup.body(self.pose, self.betas).transforms
+        self._update_ms: dict[str, float] = {}
 
     def sdf(self, name: str) -> tuple[BodySdf, float]:
         """The distance of that name to this body, and how long it took to take over the body [ms]."""

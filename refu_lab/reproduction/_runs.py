@@ -2,37 +2,100 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
-from refu_core._cache import code_hash
 from refu_core._engine import Engine, InProcess, Lost
-from refu_core._files import read_json, replacing
 from refu_core.errors import RefuError
 from refu_core.metrics import CollisionChecker, Figures, FrameMetrics, GarmentMetrics
+from refu_core.simulation import GarmentDataset, GarmentSequences, open_dataset
 from refu_lab.reproduction._load import Library
-from refu_lab.reproduction._methods import METHODS, Method
+from refu_lab.reproduction._methods import METHODS
 from refu_lab.reproduction._predict import GarmentSetup, MethodOutput, Predictor, SampleScene
-from refu_lab.reproduction._samples import Sample, SampleSet
 from refu_lab.reproduction._tables import Missing
 
 RATIO_EDGES: tuple[float, ...] = (0.0, 0.25, 0.75, 1.25, 1.75, 2.25, 2.75, 3.25, 3.75, 4.25, 4.75, float("inf"))
 """Groups of the ratio of approximate to accurate distance, as in the supplement's bar plot."""
 _BLOCK = 8
 """Samples of a task: some seconds' work."""
-_CODE = (
-    *("refu_core/**/*.py", "refu_core/assets/*.npz", "refu_lab/baselines.py"),
-    *("refu_lab/reproduction/_runs.py", "refu_lab/reproduction/_predict.py"),
-)
-"""Files that a run's figures depend on; those that only write tables aren't among them."""
+
+
+class Sample(NamedTuple):
+    """One body and the garment that was simulated on it."""
+
+    vertices: NDArray[np.float32]
+    """The true garment [m], shape (N, 3)."""
+    pose: NDArray[np.float32]
+    """θ [rad], shape (24, 3)."""
+    betas: NDArray[np.float32]
+    """β, shape (10,)."""
+    style: NDArray[np.float32]
+    """γ, shape (4,)."""
+    unseen: float
+    """Distance to the nearest training sample in (θ, β, γ); NaN where it isn't known."""
+
+
+@dataclass(frozen=True, eq=False)
+class SampleSet:
+    """The test samples of one garment, read one at a time."""
+
+    garment: str
+    count: int
+    shapes: int | None
+    """Body shapes of a set of sequences; None for a set of poses."""
+    read: Callable[[int], Sample]
+    """The sample of a number from 0 to `count` - 1."""
+
+    def __len__(self) -> int:
+        return self.count
+
+    def thinned(self, most: int) -> SampleSet:
+        """At most so many of these samples, evenly spread."""
+        rows = np.unique(np.linspace(0, self.count - 1, min(most, self.count)).round().astype(int))
+        return replace(self, count=len(rows), read=lambda number: self.read(int(rows[number])))
+
+    @classmethod
+    def open(cls, path: Path) -> SampleSet:
+        """The test samples of the set in the folder `path`, finished so far.
+
+        Raises:
+            RefuError: no such set, a damaged one, or one without a finished test sample.
+        """
+        dataset = open_dataset(path)
+        samples = _of_sequences(dataset) if isinstance(dataset, GarmentSequences) else _of_poses(dataset)
+        if not samples.count:
+            msg = f"{path}: no test sample in it is finished yet"
+            raise RefuError(msg)
+        return samples
+
+
+def _of_poses(dataset: GarmentDataset) -> SampleSet:
+    rows = np.flatnonzero(dataset.test)
+
+    def read(number: int) -> Sample:
+        sample = dataset.sample(int(rows[number]))
+        return Sample(sample.vertices, sample.pose, sample.betas, sample.style, sample.unseen)
+
+    return SampleSet(str(dataset.card["garment"]), len(rows), None, read)
+
+
+def _of_sequences(dataset: GarmentSequences) -> SampleSet:
+    sequences = [dataset.sequence(int(row)) for row in np.flatnonzero(dataset.test)]
+    frames = [(k, int(t)) for k, sequence in enumerate(sequences) for t in np.flatnonzero(sequence.kept)]
+
+    def read(number: int) -> Sample:
+        sequence, t = sequences[frames[number][0]], frames[number][1]
+        return Sample(sequence.vertices(t), sequence.pose[t], sequence.betas, sequence.style, float("nan"))
+
+    plan = dataset.card["plan"]
+    return SampleSet(str(plan["garment"]), len(frames), int(plan["shapes"]), read)
 
 
 @dataclass(eq=False)
@@ -95,24 +158,6 @@ class MethodRun:
             self.ms.setdefault(component, []).extend(ms)
         self.scales.join(other.scales)
 
-    def as_dict(self) -> dict[str, Any]:
-        """The run, ready for JSON."""
-        return {
-            "garment": self.garment,
-            "method": self.method,
-            "samples": [asdict(sample) for sample in self.samples],
-            "unseen": self.unseen,
-            "ms": self.ms,
-            "scales": {"count": self.scales.count.tolist(), "total": self.scales.total.tolist()},
-        }
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> MethodRun:
-        """The run that `as_dict` gave."""
-        scales = ScaleByRatio(np.array(data["scales"]["count"]), np.array(data["scales"]["total"]))
-        samples = [FrameMetrics(**sample) for sample in data["samples"]]
-        return cls(data["garment"], data["method"], samples, data["unseen"], data["ms"], scales)
-
 
 @dataclass(eq=False)
 class Study:
@@ -136,55 +181,41 @@ def run_methods(
     methods: Sequence[str],
     *,
     library: Library,
-    cache_folder: Path | None = None,
-    progress: Callable[[int, int], None] | None = None,
     engine: Engine | None = None,
+    progress: bool = False,
 ) -> None:
-    """Runs methods on the test samples of one garment, into `study`.
+    """Runs methods by name, and the base of each, on the test samples of one garment, into `study`.
 
-    Args:
-        study: What runs and reasons are added to.
-        samples: The garment's test samples.
-        methods: Names of methods; the base of each is run with it.
-        library: Where trained networks are.
-        cache_folder: Where runs are kept, and found again while samples, weights and code are the same.
-        progress: Called with (samples done, samples in all).
-        engine: Who runs them, a block of samples a task; None for this process. Figures don't depend on it, times do.
+    `engine` runs them, a block of samples a task; None for this process. Figures don't depend on it, times do.
 
     Raises `RefuError` where blocks are lost with their processes, or those are out of reach.
     """
     garment = samples.garment
     study.n_samples[garment] = len(samples)
-    setup = GarmentSetup.of(garment, collider=library.collider, fit=library.fit)
+    setup = GarmentSetup(garment, library)
     ready: dict[str, Predictor] = {}
-    files: dict[str, Path] = {}
-    for method in _with_bases(methods):
-        if (garment, method.name) in study.runs:
-            continue
-        if cache_folder is not None:
-            files[method.name] = cache_folder / _cache_name(garment, method, samples.key, library)
-            if (known := _read_cached(files[method.name])) is not None:
-                study.runs[garment, method.name] = known
-                continue
+    bases = [METHODS[name].base for name in methods]
+    for name in dict.fromkeys([*bases, *methods]):  # their Laplacian errors are measured against the bases'
+        method = METHODS[name]
         try:
-            ready[method.name] = Predictor(method, setup, library)
+            ready[name] = Predictor(method, setup, library)
         except RefuError as error:
-            command = method.train_command(garment)
-            study.missing[garment, method.name] = Missing(garment, method.name, str(error), command)
-    wanted = list(ready)
-    if not wanted:
+            study.missing[garment, name] = Missing(garment, name, str(error), method.train_command(garment))
+    if not ready:
         return
-    for name in wanted:  # a base that is known is still asked which vertices collide
-        base = METHODS[name].base
-        if base not in ready and (garment, base) not in study.missing:
-            ready[base] = Predictor(METHODS[base], setup, library)
-    bases_first = dict(sorted(ready.items(), key=lambda item: METHODS[item[0]].base != item[0]))
-    runner = _Runner(garment, library, tuple(bases_first), (setup, bases_first))
-    runs = _run_blocks(runner, samples, engine or InProcess(), progress)
-    for name in wanted:
-        study.runs[garment, name] = runs[name]
-        if name in files:
-            _write_cached(files[name], runs[name])
+    runner = _Runner(garment, library, tuple(ready), (setup, ready))
+    parts: dict[int, dict[str, MethodRun]] = {}
+    with tqdm(total=len(samples), desc=garment, unit="sample", disable=None if progress else True) as bar:
+        for index, part in (engine or InProcess()).run(runner, _Blocks(samples)):
+            if isinstance(part, Lost):
+                msg = f"{garment}: samples {index * _BLOCK} and following are lost: {part.reason}"
+                raise RefuError(msg)
+            parts[index] = part
+            bar.update(len(next(iter(part.values())).samples))
+    for name in ready:
+        study.runs[garment, name] = joined = MethodRun(garment, name)
+        for index in sorted(parts):  # in the samples' order, whoever was first
+            joined.join(parts[index][name])
 
 
 @dataclass
@@ -200,7 +231,7 @@ class _Runner:
 
     def __call__(self) -> Callable[[list[Sample]], dict[str, MethodRun]]:
         if self.made is None:
-            setup = GarmentSetup.of(self.garment, collider=self.library.collider, fit=self.library.fit)
+            setup = GarmentSetup(self.garment, self.library)
             self.made = setup, {name: Predictor(METHODS[name], setup, self.library) for name in self.methods}
         return partial(_run_samples, *self.made, self.garment)
 
@@ -222,25 +253,6 @@ class _Blocks(Sequence[list[Sample]]):
         return [self._samples.read(number) for number in range(first, min(first + _BLOCK, len(self._samples)))]
 
 
-def _run_blocks(
-    runner: _Runner, samples: SampleSet, engine: Engine, progress: Callable[[int, int], None] | None
-) -> dict[str, MethodRun]:
-    """The runs, joined in the samples' order whoever was first."""
-    parts: dict[int, dict[str, MethodRun]] = {}
-    for index, part in engine.run(runner, _Blocks(samples)):
-        if isinstance(part, Lost):
-            msg = f"{runner.garment}: samples {index * _BLOCK} and following are lost: {part.reason}"
-            raise RefuError(msg)
-        parts[index] = part
-        if progress is not None:
-            progress(sum(len(next(iter(runs.values())).samples) for runs in parts.values()), len(samples))
-    joined = {name: MethodRun(runner.garment, name) for name in runner.methods}
-    for index in sorted(parts):
-        for name, run in joined.items():
-            run.join(parts[index][name])
-    return joined
-
-
 def _run_samples(
     setup: GarmentSetup, predictors: Mapping[str, Predictor], garment: str, samples: Sequence[Sample]
 ) -> dict[str, MethodRun]:
@@ -249,7 +261,7 @@ def _run_samples(
     metrics = {name: GarmentMetrics(faces) for name in predictors}
     runs = {name: MethodRun(garment, name) for name in predictors}
     for sample in samples:
-        scene = SampleScene.of(setup, sample.pose, sample.betas, sample.style)
+        scene = SampleScene(setup, sample.pose, sample.betas, sample.style)
         checker.update(scene.vertices)
         colliding = dict.fromkeys(METHODS, np.zeros(setup.template.n_vertices, np.bool_))
         for name, predict in predictors.items():
@@ -266,30 +278,3 @@ def _run_samples(
             for component, ms in output.ms.items():
                 run.ms.setdefault(component, []).append(ms)
     return runs
-
-
-def _with_bases(names: Sequence[str]) -> list[Method]:
-    """The methods and those that their Laplacian error is measured against, bases first, each once."""
-    bases = dict.fromkeys(METHODS[name].base for name in names)
-    return [METHODS[name] for name in dict.fromkeys([*bases, *names])]
-
-
-def _cache_name(garment: str, method: Method, samples_key: str, library: Library) -> str:
-    told = json.dumps(
-        [asdict(method), samples_key, library.key(method, garment), library.collider, library.body, code_hash(*_CODE)],
-        sort_keys=True,
-    )
-    return f"{garment}-{method.name}-{hashlib.sha256(told.encode()).hexdigest()[:16]}.json"
-
-
-def _read_cached(file: Path) -> MethodRun | None:
-    try:
-        return MethodRun.from_dict(read_json(file, error=RefuError, wanted="a run"))
-    except (RefuError, ValueError, KeyError, TypeError):
-        return None
-
-
-def _write_cached(file: Path, run: MethodRun) -> None:
-    file.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(file) as part:
-        part.write(json.dumps(run.as_dict()).encode())

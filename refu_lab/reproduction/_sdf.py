@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -10,12 +10,13 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
+from tqdm import tqdm
 
-from refu_core.errors import MeshError, WeightsError
+from refu_core.errors import WeightsError
 from refu_core.sdf import BodySdf
 from refu_lab.reproduction._load import Library
 from refu_lab.reproduction._predict import GarmentSetup, SampleScene
-from refu_lab.reproduction._samples import Sample, SampleSet
+from refu_lab.reproduction._runs import Sample, SampleSet
 from refu_lab.reproduction._tables import Missing, ResultRow, ResultTable
 from refu_lab.touching_poses import touching_pose
 
@@ -29,8 +30,6 @@ MISS = 2e-3
 class SdfErrors:
     """Errors over some points; None where there are none."""
 
-    n_points: int
-    """Points that were compared."""
     mean_absolute_mm: float | None
     """Mean of |f - s| [mm] (supplement, Eq. 12)."""
     mean_relative_percent: float | None
@@ -44,21 +43,13 @@ class SdfErrors:
 
     @staticmethod
     def between(approximate: ArrayLike, accurate: ArrayLike) -> SdfErrors:
-        """Compares distances f and s [m], both of shape (P,).
-
-        Raises:
-            MeshError: shapes that differ, or values that aren't finite.
-        """
+        """Compares distances f and s [m], both of shape (P,)."""
         f, s = np.asarray(approximate, np.float64), np.asarray(accurate, np.float64)
-        if f.shape != s.shape or f.ndim != 1 or not (np.isfinite(f).all() and np.isfinite(s).all()):
-            msg = f"wanted finite distances of one shape (P,), got {f.shape} and {s.shape}"
-            raise MeshError(msg)
         error: NDArray[np.float64] = np.abs(f - s)
         off = np.abs(s) > _AT_SURFACE
         if not len(error):
-            return SdfErrors(0, None, None, None, None, None)
+            return SdfErrors(None, None, None, None, None)
         return SdfErrors(
-            n_points=len(error),
             mean_absolute_mm=1e3 * float(error.mean()),
             mean_relative_percent=100.0 * float((error[off] / np.abs(s[off])).mean()) if off.any() else None,
             p99_mm=1e3 * float(np.percentile(error, 99)),
@@ -79,19 +70,7 @@ _POINTS_ASKED = 8
 """The network is asked for every so-many-th vertex: it takes a second a thousand points on one core."""
 _METRICS = ("mean_absolute_mm", "mean_relative_percent", "p99_mm", "missed_percent", "hidden_percent")
 _CLOSE = ", within 2 cm"
-_NAMES: Mapping[str, str] = {
-    "approx": "walk over the posed mesh (real time)",
-    "neural": "the paper's network",
-}
-
-
-def _labels() -> dict[str, str]:
-    labels = {}
-    for name, title in _NAMES.items():
-        labels[name] = title
-        labels[name + _CLOSE] = "the same, points within 2 cm of the skin"
-        labels |= {f"{name}, {pose}": f"the same, {pose}, points within 2 cm of the skin" for pose in FOLDED_POSES}
-    return labels
+_NAMES = {"approx": "walk over the posed mesh (real time)", "neural": "the paper's network"}
 
 
 class _Asked(NamedTuple):
@@ -101,14 +80,13 @@ class _Asked(NamedTuple):
     accurate: Tensor
 
 
-def sdf_table(
-    sets: Sequence[SampleSet],
-    *,
-    library: Library,
-    progress: Callable[[int, int], None] | None = None,
-) -> ResultTable:
+def sdf_table(sets: Sequence[SampleSet], *, library: Library, progress: bool = False) -> ResultTable:
     """Errors of each approximation at the garments' vertices, half of them disturbed: over the test samples, and where
     the body is folded."""
+    labels = dict(_NAMES)
+    for name in _NAMES:
+        labels[name + _CLOSE] = "the same, points within 2 cm of the skin"
+        labels |= {f"{name}, {pose}": f"the same, {pose}, points within 2 cm of the skin" for pose in FOLDED_POSES}
     table = ResultTable(
         "sdf",
         "Errors of the approximate signed distance",
@@ -117,12 +95,11 @@ def sdf_table(
         "figures are over all three kinds, of its network. The relative error leaves out points within 0.1 mm of the "
         f"skin. Squat, crossed arms and hands on hips are those poses of {_FOLDED_SHAPES} of the bodies, with the "
         "garment as it follows the skin: there limbs press on each other, and the collider is pulled apart.",
-        labels=_labels(),
+        labels=labels,
     )
-    total, done = sum(map(len, sets)), 0
     for samples in sets:
         garment = samples.garment
-        setup = GarmentSetup.of(garment, collider=library.collider, fit=library.fit)
+        setup = GarmentSetup(garment, library)
         sdfs: dict[str, BodySdf] = {"approx": setup.approx}
         try:
             sdfs["neural"] = library.load_neural_sdf("paper", garment, setup.body)
@@ -132,20 +109,18 @@ def sdf_table(
             table.rows += [ResultRow.of("sdf", garment, "neural", metric, None) for metric in _METRICS]
         questions = _Questions(setup, sdfs)
         bodies: dict[bytes, Sample] = {}
-        for sample in map(samples.read, range(len(samples))):
-            scene = SampleScene.of(setup, sample.pose, sample.betas, sample.style)
+        numbers = tqdm(range(len(samples)), desc=f"sdf, {garment}", unit="sample", disable=None if progress else True)
+        for sample in map(samples.read, numbers):
+            scene = SampleScene(setup, sample.pose, sample.betas, sample.style)
             questions.ask(scene, torch.from_numpy(sample.vertices))
             bodies.setdefault(sample.betas.tobytes(), sample)
-            done += 1
-            if progress is not None:
-                progress(done, total)
         for name, asked in questions.answers().items():
             table.rows += _rows(garment, name, asked)
             table.rows += _rows(garment, name + _CLOSE, asked, is_close=True)
         for title in FOLDED_POSES:
             pose = touching_pose(title)
             for sample in list(bodies.values())[:_FOLDED_SHAPES]:
-                scene = SampleScene.of(setup, pose, sample.betas, sample.style)
+                scene = SampleScene(setup, pose, sample.betas, sample.style)
                 unposed = setup.template.rest(scene.betas, scene.style)
                 questions.ask(scene, setup.template.pose(unposed, scene.transforms)[0])
             for name, asked in questions.answers().items():

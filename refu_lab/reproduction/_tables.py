@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import platform
 from collections.abc import Iterable, Mapping, Sequence
@@ -13,7 +14,6 @@ from typing import Any, NamedTuple
 from refu_core._files import read_json
 from refu_core.errors import RefuError
 from refu_lab.reproduction._methods import METHODS
-from refu_lab.reproduction._paper import paper_figure
 from refu_lab.tables import RESULT_TABLES, TextTable, picture_markdown, write_json, write_page
 
 ALL = "all"
@@ -23,6 +23,42 @@ _PAPER_NOTE = (
     "*Figures of the paper, in italics, were measured on other data (TailorNet's, of which the authors selected "
     "samples) and other hardware (a server with V100 GPUs): compare orders and ratios, not absolute figures.*"
 )
+
+
+_MAIN = ("mpve_mm", "vfcp_percent", "cfmp_percent")
+_PRINTED = json.loads(Path(__file__).with_name("paper.json").read_text(encoding="utf-8"))
+"""By table: the methods, and their values by garment (empty where the supplement doesn't say which) and metric."""
+
+PAPER: Mapping[tuple[str, str, str, str], float] = {
+    (table, garment, method, metric): value
+    for table, printed in _PRINTED.items()
+    for garment, metrics in printed["garments"].items()
+    for metric, values in metrics.items()
+    for method, value in zip(printed["methods"], values, strict=True)
+}
+"""(table, garment, method, metric) to what the paper prints."""
+
+
+def paper_figure(table: str, garment: str, method: str, metric: str) -> float | None:
+    """What the paper prints; None where it prints nothing.
+
+    Where it doesn't name the garment, its figure stands beside that of any of ours. Its changes against the baseline
+    ("Trend") are computed anew from its own figures: the printed ones of VFCP aren't (.60 to .24 is -60 %, not -97.5
+    %).
+    """
+    if metric.endswith("_trend"):
+        value, base = (paper_figure(table, garment, m, metric[: -len("_trend")]) for m in (method, "tailornet"))
+        return None if value is None or not base else 100.0 * (value - base) / base
+    return PAPER.get((table, garment, method, metric), PAPER.get((table, "", method, metric)))
+
+
+def published_modes() -> dict[str, dict[str, float]]:
+    """The paper's modes, all garments together: `ms` of a frame on a V100, and the errors."""
+    found = {}
+    for mode, sdf in (("approx", "sdf-approx"), ("hybrid", "sdf-approx"), ("accurate", "sdf-accurate")):
+        ms = sum(PAPER["time", "all", component, "ms"] for component in ("backbone", sdf, "refu"))
+        found[mode] = {"ms": ms} | {metric: PAPER["comparison", "all", f"refu-{mode}", metric] for metric in _MAIN}
+    return found
 
 
 class Metric(NamedTuple):
@@ -117,8 +153,7 @@ class ResultTable:
 
     def value(self, garment: str, method: str, metric: str) -> float | None:
         """The figure measured; None where there is none."""
-        found = (row.value for row in self.rows if row[1:4] == (garment, method, metric))
-        return next(found, None)
+        return next((row.value for row in self.rows if row[1:4] == (garment, method, metric)), None)
 
     def label(self, method: str) -> str:
         """A row's name for people."""
@@ -240,13 +275,12 @@ def write_summary(folder: Path) -> Path:
         f"- not made yet: `refu evaluate --table {name}`" if table is None else f"- [{table.title}]({name}.md)"
         for name, table in tables.items()
     ]
-    for file, title in (
-        ("performance.md", "Run time: `refu benchmark`"),
-        ("collider.md", "The collider: what each number does"),
-        ("contact.md", "Collision handling: what each number does"),
-    ):
-        if (folder / file).exists():
-            links.append(f"- [{title}]({file})")
+    others = {
+        "performance.md": "Run time: `refu benchmark`",
+        "collider.md": "The collider: what each number does",
+        "contact.md": "Collision handling: what each number does",
+    }
+    links += [f"- [{title}]({file})" for file, title in others.items() if (folder / file).exists()]
     about = folder / "about.txt"
     parts = [
         "# Results",
@@ -285,14 +319,8 @@ def weighted(values: Iterable[tuple[float | None, int]]) -> float | None:
     """
     pairs = list(values)
     total = sum(count for _, count in pairs)
-    if not total:
-        return None
-    result = 0.0
-    for value, count in pairs:
-        if value is None:
-            return None
-        result += value * count / total
-    return result
+    known = [(value, count) for value, count in pairs if value is not None]
+    return sum(value * count / total for value, count in known) if total and len(known) == len(pairs) else None
 
 
 def _kind(metric: str) -> str:

@@ -44,7 +44,7 @@ def nothing_inside(subject: Subject, trial: Trial) -> Iterator[Measurement]:
     """
     (out,) = subject.pipeline(trial.frames)
     if not out.stats.within_promise:
-        yield from _counted(subject, out)
+        yield from counted(subject, trial)
         return
     subject.checker.update(out.body)
     for mesh in out.values():
@@ -55,10 +55,6 @@ def nothing_inside(subject: Subject, trial: Trial) -> Iterator[Measurement]:
 def counted(subject: Subject, trial: Trial) -> Iterator[Measurement]:
     """The certificate (`n_unresolved`) against the winding numbers of every vertex that came out, by garment."""
     (out,) = subject.pipeline(trial.frames)
-    yield from _counted(subject, out)
-
-
-def _counted(subject: Subject, out: PipelineOutput) -> Iterator[Measurement]:
     subject.checker.update(out.body)
     for name, mesh in out.items():
         found = subject.checker.check(mesh.local, mesh.faces)

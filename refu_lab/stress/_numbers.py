@@ -68,30 +68,31 @@ def n_not_finite(*arrays: NDArray[np.floating]) -> int:
     return sum(int(np.count_nonzero(~np.isfinite(array))) for array in arrays)
 
 
-Place = Callable[[NDArray[np.float32], NDArray[np.int64], np.random.Generator], NDArray[np.float64]]
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+Place = Callable[[F32, I64, np.random.Generator], F64]
 """Points to ask for, (N, 3), around a body's vertices (V, 3) and faces (F, 3); it may move the vertices."""
 
 
-def _on_faces(vertices: NDArray[np.float32], faces: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.float64]:
+def _on_faces(vertices: F32, faces: I64, rng: np.random.Generator) -> F64:
     weights = rng.dirichlet((0.3, 0.3, 0.3), _POINTS)
     return _mixed(vertices, faces[rng.integers(len(faces), size=_POINTS)], weights)
 
 
-def _on_edges(vertices: NDArray[np.float32], faces: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.float64]:
+def _on_edges(vertices: F32, faces: I64, rng: np.random.Generator) -> F64:
     share = rng.random(_POINTS)
     weights = np.stack([share, 1 - share, np.zeros(_POINTS)], 1)
     weights[: _POINTS // 2] = (1, 0, 0)  # half of them on vertices, to the bit
     return _mixed(vertices, faces[rng.integers(len(faces), size=_POINTS)], weights)
 
 
-def _mixed(
-    vertices: NDArray[np.float32], faces: NDArray[np.int64], weights: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    mixed: NDArray[np.float64] = (vertices[faces].astype(np.float64) * weights[..., None]).sum(1)
+def _mixed(vertices: F32, faces: I64, weights: F64) -> F64:
+    mixed: F64 = (vertices[faces].astype(np.float64) * weights[..., None]).sum(1)
     return mixed
 
 
-def _medial(vertices: NDArray[np.float32], faces: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.float64]:
+def _medial(vertices: F32, faces: I64, rng: np.random.Generator) -> F64:
     """Half-way between the skin and the skin across, where the gradient turns round."""
     chosen = faces[rng.integers(len(faces), size=_POINTS)]
     a, b, c = vertices[chosen].astype(np.float64).transpose(1, 0, 2)
@@ -107,22 +108,20 @@ def _medial(vertices: NDArray[np.float32], faces: NDArray[np.int64], rng: np.ran
         points = torch.from_numpy((start + middle[:, None] * inward).astype(np.float32))
         is_under = sdf.query(points).distance.abs().numpy() >= middle - 1e-6
         low, high = np.where(is_under, middle, low), np.where(is_under, high, middle)
-    halfway: NDArray[np.float64] = start + ((low + high) / 2)[:, None] * inward
+    halfway: F64 = start + ((low + high) / 2)[:, None] * inward
     return halfway
 
 
-def _hair(vertices: NDArray[np.float32], faces: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.float64]:
+def _hair(vertices: F32, faces: I64, rng: np.random.Generator) -> F64:
     """A hair's breadth off the skin, on either side, down to less than float32 resolves."""
     return _on_faces(vertices, faces, rng) + rng.normal(size=(_POINTS, 3)) * 10.0 ** rng.uniform(-40, -4, (_POINTS, 1))
 
 
-def _far(vertices: NDArray[np.float32], faces: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.float64]:
+def _far(vertices: F32, faces: I64, rng: np.random.Generator) -> F64:
     return _on_faces(vertices, faces, rng) + rng.normal(size=(_POINTS, 3)) * 10.0 ** rng.uniform(-1, 5, (_POINTS, 1))
 
 
-def _without_area(
-    vertices: NDArray[np.float32], faces: NDArray[np.int64], rng: np.random.Generator
-) -> NDArray[np.float64]:
+def _without_area(vertices: F32, faces: I64, rng: np.random.Generator) -> F64:
     """Around faces whose corners are in one place, or in one line."""
     chosen = faces[rng.integers(len(faces), size=_COLLAPSED)]
     vertices[chosen[::2, 1]] = vertices[chosen[::2, 0]]

@@ -1,12 +1,12 @@
-"""What `refu stress` does: all checks, round after round, until there have been enough of them; then the soaks."""
+"""What `refu stress` does: all checks, round after round, until there are enough of them; the soaks; its table."""
 
 from __future__ import annotations
 
 import math
 import time
 import zlib
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,8 @@ from refu_lab.commands.stress import StressOptions
 from refu_lab.stress._checks import CHECKS
 from refu_lab.stress._soak import SoakResult, soak
 from refu_lab.stress._subject import Subject, Wardrobe
-from refu_lab.stress._trial import Check, StressError, Tally, load_trial, save_trial
+from refu_lab.stress._trial import Check, Measurement, StressError, Tally, load_trial, save_trial
+from refu_lab.tables import format_table
 
 _SOAK_SHARE = 0.3
 """Of the time of a long run."""
@@ -29,7 +30,7 @@ _SOAK_SHARE = 0.3
 
 @dataclass(frozen=True, kw_only=True)
 class StressResult:
-    """What came of it."""
+    """What came of all checks and soaks."""
 
     tallies: list[Tally] = field(default_factory=list)
     soaks: list[SoakResult] = field(default_factory=list)
@@ -52,10 +53,8 @@ class StressResult:
         return {"rows": [row.as_dict() for row in self._all], "left_out": self.left_out, "failures": self.failures}
 
 
-def run_stress(
-    options: StressOptions, *, progress: bool, report: Callable[[StressResult], object] = id
-) -> StressResult:
-    """Tries all that was asked for; `report` gets what there is so far, every minute of a soak.
+def run_stress(options: StressOptions, *, progress: bool) -> StressResult:
+    """Tries all that was asked for.
 
     Raises:
         StressError: there is nothing to try: no such part, or no weights of any garment.
@@ -67,25 +66,20 @@ def run_stress(
     checks = [check for check in CHECKS.values() if check.part in options.parts]
     has_soak = "soak" in options.parts
     with one_thread():
-        subjects = {
-            wardrobe: Subject(wardrobe, weights=options.weights, collider=options.collider) for wardrobe in wardrobes
-        }
-        pairs = [
-            (check, subject) for check in checks for subject in subjects.values() if check.holds_for(subject.wardrobe)
-        ]
+        subjects = [Subject(one, weights=options.weights, collider=options.collider) for one in wardrobes]
+        pairs = [(check, one) for check in checks for one in subjects if check.holds_for(one.wardrobe)]
         result.tallies.extend(_run_checks(options, pairs, seconds * (1 - _SOAK_SHARE * has_soak), progress=progress))
-        for wardrobe, subject in subjects.items() if has_soak else ():
+        for subject in subjects if has_soak else ():
             share = _SOAK_SHARE if checks else 1.0
             with tqdm(total=options.n_frames, unit="frame", disable=not progress, leave=False, mininterval=1) as bar:
                 done = soak(
                     subject.pipeline,
-                    mode=f"{wardrobe.mode} {', '.join(wardrobe.garments)}",
+                    mode=f"{subject.wardrobe.mode} {', '.join(subject.wardrobe.garments)}",
                     frames=options.n_frames,
                     persons=options.persons,
                     seconds=share * seconds / len(wardrobes) if options.hours is not None else math.inf,
                     seed=options.seed,
                     tick=bar.update,
-                    report=lambda so_far: report(replace(result, soaks=[*result.soaks, so_far])),
                 )
             result.soaks.append(done)
     if options.output is not None:
@@ -114,14 +108,17 @@ def _wardrobes(options: StressOptions) -> tuple[list[Wardrobe], list[str]]:
 def _run_checks(
     options: StressOptions, pairs: Sequence[tuple[Check, Subject]], seconds: float, *, progress: bool
 ) -> list[Tally]:
-    """Tries all, round after round; what is drawn depends on the seed, the check and the round alone.
+    """Tries all, whole rounds first, then until the time is over; one tally a check and mode, in the checks' order.
 
-    One tally a check and mode, in the checks' order.
+    What is drawn depends on the seed, the check and the round alone.
     """
     tallies: dict[tuple[str, str], Tally] = {}
     total = options.n_rounds * len(pairs) if options.hours is None else None
+    start = time.monotonic()
     with tqdm(total=total, unit="check", disable=not progress, leave=False) as bar:
-        for round_, (check, subject) in _turns(pairs, options.n_rounds, seconds):
+        for round_, (check, subject) in ((n, pair) for n in count() for pair in pairs) if pairs else ():
+            if round_ >= options.n_rounds and time.monotonic() - start >= seconds:
+                break
             wardrobe = subject.wardrobe
             tally = tallies.setdefault((check.name, wardrobe.mode), Tally(check.name, wardrobe.mode))
             key = zlib.crc32(f"{check.name} {wardrobe.garments}".encode())
@@ -133,20 +130,7 @@ def _run_checks(
     return list(tallies.values())
 
 
-def _turns(
-    pairs: Sequence[tuple[Check, Subject]], rounds: int, seconds: float
-) -> Iterator[tuple[int, tuple[Check, Subject]]]:
-    """Whose turn it is, with the number of the round; whole rounds first, then until the time is over."""
-    start = time.monotonic()
-    for round_ in count() if pairs else ():
-        for pair in pairs:
-            if round_ >= rounds and time.monotonic() - start >= seconds:
-                return
-            yield round_, pair
-
-
 def _save_worst(tallies: Sequence[Tally], folder: Path) -> list[Path]:
-    """Writes the worst trial of each tally as `folder`/<check>-<mode>.npz."""
     written = []
     for tally in tallies:
         if tally.worst_trial is not None and tally.worst_trial[1].frames:
@@ -170,3 +154,60 @@ def replay_trial(path: Path, *, weights: Path | None = None, collider: bool = Tr
     with one_thread():
         tally.add(wardrobe, trial, CHECKS[name].run(Subject(wardrobe, weights=weights, collider=collider), trial))
     return tally
+
+
+def stress_table(result: StressResult) -> str:
+    """All rows, faults, and where the worst cases are."""
+    lines = []
+    if result.tallies:
+        rows = []
+        for tally in result.tallies:
+            worst = tally.worst or Measurement()
+            counts = (tally.runs, tally.failures, tally.nan, tally.refused)
+            rows.append((tally.case, tally.mode, *map(str, counts), length(worst.deviation), length(worst.limit)))
+        lines += [
+            format_table(("case", "mode", "runs", "failures", "NaN", "refused", "deviation", "limit"), rows),
+            "(deviation and limit are those of the worst trial; a few limits depend on the frame)",
+            "",
+        ]
+    if result.soaks:
+        header = ("soak", "frames", "NaN", "memory MB", "", "p99 ms", "", "wall p99 ms", "machine")
+        soaks = [
+            (
+                soak.mode,
+                f"{soak.frames} by {soak.persons}",
+                str(soak.nan),
+                _first_last("{:.0f}", soak.tenths_mb),
+                f"{100 * soak.growth:+.1f} %",
+                _first_last("{:.1f}", soak.tenths_ms),
+                f"{100 * soak.slowdown:+.1f} %",
+                _first_last("{:.1f}", soak.tenths_wall_ms),
+                f"{100 * soak.machine_slowdown:+.1f} %",
+            )
+            for soak in result.soaks
+        ]
+        lines += [
+            format_table(header, soaks),
+            "(first tenth → last tenth; machine: of the processor time of a fixed piece of work)",
+            "",
+        ]
+    lines += [f"{tally.case} ({tally.mode}): {fault}" for tally in result.tallies for fault in tally.faults]
+    lines += [f"left out: {text}" for text in result.left_out]
+    if result.files:
+        lines.append(f"worst cases: {result.files[0].parent}/*.npz, to be tried again with refu stress --replay FILE")
+    lines.append("nothing failed" if not result.failures else f"{result.failures} FAILED")
+    return "\n".join(lines)
+
+
+def _first_last(form: str, tenths: tuple[float, ...]) -> str:
+    return f"{form.format(tenths[0])} → {form.format(tenths[-1])}"
+
+
+def length(metres: float) -> str:
+    """A length with the unit that suits it."""
+    if not math.isfinite(metres):
+        return "-"
+    for scale, unit in ((1.0, "m"), (1e-3, "mm"), (1e-6, "µm"), (1e-9, "nm")):
+        if metres >= scale:
+            return f"{metres / scale:.3g} {unit}"
+    return "0" if metres < 1e-12 else f"{metres / 1e-12:.3g} pm"

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import math
+import resource
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,6 @@ JUDGED_FROM = 20_000
 _POSES = 8
 _STEPS = 25
 _FEWEST = 10
-_REPORT_S = 60.0
 _YARDSTICK = 192
 """Size of the matrix that the yardstick multiplies: a fifth of a millisecond."""
 
@@ -59,34 +59,27 @@ class SoakResult:
 
     @property
     def slowdown(self) -> float:
-        """Of the processor time's 99th percentile, as a share of the first tenth's."""
+        """Of the processor time's 99th percentile, likewise."""
         return _growth(self.tenths_ms)
 
     @property
     def machine_slowdown(self) -> float:
-        """Of the yardstick: how much slower the machine itself has become."""
+        """Of the yardstick, likewise: how much slower the machine itself has become."""
         return _growth(self.tenths_yardstick_ms)
 
     @property
-    def is_slower(self) -> bool:
-        """Whether calls take longer, by the clock and by the yardstick, too; few calls aren't judged."""
-        times = 1 + self.slowdown
-        return is_slower(times, times, 1 + self.machine_slowdown) and self.frames >= JUDGED_FROM * self.persons
-
-    @property
     def failures(self) -> int:
-        """How many of these have failed: memory, latency, finite numbers."""
-        return (self.growth > TOLERANCE) + self.is_slower + (self.nan > 0)
+        """How many have failed of memory, latency (of many calls, by the clock and by the yardstick) and numbers."""
+        times, is_judged = 1 + self.slowdown, self.frames >= JUDGED_FROM * self.persons
+        slower = is_judged and is_slower(times, times, 1 + self.machine_slowdown)
+        return (self.growth > TOLERANCE) + slower + (self.nan > 0)
 
     def as_dict(self) -> dict[str, Any]:
         """A row of the results, ready for JSON."""
-        row = {name: getattr(self, name) for name in self.__dataclass_fields__ if name != "frames"}
+        row = {"case": "soak: pipeline", "runs": self.frames, "max_deviation_m": 0.0} | asdict(self)
+        del row["frames"]
         judged = ("growth", "slowdown", "machine_slowdown", "failures")
-        return (
-            {"case": "soak: pipeline", "runs": self.frames, "max_deviation_m": 0.0}
-            | row
-            | {name: getattr(self, name) for name in judged}
-        )
+        return row | {name: getattr(self, name) for name in judged}
 
 
 def soak_frames(rng: np.random.Generator) -> list[SmplFrame]:
@@ -105,22 +98,11 @@ def soak(
     seconds: float = math.inf,
     seed: int = 0,
     tick: Callable[[int], object] = int,
-    report: Callable[[SoakResult], object] = id,
 ) -> SoakResult:
     """Runs the same motions over and over, until `frames` or `seconds` are over, and compares the tenths.
 
-    Args:
-        pipeline: What is to endure.
-        mode: Its name.
-        frames: How many to run, at most; each person of a call is one.
-        persons: In one call, each with a motion of their own.
-        seconds: For how long, at most.
-        seed: Of the motions.
-        tick: Called with a number of frames that are done.
-        report: Called every minute with what has come of it so far.
-
-    Returns:
-        The tenths; those so far after an interrupt (Ctrl-C).
+    Each of the `persons` of a call has a motion of their own and is a frame; `tick` is called with how many are done.
+    After an interrupt (Ctrl-C) the tenths are those so far.
 
     Raises:
         StressError: fewer than ten calls, which have no tenths.
@@ -129,24 +111,35 @@ def soak(
     if calls < _FEWEST:
         msg = f"a soak needs {_FEWEST} frames or more of each person, got {calls}"
         raise StressError(msg)
-    motions = [soak_frames(np.random.default_rng(seed + i)) for i in range(persons)]
-    steps = list(zip(*motions, strict=True))
+    steps = list(zip(*(soak_frames(np.random.default_rng(seed + i)) for i in range(persons)), strict=True))
     for step in steps:  # what is made in the first frames of all is no growth
         pipeline(step)
-    log = _Log(calls)
-    start = last = time.perf_counter()
-
-    def result() -> SoakResult:
-        return log.result(mode=mode, persons=persons, seconds=time.perf_counter() - start)
-
+    log = np.ones((4, calls), np.float32)  # touched now: it mustn't look like the pipeline's growth
+    yardstick, nan, n = Yardstick(), 0, 0
+    start = time.perf_counter()
     with contextlib.suppress(KeyboardInterrupt):
-        while log.n < calls and (log.n < _FEWEST or time.perf_counter() - start < seconds):
-            log.take(pipeline, steps[log.n % len(steps)])
+        while n < calls and (n < _FEWEST or time.perf_counter() - start < seconds):
+            cpu, wall = time.thread_time(), time.perf_counter()
+            outs = pipeline(steps[n % len(steps)])
+            wall, cpu = 1e3 * (time.perf_counter() - wall), 1e3 * (time.thread_time() - cpu)
+            same = yardstick.measure()
+            nan += n_not_finite(*(mesh.local for out in outs for mesh in out.values()))
+            log[:, n] = resident_mb(), cpu, wall, same
+            n += 1
             tick(persons)
-            if time.perf_counter() - last > _REPORT_S and log.n >= _FEWEST:
-                last = time.perf_counter()
-                report(result())
-    return result()
+    memory, *times = (np.array_split(row[:n], 10) for row in log)
+    of_cpu, of_wall, of_yardstick = (tuple(float(np.percentile(tenth, 99)) for tenth in tenths) for tenths in times)
+    return SoakResult(
+        mode=mode,
+        frames=n * persons,
+        persons=persons,
+        nan=nan,
+        seconds=time.perf_counter() - start,
+        tenths_mb=tuple(float(tenth.max()) for tenth in memory),
+        tenths_ms=of_cpu,
+        tenths_wall_ms=of_wall,
+        tenths_yardstick_ms=of_yardstick,
+    )
 
 
 class Yardstick:
@@ -164,62 +157,10 @@ class Yardstick:
         return 1e3 * (time.thread_time() - before)
 
 
-class _Log:
-    """The figures of all calls so far."""
-
-    def __init__(self, calls: int) -> None:
-        # Room for all of them, touched now: it mustn't look like the pipeline's growth.
-        self._cpu, self._wall, self._memory, self._same = np.zeros((4, calls), np.float32) + 1
-        self._yardstick = Yardstick()
-        self._nan = 0
-        self.n = 0
-
-    def take(self, pipeline: GarmentPipeline, step: Sequence[SmplFrame]) -> None:
-        """One call, and the yardstick."""
-        cpu, wall = time.thread_time(), time.perf_counter()
-        outs = pipeline(step)
-        self._wall[self.n] = 1e3 * (time.perf_counter() - wall)
-        self._cpu[self.n] = 1e3 * (time.thread_time() - cpu)
-        self._same[self.n] = self._yardstick.measure()
-        self._nan += n_not_finite(*(mesh.local for out in outs for mesh in out.values()))
-        self._memory[self.n] = resident_mb()
-        self.n += 1
-
-    def result(self, *, mode: str, persons: int, seconds: float) -> SoakResult:
-        """What has come of it so far."""
-        cpu, wall, memory, same = (
-            np.array_split(log[: self.n], 10) for log in (self._cpu, self._wall, self._memory, self._same)
-        )
-        return SoakResult(
-            mode=mode,
-            frames=self.n * persons,
-            persons=persons,
-            nan=self._nan,
-            seconds=seconds,
-            tenths_mb=tuple(float(tenth.max()) for tenth in memory),
-            tenths_ms=_p99(cpu),
-            tenths_wall_ms=_p99(wall),
-            tenths_yardstick_ms=_p99(same),
-        )
-
-
 def resident_mb(process: int | str = "self") -> float:
     """Resident memory of a process [MB]; raises `OSError` where there is none of that number."""
     pages = int(Path(f"/proc/{process}/statm").read_text(encoding="ascii").split()[1])
-    return pages * _PAGE_MB
-
-
-def _page_mb() -> float:
-    import resource
-
-    return resource.getpagesize() / 1e6
-
-
-_PAGE_MB = _page_mb()
-
-
-def _p99(tenths: Sequence[NDArray[np.float32]]) -> tuple[float, ...]:
-    return tuple(float(np.percentile(tenth, 99)) for tenth in tenths)
+    return pages * resource.getpagesize() / 1e6
 
 
 def is_slower(later: float, longer: float, machine: float) -> bool:

@@ -11,9 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from refu_core.errors import RefuError
 from refu_core.frames import N_STYLES, SmplFrame
-from refu_core.garments import PAPER_GARMENTS
 from refu_core.metrics import CollisionChecker
 from refu_core.modes import SdfMode
 from refu_core.realtime import ContactStage, GarmentPipeline, Outfit, Wearer, dress
@@ -39,10 +37,6 @@ class Subject:
 
     def __init__(self, wardrobe: Wardrobe, *, weights: Path | None = None, collider: bool = True) -> None:
         """Loads the pipeline; raises as `GarmentPipeline.load`."""
-        unknown = [name for name in wardrobe.garments if name not in PAPER_GARMENTS]
-        if unknown:
-            msg = f"no garment {unknown[0]!r}: wanted {', '.join(PAPER_GARMENTS)}"
-            raise RefuError(msg)
         self.wardrobe = wardrobe
         self._weights, self._collider = weights, collider
         self.pipeline = self.load()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
     from refu_core import SmplFrame
     from refu_core.realtime import PipelineOutput
     from refu_lab.commands.replay import RecordingOptions
-    from refu_lab.sources import Source
 
 _AWAY_S = 0.25
 """Somebody whose nearest frame is farther off in time isn't there [s]."""
@@ -174,9 +174,11 @@ class DressedFilm:
         """In the order of their stamps, one at least."""
         source = open_source(options, lambda: self._pipeline.body)
         source.history = PoseHistory()  # other garments may heed it
-        found = [_frame_of(source, record) for record in source.records]
-        frames = [frame for frame in found if frame is not None]
-        n_bad = len(found) - len(frames)
+        records, frames = list(source.records), []
+        for record in records:
+            with suppress(RefuError):
+                frames.append(source.frame_of(record))
+        n_bad = len(records) - len(frames)
         self.notes += source.warnings(self._pipeline)
         if n_bad:
             self.notes.append(f"{options.input}: {n_bad} messages are no frame and are left out")
@@ -184,13 +186,6 @@ class DressedFilm:
             msg = f"{options.input}: no frame that can be shown"
             raise RefuError(msg)
         return sorted(frames, key=lambda frame: frame.stamp_ns)
-
-
-def _frame_of(source: Source, record: adapters.FrameRecord) -> SmplFrame | None:
-    try:
-        return source.frame_of(record)
-    except RefuError:
-        return None
 
 
 def _different(names: Sequence[str]) -> list[str]:

@@ -40,35 +40,6 @@ class Topology:
         return len(points) == self.faces.size and np.array_equal(points[self.first][self.faces.reshape(-1)], points)
 
 
-class MarkerShapes:
-    """Shapes of one marker after the other: what doesn't change stays one array, and the first vertex is the origin."""
-
-    def __init__(self) -> None:
-        self._origin: NDArray[np.float64] | None = None
-        self._topologies: dict[tuple[str, int], Topology] = {}
-
-    def shape(self, marker: Marker) -> Shape:
-        """A marker of triangles as a shape."""
-        key, points = (marker.ns, marker.id), marker.points
-        topology = self._topologies.get(key)
-        if topology is None or not topology.fits(points):
-            topology = self._topologies[key] = Topology.of(points)
-        vertices = _placed(points[topology.first], marker)
-        if self._origin is None:
-            self._origin = vertices[0].copy()
-        person, _, name = marker.ns.rpartition("/")
-        color = (marker.color[0], marker.color[1], marker.color[2])
-        return Shape(name, person, (vertices - self._origin).astype(np.float32), topology.faces, color)
-
-
-def _placed(points: NDArray[np.float64], marker: Marker) -> NDArray[np.float64]:
-    """Points (N, 3) [m] of a marker in its frame. A rotation that nobody has set is none."""
-    points = points * marker.scale
-    if any(marker.pose[3:6]):
-        points = Rotation.from_quat(marker.pose[3:]).apply(points)
-    return points + marker.pose[:3] if any(marker.pose[:3]) else points
-
-
 def is_mesh(marker: Marker) -> bool:
     """Whether it shows triangles."""
     return marker.type == TRIANGLE_LIST and marker.action == ADD and len(marker.points) > 0
@@ -86,12 +57,17 @@ _Kept = TypeVar("_Kept")
 
 
 class MarkerScene(Generic[_Kept]):
-    """What is there of markers that come, of several topics: each stays until it is deleted, or its time is over."""
+    """What is there of markers that come, of several topics: each stays until it is deleted, or its time is over.
+
+    What doesn't change from marker to marker stays one array, and the first vertex of all is the origin.
+    """
 
     def __init__(self, keep: Callable[[Shape], _Kept]) -> None:
         """What is kept of a shape is up to `keep`."""
-        self._keep, self._shapes = keep, MarkerShapes()
+        self._keep = keep
         self._shown: dict[tuple[str, str, int], tuple[_Kept, float]] = {}
+        self._origin: NDArray[np.float64] | None = None
+        self._topologies: dict[tuple[str, int], Topology] = {}
 
     @property
     def topics(self) -> set[str]:
@@ -118,8 +94,24 @@ class MarkerScene(Generic[_Kept]):
         drawable = [marker for marker in meshes if is_drawable(marker)]
         for marker in drawable:
             until_ns = now_ns + marker.lifetime_ns if marker.lifetime_ns > 0 else np.inf
-            self._shown[topic, marker.ns, marker.id] = self._keep(self._shapes.shape(marker)), until_ns
+            self._shown[topic, marker.ns, marker.id] = self._keep(self.shape(marker)), until_ns
         return max((marker.stamp_ns or now_ns for marker in drawable), default=0), len(meshes) - len(drawable)
+
+    def shape(self, marker: Marker) -> Shape:
+        """A marker of triangles as a shape."""
+        key, points = (marker.ns, marker.id), marker.points
+        topology = self._topologies.get(key)
+        if topology is None or not topology.fits(points):
+            topology = self._topologies[key] = Topology.of(points)
+        vertices = points[topology.first] * marker.scale
+        if any(marker.pose[3:6]):  # a rotation that nobody has set is none
+            vertices = Rotation.from_quat(marker.pose[3:]).apply(vertices)
+        vertices = vertices + marker.pose[:3]
+        if self._origin is None:
+            self._origin = vertices[0].copy()
+        person, _, name = marker.ns.rpartition("/")
+        color = (marker.color[0], marker.color[1], marker.color[2])
+        return Shape(name, person, (vertices - self._origin).astype(np.float32), topology.faces, color)
 
 
 def shows_meshes(data: bytes) -> bool:

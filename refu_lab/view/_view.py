@@ -8,6 +8,7 @@ import os
 import socket
 import sys
 import webbrowser
+from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 from refu_core import RefuError
@@ -35,19 +36,20 @@ def view(
     *,
     progress: bool = False,
     say: Callable[[str], None] = print,
-    until: Callable[[], bool] | None = None,
+    until: Callable[[], bool] = lambda: False,
 ) -> None:
     """Shows the inputs until it is interrupted (Ctrl-C, which ends it), or until `until` says so.
 
     Raises `RefuError` for inputs that can't be shown, a port that is taken, and where viser isn't installed.
     """
-    _require_viser()
+    if find_spec("viser") is None:
+        msg = 'the viewer needs viser: pip install "refu-ros[view]"'
+        raise RefuError(msg)
     from refu_lab.view._player import Player
 
     film = open_film(options, progress=progress)
     for note in film.notes:
         say(f"warning: {note}")
-    until = until or (lambda: False)
     server = _serve(options)
     try:
         if isinstance(film, LiveFilm):
@@ -61,9 +63,6 @@ def view(
         say(f"{film.title}{what} at {url} (Ctrl-C ends it)")
         if options.browser and _has_display():
             webbrowser.open(url)
-        elif "SSH_CONNECTION" in os.environ and options.host == "localhost":
-            port = server.get_port()
-            say(f"from your own machine: ssh -L {port}:localhost:{port} {socket.gethostname()}, then open {url} there")
         player.run(until=until)
     except KeyboardInterrupt:
         say("viewer closed")
@@ -92,14 +91,6 @@ def open_film(options: ViewOptions, *, progress: bool = False) -> DressedFilm | 
             raise RefuError(msg)
         return RecordedFilm(first, progress=progress)
     return DressedFilm(options.inputs, options.dressing)
-
-
-def _require_viser() -> None:
-    try:
-        import viser  # noqa: F401
-    except ImportError as error:
-        msg = 'the viewer needs viser: pip install "refu-ros[view]"'
-        raise RefuError(msg) from error
 
 
 def _serve(options: ViewOptions) -> viser.ViserServer:

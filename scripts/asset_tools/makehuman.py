@@ -96,9 +96,9 @@ class BaseMesh:
         weights[members] = 1 / len(members)
         return weights
 
-    def people(self, count: int, *, gender: str, seed: int) -> NDArray[np.float32]:
+    def people(self, count: int, *, gender: str) -> NDArray[np.float32]:
         """Draws adults of one gender in the base mesh's rest pose [m], shape (count, n, 3)."""
-        rng = np.random.default_rng(seed)
+        rng = np.random.default_rng(0)
 
         def around(mean: float, deviation: float) -> NDArray[np.float64]:
             return np.clip(rng.normal(mean, deviation, count), 0.02, 0.98)

@@ -19,12 +19,12 @@ _SPLIT, _COLLAPSE = 4 / 3, 4 / 5
 _FLIP_NORMAL = 0.3  # cosine: no operation may turn a face farther than this
 
 
-def remesh(v: Vertices, f: Faces, *, sizing: Sizing, rounds: int = 8) -> tuple[Vertices, Faces]:
+def remesh(v: Vertices, f: Faces, *, sizing: Sizing) -> tuple[Vertices, Faces]:
     """Even triangles of the wanted size on the same surface; the boundary polylines are resampled at the same size."""
     surface = trimesh.Trimesh(v, f, process=False)
     curves = [v[np.append(loop, loop[0])] for loop in boundary_loops(f)]
     mesh = _Mesh(v, f, sizing)
-    for _ in range(rounds):
+    for _ in range(8):
         mesh.split_long_edges()
         mesh.collapse_short_edges()
         mesh.flip_edges()

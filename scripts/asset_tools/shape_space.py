@@ -45,14 +45,10 @@ class ShapeSpace:
     """T-pose [m], shape (n, 3)."""
     basis: NDArray[np.float64]
     """[m] a unit of beta, shape (n, 3, 10)."""
-    samples: NDArray[np.float32]
-    """The T-posed people it was fitted to [m], shape (count, n, 3)."""
     joints: NDArray[np.float64]
-    """Their joints [m], shape (count, 24, 3)."""
+    """Of the people it was fitted to [m], shape (count, 24, 3)."""
     betas: NDArray[np.float64]
     """Their scores, shape (count, 10)."""
-    explained: float
-    """Share of the body's variance that the betas carry."""
 
     @classmethod
     def fit(cls, samples: NDArray[np.float32], joints: NDArray[np.float64], mesh: BaseMesh) -> ShapeSpace:
@@ -67,7 +63,7 @@ class ShapeSpace:
         centred = (samples - mean.astype(np.float32)).reshape(count, -1)
         area = vertex_areas(mean[:BODY_VERTICES], body)
         weighted = centred[:, : 3 * BODY_VERTICES] * np.repeat(np.sqrt(area / area.sum()), 3).astype(np.float32)
-        variance, vectors = np.linalg.eigh((weighted @ weighted.T).astype(np.float64))
+        _, vectors = np.linalg.eigh((weighted @ weighted.T).astype(np.float64))
         betas = vectors[:, ::-1][:, :N_BETAS] * np.sqrt(count)
 
         height = np.ptp(samples[:, :BODY_VERTICES, 1], axis=1)
@@ -86,8 +82,7 @@ class ShapeSpace:
         # MakeHuman's targets are symmetric to 0.2 mm only.
         mean = (mean + mean[mesh.mirror] * MIRROR) / 2
         basis = (basis + basis[mesh.mirror] * MIRROR[:, None]) / 2
-        explained = variance[::-1][:N_BETAS].sum() / variance.sum()
-        return cls(mean, basis.astype(np.float64), samples, joints, betas, float(explained))
+        return cls(mean, basis.astype(np.float64), joints, betas)
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,12 +158,12 @@ class TPose:
         return rotations
 
 
-def build_shape_spaces(mesh: BaseMesh, *, count: int, seed: int = 0) -> dict[str, ShapeSpace]:
+def build_shape_spaces(mesh: BaseMesh, *, count: int) -> dict[str, ShapeSpace]:
     """Shape spaces of `count` men, of as many women, and (`neutral`) of all of them."""
     to_tpose = TPose(mesh)
     samples, joints = {}, {}
     for gender in ("male", "female"):
-        people = mesh.people(count, gender=gender, seed=seed)
+        people = mesh.people(count, gender=gender)
         joints[gender] = np.empty((count, len(JOINT_NAMES), 3))
         for i in range(count):  # in place: a gender's samples are 160 MB
             people[i], joints[gender][i] = to_tpose(people[i])

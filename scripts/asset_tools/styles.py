@@ -10,17 +10,15 @@ where they belong, in the displacement that a backbone predicts.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from refu_core.body import SmplBody
-from refu_core.errors import GarmentError
 from refu_core.frames import N_BETAS
-from refu_core.garments import N_STYLES, GarmentTemplate, Tailoring
+from refu_core.garments import N_STYLES, GarmentTemplate
 from refu_core.sdf import ExactSdf
 from refu_core.simulation._cloth import F32
 from refu_core.simulation._drape import Draper
@@ -29,23 +27,8 @@ from refu_core.simulation._mesh import ClothTopology
 F64 = NDArray[np.float64]
 _CLEARANCE = 0.005
 """Distance that a cut made longer or wider keeps from the mean body [m]."""
-
-
-@dataclass(frozen=True, eq=False)
-class StyleBasis:
-    """What a garment with styles is made of."""
-
-    v_template: F32
-    """The mean cut in the T-pose [m], shape (N, 3): the template, moved to the middle of each parameter's range."""
-    styledirs: F32
-    """Displacement of the cut a unit of each γ [m], shape (N, 3, 4)."""
-    tailoring_from_style: F32
-    """Parameters in standard deviations of a γ, shape (4, 4): p = A γ; orthogonal, so γ = Aᵀ p."""
-    parameters: tuple[Tailoring, ...]
-    variance: F64
-    """Share of the drapes' variance on each axis of γ, shape (4,)."""
-    linear: float
-    """Share of the drapes' variance that is linear in the parameters; the rest is folds."""
+_DRAPES = 24
+"""Drapes of drawn parameters, besides the mean cut's and two of each parameter."""
 
 
 def _smoothstep(value: F64, low: float, high: float) -> F64:
@@ -186,19 +169,9 @@ _ALONG_THE_BODY = ("length", "sleeve_length", "neckline", "rise")
 """Fields that carry cloth to where the body may be wider; what they move is kept outside of it."""
 
 
-def _tailoring(garment: GarmentTemplate) -> tuple[Tailoring, ...]:
-    unknown = [one.name for one in garment.card.tailoring if one.name not in _FIELDS]
-    if unknown or not garment.card.tailoring:
-        msg = f"{garment.name}: wanted {N_STYLES} parameters of tailoring out of {', '.join(_FIELDS)} on its card, "
-        msg += f"got {', '.join(unknown) or 'none'}"
-        raise GarmentError(msg)
-    return garment.card.tailoring
-
-
 def tailored(garment: GarmentTemplate, body: SmplBody) -> tuple[F64, F64]:
     """The mean cut [m], shape (N, 3), and its displacement a standard deviation of each parameter, shape (N, 3, 4)."""
-    cut = _Cut(garment, body)
-    parameters = _tailoring(garment)
+    cut, parameters = _Cut(garment, body), garment.card.tailoring
     mean = cut.x.copy()
     fields = []
     for parameter in parameters:
@@ -214,60 +187,30 @@ def tailored(garment: GarmentTemplate, body: SmplBody) -> tuple[F64, F64]:
     return mean, np.stack(out, -1)
 
 
-def build_styles(
-    garment: GarmentTemplate,
-    body: SmplBody,
-    *,
-    n_drapes: int = 24,
-    seed: int = 0,
-    progress: Callable[[int], Any] | None = None,
-) -> StyleBasis:
+def build_styles(garment: GarmentTemplate, body: SmplBody) -> dict[str, F32]:
     """Cuts the garment's styles and finds the principal axes of their drapes on the mean body.
 
-    Args:
-        garment: as it was cut, without styles.
-        body: the body it was cut for.
-        n_drapes: how many drapes, besides the mean cut's and two of each parameter.
-        seed: of their parameters.
-        progress: called with the number of drapes done.
-
-    Raises:
-        GarmentError: its card has no tailoring, or a parameter that there isn't.
+    Returns what its file gets:
+        v_template: the mean cut in the T-pose [m], shape (N, 3): each parameter in the middle of its range.
+        styledirs: displacement of the cut a unit of each γ [m], shape (N, 3, 4).
+        tailoring_from_style: parameters in standard deviations of a γ, (4, 4): p = A γ; orthogonal, so γ = Aᵀ p.
     """
     mean, fields = tailored(garment, body)
-    n = len(mean)
     corners = np.concatenate((1.5 * np.eye(N_STYLES), -1.5 * np.eye(N_STYLES)))
-    drawn = np.clip(np.random.default_rng(seed).normal(size=(n_drapes, N_STYLES)), -2, 2)
+    drawn = np.clip(np.random.default_rng(0).normal(size=(_DRAPES, N_STYLES)), -2, 2)
     scores = np.concatenate((np.zeros((1, N_STYLES)), corners, drawn))
     directions = np.ascontiguousarray(fields, dtype=np.float32)
-    cut = with_styles(garment, mean.astype(np.float32), directions)
+    cut = replace(
+        garment,
+        v_template=torch.from_numpy(mean.astype(np.float32)),
+        styledirs=torch.from_numpy(directions.reshape(-1, N_STYLES)),
+    )
     draper = Draper(cut, body)
-    drapes = np.empty((len(scores), n, 3))
-    for k, score in enumerate(scores):
-        drapes[k], _ = draper.canonical(np.zeros(N_BETAS), score)
-        if progress is not None:
-            progress(k + 1)
+    drapes = np.stack([draper.canonical(np.zeros(N_BETAS), score)[0] for score in scores]).astype(np.float64)
     weight = np.sqrt(draper.topology.vertex_areas(mean))[None, :, None]
     centred = ((drapes - drapes.mean(0)) * weight).reshape(len(scores), -1)
     slope, *_ = np.linalg.lstsq(scores - scores.mean(0), centred, rcond=None)  # (4, 3N): drape a unit of each parameter
-    _, singular, axes = np.linalg.svd(slope.T, full_matrices=False)
-    rotation = axes.T  # p = A γ
+    rotation = np.linalg.svd(slope.T, full_matrices=False)[2].T  # p = A γ
     rotation *= np.sign(rotation[np.abs(rotation).argmax(0), np.arange(N_STYLES)])  # larger is longer, wider, deeper
-    explained = ((scores - scores.mean(0)) @ slope).var(0).sum() / centred.var(0).sum()
-    return StyleBasis(
-        mean.astype(np.float32),
-        (fields @ rotation).astype(np.float32),
-        rotation.astype(np.float32),
-        garment.card.tailoring,
-        singular**2 / (singular**2).sum(),
-        float(explained),
-    )
-
-
-def with_styles(garment: GarmentTemplate, v_template: F32, styledirs: F32) -> GarmentTemplate:
-    """The garment with another mean cut (N, 3) and these style directions (N, 3, 4), everything else as it was."""
-    return replace(
-        garment,
-        v_template=torch.from_numpy(np.ascontiguousarray(v_template)),
-        styledirs=torch.from_numpy(np.ascontiguousarray(styledirs).reshape(-1, N_STYLES)),
-    )
+    found = {"v_template": mean, "styledirs": fields @ rotation, "tailoring_from_style": rotation}
+    return {name: values.astype(np.float32) for name, values in found.items()}

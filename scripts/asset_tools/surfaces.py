@@ -6,7 +6,8 @@ import numpy as np
 import scipy.sparse
 import trimesh
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+
+from refu_core.metrics import SheetChecker
 
 Vertices = NDArray[np.float64]
 Faces = NDArray[np.int64]
@@ -44,28 +45,6 @@ def compact(f: Faces) -> tuple[NDArray[np.int64], Faces]:
     return used, local.reshape(-1, 3)
 
 
-def corner_angles(v: Vertices, f: Faces) -> NDArray[np.float64]:
-    """Angles of the faces at their corners [degrees], shape (F, 3)."""
-    angles = np.empty(f.shape)
-    for k in range(3):
-        a, b = v[f[:, (k + 1) % 3]] - v[f[:, k]], v[f[:, (k + 2) % 3]] - v[f[:, k]]
-        angles[:, k] = np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.einsum("fk,fk->f", a, b))
-    return np.degrees(angles)
-
-
-def edge_lengths(v: Vertices, f: Faces) -> NDArray[np.float64]:
-    """Length of every edge, once [m]."""
-    edges = np.unique(np.sort(directed_edges(f), 1), axis=0)
-    return np.linalg.norm(v[edges[:, 0]] - v[edges[:, 1]], axis=1)
-
-
-def vertex_normals(v: Vertices, f: Faces) -> Vertices:
-    """Area-weighted unit normals, shape (V, 3)."""
-    area = np.cross(v[f[:, 1]] - v[f[:, 0]], v[f[:, 2]] - v[f[:, 0]])
-    total = np.stack([np.bincount(f.ravel(), np.repeat(area[:, k], 3), len(v)) for k in range(3)], 1)
-    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
-
-
 def smoothing_matrix(f: Faces, n: int) -> scipy.sparse.csr_matrix:
     """Mean of the neighbours; on a boundary, of the two neighbours along it. Shape (n, n)."""
     edges = {(int(a), int(b)) for a, b in directed_edges(f)}
@@ -88,47 +67,9 @@ def attach(points: Vertices, v: Vertices, f: Faces) -> scipy.sparse.csr_matrix:
     return scipy.sparse.csr_matrix((weights.ravel(), (rows, f[face].ravel())), shape=(len(points), len(v)))
 
 
-def self_intersections(v: Vertices, f: Faces) -> NDArray[np.int64]:
+def self_intersections(v: Vertices, f: Faces) -> NDArray[np.int32]:
     """Pairs of faces that share no vertex and cross, shape (pairs, 2)."""
-    corners = v[f]
-    centre = corners.mean(1)
-    reach = np.linalg.norm(corners - centre[:, None], axis=2).max(1)
-    # Few large faces would make every search wide: size classes keep the candidates few.
-    order = np.argsort(reach)
-    found = []
-    for part in np.array_split(order, 8):
-        tree = cKDTree(centre[part])
-        smaller = np.flatnonzero(reach <= reach[part].max())
-        for i, close in zip(
-            smaller, tree.query_ball_point(centre[smaller], reach[smaller] + reach[part].max()), strict=True
-        ):
-            if close:
-                others = part[close]
-                found.append(np.stack([np.full(len(others), i), others], 1))
-    pairs = np.unique(np.sort(np.concatenate(found), 1), axis=0)
-    pairs = pairs[np.linalg.norm(centre[pairs[:, 0]] - centre[pairs[:, 1]], axis=1) <= reach[pairs].sum(1)]
-    pairs = pairs[~(f[pairs[:, 0]][:, :, None] == f[pairs[:, 1]][:, None, :]).any((1, 2))]
-    a, b = corners[pairs[:, 0]], corners[pairs[:, 1]]
-    apart = ((a.min(1) > b.max(1)) | (b.min(1) > a.max(1))).any(1)
-    pairs, a, b = pairs[~apart], a[~apart], b[~apart]
-    crossing = np.zeros(len(pairs), bool)
-    for k in range(3):
-        crossing |= _segment_hits(a[:, k], a[:, (k + 1) % 3], b) | _segment_hits(b[:, k], b[:, (k + 1) % 3], a)
-    return pairs[crossing]
-
-
-def _segment_hits(start: Vertices, end: Vertices, triangle: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Whether segments cross triangles (N, 3, 3); Möller and Trumbore's test."""
-    e1, e2 = triangle[:, 1] - triangle[:, 0], triangle[:, 2] - triangle[:, 0]
-    direction = end - start
-    p = np.cross(direction, e2)
-    determinant = np.einsum("nk,nk->n", e1, p)
-    safe = np.where(np.abs(determinant) > 1e-18, determinant, 1.0)
-    offset = start - triangle[:, 0]
-    u = np.einsum("nk,nk->n", offset, p) / safe
-    q = np.cross(offset, e1)
-    w = np.einsum("nk,nk->n", direction, q) / safe
-    t = np.einsum("nk,nk->n", e2, q) / safe
-    inside = (u >= 0) & (w >= 0) & (u + w <= 1) & (t >= 0) & (t <= 1)
-    hits: NDArray[np.bool_] = inside & (np.abs(determinant) > 1e-18)
-    return hits
+    checker = SheetChecker(f)
+    checker.update(v)
+    pairs = checker.with_itself()
+    return pairs[~(f[pairs[:, 0]][:, :, None] == f[pairs[:, 1]][:, None]).any((1, 2))]

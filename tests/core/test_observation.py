@@ -13,7 +13,7 @@ from refu_core import FrameError, GarmentPipeline, SmplFrame
 from refu_core.observation import DEFAULT_OBSERVATION, Observer
 from refu_core.observation._estimate import Estimate
 from refu_core.outputs import Clearance, PinholeCamera, depth_image, visible
-from refu_lab.held_out import Moment, moments_of
+from refu_lab.truth import Moment, moments_of
 
 BAG = Path(__file__).parents[2] / "bags" / "eval_short_pant_male"
 NAME = "short-pant-male"

@@ -10,7 +10,7 @@ import torch
 
 from refu_core import FrameError, GarmentPipeline, MeshError, SmplFrame, WeightsError, load_garment
 from refu_core.outputs import RADIUS_90, UNKNOWN_SIGMA, Sigma, SigmaMap, bend_of, fit_sigma, load_sigma, save_sigma
-from refu_lab.held_out import cross_checked, held_out
+from refu_lab.truth import cross_checked, held_out
 
 BAGS = Path(__file__).parents[2] / "bags"
 

@@ -77,7 +77,7 @@ def test_optimisation_solves_drapes_least_squares(cloth: tuple[Tensor, Tensor], 
         rows = np.vstack([push, np.sqrt(smoothness) * laplacian, np.sqrt(damping) * np.eye(3 * n)])
         target = np.concatenate([wanted, np.sqrt(smoothness) * laplacian @ y.ravel(), np.sqrt(damping) * y.ravel()])
         y = np.linalg.lstsq(rows, target, rcond=None)[0].reshape(n, 3)
-    done = PostProcess.of_faces(faces, n).optimise(points, Ball(), clearance=clearance, reach=reach)
+    done = PostProcess(faces, n).optimise(points, Ball(), clearance=clearance, reach=reach)
     torch.testing.assert_close(done.double(), torch.tensor(y), atol=1e-5, rtol=0)
     assert (done.norm(dim=1) < RADIUS).sum() < 0.5 * (points.norm(dim=1) < RADIUS).sum()
 
@@ -87,7 +87,7 @@ def test_on_an_exact_distance_most_is_outside_and_the_rest_of_the_cloth_follows(
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=RADIUS)
     sdf = ExactSdf(mesh.faces)
     sdf.update(torch.tensor(mesh.vertices, dtype=torch.float32))
-    process = PostProcess.of_faces(faces, len(points))
+    process = PostProcess(faces, len(points))
     before = sdf.query(points).distance
     done = process.optimise(points, sdf, clearance=0.004)
     assert (sdf.query(done).distance < 0).sum() < 0.4 * (before < 0).sum()
@@ -96,7 +96,7 @@ def test_on_an_exact_distance_most_is_outside_and_the_rest_of_the_cloth_follows(
 
 def test_nothing_inside_nothing_done(cloth: tuple[Tensor, Tensor]) -> None:
     points, faces = cloth
-    process = PostProcess.of_faces(faces, len(points))
+    process = PostProcess(faces, len(points))
     outside = 1.5 * points
     assert torch.equal(process.optimise(outside, Ball()), outside)
     assert torch.equal(push_naively(outside, Ball()), outside)
@@ -105,6 +105,6 @@ def test_nothing_inside_nothing_done(cloth: tuple[Tensor, Tensor]) -> None:
 def test_refuses_faces_of_other_vertices(cloth: tuple[Tensor, Tensor]) -> None:
     points, faces = cloth
     with pytest.raises(MeshError, match="index vertices 0 to 4"):
-        PostProcess.of_faces(faces, 5)
+        PostProcess(faces, 5)
     with pytest.raises(MeshError, match=r"integers of shape \(F, 3\)"):
-        PostProcess.of_faces(faces[:, :2], len(points))
+        PostProcess(faces[:, :2], len(points))

@@ -7,7 +7,6 @@ import pytest
 import trimesh
 from PIL import Image
 
-from refu_core.errors import MeshError, RefuError
 from refu_lab.render import Backdrop, Camera, RenderMesh, render, save_png
 
 PLAIN = Backdrop(background=(0.2, 0.4, 0.6), show_ground=False)
@@ -106,26 +105,3 @@ def test_same_input_same_picture_and_png(tmp_path) -> None:
     assert first.dtype == np.uint8
     save_png(first, tmp_path / "ball.png")
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "ball.png")), first)
-
-
-@pytest.mark.parametrize(
-    "meshes",
-    [
-        [],
-        [RenderMesh(np.zeros((3, 2)), [[0, 1, 2]])],
-        [RenderMesh(np.zeros((3, 3)), [[0, 1, 3]])],
-        [RenderMesh(np.full((3, 3), np.nan), [[0, 1, 2]])],
-        [RenderMesh(np.eye(3), np.zeros((0, 3), int))],
-        [RenderMesh(np.eye(3), [[0, 1, 2]], (255, 0, 0))],
-    ],
-)
-def test_refuses_what_it_cannot_draw(meshes) -> None:
-    with pytest.raises(MeshError):
-        render(meshes, camera=Camera.looking_at((0, 0, 0), distance=3.0), size=(8, 8))
-
-
-def test_refuses_bad_cameras_and_sizes() -> None:
-    with pytest.raises(RefuError, match="up"):
-        render([sphere()], camera=Camera(eye=(0, 5, 0), target=(0, 0, 0)), size=(8, 8))
-    with pytest.raises(RefuError, match="size"):
-        render([sphere()], camera=Camera.looking_at((0, 0, 0), distance=3.0), size=(0, 8))

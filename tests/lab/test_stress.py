@@ -252,18 +252,15 @@ def test_a_soak_fails_by_memory_or_by_latency(
     assert result.failures == failures
 
 
-def test_an_interrupted_soak_has_its_row(subject: Subject, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("refu_lab.stress._soak._REPORT_S", 0.0)
-    so_far: list[SoakResult] = []
+def test_an_interrupted_soak_has_its_row(subject: Subject) -> None:
+    ticked: list[int] = []
 
-    def report(result: SoakResult) -> None:
-        so_far.append(result)
-        if len(so_far) == 3:
+    def tick(count: int) -> None:
+        ticked.append(count)
+        if len(ticked) == 12:
             raise KeyboardInterrupt
 
-    result = soak(subject.pipeline, mode="here", frames=100, report=report)
-    assert [part.frames for part in so_far] == [10, 11, 12]
-    assert result.frames == 12
+    assert soak(subject.pipeline, mode="here", frames=100, tick=tick).frames == 12
 
 
 def test_resident_memory_is_this_process() -> None:

@@ -31,7 +31,7 @@ from refu_lab.commands.view import ViewOptions
 from refu_lab.view import view
 from refu_lab.view._dressed import DressedFilm, Track
 from refu_lab.view._film import BODY, SKIN, Cache, Shape
-from refu_lab.view._markers import MarkerShapes, Topology, is_drawable
+from refu_lab.view._markers import MarkerScene, Topology, is_drawable
 from refu_lab.view._marks import CLEARANCE, Marker, Marking
 from refu_lab.view._player import Player
 from refu_lab.view._recorded import RecordedFilm
@@ -159,7 +159,8 @@ def test_markers_that_make_no_picture_are_left_out_and_a_rotation_unset_is_none(
     unset = replace(whole, pose=(1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 0.0))
     assert is_drawable(whole)
     assert is_drawable(unset)
-    np.testing.assert_array_equal(MarkerShapes().shape(unset).vertices, MarkerShapes().shape(whole).vertices)
+    first, second = (MarkerScene(lambda shape: shape).shape(one).vertices for one in (unset, whole))
+    np.testing.assert_array_equal(first, second)
     for odd in (
         replace(whole, points=whole.points[:2]),
         replace(whole, points=np.full((3, 3), np.nan)),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -76,12 +75,12 @@ def replay_fleet(
     pipeline_for(options.replay)  # what no recording could be replayed with is said once, and now
     result = FleetResult(with_report=options.report is not None)
     rows: dict[int, dict[str, Any]] = {}
-    folders = {place: Folder(place) for place in (options.output, options.report) if place is not None}
     with ExitStack() as stack:
-        for folder in folders.values():
-            stack.enter_context(folder.locked())
+        for place in dict.fromkeys((options.output, options.report)):
+            if place is not None:
+                stack.enter_context(Folder(place).locked())
         jobs = [_Job(recording, options) for recording in recordings]
-        bar = tqdm(total=len(jobs), unit="recording", disable=None if progress else True)
+        bar = stack.enter_context(tqdm(total=len(jobs), unit="recording", disable=None if progress else True))
         try:
             for index, row in engine.run(run_function(_replay_job), jobs):
                 lost = {"error": row.reason} if isinstance(row, Lost) else row
@@ -89,15 +88,10 @@ def replay_fleet(
                 bar.update()
         except KeyboardInterrupt:
             result.interrupted = True
-        finally:
-            bar.close()
-            for folder in folders.values():
-                folder.tidy()
         result.rows = [rows[index] for index in sorted(rows)]
         result.n_left = len(recordings) - len(rows)
         if options.report is not None:
             Folder(options.report).put_text(result.page(), "index.html")
-            Folder(options.report).tidy()
     return result
 
 
@@ -136,15 +130,18 @@ def _is_there(record: dict[str, Any], job: _Job) -> bool:
 def _make(job: _Job, path: Path) -> dict[str, Any]:
     options, name = job.options, job.recording.name
     pipeline = pipeline_for(options.replay)
-    if options.output is None:
-        result, size = _replayed(replace(options.replay, input=path, output=None), pipeline), None
-    else:
-        folder = Folder(options.output)
-        with folder.scratch() as scratch:
-            bag = scratch / f"{Path(name).name}.mcap"  # a bag holds its own name
-            result = _replayed(replace(options.replay, input=path, output=bag), pipeline)
-            size = bag.stat().st_size
-            folder.put(bag, f"{name}.mcap")
+    size = output = None
+    with ExitStack() as stack:
+        bag = None
+        if options.output is not None:
+            # A bag holds its own name.
+            bag = stack.enter_context(Folder(options.output).scratch()) / f"{Path(name).name}.mcap"
+        result = replay(replace(options.replay, input=path, output=bag), pipeline=pipeline)
+        if result.interrupted:  # a part isn't what this is a record of
+            raise KeyboardInterrupt
+        if options.output is not None and bag is not None:
+            size, output = bag.stat().st_size, Folder(options.output).at(f"{name}.mcap")
+            Folder(options.output).put(bag, f"{name}.mcap")
     if options.report is not None and result.frames:
         from refu_lab.report import write_report
 
@@ -152,17 +149,8 @@ def _make(job: _Job, path: Path) -> dict[str, Any]:
         with folder.scratch() as scratch:
             write_report(result, scratch / "page")
             folder.put(scratch / "page", name)
-    record = result.as_dict() | _over_all(result)
-    record["input"] = job.recording.source
-    record["output"] = None if options.output is None else Folder(options.output).at(f"{name}.mcap")
-    return record | {"output_bytes": size}
-
-
-def _replayed(options: ReplayOptions, pipeline: GarmentPipeline) -> ReplayResult:
-    result = replay(options, pipeline=pipeline)
-    if result.interrupted:  # a part isn't what this is a record of
-        raise KeyboardInterrupt
-    return result
+    told = {"input": job.recording.source, "output": output, "output_bytes": size}
+    return result.as_dict() | _over_all(result) | told
 
 
 _loaded: dict[str, GarmentPipeline] = {}
@@ -241,16 +229,10 @@ def _recording_hash(source: str, path: Path) -> str:
 def _tree_hash(path: Path) -> str:
     """Of a file, or of a folder's files by their names; of nothing where there is nothing."""
     digest = hashlib.sha256()
-    for file in _files(path):
+    files = sorted(path.rglob("*")) if path.is_dir() else [path]
+    for file in (one for one in files if one.is_file()):
         digest.update(b"" if file == path else file.relative_to(path).as_posix().encode() + b"\0")
         with file.open("rb") as stream:
             while block := stream.read(1 << 20):
                 digest.update(block)
     return digest.hexdigest()
-
-
-def _files(path: Path) -> Iterator[Path]:
-    if path.is_dir():
-        yield from sorted(file for file in path.rglob("*") if file.is_file())
-    elif path.is_file():
-        yield path
