@@ -48,6 +48,8 @@ class ClothSettings:
     """Sweeps over all constraints a time step: more steps of one sweep stretch less than fewer of several."""
     most_ease: float = 0.15
     """Share by which an edge may give way freely, for the sake of moving joints."""
+    most_crease: float = 0.3
+    """Share by which an edge may shorten freely, in the crook of a bent elbow."""
     anchor_stiffness: float = 0.2
     """Share of a waistband's distance from its place on the skin that is closed in one sweep."""
 
@@ -128,12 +130,14 @@ class SimulatedCloth:
         positions: F32,
         *,
         eased: Sequence[F32] = (),
+        crooks: Sequence[F32] = (),
         waist: NDArray[np.intp] | None = None,
         body_rest: F32 | None = None,
     ) -> None:
         """Puts the cloth at `positions` (N, 3), at rest, with the rest lengths and masses of `rest` (N, 3).
 
-        Where an edge is longer in one of the shapes `eased`, (N, 3) each, it gives way up to there, within limits.
+        Where an edge is longer in one of the shapes `eased`, (N, 3) each, it gives way up to there, within limits;
+        where it is shorter in one of `crooks`, down to there.
 
         `waist` vertices are held at the place of the skin that they have in the rest pose: the body at rest is
         `body_rest` (V, 3).
@@ -141,16 +145,12 @@ class SimulatedCloth:
         self._dress(np.ascontiguousarray(rest, dtype=np.float32))
         self.positions[:] = positions
         self.velocities[:] = 0
-        ends = self._rest[self._ends]
-        self._shortest: F32 = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).astype(np.float32)
-        self._longest = self._shortest
-        for shape in eased:
-            ends = shape[self._ends]
-            self._longest = np.maximum(
-                self._longest, np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).astype(np.float32)
-            )
-        self._longest = np.minimum(self._longest, self._shortest * np.float32(1 + self.settings.most_ease))
-        self._edge_length = float(np.median(self._shortest[-len(self.topology.mesh.edges) :]))
+        length = self._lengths(self._rest)
+        longest = np.max([length, *map(self._lengths, eased)], axis=0)
+        shortest = np.min([length, *map(self._lengths, crooks)], axis=0)
+        self._longest: F32 = np.minimum(longest, length * np.float32(1 + self.settings.most_ease))
+        self._shortest: F32 = np.maximum(shortest, length * np.float32(1 - self.settings.most_crease))
+        self._edge_length = float(np.median(length[-len(self.topology.mesh.edges) :]))
         area = self.topology.vertex_areas(self._rest)
         # Slivers would get next to no mass and soak up every correction of their neighbours.
         area = np.maximum(area, 0.25 * np.median(area))
@@ -159,6 +159,12 @@ class SimulatedCloth:
         if waist is not None and len(waist):
             assert body_rest is not None
             self._anchors = self._anchor(waist, body_rest)
+
+    def _lengths(self, shape: F32) -> F32:
+        """Of all that keeps its length, edges last, in a shape (N, 3) [m]."""
+        ends = shape[self._ends]
+        lengths: F32 = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).astype(np.float32)
+        return lengths
 
     def _anchor(self, waist: NDArray[np.intp], body_rest: F32) -> tuple[NDArray[np.int32], NDArray[np.int32], F32, F32]:
         self._sdf.update(torch.from_numpy(body_rest))
