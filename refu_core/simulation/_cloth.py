@@ -48,6 +48,8 @@ class ClothSettings:
     """Sweeps over all constraints a time step: more steps of one sweep stretch less than fewer of several."""
     most_ease: float = 0.15
     """Share by which an edge may give way freely, for the sake of moving joints."""
+    most_crease: float = 0.3
+    """Share by which an edge may shorten freely, in the crook of a bent elbow."""
     anchor_stiffness: float = 0.2
     """Share of a waistband's distance from its place on the skin that is closed in one sweep."""
 
@@ -116,11 +118,19 @@ class SimulatedCloth:
         self._previous: F32 = np.zeros((n, 3), np.float32)
 
     def start(
-        self, rest: F32, positions: F32, *, eased: Sequence[F32], waist: NDArray[np.intp], body_rest: F32
+        self,
+        rest: F32,
+        positions: F32,
+        *,
+        eased: Sequence[F32],
+        crooks: Sequence[F32],
+        waist: NDArray[np.intp],
+        body_rest: F32,
     ) -> None:
         """Puts the cloth at `positions` (N, 3), at rest, with the rest lengths and masses of `rest` (N, 3).
 
-        Where an edge is longer in one of the shapes `eased`, (N, 3) each, it gives way up to there, within limits.
+        Where an edge is longer in one of the shapes `eased`, (N, 3) each, it gives way up to there, within limits;
+        where it is shorter in one of `crooks`, down to there.
 
         `waist` vertices are held at the place of the skin that they have in the rest pose: the body at rest is
         `body_rest` (V, 3).
@@ -131,10 +141,12 @@ class SimulatedCloth:
         self._searched_at: F32 = np.full((n, 3), 1e6, np.float32)  # far away: nothing that was found holds
         self.positions[:] = positions
         self.velocities[:] = 0
-        self._shortest = self._lengths(rest)
-        self._longest = np.maximum.reduce([self._shortest, *(self._lengths(shape) for shape in eased)])
-        self._longest = np.minimum(self._longest, self._shortest * np.float32(1 + self.settings.most_ease))
-        self._edge_length = float(np.median(self._shortest[-n_edges:]))
+        length = self._lengths(rest)
+        longest = np.maximum.reduce([length, *(self._lengths(shape) for shape in eased)])
+        shortest = np.minimum.reduce([length, *(self._lengths(shape) for shape in crooks)])
+        self._longest = np.minimum(longest, length * np.float32(1 + self.settings.most_ease))
+        self._shortest = np.maximum(shortest, length * np.float32(1 - self.settings.most_crease))
+        self._edge_length = float(np.median(length[-n_edges:]))
         area = self.topology.vertex_areas(rest)
         # Slivers would get next to no mass and soak up every correction of their neighbours.
         area = np.maximum(area, 0.25 * np.median(area))

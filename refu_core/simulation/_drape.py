@@ -23,6 +23,7 @@ from refu_core.sdf import ExactSdf
 from refu_core.simulation._cloth import F32, ClothSettings, SimulatedCloth
 from refu_core.simulation._joined import JoinedGarments
 from refu_core.simulation._mesh import ClothTopology
+from refu_core.simulation._untangle import Untangle
 
 GRAVITY = 9.81
 """[m/s²], along -y of the world."""
@@ -88,11 +89,18 @@ def comfort_poses() -> NDArray[np.float32]:
     hang, bend, raised, spread = np.zeros((4, N_JOINTS, 3), np.float32)
     hang[16, 2], hang[17, 2] = -0.87, 0.87
     bend[16, 1], bend[17, 1] = -0.7, 0.7
-    bend[18, 1], bend[19, 1] = -1.2, 1.2
+    bend[18, 1], bend[19, 1] = -2.0, 2.0
     raised[1, 0] = raised[2, 0] = -0.8
     raised[4, 0] = raised[5, 0] = 1.2
     spread[1, 2], spread[2, 2] = 0.4, -0.4
     return np.stack((hang, bend, raised, spread))
+
+
+def crook_pose() -> NDArray[np.float32]:
+    """Elbows bent by 2 rad [rad], shape (24, 3): where a sleeve gets shorter, cloth wrinkles finer than its mesh."""
+    pose = np.zeros((N_JOINTS, 3), np.float32)
+    pose[18, 1], pose[19, 1] = -2.0, 2.0
+    return pose
 
 
 def _alone(values: NDArray[np.floating]) -> torch.Tensor:
@@ -149,7 +157,8 @@ class Draper:
             self.topology, sdf, piece=self.outfit.number_of_vertex, settings=self.settings.cloth
         )
         self._waist = self._waists()
-        self._comfort = comfort_poses()
+        self._untangle = Untangle(garment.mesh, sdf, margin=self.settings.cloth.margin)
+        self._comfort = np.concatenate((comfort_poses(), crook_pose()[None]))
         self._canonical: tuple[bytes, F32, F32] | None = None
 
     def _waists(self) -> NDArray[np.intp]:
@@ -208,7 +217,8 @@ class Draper:
         body_rest = self.body.rest_vertices(shape)[0].numpy()
         self._sdf.update(torch.from_numpy(body_rest))
         self._sdf.rebuild()
-        self.cloth.start(rest, positions, eased=list(eased), waist=self._waist, body_rest=body_rest)
+        *eased, crook = eased
+        self.cloth.start(rest, positions, eased=eased, crooks=[crook], waist=self._waist, body_rest=body_rest)
         self.rebuild(body)
 
     def rebuild(self, body: F32) -> None:
@@ -247,7 +257,8 @@ class Draper:
                 break
         for _ in range(s.careful_frames):
             speed = self.cloth.frame(body, body, gravity=gravity, drag=s.drag[2], careful=True)
-        return SettledDrape(self._with_root(self.cloth.positions, root, betas), speed, self.cloth.stretch())
+        level = self._untangle(self.cloth.positions, body)
+        return SettledDrape(self._with_root(level, root, betas), speed, self.cloth.stretch(level))
 
     def _with_root(self, points: F32, root: Rotation, betas: NDArray[np.floating]) -> F32:
         pelvis = self.body.rest_joints(_alone(betas))[0, 0].numpy()
