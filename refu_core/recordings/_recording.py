@@ -115,11 +115,21 @@ def _recording(content: Content, *, fps: float | None, axes: Axes, person: str |
     if layout.is_time_last:
         arrays = {name: np.moveaxis(array, -1, 0) for name, array in arrays.items()}
     if layout.holds_places:
-        arrays = {name: _places(array, name) for name, array in arrays.items()}
+        arrays = {name: _by_time(array) for name, array in arrays.items()}
     n_persons = _persons(arrays)
     which = _chosen([str(i) for i in range(n_persons)], person, [0] * n_persons, notes) if n_persons > 1 else 0
     if n_persons:
         arrays = {name: array[which] for name, array in arrays.items()}
+    if layout.holds_places:
+        lengths = node.get(table.LENGTHS)
+        lengths = None if lengths is None else content.array(lengths)
+        n = None if lengths is None or lengths.shape != (n_persons,) else max(1, int(lengths[which]))
+        for name, array in arrays.items():
+            arrays[name] = array[:n]  # what follows pads a batch
+            if not _is_of_places({name: arrays[name]}):
+                wanted = "places of SMPL's joints, (T, n, 3) with n = 22 or 24, between which are bones"
+                msg = f"{name} {array.shape}: no {wanted}"
+                raise ValueError(msg)
     if _is_of_places(arrays):
         return _of_places(content, above, arrays, fps=fps, axes=axes, notes=notes)
     poses = _poses(arrays, layout, node, notes)
@@ -177,16 +187,12 @@ def _of_mhr(
     return follow(POINTS, chosen.places, fps=rate, axes=axes, usual="y-down", notes=notes)
 
 
-def _places(array: NDArray[Any], name: str) -> NDArray[Any]:
-    """Places of joints (T, n, 3), or of several persons (N, T, n, 3)."""
+def _by_time(array: NDArray[Any]) -> NDArray[Any]:
+    """Places of joints as (T, n, 3), or of several persons as (N, T, n, 3)."""
     if array.ndim == 4:  # the time was last: it is first now, and persons are second
         array = array.swapaxes(0, 1)
     if array.ndim == 2 and array.shape[1] % 3 == 0:
         array = array.reshape(len(array), -1, 3)
-    shown = array[0] if array.ndim == 4 and len(array) else array
-    if not _is_of_places({name: shown}):
-        msg = f"{name} {array.shape}: no places of SMPL's joints, (T, n, 3) with n = 22 or 24, between which are bones"
-        raise ValueError(msg)
     return array
 
 
