@@ -5,11 +5,12 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from msg_adapters import Placement
 from msg_adapters.axes import ros_from_sender
@@ -185,7 +186,7 @@ class Worker:
             near = {}
         frames = {person: settings.applied(arrival.frame) for person, arrival in near.items()}
         if pipeline.heeds_past:
-            frames = {person: self._history(frame, person) for person, frame in frames.items()}
+            frames = {person: self._told(frame, person, near[person]) for person, frame in frames.items()}
         known: dict[str, _Known] = {}
         job = _Job(self._n_taken, settings, pipeline, fittings, near, frames, known, gone)
         for person, frame in frames.items():
@@ -195,6 +196,16 @@ class Worker:
                 known[person] = last
         self._n_taken += 1
         return job
+
+    def _told(self, frame: SmplFrame, person: str, arrival: Arrival) -> SmplFrame:
+        """A frame with its past, as it was where messages are: what a moving camera sees move stands still there."""
+        there = arrival.placement.after(Placement(ros_from_sender(self.settings.axes)))
+        body = self._pipeline.body
+        pelvis = body.rest_joints(torch.tensor(frame.betas[None], device=body.device))[0, 0].cpu().double().numpy()
+        pose = frame.pose.copy()
+        pose[0] = Rotation.from_matrix(there.rotation @ Rotation.from_rotvec(pose[0]).as_matrix()).as_rotvec()
+        place = there.rotation @ (frame.transl + pelvis) + there.translation
+        return replace(frame, past=self._history(replace(frame, pose=pose, transl=place), person).past)
 
     def _finish(self, job: _Job, outputs: Mapping[str, PipelineOutput]) -> None:
         """Sends what came of a job."""

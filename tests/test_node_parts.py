@@ -17,8 +17,10 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from msg_adapters import (
     BagError,
@@ -28,6 +30,7 @@ from msg_adapters import (
     Doubts,
     InputStream,
     Marker,
+    Placement,
     QosProfile,
     check_plausible,
     decode_marker_array,
@@ -391,6 +394,25 @@ def test_unchanged_frames_cost_no_inference_but_move(pipeline: GarmentPipeline) 
     (first,), (second,) = setup.viewer.messages
     assert (second.stamp_ns, setup.total("skip.unchanged")) == (2, 1)
     np.testing.assert_allclose(second.points, first.points + np.array([0.0, 1.0, 0.0]), atol=1e-12)
+
+
+def test_a_camera_that_turns_swings_no_skirt() -> None:
+    setup = Setup(GarmentPipeline.load(["skirt-female"]), garments=["skirt-female"], input_axes="frame")
+    stands, found = frame().pose, []
+    for step in range(20):
+        camera = Placement(
+            Rotation.from_rotvec([0.02 * step, 0.05 * step, 0]).as_matrix(), np.array([0.1 * step, 0, 1])
+        )
+        seen = camera.inverse()
+        pose = stands.copy()
+        pose[0] = Rotation.from_matrix(seen.rotation @ Rotation.from_rotvec(stands[0]).as_matrix()).as_rotvec()
+        pelvis = setup.worker._pipeline.body.rest_joints(torch.zeros(1, 10))[0, 0].double().numpy()
+        transl = seen.rotation @ (pelvis + 3 * np.eye(3)[2]) + seen.translation - pelvis
+        there = SmplFrame(pose=pose, transl=transl, stamp_ns=1 + step * 33_000_000, up=seen.rotation[:, 1])
+        setup.scene.put("ann", there, camera)
+        setup.worker.tick(lambda: setup.scene.take(timeout=0.0))
+        found.append(setup.viewer.messages[-1][0].points)
+    assert np.abs(np.array(found) - found[0]).max() < 1e-5
 
 
 def test_cloth_comes_to_rest_after_the_pose_has() -> None:

@@ -9,6 +9,7 @@ from refu_core.backbones._dynamics import DynamicsConfig as DynamicsConfig
 from refu_core.backbones._features import PoseFeatures as PoseFeatures
 from refu_core.backbones._features import style_shape as style_shape
 from refu_core.backbones._features import tilt_rotvec as tilt_rotvec
+from refu_core.backbones._features import told_up as told_up
 from refu_core.backbones._features import up_in_root as up_in_root
 from refu_core.backbones._features import upright as upright
 from refu_core.backbones._files import backbone_from_weights as backbone_from_weights

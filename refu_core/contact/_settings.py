@@ -11,7 +11,7 @@ from refu_core.refu import MAX_DISPLACEMENT
 class ContactSettings:
     """How a garment is brought off the body and off the garments below it.
 
-    Each number says what it is for. `benchmarks/sensitivity.py` measures what half and twice of it do on recorded motion.
+    Each number says what it is for. `benchmarks/sensitivity.py` measures what half and twice of it do.
     """
 
     # Pushes along the gradient

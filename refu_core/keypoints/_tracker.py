@@ -137,8 +137,8 @@ class KeypointTracker:
             msg = f"wanted {n} keypoints of {self.skeleton.layout.name}, got {given.shape} and {weights.shape}"
             raise FrameError(msg)
         weights[~(weights > 0)] = 0.0
-        top = weights.max(initial=0.0)
-        weights = np.minimum(weights if top <= 1 else weights / 100, 1.0)
+        is_percent = weights.max(initial=0.0) > _MOST_SCORE
+        weights = np.minimum(weights / 100 if is_percent else weights, 1.0)
         here = np.isfinite(given).all(axis=1) & (np.abs(given) < 1e6).all(axis=1)
         weights[~here | (weights < _LEAST)] = 0.0
         return _Seen(np.where(weights[:, None] > 0, given, 0.0), weights)
@@ -277,6 +277,8 @@ _FASTEST = np.concatenate([np.full(3, 12.0), np.full(3 * N_JOINTS, 40.0), np.zer
 """No pelvis [m/s], no joint [rad/s] is faster."""
 _LEAST = 0.05
 """A confidence below it is none."""
+_MOST_SCORE = 2.0
+"""Detectors that score by the height of a heat map go a little beyond 1; larger ones are per cent."""
 _FITS = 0.04
 """A first pose that its keypoints lie so near to [m] has its sides right."""
 _NEAR, _FAR = 0.1, 0.5

@@ -60,6 +60,7 @@ class Clearance:
         if name not in self._rings:
             msg = f"no garment {name!r} here: wanted one of {', '.join(self._rings)}"
             raise MeshError(msg)
-from refu_core.mesh import as_points
-from refu_core.sdf import BandSdf
+        ring = self._rings[name]
+        points = as_points("the garment's vertices", vertices, len(ring.start) - 1, dtype=np.float32)
+        distance: NDArray[np.float32] = self._sdf.clipped(torch.from_numpy(points), ring).distance.numpy()
         return distance

@@ -97,4 +97,5 @@ def pressed_kernel(
     second = beside(p, parts, within - first.distance, first.part, first.normal, opposed)
     if second.part >= 0:
         pair[i] = wp.min(first.part, second.part) * parts.mesh.shape[0] + wp.max(first.part, second.part)
-        depth[i] = first.gave + second.gave
+        # What there is room for now they needn't have been in each other for.
+        depth[i] = wp.max(first.gave + second.gave - first.distance - second.distance, 0.0)

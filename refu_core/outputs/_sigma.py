@@ -66,7 +66,8 @@ def bend_of(garment: GarmentTemplate, pose: NDArray[Any]) -> NDArray[np.float64]
     """How much the joints that a garment feels are bent [rad], root left out, of poses (…, 24, 3) [rad]; shape (…,)."""
     joints = [joint for joint in garment.card.joints if joint != 0]
     angle = np.linalg.norm(np.asarray(pose, np.float64)[..., joints, :], axis=-1)
-    found: NDArray[np.float64] = np.sqrt((np.minimum(angle, np.pi) ** 2).sum(-1))
+    wrapped = np.remainder(angle + np.pi, 2 * np.pi) - np.pi  # a rotation of 350° is one of 10°
+    found: NDArray[np.float64] = np.sqrt((wrapped**2).sum(-1))
     return found
 
 

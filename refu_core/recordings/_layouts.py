@@ -100,6 +100,8 @@ LAYOUTS: tuple[Layout, ...] = (
 RATES = ("mocap_framerate", "mocap_frame_rate", "fps", "framerate", "frame_rate", "frameRate", "FPS")
 GENDERS = ("gender", "genders")
 FRAME_NUMBERS = ("frame_ids", "frame_id")
+LENGTHS = "lengths"
+"""How many frames each sample of a batch has; the others pad it."""
 SCALINGS = ("smpl_scaling",)
 """AIST++'s translations are of a body that is larger by so much."""
 MODELS = ("surface_model_type",)
@@ -112,7 +114,7 @@ POSE_KEYS = frozenset(name for layout in LAYOUTS if layout.is_whole for name in 
 """Of whole poses."""
 ALL_KEYS = frozenset(
     {name for layout in LAYOUTS for names in (layout.pose, layout.transl, layout.betas) for name in names}
-    | {*RATES, *GENDERS, *FRAME_NUMBERS, *SCALINGS, *MODELS, *_SOMA}
+    | {*RATES, *GENDERS, *FRAME_NUMBERS, LENGTHS, *SCALINGS, *MODELS, *_SOMA}
 )
 """Everything that is read; all else in a file, meshes and pictures, is left unread."""
 

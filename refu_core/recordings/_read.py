@@ -94,11 +94,16 @@ def _recording(content: Content, *, fps: float | None, axes: Axes, person: str |
     if layout.is_time_last:
         arrays = {name: np.moveaxis(array, -1, 0) for name, array in arrays.items()}
     if layout.holds_places:
-        arrays = {name: _places(array, name) for name, array in arrays.items()}
+        arrays = {name: _by_time(array) for name, array in arrays.items()}
     n_persons = _persons(arrays)
     which = _chosen([str(i) for i in range(n_persons)], person, [0] * n_persons, notes) if n_persons > 1 else 0
     if n_persons:
         arrays = {name: array[which] for name, array in arrays.items()}
+    if layout.holds_places:
+        given = node.get(table.LENGTHS)
+        lengths = np.zeros(0) if given is None else content.array(given)
+        n_lived = max(1, int(lengths[which])) if lengths.shape == (n_persons,) else None
+        arrays = {name: _checked(array[:n_lived], name) for name, array in arrays.items()}  # the rest pads a batch
 
     def one(names: Sequence[str]) -> NDArray[Any] | None:
         name = next((name for name in names if node.get(name) is not None), None)
@@ -150,14 +155,17 @@ def _recording(content: Content, *, fps: float | None, axes: Axes, person: str |
         return Recording(poses.astype(np.float32), transl, betas, rate, gender, tuple(notes))
 
 
-def _places(array: NDArray[Any], name: str) -> NDArray[Any]:
-    """Places of joints (T, n, 3), or of several persons (N, T, n, 3)."""
+def _by_time(array: NDArray[Any]) -> NDArray[Any]:
+    """Places of joints as (T, n, 3), or of several persons as (N, T, n, 3)."""
     if array.ndim == 4:  # the time was last: it is first now, and persons are second
         array = array.swapaxes(0, 1)
     if array.ndim == 2 and array.shape[1] % 3 == 0:
         array = array.reshape(len(array), -1, 3)
-    shown = array[0] if array.ndim == 4 and len(array) else array
-    if not _is_of_places({name: shown}):
+    return array
+
+
+def _checked(array: NDArray[Any], name: str) -> NDArray[Any]:
+    if not _is_of_places({name: array}):
         msg = f"{name} {array.shape}: no places of SMPL's joints, (T, n, 3) with n = 22 or 24, between which are bones"
         raise ValueError(msg)
     return array

@@ -72,7 +72,7 @@ def load_clips(path: str | Path, *, axes: Axes = "auto", fps: float | None = Non
     """The motions of a file or a folder, by name, with y up; `docs/guide/inputs.md` lists what files are recognised.
 
     Args:
-        path: a file, or a folder of them.
+        path: a file, or a folder of them and of such folders, as AMASS comes.
         axes: what the files' roots are expressed in; `auto` sees it from the people, and says so in `Clip.notes`.
         fps: frames a second, in place of what the files say.
 
@@ -80,11 +80,13 @@ def load_clips(path: str | Path, *, axes: Axes = "auto", fps: float | None = Non
         SimulationError: nothing there, or a file of another layout.
     """
     path = Path(path)
-    files = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES) if path.is_dir() else [path]
+    files = [path]
+    if path.is_dir():
+        files = sorted(file for file in path.rglob("*") if file.suffix.lower() in SUFFIXES and not _is_shape(file))
     if not files or not files[0].exists():
         msg = f"{path}: wanted motions ({', '.join(SUFFIXES)}), found none; give a folder of them or a file"
         raise SimulationError(msg)
-    return [_load_clip(file, axes, fps) for file in files]
+    return [_load_clip(file, axes, fps, path if path.is_dir() else path.parent) for file in files]
 
 
 def as_clips(motions: str | Path | Sequence[Clip]) -> list[Clip]:
@@ -92,12 +94,18 @@ def as_clips(motions: str | Path | Sequence[Clip]) -> list[Clip]:
     return load_clips(motions) if isinstance(motions, (str, Path)) else list(motions)
 
 
-def _load_clip(path: Path, axes: Axes, fps: float | None) -> Clip:
+def _is_shape(path: Path) -> bool:
+    """AMASS has shapes without motion in the folders of its motions."""
+    return path.name == "shape.npz" or path.stem.endswith("_stagei")
+
+
+def _load_clip(path: Path, axes: Axes, fps: float | None, folder: Path) -> Clip:
     recording = read_recording(path, error=SimulationError, axes="z-up" if axes == "frame" else axes, fps=fps)
     if not (np.isfinite(recording.poses).all() and np.isfinite(recording.transl).all()):
         msg = f"{path}: wanted finite poses and trans; cut out the frames that aren't"
         raise SimulationError(msg)
-    return Clip(path.stem, recording.poses, recording.transl, recording.fps, recording.notes)
+    name = path.relative_to(folder).with_suffix("").as_posix()
+    return Clip(name, recording.poses, recording.transl, recording.fps, recording.notes)
 
 
 def split_clips(clips: Sequence[Clip], *, test_every: int = 5) -> tuple[list[Clip], list[Clip]]:

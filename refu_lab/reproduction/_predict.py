@@ -105,8 +105,7 @@ class Predictor:
                 raise WeightsError(msg)
             self._refu = _with_margin(worn.refu, method.margin)
         self._name = setup.template.name
-        # What it is pushed off is the scene's.
-        self._outfit = Outfit(setup.body, {self._name: replace(worn, refu=self._refu)})
+        self._outfit = Outfit(setup.body, {self._name: replace(worn, refu=self._refu)}, setup.collider)
 
     @torch.no_grad()
     def __call__(self, scene: SampleScene) -> MethodOutput:

@@ -40,6 +40,7 @@ from refu_core.backbones import (
     save_basis,
     style_shape,
     tilt_rotvec,
+    told_up,
     up_in_root,
 )
 from refu_core.backbones._gcnn import MeshGraph, UpConv
@@ -223,6 +224,21 @@ def test_heading_changes_nothing_and_tilt_does(encoding: str) -> None:
     torch.testing.assert_close(features(turned), features(pose), atol=1e-5, rtol=0)
     turned[:, 0, 0] += 0.3
     assert bool(((features(turned) - features(pose)).abs().amax(1) > 0.05).all())
+
+
+def test_a_tilt_that_networks_have_not_seen_is_told_as_one_that_they_may_have() -> None:
+    angle = torch.linspace(0, torch.pi, 2001, dtype=torch.float64)
+    for way in (0.0, 1.0, 4.0):
+        level = torch.sin(angle)
+        up = torch.stack((level * np.cos(way), torch.cos(angle), level * np.sin(way)), 1).requires_grad_()
+        told = told_up(up)
+        tilt = torch.rad2deg(torch.arccos(told[:, 1].detach().clamp(max=1.0)))
+        assert torch.equal(told[angle < 1.04], up[angle < 1.04])
+        assert float(tilt.max()) == pytest.approx(60)
+        torch.testing.assert_close(told.norm(dim=1), torch.ones_like(angle))
+        assert (told[1:] - told[:-1]).norm(dim=1).max() < 1.01 * torch.pi / 2000
+        (gradient,) = torch.autograd.grad(told.sum(), up)
+        assert torch.isfinite(gradient).all()
 
 
 def test_tilt_is_the_root_without_its_heading() -> None:

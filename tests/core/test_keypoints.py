@@ -371,6 +371,9 @@ def test_confidence() -> None:
     for frame in frames:
         assert frame is not None
         np.testing.assert_allclose(frame.pose, reference.pose, atol=1e-3)
+    scores = np.random.default_rng(0).uniform(0.6, 1.06, 17)
+    scores[3] = 1.02  # as heat maps have them, no per cent
+    assert KeypointTracker(skeleton("coco17")).update(points, 1, confidence=scores) is not None
     with pytest.raises(FrameError, match=r"wanted 17 keypoints of coco17, got \(33, 3\)"):
         KeypointTracker(skeleton("coco17")).update(np.zeros((33, 3)), 1)
 

@@ -127,6 +127,13 @@ def test_places_under_a_name(tmp_path: Path) -> None:
     first, second = (read_motion(tmp_path / "results.npy", fps=20, person=person) for person in ("0", "1"))
     assert len(first) == T
     np.testing.assert_allclose(second.transl - first.transl, np.tile([1.0, 0, 0], (T, 1)), atol=1e-6)
+    samples[1, :, :, T // 2 :] = 0  # padding
+    np.save(tmp_path / "results", {"motion": samples, "lengths": np.array([T, T // 2])}, allow_pickle=True)
+    second = read_motion(tmp_path / "results.npy", fps=20, person="1")
+    assert len(second) == T // 2
+    np.save(tmp_path / "results", {"motion": samples}, allow_pickle=True)
+    with pytest.raises(MotionFileError, match=r"motion .* no places of SMPL's joints"):
+        read_motion(tmp_path / "results.npy", fps=20, person="1")
 
 
 def test_a_rate_that_is_text(tmp_path: Path) -> None:

@@ -580,6 +580,16 @@ def test_folder_without_motions_is_refused(tmp_path: Path) -> None:
         simulate(tmp_path / "set", tmp_path)
 
 
+def test_motions_lie_in_folders_of_subjects_beside_their_shapes(tmp_path: Path) -> None:
+    for subject in ("01", "02"):
+        (tmp_path / subject).mkdir()
+        write_clip(tmp_path / subject / "walk_poses.npz", np.random.default_rng(0))
+        np.savez(tmp_path / subject / "shape.npz", betas=np.zeros(16))
+        np.savez(tmp_path / subject / "walk_stagei.npz", betas=np.zeros(16))
+    assert [clip.name for clip in load_clips(tmp_path)] == ["01/walk_poses", "02/walk_poses"]
+    assert load_clips(tmp_path / "01" / "walk_poses.npz")[0].name == "walk_poses"
+
+
 @pytest.mark.parametrize(
     ("replaced", "match"),
     [
