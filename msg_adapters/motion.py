@@ -13,6 +13,7 @@ from msg_adapters.cdr import NS_PER_S
 from msg_adapters.errors import BagError, MotionFileError
 from msg_adapters.rotations import quaternion_from_rotvec, quaternion_product, rotvec_from_quaternion, slerp
 from refu_core.frames import N_JOINTS, SmplFrame
+from refu_core.keypoints import Proportions
 from refu_core.recordings import SUFFIXES, Axes, Recording, n_resampled, read_recording
 from refu_core.skeleton import JOINT_NAMES
 
@@ -77,7 +78,12 @@ class Motion(Recording):
 
 
 def read_motion(
-    path: str | Path, *, fps: float | None = None, axes: Axes = "auto", person: str | None = None
+    path: str | Path,
+    *,
+    fps: float | None = None,
+    axes: Axes = "auto",
+    person: str | None = None,
+    worn: Proportions | None = None,
 ) -> Motion:
     """Reads a file of motion: `docs/guide/inputs.md` lists what is recognised.
 
@@ -87,10 +93,12 @@ def read_motion(
         axes: what root orientations and translations are expressed in; `auto` sees it from the people, and says so in
             the motion's `notes`. The motion is in SMPL's axes, but for `frame`, which leaves it as it is.
         person: whose motion, where the file has several; the one with most frames if not given.
+        worn: the body that will be worn (`Proportions.of_body`): betas are fitted to it where the file has only places
+            of joints, and roots turn about its pelvis. A built-in body if not given.
 
     Raises `MotionFileError` for a file that can't be read or isn't recognised, or whose arrays have other shapes.
     """
-    recording = read_recording(path, error=MotionFileError, fps=fps, axes=axes, person=person)
+    recording = read_recording(path, error=MotionFileError, fps=fps, axes=axes, person=person, worn=worn)
     return Motion(**{item.name: getattr(recording, item.name) for item in fields(recording)})
 
 

@@ -13,6 +13,7 @@ import msg_adapters as adapters
 from msg_adapters.axes import up_of
 from refu_core import FrameError, RefuError
 from refu_core.history import PoseHistory
+from refu_core.keypoints import Proportions
 from refu_core.modes import FOREIGN_BETAS, ONE_STYLE, BetasSource
 from refu_core.recordings import GENDERS, SUFFIXES, upright_turn
 from refu_lab.commands.replay import RecordingOptions
@@ -49,6 +50,8 @@ class Source:
     """What the reader of a motion file took for granted."""
     gender: str = "neutral"
     """Whose motion it is, where the file says it."""
+    is_fitted: bool = False
+    """Whether its betas were fitted to the body that wears the garments."""
     frame_id: str = "map"
     """Of what comes of it."""
 
@@ -79,7 +82,7 @@ class Source:
         """What there is to say of the file and of who wears what in it; complete after the last record."""
         options, bag = self.options, self.bag
         is_told = betas_are_told or options.betas_are_told or pipeline.fit is not None
-        is_told = is_told or options.input_type in adapters.KEYPOINT_TYPES
+        is_told = is_told or self.is_fitted or options.input_type in adapters.KEYPOINT_TYPES
         is_told = is_told or (bag is not None and bag.topic.betas_of == BetasSource.BUILTIN)
         plain = [name for name, one in pipeline.garments.items() if one.styledirs is None]
         return [
@@ -92,7 +95,7 @@ class Source:
 
 
 def open_source(options: RecordingOptions, body: Callable[[], SmplBody]) -> Source:
-    """Opens the input; `body` is whose bones keypoints have, and isn't asked for where there are none.
+    """Opens the input; `body` is who wears the garments, and isn't asked for where nothing depends on it.
 
     Raises `RefuError` for an input that can't be read, or with options that it has no use for.
     """
@@ -101,13 +104,20 @@ def open_source(options: RecordingOptions, body: Callable[[], SmplBody]) -> Sour
             what = "--topic" if options.topic is not None else "--input-type"
             msg = f"{options.input}: {what} is for bags, this is a file of motion"
             raise RefuError(msg)
-        motion = adapters.read_motion(options.input, fps=options.fps, axes=options.input_axes, person=options.person)
+        motion = adapters.read_motion(
+            options.input,
+            fps=options.fps,
+            axes=options.input_axes,
+            person=options.person,
+            worn=Proportions.of_body(body()),
+        )
         description = f"{options.input.name}, {len(motion)} frames at {motion.fps:g} Hz"
         up = upright_turn(motion.poses[:, 0].astype(np.float64))[1] if options.axes == "frame" else None
         of_message = adapters.INPUT_TYPES["multiarray"], _decoding(adapters.decoder_for("multiarray"), lambda _: up)
         records = _motion_records(motion, INPUT_TOPIC)
         source = Source(options, description, INPUT_TOPIC, *of_message, records, len(motion))
-        return replace(source, notes=motion.notes, gender=motion.gender)
+        gender = "" if motion.is_fitted else motion.gender
+        return replace(source, notes=motion.notes, gender=gender, is_fitted=motion.is_fitted)
     if options.fps is not None or options.input_axes in ("z-up", "y-down"):
         what = "--fps" if options.fps is not None else f"--input-axes {options.input_axes}"
         msg = f"{options.input}: {what} is for files of motion ({', '.join(SUFFIXES)})"

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from refu_core._files import read_file
 from refu_core.errors import RefuError
+from refu_core.keypoints import Proportions
 from refu_core.recordings._followed import follow, metres_of
 from refu_core.recordings._layouts import WANTED
 from refu_core.recordings._recording import MAX_FRAMES, Recording, check_fps
@@ -54,13 +55,15 @@ class _Joint:
     channels: list[str] = field(default_factory=list)
 
 
-def read_bvh(path: Path, *, error: type[RefuError], fps: float | None, axes: Axes) -> Recording:
+def read_bvh(
+    path: Path, *, error: type[RefuError], fps: float | None, axes: Axes, worn: Proportions | None
+) -> Recording:
     """The motion of a BVH file. Raises `error` for a damaged one, and for a skeleton that isn't a person's."""
     text = read_file(path, most=_MAX_BYTES, error=error, wanted=WANTED).decode("utf-8", "replace")
     try:
         joints, rows, seconds = _parsed(text)
         rate = check_fps(fps if fps is not None else 1 / seconds if seconds > 0 else 0.0)
-        return _fitted(joints, _placed(joints, rows), rate, axes)
+        return _fitted(joints, _placed(joints, rows), rate, axes, worn)
     except ValueError as cause:
         msg = f"{path}: {cause}"
         raise error(msg) from cause
@@ -152,7 +155,7 @@ def _placed(joints: list[_Joint], rows: Array) -> Array:
     return frames
 
 
-def _fitted(joints: list[_Joint], places: Array, fps: float, axes: Axes) -> Recording:
+def _fitted(joints: list[_Joint], places: Array, fps: float, axes: Axes, worn: Proportions | None) -> Recording:
     points = _points(joints)
     missing = [name for name in _NEEDED if name not in points]
     if missing:
@@ -163,7 +166,7 @@ def _fitted(joints: list[_Joint], places: Array, fps: float, axes: Axes) -> Reco
     scale = metres_of(list(points), places[0, list(points.values())], notes)
     seen = scale * places[:, list(points.values())]
     notes.append(f"the skeleton of {len(joints)} joints is fitted by the positions of {len(points)}")
-    return follow(tuple(points), seen, fps=fps, axes=axes, usual="smpl", notes=notes)
+    return follow(tuple(points), seen, fps=fps, axes=axes, usual="smpl", worn=worn, notes=notes)
 
 
 def _points(joints: list[_Joint]) -> dict[str, int]:

@@ -30,15 +30,24 @@ _NOTHING = 1e-3
 
 
 def follow(
-    points: Sequence[str], places: NDArray[np.float64], *, fps: float, axes: Axes, usual: Axes, notes: list[str]
+    points: Sequence[str],
+    places: NDArray[np.float64],
+    *,
+    fps: float,
+    axes: Axes,
+    usual: Axes,
+    worn: Proportions | None,
+    notes: list[str],
 ) -> Recording:
     """The motion of a person whose `points`, by the names of keypoint layouts, are in places (T, K, 3) [m].
 
-    A point that isn't seen is NaN. What is taken for granted is added to `notes`, which the recording gets.
+    A point that isn't seen is NaN. The betas are `worn`'s, the neutral body's if not given. What is taken for granted
+    is added to `notes`, which the recording gets.
 
     Raises `ValueError` where no frame shows a person.
     """
-    skeleton = Skeleton(layout_of("recording", tuple(points)), Proportions.builtin("neutral"))
+    known_body = Proportions.builtin("neutral") if worn is None else worn
+    skeleton = Skeleton(layout_of("recording", tuple(points)), known_body)
     some = np.linspace(0, len(places) - 1, min(_FIT, len(places))).astype(int)
     shapes = [KeypointTracker(skeleton, settings=_SETTINGS).update(places[i], 0) for i in some]
     known = [frame.betas for frame in shapes if frame is not None]
@@ -50,9 +59,13 @@ def follow(
     frames = [track.update(place, round(1e9 * i / fps)) for i, place in enumerate(places)]
     poses = np.stack([np.full((24, 3), np.nan) if frame is None else frame.pose for frame in frames])
     transl = np.stack([np.full(3, np.nan) if frame is None else frame.transl for frame in frames])
-    roots, transl = to_smpl(poses[:, 0].astype(np.float64), transl, axes, notes, usual=usual)
+    pelvis = known_body.of(betas)[0]
+    roots, transl = to_smpl(poses[:, 0].astype(np.float64), transl, axes, notes, usual=usual, pelvis=pelvis)
     poses[:, 0] = roots
-    return Recording(poses.astype(np.float32), transl, betas.astype(np.float32), fps, "neutral", tuple(notes))
+    is_fitted = worn is not None
+    return Recording(
+        poses.astype(np.float32), transl, betas.astype(np.float32), fps, "neutral", tuple(notes), is_fitted
+    )
 
 
 def are_places(array: NDArray[np.float64]) -> bool:

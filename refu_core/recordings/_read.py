@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from refu_core.errors import RefuError
 from refu_core.frames import N_JOINTS
+from refu_core.keypoints import Proportions
 from refu_core.recordings import _layouts as table
 from refu_core.recordings._bvh import read_bvh
 from refu_core.recordings._containers import Content, Key, entries, open_content
@@ -22,7 +23,7 @@ from refu_core.recordings._rotations import BODY, WHOLE, rotvecs_of
 from refu_core.recordings._soma import smpl_of_soma
 from refu_core.recordings._tracks import filled, frames_of, places_in_time
 from refu_core.recordings._upright import AXES, PELVIS, Axes, to_smpl
-from refu_core.recordings._values import betas_of, fps_of, gender_of, pelvis_of, transl_of, word_of
+from refu_core.recordings._values import betas_of, fps_of, gender_of, transl_of, turned, word_of
 
 _BODY_JOINTS = 22  # what SMPL, SMPL-H and SMPL-X share; SMPL's two hand joints have no counterpart in the others
 _WORLD, _CAMERA = ("world", "global"), ("cam", "incam", "camera")
@@ -56,6 +57,7 @@ def read_recording(
     fps: float | None = None,
     axes: Axes = "auto",
     person: str | None = None,
+    worn: Proportions | None = None,
 ) -> Recording:
     """Reads the motion of a file; `docs/guide/inputs.md` lists what is recognised.
 
@@ -65,6 +67,8 @@ def read_recording(
         fps: frames a second, in place of what the file says; must be given where it says nothing.
         axes: what root orientations and translations are expressed in.
         person: whose motion, where the file has several; the one with most frames if not given.
+        worn: the body that will be worn: betas are fitted to it where the file has only places of joints, and roots
+            turn about its pelvis. A built-in body if not given.
 
     Raises:
         error: the file can't be read, isn't recognised, has no frame rate, or its arrays have other shapes or meanings.
@@ -74,18 +78,20 @@ def read_recording(
         msg = f"{path}: wanted axes of {', '.join(AXES)} and frames a second as a number, got {axes!r} and {fps!r}"
         raise error(msg)
     if path.suffix.lower() == ".bvh":
-        return read_bvh(path, error=error, fps=fps, axes=axes)
+        return read_bvh(path, error=error, fps=fps, axes=axes, worn=worn)
     content = open_content(path, error=error)
     try:
-        return _recording(content, fps=fps, axes=axes, person=person)
+        return _recording(content, fps=fps, axes=axes, person=person, worn=worn)
     except ValueError as cause:
         msg = f"{path}: {cause}"
         raise error(msg) from cause
 
 
-def _recording(content: Content, *, fps: float | None, axes: Axes, person: str | None) -> Recording:
+def _recording(
+    content: Content, *, fps: float | None, axes: Axes, person: str | None, worn: Proportions | None
+) -> Recording:
     notes: list[str] = []
-    content, like = _spelled(smpl_of_soma(content, notes))
+    content, like = _spelled(smpl_of_soma(content, notes, PELVIS if worn is None else worn.joints[0]))
     if like:
         notes.append(f"taken by like names: {', '.join(f'{key} as {name}' for key, name in like.items())}")
     found, above = _find(content, person, notes)
@@ -100,9 +106,9 @@ def _recording(content: Content, *, fps: float | None, axes: Axes, person: str |
     if n_persons:
         arrays = {name: array[which] for name, array in arrays.items()}
     if layout.holds_places:
-        given = node.get(table.LENGTHS)
-        lengths = np.zeros(0) if given is None else content.array(given)
-        n_lived = max(1, int(lengths[which])) if lengths.shape == (n_persons,) else None
+        lengths = content.array(node.get(table.LENGTHS, np.zeros(0)))
+        is_told = n_persons and lengths.shape == (n_persons,) and lengths.dtype.kind in "iu"
+        n_lived = max(1, int(lengths[which])) if is_told else None
         arrays = {name: _checked(array[:n_lived], name) for name, array in arrays.items()}  # the rest pads a batch
 
     def one(names: Sequence[str]) -> NDArray[Any] | None:
@@ -120,13 +126,13 @@ def _recording(content: Content, *, fps: float | None, axes: Axes, person: str |
         notes.append("MHR, another body than SMPL's: followed by its keypoints")
         at = places_in_time(frames, len(array))
         places = places_of_mhr(array, transl_of(one(layout.transl), layout, len(array), notes), at)
-        return follow(POINTS, places, fps=rate, axes=axes, usual="y-down", notes=notes)
+        return follow(POINTS, places, fps=rate, axes=axes, usual="y-down", worn=worn, notes=notes)
     if _is_of_places(arrays):
         ((name, array),) = arrays.items()
         notes.append(f"{name} {array.shape} holds places of joints and no rotations: SMPL's skeleton is fitted to them")
         places = array[:, : len(SMPL_POINTS)].astype(np.float64)
         places = metres_of(SMPL_POINTS, places[0], notes) * places
-        return follow(SMPL_POINTS, places, fps=rate, axes=axes, usual="smpl", notes=notes)
+        return follow(SMPL_POINTS, places, fps=rate, axes=axes, usual="smpl", worn=worn, notes=notes)
     poses = _poses(arrays, layout, node, notes)
     n = len(poses)
     transl = transl_of(one(layout.transl), layout, n, notes)
@@ -134,18 +140,20 @@ def _recording(content: Content, *, fps: float | None, axes: Axes, person: str |
     if scaling is not None:
         transl = transl / float(scaling.reshape(-1)[0])
         notes.append(f"translations are divided by {table.SCALINGS[0]}")
-    if layout.turns_about_origin:
-        transl = transl + pelvis_of(poses[:, 0]) - PELVIS
     is_smplx = (
         any("smplx" in table.spelled(key) for key in like)
         or "x" in word_of(content, _first(above, table.MODELS))
         or _columns(arrays) in (165, 330, 495)
     )
     betas = betas_of(one(layout.betas), n, notes, is_smplx=is_smplx)
+    pelvis = PELVIS if worn is None else worn.of(betas.astype(np.float64))[0]
+    if layout.turns_about_origin:
+        transl = transl + turned(pelvis, poses[:, 0]) - pelvis
     poses, transl = filled(poses, transl, frames, notes)
     of_amass = _columns(arrays) in (156, 165) and _first(above, table.RATES[:2]) is not None
     roots = poses[:, 0].astype(np.float64)
-    roots, transl = to_smpl(roots, transl, axes, notes, usual="z-up" if of_amass else "smpl")
+    usual: Axes = "z-up" if of_amass else "smpl"
+    roots, transl = to_smpl(roots, transl, axes, notes, usual=usual, pelvis=pelvis)
     if axes != "frame":
         with np.errstate(over="ignore", invalid="ignore"):
             poses[:, 0] = roots

@@ -31,6 +31,8 @@ class Recording:
     """male, female or neutral: whose shape space the betas are of."""
     notes: tuple[str, ...] = field(default=())
     """What was taken for granted, left out or turned: a sentence each, to be shown to whoever gave the file."""
+    is_fitted: bool = False
+    """Whether the betas were fitted to the body that will be worn, and are its own."""
 
 
 def check_fps(fps: float) -> float:

@@ -16,7 +16,6 @@ from refu_core.frames import N_JOINTS
 from refu_core.recordings._containers import Content
 from refu_core.recordings._layouts import RATES, SOMA_NAMES
 from refu_core.recordings._rotations import rotvecs_of
-from refu_core.recordings._upright import PELVIS
 from refu_core.recordings._values import word_of
 
 _CHAINS = "Hips LeftLeg RightLeg Spine1 LeftShin RightShin Spine2 LeftFoot RightFoot Chest LeftToeBase RightToeBase "
@@ -25,8 +24,8 @@ _METRES = {"meters": 1.0, "centimeters": 0.01, "millimeters": 0.001}
 _SMPL = ("smpl", "smplh", "smplx")
 
 
-def smpl_of_soma(content: Content, notes: list[str]) -> Content:
-    """A file of SOMA as one of SMPL; any other as it is.
+def smpl_of_soma(content: Content, notes: list[str], pelvis: NDArray[np.float64]) -> Content:
+    """A file of SOMA as one of SMPL, whose pelvis (3,) is there at rest [m]; any other as it is.
 
     Raises `ValueError` for one without the body's joints, or whose turns aren't about the axes of the T-pose.
     """
@@ -55,7 +54,7 @@ def smpl_of_soma(content: Content, notes: list[str]) -> Content:
     if root.get("transl") is not None:  # where SOMA's hips are: SMPL's is added to the pelvis at rest
         transl = content.array(root["transl"])
         is_place = transl.dtype.kind in "iuf" and transl.shape[-1:] == (3,)
-        found["transl"] = _METRES[unit] * transl - PELVIS if is_place else transl
+        found["transl"] = _METRES[unit] * transl - pelvis if is_place else transl
     kind = word_of(content, root.get("identity_model_type"))
     if kind in _SMPL and root.get("identity_coeffs") is not None:
         found["betas"] = content.array(root["identity_coeffs"])

@@ -66,8 +66,13 @@ def upright_turn(roots: Array) -> Array:
     return _TURNS.get({"+z": "z-up", "-y": "y-down"}.get(axis_of(roots), ""), np.eye(3))
 
 
-def to_smpl(roots: Array, transl: Array, axes: Axes, notes: list[str], *, usual: Axes) -> tuple[Array, Array]:
-    """Roots [rad] and translations [m], shapes (T, 3), in SMPL's axes; `usual` is what such files mean, where seen."""
+def to_smpl(
+    roots: Array, transl: Array, axes: Axes, notes: list[str], *, usual: Axes, pelvis: Array = PELVIS
+) -> tuple[Array, Array]:
+    """Roots [rad] and translations [m], shapes (T, 3), in SMPL's axes.
+
+    `usual` is what such files mean where it can't be seen, and `pelvis` (3,) [m] what a root turns about.
+    """
     if axes == "frame":
         return roots, transl
     chosen: str = axes
@@ -88,7 +93,7 @@ def to_smpl(roots: Array, transl: Array, axes: Axes, notes: list[str], *, usual:
         turned = roots.copy()
         if there.any():
             turned[there] = (Rotation.from_matrix(turn) * Rotation.from_rotvec(roots[there])).as_rotvec()
-        roots, transl = turned, transl @ turn.T + (turn - np.eye(3)) @ PELVIS
+        roots, transl = turned, transl @ turn.T + (turn - np.eye(3)) @ pelvis
     if not lies:
         _tell_lying(roots, notes)
     return roots, transl

@@ -12,18 +12,17 @@ from scipy.spatial.transform import Rotation
 from refu_core.frames import N_BETAS
 from refu_core.recordings import _layouts as table
 from refu_core.recordings._containers import Content
-from refu_core.recordings._upright import PELVIS
 
 GENDERS = {"m": "male", "male": "male", "f": "female", "female": "female", "n": "neutral", "neutral": "neutral"}
 _STEADY = 1e-3  # betas that differ by less between frames are one shape
 
 
-def pelvis_of(roots: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Where roots (T, 3) [rad] turn the pelvis to about the mesh's origin [m], shape (T, 3)."""
-    turned = np.full(roots.shape, np.nan)
+def turned(place: NDArray[np.float64], roots: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Where roots (T, 3) [rad] turn a place (3,) to about the mesh's origin [m], shape (T, 3)."""
+    found = np.full(roots.shape, np.nan)
     sound = np.isfinite(roots).all(axis=1)
-    turned[sound] = Rotation.from_rotvec(roots[sound]).apply(PELVIS)
-    return turned
+    found[sound] = Rotation.from_rotvec(roots[sound]).apply(place)
+    return found
 
 
 def transl_of(array: NDArray[Any] | None, layout: table.Layout, n: int, notes: list[str]) -> NDArray[np.float64]:

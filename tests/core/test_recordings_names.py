@@ -16,6 +16,7 @@ from test_recordings import POSES, TRANSL, T, same
 
 from msg_adapters import MotionFileError, read_motion
 from refu_core import load_body
+from refu_core.keypoints import Proportions
 
 BETAS = np.linspace(-1, 1, 10)
 
@@ -134,6 +135,32 @@ def test_places_under_a_name(tmp_path: Path) -> None:
     np.save(tmp_path / "results", {"motion": samples}, allow_pickle=True)
     with pytest.raises(MotionFileError, match=r"motion .* no places of SMPL's joints"):
         read_motion(tmp_path / "results.npy", fps=20, person="1")
+
+
+def test_places_are_fitted_to_the_body_that_is_worn(tmp_path: Path) -> None:
+    body, betas = load_body("male"), torch.tensor([[-2.0, *[0.0] * 9]])
+    poses = torch.from_numpy(POSES.astype(np.float32))
+    joints = body(poses, betas.expand(T, 10), transl=torch.from_numpy(TRANSL).float()).joints.double().numpy()
+    np.savez(tmp_path / "a", joints=joints, fps=30)
+    motion = read_motion(tmp_path / "a.npz", worn=Proportions.of_body(body), axes="smpl")
+    assert motion.is_fitted
+    fitted = body(
+        torch.tensor(motion.poses),
+        torch.tensor(motion.betas).expand(T, 10),
+        transl=torch.from_numpy(motion.transl).float(),
+    )
+    off = np.linalg.norm(fitted.joints.double().numpy() - joints, axis=-1)
+    assert off.mean() < 0.01
+    assert not read_motion(tmp_path / "a.npz").is_fitted
+
+
+def test_roots_turn_about_the_pelvis_of_the_body_that_is_worn(tmp_path: Path) -> None:
+    arrays = load_body("male")
+    low = Proportions(Proportions.of_body(arrays).joints - [0, 1.1, 0], Proportions.of_body(arrays).shapedirs)
+    np.savez(tmp_path / "a", poses=POSES, trans=TRANSL, mocap_framerate=30.0)
+    as_it_is, turned = (read_motion(tmp_path / "a.npz", worn=low, axes=axes) for axes in ("frame", "z-up"))
+    places = [motion.transl + low.of(motion.betas.astype(np.float64))[0] for motion in (as_it_is, turned)]
+    np.testing.assert_allclose(places[0], places[1][:, [2, 0, 1]], atol=1e-9)
 
 
 def test_a_rate_that_is_text(tmp_path: Path) -> None:
