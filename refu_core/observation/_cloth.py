@@ -18,6 +18,8 @@ from refu_core.observation._match_kernels import match_kernel
 from refu_core.observation._modes import smooth_modes
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from refu_core.garments import GarmentTemplate
     from refu_core.observation._settings import ObservationSettings
 
@@ -109,14 +111,22 @@ class ObservedCloth:
         self._points.copy_(torch.from_numpy(vertices))
         self._mesh.refit()
 
-    def match(self, measured: Measured, skin: wp.Mesh, eye: NDArray[np.float64] | None) -> Matches:
-        """Which of the points are the cloth's, and where."""
+    @property
+    def tree(self) -> int:
+        """Warp's handle of where it is."""
+        return int(self._mesh.id)
+
+    def match(
+        self, measured: Measured, skin: wp.Mesh, others: Sequence[int], eye: NDArray[np.float64] | None
+    ) -> Matches:
+        """Which of the points are the cloth's, and no other garment's of these trees, and where."""
         how = self._settings
         own = self._points.numpy()
         rows = np.flatnonzero(within(measured.points, own.min(0) - how.reach, own.max(0) + how.reach))
         points = wp.array(measured.points[rows], dtype=wp.vec3, device="cpu")
         seen = wp.vec3() if eye is None else wp.vec3(*eye.tolist())
-        inputs = [points, self._mesh.id, skin.id, self._rim, how.reach, how.slack, eye is not None, seen]
+        trees = wp.array(np.array(others, np.uint64), dtype=wp.uint64, device="cpu")
+        inputs = [points, self._mesh.id, skin.id, trees, self._rim, how.reach, how.slack, eye is not None, seen]
         outputs = [wp.empty(len(rows), dtype=kind, device="cpu") for kind in (wp.int32, wp.vec3, wp.vec3, wp.float32)]
         wp.launch(match_kernel, len(rows), inputs, outputs, device="cpu")
         face, weight, normal, height = (one.numpy() for one in outputs)

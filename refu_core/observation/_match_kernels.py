@@ -8,6 +8,7 @@ def match_kernel(
     points: wp.array[wp.vec3],
     cloth: wp.uint64,
     skin: wp.uint64,
+    others: wp.array[wp.uint64],
     rim: wp.array[wp.int32],
     reach: float,
     slack: float,
@@ -19,8 +20,8 @@ def match_kernel(
     normal: wp.array[wp.vec3],
     height: wp.array[float],
 ) -> None:
-    """The closest place of the cloth within `reach`, -1 for a point that is none of its: one nearer to the skin by more
-    than `slack`, one beyond a rim, and one on a side that the camera can't see."""
+    """The closest place of the cloth within `reach`, -1 for a point that is none of its: one nearer to one of the
+    `others`, or to the skin by more than `slack`, one beyond a rim, and one on a side that the camera can't see."""
     i = wp.tid()
     p = points[i]
     face[i] = -1
@@ -40,6 +41,10 @@ def match_kernel(
         or ((edges & 4) != 0 and query.v < 1.0e-4)
     ):
         return
+    for k in range(others.shape[0]):
+        other = wp.mesh_query_point_no_sign(others[k], p, wp.length(way))
+        if other.result:
+            return
     nearer = wp.length(way) - slack
     if nearer > 0.0:
         below = wp.mesh_query_point_no_sign(skin, p, nearer)

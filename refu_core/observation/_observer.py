@@ -97,14 +97,17 @@ class Observer:
         if seen is not None:
             self._skin.copy_(dressed.skin[0])
             self._skin_mesh.refit()
-        drapes = dict(dressed.drapes)
+        drapes, blends = dict(dressed.drapes), {}
+        for name, cloth in self._cloths.items():
+            weights = self._pipeline.garments[name].weights
+            blends[name] = blend_transforms(weights, dressed.transforms).rotation[0].cpu().numpy()
+            if seen is not None:
+                cloth.place(drapes[name].vertices[0].cpu().numpy() + _posed(blends[name], cloth.offset))
         for name, cloth in self._cloths.items():
             self.matched[name] = 0
             if seen is None and not cloth.estimate.is_informed:
                 continue
-            drape = drapes[name]
-            weights = self._pipeline.garments[name].weights
-            blend = blend_transforms(weights, dressed.transforms).rotation[0].cpu().numpy()
+            drape, blend = drapes[name], blends[name]
             if seen is not None:
                 self._fit(cloth, drape.vertices[0].cpu().numpy(), blend, seen, camera, name)
             offset = cloth.offset
@@ -135,7 +138,8 @@ class Observer:
         numbers, after = estimate.mean, estimate.precision
         for _ in range(1 if estimate.is_informed else how.first_rounds):
             cloth.place(predicted + _posed(blend, cloth.offset))
-            found = cloth.match(seen, self._skin_mesh, eye)
+            others = [other.tree for other in self._cloths.values() if other is not cloth]
+            found = cloth.match(seen, self._skin_mesh, others, eye)
             self.matched[name] = len(found.say)
             slopes = cloth.slopes(found, blend)
             trust = found.say / (1 + (found.height / how.robust) ** 2) / how.noise**2

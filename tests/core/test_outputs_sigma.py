@@ -58,6 +58,22 @@ def test_sigma_is_that_of_the_errors(tmp_path: Path) -> None:
         fit_sigma(garment, errors[:9], poses[:9])
 
 
+def test_of_somebody_who_lies_little_is_known(pipeline: GarmentPipeline) -> None:
+    name, ask = "short-pant-male", Sigma(pipeline)
+    pose = np.zeros((24, 3))
+    found = []
+    for lean in (0.0, 0.5, 0.9, 1.5):
+        pose[0, 0] = lean
+        frame = SmplFrame(pose=pose)
+        found.append(ask(frame, pipeline(frame))[name])
+    stands, leans, falls, lies = found
+    assert np.array_equal(stands, leans)
+    assert (falls > stands).all()
+    assert (lies >= UNKNOWN_SIGMA * (1 - 1e-6)).all()
+    frame = SmplFrame(pose=pose, up=np.array([0.0, np.cos(1.5), np.sin(1.5)]))  # a camera that leans as much
+    assert np.allclose(ask(frame, pipeline(frame))[name], stands)
+
+
 def test_what_nobody_has_measured_is_said_to_be_unknown(pipeline: GarmentPipeline) -> None:
     frame = SmplFrame(pose=np.zeros(72))
     every = Sigma(pipeline)
