@@ -36,8 +36,8 @@ REGIONS = 3
 _SWEEPS = 10
 """The errors of neighbours are averaged along edges so often: some fifty samples say less of one vertex than that."""
 _SEEN_TILT = (np.radians(40), np.radians(60))
-"""No training clip tilts the pelvis beyond the first of these [rad]; from the second on σ is `UNKNOWN_SIGMA` at least. Of
-somebody who lies a T-shirt is off by 12 to 18 mm, a skirt by 32 to 44, in place of 5."""
+"""No training clip tilts the pelvis beyond the first of these [rad]; from the second on σ is `UNKNOWN_SIGMA` at least.
+Of somebody who lies a T-shirt is off by 12 to 18 mm, a skirt by 32 to 44, in place of 5."""
 _FILE = "sigma"
 
 
