@@ -65,16 +65,7 @@ class ObservedCloth:
         std = settings.amplitude * falls / np.sqrt((falls**2).sum())
         self._fields = np.ascontiguousarray(fields[:, kept]) * std.astype(np.float32)
         """How far vertices move along the normal with each number [m], shape (V, K)."""
-        directions = [garment.shapedirs] if garment.styledirs is None else [garment.styledirs, garment.shapedirs]
-        self._cut = np.concatenate([d.detach().cpu().numpy().reshape(n, 3, -1) for d in directions], 2)
-        n_style = 0 if garment.styledirs is None else garment.styledirs.shape[1]
-        n_cut = self._cut.shape[2]
-        self._cut *= np.where(np.arange(n_cut) < n_style, settings.style, settings.shape)
-        self._cut = self._cut.astype(np.float32).reshape(3 * n, n_cut)
-        """Of style and shape: how coordinates change with each number [m], shape (3 V, C)."""
-        times = np.full(n_cut + len(std), settings.remembered)
-        times[:n_cut] = settings.style_remembered
-        self.estimate = Estimate(times, settings.bound)
+        self.estimate = Estimate(np.full(len(std), settings.remembered), settings.bound)
         self.reset()
         on_rim = garment.mesh.n_faces_of_edge[garment.mesh.edge_of_corner] == 1
         # Bit k says that the edge across from weight k is on the boundary, in the kernel's order of weights.
@@ -86,24 +77,21 @@ class ObservedCloth:
     def reset(self) -> None:
         """Forgets what was measured."""
         self.estimate.reset()
-        self._recut, self._lift = np.zeros(3 * len(self._out), np.float32), np.zeros(len(self._out), np.float32)
+        self._lift = np.zeros(len(self._out), np.float32)
 
     def wait(self, seconds: float) -> None:
         """Lets time pass. What is drawn fades as the numbers do."""
         self.estimate.wait(seconds)
-        self._recut *= math.exp(-seconds / self._settings.style_remembered)
         self._lift *= math.exp(-seconds / self._settings.remembered)
 
     def draw(self, numbers: NDArray[np.float64]) -> None:
         """Takes over what the numbers (D,) say, in standard deviations."""
-        n = self._cut.shape[1]
-        some = numbers.astype(np.float32)
-        self._recut, self._lift = self._cut @ some[:n], self._fields @ some[n:]
+        self._lift = self._fields @ numbers.astype(np.float32)
 
     @property
     def offset(self) -> F32:
         """What is drawn adds to the garment before it is posed [m], shape (V, 3)."""
-        found: F32 = self._recut.reshape(-1, 3) + self._lift[:, None] * self._out
+        found: F32 = self._lift[:, None] * self._out
         return found
 
     def place(self, vertices: F32) -> None:
@@ -141,12 +129,11 @@ class ObservedCloth:
         m = len(found.face)
         corner = self._faces[found.face].astype(np.int32)
         along = np.matmul(found.normal[:, None, None], blend[corner])[:, :, 0] * found.weight[:, :, None]
-        # Sparse products: what they gather is as large as a processor's cache, and isn't copied first.
-        places, ends = corner[:, :, None] * 3 + np.arange(3, dtype=np.int32), np.arange(m + 1, dtype=np.int32)
-        cut = csr_array((along.ravel(), places.ravel(), 9 * ends), shape=(m, 3 * len(blend)))
         lift = (along * self._out[corner]).sum(2)
-        fields = csr_array((lift.ravel(), corner.ravel(), 3 * ends), shape=(m, len(blend)))
-        return np.concatenate((cut @ self._cut, fields @ self._fields), axis=1)
+        # A sparse product: what it gathers is as large as a processor's cache, and isn't copied first.
+        ends = 3 * np.arange(m + 1, dtype=np.int32)
+        slopes: F32 = csr_array((lift.ravel(), corner.ravel(), ends), shape=(m, len(blend))) @ self._fields
+        return slopes
 
 
 def within(points: NDArray[np.floating], low: F32, high: F32) -> NDArray[np.bool_]:

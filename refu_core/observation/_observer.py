@@ -26,9 +26,10 @@ _LONGEST_GAP = 10.0
 class Observer:
     """Dresses one person, and brings the garments to measured points before collisions are handled.
 
-    Points change three things of a garment, each within bounds: its style, how it follows the shape, and a displacement
-    made of smooth fields. What they say is kept from frame to frame, fades, and can't drift (`Estimate`). The contact
-    stage runs after it as always, so a garment is as free of the body as without points, whatever is measured.
+    Points change a displacement made of smooth fields, within bounds. What they say is kept from frame to frame, fades,
+    and can't drift (`Estimate`). The contact stage runs after it as always, so a garment is as free of the body as
+    without points, whatever is measured. Style and shape stay as they were told: where points moved them, too, cloth
+    that isn't seen was 0.7 to 2 mm worse after 1.5 s, and what is seen no better.
 
     One observer for each person: it remembers. A pipeline may serve several.
 

@@ -16,11 +16,6 @@ class ObservationSettings:
     """Smooth fields of the displacement along the normal, at most."""
     finest: float = 55.0
     """Their largest wave number [rad/m]: waves of 11 cm. A small garment has fewer fields."""
-    style: float = 0.15
-    """How far the style γ may be from what it is said to be [standard deviations, each]. More than
-    this lets a displacement that isn't understood pass for a wider cut, which throws off what nobody sees."""
-    shape: float = 0.05
-    """The same of β, as the garment follows it: the body itself stays as it is."""
     amplitude: float = 0.009
     """Standard deviation of that displacement [m]: the networks' errors along the normal."""
     wave: float = 30.0
@@ -47,8 +42,6 @@ class ObservationSettings:
     """More points than this are thinned out evenly."""
     remembered: float = 0.5
     """Time after which a displacement has faded to a third [s]: folds change with the pose."""
-    style_remembered: float = 20.0
-    """The same of style and shape [s], which don't."""
     step: float = 1 / 30
     """Time between frames that have no stamps [s]."""
 

@@ -70,6 +70,17 @@ def test_the_visible_error_is_a_third_less(
     assert np.mean(after) < 0.7 * np.mean(before)
 
 
+def test_points_of_an_outer_garment_move_no_inner_one(pipeline: GarmentPipeline) -> None:
+    outfit = GarmentPipeline.load(["tshirt-male", NAME])
+    observer, frame = Observer(outfit), SmplFrame(pose=np.zeros((24, 3)))
+    shirt = outfit(frame)["tshirt-male"]
+    shorts = pipeline(frame)[NAME].local
+    near = shirt.raw[np.abs(shirt.raw[:, 1] - shorts[:, 1].max()) < 0.1]  # around the waistband
+    observer(frame, near)
+    assert observer.matched["tshirt-male"] > 20
+    assert observer.matched[NAME] < 0.2 * observer.matched["tshirt-male"]
+
+
 def test_without_points_it_is_the_prediction(
     pipeline: GarmentPipeline, observer: Observer, moments: list[Moment]
 ) -> None:
