@@ -59,7 +59,7 @@ def follow(
     frames = [track.update(place, round(1e9 * i / fps)) for i, place in enumerate(places)]
     poses = np.stack([np.full((24, 3), np.nan) if frame is None else frame.pose for frame in frames])
     transl = np.stack([np.full(3, np.nan) if frame is None else frame.transl for frame in frames])
-    pelvis = known_body.of(betas)[0]
+    pelvis = known_body.of(betas.astype(np.float64))[0]
     roots, transl = to_smpl(poses[:, 0].astype(np.float64), transl, axes, notes, usual=usual, pelvis=pelvis)
     poses[:, 0] = roots
     is_fitted = worn is not None
