@@ -52,7 +52,7 @@ class DressedBag:
         self._settings = {"sdf": str(options.sdf), "backbone": str(options.backbone)}
         self._writer = adapters.BagWriter(options.output, overwrite=options.overwrite, in_background=True)
         given = None if source.bag is None else source.bag.topic
-        own = {}
+        own: dict[str, Any] = {}
         if given is not None:
             own = {"definition": given.definition, "type_hash": given.type_hash, "betas_of": given.betas_of}
         self._writer.add_topic(source.topic, source.message_type, **own)

@@ -76,10 +76,11 @@ class _Layout:
 
     def frame(self, position: NDArray[Any], stamp_ns: int) -> SmplFrame:
         """The frame of as many positions as there are names."""
-        values = np.zeros(len(_NAMES))
+        values: NDArray[Any] = np.zeros(len(_NAMES))
         values[self.slots] = position[self.given]
         if self.is_ros4hri:
-            return SmplFrame(_ros4hri.pose_of(values[: len(_ros4hri.AXES)]), transl=-PELVIS, stamp_ns=stamp_ns)
+            turns: NDArray[Any] = _ros4hri.pose_of(values[: len(_ros4hri.AXES)])
+            return SmplFrame(turns, transl=-PELVIS, stamp_ns=stamp_ns)
         pose, betas, transl = np.split(values, [len(_POSE_NAMES), -len(_TRANSL_NAMES)])
         return SmplFrame(pose, betas, transl, stamp_ns=stamp_ns)
 

@@ -5,7 +5,10 @@ The other positions aren't read (bone lengths come from the betas, which this ty
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from msg_adapters.cdr import Buffer, CdrReader, CdrWriter
 from msg_adapters.errors import DecodeError, decoding
@@ -36,7 +39,8 @@ def from_bytes(data: Buffer) -> SmplFrame:
             msg = f"the orientation of {JOINT_NAMES[joint]} isn't a rotation: {quaternions[joint].tolist()}"
             msg += "; an identity is (0, 0, 0, 1)"
             raise DecodeError(msg)
-        return SmplFrame(rotvec_from_quaternion(quaternions), transl=poses[0, :3], stamp_ns=stamp_ns)
+        pose: NDArray[Any] = rotvec_from_quaternion(quaternions)
+        return SmplFrame(pose, transl=poses[0, :3], stamp_ns=stamp_ns)
 
 
 def to_bytes(frame: SmplFrame, *, frame_id: str = "map") -> bytes:

@@ -133,7 +133,7 @@ def test_persons_stand_apart_and_move_apart(context: Context, tmp_path: Path) ->
         status = process.wait(PATIENCE_S)
         listener.close()
     assert status == 0, log.read_text()
-    decode = adapters.decoder_for("joint_state")
+    decode = adapters.decoder_for("joint_state").from_bytes
     ann, bob = ({f.stamp_ns: f for f in map(decode, messages)} for messages in listener.received.values())
     common = sorted(ann.keys() & bob.keys())
     assert common
@@ -162,7 +162,7 @@ def test_ends_with_the_motion(context: Context) -> None:
     listener.executor.add_node(node)
     while not node.finished:
         listener.executor.spin_once(timeout_sec=1.0)
-    decode, received = adapters.decoder_for("joint_state"), listener.received["smpl_params"]
+    decode, received = adapters.decoder_for("joint_state").from_bytes, listener.received["smpl_params"]
     listener.until(lambda: bool(received) and np.allclose(decode(received[-1]).pose, march().poses[-1], atol=1e-5))
     node.destroy_node()
     listener.close()
