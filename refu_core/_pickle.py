@@ -20,6 +20,7 @@ from refu_core._pickle_machine import (
     Name,
     Record,
     Unpickler,
+    bytes_of,
     dtype_of,
     exactly,
     is_plain,
@@ -71,14 +72,13 @@ class PickledArrays:
                 raise ValueError(msg)
             _, shape, kind, is_fortran, raw = record.state
             order = "F" if is_fortran else "C"
-        raw = raw.encode("latin1") if isinstance(raw, str) else raw
-        if not isinstance(kind, Record) or kind.kind != "dtype" or not isinstance(raw, bytes):
+        if not isinstance(kind, Record) or kind.kind != "dtype" or not isinstance(raw, (str, bytes)):
             msg = "an array of objects"
             raise ValueError(msg)
         dtype = dtype_of(kind)
         shape = tuple(operator.index(n) for n in exactly(tuple, shape))
         self._budget.take(shape, dtype)
-        flat: NDArray[Any] = np.frombuffer(raw, dtype)
+        flat: NDArray[Any] = np.frombuffer(bytes_of(raw), dtype)
         return flat.reshape(shape, order="F" if order == "F" else "C")
 
     def _tensor(self, record: Record) -> NDArray[Any]:
@@ -125,7 +125,7 @@ class PickledArrays:
 
 def _streamed(record: Record) -> tuple[Record, Callable[[str], bytes]]:
     """A storage that torch has written as a stream of its own, and what gives its bytes."""
-    file = io.BytesIO(exactly(bytes, record.args[0] if record.args else None))
+    file = io.BytesIO(bytes_of(record.args[0] if record.args else None))
     if Unpickler(file).load() != STREAM_MAGIC:
         msg = "a tensor whose numbers are no stream of torch"
         raise ValueError(msg)

@@ -36,11 +36,12 @@ _NUMPY = ("numpy.core", "numpy._core")
 MODEL_NAMES: dict[str, str] = {
     "numpy.dtype": "dtype",
     "numpy.ndarray": "array",
-    "_codecs.encode": "latin1",
+    "_codecs.encode": "bytes",
     **{f"{package}.multiarray._reconstruct": "new array" for package in _NUMPY},
     **{f"{package}.numeric._frombuffer": "buffer" for package in _NUMPY},
     **{f"{module}._reconstructor": "new" for module in ("copy_reg", "copyreg")},
-    **{f"{module}.{name}": name for module in ("__builtin__", "builtins") for name in ("object", "bytearray")},
+    **{f"{module}.object": "object" for module in ("__builtin__", "builtins")},
+    **{f"{module}.bytearray": "bytes" for module in ("__builtin__", "builtins")},
     **{f"{module}.csc_matrix": "sparse" for module in ("scipy.sparse.csc", "scipy.sparse._csc", "scipy.sparse")},
     **{f"chumpy.{name}": "chumpy" for name in ("ch.Ch", "ch.MatVecMult", "reordering.Select")},
 }
@@ -260,6 +261,12 @@ def exactly(kind: type[Any], value: Any) -> Any:
     return value
 
 
+def bytes_of(value: Any) -> bytes:
+    """Bytes, which Python 3 writes as text into protocol 2; made when asked for, as many may share one text."""
+    encoded: bytes = value.encode("latin1") if type(value) is str else exactly(bytes, value)
+    return encoded
+
+
 def dtype_of(record: Record) -> np.dtype[Any]:
     """The type of numbers that a record of one stands for."""
     code = record.args[0] if record.args else None
@@ -274,7 +281,7 @@ def dtype_of(record: Record) -> np.dtype[Any]:
 def scalar_of(record: Record) -> NDArray[Any]:
     """NumPy's scalar that a record of one stands for; trackers count persons with them."""
     dtype, raw = record.args
-    return np.frombuffer(exactly(bytes, raw), dtype_of(exactly(Record, dtype)), count=1).reshape(())
+    return np.frombuffer(bytes_of(raw), dtype_of(exactly(Record, dtype)), count=1).reshape(())
 
 
 def is_plain(code: Any) -> bool:
@@ -293,9 +300,7 @@ def _made(called: Any, args: tuple[Any, ...]) -> Any:
         return {}
     if kind == "new array":
         return Record("array")
-    if kind == "latin1":  # how Python 3 writes bytes into protocol 2
-        return exactly(str, args[0]).encode("latin1")
-    return args[0] if kind == "bytearray" and args else Record(kind, args)
+    return args[0] if kind == "bytes" and args else Record(kind, args)
 
 
 def _put(holder: Any, items: list[Any]) -> None:

@@ -47,9 +47,10 @@ class SelfContact:
         queries = as_vertices("points", points)
         if self.is_free or not len(queries):
             return np.zeros(len(queries), np.bool_)
-        contact = Surface(self.vertices.astype(np.float64), self._body_faces[self.faces])
-        away: NDArray[Any] = np.linalg.norm(contact.at(contact.closest(queries)) - queries, axis=1)
-        closest = Surface(self.vertices.astype(np.float64), self._body_faces).closest(queries).face
+        vertices, places = self.vertices.astype(np.float64), queries.astype(np.float64)
+        contact = Surface(vertices, self._body_faces[self.faces])
+        away: NDArray[Any] = np.linalg.norm(contact.at(contact.closest(places)) - places, axis=1)
+        closest = Surface(vertices, self._body_faces).closest(places).face
         is_within = _are_inside(Winding(torch.from_numpy(self._body_faces)), self.vertices, queries)
         near: NDArray[np.bool_] = (away <= distance) | (np.isin(closest, self.faces) & is_within)
         return near
@@ -82,7 +83,7 @@ class SelfContactDetector:
             raise MeshError(msg)
         pairs, buried = self._contacts(vertices)
         # Without a crossing nothing is buried but what a fold of toes comes near to.
-        covered = np.flatnonzero((buried & ~self._rest_buried)[self._faces].any(axis=1)) if len(pairs) else []
+        covered = np.flatnonzero((buried & ~self._rest_buried)[self._faces].any(axis=1) & (len(pairs) > 0))
         pairs = pairs[~np.isin(self._keys(pairs), self._rest_pairs)]
         faces = np.union1d(pairs, covered).astype(np.int32)
         return SelfContact(pairs, faces, vertices, self._faces)
