@@ -39,8 +39,7 @@ class RestFaces:
 
     def __init__(self, body: SmplBody) -> None:
         """Around the mean shape of `body`, on its device."""
-        rest, faces = body.v_template.float().cpu().numpy(), body.faces.cpu().numpy().astype(np.int32)
-        low, face = _grid_of(rest.tobytes(), faces.tobytes(), str(body.device))
+        low, face = _grid_of(body)
         self._device = torch.device(body.device)
         fixed = [wp.vec3(*low), _CELL, wp.array(face, dtype=wp.int32, device=str(self._device))]
         self._look_up = Repeated(grid_lookup_kernel, (wp.vec3, wp.int32), fixed)
@@ -61,19 +60,15 @@ class RestFaces:
         return near.view(unposed.shape[:-1])
 
 
-@lru_cache(maxsize=3)
-def _grid_of(rest_bytes: bytes, face_bytes: bytes, device: str) -> tuple[list[float], NDArray[np.int32]]:
-    """Least corner [m], and near face of each cell by y, x and z: vertices in a row are mostly about as high.
-
-    Of arrays as bytes, by which they are known again: every pipeline of one body asks for the same.
-    """
-    rest = torch.from_numpy(np.frombuffer(rest_bytes, np.float32).reshape(-1, 3).copy())
-    faces = torch.from_numpy(np.frombuffer(face_bytes, np.int32).reshape(-1, 3).copy())
-    exact = ExactSdf(faces, device=device)
-    exact.update(rest.to(device))
+@lru_cache(maxsize=3)  # every pipeline of one body asks for the same
+def _grid_of(body: SmplBody) -> tuple[list[float], NDArray[np.int32]]:
+    """Least corner [m], and near face of each cell by y, x and z: vertices in a row are mostly about as high."""
+    exact = ExactSdf(body.faces, device=body.device)
+    exact.update(body.v_template.float())
+    rest, faces = body.v_template.float().cpu(), body.faces.cpu()
     low, high = rest.amin(0) - _ROOM, rest.amax(0) + _ROOM
     shape = ((high - low) / _CELL).ceil().int().tolist()
-    middles = rest[faces.long()].mean(1)
+    middles = rest[faces].mean(1)
     on_skin = np.zeros(shape, np.bool_)
     on_skin[tuple(((middles - low) / _CELL).long().numpy().T)] = True
     band = binary_dilation(on_skin, np.ones((3, 3, 3), np.bool_), iterations=_BAND)
