@@ -100,8 +100,7 @@ class Anatomy:
         self.segments = self._bind_segments(rest, solids, weights)
         self.farthest = self._thickness(rest, mesh).mul(settings.thin).clamp(max=settings.farthest)
         """How far skin may be moved [m], shape (V,)."""
-        joints = body.joint_template.double().cpu().numpy()
-        self.aside = Aside(rest, mesh, weights, joints, settings.aside_farthest, settings.aside_rounds, self.device)
+        self.aside = Aside(body, mesh, farthest=settings.aside_farthest, rounds=settings.aside_rounds)
         """Arms out of what isn't an arm."""
         self.work = self.memory.work
         self.work.farthest = as_warp(self.farthest, wp.float32)
