@@ -96,12 +96,11 @@ class Anatomy:
         self.memory = Memory(len(rest), n_middles, len(mesh.edges), settings.deepen_rounds, self.device)
         self.rings = self._bind_rings(mesh)
         self.bones = self._bind_bones(rest, mesh, weights)
-        self.seams = self._bind_seams(rest, mesh, weights)
+        self.seams = self._bind_seams(body)
         self.segments = self._bind_segments(rest, solids, weights)
         self.farthest = self._thickness(rest, mesh).mul(settings.thin).clamp(max=settings.farthest)
         """How far skin may be moved [m], shape (V,)."""
-        joints = body.joint_template.double().cpu().numpy()
-        self.aside = Aside(rest, mesh, weights, joints, settings.aside_farthest, settings.aside_rounds, self.device)
+        self.aside = Aside(body, mesh, farthest=settings.aside_farthest, rounds=settings.aside_rounds)
         """Arms out of what isn't an arm."""
         self.work = self.memory.work
         self.work.farthest = as_warp(self.farthest, wp.float32)
@@ -131,9 +130,9 @@ class Anatomy:
         bones.parent, bones.levels = self._ints([max(parent, 0) for parent in PARENTS]), self._floats(LEVELS)
         return bones
 
-    def _bind_seams(self, rest: NDArray[np.float64], mesh: Connectivity, weights: NDArray[np.float64]) -> Any:
+    def _bind_seams(self, body: SmplBody) -> Any:
         how = self.settings
-        found = find_creases(rest, mesh.edges, weights, reach=how.crease_reach + FADE)
+        found = find_creases(body, how.crease_reach + FADE)
         beyond = np.clip(found.along - how.crease_reach, 0.0, None)
         held, first = np.unique(found.vertex, return_index=True)
         seams = kernels.Seams()

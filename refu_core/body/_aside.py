@@ -18,6 +18,7 @@ from refu_core.body import _aside_kernels as kernels
 from refu_core.body._collider_gradient import weights_at
 from refu_core.body._collider_kernels import Means
 from refu_core.body._kinematics import rotvec_to_rotmat
+from refu_core.body._model import SmplBody
 from refu_core.body._parts import ARMS, joints_of, part_of_faces
 from refu_core.body._segments import SOFTNESS, cut
 from refu_core.mesh import Connectivity
@@ -43,21 +44,13 @@ class Aside:
     most. So arms go continuously; where none is inside, nothing moves.
     """
 
-    def __init__(
-        self,
-        rest: Array,
-        mesh: Connectivity,
-        weights: Array,
-        joints: Array,
-        farthest: float,
-        rounds: int,
-        device: torch.device,
-    ) -> None:
-        """Of a rest pose (V, 3) [m], skinning weights (V, 24) and joints (24, 3) [m].
-
-        No arm goes by more than `farthest` [m], in as many `rounds`.
-        """
-        self._farthest, self._rounds, self._device = farthest, rounds, device
+    def __init__(self, body: SmplBody, mesh: Connectivity, *, farthest: float, rounds: int) -> None:
+        """Of a body of a closed `mesh`. No arm goes by more than `farthest` [m], in as many `rounds`."""
+        self._farthest, self._rounds, self._device = farthest, rounds, body.device
+        device = body.device
+        rest, weights, joints = (
+            one.double().cpu().numpy() for one in (body.v_template, body.weights, body.joint_template)
+        )
         self._is_serial = device.type == "cpu"
         share = np.stack([weights[:, list(one)].sum(1) for one in ARMS], axis=1)
         solids = cut(mesh.faces, np.concatenate((1 - share.sum(1, keepdims=True), share), axis=1))

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import itertools
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from refu_core.body._kinematics import JOINT_NAMES, PARENTS
+from refu_core.mesh import Connectivity
+
+if TYPE_CHECKING:
+    from refu_core.body._model import SmplBody
 
 LEVELS = (0.25, 0.5, 0.75)
 """A joint has a seam where this share of the skinning weight is the joint's, with all that hangs on it. With the middle
@@ -58,28 +62,11 @@ class Creases(NamedTuple):
     """… by these weights, shape (R, 6)."""
 
 
-def find_creases(
-    rest: NDArray[np.float64], edges: NDArray[np.int32], weights: NDArray[np.float64], *, reach: float
-) -> Creases:
-    """The creases of a body: rest pose (V, 3) [m], edges (E, 2), skinning weights (V, 24).
-
-    Skin farther than `reach` [m] from a seam isn't held by it. The last few bodies are remembered: every pipeline and
-    every checker of one body asks for the same.
-    """
-    return _find(
-        np.ascontiguousarray(rest, np.float64).tobytes(),
-        np.ascontiguousarray(edges, np.int32).tobytes(),
-        np.ascontiguousarray(weights, np.float64).tobytes(),
-        reach,
-    )
-
-
-@lru_cache(maxsize=3)
-def _find(rest_bytes: bytes, edge_bytes: bytes, weight_bytes: bytes, reach: float) -> Creases:
-    """Of arrays as bytes, by which they are known again."""
-    rest = np.frombuffer(rest_bytes, np.float64).reshape(-1, 3)
-    edges = np.frombuffer(edge_bytes, np.int32).reshape(-1, 2)
-    weights = np.frombuffer(weight_bytes, np.float64).reshape(len(rest), -1)
+@lru_cache(maxsize=3)  # every pipeline and every checker of one body asks for the same
+def find_creases(body: SmplBody, reach: float) -> Creases:
+    """The creases of a body. Skin farther than `reach` [m] from a seam isn't held by it."""
+    rest, weights = (one.double().cpu().numpy() for one in (body.v_template, body.weights))
+    edges = Connectivity.of(body.faces.cpu(), len(rest)).edges
     moved_by = _moved_by(weights)
     tree = cKDTree(rest)
     station_rows: list[tuple[NDArray[Any], NDArray[Any]]] = []

@@ -163,6 +163,18 @@ class SmplBody:
         """Joints of the mean shape [m], shape (24, 3)."""
         self._joint_shapedirs = tensor(np.einsum("jv,vcb->jcb", arrays.joint_regressor, arrays.shapedirs))
 
+    def __eq__(self, other: object) -> bool:
+        """Whether it is the same body, in the same precision and on the same device."""
+        return isinstance(other, SmplBody) and self._identity == other._identity
+
+    def __hash__(self) -> int:
+        """By what makes bodies equal."""
+        return hash(self._identity)
+
+    @property
+    def _identity(self) -> tuple[str, torch.device, torch.dtype]:
+        return self.fingerprint, self.device, self.dtype
+
     def __repr__(self) -> str:
         return f"SmplBody({self.name!r}, {self.n_vertices} vertices, {self.dtype}, {self.device})"
 

@@ -105,18 +105,18 @@ def derivatives(name: str) -> Derivatives:
     return Derivatives(*found)
 
 
-def register(source: SmplBody, target: SmplBody, settings: RegistrationSettings | None = None) -> Registration:
+def register(source: SmplBody, target: SmplBody) -> Registration:
     """Lays the mesh of `source` onto the rest surface of `target`, in some seconds.
 
     First by shape, pose and place of the source; then each vertex to the closest point, less and less held back by its
     neighbours.
     """
-    return _Registrar(source, target, settings or RegistrationSettings()).run()
+    return _Registrar(source, target).run()
 
 
 class _Registrar:
-    def __init__(self, source: SmplBody, target: SmplBody, settings: RegistrationSettings) -> None:
-        self.how = settings
+    def __init__(self, source: SmplBody, target: SmplBody) -> None:
+        self.how = RegistrationSettings()
         self.source = source.to(device="cpu", dtype=torch.float64)
         self.target = target.to(device="cpu", dtype=torch.float64)
         self.mesh = Connectivity.of(source.faces.cpu().numpy(), source.n_vertices)

@@ -81,8 +81,8 @@ class Solver:
         self._settings = settings
         self._fits_betas = fits_betas
         turns = 3 + 3 * skeleton.turning[:, None] + np.arange(3)
-        parts = [np.arange(3), turns.ravel(), np.arange(N_PARTS)[BETAS] if fits_betas else []]
-        self._free = np.concatenate(parts).astype(np.intp)
+        betas = np.arange(N_PARTS)[BETAS if fits_betas else slice(0)]
+        self._free = np.concatenate((np.arange(3), turns.ravel(), betas))
         """The unknowns among the parts of a step."""
         of_turns = 3 + np.arange(turns.size).reshape(-1, 3)
         self._blocks = of_turns[:, :, None], of_turns[:, None]

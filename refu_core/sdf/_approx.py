@@ -136,7 +136,7 @@ class ApproxSdf(MeshSdf):
             fixed = [self._posed.points, _CELL, _DEPTH]
             self._enter = Repeated(enter_guides_kernel, (wp.vec4i, wp.int32), fixed)
             self._walk = Repeated(walk_kernel, (wp.vec3, wp.int32, wp.int32, *FOUND), [self._posed, self._guides])
-            fixed = [self._exact.mesh_id, self._posed, self._exact_from]
+            fixed = [self._exact_of_pose().mesh_id, self._posed, self._exact_from]
             self._ask_deep = Repeated(requery_deep_kernel, (wp.vec3, *FOUND), fixed)
         self._enter((len(self._guide_rows),), self._guide_rows, self._table)
 

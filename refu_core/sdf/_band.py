@@ -133,7 +133,7 @@ class BandSdf(MeshSdf):
     def _find(self, points: Tensor, near: Tensor | None) -> Found:
         if near is not None or len(points) < _FEW:
             near = torch.full((len(points),), -1, dtype=torch.int32) if near is None else near
-            self.skin()
+            self.skin()  # fits the tree to the pose
             return ask(self._tell, points, near, self._all)
         found = self._scan(points, beyond=math.inf)
         self._ask_tree(points, found, found.face < 0)
@@ -143,7 +143,7 @@ class BandSdf(MeshSdf):
         """Replaces those of the answers that are asked for by the tree's, and says whether there are any."""
         any_asked = bool(is_asked.any())
         if any_asked:
-            self.skin()
+            self.skin()  # fits the tree to the pose
             self._tell((len(points),), points, found.face, is_asked, *found)
         return any_asked
 

@@ -67,7 +67,6 @@ class ExactSdf(MeshSdf):
             msg = f'sign must be "normal" or "winding", got {sign!r}'
             raise MeshError(msg)
         super().__init__(faces, device=device)
-        self.sign: Sign = sign
         self._by_winding = sign == "winding"
         self._rebuild_distance = rebuild_distance
         self._built_at = torch.empty(0, 3)  # the pose the BVH was built for

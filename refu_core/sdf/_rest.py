@@ -23,8 +23,6 @@ _CELL = 0.015
 """Edge of the grid's cells [m]: less than the body's longer edges, so a look-up is mostly no face off, or one."""
 _BAND = 2
 """Cells around the skin whose closest face is asked for; those farther out take that of the nearest such cell."""
-_BLOCK = 4
-"""Cells of a block's edge, as `grid_lookup_kernel` has it."""
 _ROOM = 0.1
 """How far the grid reaches beyond the body [m]; places outside of it are looked up at its border."""
 
@@ -41,11 +39,9 @@ class RestFaces:
 
     def __init__(self, body: SmplBody) -> None:
         """Around the mean shape of `body`, on its device."""
-        rest, faces = body.v_template.float().cpu().numpy(), body.faces.cpu().numpy().astype(np.int32)
-        low, shape, rows = _grid_of(rest.tobytes(), faces.tobytes(), str(body.device))
+        low, face = _grid_of(body)
         self._device = torch.device(body.device)
-        grid = wp.array(rows, dtype=wp.int32, device=str(self._device))
-        fixed = [wp.vec3(*low), _CELL, wp.vec3i(*shape), grid]
+        fixed = [wp.vec3(*low), _CELL, wp.array(face, dtype=wp.int32, device=str(self._device))]
         self._look_up = Repeated(grid_lookup_kernel, (wp.vec3, wp.int32), fixed)
 
     def under(self, unposed: Tensor, betas: Tensor, shapedirs: Tensor) -> Tensor:
@@ -64,20 +60,15 @@ class RestFaces:
         return near.view(unposed.shape[:-1])
 
 
-@lru_cache(maxsize=3)
-def _grid_of(rest_bytes: bytes, face_bytes: bytes, device: str) -> tuple[list[float], list[int], NDArray[np.int32]]:
-    """Least corner [m], cells along each axis, and near face of each cell, block by block.
-
-    Of arrays as bytes, by which they are known again: every pipeline of one body asks for the same.
-    """
-    rest = torch.from_numpy(np.frombuffer(rest_bytes, np.float32).reshape(-1, 3).copy())
-    faces = torch.from_numpy(np.frombuffer(face_bytes, np.int32).reshape(-1, 3).copy())
-    exact = ExactSdf(faces, device=device)
-    exact.update(rest.to(device))
+@lru_cache(maxsize=3)  # every pipeline of one body asks for the same
+def _grid_of(body: SmplBody) -> tuple[list[float], NDArray[np.int32]]:
+    """Least corner [m], and near face of each cell by y, x and z: vertices in a row are mostly about as high."""
+    exact = ExactSdf(body.faces, device=body.device)
+    exact.update(body.v_template.float())
+    rest, faces = body.v_template.float().cpu(), body.faces.cpu()
     low, high = rest.amin(0) - _ROOM, rest.amax(0) + _ROOM
-    blocks = ((high - low) / (_BLOCK * _CELL)).ceil().int()
-    shape = (_BLOCK * blocks).tolist()
-    middles = rest[faces.long()].mean(1)
+    shape = ((high - low) / _CELL).ceil().int().tolist()
+    middles = rest[faces].mean(1)
     on_skin = np.zeros(shape, np.bool_)
     on_skin[tuple(((middles - low) / _CELL).long().numpy().T)] = True
     band = binary_dilation(on_skin, np.ones((3, 3, 3), np.bool_), iterations=_BAND)
@@ -85,6 +76,4 @@ def _grid_of(rest_bytes: bytes, face_bytes: bytes, device: str) -> tuple[list[fl
     face = np.zeros(shape, np.int32)
     face[band] = exact.closest(centres).face.cpu().numpy()
     nearest = distance_transform_edt(~band, return_distances=False, return_indices=True)
-    by_block = face[tuple(nearest)].reshape([n for count in blocks.tolist() for n in (count, _BLOCK)])
-    rows = by_block.transpose(0, 2, 4, 1, 3, 5).reshape(-1, _BLOCK**3)
-    return low.tolist(), shape, rows
+    return low.tolist(), np.ascontiguousarray(face[tuple(nearest)].swapaxes(0, 1))

@@ -78,23 +78,18 @@ def row_of(x: int, y: int, z: int) -> int:
 def grid_lookup_kernel(
     low: wp.vec3,
     cell: float,
-    shape: wp.vec3i,
-    grid: wp.array2d[int],
+    grid: wp.array3d[int],
     places: wp.array[wp.vec3],
     # outputs
     near: wp.array[int],
 ) -> None:
-    """Looks places up in a grid with the corner `low`; places outside of it at its border.
-
-    Its cells come in blocks of 4 x 4 x 4, a row each, so what is near in space is mostly near in memory, too.
-    """
+    """Looks places up in a grid, by y, x and z, with the corner `low`; places outside of it at its border."""
     i = wp.tid()
     p = (places[i] - low) / cell
-    x = int(wp.clamp(p[0], 0.0, float(shape[0] - 1)))
-    y = int(wp.clamp(p[1], 0.0, float(shape[1] - 1)))
-    z = int(wp.clamp(p[2], 0.0, float(shape[2] - 1)))
-    block = ((x >> 2) * (shape[1] >> 2) + (y >> 2)) * (shape[2] >> 2) + (z >> 2)
-    near[i] = grid[block, ((x & 3) << 4) | ((y & 3) << 2) | (z & 3)]
+    x = int(wp.clamp(p[0], 0.0, float(grid.shape[1] - 1)))
+    y = int(wp.clamp(p[1], 0.0, float(grid.shape[0] - 1)))
+    z = int(wp.clamp(p[2], 0.0, float(grid.shape[2] - 1)))
+    near[i] = grid[y, x, z]
 
 
 @wp.kernel(enable_backward=False)

@@ -29,14 +29,10 @@ class Winding:
         mesh.require_closed()
         device = faces.device
         self._body = torch.zeros(mesh.n_vertices, 3, device=device)
-        # The first point of each cell, its least distance, and the box of all: as they are before any point is known.
+        # The first point of each cell, its least distance, and the box of all.
         n = 2 * _N_CELLS**2
-        box = torch.tensor([torch.inf] * 3 + [-torch.inf] * 3)
-        blank = (torch.full((n,), -1, dtype=torch.int32), torch.full((n,), torch.inf).view(torch.int32))
-        self._blank = torch.cat((*blank, box.view(torch.int32))).to(device)
-        self._memory = self._blank.clone()
-        self._first, rest = self._memory[:n], self._memory[n:].view(torch.float32)
-        self._farthest_in, self._box = rest[:n], rest[n:].view(2, 3)
+        self._first = torch.empty(n, dtype=torch.int32, device=device)
+        self._farthest_in, self._box = torch.empty(n, device=device), torch.empty(2, 3, device=device)
         # A CPU's compiler keeps more in registers within a loop than from call to call.
         n_faces = len(mesh.faces)
         each = n_faces if device.type == "cpu" else 1
@@ -58,7 +54,10 @@ class Winding:
         points = points.to(device=device, dtype=torch.float32).contiguous()
         winding, following = (torch.zeros(n, dtype=torch.int32, device=device) for _ in range(2))
         if n:
-            self._memory.copy_(self._blank)
+            self._first.fill_(-1)
+            self._farthest_in.fill_(torch.inf)
+            self._box[0].fill_(torch.inf)
+            self._box[1].fill_(-torch.inf)
             listed = points, self._box, self._first, following, self._farthest_in
             n_strips, each = strips(n, device)
             self._bound((n_strips,), each, points, self._box)
