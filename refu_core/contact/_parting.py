@@ -31,7 +31,8 @@ class Parting:
         self._settings, self._device, self._sheet = settings, rest.device, sheet
         self._is_serial = rest.device.type == "cpu"
         n, n_faces = len(rest), len(cut.faces)
-        self._points, self._other = torch.zeros(2, n, 3, device=rest.device)
+        self._points = torch.zeros(n, 3, device=rest.device)
+        self._other = torch.zeros_like(self._points)
         self._marked, self._wider = torch.zeros(2, n, device=rest.device)
         self._count = torch.zeros(1, dtype=torch.int32, device=rest.device)
         self._ways = torch.zeros(2, n_faces, 3, device=rest.device)

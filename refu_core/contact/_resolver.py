@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -91,7 +90,7 @@ class Resolver:
         # On a CPU a kernel is one thread and can do several short steps, and reading a number costs nothing.
         self._is_serial = self.device.type == "cpu"
         self._read_counts = self._counts.numpy() if self._is_serial else np.zeros(0)
-        self._launches = lru_cache(_MOST_MARGINS)(self._recorded)
+        self._known: dict[tuple[Any, float], dict[str, Any]] = {}
 
     @torch.no_grad()
     def __call__(
@@ -224,6 +223,13 @@ class Resolver:
         if parameter is not None:
             self._commands[name].set_param_at_index(*parameter)
         self._commands[name].launch()
+
+    def _launches(self, skin: Any, margin: float) -> dict[str, Any]:
+        if (skin, margin) not in self._known:
+            if len(self._known) >= _MOST_MARGINS:
+                self._known.clear()
+            self._known[skin, margin] = self._recorded(skin, margin)
+        return self._known[skin, margin]
 
     def _recorded(self, skin: Any, margin: float) -> dict[str, Any]:
         """The launches of a frame, by name: on a CPU by one thread, which goes through all."""
