@@ -52,7 +52,7 @@ class Controls:
         graph = sparse.csr_array((length, (first, second)), (len(points), len(points)))
         chosen, way = [0], np.full(len(points), np.inf)
         while len(chosen) < min(count, len(points)):
-            way = np.minimum(way, dijkstra(graph, directed=False, indices=chosen[-1]))
+            way = np.minimum(way, dijkstra(graph, directed=False, indices=[chosen[-1]])[0])
             chosen.append(int(way.argmax()))
         return cls(garment.mesh, torch.tensor(chosen, dtype=torch.int32))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -85,7 +86,9 @@ class GarmentTemplate:
     def to(self, *, device: str | torch.device | None = None, dtype: torch.dtype | None = None) -> GarmentTemplate:
         """The same garment on another device or in another precision."""
         own = {name: getattr(self, name) for name in ("weights", "v_template", "shapedirs", "styledirs")}
-        moved = {name: None if one is None else one.to(device=device, dtype=dtype) for name, one in own.items()}
+        moved: dict[str, Any] = {
+            name: None if one is None else one.to(device=device, dtype=dtype) for name, one in own.items()
+        }
         return replace(self, faces=self.faces.to(device=device), **moved)
 
     def rest(self, betas: Tensor, style: Tensor | None = None) -> Tensor:

@@ -86,7 +86,15 @@ def load_clips(path: str | Path, *, axes: Axes = "auto", fps: float | None = Non
     if not files or not files[0].exists():
         msg = f"{path}: wanted motions ({', '.join(SUFFIXES)}), found none; give a folder of them or a file"
         raise SimulationError(msg)
-    return [_load_clip(file, axes, fps, path if path.is_dir() else path.parent) for file in files]
+    clips, folder = [], path if path.is_dir() else path.parent
+    for file in files:
+        found = read_recording(file, error=SimulationError, axes="z-up" if axes == "frame" else axes, fps=fps)
+        if not (np.isfinite(found.poses).all() and np.isfinite(found.transl).all()):
+            msg = f"{file}: wanted finite poses and trans; cut out the frames that aren't"
+            raise SimulationError(msg)
+        name = file.relative_to(folder).with_suffix("").as_posix()
+        clips.append(Clip(name, found.poses, found.transl, found.fps, found.notes))
+    return clips
 
 
 def as_clips(motions: str | Path | Sequence[Clip]) -> list[Clip]:
@@ -99,17 +107,8 @@ def _is_shape(path: Path) -> bool:
     return path.name == "shape.npz" or path.stem.endswith("_stagei")
 
 
-def _load_clip(path: Path, axes: Axes, fps: float | None, folder: Path) -> Clip:
-    recording = read_recording(path, error=SimulationError, axes="z-up" if axes == "frame" else axes, fps=fps)
-    if not (np.isfinite(recording.poses).all() and np.isfinite(recording.transl).all()):
-        msg = f"{path}: wanted finite poses and trans; cut out the frames that aren't"
-        raise SimulationError(msg)
-    name = path.relative_to(folder).with_suffix("").as_posix()
-    return Clip(name, recording.poses, recording.transl, recording.fps, recording.notes)
-
-
-def split_clips(clips: Sequence[Clip], *, test_every: int = 5) -> tuple[list[Clip], list[Clip]]:
-    """Train and test clips: every `test_every`-th by name, from the second on, is kept for the test, whole.
+def split_clips(clips: Sequence[Clip]) -> tuple[list[Clip], list[Clip]]:
+    """Train and test clips: every fifth by name, from the second on, is kept for the test, whole.
 
     Raises `SimulationError` for fewer than two clips, which can't be split.
     """
@@ -117,7 +116,7 @@ def split_clips(clips: Sequence[Clip], *, test_every: int = 5) -> tuple[list[Cli
         msg = f"wanted two motions or more, so that whole ones can be kept for the test; got {len(clips)}"
         raise SimulationError(msg)
     ordered = sorted(clips, key=lambda clip: clip.name)
-    test = [clip for i, clip in enumerate(ordered) if i % test_every == 1]
+    test = [clip for i, clip in enumerate(ordered) if i % 5 == 1]
     return [clip for clip in ordered if clip not in test], test
 
 

@@ -239,11 +239,10 @@ def principal_components(values: Tensor, *, rank: int) -> tuple[Tensor, Tensor]:
 
 def _check(dataset: GarmentDataset | GarmentSequences, body: SmplBody, garment: GarmentTemplate) -> None:
     """Raises `RefuError` for a set that wasn't simulated for this garment on this body."""
-    checks = {
-        "garment": (garment.name, dataset.parts),
-        "body_fingerprint": (body.fingerprint, [dataset.card.get("body_fingerprint")]),
-    }
-    for what, (wanted, of_set) in checks.items():
+    for what, wanted, of_set in (
+        ("garment", garment.name, dataset.parts),
+        ("body_fingerprint", body.fingerprint, [dataset.card.get("body_fingerprint")]),
+    ):
         if wanted not in of_set:
             got = dataset.card.get(what)
             msg = f"wanted a set whose {what} is {wanted}, got {got}: simulate one with `refu simulate {garment.name}`"

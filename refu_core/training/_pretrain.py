@@ -204,12 +204,12 @@ def stages(
         mean = train.displacement.mean(0)
         model.mean.copy_(mean)
         model.scale.copy_((train.displacement - mean).std())
-        model.head.standardise(torch.cat((_features(model, train), train.style_shape), 1), model.features.groups)
+        model.head.standardise(torch.cat((model.features(train.pose), train.style_shape), 1), model.features.groups)
         parts = [(s.betas, s.pose, s.style, s.displacement) for s in (train, validation)]
         objective = Objective([model], lambda *inputs: model(*inputs).displacement, _vertex_loss)
         return [TrainingStage("all", objective, settings.steps, *parts)]
-    inputs = [(_features(model, s), s.style_shape) for s in (train, validation)]
-    codes = [_encode(model, s) for s in (train, validation)]
+    inputs = [(model.features(s.pose), s.style_shape) for s in (train, validation)]
+    codes = [in_chunks(model.decoder.encode, s.displacement, size=256) for s in (train, validation)]
     loss = CodeLoss(model)
     both = [(x, s, code) for (x, s), code in zip(inputs, codes, strict=True)]
     if isinstance(model, Mlp):
@@ -278,13 +278,3 @@ def low_frequency_code(
         return decoder.encode(smooth(whole) - rest)
 
     return in_chunks(code, samples.betas, samples.style, samples.displacement)
-
-
-def _features(model: TailorNet | Mlp | Gcnn, samples: TrainingSamples) -> Tensor:
-    features: Tensor = model.features(samples.pose)
-    return features
-
-
-def _encode(model: TailorNet | Mlp, samples: TrainingSamples) -> Tensor:
-    """Codes of the samples' displacements, shape (N, C)."""
-    return in_chunks(model.decoder.encode, samples.displacement, size=256)
