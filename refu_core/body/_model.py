@@ -264,7 +264,7 @@ class SmplBody:
         if self._posedirs is not None:
             eye = torch.eye(3, dtype=self.dtype, device=self.device)
             feature = (rotations[:, 1:] - eye).flatten(1)
-            vertices = vertices + (feature @ self._posedirs.T).view(len(pose), -1, 3)
+            vertices = vertices + (feature @ self._posedirs.T).view(len(pose), vertices.shape[1], 3)
         return BodyOutput(self._skinning(vertices, transforms), joints, transforms)
 
 

@@ -74,7 +74,6 @@ class GarmentPipeline:
         """The body model that the garments are worn on."""
         self.fit = outfit.fit
         """How well the built-in mesh lies on a body that was named; None where none was."""
-        self.warnings: list[str] = [] if self.fit is None else self.fit.warnings
         """What there is to warn of before anything is dressed, for people."""
         self.garments = {name: one.template for name, one in outfit.wearables.items()}
         """The loaded garments by name."""
@@ -101,6 +100,11 @@ class GarmentPipeline:
         self._together = lru_cache(self.threads)(Wearer.together)
         """One wearer of all persons of a call; that of the last calls for the same ones."""
         self._last: tuple[float | None, dict[bytes, PipelineOutput]] = margin, {}
+
+    @property
+    def warnings(self) -> list[str]:
+        """What there is to warn of before anything is dressed, for people."""
+        return [] if self.fit is None else self.fit.warnings
 
     @property
     def margin(self) -> float | None:

@@ -119,20 +119,22 @@ def _recording(
         array = np.moveaxis(array, -1, 0) if layout.is_time_last and array.ndim == 2 else array
         return array[which] if n_persons and len(array) == n_persons and array.ndim > 1 else array
 
-    rate = check_fps(fps if fps is not None else fps_of(content, _first(above, table.RATES)))
+    def rate() -> float:
+        return check_fps(fps if fps is not None else fps_of(content, _first(above, table.RATES)))
+
     frames = one(table.FRAME_NUMBERS)
     if layout is table.MHR:
         (array,) = arrays.values()
         notes.append("MHR, another body than SMPL's: followed by its keypoints")
         at = places_in_time(frames, len(array))
         places = places_of_mhr(array, transl_of(one(layout.transl), layout, len(array), notes), at)
-        return follow(POINTS, places, fps=rate, axes=axes, usual="y-down", worn=worn, notes=notes)
+        return follow(POINTS, places, fps=rate(), axes=axes, usual="y-down", worn=worn, notes=notes)
     if _is_of_places(arrays):
         ((name, array),) = arrays.items()
         notes.append(f"{name} {array.shape} holds places of joints and no rotations: SMPL's skeleton is fitted to them")
         places = array[:, : len(SMPL_POINTS)].astype(np.float64)
         places = metres_of(SMPL_POINTS, places[0], notes) * places
-        return follow(SMPL_POINTS, places, fps=rate, axes=axes, usual="smpl", worn=worn, notes=notes)
+        return follow(SMPL_POINTS, places, fps=rate(), axes=axes, usual="smpl", worn=worn, notes=notes)
     poses = _poses(arrays, layout, node, notes)
     n = len(poses)
     transl = transl_of(one(layout.transl), layout, n, notes)
@@ -157,10 +159,11 @@ def _recording(
     if axes != "frame":
         with np.errstate(over="ignore", invalid="ignore"):
             poses[:, 0] = roots
-    tell_pace(transl, rate, notes)
+    hertz = rate()
+    tell_pace(transl, hertz, notes)
     gender = gender_of(word_of(content, _first(above, table.GENDERS), which), notes)
     with np.errstate(over="ignore", invalid="ignore"):  # becomes inf or NaN, which the frame refuses
-        return Recording(poses.astype(np.float32), transl, betas, rate, gender, tuple(notes))
+        return Recording(poses.astype(np.float32), transl, betas, hertz, gender, tuple(notes))
 
 
 def _by_time(array: NDArray[Any]) -> NDArray[Any]:

@@ -76,7 +76,9 @@ def fps_of(content: Content, value: Any) -> float:
     if type(value) in (int, float):
         return float(value)
     array = np.asarray(value) if isinstance(value, str) else content.array(value)
-    if array.size == 1 and array.dtype.kind in "iufUS":
+    if array.size == 1 and array.dtype.kind in "iuf":
+        return float(array.reshape(-1)[0])
+    if array.size == 1 and array.dtype.kind in "US":
         with contextlib.suppress(ValueError):
             return float(word_of(content, array))
     msg = f"no frame rate: {table.RATES[0]} must be one number, got {array.dtype} {array.shape}"

@@ -22,7 +22,7 @@ from refu_core import GarmentPipeline, PoseHistory
 from refu_core.backbones import Prediction, Skinned, WithoutWearerCode
 from refu_core.body import Collider, load_body
 from refu_core.errors import RefuError, WeightsError
-from refu_core.garments import PAPER_GARMENTS, GarmentTemplate, load_garment
+from refu_core.garments import PAPER_GARMENTS, GarmentTemplate, SkinBelow, load_garment
 from refu_core.modes import DEFAULT_GARMENTS
 from refu_core.realtime import Wearable
 from refu_core.refu import SCALE_PRESETS, Refu
@@ -170,8 +170,9 @@ def test_figures_of_the_baseline_against_a_loop_of_other_libraries(study: rp.Stu
         pose, betas, style = (torch.from_numpy(a)[None] for a in (sample.pose, sample.betas, sample.style))
         posed = body(pose, betas)
         unposed = garment.rest(betas, style) + backbone(betas, pose, style).displacement
-        mine = garment.pose(unposed, posed.transforms)[0].numpy().astype(float)
-        skin, skin_faces = collider(posed.vertices, posed.transforms)[0].numpy().astype(float), body.faces.numpy()
+        apart = collider(posed.vertices, posed.transforms)
+        taken = garment.pose(unposed, posed.transforms) + SkinBelow.of(garment, body)(apart - posed.vertices)
+        mine, skin, skin_faces = taken[0].numpy().astype(float), apart[0].numpy().astype(float), body.faces.numpy()
         errors.append(
             np.mean([np.linalg.norm(a - b) for a, b in zip(mine, sample.vertices.astype(float), strict=True)])
         )
