@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import msg_adapters as adapters
 from msg_adapters.cdr import CdrWriter
+from msg_adapters.inputs._ros4hri import AXES
 from refu_core import SmplFrame
 from refu_core.keypoints import Proportions, Skeleton, keypoint_layout
 from refu_core.keypoints._pose import Pose, exp_so3
@@ -134,6 +135,21 @@ def test_a_bag_in_other_units_is_said(tmp_path: Path, change: Callable[[SmplFram
         for frame in FRAMES:
             writer.write("/smpl_params", encode(change(frame)), log_time_ns=10**9 + frame.stamp_ns)
     assert said in "; ".join(run(tmp_path / "a.mcap", max_frames=None).warnings)
+
+
+def test_a_body_of_ros4hri_is_shown_where_tf_has_it(tmp_path: Path) -> None:
+    with adapters.BagWriter(tmp_path / "hri.mcap") as writer:
+        writer.add_topic("/humans/bodies/bob/joint_states", adapters.INPUT_TYPES["joint_state"])
+        message = CdrWriter()
+        message.fields("Ts", 10**18, "camera")
+        message.strings([f"{joint}_bob" for joint in AXES])
+        message.sequence("f8", np.zeros(len(AXES)))
+        message.fields("II", 0, 0)
+        writer.write("/humans/bodies/bob/joint_states", message.to_bytes(), log_time_ns=10**18)
+    result = run(tmp_path / "hri.mcap")
+    assert result.options.frame_id == "body_bob"
+    assert "the person stays at the origin of body_bob" in " ".join(result.warnings)
+    assert run(ROOT / "bags" / "walk").options.frame_id == "map"
 
 
 def write_keypoints(path: Path, *, stamped: bool) -> None:
