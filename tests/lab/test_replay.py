@@ -413,10 +413,11 @@ def test_a_bag_directory_is_not_written_into(tmp_path: Path, capsys: pytest.Capt
     given = write_bag(tmp_path / "given", motion(2))
     (file,) = given.glob("*.mcap")
     before = file.read_bytes()
-    for written in (given, file):
+    for written in (given, file, given / "out.mcap"):
         code = run(given, "--garments", "short-pant-male", "--overwrite", "--output", written)
         assert_one_line(code, capsys.readouterr().err, "written over the input")
     assert file.read_bytes() == before
+    assert not (given / "out.mcap").exists()
 
 
 def test_a_damaged_bag_is_not_called_empty(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
