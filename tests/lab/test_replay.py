@@ -409,6 +409,13 @@ def test_a_recording_is_never_written_over(option: str, tmp_path: Path, capsys: 
         assert given.read_bytes() == before
 
 
+def test_a_link_to_itself_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    link = tmp_path / "link.mcap"
+    link.symlink_to(link)
+    code = run(link, "--garments", "short-pant-male", "--output", tmp_path / "out.mcap")
+    assert_one_line(code, capsys.readouterr().err, "link.mcap")
+
+
 def test_a_bag_directory_is_not_written_into(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     given = write_bag(tmp_path / "given", motion(2))
     (file,) = given.glob("*.mcap")
