@@ -14,10 +14,10 @@ from refu_core import GarmentPipeline, SmplFrame, load_body
 from refu_core.body import Registration
 from refu_core.modes import FOREIGN_BETAS
 from refu_core.simulation import DrapeSettings, GarmentDataset, SelectionSettings, SimulationSettings, simulate_dataset
-from refu_lab.bodies import body_warnings
 from refu_lab.cli import main
 from refu_lab.commands.replay import ReplayOptions
 from refu_lab.replay import replay
+from refu_lab.sources import body_warnings
 
 BAGS = Path(__file__).parents[2] / "bags"
 GARMENT = "short-pant-male"
