@@ -66,6 +66,11 @@ def upright_turn(roots: Array) -> Array:
     return _TURNS.get({"+z": "z-up", "-y": "y-down"}.get(axis_of(roots), ""), np.eye(3))
 
 
+def turn_from(up: Array) -> Array:
+    """The rotation (3, 3) to SMPL's axes from those in which `up`, shape (3,), is up; the identity for any other."""
+    return next((turn for turn in _TURNS.values() if turn[1] @ up > _CLEAR), np.eye(3))
+
+
 def to_smpl(
     roots: Array, transl: Array, axes: Axes, notes: list[str], *, usual: Axes, pelvis: Array = PELVIS
 ) -> tuple[Array, Array]:
