@@ -17,6 +17,8 @@ from refu_core.keypoints import Proportions
 from refu_core.recordings import SUFFIXES, Axes, Recording, n_resampled, read_recording
 from refu_core.skeleton import JOINT_NAMES
 
+_PAUSE_NS = NS_PER_S
+"""A step between a bag's frames that is longer is a pause, unless it is what is usual there."""
 _BLOCK = 10_000  # frames that are resampled at once: a clip of hours would take gigabytes
 
 
@@ -103,8 +105,9 @@ def read_motion(
 
 
 def load_motion(path: str, *, axes: Axes = "auto", fps: float = 0.0) -> Motion:
-    """The motion of a file, of a bag (evenly spaced, with the betas of its first frame), or `march` for an empty path.
+    """The motion of a file, of a bag, or `march` for an empty path.
 
+    A bag's frames are spaced evenly, without its pauses, and have the betas of the first.
     A file's axes and rate (0 for its own) are as `read_motion` takes them. Raises `MotionFileError` and `BagError`.
     """
     if not path:
@@ -115,10 +118,18 @@ def load_motion(path: str, *, axes: Axes = "auto", fps: float = 0.0) -> Motion:
     if not frames:
         msg = f"{path}: no frame of its SMPL topic can be decoded; `refu replay {path}` says why"
         raise BagError(msg)
-    seconds = (frames[-1].stamp_ns - frames[0].stamp_ns) / NS_PER_S
-    fps = (len(frames) - 1) / seconds if seconds > 0 else MARCH_FPS
+    steps = np.diff([frame.stamp_ns for frame in frames])
+    longest = max(_PAUSE_NS, 3 * float(np.median(np.abs(steps)))) if len(steps) else 0.0
+    kept = steps[np.abs(steps) <= longest]  # backwards, too: what is stamped anew goes on
+    seconds = int(kept.sum()) / NS_PER_S
+    fps = len(kept) / seconds if seconds > 0 else MARCH_FPS
+    notes = []
+    if n_pauses := len(steps) - len(kept):
+        notes.append(f"pauses are left out ({n_pauses}): stamps jump by more than {longest / NS_PER_S:g} s")
+    if any((frame.betas != frames[0].betas).any() for frame in frames):
+        notes.append("betas differ between frames: a person has one shape, the first frame's")
     poses, transl = (np.stack(arrays) for arrays in zip(*((f.pose, f.transl) for f in frames), strict=True))
-    return Motion(poses, transl, frames[0].betas, fps)
+    return Motion(poses, transl, frames[0].betas, fps, notes=tuple(notes))
 
 
 MARCH_FPS = 30.0

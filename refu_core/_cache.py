@@ -34,11 +34,9 @@ def cache_folder() -> Path:
 def recall(name: str, *, keys: Collection[str]) -> dict[str, NDArray[Any]] | None:
     """The arrays that were kept as `name`; None where there are none, or not all of `keys`."""
     path = cache_folder() / f"{name}.npz"
-    if not path.exists():
-        return None
     try:
         found = read_npz(path, keys=keys, error=RefuError, wanted="what was kept")
-    except RefuError:  # cut short by a crash, perhaps
+    except RefuError:  # none, out of reach, or cut short by a crash
         return None
     return found if set(found) == set(keys) else None
 

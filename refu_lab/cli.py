@@ -50,8 +50,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         args = _parser().parse_args(arguments)
         for path in (getattr(args, name, None) for name in ("json", "output", "picture")):
             check_writable(path if isinstance(path, Path) else None)
-        for given in _inputs(args) if getattr(args, "json", None) else ():
-            require_apart(given, args.json)
+        json = getattr(args, "json", None)
+        if json is not None and json.exists():
+            for given in _inputs(args):
+                require_apart(given, json)
         code: int = args.run(args)
     except RefuError as error:
         return _failed(f"error: {error}", EXIT_BAD_INPUT)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import islice
 from pathlib import Path
@@ -13,6 +13,7 @@ import numpy as np
 
 from refu_core.errors import RefuError
 from refu_core.history import PoseHistory
+from refu_core.recordings import turn_from
 from refu_lab.render import SKIN
 
 if TYPE_CHECKING:
@@ -98,7 +99,8 @@ def export(
 ) -> tuple[list[Path], list[str]]:
     """What `refu export` does: some frames of a bag or motion file, dressed, as files; and what there is to warn of.
 
-    Frames are numbered as they were recorded; those that can't be read are left out, and said.
+    Frames are numbered as they were recorded; those that can't be read are left out, and said. Whatever the input's
+    axes are, y is up in the files.
 
     Raises:
         RefuError: as `write_meshes`; options that make no pipeline, an input that can't be read, or no frame.
@@ -111,7 +113,7 @@ def export(
     source = open_source(options, lambda: load().body)
     pipeline = load()
     source.history = PoseHistory() if pipeline.heeds_past else None
-    stamps, outputs, left_out = [], [], list[str]()
+    frames, outputs, left_out = [], [], list[str]()
     for number, record in enumerate(islice(source.records, first + count)):
         if number < first:  # what comes of the rest depends on it: the past, and where keypoints were
             with suppress(RefuError):
@@ -123,15 +125,19 @@ def export(
         except RefuError as error:
             left_out.append(f"frame {number} is left out: {error}")
         else:
-            stamps.append(frame.stamp_ns)
+            frames.append(frame)
     warnings = [*source.warnings(pipeline), *left_out]
     if not outputs:
         why = f": {warnings[-1]}" if warnings else ""
         msg = f"{options.input}: has no frame that can be dressed from number {first} on{why}"
         raise RefuError(msg)
-    step = 1e-9 * float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
+    step = 1e-9 * float(np.median(np.diff([frame.stamp_ns for frame in frames]))) if len(frames) > 1 else 0.0
     fps = round(1 / step, 3) if step > 0 else 30.0
-    return write_meshes(meshes_of(pipeline, outputs, with_body=with_body), path, fps=fps), warnings
+    turn = turn_from(frames[0].up.astype(np.float64))
+    meshes = meshes_of(pipeline, outputs, with_body=with_body)
+    if turn[1, 1] != 1:
+        meshes = [replace(mesh, vertices=mesh.vertices @ turn.T.astype(np.float32)) for mesh in meshes]
+    return write_meshes(meshes, path, fps=fps), warnings
 
 
 def _glb(meshes: Sequence[ExportMesh], frame: int) -> bytes:

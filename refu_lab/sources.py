@@ -11,6 +11,7 @@ import numpy as np
 
 import msg_adapters as adapters
 from msg_adapters.axes import up_of
+from msg_adapters.inputs import body_of
 from refu_core import FrameError, RefuError
 from refu_core.history import PoseHistory
 from refu_core.keypoints import Proportions
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
     from refu_core.body import BodyFit
 
 INPUT_TOPIC = "/smpl_params"
+_SHOWN = 8
+PLACED_BY_TF = "the person stays at the origin of {}: tf says where that is, and tf isn't read from a bag"
 
 
 @dataclass(eq=False)
@@ -125,23 +128,31 @@ def open_source(options: RecordingOptions, body: Callable[[], SmplBody]) -> Sour
         raise RefuError(msg)
     bag = adapters.open_smpl_bag(options.input, topic=options.topic, input_type=options.input_type)
     topic, kind = bag.topic.name, bag.topic.message_type
-    decode = _follower(options, body()) if bag.decoder is None else _decoding(bag.decoder, _up_of(options, bag.decoder))
-    given = _frame_of_first(bag) if options.axes == "frame" else ""
-    found = Source(options, f"{topic} ({kind})", topic, kind, decode, iter(bag), bag.message_count, bag)
-    return replace(found, frame_id=given or found.frame_id)
+    given, is_placed = _frame_of_first(bag)
+    notes = [PLACED_BY_TF.format(given)] if is_placed else []
+    if bag.decoder is None:
+        decode = _follower(options, body(), notes)
+    else:
+        decode = _decoding(bag.decoder, _up_of(options, bag.decoder))
+    found = Source(options, f"{topic} ({kind})", topic, kind, decode, iter(bag), bag.message_count, bag, notes)
+    return replace(found, frame_id=given) if given and (is_placed or options.axes == "frame") else found
 
 
-def _frame_of_first(bag: adapters.SmplBag) -> str:
-    """The frame that a bag's first message of people is in; empty where it says none, or can't be read."""
+def _frame_of_first(bag: adapters.SmplBag) -> tuple[str, bool]:
+    """The frame that a bag's first message of people is in, and whether it is a body's own, of ROS4HRI.
+
+    Empty where it says none, or can't be read.
+    """
     record = next(iter(bag), None)
     try:
         if record is None or record.error is not None:
-            return ""
+            return "", False
         if bag.topic.message_type == adapters.MARKER_ARRAY:
-            return next((marker.frame_id for marker in adapters.decode_marker_array(record.raw)), "")
-        return adapters.frame_id_of(record.raw, "pose_array" if bag.decoder is None else bag.decoder.input_type)
+            return next((marker.frame_id for marker in adapters.decode_marker_array(record.raw)), ""), False
+        kind = "pose_array" if bag.decoder is None else bag.decoder.input_type
+        return adapters.frame_id_of(record.raw, kind), kind == "joint_state" and body_of(record.raw) is not None
     except adapters.DecodeError:
-        return ""
+        return "", False
 
 
 def _motion_records(motion: adapters.Motion, topic: str) -> Iterator[FrameRecord]:
@@ -177,12 +188,16 @@ def _up_of(options: RecordingOptions, decoder: adapters.Decoder) -> _Up:
     return lambda data: up_of(adapters.frame_id_of(data, decoder.input_type))
 
 
-def _follower(options: RecordingOptions, body: SmplBody) -> Callable[[bytes, int], SmplFrame]:
-    """Decodes messages of keypoints to the frames of one person: `options.person`, or who comes first."""
+def _follower(options: RecordingOptions, body: SmplBody, notes: list[str]) -> Callable[[bytes, int], SmplFrame]:
+    """Decodes messages of keypoints to the frames of one person: `options.person`, or who comes first.
+
+    In `notes` it says who else is to be seen, if nobody was asked for.
+    """
     assert options.input_type is not None
     stream = adapters.InputStream(options.input_type)
     stream.follow(body, options.keypoints, betas=options.known_betas)
     followed = options.person
+    others: dict[str, None] = {}
 
     def decode(data: bytes, received_ns: int) -> SmplFrame:
         nonlocal followed
@@ -193,6 +208,10 @@ def _follower(options: RecordingOptions, body: SmplBody) -> Callable[[bytes, int
             if people:
                 msg = f"{followed} isn't to be seen; who is: {', '.join(people)}"
             raise adapters.DecodeError(msg)
+        if options.person is None and (new := people.keys() - others.keys() - {followed}):
+            others.update(dict.fromkeys(sorted(new)))
+            listing = ", ".join([*others][:_SHOWN]) + (" …" if len(others) > _SHOWN else "")
+            notes[:] = [f"{1 + len(others)} persons: {followed} is taken; also {listing} (--person chooses another)"]
         return replace(people[followed], up=up_of(frame_id))
 
     return decode

@@ -1,5 +1,6 @@
 """What a body may arrive in: messages of SMPL parameters to `SmplFrame` and back, messages of keypoints to points."""
 
+from msg_adapters.inputs._joint_state import body_of as body_of
 from msg_adapters.inputs._keypoints import KEYPOINT_TYPES as KEYPOINT_TYPES
 from msg_adapters.inputs._keypoints import Keypoints as Keypoints
 from msg_adapters.inputs._keypoints import decode_keypoints as decode_keypoints

@@ -12,6 +12,7 @@ from refu_core.recordings._upright import AXES as AXES
 from refu_core.recordings._upright import PELVIS as PELVIS
 from refu_core.recordings._upright import Axes as Axes
 from refu_core.recordings._upright import axis_of as axis_of
+from refu_core.recordings._upright import turn_from as turn_from
 from refu_core.recordings._upright import upright_share as upright_share
 from refu_core.recordings._upright import upright_turn as upright_turn
 from refu_core.recordings._values import GENDERS as GENDERS

@@ -97,6 +97,8 @@ LAYOUTS: tuple[Layout, ...] = (
 )
 """In the order of preference, where a file holds several."""
 
+OF_SMPLX = ("global_orient", "body_pose")
+"""Arrays that are of SMPL-X where they hold 22 joints; AMASS's of 22 are of SMPL-H, too."""
 RATES = ("mocap_framerate", "mocap_frame_rate", "fps", "framerate", "frame_rate", "frameRate", "FPS")
 GENDERS = ("gender", "genders")
 FRAME_NUMBERS = ("frame_ids", "frame_id")

@@ -22,7 +22,7 @@ from refu_core.recordings._recording import MAX_FRAMES, Recording, check_fps, te
 from refu_core.recordings._rotations import BODY, WHOLE, rotvecs_of
 from refu_core.recordings._soma import smpl_of_soma
 from refu_core.recordings._tracks import filled, frames_of, places_in_time
-from refu_core.recordings._upright import AXES, PELVIS, Axes, to_smpl
+from refu_core.recordings._upright import AXES, PELVIS, PELVIS_OF_SMPLX, Axes, to_smpl
 from refu_core.recordings._values import betas_of, fps_of, gender_of, transl_of, turned, word_of
 
 _BODY_JOINTS = 22  # what SMPL, SMPL-H and SMPL-X share; SMPL's two hand joints have no counterpart in the others
@@ -146,11 +146,18 @@ def _recording(
         any("smplx" in table.spelled(key) for key in like)
         or "x" in word_of(content, _first(above, table.MODELS))
         or _columns(arrays) in (165, 330, 495)
+        or (layout.pose == table.OF_SMPLX and _columns(arrays) in (66, 132, 198))
     )
     betas = betas_of(one(layout.betas), n, notes, is_smplx=is_smplx)
     pelvis = PELVIS if worn is None else worn.of(betas.astype(np.float64))[0]
+    is_low = pelvis[1] < (PELVIS + PELVIS_OF_SMPLX)[1] / 2  # one's own body may be SMPL-X's, too
+    theirs = PELVIS_OF_SMPLX if is_smplx and transl.any() and not is_low else pelvis
     if layout.turns_about_origin:
-        transl = transl + turned(pelvis, poses[:, 0]) - pelvis
+        transl = transl + turned(theirs, poses[:, 0]) - pelvis
+    elif theirs is not pelvis:
+        transl = transl + theirs - pelvis
+    if theirs is not pelvis:
+        notes.append("SMPL-X's mesh has its pelvis 13 cm lower than SMPL's: translations are changed by that")
     poses, transl = filled(poses, transl, frames, notes)
     of_amass = _columns(arrays) in (156, 165) and _first(above, table.RATES[:2]) is not None
     roots = poses[:, 0].astype(np.float64)
@@ -243,7 +250,8 @@ def _bare(array: NDArray[Any], notes: list[str]) -> dict[Key, Any]:
     """An array alone: a pose, or the columns of Motion-X."""
     if array.ndim == 2 and array.shape[1] == 322:
         notes.append("322 columns: taken as Motion-X's")
-        return {"poses": array[:, :66], "trans": array[:, 309:312], "betas": array[:, 312:322]}
+        arrays: dict[Key, Any] = {"poses": array[:, :66], "trans": array[:, 309:312], "betas": array[:, 312:322]}
+        return arrays | {table.MODELS[0]: "smplx"}
     if array.ndim == 2 and array.shape[1] == 263:
         msg = f"263 columns are HumanML3D features; {table.UNREAD_ADVICE['HumanML3D features']}"
         raise ValueError(msg)

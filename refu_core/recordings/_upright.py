@@ -20,6 +20,8 @@ AXES: tuple[Axes, ...] = get_args(Axes)
 PELVIS = np.array([0.0, -0.22, 0.02])
 """SMPL's pelvis at rest [m], shape (3,): within 5 mm that of the built-in bodies, whatever the betas. The root turns
 about it, and a translation is added afterwards."""
+PELVIS_OF_SMPLX = np.array([0.003, -0.351, 0.012])
+"""SMPL-X's [m], shape (3,), of the neutral mean shape, as open projects' tables of its joints have it."""
 _TURNS: dict[str, Array] = {
     "z-up": np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]),  # as vertices_smpl_from_ros: in ROS axes nothing changes
     "y-down": np.diag([1.0, -1, -1]),
@@ -64,6 +66,11 @@ def axis_of(roots: Array) -> str:
 def upright_turn(roots: Array) -> Array:
     """The rotation (3, 3) to SMPL's axes from those that people stand in, as far as it shows; the identity if not."""
     return _TURNS.get({"+z": "z-up", "-y": "y-down"}.get(axis_of(roots), ""), np.eye(3))
+
+
+def turn_from(up: Array) -> Array:
+    """The rotation (3, 3) to SMPL's axes from those in which `up`, shape (3,), is up; the identity for any other."""
+    return next((turn for turn in _TURNS.values() if turn[1] @ up > _CLEAR), np.eye(3))
 
 
 def to_smpl(

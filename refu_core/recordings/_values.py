@@ -95,7 +95,7 @@ def word_of(content: Content, value: Any, which: int = 0) -> str:
         except ValueError:
             found = []
         value = found[0] if found else ""
-    word = value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value or "")
+    word = value.decode("utf-8", "replace") if isinstance(value, bytes) else str("" if value is None else value)
     return word.strip().removeprefix("b'").removesuffix("'").lower()
 
 

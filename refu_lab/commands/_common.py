@@ -267,9 +267,9 @@ def check_writable(path: Path | None) -> None:
 
 
 def require_apart(given: Path, written: Path) -> None:
-    """Raises `RefuError` where what is `written` would take the place of what was `given`, or of a part of it."""
-    here, there = given.resolve(), written.resolve()
-    if here == there or there in here.parents or (here in there.parents and there.exists()):
+    """Raises `RefuError` where what is `written` would take the place of what was `given`, or be a part of it."""
+    here, there = (Path(os.path.realpath(path)) for path in (given, written))  # links that go in a circle, too
+    if here == there or there in here.parents or here in there.parents:
         msg = f"{written}: would be written over the input {given}; name another place"
         raise RefuError(msg)
 

@@ -146,7 +146,7 @@ def _replay_many(args: argparse.Namespace) -> int:
     from refu_lab.fleet import find_recordings, fleet_table, open_engine
     from refu_lab.fleet.replay import FleetOptions, replay_fleet
 
-    recordings = find_recordings(args.input)
+    recordings = find_recordings(args.input, results=(args.output, args.report))
     each = ReplayOptions(**cli.given(args, ReplayOptions) | {"input": Path(), "output": None})
     options = FleetOptions(replay=each, output=args.output, report=args.report, again=args.again or args.overwrite)
     with open_engine(args.jobs, args.scheduler) as engine:

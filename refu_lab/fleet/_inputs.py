@@ -43,18 +43,21 @@ def is_plain(inputs: Sequence[str]) -> bool:
     return not _MAGIC.search(inputs[0]) or path.exists()
 
 
-def find_recordings(inputs: Sequence[str]) -> list[Input]:
+def find_recordings(inputs: Sequence[str], *, results: Sequence[str | None] = ()) -> list[Input]:
     """The recordings that paths, folders, globs (with **) and URLs stand for, each once, sorted within each of them.
 
     A folder with `metadata.yaml`, or with files FOLDER_0, FOLDER_1, … alone, is one rosbag2 bag; any other is searched.
+    What is in the folders or URLs of `results` is left out.
 
     Raises `RefuError` where one stands for nothing.
     """
     sources: dict[str, None] = {}
+    written = tuple(f"{_whole(place)}/" for place in results if place is not None)
     for text in inputs:
-        found = list(_find(text))
+        found = [source for source in _find(text) if not written or not f"{_whole(source)}/".startswith(written)]
         if not found:
-            msg = f"{text}: no recording there; wanted bags or motions ({', '.join(SUFFIXES)}, rosbag2 folders)"
+            where = " beside the results" if written else ""
+            msg = f"{text}: no recording there{where}; wanted bags or motions ({', '.join(SUFFIXES)}, rosbag2 folders)"
             raise RefuError(msg)
         sources |= dict.fromkeys(found)
     return list(_named(sources))
@@ -76,6 +79,12 @@ def find_data_sets(inputs: Sequence[str]) -> list[Path]:
             inner = sorted(card.parent for card in path.glob("*/card.json")) if path.is_dir() else []
             found += [path] if (path / "card.json").exists() or not inner else inner
     return found
+
+
+def _whole(place: str) -> str:
+    """A path or URL as the URL that it is, links followed."""
+    fs, path = filesystem(place if is_url(place) else os.path.realpath(place))
+    return str(fs.unstrip_protocol(path)).rstrip("/")
 
 
 def _find(text: str) -> Iterator[str]:

@@ -8,8 +8,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from msg_adapters import Motion, MotionFileError, quaternion_from_rotvec, read_motion, slerp
-from refu_core import FrameError
+from msg_adapters import (
+    INPUT_TYPES,
+    BagWriter,
+    Motion,
+    MotionFileError,
+    encoder_for,
+    load_motion,
+    quaternion_from_rotvec,
+    read_motion,
+    slerp,
+)
+from refu_core import FrameError, SmplFrame
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -39,12 +49,13 @@ def test_layouts(tmp_path: Path, columns: int) -> None:
     assert len(motion) == T
     np.testing.assert_array_equal(motion.poses[:, :shared].reshape(T, -1), poses[:, : shared * 3].astype(np.float32))
     assert not motion.poses[:, shared:].any()
-    np.testing.assert_array_equal(motion.transl, trans)
+    lower = [0.003, -0.131, -0.008] if columns == 165 else [0.0, 0.0, 0.0]  # SMPL-X's pelvis, in its mesh
+    np.testing.assert_allclose(motion.transl, trans + lower, rtol=0, atol=1e-12)
     assert (motion.fps, motion.gender) == (120.0, "male")
     frames = list(motion.frames(start_ns=1000))
     assert [f.stamp_ns for f in frames[:4]] == [1000, 8334333, 16667667, 25001000]
     np.testing.assert_array_equal(frames[3].pose, motion.poses[3])
-    np.testing.assert_array_equal(frames[3].transl, trans[3])
+    np.testing.assert_array_equal(frames[3].transl, motion.transl[3])
 
 
 def test_what_may_be_left_out(tmp_path: Path) -> None:
@@ -154,6 +165,33 @@ def test_resampling_ignores_jumps_of_full_turns() -> None:
     assert len(Motion(poses[:1], transl[:1], motion.betas, 60.0).resampled(30)) == 1
     with pytest.raises(MotionFileError, match="frame rate"):
         motion.resampled(0)
+
+
+def write_bag(path: Path, stamps: Any, *, thinner: int | None = None) -> str:
+    encode = encoder_for("joint_state")
+    with BagWriter(path) as writer:
+        writer.add_topic("/smpl_params", INPUT_TYPES["joint_state"])
+        for i, stamp in enumerate(stamps):
+            frame = SmplFrame(np.zeros((24, 3)), np.full(10, float(i == thinner)), np.zeros(3), stamp_ns=int(stamp))
+            writer.write("/smpl_params", encode(frame), log_time_ns=10**18 + i)
+    return str(path)
+
+
+def test_pauses_of_a_bag_slow_nobody_down(tmp_path: Path) -> None:
+    even = 10**18 + np.arange(40) * 40_000_000
+    slow, left, anew, jittered = 10**18 + np.arange(5) * 2 * 10**9, even.copy(), even.copy(), even.copy()
+    left[15:] += 60 * 10**9
+    anew[15:] -= 10**17
+    jittered[1:-1] += RNG.integers(-60_000_000, 60_000_000, 38)
+    for name, stamps, fps, n_pauses in (
+        ("even", even, 25, 0), ("slow", slow, 0.5, 0), ("left", left, 25, 1), ("anew", anew, 25, 1),
+        ("jittered", jittered, 25, 0), ("one", even[:1], 30, 0), ("still", np.full(5, 10**18), 30, 0),
+    ):  # fmt: skip
+        motion = load_motion(write_bag(tmp_path / name, stamps))
+        assert (motion.fps, len(motion)) == (pytest.approx(fps), len(stamps)), name
+        assert motion.notes == (("pauses are left out (1): stamps jump by more than 1 s",) if n_pauses else ()), name
+    (note,) = load_motion(write_bag(tmp_path / "betas", even, thinner=3)).notes
+    assert note.startswith("betas differ between frames")
 
 
 def test_recorded_motion(motions: list[Path]) -> None:

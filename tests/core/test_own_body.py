@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from smpl_file import N_FACES, N_VERTICES, smpl_arrays, write_smpl
 
 from refu_core import BodyError, GarmentError, GarmentPipeline, SmplFrame, WeightsError, load_body, load_garment
-from refu_core._cache import cache_folder
+from refu_core._cache import cache_folder, keep, recall
 from refu_core.body import BodyFit, SmplBody, Surface, _fit, load_fit
 from refu_core.garments import worn_on
 from refu_core.mesh import Connectivity
@@ -106,6 +107,19 @@ def test_nowhere_to_keep_anything(fit: BodyFit, tmp_path: Path, monkeypatch: pyt
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setattr(_fit, "register", lambda *_: fit.registration)
     assert load_fit(fit.body).registration.vertices.shape == fit.registration.vertices.shape
+
+
+def test_a_folder_that_may_not_be_searched_is_no_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("REFU_CACHE", str(tmp_path / "home" / "refu"))
+    (tmp_path / "home").mkdir(mode=0)
+    user = os.geteuid()
+    if user == 0:  # who may search everything
+        os.seteuid(65534)
+    try:
+        keep("ones", {"ones": np.ones(3)})
+        assert recall("ones", keys=("ones",)) is None
+    finally:
+        os.seteuid(user)
 
 
 # Garments

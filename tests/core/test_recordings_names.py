@@ -17,6 +17,8 @@ from test_recordings import POSES, TRANSL, T, same
 from msg_adapters import MotionFileError, read_motion
 from refu_core import load_body
 from refu_core.keypoints import Proportions
+from refu_core.recordings import PELVIS
+from refu_core.recordings._upright import PELVIS_OF_SMPLX
 
 BETAS = np.linspace(-1, 1, 10)
 
@@ -75,6 +77,34 @@ def test_easymocap_turns_people_about_the_origin(n_joints: int, tmp_path: Path) 
     wanted += TRANSL[:, None]
     got = body(motion.poses, motion.betas[None], motion.transl.astype(np.float32)).vertices.double().numpy()
     assert np.linalg.norm(got - wanted, axis=2).max() < 0.01  # the pelvis of any betas is within 5 mm of one place
+
+
+@pytest.mark.parametrize("kind", ["GVHMR", "Motion-X", "AMASS", "EasyMocap"])
+def test_people_of_smplx_are_where_its_pelvis_is(kind: str, tmp_path: Path) -> None:
+    """In its mesh that is lower: a translation moves another point of the body."""
+    body = {"global_orient": POSES[:, 0], "body_pose": POSES[:, 1:22].reshape(T, 63), "transl": TRANSL, "betas": BETAS}
+    flat, file = POSES[:, :22].reshape(T, 66), tmp_path / "a.npz"
+    if kind == "GVHMR":
+        file = tmp_path / "a.pkl"
+        file.write_bytes(pickle.dumps({"smpl_params_global": body}))
+    elif kind == "Motion-X":
+        file = tmp_path / "a.npy"
+        np.save(file, np.hstack([flat, np.zeros((T, 243)), TRANSL, np.tile(BETAS, (T, 1))]))
+    elif kind == "AMASS":
+        np.savez(file, poses=np.pad(flat, ((0, 0), (0, 99))), trans=TRANSL, betas=BETAS)
+    else:
+        poses = np.pad(flat[:, 3:], ((0, 0), (3, 99)))
+        np.savez(file, Rh=POSES[:, 0], Th=TRANSL, poses=poses, shapes=BETAS[None], surface_model_type="smplx")
+    motion = read_motion(file, fps=30)
+    at = PELVIS_OF_SMPLX if kind != "EasyMocap" else Rotation.from_rotvec(POSES[:, 0]).apply(PELVIS_OF_SMPLX)
+    np.testing.assert_allclose(motion.transl + PELVIS, TRANSL + at, atol=1e-6)
+    assert "betas are SMPL-X's" in "; ".join(motion.notes)
+    assert "SMPL-X's mesh has its pelvis 13 cm lower" in "; ".join(motion.notes)
+    male = Proportions.builtin("male")
+    own = read_motion(file, fps=30, worn=Proportions(male.joints - [0, 0.13, 0], male.shapedirs))  # is SMPL-X's, too
+    assert "lower" not in "; ".join(own.notes)
+    if kind != "EasyMocap":
+        np.testing.assert_allclose(own.transl, TRANSL, atol=1e-12)
 
 
 def test_two_roots_are_refused(tmp_path: Path) -> None:

@@ -85,6 +85,25 @@ def test_folders_globs_and_urls_stand_for_the_same(bags: Path) -> None:
         names(f"{bags}/*.mcap")
 
 
+def test_results_among_the_recordings_are_not_replayed(bags: Path, tmp_path: Path, capsys: Any) -> None:
+    folder = tmp_path / "bags"
+    shutil.copytree(bags / "a", folder)
+    for _ in range(2):
+        assert run(folder, "--output", folder / "out") == 0
+        assert "2 of 2 recordings replayed" in capsys.readouterr().out
+    (tmp_path / "link").symlink_to(folder)
+    for results in (str(folder / "out"), f"file://{folder}/out/", str(tmp_path / "link" / "out")):
+        for text in (str(folder), f"file://{folder}", f"{tmp_path}/**/*.mcap"):
+            found = [one.source for one in find_recordings([text], results=[None, results])]
+            assert found
+            assert not any("/out/" in source for source in found)
+        with pytest.raises(RefuError, match="no recording there beside the results"):
+            find_recordings([str(folder / "out")], results=[results])
+    before = [path.read_bytes() for path in sorted(folder.glob("*.mcap"))]
+    assert run(folder, "--output", folder) == 2
+    assert [path.read_bytes() for path in sorted(folder.glob("*.mcap"))] == before
+
+
 def test_one_recording_is_one_replay_as_ever(bags: Path, tmp_path: Path) -> None:
     split = tmp_path / "long"
     split.mkdir()

@@ -254,6 +254,8 @@ def test_an_export_takes_the_options_of_a_replay(tmp_path: Path, capsys) -> None
     np.savez(motion, poses=poses, trans=np.zeros((90, 3)), betas=np.full(10, 0.5), mocap_framerate=30.0)
     standing = exported(motion, "--input-axes", "z-up", "--first", "80", "--fps", "60")["body"]
     assert np.ptp(standing[:, 1]) > 1.4
+    as_it_is = exported(motion, "--input-axes", "frame", "--first", "80")["body"]  # y is up in the files
+    np.testing.assert_allclose(as_it_is, standing, atol=1e-5)
     assert np.ptp(exported(motion, "--input-axes", "smpl")["body"][:, 1]) < 0.6  # lies, as it was asked to
     assert "betas arrive" in capsys.readouterr().out
 

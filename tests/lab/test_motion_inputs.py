@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,8 @@ from scipy.spatial.transform import Rotation
 
 import msg_adapters as adapters
 from msg_adapters.cdr import CdrWriter
+from msg_adapters.inputs._ros4hri import AXES
+from msg_adapters.markers import encode_lists
 from refu_core import SmplFrame
 from refu_core.keypoints import Proportions, Skeleton, keypoint_layout
 from refu_core.keypoints._pose import Pose, exp_so3
@@ -136,14 +138,33 @@ def test_a_bag_in_other_units_is_said(tmp_path: Path, change: Callable[[SmplFram
     assert said in "; ".join(run(tmp_path / "a.mcap", max_frames=None).warnings)
 
 
-def write_keypoints(path: Path, *, stamped: bool) -> None:
+def test_a_body_of_ros4hri_is_shown_where_tf_has_it(tmp_path: Path) -> None:
+    with adapters.BagWriter(tmp_path / "hri.mcap") as writer:
+        writer.add_topic("/humans/bodies/bob/joint_states", adapters.INPUT_TYPES["joint_state"])
+        message = CdrWriter()
+        message.fields("Ts", 10**18, "camera")
+        message.strings([f"{joint}_bob" for joint in AXES])
+        message.sequence("f8", np.zeros(len(AXES)))
+        message.fields("II", 0, 0)
+        writer.write("/humans/bodies/bob/joint_states", message.to_bytes(), log_time_ns=10**18)
+    result = run(tmp_path / "hri.mcap")
+    assert result.options.frame_id == "body_bob"
+    assert "the person stays at the origin of body_bob" in " ".join(result.warnings)
+    assert run(ROOT / "bags" / "walk").options.frame_id == "map"
+
+
+def keypoints() -> Iterator[tuple[int, Any]]:
+    """A tracker's points of `FRAMES`, z up, and their stamps."""
     bones = Skeleton(keypoint_layout("zed38"), Proportions.builtin("male"))
+    for i, frame in enumerate(FRAMES):
+        pose = Pose(frame.transl + np.array([0, -0.22, 0.02]), exp_so3(frame.pose.astype(float)), np.zeros(10))
+        yield 10**9 + round(i * 1e9 / 30), Z_UP.apply(bones.posed(pose).points)
+
+
+def write_keypoints(path: Path, *, stamped: bool) -> None:
     with adapters.BagWriter(path) as writer:
         writer.add_topic("/skeleton", adapters.KEYPOINT_TYPES["keypoint_poses"])
-        for i, frame in enumerate(FRAMES):
-            pose = Pose(frame.transl + np.array([0, -0.22, 0.02]), exp_so3(frame.pose.astype(float)), np.zeros(10))
-            points = Z_UP.apply(bones.posed(pose).points)
-            stamp = 10**9 + round(i * 1e9 / 30)
+        for stamp, points in keypoints():
             cdr = CdrWriter()
             cdr.fields("Ts", stamp if stamped else 0, "map")
             cdr.fields("I", len(points))
@@ -164,6 +185,21 @@ def test_keypoints_of_a_bag(tmp_path: Path) -> None:
         np.testing.assert_allclose(a.frame.transl, b.frame.transl, atol=1e-4)
     assert main(["replay", str(tmp_path / "a.mcap"), "--input-type", "keypoint_poses", "--keypoints", "coco17"]) == 2
     assert main(["replay", str(tmp_path / "a.mcap")]) == 2
+
+
+def test_all_whose_keypoints_a_bag_has_are_named(tmp_path: Path) -> None:
+    unturned = [0, 0, 0, 0, 0, 0, 1]
+    with adapters.BagWriter(tmp_path / "a.mcap") as writer:
+        writer.add_topic("/skeletons", adapters.MARKER_ARRAY)
+        for stamp, points in keypoints():
+            people = [(name, stamp, unturned, points + at) for at, name in enumerate(("ann", "bob", "eve"))]
+            data = encode_lists(8, people, frame_id="map", color=(1, 1, 1, 1), size=0.03)  # POINTS
+            writer.write("/skeletons", data, log_time_ns=stamp)
+    first = run(tmp_path / "a.mcap", input_type="keypoint_markers", max_frames=None)
+    assert "3 persons: ann is taken; also bob, eve (--person chooses another)" in first.warnings
+    bob = run(tmp_path / "a.mcap", input_type="keypoint_markers", person="bob", max_frames=None)
+    np.testing.assert_allclose(bob.frames[-1].frame.transl - first.frames[-1].frame.transl, 1, atol=0.01)
+    assert not [warning for warning in bob.warnings if "persons" in warning]
 
 
 def test_simulate_says_how_motions_were_meant(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

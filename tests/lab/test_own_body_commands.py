@@ -18,6 +18,7 @@ from refu_core.simulation import DrapeSettings, GarmentDataset, SelectionSetting
 from refu_lab.cli import main
 from refu_lab.commands.replay import ReplayOptions
 from refu_lab.replay import replay
+from refu_lab.sources import body_warnings
 
 BAGS = Path(__file__).parents[2] / "bags"
 GARMENT = "short-pant-male"

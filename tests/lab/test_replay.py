@@ -409,14 +409,22 @@ def test_a_recording_is_never_written_over(option: str, tmp_path: Path, capsys: 
         assert given.read_bytes() == before
 
 
+def test_a_link_to_itself_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    link = tmp_path / "link.mcap"
+    link.symlink_to(link)
+    code = run(link, "--garments", "short-pant-male", "--output", tmp_path / "out.mcap")
+    assert_one_line(code, capsys.readouterr().err, "link.mcap")
+
+
 def test_a_bag_directory_is_not_written_into(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     given = write_bag(tmp_path / "given", motion(2))
     (file,) = given.glob("*.mcap")
     before = file.read_bytes()
-    for written in (given, file):
+    for written in (given, file, given / "out.mcap"):
         code = run(given, "--garments", "short-pant-male", "--overwrite", "--output", written)
         assert_one_line(code, capsys.readouterr().err, "written over the input")
     assert file.read_bytes() == before
+    assert not (given / "out.mcap").exists()
 
 
 def test_a_damaged_bag_is_not_called_empty(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
