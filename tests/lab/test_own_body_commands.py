@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from refu_lab.bodies import body_warnings
 from smpl_file import write_smpl
 
 from refu_core import GarmentPipeline, SmplFrame, load_body
