@@ -454,6 +454,17 @@ def test_who_goes_away_is_deleted(pipeline: GarmentPipeline) -> None:
     assert len(setup.viewer.messages) == count  # nobody is left to delete
 
 
+@pytest.mark.parametrize("y", [-3.0, 3.0])
+def test_who_is_near_is_so_in_the_frame_of_the_messages(pipeline: GarmentPipeline, y: float) -> None:
+    setup = Setup(pipeline, max_distance=4.3)
+    mocap = Placement(translation=np.array([3.0, 0.0, 0.0]))
+    setup.scene.put("ann", frame(transl=(y, 0.0, 0.0)), mocap)  # SMPL's x is ROS's y: 4.2 m away on either side
+    setup.scene.put("bob", frame(transl=(0.0, 0.0, 1.5 * y / 3.0)), mocap)
+    setup.tick()
+    near = {f"ann/{GARMENT}", *[f"bob/{GARMENT}"] * (y < 0)}
+    assert {marker.ns for marker in setup.viewer.messages[0]} == near
+
+
 def test_a_pipeline_is_swapped_between_ticks(pipeline: GarmentPipeline) -> None:
     setup = Setup(pipeline)
     setup.tick(ann=frame(stamp_ns=1))
