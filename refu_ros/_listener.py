@@ -261,7 +261,8 @@ class Listener:
 
     def _on_transforms(self, is_static: bool, data: bytes) -> None:
         if n := self._tf.put(data, is_static=is_static):
-            msg = f"{n} transforms make no sense: no frame, no finite numbers, or no rotation"
+            why = "they make no sense: no frame, no finite numbers, or no rotation"
+            msg = f"{n} transforms left out: {f'more than {len(self._tf)} frames' if self._tf.is_full else why}"
             raise RefuError(msg)
 
     # Humans (REP-155) -----------------------------------------------------------------------------
