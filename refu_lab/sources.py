@@ -186,14 +186,14 @@ def _follower(options: RecordingOptions, body: SmplBody) -> Callable[[bytes, int
 
     def decode(data: bytes, received_ns: int) -> SmplFrame:
         nonlocal followed
-        people, frame_id = stream.frames(data, received_ns)
+        people, frame_ids = stream.frames(data, received_ns)
         followed = followed if followed is not None or not people else next(iter(people))
         if followed not in people:
             msg = "nobody is to be seen: of too few keypoints there are finite numbers, with confidence"
             if people:
                 msg = f"{followed} isn't to be seen; who is: {', '.join(people)}"
             raise adapters.DecodeError(msg)
-        return replace(people[followed], up=up_of(frame_id))
+        return replace(people[followed], up=up_of(frame_ids[followed]))
 
     return decode
 

@@ -833,8 +833,8 @@ def test_keypoints_are_followed_from_message_to_frames() -> None:
 
     for i in range(10):
         data, now_ns = message(10**9 + i * 33_333_333, 0.05 * i), 5 * 10**9 + i * 33_333_333
-        frames, frame_id = decoder.frames(data, now_ns, sender="ann")
-    assert (list(frames), frame_id) == (["ann"], "camera")
+        frames, frame_ids = decoder.frames(data, now_ns, sender="ann")
+    assert (list(frames), frame_ids) == (["ann"], {"ann": "camera"})
     now = 5 * 10**9 + 9 * 33_333_333
     held, ahead = decoder.predicted(now)["ann"], decoder.predicted(now + 66_666_666)["ann"]
     assert 0.05 < ahead.transl[0] - held.transl[0] < 0.11  # goes on at 1.5 m/s, and dies away
