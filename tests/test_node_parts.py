@@ -8,6 +8,7 @@ import resource
 import tempfile
 import threading
 import time
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from pathlib import Path
@@ -644,6 +645,7 @@ def report_of(
     recording: RecorderState | None = None,
     *,
     persons: tuple[str, ...] = ("",),
+    given: Sequence[str] = ("",),
     has_foreign_betas: bool = False,
     **settings: Any,
 ) -> dict[str, Any]:
@@ -655,7 +657,7 @@ def report_of(
         recording_error=recording.error if recording else "",
         has_foreign_betas=has_foreign_betas,
     )
-    found = statuses(statistics.report(), NodeSettings().changed(settings), now)
+    found = statuses(statistics.report(), NodeSettings().changed({"persons": [*given], **settings}), now)
     return {status.name.removeprefix("n: "): status for status in found}
 
 
@@ -664,6 +666,23 @@ def test_messages_with_nobody_in_them_are_no_silence() -> None:
     statistics.receive()
     assert report_of(statistics, persons=())["input"].message == "nobody is here, though 1 messages came"
     assert report_of(statistics, persons=())["input"].message.startswith("no input for")
+
+
+@pytest.mark.parametrize(
+    ("given", "persons", "message"),
+    [
+        ([""], ("ann", "bob"), "0.0 Hz"),
+        ([""], (), "no input for"),
+        (["left", "right"], ("left_ann", "right_ann"), "0.0 Hz"),
+        (["left", "right"], ("left_ann", "bright_ann"), "no input from right"),
+    ],
+)
+def test_people_in_markers_have_names_of_their_own(given: list[str], persons: tuple[str, ...], message: str) -> None:
+    statistics = Statistics()
+    statistics.receive()
+    report_of(statistics)
+    status = report_of(statistics, persons=persons, given=given, input_type="keypoint_markers")["input"]
+    assert (status.level, status.message[: len(message)]) == (int(message != "0.0 Hz"), message)
 
 
 def test_levels_mean_something(tmp_path: Path) -> None:
