@@ -85,8 +85,8 @@ class InputStream:
             people = People(skeleton, betas=betas, settings=TrackerSettings(smoothing=smoothing))
             self._followed, self._people = followed, (people, len(points))
 
-    def frames(self, data: Buffer, now_ns: int, *, sender: str = "") -> tuple[dict[str, SmplFrame], str]:
-        """Everybody in a message by name, and the frame that it is in: empty where it names none.
+    def frames(self, data: Buffer, now_ns: int, *, sender: str = "") -> tuple[dict[str, SmplFrame], dict[str, str]]:
+        """Everybody in a message by name, and the frame that each is in: empty where the message names none.
 
         The name is the sender's; of keypoints also that of the namespace, as far as there are such. What has no stamp,
         for want of a header or with an empty one, is of now. Raises `DecodeError` for a message that can't be read, and
@@ -95,22 +95,23 @@ class InputStream:
         if self._decoder is not None:
             frame = self._decoder.from_bytes(data)
             frame = frame if frame.stamp_ns else replace(frame, stamp_ns=now_ns)
-            return {sender: frame}, frame_id_of(data, self._decoder.input_type)
+            return {sender: frame}, {sender: frame_id_of(data, self._decoder.input_type)}
         assert self._people is not None, "nobody is followed"
         followed, n_points = self._people
-        frames, frame_id = {}, ""
+        frames, frame_ids = {}, {}
         people = decode_keypoints(self._input_type, data, n_points)
         if len(people) > MOST_PEOPLE:
             msg = f"{len(people)} people in a message; up to {MOST_PEOPLE} are followed"
             raise DecodeError(msg)
         for name, seen in people.items():
-            person, frame_id = "_".join(word for word in (sender, name) if word), frame_id or seen.frame_id
+            person = "_".join(word for word in (sender, name) if word)
+            frame_ids[person] = seen.frame_id
             own = followed.update(
                 person, seen.points, confidence=seen.confidence, stamp_ns=seen.stamp_ns or now_ns, now_ns=now_ns
             )
             if own is not None:
                 frames[person] = own
-        return frames, frame_id
+        return frames, frame_ids
 
     def predicted(self, now_ns: int) -> dict[str, SmplFrame]:
         """Everybody whose keypoints are followed, by now."""

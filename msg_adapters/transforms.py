@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from bisect import bisect_left, bisect_right
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -126,21 +127,36 @@ def _between(values: Sequence[NDArray[np.float64]], stamps: Sequence[int], stamp
 
 
 class TransformBuffer:
-    """The transforms of `/tf` and `/tf_static` of the last ten seconds. Not thread-safe."""
+    """The transforms of `/tf` and `/tf_static` of the last ten seconds. Not thread-safe.
 
-    def __init__(self) -> None:
+    A frame of `/tf` that no transform has come of for `HISTORY_NS` of the `clock` [s] is forgotten.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._tracks: dict[str, _Track] = {}
+        self._clock, self._forget_at = clock, 0.0
+        self._heard: set[str] = set()
+        """Frames that came since some were forgotten."""
 
     def __len__(self) -> int:
         """How many frames have a parent."""
         return len(self._tracks)
 
+    @property
+    def is_full(self) -> bool:
+        """Whether no further frame is taken."""
+        return len(self) >= _MOST_FRAMES
+
     def put(self, data: Buffer, *, is_static: bool) -> int:
-        """Takes a `tf2_msgs/TFMessage`; returns how many of its transforms make no sense and were left out.
+        """Takes a `tf2_msgs/TFMessage`; returns how many of its transforms make no sense, or are too many.
 
         Raises `DecodeError` for anything that isn't such a message.
         """
-        return sum(not self._take(one, is_static) for one in decode_transforms(data))
+        transforms, now = decode_transforms(data), self._clock()
+        if now >= self._forget_at:
+            self._tracks = {name: one for name, one in self._tracks.items() if one.is_static or name in self._heard}
+            self._heard, self._forget_at = set(), now + 1e-9 * HISTORY_NS
+        return sum(not self._take(one, is_static) for one in transforms)
 
     def _take(self, one: Transform, is_static: bool) -> bool:
         parent, child = one.parent.lstrip("/"), one.child.lstrip("/")
@@ -148,13 +164,14 @@ class TransformBuffer:
         length = float(np.linalg.norm(value[3:]))
         if not (parent and child and parent != child and (np.abs(value) <= PLAUSIBLE_TRANSL).all()):
             return False
-        if abs(length - 1.0) > _UNIT_TOLERANCE or (child not in self._tracks and len(self) >= _MOST_FRAMES):
+        if abs(length - 1.0) > _UNIT_TOLERANCE or (child not in self._tracks and self.is_full):
             return False
         value[3:] /= length
         track = self._tracks.get(child)
         if track is None or track.parent != parent or track.is_static != is_static:
             track = self._tracks[child] = _Track(parent, is_static)
         track.put(one.stamp_ns, value)
+        self._heard.add(child)
         return True
 
     def lookup(self, target: str, source: str, stamp_ns: int, *, tolerance_ns: int = 0) -> Placement:

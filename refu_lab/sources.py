@@ -201,7 +201,7 @@ def _follower(options: RecordingOptions, body: SmplBody, notes: list[str]) -> Ca
 
     def decode(data: bytes, received_ns: int) -> SmplFrame:
         nonlocal followed
-        people, frame_id = stream.frames(data, received_ns)
+        people, frame_ids = stream.frames(data, received_ns)
         followed = followed if followed is not None or not people else next(iter(people))
         if followed not in people:
             msg = "nobody is to be seen: of too few keypoints there are finite numbers, with confidence"
@@ -212,7 +212,7 @@ def _follower(options: RecordingOptions, body: SmplBody, notes: list[str]) -> Ca
             others.update(dict.fromkeys(sorted(new)))
             listing = ", ".join([*others][:_SHOWN]) + (" …" if len(others) > _SHOWN else "")
             notes[:] = [f"{1 + len(others)} persons: {followed} is taken; also {listing} (--person chooses another)"]
-        return replace(people[followed], up=up_of(frame_id))
+        return replace(people[followed], up=up_of(frame_ids[followed]))
 
     return decode
 

@@ -33,7 +33,9 @@ class BagJob:
     Raises `RefuError` where the process can't be started.
     """
 
-    def __init__(self, bag: Path, output: Path, settings: NodeSettings, told: Callable[[int, int], object]) -> None:
+    def __init__(
+        self, bag: Path, output: Path, settings: NodeSettings, told: Callable[[int, int], object], *, topic: str = ""
+    ) -> None:
         self.output = output
         self._folder = tempfile.TemporaryDirectory(prefix="refu-replay-")
         self._result = Path(self._folder.name, "result.json")
@@ -41,6 +43,7 @@ class BagJob:
         given = ["betas_source", *["betas"] * bool(settings.known_betas), *["style"] * any(settings.style)]
         if bag.suffix.lower() not in SUFFIXES:  # a file of motion says itself how it is to be read
             given += ["input_axes", *["input_type", "keypoints"] * (settings.input_type in KEYPOINT_TYPES)]
+        command += [f"--topic={topic}"] * bool(topic)
         command += [f"--json={self._result}", *arguments(settings, *PIPELINE_OPTIONS, "margin", "frame_id", *given)]
         pipes: Any = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
         try:

@@ -77,6 +77,8 @@ def _input(report: Report, settings: NodeSettings, now: Situation) -> Judgement:
     recent, reasons, persons, silent_for = report.recent, report.reasons, now.persons, report.silent_for
     received, invalid, waited = recent["received"], recent["drop.invalid"], now.listening_for or 0.0
     missing = [] if settings.follow_humans else [person for person in settings.persons if person not in persons]
+    if settings.input_type == "keypoint_markers":  # who is in them is called `<person>_<namespace>`
+        missing = [name for name in missing if not any(one.startswith(f"{name}_" if name else "") for one in persons)]
     who = ", ".join(filter(None, missing)) or f"{min(silent_for or 0.0, waited):.1f} s"
     silence = f"no input {'from' if any(missing) else 'for'} {who}"
     rules: list[tuple[object, int, str]] = [

@@ -144,18 +144,18 @@ class Listener:
             node.statistics.count("skip.unwatched")
             return
         try:
-            frames, given = self.stream.frames(data, node.now_ns(), sender=person)
+            frames, frame_ids = self.stream.frames(data, node.now_ns(), sender=person)
         except (adapters.AdapterError, FrameError) as error:
             self._refuse(topic, error)
             return
-        given = printable(given.lstrip("/"))
+        given = {name: printable(frame_id.lstrip("/")) for name, frame_id in frame_ids.items()}
         # Keypoints' betas are measured on the body that is dressed, and their axes those of `frame_id`.
         known = [] if self.stream.is_of_keypoints else [*frames.values()]
         if doubt := self.doubts.of(known, self._settings, is_y_up=self._settings.axes == "smpl"):
             node.get_logger().warning(f"{topic}: {doubt}")
-        self.input_frame = given if self._need_transforms(topic, given) else ""
+        self.input_frame = next((one for one in given.values() if self._need_transforms(topic, one)), "")
         for name, frame in frames.items():
-            self._frames[name] = given
+            self._frames[name] = given[name]
             if not self.is_steady:
                 self._put(name, frame, topic)
 
@@ -261,7 +261,8 @@ class Listener:
 
     def _on_transforms(self, is_static: bool, data: bytes) -> None:
         if n := self._tf.put(data, is_static=is_static):
-            msg = f"{n} transforms make no sense: no frame, no finite numbers, or no rotation"
+            why = "they make no sense: no frame, no finite numbers, or no rotation"
+            msg = f"{n} transforms left out: {f'more than {len(self._tf)} frames' if self._tf.is_full else why}"
             raise RefuError(msg)
 
     # Humans (REP-155) -----------------------------------------------------------------------------

@@ -152,7 +152,7 @@ class Requests:
         def tell(done: int, total: int) -> None:
             goal.publish_feedback(self._replay.Feedback(frames_done=done, frames_total=total))
 
-        self._job = BagJob(bag, output, settings, self._node.guarded("replay_bag", tell))
+        self._job = BagJob(bag, output, settings, self._node.guarded("replay_bag", tell), topic=request.topic)
         self._goal = goal
         return self._job
 

@@ -63,6 +63,11 @@ class _Job:
         return self.pipeline, self.settings.margin, frame.pose.tobytes() + frame.betas.tobytes() + style, up, past
 
 
+def _there(arrival: Arrival, settings: NodeSettings) -> Placement:
+    """From the axes of the sender's roots to those of the messages."""
+    return arrival.placement.after(Placement(ros_from_sender(settings.axes)))
+
+
 class Worker:
     """Takes the newest frames from the scene and sends garments, in threads of its own.
 
@@ -199,8 +204,7 @@ class Worker:
 
     def _told(self, frame: SmplFrame, person: str, arrival: Arrival) -> SmplFrame:
         """A frame with its past, as it was where messages are: what a moving camera sees move stands still there."""
-        there = arrival.placement.after(Placement(ros_from_sender(self.settings.axes)))
-        body = self._pipeline.body
+        there, body = _there(arrival, self.settings), self._pipeline.body
         pelvis = body.rest_joints(torch.tensor(frame.betas[None], device=body.device))[0, 0].cpu().double().numpy()
         pose = frame.pose.copy()
         pose[0] = Rotation.from_matrix(there.rotation @ Rotation.from_rotvec(pose[0]).as_matrix()).as_rotvec()
@@ -222,7 +226,8 @@ class Worker:
     def _near(self, arrivals: Mapping[str, Arrival], settings: NodeSettings) -> dict[str, Arrival]:
         near = {}
         for person, arrival in arrivals.items():
-            place = arrival.placement.rotation @ arrival.frame.transl + arrival.placement.translation
+            there = _there(arrival, settings)
+            place = there.rotation @ arrival.frame.transl + there.translation
             if settings.max_distance and np.linalg.norm(place) > settings.max_distance:
                 self._statistics.count("skip.distance")
             else:
@@ -275,11 +280,10 @@ class Worker:
             self._sent_with = job.fittings
             for row in self._outputs:
                 row.forget()
-        axes = Placement(ros_from_sender(job.settings.axes))
         worn = []
         for person, frame in frames.items():
             arrival, output = job.arrivals[person], self._dressed[person].output
-            there = arrival.placement.after(axes)
+            there = _there(arrival, job.settings)
             offset = there.rotation @ frame.transl + there.translation
             worn.append(Dressed(person, frame, output, job.fittings, there.rotation, offset, arrival.camera))
         self._here.update(frames)

@@ -8,6 +8,7 @@ import resource
 import tempfile
 import threading
 import time
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from pathlib import Path
@@ -454,6 +455,17 @@ def test_who_goes_away_is_deleted(pipeline: GarmentPipeline) -> None:
     assert len(setup.viewer.messages) == count  # nobody is left to delete
 
 
+@pytest.mark.parametrize("y", [-3.0, 3.0])
+def test_who_is_near_is_so_in_the_frame_of_the_messages(pipeline: GarmentPipeline, y: float) -> None:
+    setup = Setup(pipeline, max_distance=4.3)
+    mocap = Placement(translation=np.array([3.0, 0.0, 0.0]))
+    setup.scene.put("ann", frame(transl=(y, 0.0, 0.0)), mocap)  # SMPL's x is ROS's y: 4.2 m away on either side
+    setup.scene.put("bob", frame(transl=(0.0, 0.0, 1.5 * y / 3.0)), mocap)
+    setup.tick()
+    near = {f"ann/{GARMENT}", *[f"bob/{GARMENT}"] * (y < 0)}
+    assert {marker.ns for marker in setup.viewer.messages[0]} == near
+
+
 def test_a_pipeline_is_swapped_between_ticks(pipeline: GarmentPipeline) -> None:
     setup = Setup(pipeline)
     setup.tick(ann=frame(stamp_ns=1))
@@ -633,6 +645,7 @@ def report_of(
     recording: RecorderState | None = None,
     *,
     persons: tuple[str, ...] = ("",),
+    given: Sequence[str] = ("",),
     has_foreign_betas: bool = False,
     **settings: Any,
 ) -> dict[str, Any]:
@@ -644,7 +657,7 @@ def report_of(
         recording_error=recording.error if recording else "",
         has_foreign_betas=has_foreign_betas,
     )
-    found = statuses(statistics.report(), NodeSettings().changed(settings), now)
+    found = statuses(statistics.report(), NodeSettings().changed({"persons": [*given], **settings}), now)
     return {status.name.removeprefix("n: "): status for status in found}
 
 
@@ -653,6 +666,23 @@ def test_messages_with_nobody_in_them_are_no_silence() -> None:
     statistics.receive()
     assert report_of(statistics, persons=())["input"].message == "nobody is here, though 1 messages came"
     assert report_of(statistics, persons=())["input"].message.startswith("no input for")
+
+
+@pytest.mark.parametrize(
+    ("given", "persons", "message"),
+    [
+        ([""], ("ann", "bob"), "0.0 Hz"),
+        ([""], (), "no input for"),
+        (["left", "right"], ("left_ann", "right_ann"), "0.0 Hz"),
+        (["left", "right"], ("left_ann", "bright_ann"), "no input from right"),
+    ],
+)
+def test_people_in_markers_have_names_of_their_own(given: list[str], persons: tuple[str, ...], message: str) -> None:
+    statistics = Statistics()
+    statistics.receive()
+    report_of(statistics)
+    status = report_of(statistics, persons=persons, given=given, input_type="keypoint_markers")["input"]
+    assert (status.level, status.message[: len(message)]) == (int(message != "0.0 Hz"), message)
 
 
 def test_levels_mean_something(tmp_path: Path) -> None:
@@ -822,8 +852,8 @@ def test_keypoints_are_followed_from_message_to_frames() -> None:
 
     for i in range(10):
         data, now_ns = message(10**9 + i * 33_333_333, 0.05 * i), 5 * 10**9 + i * 33_333_333
-        frames, frame_id = decoder.frames(data, now_ns, sender="ann")
-    assert (list(frames), frame_id) == (["ann"], "camera")
+        frames, frame_ids = decoder.frames(data, now_ns, sender="ann")
+    assert (list(frames), frame_ids) == (["ann"], {"ann": "camera"})
     now = 5 * 10**9 + 9 * 33_333_333
     held, ahead = decoder.predicted(now)["ann"], decoder.predicted(now + 66_666_666)["ann"]
     assert 0.05 < ahead.transl[0] - held.transl[0] < 0.11  # goes on at 1.5 m/s, and dies away

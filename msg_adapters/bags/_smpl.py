@@ -96,7 +96,7 @@ def _choose(path: Path, topics: Sequence[TopicInfo], name: str | None, kinds: Se
     if len(found) == 1 or len(usual) == 1:
         return (usual or found)[0]
     if found:
-        msg = f"{path}: {len(found)} topics could carry the body: {_listing(found)}; choose one with --topic"
+        msg = f"{path}: {len(found)} topics could carry the body: {_listing(found)}; choose one by topic"
     else:
         msg = f"{path}: no SMPL topic; the bag has {_listing(topics)}, wanted a topic of {wanted}"
     raise BagError(msg)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,7 +91,8 @@ def _of_markers(markers: Sequence[Marker], n: int) -> dict[str, Keypoints]:
         _check_count(len(marker.points), n, "points")
         alpha = marker.colors[:, 3] if len(marker.colors) == n else np.full(n, 1.0)
         name = _name(marker.ns, marker.id if several else 0)
-        people[name] = _keypoints(marker.points, alpha, marker.stamp_ns, marker.frame_id)
+        seen = _keypoints(marker.points, alpha, marker.stamp_ns, marker.frame_id)
+        people[name] = replace(seen, points=marker.placed(seen.points))
     for marker in shown:
         if marker.type in (_CUBE, _SPHERE):
             loose.setdefault(_name(marker.ns, marker.id // _PERSON), []).append(marker)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from msg_adapters.cdr import Buffer, CdrReader
 from msg_adapters.errors import DecodeError
+from msg_adapters.rotations import matrix_from_quaternion
 
 _MIN_MARKER_BYTES = 180
 
@@ -32,10 +33,19 @@ class Marker:
     lifetime_ns: int
     frame_locked: bool
     points: NDArray[np.float64]
-    """Triangle corners [m], shape (3F, 3), or the points of POINTS, (V, 3), in the axes of `frame_id`: a read-only view
-    of the message."""
+    """Triangle corners [m], shape (3F, 3), or the points of POINTS, (V, 3), in the axes of `pose`: a read-only view of
+    the message."""
     colors: NDArray[np.float32]
     """Colour of each corner, shape (3F, 4), or (0, 4): a read-only view of the message."""
+
+    def placed(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points [m], shape (N, 3), from the axes of `pose` to those of `frame_id`."""
+        quaternion = np.array(self.pose[3:])
+        with np.errstate(all="ignore"):  # no finite numbers in, none out
+            if quaternion[:3].any():  # a rotation that nobody has set is none
+                quaternion /= np.abs(quaternion).max()  # its square is finite, and not zero
+                points = points @ matrix_from_quaternion(quaternion / np.linalg.norm(quaternion)).T
+            return points + self.pose[:3]
 
 
 def _marker(reader: CdrReader) -> Marker:

@@ -63,7 +63,8 @@ def _markers(
             return MarkerArrayEncoder(every, frame_id=frame_id, axes="frame", lifetime_ns=lifetime_ns)
 
         arrays = [vertices(one) for one in worn]
-        data: bytes = layouts.get((tuple(one.person for one in worn), frame_id, lifetime_ns), make).encode(
+        key = tuple(one.person for one in worn), frame_id, lifetime_ns
+        data: bytes = layouts.get(key, make, n_people=len(worn)).encode(
             [points for own in arrays for points in own],
             stamp_ns=[one.stamp_ns for one, own in zip(worn, arrays, strict=True) for _ in own],
             transl=[one.offset for one, own in zip(worn, arrays, strict=True) for _ in own],

@@ -12,8 +12,8 @@ from msg_adapters.markers import garment_namespace
 if TYPE_CHECKING:
     from refu_core.outputs import Dressed, Fittings
 
-_MAX_LAYOUTS = 16
-"""Sets of persons whose message layout is kept; making one takes a millisecond."""
+_MOST_LAID_OUT = 64
+"""People in all layouts that are kept, but for one of more; of each a layout has the bytes, and takes a millisecond."""
 Messages = Iterator[tuple[str, bytes]]
 """Topics, and what is to be sent there."""
 
@@ -60,16 +60,20 @@ class Layouts:
 
     def __init__(self) -> None:
         self._known: dict[Any, Any] = {}
+        self._n_people = 0
 
-    def get(self, key: Any, make: Callable[[], Any]) -> Any:
+    def get(self, key: Any, make: Callable[[], Any], *, n_people: int = 1) -> Any:
+        """What `make` makes, of so many people, or made the last time."""
         if key not in self._known:
-            if len(self._known) >= _MAX_LAYOUTS:
-                self._known.clear()
+            if self._n_people + n_people > _MOST_LAID_OUT:
+                self.clear()
             self._known[key] = make()
+            self._n_people += n_people
         return self._known[key]
 
     def clear(self) -> None:
         self._known.clear()
+        self._n_people = 0
 
 
 class Together(Output):

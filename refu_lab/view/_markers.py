@@ -8,7 +8,6 @@ from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from msg_adapters import Marker, decode_marker_array
 from msg_adapters.errors import DecodeError
@@ -103,10 +102,7 @@ class MarkerScene(Generic[_Kept]):
         topology = self._topologies.get(key)
         if topology is None or not topology.fits(points):
             topology = self._topologies[key] = Topology.of(points)
-        vertices = points[topology.first] * marker.scale
-        if any(marker.pose[3:6]):  # a rotation that nobody has set is none
-            vertices = Rotation.from_quat(marker.pose[3:]).apply(vertices)
-        vertices = vertices + marker.pose[:3]
+        vertices = marker.placed(points[topology.first] * marker.scale)
         if self._origin is None:
             self._origin = vertices[0].copy()
         person, _, name = marker.ns.rpartition("/")

@@ -34,15 +34,25 @@ def point(xyz: Any) -> Any:
     return make("geometry_msgs/msg/Point", *map(float, xyz))
 
 
-def pose(xyz: Any) -> Any:
-    return make("geometry_msgs/msg/Pose", point(xyz), make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 0.0))
+def pose(xyz: Any, turn: Any = (0, 0, 0, 0)) -> Any:
+    return make("geometry_msgs/msg/Pose", point(xyz), make("geometry_msgs/msg/Quaternion", *map(float, turn)))
 
 
 def pose_array(points: Any, stamp_ns: int = 5, frame_id: str = "camera") -> bytes:
     return serialise(make(POSES, header(stamp_ns, frame_id), [pose(xyz) for xyz in points]), POSES)
 
 
-def marker(kind: int, number: int = 0, *, ns: str = "", at: Any = (0, 0, 0), points: Any = (), alpha: Any = 1.0) -> Any:
+def marker(
+    kind: int,
+    number: int = 0,
+    *,
+    ns: str = "",
+    frame_id: str = "camera",
+    at: Any = (0, 0, 0),
+    turn: Any = (0, 0, 0, 0),
+    points: Any = (),
+    alpha: Any = 1.0,
+) -> Any:
     zero = make("builtin_interfaces/msg/Duration", 0, 0)
     alphas = np.broadcast_to(alpha, max(len(points), 1))
     colors = [make("std_msgs/msg/ColorRGBA", 0.0, 0.0, 0.0, float(a)) for a in alphas]
@@ -51,8 +61,8 @@ def marker(kind: int, number: int = 0, *, ns: str = "", at: Any = (0, 0, 0), poi
     scale = make("geometry_msgs/msg/Vector3", 0.1, 0.1, 0.1)
     spots = [point(xyz) for xyz in points]
     return make(
-        "visualization_msgs/msg/Marker", header(7, "camera"), ns, number, kind, 0, pose(at), scale, colors[0], zero,
-        False, spots, colors if len(points) else [], "", texture, [], "", "", mesh, False,
+        "visualization_msgs/msg/Marker", header(7, frame_id), ns, number, kind, 0, pose(at, turn), scale,
+        colors[0], zero, False, spots, colors if len(points) else [], "", texture, [], "", "", mesh, False,
     )  # fmt: skip
 
 
@@ -83,6 +93,18 @@ def test_markers(one: Any, two: Any, alpha: Any) -> None:
         for name, points in zip(sorted(names), (one, two), strict=True):
             np.testing.assert_array_equal(found[name].points, points)
         np.testing.assert_array_equal(found[sorted(names)[0]].confidence, alpha)
+
+
+def test_points_of_a_list_are_placed_by_its_pose() -> None:
+    """A quarter turn about z, by hand; what isn't seen stays so, and a rotation may be of any length."""
+    points = np.arange(3.0 * K).reshape(K, 3) * (np.arange(K) > 0)[:, None]
+    for turn, placed in (((0, 0, 2, 2), points[:, [1, 0, 2]] * [-1, 1, 1]), ((0, 0, 0, 0), points)):
+        data = marker_array(marker(7, points=points, at=(2, 0, 1), turn=turn))
+        (seen,) = decode_keypoints("keypoint_markers", data, K).values()
+        assert np.isnan(seen.points[0]).all()
+        np.testing.assert_allclose(seen.points[1:], placed[1:] + np.array([2, 0, 1]), atol=1e-13)
+    odd = marker_array(marker(7, points=points, at=(np.inf, 0, 0), turn=(np.nan, np.inf, 0, 1e-320)))
+    assert not np.isfinite(decode_keypoints("keypoint_markers", odd, K)[""].points).all(axis=1).any()
 
 
 def test_different_people_have_different_names() -> None:
@@ -150,9 +172,11 @@ def test_a_message_of_more_people_than_are_followed_is_refused() -> None:
 def test_streams_and_bags(tmp_path: Path) -> None:
     stream = InputStream("keypoint_markers")
     stream.follow(load_body("male"), "coco17")
-    data = marker_array(*(marker(7, ns=ns, points=standing("coco17", x)) for ns, x in (("a", 0.0), ("b", 2.0))))
-    frames, frame_id = stream.frames(data, 5, sender="left")
-    assert (sorted(frames), frame_id) == (["left_a", "left_b"], "camera")
+    people = ("a", "camera", 0.0), ("b", "lidar", 2.0)
+    data = marker_array(*(marker(7, ns=ns, frame_id=at, points=standing("coco17", x)) for ns, at, x in people))
+    frames, frame_ids = stream.frames(data, 5, sender="left")
+    assert sorted(frames) == ["left_a", "left_b"]
+    assert frame_ids == {"left_a": "camera", "left_b": "lidar"}
     assert frames["left_b"].transl[0] - frames["left_a"].transl[0] == pytest.approx(2, abs=1e-6)
     assert sorted(stream.predicted(10**8)) == ["left_a", "left_b"]
     with BagWriter(tmp_path / "a.mcap") as writer:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from importlib import import_module
+from itertools import combinations
+from types import SimpleNamespace
 from typing import Any
+from weakref import WeakSet
 
 import numpy as np
 import pytest
@@ -21,6 +25,7 @@ from msg_adapters import (
     TF_MESSAGE,
     DecodeError,
     EncodeError,
+    MarkerArrayEncoder,
     MarkerMesh,
     Placement,
     decode_camera_info,
@@ -32,6 +37,7 @@ from msg_adapters import (
     quaternion_from_matrix,
     quaternion_from_rotvec,
 )
+from msg_adapters.markers import SKIN
 from msg_adapters.outputs import (
     COLLISION_OBJECT,
     POINT_CLOUD,
@@ -45,6 +51,7 @@ from msg_adapters.outputs import (
     encode_polygon,
     encode_rims,
     encode_scene,
+    make_outputs,
 )
 from msg_adapters.rotations import matrix_from_quaternion
 
@@ -75,6 +82,40 @@ def same_again(data: bytes, message_type: str) -> Any:
     message = deserialise(data, message_type)
     assert serialise(message, message_type) == data
     return message
+
+
+def test_few_layouts_of_many_people_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each holds a whole message; which people are in it may change with every frame that is lost."""
+    garments, kept, n_made = make_outputs()[0], WeakSet[MarkerArrayEncoder](), 0
+    fittings = SimpleNamespace(names=["shirt"], colors={"shirt": SKIN}, faces={"shirt": FACES}, counts={"shirt": 4})
+    vertices = {"shirt": np.eye(4, 3)}
+    crowd = [
+        SimpleNamespace(person=f"p{i}", fittings=fittings, vertices=vertices, stamp_ns=i, offset=np.full(3, i))
+        for i in range(50)
+    ]
+    moment: Any = SimpleNamespace(frame_id="map", lifetime_ns=0, watchers=lambda _: 1, now_ns=5)
+
+    def make(meshes: Sequence[MarkerMesh], **how: Any) -> MarkerArrayEncoder:
+        nonlocal n_made
+        n_made += 1
+        kept.add(one := MarkerArrayEncoder(meshes, **how))
+        return one
+
+    monkeypatch.setattr("msg_adapters.outputs._table.MarkerArrayEncoder", make)
+
+    def send(people: Sequence[Any]) -> None:
+        ((_, data),) = garments.messages(people, moment)
+        assert [marker.stamp_ns for marker in decode_marker_array(data)] == [one.stamp_ns for one in people]
+
+    for gone in range(50):
+        send([one for one in crowd if one.stamp_ns != gone])
+        assert len(kept) == 1
+    sets = [[*people] for n in (1, 2, 3, 4) for people in combinations(crowd[:4], n)]
+    for _ in range(3):
+        n_made = 0
+        for people in sets:
+            send(people)
+    assert n_made == 0  # of few, all are kept
 
 
 # Points -------------------------------------------------------------------------------------------

@@ -163,6 +163,26 @@ def test_history_is_bounded_and_a_clock_may_go_back() -> None:
         buffer.lookup("map", "cam", 5 * S)
 
 
+def test_frames_of_people_who_have_left_are_forgotten() -> None:
+    now = 0.0
+    buffer = TransformBuffer(clock=lambda: now)
+    put(buffer, transform("base", "cam"), is_static=True)
+    for i in range(50):  # of each, thirty frames for ten seconds; the robot's come all the time
+        now = 10.0 * i
+        body = [transform("cam", f"body_{i}_{part}", i * S) for part in range(30)]
+        assert put(buffer, transform("map", "base", i * S), *body) == 0
+        buffer.lookup("map", f"body_{i}_0", i * S)
+        assert len(buffer) <= 2 + 2 * 30
+    many = [transform("map", f"f{i}") for i in range(10_000)]
+    assert put(buffer, *many) > 0
+    assert buffer.is_full
+    for _ in range(2):
+        now += 10.0
+        put(buffer, transform("map", "base"))
+    assert len(buffer) == 2
+    assert not buffer.is_full
+
+
 def test_a_camera_that_looks_ahead_sees_people_upright() -> None:
     """Optical frames have z ahead and y down; the numbers are REP-103's, by hand."""
     buffer = TransformBuffer()

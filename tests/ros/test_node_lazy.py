@@ -12,11 +12,12 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy isn't installed (extra ros): the node isn't tested")
 
-from harness import CHEAP, GARMENTS, NodeProcess, Peer, frame, ros_arguments
+from harness import CHEAP, GARMENTS, ROOT, NodeProcess, Peer, frame, ros_arguments
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
-from rclpy.qos import ReliabilityPolicy
+from rclpy.qos import QoSPolicyKind, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from std_srvs.srv import SetBool
 from visualization_msgs.msg import MarkerArray
 
@@ -275,6 +276,14 @@ def test_overridden_qualities_hold_each_time(stage: Callable[..., Stage]) -> Non
         assert info.qos_profile.reliability == ReliabilityPolicy.RELIABLE
         scene.peer.unwatch()
         scene.rests()
+
+
+def test_the_guide_names_the_qualities_that_can_be_overridden() -> None:
+    text = (ROOT / "docs" / "guide" / "ros.md").read_text(encoding="utf-8")
+    said = text.partition("QoS overrides change")[2].partition(".")[0]
+    policies = {kind.name.lower() for kind in QoSPolicyKind}
+    overridable = {kind.name.lower() for kind in QoSOverridingOptions.with_default_policies().policy_kinds}
+    assert {word.strip(",") for word in said.split()} & policies == overridable
 
 
 def test_the_program_rests_after_some_seconds(ros: None, tmp_path: Path) -> None:  # noqa: ARG001

@@ -27,6 +27,7 @@ from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, JointState, PointCloud2
 from shape_msgs.msg import Mesh
 from std_msgs.msg import String
+from test_node_keypoints import people
 from visualization_msgs.msg import MarkerArray
 
 from msg_adapters import (
@@ -392,6 +393,33 @@ def test_without_transforms_the_frame_is_warned_of(
     scene.peer.diagnostics.clear()
     scene.until(lambda: scene.peer.diagnostics, "the node says how it is")
     assert scene.peer.status("input")[2]["frame"] == "camera, shown as map"
+
+
+def test_each_person_is_where_their_own_marker_is(robot: Callable[..., Robot], foreign: Callable[..., Any]) -> None:
+    """Of two cameras, one at the origin of the map."""
+    kind = foreign("tf2_msgs/msg/TFMessage")
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    scene = robot("nobody", garments=[TSHIRT], input_type="keypoint_markers", keypoints="coco17", person_timeout=30.0)
+    static = scene.peer.node.create_publisher(kind, "/tf_static", latched)
+    tracker = scene.peer.node.create_publisher(MarkerArray, "smpl_params", 1)
+    data, buffer = world()
+    static.publish(data)
+    scene.hear("garments", MarkerArray, raw=True)
+    there = buffer.lookup("map", "optical", 0)
+    wanted = {"ann": np.array([0.0, 0.0, 3.0]), "bob": there.rotation @ [1.5, 0.0, 4.0] + there.translation}
+    ticks = iter(range(10**6))
+
+    def are_there() -> bool:
+        message = people(1e-4 * next(ticks))
+        message.markers[0].header.frame_id, message.markers[1].header.frame_id = "map", "optical"
+        tracker.publish(message)
+        came = [marker for data in scene.heard["garments"][-1:] for marker in decode_marker_array(data)]
+        places = {marker.ns.split("/")[0]: marker.points.mean(0) for marker in came if len(marker.points)}
+        return wanted.keys() <= places.keys() and all(
+            np.linalg.norm(places[person] - place) < 0.7 for person, place in wanted.items()
+        )
+
+    scene.until(are_there, "each is where their camera has them")
 
 
 def test_who_is_tracked_is_followed(robot: Callable[..., Robot], foreign: Callable[..., Any]) -> None:

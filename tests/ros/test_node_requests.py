@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -40,11 +41,13 @@ def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder.mkdir()
     with BagReader(WALK) as walk:
         messages = [message for message in walk.messages() if message.topic == "/smpl_params"][:N_WALK]
-    for path in (folder / "walk.mcap", home / "secret.mcap"):
+    one, two = ["/smpl_params"], ["/ann/smpl_params", "/bob/smpl_params"]
+    for path, topics in ((folder / "walk.mcap", one), (folder / "two.mcap", two), (home / "secret.mcap", one)):
         with BagWriter(path) as bag:
-            bag.add_topic("/smpl_params", messages[0].message_type)
-            for message in messages:
-                bag.write("/smpl_params", message.data, log_time_ns=message.log_time_ns)
+            for topic in topics:
+                bag.add_topic(topic, messages[0].message_type)
+            for topic, message in product(topics, messages):
+                bag.write(topic, message.data, log_time_ns=message.log_time_ns)
     (folder / "out.mcap").symlink_to(home / "secret.mcap")
     (folder / "noise.mcap").write_bytes(os.urandom(1000))
     return folder
@@ -203,18 +206,18 @@ def test_a_recording_says_where_it_is(peer: Peer, bags: Path) -> None:
 
 def test_a_bag_is_dressed_beside_the_stream(peer: Peer, bags: Path) -> None:
     replayer = Replayer(peer)
-    handle = replayer.begin(bag="walk.mcap", garments=GARMENTS[:1])
+    handle = replayer.begin(bag="two.mcap", topic="/bob/smpl_params", garments=GARMENTS[:1])
     peer.dress(frame(4))  # meanwhile
     status, result = replayer.result(handle)
     assert (status, result.success) == (GoalStatus.STATUS_SUCCEEDED, True), result.message
-    assert result.output == str(bags / "walk-dressed.mcap")
+    assert result.output == str(bags / "two-dressed.mcap")
     assert (result.frames, list(result.garments)) == (N_WALK, [GARMENTS[0]])
     assert 0 <= result.vfcp_percent[0] <= 100
     assert 0 <= result.cfmp_percent[0] <= 100
     assert replayer.feedback[0] == (0, N_WALK)
     # The last word of it may still be on its way when the result has come.
     peer.spin_until(lambda: replayer.feedback[-1] == (N_WALK, N_WALK), "all of it is told")
-    with BagReader(bags / "walk-dressed.mcap") as bag:
+    with BagReader(bags / "two-dressed.mcap") as bag:
         assert sum(message.topic == "/garments" for message in bag.messages()) == N_WALK
 
 
@@ -263,6 +266,9 @@ def test_one_bag_at_a_time_and_it_can_be_cancelled(peer: Peer, bags: Path) -> No
         ({"bag": "walk.mcap", "garments": ["x.npz"]}, "garments"),
         ({"bag": "walk.mcap", "sdf": "--help"}, "sdf"),
         ({"bag": "noise.mcap"}, "noise.mcap"),
+        ({"bag": "two.mcap"}, "/ann/smpl_params (std_msgs/msg/Float32MultiArray), /bob/smpl_params"),
+        ({"bag": "two.mcap", "topic": "/eve"}, "no topic /eve"),
+        ({"bag": "two.mcap", "topic": "/eve\n--overwrite"}, "control characters"),
     ],
     ids=lambda value: "" if isinstance(value, dict) else value,
 )
