@@ -112,7 +112,7 @@ def open_source(options: RecordingOptions, body: Callable[[], SmplBody]) -> Sour
             fps=options.fps,
             axes=options.input_axes,
             person=options.person,
-            worn=Proportions.of_body(body()),
+            worn=Proportions.of_body(body()) if options.input.exists() else None,  # what isn't there is told at once
         )
         description = f"{options.input.name}, {len(motion)} frames at {motion.fps:g} Hz"
         up = upright_turn(motion.poses[:, 0].astype(np.float64))[1] if options.axes == "frame" else None

@@ -32,7 +32,7 @@ def test_a_sparse_matrix_of_more_entries_than_it_has(tmp_path: Path) -> None:
     parts = {"data": np.ones(2), "indices": np.zeros(2, int), "indptr": np.array([0, 1 << 40])}
     state = b"".join(b"S'%s'\n" % key.encode() + pickle.dumps(part, 2)[2:-1] + b"s" for key, part in parts.items())
     matrix = b"cscipy.sparse.csc\ncsc_matrix\n)\x81}" + state + b"S'_shape'\n(K\x18K\x01tsb"
-    with pytest.raises(BodyError, match="whose columns have 1099511627776 entries, and 2 are given"):
+    with pytest.raises(BodyError, match="J_regressor can't be read"):
         load_body(pickled(tmp_path, b"(dS'J_regressor'\n" + matrix + b"s."))
 
 

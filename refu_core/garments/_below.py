@@ -66,7 +66,7 @@ class SkinBelow:
             return cloth
         by_vertex = shift.transpose(0, 1).flatten(1)
         moved = functional.embedding_bag(self.vertex, by_vertex, mode="sum", per_sample_weights=self.weight)
-        return moved.view(-1, *shift.shape[::2]).transpose(0, 1)
+        return moved.view(len(self.vertex), len(shift), 3).transpose(0, 1)
 
 
 _follow = Repeated(follow_kernel, (Vertices, Weights, wp.vec3, wp.int32, wp.vec3))

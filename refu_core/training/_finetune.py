@@ -213,7 +213,8 @@ def _tensors(samples: TrainingSamples, body: SmplBody, garment: GarmentTemplate)
         return garment.pose(rest + whole, body(pose, betas).transforms)
 
     inputs = samples.betas, samples.pose, samples.style
-    return *inputs, in_chunks(posed, samples.displacement, *inputs)
+    whole = in_chunks(posed, samples.displacement, *inputs) if len(samples) else samples.displacement
+    return *inputs, whole
 
 
 def _layer(mode: str, settings: FinetuneSettings, n_vertices: int) -> Refu | None:

@@ -183,7 +183,7 @@ def _read_tensors(path: Path, sha256: Any) -> dict[str, Tensor]:
     try:
         with _open(path, MAX_BYTES) as file:
             (n,) = struct.unpack("<Q", file.read(8))
-            if n > MAX_CARD_BYTES:
+            if not 2 <= n <= MAX_CARD_BYTES:  # {} at least
                 msg = f"a header of {n} bytes"
                 raise ValueError(msg)
             file.seek(0)

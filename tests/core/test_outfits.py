@@ -19,7 +19,7 @@ from refu_core.sdf import ExactSdf
 from refu_core.simulation import GarmentDataset, SimulationError, colliders, simulate_dataset
 from refu_core.simulation._joined import JoinedGarments
 from refu_core.simulation._plan import names_of
-from refu_core.simulation._store import read_card, write_card
+from refu_core.simulation._store import FORMAT, read_card, write_card
 from refu_core.training._data import TrainingSet
 
 NAMES = ("tshirt-male", "short-pant-male")
@@ -147,6 +147,6 @@ def test_one_garment_of_the_set_is_trained_on(dataset: GarmentDataset) -> None:
 )
 def test_damaged_parts_are_refused(simulated: Path, tmp_path: Path, parts: Any) -> None:
     path = shutil.copytree(simulated, tmp_path / "set")
-    write_card(path, read_card(path) | {"parts": parts})
+    write_card(path, read_card(path, FORMAT) | {"parts": parts})
     with pytest.raises(SimulationError, match="wanted a card whose parts are the 10361 vertices"):
         GarmentDataset(path)
