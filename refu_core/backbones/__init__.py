@@ -34,7 +34,6 @@ from refu_core.backbones._presets import build_backbone as build_backbone
 from refu_core.backbones._presets import uses_basis as uses_basis
 from refu_core.backbones._protocol import MAX_OFFSET as MAX_OFFSET
 from refu_core.backbones._protocol import Backbone as Backbone
-from refu_core.backbones._protocol import Prediction as Prediction
 from refu_core.backbones._protocol import Skinned as Skinned
 from refu_core.backbones._protocol import WithoutWearerCode as WithoutWearerCode
 from refu_core.backbones._tailornet import TailorNet as TailorNet

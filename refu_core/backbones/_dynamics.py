@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from refu_core.backbones._features import N_STYLE_SHAPE, style_shape
 from refu_core.backbones._perceptron import Perceptron
-from refu_core.backbones._protocol import Prediction
 from refu_core.backbones._tailornet import TailorNet
 from refu_core.frames import LAGS, N_JOINTS, N_PAST
 
@@ -97,10 +96,11 @@ class Dynamic(nn.Module):
         *,
         wearer_code: Tensor | None = None,
         past: Tensor | None = None,
-    ) -> Prediction:
+    ) -> Tensor:
         """Predicts as the TailorNet does and, where it is told the past (B, 4, 219), for moving cloth."""
         x, s = self.still.features(pose), style_shape(betas, style)
         code = self.still.code(x, s, wearer_code)
         if past is not None:
             code = code + self.dynamics(x, s, past)
-        return Prediction(self.still.decoder(code), None)
+        displacement: Tensor = self.still.decoder(code)
+        return displacement

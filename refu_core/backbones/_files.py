@@ -95,7 +95,7 @@ def backbone_from_weights(weights: Weights, garment: GarmentTemplate, *, device:
     module = module.float().to(device).eval()
     with torch.no_grad():
         at_rest = module(torch.zeros(1, N_BETAS, device=device), torch.zeros(1, N_JOINTS, 3, device=device), None)
-    offset = 0.0 if at_rest.displacement is None else float(at_rest.displacement.abs().max())
+    offset = 0.0 if at_rest is None else float(at_rest.abs().max())
     if not offset <= MAX_OFFSET:  # nor NaN
         msg = f"{weights.path}: wanted a garment within {MAX_OFFSET:g} m of a body at rest, this one is "
         msg += f"{offset:.3g} m off; train it again"

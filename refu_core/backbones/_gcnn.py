@@ -14,7 +14,7 @@ from torch.nn import functional
 
 from refu_core.backbones._features import N_STYLE_SHAPE, PoseFeatures, style_shape
 from refu_core.backbones._perceptron import Perceptron
-from refu_core.backbones._protocol import Prediction, WithoutWearerCode
+from refu_core.backbones._protocol import WithoutWearerCode
 from refu_core.errors import WeightsError
 from refu_core.garments import GarmentTemplate
 from refu_core.mesh import Connectivity
@@ -173,7 +173,7 @@ class Gcnn(WithoutWearerCode, nn.Module):
     """A mesh decoder conditioned on (θ, β, γ).
 
     The original is an autoencoder of meshes, and there is no mesh to encode at run time: how (θ, β, γ) enter is this
-    project's choice. A perceptron fills the latent of the coarsest graph, which is also the global feature z of ReFU.
+    project's choice. A perceptron fills the latent of the coarsest graph.
     """
 
     def __init__(self, config: GcnnConfig, garment: GarmentTemplate) -> None:
@@ -182,9 +182,7 @@ class Gcnn(WithoutWearerCode, nn.Module):
         self.n_vertices = garment.n_vertices
         graph = MeshGraph.of(garment.mesh, levels=len(config.channels), stride=config.stride)
         self.features = PoseFeatures(config.joints, config.encoding)
-        self.feature_size = graph.sizes[-1] * config.channels[0]
-        """M, the size of z."""
-        n, m = self.features.size + N_STYLE_SHAPE, self.feature_size
+        n, m = self.features.size + N_STYLE_SHAPE, graph.sizes[-1] * config.channels[0]
         self.head = Perceptron(n, config.hidden, m, activation=config.activation, dropout=config.dropout)
         ends = (*config.channels[1:], 3)
         self.layers = nn.ModuleList(
@@ -203,10 +201,11 @@ class Gcnn(WithoutWearerCode, nn.Module):
         style: Tensor | None,
         *,
         wearer_code: Tensor | None = None,  # noqa: ARG002
-    ) -> Prediction:
+    ) -> Tensor:
         """Predicts for betas (B, 10), pose (B, 24, 3) [rad] and style (B, 4)."""
         z = self.head(torch.cat((self.features(pose), style_shape(betas, style)), 1))
         x = z.view(len(z), -1, self.config.channels[0]).transpose(0, 1)
         for layer in self.layers[:-1]:
             x = functional.elu(layer(x))
-        return Prediction(self.mean + self.scale * self.layers[-1](x).transpose(0, 1), z)
+        displacement: Tensor = self.mean + self.scale * self.layers[-1](x).transpose(0, 1)
+        return displacement

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from refu_core.backbones._decoder import Decoder
 from refu_core.backbones._features import N_STYLE_SHAPE, PoseFeatures, style_shape
 from refu_core.backbones._perceptron import Perceptron
-from refu_core.backbones._protocol import Prediction, WithoutWearerCode
+from refu_core.backbones._protocol import WithoutWearerCode
 
 
 @dataclass(frozen=True)
@@ -47,9 +47,10 @@ class Mlp(WithoutWearerCode, nn.Module):
         style: Tensor | None,
         *,
         wearer_code: Tensor | None = None,  # noqa: ARG002
-    ) -> Prediction:
+    ) -> Tensor:
         """Predicts for betas (B, 10), pose (B, 24, 3) [rad] and style (B, 4)."""
-        return Prediction(self.decoder(self.code(self.features(pose), style_shape(betas, style))), None)
+        displacement: Tensor = self.decoder(self.code(self.features(pose), style_shape(betas, style)))
+        return displacement
 
     def code(self, x: Tensor, s: Tensor) -> Tensor:
         """Code, shape (B, C), of pose features (B, I) and (β, γ) (B, 14)."""

@@ -1,20 +1,10 @@
-"""What a backbone is: (β, θ, γ) to unposed displacement and global feature."""
+"""What a backbone is: (β, θ, γ) to unposed displacements."""
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 from torch import Tensor
-
-
-class Prediction(NamedTuple):
-    """What a backbone predicts for a batch of bodies."""
-
-    displacement: Tensor | None
-    """Added to the garment's template in the T-pose [m], shape (B, V, 3); None for none."""
-    feature: Tensor | None
-    """Global garment feature z = h(β, θ, γ) that the ReFU scale is predicted from, shape (B, M); None without one."""
-
 
 MAX_OFFSET = 2.0
 """No vertex is further from where the template has it [m], whatever a network says; as in the data it learns from."""
@@ -37,11 +27,11 @@ class Backbone(Protocol):
 
     def __call__(
         self, betas: Tensor, pose: Tensor, style: Tensor | None, *, wearer_code: Tensor | None = None
-    ) -> Prediction:
-        """Predicts for betas (B, 10), pose (B, 24, 3) [rad] and style (B, 4).
+    ) -> Tensor | None:
+        """What is added to the garment's template in the T-pose [m], shape (B, V, 3); None for nothing.
 
-        Given the `wearer_code` of (β, γ), that isn't computed again. One that heeds the past takes it as `past`, too,
-        of the shape (B, 4, 219).
+        For betas (B, 10), pose (B, 24, 3) [rad] and style (B, 4). Given the `wearer_code` of (β, γ), it isn't computed
+        again. One that heeds the past takes it as `past`, too, of the shape (B, 4, 219).
         """
         ...
 
@@ -60,11 +50,10 @@ class Skinned(WithoutWearerCode):
 
     def __call__(
         self,
-        betas: Tensor,  # noqa: ARG002
-        pose: Tensor,  # noqa: ARG002
-        style: Tensor | None,  # noqa: ARG002
+        betas: Tensor,
+        pose: Tensor,
+        style: Tensor | None,
         *,
-        wearer_code: Tensor | None = None,  # noqa: ARG002
-    ) -> Prediction:
+        wearer_code: Tensor | None = None,
+    ) -> None:
         """Predicts no displacement."""
-        return Prediction(None, None)

@@ -11,7 +11,6 @@ from torch.func import functional_call
 from refu_core.backbones._decoder import Decoder
 from refu_core.backbones._features import N_STYLE_SHAPE, PoseFeatures, style_shape
 from refu_core.backbones._perceptron import Perceptron, StackedPerceptrons
-from refu_core.backbones._protocol import Prediction
 from refu_core.garments import GarmentTemplate
 
 
@@ -73,10 +72,11 @@ class TailorNet(nn.Module):
 
     def forward(
         self, betas: Tensor, pose: Tensor, style: Tensor | None, *, wearer_code: Tensor | None = None
-    ) -> Prediction:
+    ) -> Tensor:
         """Predicts for betas (B, 10), pose (B, 24, 3) [rad], style (B, 4) and, where it is known, their code (B, K)."""
         code = self.code(self.features(pose), style_shape(betas, style), wearer_code)
-        return Prediction(self.decoder(code), None)
+        displacement: Tensor = self.decoder(code)
+        return displacement
 
     def code(self, x: Tensor, s: Tensor, mixture: Tensor | None = None) -> Tensor:
         """Code, shape (B, C), of pose features (B, I), (β, γ) (B, 14) and, where it is known, their mixture (B, K)."""

@@ -100,8 +100,8 @@ def _drape(
     told = {"past": past} if past is not None and wearable.backbone.heeds_past else {}
     predicted = wearable.backbone(garment.betas, pose, style, wearer_code=garment.code, **told)
     unposed, on_mean = garment.rest, garment.on_mean
-    if predicted.displacement is not None:
-        displacement = predicted.displacement.clamp(-MAX_OFFSET, MAX_OFFSET).to(unposed)
+    if predicted is not None:
+        displacement = predicted.clamp(-MAX_OFFSET, MAX_OFFSET).to(unposed)
         unposed, on_mean = unposed + displacement, on_mean + displacement
     z = None
     if wearable.refu is not None:

@@ -123,7 +123,7 @@ class Carried:
 
         def one(betas: Tensor, pose: Tensor) -> Tensor:
             known = betas if self._betas is None else self._betas(betas).float()
-            there = self.network(known, pose, None).displacement
+            there = self.network(known, pose, None)
             assert there is not None  # a network was asked for
             rest, transforms = self._garment.rest(betas), self._body(pose, betas).transforms
             posed = self._posed_as.pose(rest + self._mixed(there), transforms)

@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from refu_core.backbones import Backbone, Prediction
+from refu_core.backbones import Backbone
 from refu_core.body import Collider, SmplBody
 from refu_core.contact import Blend
 from refu_core.garments import GarmentTemplate
@@ -92,7 +92,7 @@ class _InPrecision:
 
     def __call__(
         self, betas: Tensor, pose: Tensor, style: Tensor | None, *, wearer_code: Tensor | None = None
-    ) -> Prediction:
+    ) -> Tensor | None:
         """As `Backbone`."""
         with torch.autocast(betas.device.type, self.dtype, enabled=self.is_low):
             return self.backbone(betas, pose, style, wearer_code=wearer_code)

@@ -20,7 +20,7 @@ def displacements(backbone: Backbone, samples: TrainingSamples) -> Tensor:
     """What a backbone predicts for samples [m], shape (N, V, 3); zero for one without a network."""
 
     def predict(betas: Tensor, pose: Tensor, style: Tensor, truth: Tensor) -> Tensor:
-        predicted = backbone(betas, pose, style).displacement
+        predicted = backbone(betas, pose, style)
         return torch.zeros_like(truth) if predicted is None else predicted
 
     return in_chunks(predict, samples.betas, samples.pose, samples.style, samples.displacement, size=_CHUNK)

@@ -206,7 +206,7 @@ def stages(
         model.scale.copy_((train.displacement - mean).std())
         model.head.standardise(torch.cat((model.features(train.pose), train.style_shape), 1), model.features.groups)
         parts = [(s.betas, s.pose, s.style, s.displacement) for s in (train, validation)]
-        objective = Objective([model], lambda *inputs: model(*inputs).displacement, _vertex_loss)
+        objective = Objective([model], model, _vertex_loss)
         return [TrainingStage("all", objective, settings.steps, *parts)]
     inputs = [(model.features(s.pose), s.style_shape) for s in (train, validation)]
     codes = [in_chunks(model.decoder.encode, s.displacement, size=256) for s in (train, validation)]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from refu_core import GarmentTemplate, SmplBody
-from refu_core.backbones import Backbone, Prediction, WithoutWearerCode, backbone_config, build_backbone
+from refu_core.backbones import Backbone, WithoutWearerCode, backbone_config, build_backbone
 from refu_core.frames import N_BETAS, N_STYLES, SmplFrame
 from refu_core.realtime import Outfit, Wearable, Wearer, dress
 from refu_core.refu import PAPER, ScaleNet, repulse
@@ -45,7 +45,7 @@ class _InPrecision(WithoutWearerCode):
         style: Tensor | None,
         *,
         wearer_code: Tensor | None = None,  # noqa: ARG002
-    ) -> Prediction:
+    ) -> Tensor | None:
         """As `Backbone`."""
         style = None if style is None else style.to(self._dtype)
         return self._backbone(betas.to(self._dtype), pose.to(self._dtype), style)

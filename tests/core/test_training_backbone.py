@@ -21,7 +21,6 @@ from refu_core.backbones import (
     GcnnConfig,
     LaplacianSmoothing,
     MlpConfig,
-    Prediction,
     TailorNetConfig,
     WithoutWearerCode,
     load_backbone,
@@ -115,9 +114,9 @@ class Told(WithoutWearerCode):
     def __init__(self, displacement: Tensor) -> None:
         self.displacement = displacement
 
-    def __call__(self, *inputs: Tensor | None, wearer_code: Tensor | None = None) -> Prediction:
+    def __call__(self, *inputs: Tensor | None, wearer_code: Tensor | None = None) -> Tensor:
         del inputs, wearer_code
-        return Prediction(self.displacement, None)
+        return self.displacement
 
 
 def test_a_network_that_says_what_samples_say_makes_the_simulated_garment(

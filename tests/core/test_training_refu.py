@@ -13,7 +13,7 @@ from small_set import write_set
 from torch import Tensor, nn
 
 from refu_core import load_body, load_garment
-from refu_core.backbones import MlpConfig, Prediction, WithoutWearerCode, backbone_from_weights
+from refu_core.backbones import MlpConfig, WithoutWearerCode, backbone_from_weights
 from refu_core.body import ARMS, Collider, SmplBody
 from refu_core.contact import Blend
 from refu_core.errors import RefuError, WeightsError
@@ -83,9 +83,9 @@ class Tight(WithoutWearerCode, nn.Module):
 
     def forward(
         self, betas: Tensor, pose: Tensor, style: Tensor | None, *, wearer_code: Tensor | None = None
-    ) -> Prediction:
+    ) -> Tensor:
         del pose, style, wearer_code
-        return Prediction(self.inward.expand(len(betas), -1, -1), None)
+        return self.inward.expand(len(betas), -1, -1)
 
 
 def bodies(batch: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -189,7 +189,7 @@ def test_every_mode_writes_what_can_be_read(
     network, refu = trained_from_weights(load_weights(stem, expect=expect), garment)
     betas, pose, style = bodies(2)
     before = backbone_from_weights(load_weights(pretrained / "mlp-none", expect=expect), garment)
-    assert not torch.equal(network(betas, pose, style).displacement, before(betas, pose, style).displacement)
+    assert not torch.equal(network(betas, pose, style), before(betas, pose, style))
     assert card["mode"] == load_weights(stem).card["mode"] == mode
     assert (tmp_path / f"mlp-{mode}.png").exists()
     assert not (tmp_path / f"mlp-{mode}.checkpoint").exists()
@@ -259,7 +259,7 @@ def test_a_gcnn_is_trained_from_scratch(tmp_path: Path, dataset: Path, garment: 
     card = finetune(GARMENT, dataset, None, tmp_path, mode="approx", backbone="gcnn", settings=settings, quiet=True)
     assert card["from_scratch"]
     network = backbone_from_weights(load_weights(tmp_path / "gcnn-approx"), garment)
-    assert torch.isfinite(network(*bodies(1)).displacement).all()
+    assert torch.isfinite(network(*bodies(1))).all()
 
 
 def test_a_gcnn_has_as_much_training_with_refu_as_alone() -> None:

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from msg_adapters import Motion
 from refu_core import GarmentPipeline, PoseHistory
-from refu_core.backbones import Prediction, Skinned, WithoutWearerCode
+from refu_core.backbones import Skinned, WithoutWearerCode
 from refu_core.body import Collider, load_body
 from refu_core.errors import RefuError, WeightsError
 from refu_core.garments import PAPER_GARMENTS, GarmentTemplate, SkinBelow, load_garment
@@ -86,10 +86,10 @@ class Noisy(WithoutWearerCode):
         style: Tensor | None,  # noqa: ARG002
         *,
         wearer_code: Tensor | None = None,  # noqa: ARG002
-    ) -> Prediction:
+    ) -> torch.Tensor:
         x = self.garment.v_template
         wave = torch.sin(25 * x.sum(-1) + 3 * pose.sum())
-        return Prediction(self.amplitude * wave[None, :, None] * torch.tensor([1.0, 0.0, 1.0]), None)
+        return self.amplitude * wave[None, :, None] * torch.tensor([1.0, 0.0, 1.0])
 
 
 class Emulated(rp.Library):
@@ -169,7 +169,7 @@ def test_figures_of_the_baseline_against_a_loop_of_other_libraries(study: rp.Stu
         sample = samples.read(k)
         pose, betas, style = (torch.from_numpy(a)[None] for a in (sample.pose, sample.betas, sample.style))
         posed = body(pose, betas)
-        unposed = garment.rest(betas, style) + backbone(betas, pose, style).displacement
+        unposed = garment.rest(betas, style) + backbone(betas, pose, style)
         apart = collider(posed.vertices, posed.transforms)
         taken = garment.pose(unposed, posed.transforms) + SkinBelow.of(garment, body)(apart - posed.vertices)
         mine, skin, skin_faces = taken[0].numpy().astype(float), apart[0].numpy().astype(float), body.faces.numpy()
