@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
 
 from refu_core.body import Surface
 from refu_core.errors import MeshError
-from refu_core.mesh import vertex_normals
+from refu_core.mesh import Connectivity, vertex_normals
 from refu_core.metrics._intersect import SheetChecker, as_vertices
 from refu_core.sdf import Winding
 
@@ -72,6 +73,7 @@ class SelfContactDetector:
         self._faces = self._sheet.faces
         self._winding = Winding(torch.from_numpy(self._faces))
         rest = as_vertices("rest_vertices", rest_vertices)
+        self._around = Connectivity.of(self._faces, len(rest)).adjacency_matrix()
         pairs, self._rest_buried = self._contacts(rest)
         self._rest_pairs = self._keys(pairs)
 
@@ -82,10 +84,15 @@ class SelfContactDetector:
             msg = f"body_vertices must have the rest pose's shape ({len(self._rest_buried)}, 3), got {vertices.shape}"
             raise MeshError(msg)
         pairs, buried = self._contacts(vertices)
-        # Without a crossing nothing is buried but what a fold of toes comes near to.
-        covered = np.flatnonzero((buried & ~self._rest_buried)[self._faces].any(axis=1) & (len(pairs) > 0))
         pairs = pairs[~np.isin(self._keys(pairs), self._rest_pairs)]
-        faces = np.union1d(pairs, covered).astype(np.int32)
+        # Skin gets into another part by crossing its skin: what is buried without that is a fold that nearly touches.
+        crosses = np.zeros(len(vertices), np.bool_)
+        crosses[self._faces[pairs]] = True
+        buried &= ~self._rest_buried
+        kept = np.flatnonzero(buried | crosses)
+        _, patch = connected_components(self._around[kept][:, kept], directed=False)
+        buried[kept] &= np.isin(patch, patch[crosses[kept]])
+        faces = np.union1d(pairs, np.flatnonzero(buried[self._faces].any(axis=1))).astype(np.int32)
         return SelfContact(pairs, faces, vertices, self._faces)
 
     def _contacts(self, vertices: NDArray[np.float32]) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
