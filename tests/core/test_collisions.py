@@ -272,17 +272,19 @@ def test_a_fold_that_nearly_touches_is_no_contact() -> None:
     caps = [(0, 5, 7), (7, 5, 6), (0, 1, 5), (5, 1, 4), (4, 1, 2), (4, 2, 3)]
     around = [(i, (i + 1) % 8) for i in range(8)]
     sides = [face for i, j in around for face in ((i, j, j + 8), (i, j + 8, i + 8))]
-    clamp_faces = np.array([*[(a, c, b) for a, b, c in caps], *[(a + 8, b + 8, c + 8) for a, b, c in caps], *sides])
+    corner_faces = np.array([*[(a, c, b) for a, b, c in caps], *[(a + 8, b + 8, c + 8) for a, b, c in caps], *sides])
+    jaw_vertices, clamp_faces = trimesh.remesh.subdivide(np.zeros((16, 3)), corner_faces)
     box = trimesh.creation.box((1, 1, 1))
 
     def scene(gap: float, apart: float) -> np.ndarray:
         flat = outline.copy()
         flat[[3, 4], 0] = 1 + gap
-        jaws = np.concatenate([np.column_stack((flat, np.full(8, z))) for z in (0.0, 1.0)])
+        corners = np.concatenate([np.column_stack((flat, np.full(8, z))) for z in (0.0, 1.0)])
+        jaws, _ = trimesh.remesh.subdivide(corners, corner_faces)
         both = [box.vertices + np.array(place) for place in ((10, 0, 0), (10 + apart, 0.1, 0.1))]
         return (0.1 * np.concatenate((jaws, *both))).astype(np.float32)
 
-    faces = np.concatenate((clamp_faces, box.faces + 16, box.faces + 24))
+    faces = np.concatenate((clamp_faces, box.faces + len(jaw_vertices), box.faces + len(jaw_vertices) + 8))
     found = SelfContactDetector(faces, scene(1.0, 2.0)).detect(scene(5e-4, 0.9))
     assert len(found.pairs)
     assert found.faces.min() >= len(clamp_faces)
