@@ -119,8 +119,7 @@ def open_source(options: RecordingOptions, body: Callable[[], SmplBody]) -> Sour
         of_message = adapters.INPUT_TYPES["multiarray"], _decoding(adapters.decoder_for("multiarray"), lambda _: up)
         records = _motion_records(motion, INPUT_TOPIC)
         source = Source(options, description, INPUT_TOPIC, *of_message, records, len(motion))
-        gender = "" if motion.is_fitted else motion.gender
-        return replace(source, notes=motion.notes, gender=gender, is_fitted=motion.is_fitted)
+        return replace(source, notes=motion.notes, gender=motion.gender, is_fitted=motion.is_fitted)
     if options.fps is not None or options.input_axes in ("z-up", "y-down"):
         what = "--fps" if options.fps is not None else f"--input-axes {options.input_axes}"
         msg = f"{options.input}: {what} is for files of motion ({', '.join(SUFFIXES)})"

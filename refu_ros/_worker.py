@@ -191,7 +191,9 @@ class Worker:
             near = {}
         frames = {person: settings.applied(arrival.frame) for person, arrival in near.items()}
         if pipeline.heeds_past:
-            frames = {person: self._told(frame, person, near[person]) for person, frame in frames.items()}
+            frames = {
+                person: self._told(frame, person, _there(near[person], settings)) for person, frame in frames.items()
+            }
         known: dict[str, _Known] = {}
         job = _Job(self._n_taken, settings, pipeline, fittings, near, frames, known, gone)
         for person, frame in frames.items():
@@ -202,9 +204,9 @@ class Worker:
         self._n_taken += 1
         return job
 
-    def _told(self, frame: SmplFrame, person: str, arrival: Arrival) -> SmplFrame:
+    def _told(self, frame: SmplFrame, person: str, there: Placement) -> SmplFrame:
         """A frame with its past, as it was where messages are: what a moving camera sees move stands still there."""
-        there, body = _there(arrival, self.settings), self._pipeline.body
+        body = self._pipeline.body
         pelvis = body.rest_joints(torch.tensor(frame.betas[None], device=body.device))[0, 0].cpu().double().numpy()
         pose = frame.pose.copy()
         pose[0] = Rotation.from_matrix(there.rotation @ Rotation.from_rotvec(pose[0]).as_matrix()).as_rotvec()

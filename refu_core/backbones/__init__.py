@@ -6,6 +6,7 @@ from refu_core.backbones._decoder import DenseDecoder as DenseDecoder
 from refu_core.backbones._dynamics import Dynamic as Dynamic
 from refu_core.backbones._dynamics import Dynamics as Dynamics
 from refu_core.backbones._dynamics import DynamicsConfig as DynamicsConfig
+from refu_core.backbones._features import SEEN_TILT as SEEN_TILT
 from refu_core.backbones._features import PoseFeatures as PoseFeatures
 from refu_core.backbones._features import style_shape as style_shape
 from refu_core.backbones._features import tilt_rotvec as tilt_rotvec

@@ -100,15 +100,15 @@ class Observer:
             self._skin_mesh.refit()
         drapes, blends = dict(dressed.drapes), {}
         for name, cloth in self._cloths.items():
-            weights = self._pipeline.garments[name].weights
-            blends[name] = blend_transforms(weights, dressed.transforms).rotation[0].cpu().numpy()
-            if seen is not None:
-                cloth.place(drapes[name].vertices[0].cpu().numpy() + _posed(blends[name], cloth.offset))
-        for name, cloth in self._cloths.items():
             self.matched[name] = 0
             if seen is None and not cloth.estimate.is_informed:
                 continue
-            drape, blend = drapes[name], blends[name]
+            weights = self._pipeline.garments[name].weights
+            blends[name] = blend_transforms(weights, dressed.transforms).rotation[0].cpu().numpy()
+            if seen is not None:  # all, before any is matched: they compete for the points
+                cloth.place(drapes[name].vertices[0].cpu().numpy() + _posed(blends[name], cloth.offset))
+        for name, blend in blends.items():
+            cloth, drape = self._cloths[name], drapes[name]
             if seen is not None:
                 self._fit(cloth, drape.vertices[0].cpu().numpy(), blend, seen, camera, name)
             offset = cloth.offset
@@ -134,11 +134,12 @@ class Observer:
         eye: NDArray[np.float64] | None,
         name: str,
     ) -> None:
-        """Brings the garment's numbers to what is seen."""
+        """Brings the numbers of a garment that is in its place to what is seen."""
         how, estimate = self._settings, cloth.estimate
         numbers, after = estimate.mean, estimate.precision
-        for _ in range(1 if estimate.is_informed else how.first_rounds):
-            cloth.place(predicted + _posed(blend, cloth.offset))
+        for round_ in range(1 if estimate.is_informed else how.first_rounds):
+            if round_:
+                cloth.place(predicted + _posed(blend, cloth.offset))
             others = [other.tree for other in self._cloths.values() if other is not cloth]
             found = cloth.match(seen, self._skin_mesh, others, eye)
             self.matched[name] = len(found.say)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
+from refu_core.backbones import SEEN_TILT
 from refu_core.body import PARENTS
 from refu_core.errors import FrameError, MeshError, WeightsError
 from refu_core.frames import N_JOINTS
@@ -35,9 +36,6 @@ REGIONS = 3
 """Pose regions: as many equal shares of the samples, from hardly bent to most bent."""
 _SWEEPS = 10
 """The errors of neighbours are averaged along edges so often: some fifty samples say less of one vertex than that."""
-_SEEN_TILT = (np.radians(40), np.radians(60))
-"""No training clip tilts the pelvis beyond the first of these [rad]; from the second on σ is `UNKNOWN_SIGMA` at least.
-Of somebody who lies a T-shirt is off by 12 to 18 mm, a skirt by 32 to 44, in place of 5."""
 _FILE = "sigma"
 
 
@@ -199,10 +197,9 @@ class Sigma:
 
 
 def _unseen_tilt(frame: SmplFrame) -> float:
-    """How far a person leans beyond what networks have seen: from 0 to 1 between the tilts of `_SEEN_TILT`."""
-    up = np.array([0.0, 1.0, 0.0]) if frame.up is None else frame.up
-    tilt = np.arccos(np.clip((Rotation.from_rotvec(frame.pose[0]).as_matrix().T @ up)[1], -1, 1))
-    low, high = _SEEN_TILT
+    """How far a person leans beyond what networks have seen: from 0 to 1 between the tilts of `SEEN_TILT`."""
+    tilt = np.arccos(np.clip((Rotation.from_rotvec(frame.pose[0]).as_matrix().T @ frame.up)[1], -1, 1))
+    low, high = SEEN_TILT
     return float(np.clip((tilt - low) / (high - low), 0, 1))
 
 

@@ -129,7 +129,7 @@ def _recording(
         at = places_in_time(frames, len(array))
         places = places_of_mhr(array, transl_of(one(layout.transl), layout, len(array), notes), at)
         return follow(POINTS, places, fps=rate(), axes=axes, usual="y-down", worn=worn, notes=notes)
-    if _is_of_places(arrays):
+    if layout.holds_places or _is_of_places(arrays):
         ((name, array),) = arrays.items()
         notes.append(f"{name} {array.shape} holds places of joints and no rotations: SMPL's skeleton is fitted to them")
         places = array[:, : len(SMPL_POINTS)].astype(np.float64)

@@ -30,10 +30,9 @@ class Untangle:
     def __init__(self, mesh: Connectivity, sdf: ExactSdf, *, margin: float) -> None:
         """For a garment, above the body behind `sdf` by `margin` [m]."""
         self._faces, self._sdf, self._margin = np.asarray(mesh.faces), sdf, margin
-        both = np.concatenate((mesh.edges, mesh.edges[:, ::-1]))
-        shape = (mesh.n_vertices, mesh.n_vertices)
-        ring = sparse.csr_array((np.ones(len(both), np.float32), (both[:, 0], both[:, 1])), shape=shape)
-        self._mean = sparse.csr_array(ring.multiply(1 / np.maximum(ring.sum(1), 1)[:, None]).astype(np.float32))
+        around = mesh.adjacency_matrix()
+        share = around.multiply(1 / np.maximum(around.sum(1), 1)[:, None])
+        self._mean = sparse.csr_array(share.astype(np.float32))
         self._sheet = SheetChecker(self._faces)
 
     def __call__(self, vertices: F32, body: F32) -> F32:
