@@ -7,6 +7,10 @@ from refu_core.sdf import Skin, query_skin
 
 wp.set_module_options({"enable_backward": False})
 
+_CORNER = wp.constant(0.25)
+"""How far a corner of two planes bulges towards the middle of an edge across it, per length of the edge and per radian
+between the planes' normals: no skin between such normals bulges farther. A circle does by half of it."""
+
 
 @wp.func
 def middle_deficit(edge: int, state: State, cloth: Cloth, skin: Skin, rules: Rules) -> tuple[float, wp.vec3]:
@@ -16,9 +20,7 @@ def middle_deficit(edge: int, state: State, cloth: Cloth, skin: Skin, rules: Rul
     # Beyond a band no face is known; a known one makes the answer cheap.
     near = wp.where(state.distance[a] <= state.distance[b] + rules.tolerance, state.face[a], state.face[b])
     distance, gradient, _face = query_skin(skin, 0.5 * (state.place[a] + state.place[b]), near)
-    lack = 0.5 * rules.margin - distance
-    # What runs through a hand hasn't cut a corner, and isn't to be raised.
-    return lack * wp.clamp(2.0 - lack / rules.through, 0.0, 1.0), gradient
+    return 0.5 * rules.margin - distance, gradient
 
 
 @wp.kernel
@@ -42,7 +44,7 @@ def suspect_kernel(each: int, state: State, cloth: Cloth, rules: Rules) -> None:
             if wp.where(beyond > 0.0, beyond * beyond, 0.0) < wp.dot(way, way) and first >= 0.0 and second >= 0.0:
                 is_low = first + second < rules.margin
                 if not is_low and state.face[a] >= 0 and state.face[b] >= 0:  # else what bulges there isn't known
-                    bulge = rules.bulge * wp.length(way) * wp.length(state.gradient[a] - state.gradient[b])
+                    bulge = _CORNER * wp.length(way) * wp.length(state.gradient[a] - state.gradient[b])
                     is_low = first + second < rules.margin + 2.0 * bulge
                 if is_low:
                     state.suspects[wp.atomic_add(state.counts, CUTTING, 1)] = edge

@@ -110,8 +110,7 @@ class Layer:
 def _rules(settings: ContactSettings, edges: NDArray[np.float32]) -> Any:
     """For a sheet whose edges have these ends at rest [m], (E, 2, 3)."""
     rules = kernels.LayerRules()
-    rules.gap, rules.reach = settings.layer_gap, settings.layer_reach
-    rules.agreement, rules.doubt = settings.layer_agreement, settings.layer_doubt
+    rules.gap, rules.reach, rules.agreement = settings.gap, settings.layer_reach, settings.layer_agreement
     rules.longest = float(np.linalg.norm(edges[:, 0] - edges[:, 1], axis=1).max(initial=0.0))
     return rules
 

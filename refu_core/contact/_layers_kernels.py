@@ -79,7 +79,6 @@ class LayerRules:
     reach: wp.float32
     longest: wp.float32
     agreement: wp.float32
-    doubt: wp.float32
 
 
 @wp.func
@@ -282,7 +281,7 @@ def lift_kernel(each: int, below: Below, above: Above, rules: LayerRules) -> Non
             face = nearest_face(p, v, below)
             w, _feature, offset = closest_on_face(p, face, below.points, below.cut.faces)
             is_low = wp.dot(offset, normal_on(face, w, below)) < rules.gap
-            if is_low and wp.length(offset) > rules.doubt:
+            if is_low and wp.length(offset) > 0.5 * rules.reach:  # this may be another fold
                 face = closest_of_all(p, rules.reach, below)
             lift_off(i, face, False, below, above, rules)
 

@@ -43,7 +43,7 @@ class Parting:
         data.marked, wider = (as_warp(one, wp.float32) for one in (self._marked, self._wider))
         data.pulled = wp.zeros(n, dtype=wp.int32, device=str(rest.device))
         other, alike = as_warp(self._other, wp.vec3), wp.ones(n, dtype=wp.float32, device=str(rest.device))
-        bounds = [settings.tolerance, settings.layer_gap]
+        bounds = [settings.tolerance, settings.gap]
         launches: dict[str, tuple[Any, int, list[Any]]] = {
             "find": (kernels.find_kernel, -(-n_faces // int(BLOCK)), [sheet.data, data]),
             "widen0": (widen_kernel, n, [data.marked, alike, cut, 1.0, wider]),
@@ -71,7 +71,7 @@ class Parting:
             self._points.copy_(above)
             for k in range(self._settings.near):
                 self._commands[f"widen{k % 2}"].launch()
-            for k in range(self._settings.parting_rounds):
+            for k in range(self._settings.levellings):
                 self._commands[f"level{k % 2}"].launch()
         return self._points.clone()
 
@@ -83,7 +83,7 @@ class Parting:
         with torch_stream(self._device):
             self._points.copy_(above)
             self._ways[1].zero_()
-            for _ in range(self._settings.parting_sweeps):
+            for _ in range(self._settings.sweeps):
                 self._count.zero_()
                 self._commands["measure"].launch()
                 if self._is_serial and not int(self._count):

@@ -73,10 +73,9 @@ class Press:
         garment: GarmentTemplate,
         limbs: LimbMeshes,
         *,
-        knows_arms: bool = False,
         settings: ContactSettings = DEFAULT_CONTACT,
     ) -> None:
-        """For a garment, and the limbs of the body that it is worn on; `knows_arms` is as in `Wearable`."""
+        """For a garment, and the limbs of the body that it is worn on."""
         self._settings = settings
         self._limbs = limbs  # their memory is read
         n, self.device = garment.n_vertices, garment.v_template.device
@@ -84,7 +83,7 @@ class Press:
         self._skin, self._points = torch.zeros(2, n, 3, device=self.device)
         self._cut = torch.zeros(2, n, device=self.device)
         self._counts = torch.zeros(kernels.N_COUNTS, dtype=torch.int32, device=self.device)
-        own = weight_of_parts(garment.weights, _LIMBS) > settings.own_weight
+        own = weight_of_parts(garment.weights, _LIMBS) > 0
         foreign = (~own).cpu().numpy() @ (1 << np.arange(len(_LIMBS)))
         # Cloth that lies on the skin gives way as one piece: of its vertices a few are asked, and others follow those.
         rest = garment.v_template.cpu().numpy()
@@ -108,20 +107,19 @@ class Press:
         for name, values in lists.items():
             setattr(fabric, name, ints(values, self.device))
         feel = kernels.Feel()
-        feel.room, feel.flat, feel.looks = settings.press_room, settings.press_flat, settings.press_looks
-        feel.beside = garment.edge_length if knows_arms else settings.press_beside
-        feel.lies = wp.vec2(*settings.press_lies)
+        feel.room, feel.flat, feel.looks = settings.gap, settings.press_flat, settings.press_looks
+        feel.beside, feel.lies = settings.press_beside, wp.vec2(*settings.press_lies)
         meshes = wp.array([mesh.id for mesh in limbs.meshes], dtype=wp.uint64, device=str(self.device))
-        slope, sweeps, near = settings.press_slope, settings.around, settings.near
+        sweeps, near = settings.around, settings.near
         launches: dict[str, tuple[Any, int, list[Any]]] = {
             "look": (kernels.look_kernel, len(fabric.start) - 1, [fabric, limbs.bundles, feel]),
-            "press all": (kernels.press_all_kernel, 1, [fabric, meshes, feel, slope, sweeps, near]),
+            "press all": (kernels.press_all_kernel, 1, [fabric, meshes, feel, sweeps, near]),
             "press": (kernels.press_kernel, n, [fabric, meshes, feel]),
             "lower": (kernels.lower_kernel, n, [fabric, feel]),
         }
         for sweep in range(sweeps):
             fields = [fabric.cut, fabric.spread] if sweep % 2 == 0 else [fabric.spread, fabric.cut]
-            launches[f"spread {sweep}"] = kernels.spread_kernel, n, [fabric, 0.0 if sweep < near else slope, *fields]
+            launches[f"spread {sweep}"] = kernels.spread_kernel, n, [fabric, 0.0 if sweep < near else 1.0, *fields]
         self._commands = {name: recorded(*launch, self.device) for name, launch in launches.items()}
 
     @torch.no_grad()

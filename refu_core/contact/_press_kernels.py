@@ -136,7 +136,7 @@ def press(v: int, fabric: Fabric, limbs: wp.array[wp.uint64], feel: Feel) -> Non
 
 @wp.kernel
 def spread_kernel(fabric: Fabric, slope: float, cut: wp.array[float], wider: wp.array[float]) -> None:
-    """A vertex is drawn back as far as a neighbour of it, but for what `slope` gives for the way from there."""
+    """A vertex is drawn back as far as a neighbour of it, less `slope` times the way from there: a dent, not a tear."""
     v = wp.tid()
     most = cut[v]
     for k in range(fabric.ring_start[v], fabric.ring_start[v + 1]):
@@ -170,9 +170,7 @@ def lower_kernel(fabric: Fabric, feel: Feel) -> None:
 
 
 @wp.kernel
-def press_all_kernel(
-    fabric: Fabric, limbs: wp.array[wp.uint64], feel: Feel, slope: float, sweeps: int, reach: int
-) -> None:
+def press_all_kernel(fabric: Fabric, limbs: wp.array[wp.uint64], feel: Feel, sweeps: int, reach: int) -> None:
     """All that follows, by one thread: sweeps go on from those that the last one has drawn back farther."""
     for i in range(fabric.counts[NEAR]):
         press(fabric.near[i], fabric, limbs, feel)
@@ -181,7 +179,7 @@ def press_all_kernel(
         fabric.front[i] = fabric.rows[i]
     first = int(0)
     for sweep in range(sweeps):
-        rise = wp.where(sweep < reach, 0.0, slope)
+        rise = wp.where(sweep < reach, 0.0, 1.0)
         for i in range(n_front):
             v = fabric.front[first + i]
             fabric.spread[v] = fabric.cut[v]

@@ -44,8 +44,6 @@ class Rules:
     tolerance: wp.float32
     max_displacement: wp.float32
     max_pushes: wp.int32
-    bulge: wp.float32
-    through: wp.float32
 
 
 @wp.struct

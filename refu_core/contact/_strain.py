@@ -36,7 +36,7 @@ class StrainLimit:
         )
         net.limit, net.count = settings.strain_limit, as_warp(self._count, wp.int32)
         net.rows, net.is_listed = (wp.zeros(n, dtype=wp.int32, device=str(device)) for _ in range(2))
-        self._limit = recorded(kernels.limit_kernel, 1, [net, settings.strain_sweeps], device)
+        self._limit = recorded(kernels.limit_kernel, 1, [net, settings.sweeps], device)
         self._sweeps = [
             recorded(kernels.sweep_kernel, n, [net, *places], device)
             for places in ((net.points, net.other), (net.other, net.points))
@@ -58,7 +58,7 @@ class StrainLimit:
                 if not int(self._count):
                     return points
             else:
-                for sweep in range(self._settings.strain_sweeps):
+                for sweep in range(self._settings.sweeps):
                     self._sweeps[sweep % 2].launch()
         limited: Tensor = self._points.clone()
         return limited

@@ -59,7 +59,7 @@ class Unfold:
         fold.weight_of_joint = as_warp(of_joint, wp.float32)
         fold.rows, fold.is_listed = (wp.zeros(n, dtype=wp.int32, device=str(device)) for _ in range(2))
         fold.weight, fold.wider = (wp.zeros(n, dtype=wp.float32, device=str(device)) for _ in range(2))
-        fade, rounds, farthest = settings.unfold_fade, settings.unfold_rounds, settings.max_displacement
+        fade, rounds, farthest = settings.unfold_fade, settings.levellings, settings.max_displacement
         n_strips, each = (1, len(may)) if self._is_serial else (len(may), 1)
         launches: dict[str, tuple[Any, int, list[Any]]] = {
             "fold": (kernels.fold_kernel, n_strips, [each, fold, *settings.unfold_cosines]),
@@ -88,7 +88,7 @@ class Unfold:
                 self._origin.copy_(points)
                 for k in range(self._settings.around):
                     self._commands[f"widen{k % 2}"].launch()
-                for k in range(self._settings.unfold_rounds):
+                for k in range(self._settings.levellings):
                     self._commands[f"level{k % 2}"].launch()
                 self._commands["bound"].launch()
         unfolded: Tensor = self._points.clone()

@@ -80,8 +80,9 @@ class ContactStage:
             self._skin = Sheet(outfit.collider.anatomy.mesh, body.v_template)
             self._tents = {name: Tent(one, self._shins, settings=settings) for name, one in garments.items()}
             self._press = {
-                name: Press(one.template, self._limbs, knows_arms=one.knows_arms, settings=settings)
+                name: Press(one.template, self._limbs, settings=settings)
                 for name, one in outfit.wearables.items()
+                if not one.knows_arms
             }
             self._off_skin = {
                 name: Parting(one.mesh, one.v_template, self._skin, settings=settings) for name, one in garments.items()
@@ -113,7 +114,8 @@ class ContactStage:
         if self.way_out is not None:
             self.way_out.update(body)
         if self._has_room:
-            self._limbs.update(body)
+            if self._press:
+                self._limbs.update(body)
             self._shins.update(body)
 
     def unfold(self, name: str, vertices: Tensor, rotation: Tensor) -> Tensor:
@@ -125,7 +127,9 @@ class ContactStage:
         if not self._has_room:
             return vertices
         vertices = self._tents[name](vertices)
-        return self._press[name](vertices, self._outfit.below[name](self._body[None])[0])
+        if name in self._press:
+            vertices = self._press[name](vertices, self._outfit.below[name](self._body[None])[0])
+        return vertices
 
     def lift(
         self, name: str, vertices: Tensor, worn: Mapping[str, Worn], *, goes_on: bool = False
@@ -192,7 +196,7 @@ class ContactStage:
         partings = [layer.parting for layer in self._below[name].values()]
         resolver, before = self.resolvers[name], done.vertices
         n_cut = torch.stack([parting.find(before) for parting in partings])
-        for round_ in range(self._settings.partings):
+        for round_ in range(self._settings.max_pushes):
             if self._is_serial and not int(n_cut.sum()):
                 break
             cut_by = [one for one, n in zip(partings, n_cut, strict=True) if not self._is_serial or int(n)]

@@ -242,7 +242,7 @@ def _aims(subject: Subject, pipeline: GarmentPipeline, out: PipelineOutput) -> d
             closest, height = closest_on_sheet(mesh.raw, below.local, below.faces)
             places.append(closest)
             is_felt = np.linalg.norm(mesh.raw - closest, axis=1) < DEFAULT_CONTACT.layer_reach
-            is_pushed.append((height < DEFAULT_CONTACT.layer_gap) & is_felt)
+            is_pushed.append((height < DEFAULT_CONTACT.gap) & is_felt)
         aims[name] = _Aims(places, is_pushed)
         worn.append(mesh)
     return aims

@@ -21,7 +21,7 @@ from refu_core.metrics import CollisionChecker
 
 Array = NDArray[np.float64]
 FADE, AGREEMENT, ROUNDS = 0.03, 0.25, DEFAULT_CONTACT.around
-LAYER_GAP, LAYER_REACH = DEFAULT_CONTACT.layer_gap, DEFAULT_CONTACT.layer_reach
+LAYER_GAP, LAYER_REACH = DEFAULT_CONTACT.gap, DEFAULT_CONTACT.layer_reach
 
 
 def sheet(n: int, *, step: float = 0.01, height: float = 0.0) -> tuple[Tensor, Tensor]:

@@ -97,7 +97,7 @@ def test_what_cuts_is_found_and_levelled(seed: int, height: float) -> None:
     weight[faces.numpy()[cut].ravel()] = 1
     for _ in range(DEFAULT_CONTACT.near):
         weight = np.array([max(weight[i], *weight[around]) for i, around in enumerate(ring)])
-    wanted = levelled(high.double().numpy(), ring, weight, DEFAULT_CONTACT.parting_rounds)
+    wanted = levelled(high.double().numpy(), ring, weight, DEFAULT_CONTACT.levellings)
     np.testing.assert_allclose(layer.parting.level(high).numpy(), wanted, atol=1e-5)
 
 
@@ -119,7 +119,7 @@ def test_sheets_that_cut_are_parted_and_nothing_else_is_moved(seed: int, height:
     checker.update(low.numpy())
     after = len(checker.with_other(found.numpy(), faces.numpy()))
     assert after == 0, "there is room for all"
-    farthest = calls * DEFAULT_CONTACT.parting_sweeps * DEFAULT_CONTACT.layer_gap
+    farthest = calls * DEFAULT_CONTACT.sweeps * DEFAULT_CONTACT.gap
     assert (found - level).norm(dim=1).max() <= 3 * farthest
 
 

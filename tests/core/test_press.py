@@ -36,11 +36,11 @@ def beside(lower: float) -> tuple[Tensor, Tensor, Tensor]:
     return dressed.drapes[SKIRT].vertices[0], outfit().below[SKIRT](dressed.body)[0], dressed.body[0]
 
 
-def made(body: Tensor, sweeps: int = DEFAULT_CONTACT.around, *, knows_arms: bool = False) -> Press:
+def made(body: Tensor, sweeps: int = DEFAULT_CONTACT.around) -> Press:
     limbs = LimbMeshes(outfit().body)
     limbs.update(body)
     how = replace(DEFAULT_CONTACT, around=sweeps)
-    return Press(outfit().wearables[SKIRT].template, limbs, knows_arms=knows_arms, settings=how)
+    return Press(outfit().wearables[SKIRT].template, limbs, settings=how)
 
 
 def distances(points: NDArray[np.float64], triangles: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -67,10 +67,9 @@ def distances(points: NDArray[np.float64], triangles: NDArray[np.float64]) -> ND
     return found
 
 
-@pytest.mark.parametrize("knows_arms", [False, True])
-def test_is_what_a_look_from_the_skin_says(knows_arms: bool) -> None:
+def test_is_what_a_look_from_the_skin_says() -> None:
     points, skin, body = beside(1.45)
-    pressed = made(body, sweeps=0, knows_arms=knows_arms)(points, skin).double().numpy()
+    pressed = made(body, sweeps=0)(points, skin).double().numpy()
     x, at = points.double().numpy(), skin.double().numpy()
     parts = (joints_of("trunk", "head", "left_thigh"), *ARMS)
     of_face = part_of_faces(outfit().body.weights, outfit().body.faces, parts).numpy()
@@ -78,16 +77,15 @@ def test_is_what_a_look_from_the_skin_says(knows_arms: bool) -> None:
     to_skin = np.linalg.norm(rest[:, None] - outfit().body.v_template.numpy()[None], axis=2).min(1)
     is_asked = outfit().wearables[SKIRT].template.mesh.independent() | (to_skin > DEFAULT_CONTACT.press_lies[0])
     how, moved = DEFAULT_CONTACT, np.linalg.norm(pressed - x, axis=1)
-    farthest = outfit().wearables[SKIRT].template.edge_length if knows_arms else how.press_beside
     near = np.flatnonzero((moved > 0) | (np.arange(len(x)) % 40 == 0))
     height = np.linalg.norm(x - at, axis=1)
     arms = [body.double().numpy()[outfit().body.faces.numpy()[of_face == arm]] for arm in (1, 2)]
     wanted = x.copy()
     for v in near:
-        h, whole = height[v], height[v] + how.press_room
-        if not (is_asked[v] and how.press_room < h < how.press_lies[1]):
+        h, whole = height[v], height[v] + how.gap
+        if not (is_asked[v] and how.gap < h < how.press_lies[1]):
             continue
-        aside = min(farthest, h * h / how.press_flat)
+        aside = min(how.press_beside, h * h / how.press_flat)
         least = whole
         for triangles in arms:
             go = 0.0
@@ -95,18 +93,18 @@ def test_is_what_a_look_from_the_skin_says(knows_arms: bool) -> None:
                 off = distances((at[v] + go / h * (x[v] - at[v]))[None], triangles)[0]
                 off = min(off, aside * (least - go) / (whole - go))
                 least = min(least, go + (whole - go) * off / aside)
-                go += max(off, how.press_room)
+                go += max(off, how.gap)
                 if go >= least:
                     break
         lies = np.clip((how.press_lies[1] - h) / (how.press_lies[1] - how.press_lies[0]), 0, 1)
-        lies *= np.clip(h / how.press_room - 1, 0, 1)
-        cut = max(lies * (h - max(least - how.press_room, least / 2)), 0)
-        wanted[v] += (max(h - cut, how.press_room / 2) / h - 1) * (x[v] - at[v])
+        lies *= np.clip(h / how.gap - 1, 0, 1)
+        cut = max(lies * (h - max(least - how.gap, least / 2)), 0)
+        wanted[v] += (max(h - cut, how.gap / 2) / h - 1) * (x[v] - at[v])
     assert 20 < (np.abs(wanted - x) > 1e-5).any(axis=1).sum() < len(x) / 3
     np.testing.assert_allclose(pressed[near], wanted[near], atol=1e-5)
 
 
-def test_neighbours_are_drawn_back_as_far_and_what_the_slope_gives_less() -> None:
+def test_neighbours_are_drawn_back_as_far_and_the_way_from_there_less() -> None:
     points, skin, body = beside(1.45)
     alone, together = made(body, sweeps=0)(points, skin), made(body)(points, skin)
     cut, reached = ((points - x).norm(dim=1).double().numpy() for x in (alone, together))
@@ -115,10 +113,10 @@ def test_neighbours_are_drawn_back_as_far_and_what_the_slope_gives_less() -> Non
     lengths = (points[edges[:, 0]] - points[edges[:, 1]]).norm(dim=1).double().numpy()
     sources = (cut > 1e-4).sum()
     for sweep in range(DEFAULT_CONTACT.around):
-        rise = lengths * (0 if sweep < DEFAULT_CONTACT.near else DEFAULT_CONTACT.press_slope)
+        rise = lengths * (sweep >= DEFAULT_CONTACT.near)
         others = cut[edges[:, ::-1]] - rise[:, None]
         np.maximum.at(cut, edges, others)
-    kept = np.minimum(height, DEFAULT_CONTACT.press_room / 2)
+    kept = np.minimum(height, DEFAULT_CONTACT.gap / 2)
     assert (reached > 1e-4).sum() > 1.2 * sources
     np.testing.assert_allclose(reached, height - np.maximum(height - cut, kept), atol=1e-5)
 
@@ -171,3 +169,14 @@ def test_a_hand_beside_a_skirt_dents_it_and_does_not_tear_it(lower: float) -> No
         pairs.append(checker.check(done.vertices, template.faces).n_pairs)
     assert pairs[0] > 10
     assert pairs[1] == 0
+
+
+@pytest.mark.parametrize("knows_arms", [False, True])
+def test_cloth_whose_networks_know_arms_is_left_to_them(knows_arms: bool) -> None:
+    """Twice: what limbs press, and what they don't, isn't to hang on what was pressed before."""
+    points, _, body = beside(1.45)
+    worn = replace(outfit().wearables[SKIRT], knows_arms=knows_arms)
+    stage = ContactStage(replace(outfit(), wearables={SKIRT: worn}), sdf=SdfMode.HYBRID, certify=False)
+    for _ in range(2):
+        stage.update(body)
+        assert bool((stage.press(SKIRT, points) - points).any()) is not knows_arms

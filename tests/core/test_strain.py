@@ -64,7 +64,7 @@ def torn(seed: int) -> Tensor:
 def test_does_what_edges_say_one_by_one(seed: int) -> None:
     points = torn(seed)
     limited = StrainLimit(SHORTS.mesh, CPU)(points, REST, REST)
-    expected = slow(points, REST, SHORTS.mesh, DEFAULT_CONTACT.strain_sweeps)
+    expected = slow(points, REST, SHORTS.mesh, DEFAULT_CONTACT.sweeps)
     torch.testing.assert_close(limited.double(), expected, rtol=0, atol=1e-6)
 
 
@@ -122,5 +122,5 @@ def test_one_list_does_what_the_same_launches_in_every_frame_do() -> None:
 
 def test_no_sweeps_change_nothing() -> None:
     points = torn(1)
-    still = StrainLimit(SHORTS.mesh, CPU, settings=replace(DEFAULT_CONTACT, strain_sweeps=0))
+    still = StrainLimit(SHORTS.mesh, CPU, settings=replace(DEFAULT_CONTACT, sweeps=0))
     assert torch.equal(still(points, REST, REST), points)

@@ -71,7 +71,7 @@ def slowly(points: Tensor, rotation: Tensor) -> Array:
     for _ in range(how.around):
         wider = [min(how.unfold_fade * weight[around].max(), share[i]) for i, around in enumerate(rings)]
         weight = np.maximum(weight, wider)
-    for _ in range(how.unfold_rounds):
+    for _ in range(how.levellings):
         mean = np.stack([found[around].mean(axis=0) for around in rings])
         found = found + weight[:, None] * (mean - found)
     return found

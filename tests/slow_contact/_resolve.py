@@ -208,13 +208,13 @@ def _raise_edges(state: _State, edges: Tensor, max_rounds: int) -> int:
 
     The middle is no lower than either end by more than half the edge's length, whatever the skin is like. Most edges at
     the margin are longer than that can clear; of these the ones are asked for that skin may reach which bulges between
-    their ends as the normals there say, or more: around an elbow, a shoulder, a hand.
+    their ends as far as a corner with the normals there does: around an elbow, a shoulder, a hand.
     """
     wanted = 0.5 * state.margin
     ends = state.distance[edges]
     first, second = edges.unbind(1)
     length = torch.linalg.vector_norm(state.vertices[first] - state.vertices[second], dim=-1)
-    bulge = _SETTINGS.bulge * length * torch.linalg.vector_norm(state.gradient[first] - state.gradient[second], dim=-1)
+    bulge = length / 4 * torch.linalg.vector_norm(state.gradient[first] - state.gradient[second], dim=-1)
     bulge *= state.gradient.any(dim=-1)[edges].all(dim=1)
     may_be_low = (ends.amax(dim=1) < wanted + 0.5 * length) & (ends.mean(dim=1) < wanted + bulge)
     low = edges[may_be_low & (ends.amin(dim=1) >= 0)]
@@ -224,7 +224,6 @@ def _raise_edges(state: _State, edges: Tensor, max_rounds: int) -> int:
         closer = torch.where(of_first <= of_second + state.tolerance, low[:, 0], low[:, 1])
         middle = state.query(state.vertices[low].mean(dim=1), closer)
         lack = wanted - middle.distance
-        lack = lack * (2 - lack / _SETTINGS.through).clamp(0, 1)
         is_low = lack > 0
         if not bool(is_low.any()):
             return round_
