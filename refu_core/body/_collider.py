@@ -9,7 +9,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import as_warp, is_plain, torch_stream
+from refu_core._warp import Repeated, as_warp, is_plain, strips, torch_stream
 from refu_core.body import _collider_kernels as kernels
 from refu_core.body import _step_kernels as steps
 from refu_core.body._anatomy import DEFAULT_GAP, Anatomy, ColliderSettings
@@ -44,6 +44,8 @@ class Collider:
         self.anatomy = Anatomy(body, self.settings)
         self.device = body.device
         self._is_serial = body.device.type == "cpu"
+        most = _HELD * self.settings.aside_farthest, as_warp((_HELD * self.anatomy.farthest).float(), wp.float32)
+        self._shift = Repeated(kernels.shift_kernel, (wp.vec3, wp.vec3, wp.vec3, wp.int32, wp.float32), most)
 
     @property
     def gap(self) -> float:
@@ -140,13 +142,18 @@ class Collider:
     def _recorded(self, kernel: Any, dim: int, inputs: list[Any]) -> Any:
         return wp.launch(kernel, dim, inputs, device=str(self.device), record_cmd=True)
 
-    def is_held(self, aside: Tensor, way: Tensor) -> Tensor:
-        """Whether skin that went `aside` with its arm, and gave `way` from there, (B, V) both [m], has gone as far as
-        it may in one of the two: bool, shape (B, V).
+    @torch.no_grad()
+    def shift(self, skin: Tensor, aside: Tensor, apart: Tensor) -> Tensor:
+        """How far bodies `skin` went with their arms `aside`, and `apart` from there, all (B, V, 3) [m], shape (B, 4).
 
-        Where it has, two parts may still be in each other: as deep as flesh doesn't give way to.
+        How many vertices moved; the largest and the mean of all ways [m]; and how many have gone as far as they may in
+        one of the two: there two parts may still be in each other, as deep as flesh doesn't give way to.
         """
-        return (aside > _HELD * self.settings.aside_farthest) | (way > _HELD * self.anatomy.farthest.to(way))
+        numbers = skin.new_zeros(len(skin), 4, dtype=torch.float32)
+        n_strips, each = strips(skin.shape[1], self.device)
+        bodies = (one.float().contiguous() for one in (skin, aside, apart))
+        self._shift((len(skin), n_strips), *bodies, each, numbers)
+        return numbers
 
     @torch.no_grad()
     def touched(self, skin: Tensor) -> Tensor:

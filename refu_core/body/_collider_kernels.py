@@ -26,6 +26,41 @@ else:
     StationWeights = wp.types.vector(length=N_STATIONS, dtype=wp.float32)
 
 
+_VISIBLE = wp.constant(1.0e-4)
+"""Skin that was moved by more than this counts as moved [m]."""
+
+
+@wp.kernel
+def shift_kernel(
+    most_aside: float,
+    most_way: wp.array[float],
+    skin: wp.array2d[wp.vec3],
+    aside: wp.array2d[wp.vec3],
+    apart: wp.array2d[wp.vec3],
+    each: wp.array[int],
+    # output
+    numbers: wp.array2d[float],
+) -> None:
+    """`Collider.shift`, `each` vertices a thread; `numbers` are zero before."""
+    b, strip = wp.tid()
+    n_moved = float(0.0)
+    largest = float(0.0)
+    total = float(0.0)
+    n_held = float(0.0)
+    n = skin.shape[1]
+    for v in range(strip * each[0], wp.min((strip + 1) * each[0], n)):
+        way = wp.length(apart[b, v] - skin[b, v])
+        total += way
+        largest = wp.max(largest, way)
+        n_moved += wp.where(way > _VISIBLE, 1.0, 0.0)
+        is_held = wp.length(skin[b, v] - aside[b, v]) > most_aside or wp.length(apart[b, v] - aside[b, v]) > most_way[v]
+        n_held += wp.where(is_held, 1.0, 0.0)
+    wp.atomic_add(numbers, b, 0, n_moved)
+    wp.atomic_max(numbers, b, 1, largest)
+    wp.atomic_add(numbers, b, 2, total / float(n))
+    wp.atomic_add(numbers, b, 3, n_held)
+
+
 @wp.struct
 class Bones:
     """A posed body's joints, and how skin hangs on them."""

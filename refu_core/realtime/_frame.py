@@ -24,8 +24,6 @@ Adjust = Callable[[Dressed], Dressed]
 """Changes what was predicted: garments, not bodies."""
 N_SHIFT = 4
 _N_HELD = 3
-_MOVED = 1e-4
-"""Skin that was moved by more than this counts as moved [m]."""
 
 
 class Person(NamedTuple):
@@ -173,7 +171,4 @@ def _shift(dressed: Dressed, collider: Collider | None) -> Tensor:
     """The numbers of each person's `SkinShift`, shape (B, 4)."""
     if collider is None:
         return dressed.body.new_zeros(len(dressed.body), N_SHIFT)
-    way = torch.linalg.vector_norm(dressed.body - dressed.skin, dim=-1)
-    went, gave = (torch.linalg.vector_norm(one - dressed.aside, dim=-1) for one in (dressed.skin, dressed.body))
-    n_moved, n_held = (which.sum(1).to(way) for which in (way > _MOVED, collider.is_held(went, gave)))
-    return torch.stack((n_moved, way.amax(1), way.mean(1), n_held), 1)
+    return collider.shift(dressed.skin, dressed.aside, dressed.body)

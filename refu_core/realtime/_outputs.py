@@ -33,7 +33,7 @@ class SkinShift:
     mean: float = 0.0
     """The mean of all vertices' ways, those that stayed among them [m]."""
     n_held: int = 0
-    """Vertices that went as far as skin, or their arm, may (`Collider.is_held`): there the body may run through itself
+    """Vertices that went as far as skin, or their arm, may (`Collider.shift`): there the body may run through itself
     still, deeper than any body does, and cloth has no room."""
 
     @classmethod

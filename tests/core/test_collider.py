@@ -195,7 +195,7 @@ def test_arms_that_are_inside_go_aside(name: str, body: SmplBody, collider: Coll
     is_hand = hand[edges].all(1)
     torch.testing.assert_close(before[is_hand], after[is_hand], atol=1e-5, rtol=0)
     assert not torch.equal(rotation, skin.transforms.rotation)
-    assert not collider.is_held(way[None], torch.zeros_like(way[None])).any()
+    assert collider.shift(skin.vertices, aside, aside)[0, 3] == 0
 
 
 def test_an_arm_that_is_too_deep_is_held(body: SmplBody, collider: Collider) -> None:
@@ -206,8 +206,15 @@ def test_an_arm_that_is_too_deep_is_held(body: SmplBody, collider: Collider) -> 
     assert float((middles[1] - middles[0]).norm(dim=1).max()) == pytest.approx(
         collider.settings.aside_farthest, rel=0.02
     )
-    way = (aside - skin.vertices).norm(dim=2)
-    assert collider.is_held(way, torch.zeros_like(way)).any()
+    apart = collider.apart(aside, skin.transforms.rotation)
+    assert collider.shift(skin.vertices, aside, aside)[0, 3] > 0
+
+    went, gave, way = (
+        (b - a).norm(dim=2)[0] for a, b in ((skin.vertices, aside), (aside, apart), (skin.vertices, apart))
+    )
+    is_held = (went > 0.99 * collider.settings.aside_farthest) | (gave > 0.99 * collider.anatomy.farthest)
+    wanted = torch.stack(((way > 1e-4).sum(), way.max(), way.mean(), is_held.sum()))
+    torch.testing.assert_close(collider.shift(skin.vertices, aside, apart)[0], wanted, atol=1e-6, rtol=1e-5)
 
 
 def _asked(collider: Collider, skin: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
