@@ -73,9 +73,10 @@ class Press:
         garment: GarmentTemplate,
         limbs: LimbMeshes,
         *,
+        knows_arms: bool = False,
         settings: ContactSettings = DEFAULT_CONTACT,
     ) -> None:
-        """For a garment, and the limbs of the body that it is worn on."""
+        """For a garment, and the limbs of the body that it is worn on; `knows_arms` is as in `Wearable`."""
         self._settings = settings
         self._limbs = limbs  # their memory is read
         n, self.device = garment.n_vertices, garment.v_template.device
@@ -108,7 +109,8 @@ class Press:
             setattr(fabric, name, ints(values, self.device))
         feel = kernels.Feel()
         feel.room, feel.flat, feel.looks = settings.gap, settings.press_flat, settings.press_looks
-        feel.beside, feel.lies = settings.press_beside, wp.vec2(*settings.press_lies)
+        feel.beside = garment.edge_length if knows_arms else settings.press_beside
+        feel.lies = wp.vec2(*settings.press_lies)
         meshes = wp.array([mesh.id for mesh in limbs.meshes], dtype=wp.uint64, device=str(self.device))
         sweeps, near = settings.around, settings.near
         launches: dict[str, tuple[Any, int, list[Any]]] = {

@@ -50,10 +50,12 @@ class ContactSettings:
     with all of it a fifth more of its triangles cut each other. On recorded motion the present skirt hardly needs it;
     of 160 poses with raised heels, without it 9 % aren't free of collisions and 4 % jump by more than 40 mm (none)."""
 
-    # Other limbs beside cloth whose networks aren't told where arms are (`Wearable.knows_arms`)
+    # Other limbs beside loose cloth
     press_beside: float = 0.07
     """How far beside a limb cloth still feels it, less and less [m]: a hand that swings goes 30 mm in a frame. With
-    50 mm the skirt jumps in 13.1 % of frame pairs, with 70 mm in 12.0 % (before `press_lies`)."""
+    50 mm the skirt jumps in 13.1 % of frame pairs, with 70 mm in 12.0 % (before `press_lies`). Cloth whose networks
+    know where arms are (`Wearable.knows_arms`) feels limbs as far as one of its edges is long: what those predict is
+    nearer to the truth than where a limb from afar draws it."""
     press_flat: float = 0.025
     """Cloth at a height feels limbs beside it as far as the height squared is of this [m]: at 40 mm all that far."""
     press_lies: tuple[float, float] = (0.06, 0.16)

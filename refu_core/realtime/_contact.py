@@ -80,9 +80,8 @@ class ContactStage:
             self._skin = Sheet(outfit.collider.anatomy.mesh, body.v_template)
             self._tents = {name: Tent(one, self._shins, settings=settings) for name, one in garments.items()}
             self._press = {
-                name: Press(one.template, self._limbs, settings=settings)
+                name: Press(one.template, self._limbs, knows_arms=one.knows_arms, settings=settings)
                 for name, one in outfit.wearables.items()
-                if not one.knows_arms
             }
             self._off_skin = {
                 name: Parting(one.mesh, one.v_template, self._skin, settings=settings) for name, one in garments.items()
@@ -114,8 +113,7 @@ class ContactStage:
         if self.way_out is not None:
             self.way_out.update(body)
         if self._has_room:
-            if self._press:
-                self._limbs.update(body)
+            self._limbs.update(body)
             self._shins.update(body)
 
     def unfold(self, name: str, vertices: Tensor, rotation: Tensor) -> Tensor:
@@ -127,9 +125,7 @@ class ContactStage:
         if not self._has_room:
             return vertices
         vertices = self._tents[name](vertices)
-        if name in self._press:
-            vertices = self._press[name](vertices, self._outfit.below[name](self._body[None])[0])
-        return vertices
+        return self._press[name](vertices, self._outfit.below[name](self._body[None])[0])
 
     def lift(
         self, name: str, vertices: Tensor, worn: Mapping[str, Worn], *, goes_on: bool = False

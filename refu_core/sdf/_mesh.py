@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -199,7 +200,7 @@ def require_finite(name: str, values: Tensor) -> None:
     if values.is_cuda and torch.cuda.is_current_stream_capturing():
         return  # a CUDA graph can't wait for the answer; what it replays was checked where it came in
     # A finite sum has finite terms, and takes a tenth of the time of looking at each.
-    if not bool(torch.isfinite(values.detach().sum())) and not bool(torch.isfinite(values).all()):
+    if not math.isfinite(float(values.detach().sum())) and not bool(torch.isfinite(values).all()):
         bad = int((~torch.isfinite(values)).any(dim=-1).sum())
         msg = f"{name} must be finite, got {bad} of {len(values)} with NaN or infinite coordinates"
         raise MeshError(msg)

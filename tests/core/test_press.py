@@ -36,11 +36,11 @@ def beside(lower: float) -> tuple[Tensor, Tensor, Tensor]:
     return dressed.drapes[SKIRT].vertices[0], outfit().below[SKIRT](dressed.body)[0], dressed.body[0]
 
 
-def made(body: Tensor, sweeps: int = DEFAULT_CONTACT.around) -> Press:
+def made(body: Tensor, sweeps: int = DEFAULT_CONTACT.around, *, knows_arms: bool = False) -> Press:
     limbs = LimbMeshes(outfit().body)
     limbs.update(body)
     how = replace(DEFAULT_CONTACT, around=sweeps)
-    return Press(outfit().wearables[SKIRT].template, limbs, settings=how)
+    return Press(outfit().wearables[SKIRT].template, limbs, knows_arms=knows_arms, settings=how)
 
 
 def distances(points: NDArray[np.float64], triangles: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -67,9 +67,10 @@ def distances(points: NDArray[np.float64], triangles: NDArray[np.float64]) -> ND
     return found
 
 
-def test_is_what_a_look_from_the_skin_says() -> None:
+@pytest.mark.parametrize("knows_arms", [False, True])
+def test_is_what_a_look_from_the_skin_says(knows_arms: bool) -> None:
     points, skin, body = beside(1.45)
-    pressed = made(body, sweeps=0)(points, skin).double().numpy()
+    pressed = made(body, sweeps=0, knows_arms=knows_arms)(points, skin).double().numpy()
     x, at = points.double().numpy(), skin.double().numpy()
     parts = (joints_of("trunk", "head", "left_thigh"), *ARMS)
     of_face = part_of_faces(outfit().body.weights, outfit().body.faces, parts).numpy()
@@ -77,6 +78,7 @@ def test_is_what_a_look_from_the_skin_says() -> None:
     to_skin = np.linalg.norm(rest[:, None] - outfit().body.v_template.numpy()[None], axis=2).min(1)
     is_asked = outfit().wearables[SKIRT].template.mesh.independent() | (to_skin > DEFAULT_CONTACT.press_lies[0])
     how, moved = DEFAULT_CONTACT, np.linalg.norm(pressed - x, axis=1)
+    farthest = outfit().wearables[SKIRT].template.edge_length if knows_arms else how.press_beside
     near = np.flatnonzero((moved > 0) | (np.arange(len(x)) % 40 == 0))
     height = np.linalg.norm(x - at, axis=1)
     arms = [body.double().numpy()[outfit().body.faces.numpy()[of_face == arm]] for arm in (1, 2)]
@@ -85,7 +87,7 @@ def test_is_what_a_look_from_the_skin_says() -> None:
         h, whole = height[v], height[v] + how.gap
         if not (is_asked[v] and how.gap < h < how.press_lies[1]):
             continue
-        aside = min(how.press_beside, h * h / how.press_flat)
+        aside = min(farthest, h * h / how.press_flat)
         least = whole
         for triangles in arms:
             go = 0.0
@@ -169,14 +171,3 @@ def test_a_hand_beside_a_skirt_dents_it_and_does_not_tear_it(lower: float) -> No
         pairs.append(checker.check(done.vertices, template.faces).n_pairs)
     assert pairs[0] > 10
     assert pairs[1] == 0
-
-
-@pytest.mark.parametrize("knows_arms", [False, True])
-def test_cloth_whose_networks_know_arms_is_left_to_them(knows_arms: bool) -> None:
-    """Twice: what limbs press, and what they don't, isn't to hang on what was pressed before."""
-    points, _, body = beside(1.45)
-    worn = replace(outfit().wearables[SKIRT], knows_arms=knows_arms)
-    stage = ContactStage(replace(outfit(), wearables={SKIRT: worn}), sdf=SdfMode.HYBRID, certify=False)
-    for _ in range(2):
-        stage.update(body)
-        assert bool((stage.press(SKIRT, points) - points).any()) is not knows_arms
