@@ -20,7 +20,9 @@ def middle_deficit(edge: int, state: State, cloth: Cloth, skin: Skin, rules: Rul
     # Beyond a band no face is known; a known one makes the answer cheap.
     near = wp.where(state.distance[a] <= state.distance[b] + rules.tolerance, state.face[a], state.face[b])
     distance, gradient, _face = query_skin(skin, 0.5 * (state.place[a] + state.place[b]), near)
-    return 0.5 * rules.margin - distance, gradient
+    lack = 0.5 * rules.margin - distance
+    # What runs through a hand hasn't cut a corner, and isn't to be raised.
+    return lack * wp.clamp(2.0 - lack / rules.gap, 0.0, 1.0), gradient
 
 
 @wp.kernel

@@ -236,7 +236,7 @@ class Resolver:
         how, state, cloth, n = self._settings, self._state, self._cloth, self._n_vertices
         rules = _state.Rules()
         rules.margin, rules.tolerance, rules.max_displacement = margin, how.tolerance, how.max_displacement
-        rules.max_pushes = how.max_pushes
+        rules.max_pushes, rules.gap = how.max_pushes, how.gap
         each = n if self._is_serial else 1
         steps: dict[str, tuple[Any, list[Any]]] = {
             "begin": (_resolver_kernels.begin_kernel, [each, state]),

@@ -44,6 +44,7 @@ class Rules:
     tolerance: wp.float32
     max_displacement: wp.float32
     max_pushes: wp.int32
+    gap: wp.float32
 
 
 @wp.struct

@@ -224,6 +224,7 @@ def _raise_edges(state: _State, edges: Tensor, max_rounds: int) -> int:
         closer = torch.where(of_first <= of_second + state.tolerance, low[:, 0], low[:, 1])
         middle = state.query(state.vertices[low].mean(dim=1), closer)
         lack = wanted - middle.distance
+        lack = lack * (2 - lack / _SETTINGS.gap).clamp(0, 1)
         is_low = lack > 0
         if not bool(is_low.any()):
             return round_
