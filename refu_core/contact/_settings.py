@@ -30,9 +30,10 @@ class ContactSettings:
     between vertices. With half of it 6.8 % of frames of shirt and shorts are cut (1.4). An edge whose middle lacks up
     to this is raised in full, and one that lacks twice as much not at all: it runs through a hand. Were it raised, a
     T-shirt on limbs that run through the trunk would lie 40 mm elsewhere, not 5, when the person turns."""
-    sweeps: int = 16
+    sweeps: int = 12
     """How often edges that were torn apart, and triangles that cut each other, are drawn to where they should be. Even:
-    what is swept ends where it began. Of triangles eight sweeps leave 5 of 116 frames cut, twelve 3."""
+    what is swept ends where it began. Of triangles eight sweeps leave 5 of 116 frames cut, twelve 3, and
+    more no fewer."""
     levellings: int = 100
     """How often cloth that is folded over, or cut, is levelled. Even. Of 20 frames with folds a hundred leave 2 cut, 64
     leave 5, 32 leave 6."""
