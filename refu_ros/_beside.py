@@ -182,11 +182,11 @@ def asked_path(settings: NodeSettings, name: str) -> Path:
         msg = "a request may name no file: start the node with the parameter bags, a folder for them"
         raise RefuError(msg)
     parts = name.split("/")
-    # Path.resolve raises for links that lead in a circle.
+    # Path.resolve raises for links that lead in a circle; here they stay links.
     folder = Path(os.path.realpath(Path(settings.bags).expanduser()))
     if len(parts) <= _MOST_PARTS and all(map(_PART.fullmatch, parts)):
         path = Path(os.path.realpath(folder / name))
-        if folder in path.parents:
+        if folder in path.parents and not path.is_symlink():
             return path
     msg = f"wanted a path below the parameter bags, as today/walk.mcap, got {name!r}"
     raise RefuError(msg)

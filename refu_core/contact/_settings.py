@@ -32,8 +32,7 @@ class ContactSettings:
     T-shirt on limbs that run through the trunk would lie 40 mm elsewhere, not 5, when the person turns."""
     sweeps: int = 12
     """How often edges that were torn apart, and triangles that cut each other, are drawn to where they should be. Even:
-    what is swept ends where it began. Of triangles eight sweeps leave 5 of 116 frames cut, twelve 3, and
-    more no fewer."""
+    what is swept ends where it began. Of triangles eight sweeps leave 5 of 116 frames cut, twelve 3."""
     levellings: int = 100
     """How often cloth that is folded over, or cut, is levelled. Even. Of 20 frames with folds a hundred leave 2 cut, 64
     leave 5, 32 leave 6."""
