@@ -41,7 +41,7 @@ def add(commands: Any) -> None:
         nargs="+",
         default=[],
         metavar="DIR",
-        help="data sets of refu simulate, one a garment, or folders and globs of them; with --quick: bags",
+        help="data sets of refu simulate, one a garment, or folders and globs of them",
     )
     cli.add_options(parser, EvaluateOptions)
     parser.add_argument(
@@ -51,36 +51,13 @@ def add(commands: Any) -> None:
         metavar="DIR",
         help="folders with GARMENT/NAME.safetensors that are looked at before the weights that ship",
     )
-    parser.add_argument(
-        "--quick",
-        action="store_true",
-        help="measure the bags of --data (default: bags) instead, and exit with 1 where a figure has fallen",
-    )
-    parser.add_argument(
-        "--reference",
-        type=cli.out_file,
-        metavar="FILE",
-        help="figures that --quick holds its own against (docs/results/quick.json)",
-    )
-    parser.add_argument("--set-reference", action="store_true", help="write that file instead of comparing with it")
     cli.add_cluster(parser)
     cli.add_common(parser, run)
 
 
 def run(args: argparse.Namespace) -> int:
-    from refu_lab.fleet import find_data_sets, open_engine
-
-    if args.quick:
-        from refu_lab.quick import quick_check, quick_table
-
-        with open_engine(args.jobs, args.scheduler) as engine:
-            result = quick_check(
-                args.data, reference=args.reference, renew=args.set_reference, progress=not args.quiet, engine=engine
-            )
-        return cli.tell(
-            args, quick_table(result), result.as_dict(), code=0 if result.is_passed else cli.EXIT_CHECK_FAILED
-        )
     from refu_lab.evaluate import evaluate, results_dict, results_text
+    from refu_lab.fleet import find_data_sets, open_engine
 
     options = EvaluateOptions(**cli.given(args, EvaluateOptions) | {"data": tuple(find_data_sets(args.data))})
     with open_engine(args.jobs, args.scheduler) as engine:

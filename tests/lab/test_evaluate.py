@@ -1,9 +1,10 @@
-"""`refu evaluate`: tables of a data set from files alone, the quick check of bags, and what it refuses."""
+"""`refu evaluate`: tables of a data set from files alone, the figures that are kept, and what it refuses."""
 
 from __future__ import annotations
 
 import json
 import pickle
+import runpy
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -12,12 +13,9 @@ import numpy as np
 import pytest
 import torch
 
-import msg_adapters as adapters
 from refu_core import SmplFrame, load_body, load_garment
-from refu_lab import quick
 from refu_lab.cli import main
 from refu_lab.reproduction import Library, SampleSet, Study, _plots, _runs, run_methods
-from refu_lab.truth import TOPIC
 
 BAGS = Path(__file__).parents[2] / "bags"
 GARMENT = "short-pant-male"
@@ -146,77 +144,30 @@ def test_motion_of_a_folder(tmp_path: Path) -> None:
     assert "skin to collider" in (tmp_path / "out" / "motion.md").read_text(encoding="utf-8")
 
 
-# ---- the quick check -------------------------------------------------------------------------------------------------
+# ---- the figures that are kept ---------------------------------------------------------------------------------------
+
+SCRIPT = runpy.run_path(str(BAGS.parent / "scripts" / "check_figures.py"))
 
 
-@pytest.fixture(scope="module")
-def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A bag with ground truth."""
-    path = tmp_path_factory.mktemp("bags") / "small.mcap"
-    faces = load_garment(GARMENT).faces.numpy()
-    mesh = adapters.MarkerMesh(ns=GARMENT, faces=faces, n_vertices=faces.max() + 1, color=(1.0, 1.0, 1.0, 1.0))
-    encoder = adapters.MarkerArrayEncoder([mesh], frame_id="map", axes="smpl")
-    encode = adapters.encoder_for("multiarray")
-    with adapters.BagWriter(path) as writer:
-        writer.add_topic("/smpl_params", adapters.INPUT_TYPES["multiarray"])
-        writer.add_topic(TOPIC, adapters.MARKER_ARRAY)
-        for frame in frames():
-            writer.write("/smpl_params", encode(frame), log_time_ns=frame.stamp_ns)
-            truth = encoder.encode([truth_of(frame)], stamp_ns=frame.stamp_ns, transl=frame.transl)
-            writer.write(TOPIC, truth, log_time_ns=frame.stamp_ns)
-    return path
+@pytest.mark.parametrize("bag", SCRIPT["bags"](), ids=lambda bag: bag.name)
+def test_no_figure_of_a_shipped_bag_has_fallen(bag: Path) -> None:
+    known = {key: value for key, value in SCRIPT["read"]().items() if key[0] == bag.name}
+    assert {key[2] for key in known} >= {"auto", "node, auto, hybrid", "node, skinned, accurate"}
+    assert SCRIPT["fallen"](SCRIPT["figures_of"](bag), known) == []
 
 
-def test_quick_check_passes_on_its_own_reference_and_fails_below_it(
-    bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    reference, file = tmp_path / "quick.json", tmp_path / "rows.json"
-    arguments = ("--quick", "--data", bag, "--reference", reference)
-    assert run(*arguments, "--set-reference") == 0
-    assert run(*arguments, "--json", file) == 0
-    assert "none of" in capsys.readouterr().out
-    result = json.loads(file.read_text(encoding="utf-8"))
-    assert result["passed"]
-    found = {(row["method"], row["metric"]): row["value"] for row in result["rows"]}
-    assert found["skinned", "mpve_mm"] == pytest.approx(3, abs=0.01)
+def test_a_figure_has_fallen_when_it_is_worse_by_more_than_its_tolerance_or_gone() -> None:
+    def lines(value: float, reference: float, metric: str) -> list[str]:
+        key = ("bag", GARMENT, "skinned", metric)
+        found: list[str] = SCRIPT["fallen"]({key: value}, {key: reference})
+        return found
 
-    kept = json.loads(reference.read_text(encoding="utf-8"))
-    for row in kept["rows"]:
-        if (row["method"], row["metric"]) == ("skinned", "mpve_mm"):
-            row["value"] -= 0.5  # it was better once
-    reference.write_text(json.dumps(kept), encoding="utf-8")
-    assert run(*arguments) == 1
-    printed = capsys.readouterr().out
-    assert "1 of" in printed
-    (fallen,) = [line for line in printed.splitlines() if line.endswith("FALLEN")]
-    assert fallen.split()[:4] == ["small", GARMENT, "skinned", "MPVE"]
-
-    kept["rows"] = [{**row, "method": "gone"} for row in kept["rows"][:1]]
-    reference.write_text(json.dumps(kept), encoding="utf-8")
-    assert run(*arguments) == 1  # a figure that isn't there any more has fallen, too
-    assert "gone" in capsys.readouterr().out
-
-
-def test_no_figure_of_the_shipped_bags_and_weights_has_fallen(capsys: pytest.CaptureFixture[str]) -> None:
-    reference = BAGS.parent / "docs" / "results" / "quick.json"
-    passed = run("--quick", "--data", BAGS, "--reference", reference) == 0
-    assert passed, capsys.readouterr().out
-    rows = json.loads(reference.read_text(encoding="utf-8"))["rows"]
-    assert {row["bag"] for row in rows} == {path.parent.name for path in BAGS.glob("*/metadata.yaml")}
-    assert {row["method"] for row in rows} >= {"auto", "node, auto, hybrid", "node, skinned, accurate"}
-
-
-def test_tolerances_are_one_sided() -> None:
-    def is_passed(value: float, reference: float | None, tolerance: float, metric: str = "cfmp_percent") -> bool:
-        key = quick.FigureKey("bag", GARMENT, "skinned", metric)
-        return quick.Comparison(key, value, reference, tolerance).is_passed
-
-    assert is_passed(90.0, 93.0, 3.0)
-    assert not is_passed(90.0, 93.1, 3.0)
-    assert is_passed(90.0, 50.0, 0.0)
-    assert not is_passed(90.0, 89.0, 0.5, "mpve_mm")
-    assert is_passed(90.0, 99.0, 0.0, "mpve_mm")
-    assert is_passed(90.0, None, 0.0)
+    assert lines(86.1, 93.0, "cfmp_percent") == []
+    assert lines(85.9, 93.0, "cfmp_percent") != []
+    assert lines(93.0, 50.0, "cfmp_percent") == []
+    assert lines(9.2, 9.0, "mpve_mm") == []
+    assert lines(9.4, 9.0, "mpve_mm") != []
+    assert SCRIPT["fallen"]({}, {("bag", GARMENT, "gone", "mpve_mm"): 9.0}) != []
 
 
 # ---- what it refuses -------------------------------------------------------------------------------------------------
@@ -231,8 +182,6 @@ def test_tolerances_are_one_sided() -> None:
         (["--data", "nowhere"], "nowhere"),
         (["--table", "beauty"], "invalid choice"),
         (["--data", "x", "--motion-every", "0"], "above zero"),
-        (["--quick", "--data", "nowhere"], "no recording there"),
-        (["--quick", "--data", str(BAGS), "--reference", "nowhere.json"], "no reference there"),
     ],
 )
 def test_bad_input_is_one_line(
@@ -251,14 +200,6 @@ def test_bad_input_is_one_line(
     error = capsys.readouterr().err
     assert message in error
     assert len(error.splitlines()) == 1
-
-
-def test_a_damaged_reference_is_one_line(bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    reference = tmp_path / "quick.json"
-    for content in ("{", "[]", '{"rows": [{"bag": 1}]}'):
-        reference.write_text(content, encoding="utf-8")
-        assert run("--quick", "--data", bag, "--reference", reference) == 2
-        assert "not a reference" in capsys.readouterr().err
 
 
 def test_two_sets_of_one_garment_are_refused(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
