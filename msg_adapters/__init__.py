@@ -57,10 +57,6 @@ from msg_adapters.people import InputStream as InputStream
 from msg_adapters.people import check_plausible as check_plausible
 from msg_adapters.people import check_stamp as check_stamp
 from msg_adapters.people import decode_ids as decode_ids
-from msg_adapters.rotations import quaternion_from_matrix as quaternion_from_matrix
-from msg_adapters.rotations import quaternion_from_rotvec as quaternion_from_rotvec
-from msg_adapters.rotations import rotvec_from_quaternion as rotvec_from_quaternion
-from msg_adapters.rotations import slerp as slerp
 from msg_adapters.transforms import TF_MESSAGE as TF_MESSAGE
 from msg_adapters.transforms import Placement as Placement
 from msg_adapters.transforms import TransformBuffer as TransformBuffer

@@ -7,19 +7,18 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from msg_adapters.bags import iter_smpl_frames
 from msg_adapters.cdr import NS_PER_S
 from msg_adapters.errors import BagError, MotionFileError
-from msg_adapters.rotations import quaternion_from_rotvec, quaternion_product, rotvec_from_quaternion, slerp
-from refu_core.frames import N_JOINTS, SmplFrame
+from refu_core.frames import SmplFrame
 from refu_core.keypoints import Proportions
-from refu_core.recordings import SUFFIXES, Axes, Recording, n_resampled, read_recording
+from refu_core.recordings import SUFFIXES, Axes, Recording, interpolated, n_resampled, read_recording
 from refu_core.skeleton import JOINT_NAMES
 
 _PAUSE_NS = NS_PER_S
 """A step between a bag's frames that is longer is a pause, unless it is what is usual there."""
-_BLOCK = 10_000  # frames that are resampled at once: a clip of hours would take gigabytes
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,16 +60,8 @@ class Motion(Recording):
             )
             raise MotionFileError(msg)
         at = np.minimum(np.arange(count) * (self.fps / fps), len(self) - 1)
-        before = np.minimum(at.astype(np.intp), max(len(self) - 2, 0))
-        after = np.minimum(before + 1, len(self) - 1)
-        fraction = at - before
-        poses = np.empty((count, N_JOINTS, 3), np.float32)
-        for start in range(0, count, _BLOCK):
-            rows = slice(start, start + _BLOCK)
-            first, last = (quaternion_from_rotvec(self.poses[which[rows]]) for which in (before, after))
-            poses[rows] = rotvec_from_quaternion(slerp(first, last, fraction[rows, None]))
-        transl = self.transl[before] + fraction[:, None] * (self.transl[after] - self.transl[before])
-        return replace(self, poses=poses, transl=transl, fps=float(fps))
+        poses, transl = interpolated(self.poses, self.transl, np.arange(len(self)), at)
+        return replace(self, poses=poses.astype(np.float32), transl=transl, fps=float(fps))
 
     def in_place(self, *, up: int) -> Motion:
         """The motion with its translations held where the first frame is, but along the axis `up`."""
@@ -147,9 +138,9 @@ def march() -> Motion:
         pose[:, JOINT_NAMES.index(f"{side}_hip"), 0] = -0.9 * lift
         pose[:, JOINT_NAMES.index(f"{side}_knee"), 0] = 1.3 * lift
         pose[:, JOINT_NAMES.index(f"{side}_ankle"), 0] = -0.4 * lift  # the sole stays level
-        down = quaternion_from_rotvec(np.broadcast_to(-sign * 1.15 * z, (len(t), 3)))
-        swing = quaternion_from_rotvec((0.5 * sign * np.sin(t))[:, None] * x)
-        pose[:, JOINT_NAMES.index(f"{side}_shoulder")] = rotvec_from_quaternion(quaternion_product(swing, down))
+        down = Rotation.from_rotvec(-sign * 1.15 * z)
+        swing = Rotation.from_rotvec((0.5 * sign * np.sin(t))[:, None] * x)
+        pose[:, JOINT_NAMES.index(f"{side}_shoulder")] = (swing * down).as_rotvec()
         pose[:, JOINT_NAMES.index(f"{side}_elbow"), 1] = -sign * 0.4
     pose[:, JOINT_NAMES.index("spine2"), 1] = 0.12 * np.sin(t)
     transl = np.tile([0.0, _ROOT_HEIGHT_M, 0.0], (len(t), 1))

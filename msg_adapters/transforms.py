@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation, Slerp
 
 from msg_adapters.cdr import Buffer, CdrReader, CdrWriter
-from msg_adapters.errors import TransformError
-from msg_adapters.rotations import matrix_from_quaternion, slerp
+from msg_adapters.errors import EncodeError, TransformError
 from refu_core.frames import PLAUSIBLE_TRANSL
 
 TF_MESSAGE = "tf2_msgs/msg/TFMessage"
@@ -36,6 +36,15 @@ class Transform:
     """[m], shape (3,)."""
     quaternion: ArrayLike
     """xyzw, shape (4,)."""
+
+
+def quaternion_from_matrix(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The unit quaternion xyzw with w >= 0, shape (4,), of a rotation (3, 3). Raises `EncodeError` for others."""
+    try:
+        return Rotation.from_matrix(matrix).as_quat(canonical=True)
+    except (ValueError, np.linalg.LinAlgError) as error:
+        msg = f"wanted a rotation, got {matrix.tolist()}"
+        raise EncodeError(msg) from error
 
 
 def encode_transforms(transforms: Sequence[Transform]) -> bytes:
@@ -118,12 +127,13 @@ class _Track:
             raise TransformError(msg)
         else:
             value = _between(self.values[after - 1 : after + 1], self.stamps[after - 1 : after + 1], stamp_ns)
-        return Placement(matrix_from_quaternion(value[3:]), value[:3], is_late)
+        return Placement(Rotation.from_quat(value[3:]).as_matrix(), value[:3], is_late)
 
 
 def _between(values: Sequence[NDArray[np.float64]], stamps: Sequence[int], stamp_ns: int) -> NDArray[np.float64]:
     (start, end), fraction = values, (stamp_ns - stamps[0]) / (stamps[1] - stamps[0])
-    return np.concatenate([start[:3] + fraction * (end[:3] - start[:3]), slerp(start[3:], end[3:], fraction)])
+    turn = Slerp([0.0, 1.0], Rotation.from_quat([start[3:], end[3:]]))(fraction).as_quat()
+    return np.concatenate([start[:3] + fraction * (end[:3] - start[:3]), turn])
 
 
 class TransformBuffer:

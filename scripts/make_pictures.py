@@ -24,6 +24,7 @@ import msg_adapters as adapters
 from refu_core import GarmentPipeline, PipelineOutput, SmplFrame, load_body, load_garment
 from refu_core.body import joints_of
 from refu_core.modes import DEFAULT_GARMENTS
+from refu_core.recordings import interpolated
 from refu_core.simulation import GarmentDataset
 from refu_lab.contact_sheet import contact_sheet
 from refu_lab.garment import picture
@@ -98,10 +99,9 @@ def looped(bag: str, first: int) -> list[SmplFrame]:
         late, early = frames[first + k], frames[max(first + k - LENGTH, 0)]
         share = max(k - (LENGTH - BLEND) + 1, 0) / (BLEND + 1)
         share = share * share * (3 - 2 * share)
-        ends = [adapters.quaternion_from_rotvec(one.pose) for one in (late, early)]
-        pose = adapters.rotvec_from_quaternion(adapters.slerp(ends[0], ends[1], np.full(24, share)))
-        transl = (1 - share) * late.transl + share * early.transl if bag != "walk" else np.zeros(3)
-        found.append(replace(late, pose=pose.astype(np.float32), transl=transl))
+        ends = (np.stack(pair) for pair in ((late.pose, early.pose), (late.transl, early.transl)))
+        poses, transl = interpolated(*ends, np.arange(2), np.array([share]))
+        found.append(replace(late, pose=poses[0], transl=transl[0] if bag != "walk" else np.zeros(3)))
     return found
 
 

@@ -14,9 +14,10 @@ import numpy as np
 import rclpy
 from geometry_msgs.msg import PolygonStamped, PoseStamped
 from rclpy.node import Node
+from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import PointCloud2
 
-from msg_adapters import points_of, quaternion_from_matrix
+from msg_adapters import points_of
 
 AHEAD_M = 0.15
 """How far before the opening the gripper waits, along its normal [m]."""
@@ -39,7 +40,7 @@ class SleeveListener(Node):
         side = np.cross([0.0, 0.0, 1.0], normal)
         side /= max(np.linalg.norm(side), 1e-9)
         rotation = np.stack([np.cross(side, -normal), side, -normal], axis=1)  # z goes into the sleeve
-        place, turn = ring.mean(axis=0) + AHEAD_M * normal, quaternion_from_matrix(rotation)
+        place, turn = ring.mean(axis=0) + AHEAD_M * normal, Rotation.from_matrix(rotation).as_quat()
         target = PoseStamped(header=message.header)
         target.pose.position.x, target.pose.position.y, target.pose.position.z = place.tolist()
         q = target.pose.orientation

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from msg_adapters.cdr import Buffer, CdrReader, CdrWriter
 from msg_adapters.errors import DecodeError, decoding
-from msg_adapters.rotations import quaternion_from_rotvec, rotvec_from_quaternion
 from refu_core.frames import N_JOINTS, SmplFrame
 from refu_core.skeleton import JOINT_NAMES
 
@@ -39,7 +39,7 @@ def from_bytes(data: Buffer) -> SmplFrame:
             msg = f"the orientation of {JOINT_NAMES[joint]} isn't a rotation: {quaternions[joint].tolist()}"
             msg += "; an identity is (0, 0, 0, 1)"
             raise DecodeError(msg)
-        pose: NDArray[Any] = rotvec_from_quaternion(quaternions)
+        pose: NDArray[Any] = Rotation.from_quat(quaternions / largest[:, None]).as_rotvec()  # their squares are finite
         return SmplFrame(pose, transl=poses[0, :3], stamp_ns=stamp_ns)
 
 
@@ -47,7 +47,7 @@ def to_bytes(frame: SmplFrame, *, frame_id: str = "map") -> bytes:
     """The message in CDR; the betas aren't in it."""
     poses = np.zeros((N_JOINTS, _POSE_NUMBERS))
     poses[0, :3] = frame.transl
-    poses[:, 3:] = quaternion_from_rotvec(frame.pose)
+    poses[:, 3:] = Rotation.from_rotvec(frame.pose).as_quat()
     writer = CdrWriter()
     writer.fields("Ts", frame.stamp_ns, frame_id)
     writer.sequence("f8", poses)

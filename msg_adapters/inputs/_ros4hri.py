@@ -8,14 +8,13 @@ person stands upright where the frame `body_<id>` is, with the pelvis in its ori
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import reduce
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from msg_adapters.axes import vertices_smpl_from_ros
 from msg_adapters.errors import DecodeError
-from msg_adapters.rotations import quaternion_from_rotvec, quaternion_product, rotvec_from_quaternion
 from refu_core.frames import MAX_ANGLE
 from refu_core.skeleton import JOINT_NAMES
 
@@ -37,9 +36,8 @@ _AXES = vertices_smpl_from_ros(np.array([*AXES.values()], np.float64))
 _SPINE, _HEAD = _joints("spine1", "spine2", "spine3"), _joints("neck", "head")
 _BALLS = _joints("left_shoulder", "right_shoulder", "left_hip", "right_hip")
 _HINGES = _joints("left_elbow", "right_elbow", "left_knee", "right_knee")
-_LOWERED = np.array([[0, 0, -np.pi / 2], [0, 0, np.pi / 2], [0, 0, 0], [0, 0, 0]])
-_REST, _UNREST = quaternion_from_rotvec(_LOWERED), quaternion_from_rotvec(-_LOWERED)
-"""From SMPL's limbs at rest, where the arms point sideways, to ROS4HRI's, where they hang; and back."""
+_REST = Rotation.from_rotvec([[0, 0, -np.pi / 2], [0, 0, np.pi / 2], [0, 0, 0], [0, 0, 0]])
+"""From SMPL's limbs at rest, where the arms point sideways, to ROS4HRI's, where they hang."""
 
 
 def body_of(names: Sequence[str]) -> str | None:
@@ -61,11 +59,11 @@ def pose_of(angles: NDArray[np.float64]) -> NDArray[np.float64]:
         msg = f"{[*AXES][bad[0]]} has the angle {angles[bad[0]]:g}, wanted radians"
         raise DecodeError(msg)
     vectors = angles[:, None] * _AXES
-    turns = quaternion_from_rotvec(vectors)
-    limbs = turns[4:].reshape(4, 4, 4).swapaxes(0, 1)  # joint, limb, xyzw
+    turns = Rotation.from_rotvec(vectors)
+    first, second, third, hinge = (turns[4 + joint :: 4] for joint in range(4))  # of the four limbs
     pose = np.zeros((len(JOINT_NAMES), 3))
     pose[_SPINE] = vectors[0] / len(_SPINE)
-    pose[_HEAD] = rotvec_from_quaternion(reduce(quaternion_product, turns[1:4])) / len(_HEAD)
-    pose[_BALLS] = rotvec_from_quaternion(reduce(quaternion_product, [*limbs[:3], _REST]))
-    pose[_HINGES] = rotvec_from_quaternion(reduce(quaternion_product, [_UNREST, limbs[3], _REST]))
+    pose[_HEAD] = (turns[1] * turns[2] * turns[3]).as_rotvec() / len(_HEAD)
+    pose[_BALLS] = (first * second * third * _REST).as_rotvec()
+    pose[_HINGES] = (_REST.inv() * hinge * _REST).as_rotvec()
     return pose

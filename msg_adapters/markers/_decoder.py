@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from msg_adapters.cdr import Buffer, CdrReader
 from msg_adapters.errors import DecodeError
-from msg_adapters.rotations import matrix_from_quaternion
 
 _MIN_MARKER_BYTES = 180
 
@@ -43,8 +43,10 @@ class Marker:
         quaternion = np.array(self.pose[3:])
         with np.errstate(all="ignore"):  # no finite numbers in, none out
             if quaternion[:3].any():  # a rotation that nobody has set is none
+                if not np.isfinite(quaternion).all():
+                    return np.full_like(points, np.nan)
                 quaternion /= np.abs(quaternion).max()  # its square is finite, and not zero
-                points = points @ matrix_from_quaternion(quaternion / np.linalg.norm(quaternion)).T
+                points = points @ Rotation.from_quat(quaternion).as_matrix().T
             return points + self.pose[:3]
 
 

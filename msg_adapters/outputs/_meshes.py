@@ -15,8 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from msg_adapters.cdr import CdrWriter
 from msg_adapters.errors import EncodeError
 from msg_adapters.markers import MarkerMesh, finite_points, triangles
-from msg_adapters.rotations import quaternion_from_matrix
-from msg_adapters.transforms import Placement
+from msg_adapters.transforms import Placement, quaternion_from_matrix
 
 MESH = "shape_msgs/msg/Mesh"
 COLLISION_OBJECT = "moveit_msgs/msg/CollisionObject"

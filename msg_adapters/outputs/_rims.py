@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from msg_adapters.cdr import CdrWriter
 from msg_adapters.markers import LINE_STRIP, encode_lists, finite_points
-from msg_adapters.rotations import quaternion_from_matrix
-from msg_adapters.transforms import Transform, encode_transforms
+from msg_adapters.transforms import Transform, encode_transforms, quaternion_from_matrix
 
 POLYGON = "geometry_msgs/msg/PolygonStamped"
 _COLOR, _WIDTH_M = (0.95, 0.55, 0.1, 1.0), 0.004

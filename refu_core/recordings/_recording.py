@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
 
 FPS_RANGE = (1e-3, 10_000.0)
 """Frames a second that anything is recorded or sampled at: a frame in a quarter of an hour, and ten a millisecond."""
@@ -51,6 +53,21 @@ def n_resampled(n: int, fps: float, wanted: float) -> int:
         msg = f"{n} frames at {fps:g} Hz are {count} at {wanted:g} Hz, at most {MAX_FRAMES} are made; cut the clip"
         raise ValueError(msg)
     return count
+
+
+def interpolated(
+    poses: NDArray[np.floating], transl: NDArray[np.floating], at: NDArray[Any], wanted: NDArray[Any]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Motion that is known `at` times (T,), ascending, at the `wanted` times (N,) between them.
+
+    Rotations are taken on the shorter arc and translations along straight lines, of poses (T, J, 3) [rad] and transl
+    (T, 3) [m]. Components of rotation vectors aren't interpolated: they may jump by 2 pi between frames.
+    """
+    if len(at) == 1:
+        n = len(wanted)
+        return np.repeat(poses.astype(np.float64), n, axis=0), np.repeat(transl.astype(np.float64), n, axis=0)
+    joints = [Slerp(at, Rotation.from_rotvec(joint))(wanted).as_rotvec() for joint in poses.swapaxes(0, 1)]
+    return np.stack(joints, 1), np.stack([np.interp(wanted, at, along) for along in transl.T], 1)
 
 
 def tell_pace(transl: NDArray[np.float64], rate: float, notes: list[str]) -> None:

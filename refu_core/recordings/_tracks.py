@@ -7,12 +7,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
 
 from refu_core._pickle_machine import Record
 from refu_core.recordings import _layouts as table
 from refu_core.recordings._containers import MOST_DEPTH, Content, Key, entries
-from refu_core.recordings._recording import MAX_FRAMES
+from refu_core.recordings._recording import MAX_FRAMES, interpolated
 from refu_core.recordings._rotations import is_one_frame
 
 _SAME = 0.75
@@ -77,9 +76,8 @@ def filled(
     if at is None or not (np.isfinite(poses).all() and np.isfinite(transl).all()):
         return poses, transl
     wanted = np.arange(at[-1] + 1)
-    joints = [Slerp(at, Rotation.from_rotvec(poses[:, j]))(wanted).as_rotvec() for j in range(poses.shape[1])]
     notes.append(f"{len(wanted) - len(at)} of {len(wanted)} frames are missing: interpolated")
-    return np.stack(joints, 1), np.stack([np.interp(wanted, at, transl[:, k]) for k in range(3)], 1)
+    return interpolated(poses, transl, at, wanted)
 
 
 def _rows_apart(content: Content) -> Content:

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from refu_core.body import MIRRORED_JOINTS
 from refu_core.errors import SimulationError
 from refu_core.frames import N_JOINTS
-from refu_core.recordings import SUFFIXES, Axes, n_resampled, read_recording
+from refu_core.recordings import SUFFIXES, Axes, interpolated, n_resampled, read_recording
 
 # Range of each joint's rotation vector [degrees] about x, y, z, for the left side where there are two; the right side
 # is its mirror image. x points to the subject's left, y up, z forward, so a thigh is raised by a negative turn about x,
@@ -53,18 +53,12 @@ class Clip:
     def resampled(self, fps: float) -> Clip:
         """The motion at another frame rate, rotations on the shorter arc; `SimulationError` for a million frames."""
         n = len(self.poses)
-        if n < 2:
-            return self
         try:
-            wanted = np.arange(n_resampled(n, self.fps, fps)) / fps
+            wanted = np.minimum(np.arange(n_resampled(n, self.fps, fps)) * (self.fps / fps), n - 1)
         except ValueError as error:
             msg = f"{self.name}: {error}"
             raise SimulationError(msg) from error
-        times = np.arange(n) / self.fps
-        poses = np.stack(
-            [Slerp(times, Rotation.from_rotvec(self.poses[:, j]))(wanted).as_rotvec() for j in range(N_JOINTS)], 1
-        )
-        transl = np.stack([np.interp(wanted, times, self.transl[:, k]) for k in range(3)], 1)
+        poses, transl = interpolated(self.poses, self.transl, np.arange(n), wanted)
         return Clip(self.name, poses.astype(np.float32), transl, fps, self.notes)
 
 

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from reference import deserialise, header, serialise, stamps, texts, typestore
 from rosbags.typesys import get_types_from_msg
+from scipy.spatial.transform import Rotation
 
 from msg_adapters import (
     CAMERA_INFO,
@@ -34,8 +35,6 @@ from msg_adapters import (
     encode_mesh,
     message_definition,
     points_of,
-    quaternion_from_matrix,
-    quaternion_from_rotvec,
 )
 from msg_adapters.markers import SKIN
 from msg_adapters.outputs import (
@@ -53,7 +52,7 @@ from msg_adapters.outputs import (
     encode_scene,
     make_outputs,
 )
-from msg_adapters.rotations import matrix_from_quaternion
+from msg_adapters.transforms import quaternion_from_matrix
 
 FOREIGN = (COLLISION_OBJECT, SCENE_UPDATE, IDS_LIST)
 """Types of packages that rosbags doesn't know: by our definitions, whose hashes are those of the packages' own."""
@@ -242,9 +241,7 @@ def test_damaged_points_are_refused(data: st.DataObject) -> None:
 
 # Openings -----------------------------------------------------------------------------------------
 
-rotations = hnp.arrays(np.float64, (3,), elements=st.floats(-4, 4)).map(
-    lambda v: matrix_from_quaternion(quaternion_from_rotvec(v))
-)
+rotations = hnp.arrays(np.float64, (3,), elements=st.floats(-4, 4)).map(lambda v: Rotation.from_rotvec(v).as_matrix())
 
 
 def rim(rotation: Any, name: str = "ann/tshirt-male/neck", stamp_ns: int = 7) -> Rim:
@@ -275,14 +272,14 @@ def test_openings(rotation: Any, name: str, stamp_ns: int) -> None:
     )
     np.testing.assert_allclose(marker.points[:, 2], 0, atol=1e-12)  # in the opening's own plane, and closed
     np.testing.assert_array_equal(marker.points[0], marker.points[-1])
-    turn = matrix_from_quaternion(marker.pose[3:])
+    turn = Rotation.from_quat(marker.pose[3:]).as_matrix()
     np.testing.assert_allclose(marker.points[:-1] @ turn.T + marker.pose[:3], one.ring, atol=1e-9)
 
     message = same_again(encode_frames([one], frame_id="odom"), TF_MESSAGE)
     (frame,) = message.transforms
     assert (frame.header.frame_id, frame.child_frame_id) == ("odom", name)
     q = frame.transform.rotation
-    np.testing.assert_allclose(matrix_from_quaternion([q.x, q.y, q.z, q.w]), rotation, atol=1e-9)
+    np.testing.assert_allclose(Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), rotation, atol=1e-9)
 
 
 def test_openings_that_cannot_be() -> None:
@@ -313,7 +310,7 @@ def test_meshes(vertices: Any, rotation: Any, name: str, stamp_ns: int) -> None:
     assert (added.id, added.operation, added.header.frame_id) == (name, added.ADD, "odom")
     assert (added.pose.position.x, added.pose.position.z) == (1.0, 3.0)
     q = added.pose.orientation
-    np.testing.assert_allclose(matrix_from_quaternion([q.x, q.y, q.z, q.w]), rotation, atol=1e-9)
+    np.testing.assert_allclose(Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), rotation, atol=1e-9)
     assert added.subframe_names == ["neck", "hem"]
     assert len(added.subframe_poses) == 2
     assert (len(added.meshes), len(added.mesh_poses), added.mesh_poses[0].orientation.w) == (1, 1, 1.0)
@@ -398,7 +395,7 @@ def test_rclpy_reads_them() -> None:
 def test_quaternions_of_matrices(rotation: Any) -> None:
     quaternion = quaternion_from_matrix(rotation)
     assert quaternion[3] >= 0
-    np.testing.assert_allclose(matrix_from_quaternion(quaternion), rotation, atol=1e-12)
+    np.testing.assert_allclose(Rotation.from_quat(quaternion).as_matrix(), rotation, atol=1e-12)
 
 
 # Cameras ------------------------------------------------------------------------------------------

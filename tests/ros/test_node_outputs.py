@@ -41,7 +41,7 @@ from msg_adapters import (
 from msg_adapters.cdr import CdrWriter
 from msg_adapters.inputs._ros4hri import AXES
 from msg_adapters.outputs import COLLISION_OBJECT, SCENE_UPDATE
-from msg_adapters.transforms import Transform, encode_transforms, matrix_from_quaternion
+from msg_adapters.transforms import Transform, encode_transforms
 from refu_core import GarmentPipeline, SmplFrame, load_garment
 from refu_core.outputs import Openings
 from refu_ros import garment_node
@@ -222,7 +222,7 @@ def test_points_openings_and_meshes_are_those_of_the_pipeline(
     assert {"tshirt-male/neck", "tshirt-male/hem", "short-pant-male/waist"} <= set(rims)
     pose = rims["tshirt-male/left_sleeve"].pose
     np.testing.assert_allclose(pose[:3], opening.centre, atol=1e-4)
-    np.testing.assert_allclose(matrix_from_quaternion(pose[3:]), opening.rotation, atol=1e-3)
+    np.testing.assert_allclose(Rotation.from_quat(pose[3:]).as_matrix(), opening.rotation, atol=1e-3)
     solid = scene.heard["mesh/short_pant_male"][-1]
     assert 1000 < len(solid.triangles) <= 2000
     corners = np.array([(p.x, p.y, p.z) for p in solid.vertices])
@@ -500,7 +500,7 @@ def test_the_example_in_python_hears_the_node(robot: Callable[..., Robot], tmp_p
     place = np.array([target.pose.position.x, target.pose.position.y, target.pose.position.z])
     assert 0.1 < (place - sleeve.centre) @ sleeve.rotation[:, 2] < 0.2
     q = target.pose.orientation
-    into = matrix_from_quaternion([q.x, q.y, q.z, q.w])[:, 2]
+    into = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()[:, 2]
     assert into @ sleeve.rotation[:, 2] < -0.9
 
 
