@@ -54,6 +54,7 @@ from msg_adapters.outputs import points_of as points_of
 from msg_adapters.people import IDS_LIST as IDS_LIST
 from msg_adapters.people import Doubts as Doubts
 from msg_adapters.people import InputStream as InputStream
+from msg_adapters.people import Track as Track
 from msg_adapters.people import check_plausible as check_plausible
 from msg_adapters.people import check_stamp as check_stamp
 from msg_adapters.people import decode_ids as decode_ids

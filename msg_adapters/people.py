@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from array import array
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from msg_adapters.cdr import NS_PER_S, Buffer, CdrReader
 from msg_adapters.errors import DecodeError
@@ -17,14 +16,14 @@ from refu_core.frames import PLAUSIBLE_ANGLE, PLAUSIBLE_COEFFICIENT, PLAUSIBLE_T
 from refu_core.keypoints import MOST_PEOPLE, People, Proportions, Skeleton, TrackerSettings, keypoint_layout
 from refu_core.modes import FOREIGN_BETAS, ONE_STYLE
 from refu_core.options import DressOptions
-from refu_core.recordings import axis_of, upright_share
+from refu_core.recordings import FASTEST, LONGEST_TURN, axis_of, upright_share
 
 if TYPE_CHECKING:
     from refu_core.body import SmplBody
 
 _MAX_STAMP_NS = 2**31 * NS_PER_S
 _LOOKED_AT = 100
-"""Frames that have come before people are said to lie."""
+"""Frames of a sender that are judged together."""
 
 
 def check_plausible(frame: SmplFrame) -> None:
@@ -118,36 +117,87 @@ class InputStream:
         return {} if self._people is None else self._people[0].at(now_ns)
 
 
+class Track:
+    """What the frames of one person say of how their numbers are meant: units, stamps and axes."""
+
+    def __init__(self) -> None:
+        self._rows = array("d")  # of each frame a few numbers: recordings are long
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self._rows) // _NUMBERS
+
+    def add(self, frame: SmplFrame) -> None:
+        """Takes in the next frame."""
+        longest = np.linalg.norm(frame.pose, axis=1).max()
+        self._rows.extend((longest, 1e-9 * frame.stamp_ns, *frame.pose[0], *frame.transl))
+
+    def doubts(self, *, is_y_up: bool) -> dict[str, str]:
+        """What most frames are doubted for: a sentence by `angles`, `pace`, `stamps` or `axes`, which are said once.
+
+        `is_y_up`: they are said to be in SMPL's axes.
+        """
+        rows = np.frombuffer(self._rows).reshape(-1, _NUMBERS)
+        if not len(rows):
+            return {}
+        found = {}
+        longest, steps = float(np.median(rows[:, 0])), np.diff(rows[:, 1])
+        if longest > LONGEST_TURN:
+            text = f"rotation vectors are as long as {longest:.0f} in most frames, wanted radians: degrees?"
+            found["angles"] = text
+        way, told = np.linalg.norm(np.diff(rows[:, 5:], axis=0), axis=1), steps >= _SHORTEST_S
+        if told.any() and (pace := float(np.median(way[told] / steps[told]))) > FASTEST:
+            text = (
+                f"people move by {pace:.0f} m/s in most frames: translations in cm or mm? Or two senders on one topic?"
+            )
+            found["pace"] = text
+        if len(steps) and (n_still := int((steps <= 0).sum())) > len(steps) / 2:
+            found["stamps"] = f"stamps don't advance in {n_still} of {len(rows)} frames: does the sender's clock run?"
+        elif len(steps) and not _SHORTEST_S <= (step := float(np.median(steps))) <= _LONGEST_S:
+            found["stamps"] = f"frames are {step:.2g} s apart by their stamps: are those in another unit?"
+        share, axis = upright_share(rows[:, 2:5]), axis_of(rows[:, 2:5])
+        if is_y_up and share < 0.5:
+            along = f", heads are towards {axis}" if axis else ""
+            text = (
+                f"people are upright in {100 * share:.0f} % of {len(rows)} frames{along}: input_axes is smpl (y up). "
+            )
+            found["axes"] = text + "Where it isn't, set it to frame"
+        return found
+
+
+_NUMBERS = 8
+_SHORTEST_S, _LONGEST_S = 1e-3, 5.0
+"""Frames are no nearer to each other, and no farther apart, by stamps that are in nanoseconds [s]."""
+
+
 class Doubts:
-    """What is to be said of frames that come, each thing once: nobody says whose the betas are, or people lie."""
+    """What is to be said of frames that come, each thing once."""
 
     def __init__(self) -> None:
         self.has_foreign_betas = False
         """Whether betas have come of which nobody knew what they are of."""
-        self._is_styled = self._lie = False
-        self._roots: list[NDArray[np.float32]] = []
+        self.of_senders: dict[str, str] = {}
+        """What is doubted of the newest frames of each sender: units and stamps. Who lies may be ill."""
+        self._tracks: dict[str, Track] = {}
+        self._said: set[str] = set()
 
-    def of(self, frames: Sequence[SmplFrame], options: DressOptions, *, is_y_up: bool) -> str:
-        """What is to be said now of frames of parameters, or nothing; `is_y_up`: they are said to be in SMPL's axes."""
-        if not (self.has_foreign_betas or options.betas_are_told) and any(frame.betas.any() for frame in frames):
+    def of(self, sender: str, frame: SmplFrame, options: DressOptions, *, is_y_up: bool) -> list[str]:
+        """What is to be said now of a sender's frame of parameters; `is_y_up`: it is said to be in SMPL's axes."""
+        found = {}
+        if not options.betas_are_told and frame.betas.any():
             self.has_foreign_betas = True
-            return FOREIGN_BETAS
-        if not self._is_styled and any(frame.style is not None for frame in frames):
-            self._is_styled = True
-            if plain := options.of_one_style:
-                return ONE_STYLE.format(", ".join(plain))
-        return self._of_axes(frames) if is_y_up and not self._lie else ""
-
-    def _of_axes(self, frames: Sequence[SmplFrame]) -> str:
-        self._roots += [frame.pose[0] for frame in frames]
-        if len(self._roots) < _LOOKED_AT:
-            return ""
-        roots, self._roots = np.array(self._roots, np.float64), []
-        share, axis = upright_share(roots), axis_of(roots)
-        self._lie = share < 0.5  # as of a recording
-        along = f", and their heads are towards {axis}" if axis else ""
-        text = f"people were upright in {100 * share:.0f} % of {len(roots)} frames{along}: input_axes is smpl (y up). "
-        return text + "Where it isn't, set input_axes to frame, and frame_id to the sender's frame" if self._lie else ""
+            found["betas"] = FOREIGN_BETAS
+        if frame.style is not None and "style" not in self._said and (plain := options.of_one_style):
+            found["style"] = ONE_STYLE.format(", ".join(plain))
+        track = self._tracks.setdefault(sender, Track())
+        track.add(frame)
+        if len(track) >= _LOOKED_AT:
+            doubts = self._tracks.pop(sender).doubts(is_y_up=is_y_up)
+            self.of_senders[sender] = "; ".join(text for kind, text in doubts.items() if kind != "axes")
+            found |= doubts
+        new = [text for kind, text in found.items() if kind not in self._said]
+        self._said |= found.keys()
+        return new
 
 
 IDS_LIST = "hri_msgs/msg/IdsList"

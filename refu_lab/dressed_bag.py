@@ -49,6 +49,7 @@ class DressedBag:
         assert options.output is not None
         self._source = source
         self._skipped = 0
+        self._is_empty = True
         self._settings = {"sdf": str(options.sdf), "backbone": str(options.backbone)}
         self._writer = adapters.BagWriter(options.output, overwrite=options.overwrite, in_background=True)
         given = None if source.bag is None else source.bag.topic
@@ -69,7 +70,9 @@ class DressedBag:
         return self
 
     def __exit__(self, *error: Any) -> None:
-        """Finishes the bag, also after an exception."""
+        """Finishes the bag, also after an exception; of one without a frame nothing is left."""
+        if self._is_empty:
+            self._writer.discard()
         self._writer.__exit__(*error)
 
     def add_skip(self, record: FrameRecord, reason: str) -> None:
@@ -88,6 +91,7 @@ class DressedBag:
         exact: Mapping[str, GarmentRecord] | None,
     ) -> None:
         """A message as it came, its garments as bytes, and what exact checks have found, where there were any."""
+        self._is_empty = False
         self._add_input(record)
         self._writer.write(GARMENTS_TOPIC, garments, log_time_ns=record.log_time_ns)
         if self._body is not None:

@@ -10,7 +10,7 @@ import threading
 import time
 from array import array
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -27,11 +27,10 @@ from refu_core.history import PoseHistory
 from refu_core.metrics import CollisionChecker, Figures, GarmentMetrics
 from refu_core.modes import BackboneName
 from refu_core.realtime import PipelineOutput
-from refu_core.recordings import FASTEST, LONGEST_TURN, axis_of, upright_share
 from refu_lab.commands._common import require_apart
 from refu_lab.commands.replay import ReplayOptions
 from refu_lab.dressed_bag import DressedBag, garment_encoder
-from refu_lab.sources import Source, body_facts, open_source
+from refu_lab.sources import body_facts, open_source
 from refu_lab.truth import GroundTruth
 
 When = Literal["before", "after"]
@@ -295,43 +294,12 @@ def replay(
         if evaluator is not None:
             evaluator.summarise(result)
         result.warnings += source.warnings(pipeline, betas_are_told=bool(truth.garments))  # of the built-in bodies
-    result.warnings += _doubts(result, source)
     if not result.latencies_ms and not result.interrupted:
         reasons = "; ".join(f"{count} x {reason}" for reason, count in result.skips.most_common(3))
         reasons = reasons or "; ".join(() if source.bag is None else source.bag.reader.warnings)
         msg = f"{options.input}: no frame could be replayed: {reasons or 'the input is empty'}"
         raise adapters.BagError(msg)
     return result
-
-
-def _doubts(result: ReplayResult, source: Source) -> list[str]:
-    """Whether people lie, who should perhaps stand, or are in other units; files of motion are asked when read."""
-    doubts = []
-    if source.bag is not None and result.frames:
-        poses = np.array([one.frame.pose for one in result.frames], np.float64)
-        longest = float(np.median(np.linalg.norm(poses, axis=2).max(axis=1)))
-        if longest > LONGEST_TURN:
-            doubts.append(f"rotation vectors are as long as {longest:.0f} in most frames, wanted radians: degrees?")
-        pace = _pace([one.frame for one in result.frames])
-        if pace > FASTEST:
-            doubts.append(f"people move by {pace:.0f} m/s in most frames: translations in cm or mm?")
-        roots = np.array([one.frame.pose[0] for one in result.frames], np.float64)
-        up, upright = axis_of(roots), upright_share(roots)
-        if result.options.axes == "smpl" and upright < 0.5:
-            along = f": they stand along {up} (--input-axes frame?)" if up else ""
-            doubts.append(f"people are upright in {100 * upright:.0f} % of the frames only{along}")
-    return doubts
-
-
-_A_MILLISECOND = 1e-3
-
-
-def _pace(frames: Sequence[SmplFrame]) -> float:
-    """The median speed [m/s]; 0 where stamps don't tell, being no frames' apart."""
-    way = np.linalg.norm(np.diff([frame.transl.astype(np.float64) for frame in frames], axis=0), axis=-1)
-    seconds = 1e-9 * np.diff([frame.stamp_ns for frame in frames])
-    told = seconds >= _A_MILLISECOND
-    return float(np.median(way[told] / seconds[told])) if told.any() else 0.0
 
 
 def _counted(records: Iterable[FrameRecord], total: int, told: Callable[[int, int], object]) -> Iterator[FrameRecord]:

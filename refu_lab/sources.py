@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -58,6 +58,8 @@ class Source:
     frame_id: str = "map"
     """Of what comes of it."""
 
+    track: adapters.Track = field(default_factory=adapters.Track)
+    """What a bag's frames say of how they are meant; files of motion are asked when they are read."""
     history: PoseHistory | None = None
     """Tells frames their past, for garments that heed it (`GarmentPipeline.heeds_past`)."""
     has_betas: bool = False
@@ -76,6 +78,8 @@ class Source:
         adapters.check_plausible(frame)
         self.has_betas = self.has_betas or bool(frame.betas.any())
         self.has_style = self.has_style or frame.style is not None
+        if self.bag is not None:
+            self.track.add(frame)
         if self.history is not None:
             frame = self.history(frame)
         betas = self.options.known_betas
@@ -92,6 +96,7 @@ class Source:
             *body_warnings(pipeline, gender=self.gender),
             *self.notes,
             *(() if bag is None else bag.reader.warnings),
+            *self.track.doubts(is_y_up=options.axes == "smpl").values(),
             *([FOREIGN_BETAS] if self.has_betas and not is_told else []),
             *([ONE_STYLE.format(", ".join(plain))] if self.has_style and plain else []),
         ]

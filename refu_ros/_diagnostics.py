@@ -44,6 +44,10 @@ class Situation:
     """Whether there are transforms of it."""
     has_foreign_betas: bool = False
     """Whether nobody knows what the betas mean that came."""
+    doubted: str = ""
+    """What is doubted of the input."""
+    has_no_clock: bool = False
+    """Whether time is a simulation's that hasn't begun."""
     n_namesakes: int = 0
     """Other nodes of this name."""
 
@@ -70,7 +74,12 @@ def _node(report: Report, _: NodeSettings, now: Situation) -> Judgement:
     last = report.reasons["fault"]
     values = {"state": now.state, "last fault": last}
     values |= {f"faults: {where}": str(n) for where, n in sorted(report.group("fault").items())}
-    return [(faults, WARN, f"{faults} faults, the last: {last}"), (True, OK, now.state)], values
+    rules: list[tuple[object, int, str]] = [
+        (now.has_no_clock, WARN, "use_sim_time is set, and no /clock has come: everything is stamped 0"),
+        (faults, WARN, f"{faults} faults, the last: {last}"),
+        (True, OK, now.state),
+    ]
+    return rules, values
 
 
 def _input(report: Report, settings: NodeSettings, now: Situation) -> Judgement:
@@ -98,7 +107,8 @@ def _input(report: Report, settings: NodeSettings, now: Situation) -> Judgement:
     if missing and silent_for is not None and waited > _FIRST_INPUT_S:
         nobody = received and not persons
         rules.append((True, WARN, f"nobody is here, though {received} messages came" if nobody else silence))
-    rules += [(now.has_foreign_betas, WARN, FOREIGN_BETAS), (True, OK, f"{report.rate('received'):.1f} Hz")]
+    rules += [(now.doubted, WARN, now.doubted), (now.has_foreign_betas, WARN, FOREIGN_BETAS)]
+    rules += [(True, OK, f"{report.rate('received'):.1f} Hz")]
     way = "transformed to" if now.is_transformed else "shown as"
     values = {
         "subscribed": "no" if now.listening_for is None else "yes",

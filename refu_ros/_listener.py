@@ -77,6 +77,16 @@ class Listener:
         self.stream.follow(body, settings.keypoints, betas=betas, smoothing=smoothing)
 
     @property
+    def doubted(self) -> str:
+        """What is doubted of who is here, or of topics that several send on; empty if nothing is."""
+        here = () if self.scene is None else self.scene.persons
+        found = [text for person in here if (text := self.doubts.of_senders.get(person))]
+        for name, subscription in self._inputs.items():
+            if not name.startswith("/") and (n := self._node.count_publishers(subscription.topic_name)) > 1:
+                found.append(f"{n} publishers on {subscription.topic_name}: who leaps may be two people")
+        return "; ".join(found)
+
+    @property
     def persons(self) -> list[str]:
         """Everybody who may come, as far as that is known."""
         named = [*self._bodies()] if self._settings.follow_humans else self._settings.persons
@@ -150,9 +160,9 @@ class Listener:
             return
         given = {name: printable(frame_id.lstrip("/")) for name, frame_id in frame_ids.items()}
         # Keypoints' betas are measured on the body that is dressed, and their axes those of `frame_id`.
-        known = [] if self.stream.is_of_keypoints else [*frames.values()]
-        if doubt := self.doubts.of(known, self._settings, is_y_up=self._settings.axes == "smpl"):
-            node.get_logger().warning(f"{topic}: {doubt}")
+        for frame in () if self.stream.is_of_keypoints else frames.values():
+            for doubt in self.doubts.of(person, frame, self._settings, is_y_up=self._settings.axes == "smpl"):
+                node.get_logger().warning(f"{topic}: {doubt}")
         self.input_frame = next((one for one in given.values() if self._need_transforms(topic, one)), "")
         for name, frame in frames.items():
             self._frames[name] = given[name]

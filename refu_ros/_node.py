@@ -310,6 +310,8 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
             input_frame=self._listener.input_frame,
             is_transformed=self._listener.is_transformed,
             has_foreign_betas=self._listener.doubts.has_foreign_betas and not self.settings.betas_are_told,
+            doubted=self._listener.doubted,
+            has_no_clock=bool(self.get_parameter("use_sim_time").value) and not self.now_ns(),
             persons=() if scene is None else scene.persons,
             recording=recording,
             recording_error=error,

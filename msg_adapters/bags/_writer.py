@@ -10,11 +10,21 @@ from pathlib import Path
 from typing import BinaryIO
 
 from msg_adapters.bags._mcap_writer import McapWriter
-from msg_adapters.bags._metadata import BETAS_OF, MAX_TIME_NS, METADATA_FILE, QosProfile, TopicSummary, dump_metadata
+from msg_adapters.bags._metadata import (
+    BETAS_OF,
+    MAX_TIME_NS,
+    METADATA_FILE,
+    QosProfile,
+    TopicSummary,
+    dump_metadata,
+    read_file_paths,
+)
 from msg_adapters.definitions import full_type_name, message_definition
 from msg_adapters.errors import BagError
 
 _DEFAULT_QOS = QosProfile()
+_PARTIAL = ".partial"
+"""Ends the names of files that aren't whole yet."""
 
 
 class BagWriter:
@@ -27,8 +37,10 @@ class BagWriter:
     `in_background` packs and writes each full chunk in a thread of its own, while the caller goes on: a kill takes the
     chunk that is in its hands, too, and an error of the disk is raised by a later call.
 
-    Raises `BagError` when the path can't be written, or holds something and `overwrite` isn't set; nothing is left
-    behind then.
+    Where `overwrite` is set, a bag that is there already stays until the new one is finished and takes its place.
+
+    Raises `BagError` when the path can't be written, or holds something and `overwrite` isn't set, or holds files that
+    are no bag's; nothing is left behind then.
     """
 
     def __init__(
@@ -38,22 +50,25 @@ class BagWriter:
         self._directory = None if self.path.suffix == ".mcap" else self.path
         self.file_path = self.path if self._directory is None else self.path / f"{self.path.absolute().name}_0.mcap"
         """The MCAP file itself."""
+        self._target = self._working = self.file_path
+        """Where that is, links followed, and what is written until it is whole."""
+        self._old: list[Path] = []
+        """Files of the bag that was there before."""
+        self._made: list[Path] = []
+        """Files and folders that weren't there before, in order."""
         self._entered: list[Path] = []
         """Directories with entries that a power cut may still take."""
         self._topics: dict[str, TopicSummary] = {}
         self._channels: dict[str, int] = {}
         self._start_ns, self._end_ns = MAX_TIME_NS, 0
         self._finished = False
-        made: list[Path] = []
         try:
             with self._writing():
-                self._stream = self._open(made, overwrite=overwrite)
+                self._stream = self._open(overwrite=overwrite)
                 self._writer = McapWriter(self._stream, chunk_bytes=chunk_bytes, in_background=in_background)
                 self._writer.start(profile="ros2", library="refu-ros")
         except BagError:
-            for path in reversed(made):
-                with suppress(OSError):  # a directory that somebody else has put something into
-                    path.rmdir() if path.is_dir() else path.unlink()
+            self.discard()
             raise
 
     def __enter__(self) -> BagWriter:
@@ -151,9 +166,14 @@ class BagWriter:
             self._sync_stream()
             self._finished = True
             self._stream.close()
+            for old in self._old:
+                old.unlink(missing_ok=True)
+            if self._working != self._target:
+                self._working.replace(self._target)
+                _entries_to_disk(self._target.parent)
             if self._directory is not None:
                 # Under another name first: a reader never meets half of it.
-                partial = self._directory / f"{METADATA_FILE}.partial"
+                partial = self._directory / f"{METADATA_FILE}{_PARTIAL}"
                 with partial.open("w", encoding="utf-8") as file:
                     file.write(text)
                     file.flush()
@@ -161,48 +181,62 @@ class BagWriter:
                 partial.replace(self._directory / METADATA_FILE)
                 _entries_to_disk(self._directory)
 
+    def discard(self) -> None:
+        """Leaves nothing of this bag, which isn't finished; one that was there before stays."""
+        self._abandon()
+        for path in reversed(self._made):
+            with suppress(OSError):  # a directory that somebody else has put something into
+                path.rmdir() if path.is_dir() else path.unlink()
+
     def _sync_stream(self) -> None:
         _to_disk(self._stream.fileno())
-        if not os.path.samestat(os.fstat(self._stream.fileno()), self.file_path.stat()):
+        if not os.path.samestat(os.fstat(self._stream.fileno()), self._working.stat()):
             raise OSError(errno.ESTALE, "another file has taken its place")
         while self._entered:  # a file that its directory doesn't know is lost with all its content
             _entries_to_disk(self._entered[-1])
             self._entered.pop()
 
-    def _open(self, made: list[Path], *, overwrite: bool) -> BinaryIO:
-        """The file; `made` gets what wasn't there before, in order."""
+    def _open(self, *, overwrite: bool) -> BinaryIO:
         str(self.file_path).encode()  # metadata and diagnostics, which name it, are UTF-8
-        if self._directory is not None:
-            self._clear(self._directory, overwrite=overwrite)
+        if self._directory is not None and self._directory.exists():
+            self._old = self._own_files(self._directory, overwrite=overwrite)
         parent = self.file_path.absolute().parent
-        new = [folder for folder in (parent, *parent.parents) if not folder.exists()]
-        for folder in reversed(new):
+        for folder in reversed([folder for folder in (parent, *parent.parents) if not folder.exists()]):
             folder.mkdir(exist_ok=True)
-            made.append(folder)
-        self._entered = [*(folder.parent for folder in made), parent]
+            self._made.append(folder)
+        self._entered = [*(folder.parent for folder in self._made), parent]
         if overwrite and self.file_path.is_fifo():
             msg = f"{self.path}: a FIFO; choose another path"
             raise BagError(msg)
-        fresh = not self.file_path.exists()
+        if overwrite and (self._old or self.file_path.is_file()):
+            self._target = Path(os.path.realpath(self.file_path))
+            self._working = self._target.with_name(f"{self._target.name}{_PARTIAL}")
+        is_new = self._working != self.file_path or not self.file_path.exists()
         try:
-            stream = self.file_path.open("wb" if overwrite else "xb")
+            stream = self._working.open("wb" if overwrite else "xb")
         except FileExistsError as error:
             msg = f"{self.path}: exists already; choose another path, or overwrite it"
             raise BagError(msg) from error
-        if fresh:
-            made.append(self.file_path)
+        if is_new:
+            self._made.append(self._working)
         return stream
 
-    def _clear(self, directory: Path, *, overwrite: bool) -> None:
-        """Make way for a new bag: of an old one, its own files are removed and nothing else."""
-        old = list(directory.iterdir()) if directory.exists() else []
-        ours = [file for file in old if file.name == METADATA_FILE or file.suffix == ".mcap"]
-        if old and not (overwrite and len(ours) == len(old)):
-            hint = "it holds other files than a bag's" if overwrite else "choose another path, or overwrite it"
+    def _own_files(self, directory: Path, *, overwrite: bool) -> list[Path]:
+        """The files of the bag in a directory; raises `BagError` where it isn't to be replaced, or isn't one alone."""
+        found = [*directory.iterdir()]
+        own = {f"{directory.absolute().name}_0.mcap", METADATA_FILE}
+        with suppress(BagError):
+            own |= {file.name for file in read_file_paths(directory)}
+        others = [file.name for file in found if file.name.removesuffix(_PARTIAL) not in own]
+        if found and (others or not overwrite):
+            hint = (
+                f"it holds other files than a bag's: {others[0]}"
+                if overwrite
+                else "choose another path, or overwrite it"
+            )
             msg = f"{directory}: the directory isn't empty; {hint}"
             raise BagError(msg)
-        for file in ours:
-            file.unlink()
+        return [file for file in found if not file.name.endswith(_PARTIAL)]
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
@@ -226,7 +260,7 @@ class BagWriter:
         """Cut the file back to its last whole chunk: the writer's state isn't known any more."""
         self._finished = True
         stream, writer = getattr(self, "_stream", None), getattr(self, "_writer", None)
-        if stream is None:
+        if stream is None or stream.closed:
             return
         if writer is not None:
             writer.close()

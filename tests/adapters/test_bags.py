@@ -566,10 +566,37 @@ def test_overwriting_touches_nothing_but_a_bag(tmp_path: Path) -> None:
             write_bag(path)
         write_bag(path, count=2, overwrite=True)
         assert len(list(iter_smpl_frames(path))) == 2
-    (directory / "thesis.tex").touch()
-    with pytest.raises(BagError, match="holds other files than a bag's"):
-        write_bag(directory, overwrite=True)
-    assert len(list(directory.iterdir())) == 3
+    for other in ("thesis.tex", "monday.mcap"):
+        (directory / other).touch()
+        with pytest.raises(BagError, match=f"holds other files than a bag's: {other}"):
+            write_bag(directory, overwrite=True)
+        (directory / other).unlink()
+    assert len(list(iter_smpl_frames(directory))) == 2
+
+
+@pytest.mark.parametrize("name", ["a.mcap", "b"])
+def test_what_is_overwritten_stays_until_the_new_bag_is_whole(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    write_bag(path, count=3)
+    before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
+    for end in ("discarded", "killed"):
+        writer = BagWriter(path, overwrite=True)
+        writer.add_topic("/thing", MARKER_ARRAY)
+        writer.write("/thing", b"\0\1\0\0", log_time_ns=0)
+        writer.sync()
+        assert len(list(iter_smpl_frames(path))) == 3
+        if end == "discarded":
+            writer.discard()
+            assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()} == before
+    write_bag(path, count=2, overwrite=True)
+    assert len(list(iter_smpl_frames(path))) == 2
+    assert {file for file in tmp_path.rglob("*") if file.is_file()} == before.keys()
+    link = tmp_path / "link.mcap"
+    if path.is_file():
+        link.symlink_to(path)
+        write_bag(link, count=1, overwrite=True)
+        assert link.is_symlink()
+        assert len(list(iter_smpl_frames(path))) == 1
 
 
 def test_paths_that_cannot_be_written(tmp_path: Path) -> None:
