@@ -8,7 +8,7 @@ import resource
 import tempfile
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from pathlib import Path
@@ -803,19 +803,43 @@ def test_people_who_lie_are_warned_of_once(root: tuple[float, ...], words: str) 
     settings, doubts = NodeSettings(), Doubts()
     pose = np.zeros((24, 3), np.float32)
     pose[0] = root
-    said = [doubt for _ in range(300) if (doubt := doubts.of([SmplFrame(pose)], settings, is_y_up=True))]
-    assert len(said) == bool(words)
+    said = [doubt for _ in range(300) for doubt in doubts.of("", SmplFrame(pose), settings, is_y_up=True)]
+    assert len(said) == bool(words) + 1  # who has no stamps is told, too
     assert words in "".join(said)
     of_frame = Doubts()
-    assert not any(of_frame.of([SmplFrame(pose)], settings, is_y_up=False) for _ in range(300))
+    frames = [SmplFrame(pose, stamp_ns=i * 10**8) for i in range(300)]
+    assert not any(of_frame.of("", frame, settings, is_y_up=False) for frame in frames)
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        (lambda _: {"pose": np.full((24, 3), 40.0)}, "wanted radians: degrees?"),
+        (lambda i: {"transl": [i * 5.0, 0, 0]}, "two senders on one topic?"),
+        (lambda i: {"transl": [i % 2, 0, 0]}, "two senders on one topic?"),
+        (lambda _: {"stamp_ns": 5}, "stamps don't advance in 99 of 100 frames"),
+        (lambda i: {"stamp_ns": 10**18 - i * 10**8}, "stamps don't advance in 99 of 100 frames"),
+        (lambda i: {"stamp_ns": i * 10**11}, "frames are 1e+02 s apart by their stamps"),
+        (lambda i: {"stamp_ns": i * 10**5}, "frames are 0.0001 s apart by their stamps"),
+    ],
+)
+def test_numbers_in_other_units_are_doubted(changed: Callable[[int], Any], words: str) -> None:
+    doubts = Doubts()
+    said = []
+    for i in range(250):
+        frame = SmplFrame(**{"pose": np.zeros((24, 3)), "stamp_ns": 10**18 + i * 10**8 // 3} | changed(i))
+        said += doubts.of("ann", frame, NodeSettings(), is_y_up=True)
+    assert len(said) == 1
+    assert words in said[0]
+    assert doubts.of_senders["ann"] == said[0]
 
 
 def test_a_style_that_a_garment_has_no_ear_for_is_told_once() -> None:
     styled = SmplFrame(np.zeros((24, 3), np.float32), style=np.ones(4))
     doubts, settings = Doubts(), NodeSettings().changed({"garments": ["tshirt-female", "skirt-female"]})
-    said = [doubts.of([styled], settings, is_y_up=True) for _ in range(2)]
-    assert said == [ONE_STYLE.format("tshirt-female"), ""]
-    assert Doubts().of([styled], NodeSettings(), is_y_up=True) == ""
+    said = [doubts.of("", styled, settings, is_y_up=True) for _ in range(2)]
+    assert said == [[ONE_STYLE.format("tshirt-female")], []]
+    assert Doubts().of("", styled, NodeSettings(), is_y_up=True) == []
 
 
 @pytest.mark.parametrize("collider", [True, False])
