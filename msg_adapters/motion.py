@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from msg_adapters.bags import iter_smpl_frames
 from msg_adapters.cdr import NS_PER_S
 from msg_adapters.errors import BagError, MotionFileError
+from msg_adapters.people import Track
 from refu_core.frames import SmplFrame
 from refu_core.keypoints import Proportions
 from refu_core.recordings import SUFFIXES, Axes, Recording, interpolated, n_resampled, read_recording
@@ -117,6 +118,10 @@ def load_motion(path: str, *, axes: Axes = "auto", fps: float = 0.0) -> Motion:
     notes = []
     if n_pauses := len(steps) - len(kept):
         notes.append(f"pauses are left out ({n_pauses}): stamps jump by more than {longest / NS_PER_S:g} s")
+    track = Track()
+    for frame in frames:
+        track.add(frame)
+    notes += track.doubts(is_y_up=axes != "frame").values()
     if any((frame.betas != frames[0].betas).any() for frame in frames):
         notes.append("betas differ between frames: a person has one shape, the first frame's")
     poses, transl = (np.stack(arrays) for arrays in zip(*((f.pose, f.transl) for f in frames), strict=True))

@@ -63,10 +63,10 @@ def specs_of(kind: Any) -> dict[str, Spec]:
 
 
 def check(settings: Any) -> None:
-    """Raises `SettingsError` for a value out of its range, or that isn't among its choices."""
+    """Raises `SettingsError` for a value out of its range, or that isn't among its choices; None isn't one."""
     for name, spec in specs_of(type(settings)).items():
         value = getattr(settings, name)
-        if spec.choices and value not in spec.choices:
+        if spec.choices and value not in (*spec.choices, None):
             msg = f"{name}: wanted {' or '.join(spec.choices)}, got {value!r}"
             raise SettingsError(msg)
         low, high = spec.within or (-math.inf, math.inf)
@@ -155,6 +155,9 @@ class PipelineOptions:
             if body not in ("", *BUILTIN_BODIES) and not Path(body).is_file():
                 msg = f"no body {body!r}: wanted one of {', '.join(BUILTIN_BODIES)}, or an .npz or .pkl file"
                 raise SettingsError(msg)
+        if self.weights and not Path(self.weights).is_dir():
+            msg = f"no weights {self.weights!r}: wanted a folder"
+            raise SettingsError(msg)
         is_auto = self.backbone == BackboneName.AUTO
         for name in self.garments if self.backbone != BackboneName.SKINNED else ():
             folder = weights_folder(_template(name).name, self.weights or None)

@@ -24,6 +24,7 @@ from refu_lab.commands._common import (
     Parser,
     check_writable,
     require_apart,
+    require_distinct,
 )
 
 _OF_LAB = ("matplotlib", "PIL", "tqdm")
@@ -45,12 +46,14 @@ def _interrupt(_signal: int, _frame: FrameType | None) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command line; returns the exit code."""
-    signal.signal(signal.SIGTERM, _interrupt)  # a terminated replay closes its bag like an interrupted one
+    before = signal.signal(signal.SIGTERM, _interrupt)  # a terminated replay closes its bag like an interrupted one
     try:
         args = _parser().parse_args(arguments)
-        for path in (getattr(args, name, None) for name in ("json", "output", "picture")):
-            check_writable(path if isinstance(path, Path) else None)
-        json = getattr(args, "json", None)
+        written = _outputs(args)
+        for path in written.values():
+            check_writable(path)
+        require_distinct(written)
+        json = written.get("--json")
         if json is not None and json.exists():
             for given in _inputs(args):
                 require_apart(given, json)
@@ -72,7 +75,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _failed(f"error: the device has failed: {reason}; run it again, or on the cpu", EXIT_CHECK_FAILED)
         what = f"{type(error).__name__}: {error}"
         return _failed(f"a bug of refu, please report it; REFU_DEBUG=1 shows where: {what}", EXIT_BUG)
+    finally:
+        signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
     return code
+
+
+def _outputs(args: argparse.Namespace) -> dict[str, Path]:
+    """What a command writes, of files and folders, by option."""
+    given = {name: getattr(args, name, None) for name in ("json", "output", "report", "picture")}
+    return {f"--{name}": Path(path) for name, path in given.items() if path is not None and "://" not in str(path)}
 
 
 def _inputs(args: argparse.Namespace) -> list[Path]:

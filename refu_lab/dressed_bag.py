@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import signal
+import threading
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import msg_adapters as adapters
@@ -9,7 +12,7 @@ from msg_adapters.diagnostics import ERROR, OK, WARN
 from msg_adapters.markers import SKIN
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
 
     from msg_adapters import FrameRecord
     from refu_core import GarmentPipeline, SmplFrame
@@ -35,6 +38,23 @@ def garment_encoder(pipeline: GarmentPipeline, options: ReplayOptions) -> adapte
         for name, garment in pipeline.garments.items()
     ]
     return adapters.MarkerArrayEncoder(meshes, frame_id=options.frame_id, axes=options.axes)
+
+
+@contextmanager
+def _undisturbed() -> Iterator[None]:
+    """An interrupt waits until this ends: a bag that is left in the middle of a message can't be read."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+    before = {kind: signal.signal(kind, lambda kind, _: came.append(kind)) for kind in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for kind, handler in before.items():
+            signal.signal(kind, signal.SIG_DFL if handler is None else handler)
+        for one in dict.fromkeys(came):
+            signal.raise_signal(one)
 
 
 class DressedBag:
@@ -71,10 +91,12 @@ class DressedBag:
 
     def __exit__(self, *error: Any) -> None:
         """Finishes the bag, also after an exception; of one without a frame nothing is left."""
-        if self._is_empty:
-            self._writer.discard()
-        self._writer.__exit__(*error)
+        with _undisturbed():
+            if self._is_empty:
+                self._writer.discard()
+            self._writer.__exit__(*error)
 
+    @_undisturbed()
     def add_skip(self, record: FrameRecord, reason: str) -> None:
         """A message as it came, and why it was not replayed."""
         self._skipped += 1
@@ -82,6 +104,7 @@ class DressedBag:
         stamp_ns = min(record.stamp_ns, _LAST_STAMP_NS)  # it may be the very reason
         self._say(record, stamp_ns, [self._input(ERROR, reason)])
 
+    @_undisturbed()
     def add_frame(
         self,
         record: FrameRecord,

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import itertools
 import math
-import signal
 import sys
-import threading
 import time
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any, Literal, NamedTuple
@@ -210,23 +208,6 @@ class Evaluator:
         )
 
 
-@contextmanager
-def _undisturbed() -> Iterator[None]:
-    """An interrupt waits until this ends: a bag that is left in the middle of a message can't be read."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    came: list[int] = []
-    before = {kind: signal.signal(kind, lambda kind, _: came.append(kind)) for kind in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for kind, handler in before.items():
-            signal.signal(kind, signal.SIG_DFL if handler is None else handler)
-        for one in dict.fromkeys(came):
-            signal.raise_signal(one)
-
-
 @one_thread()
 def replay(
     options: ReplayOptions,
@@ -279,16 +260,14 @@ def replay(
                     data = encoder.encode(garments, stamp_ns=frame.stamp_ns, transl=frame.transl)
                 except RefuError as error:  # no body, a body that nobody has, or what can't be written
                     result.skip(str(error))
-                    with _undisturbed():
-                        if bag is not None:
-                            bag.add_skip(record, str(error))
+                    if bag is not None:
+                        bag.add_skip(record, str(error))
                     continue
                 latency_ms = 1e3 * (time.perf_counter() - start)
                 found = None if evaluator is None else evaluator.add(frame, output, latency_ms)
                 result.add(frame, output, latency_ms, found)
-                with _undisturbed():
-                    if bag is not None:
-                        bag.add_frame(record, frame, output, data, found)
+                if bag is not None:
+                    bag.add_frame(record, frame, output, data, found)
         except KeyboardInterrupt:
             result.interrupted = True
         if evaluator is not None:

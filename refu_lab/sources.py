@@ -130,6 +130,9 @@ def open_source(options: RecordingOptions, body: Callable[[], SmplBody]) -> Sour
         msg = f"{options.input}: {what} is for files of motion ({', '.join(SUFFIXES)})"
         msg += "" if options.fps is not None else "; the axes of bags are smpl or frame"
         raise RefuError(msg)
+    if options.person is not None and options.input_type not in adapters.KEYPOINT_TYPES:
+        msg = f"{options.input}: --person is for keypoints and files of motion; of bags, --topic says whose parameters"
+        raise RefuError(msg)
     bag = adapters.open_smpl_bag(options.input, topic=options.topic, input_type=options.input_type)
     topic, kind = bag.topic.name, bag.topic.message_type
     given, is_placed = _frame_of_first(bag)

@@ -25,7 +25,7 @@ from refu_ros._diagnostics import Situation, statuses
 from refu_ros._guard import GuardedNode, transition
 from refu_ros._interfaces import interface
 from refu_ros._listener import Listener
-from refu_ros._parameters import declare
+from refu_ros._parameters import declare, parameter
 from refu_ros._requests import Requests
 from refu_ros._settings import NodeSettings
 
@@ -61,6 +61,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         self._loader: PipelineLoader | None = None
         self._pipeline: GarmentPipeline | None = None
         self._in_use: PipelineOptions | None = None
+        self._refused: PipelineOptions | None = None
         self._lost = ""
         self._has_sent = False
         self._listener = Listener(self)
@@ -274,6 +275,15 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         text = printable(f"{key} can't be loaded, {self._in_use} stays: {error}")
         self.statistics.set_error(text)
         self.get_logger().error(text)
+        self._refused = key
+
+    def _take_back(self) -> None:
+        """Has the parameters say again what is computed with, where what they say can't be loaded."""
+        refused, self._refused = self._refused, None
+        if refused is not None and self._in_use is not None and refused == self.settings.pipeline:
+            used = {name: getattr(self._in_use, name) for name in PIPELINE_OPTIONS}
+            changed = {name: value for name, value in used.items() if value != getattr(refused, name)}
+            self.set_parameters([parameter(name, value) for name, value in changed.items()])
 
     def record(self, *, on: bool, path: str = "") -> tuple[str, str]:
         """Starts or stops a recording, by default to the parameter's path: what has been done, and the bag.
@@ -290,6 +300,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
     # Once a second --------------------------------------------------------------------------------
 
     def _on_second(self) -> None:
+        self._take_back()
         self._attend()
         if self._worker is not None:
             self._hold_topics()

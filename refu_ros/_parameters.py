@@ -38,6 +38,13 @@ def declare(node: Any, kind: type[Settings]) -> Settings:
     return kind(**coerced(kind, values))
 
 
+def parameter(name: str, value: Any) -> Any:
+    """A parameter of ROS that holds a setting."""
+    from rclpy.parameter import Parameter
+
+    return Parameter(name, value=list(value) if isinstance(value, tuple) else value)
+
+
 def _descriptor(spec: Spec) -> Any:
     from rclpy.node import FloatingPointRange, IntegerRange, ParameterDescriptor
 

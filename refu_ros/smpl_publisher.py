@@ -55,8 +55,9 @@ class PublisherOptions:
 
     def __post_init__(self) -> None:
         check(self)
-        if not all(name.isidentifier() for name in self.persons if name):
-            msg = f"persons: wanted names of letters, digits and underscores, got {list(self.persons)}"
+        is_named = all(name.isidentifier() for name in self.persons if name)
+        if not is_named or len(set(self.persons)) < len(self.persons):
+            msg = f"persons: wanted distinct names of letters, digits and underscores, got {list(self.persons)}"
             raise SettingsError(msg)
 
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from msg_adapters.bags._metadata import QosProfile
+from msg_adapters.bags._metadata import METADATA_FILE, QosProfile
 from msg_adapters.bags._writer import BagWriter
 from msg_adapters.errors import BagError
 
@@ -55,11 +55,15 @@ _SYNC = _Message("", "", QosProfile(), b"", 0, 0.0)
 def free_path(path: Path) -> Path:
     """`path` where it can take a bag, else the first of `path-1`, `path-2`, … : a recording never replaces another.
 
+    In a folder with other things than a bag's, it is `path/garments`.
+
     Raises `BagError` where something is in the way that isn't a bag, and for a name that no terminal should be sent.
     """
     if not str(path).isprintable():
         msg = f"{path}: wanted a name of printable characters"
         raise BagError(msg)
+    if path.is_dir() and any(path.iterdir()) and not any(map(_is_of_bag, path.iterdir())):
+        path /= "garments"
     names = (f"{path.stem}-{i}{path.suffix}" for i in itertools.count(1))
     for candidate in itertools.chain([path], map(path.with_name, names) if path.name else ()):
         if not candidate.exists() or (candidate.is_dir() and not any(candidate.iterdir())):
@@ -68,6 +72,10 @@ def free_path(path: Path) -> Path:
             break
     msg = f"{path}: {candidate} isn't a bag; wanted a directory, or a .mcap file, that is new"
     raise BagError(msg)
+
+
+def _is_of_bag(file: Path) -> bool:
+    return file.is_file() and (file.name == METADATA_FILE or file.suffix in (".mcap", ".db3"))
 
 
 def _opened(path: Path, open_bag: Callable[[Path], BagWriter]) -> tuple[Path, BagWriter]:

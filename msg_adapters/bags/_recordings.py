@@ -66,8 +66,6 @@ class Recording:
         if recorder is None:
             return None
         recorder.stop()
-        if error := recorder.state().error:  # that it has ended with already
-            self._error = printable(error)
         self._closing = [*(one for one in self._closing if not one.finished), recorder]
         return recorder.path
 

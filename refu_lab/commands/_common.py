@@ -7,7 +7,7 @@ import math
 import os
 import re
 import stat
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
@@ -164,7 +164,7 @@ def add_options(parser: argparse.ArgumentParser, options: type) -> None:
             action: Any = argparse.BooleanOptionalAction if spec.default else "store_true"
             parser.add_argument(flag, action=action, **told)
         elif spec.choices:
-            parser.add_argument(flag, choices=spec.choices, **told)
+            parser.add_argument(flag, choices=[str(choice) for choice in spec.choices], **told)
         else:
             parser.add_argument(flag, type=_parse(spec), metavar=spec.metavar or name.upper(), **told)
 
@@ -254,16 +254,24 @@ def given(args: argparse.Namespace, options: type) -> dict[str, Any]:
     return {name: tuple(value) if isinstance(value, list) else value for name, value in named.items()}
 
 
-def check_writable(path: Path | None) -> None:
+def check_writable(path: Path) -> None:
     """Raises `RefuError` before the work is done where its result couldn't be written."""
-    if path is None:
-        return
     existing = path.absolute()
     while not existing.exists():
         existing = existing.parent
     if not os.access(existing, os.W_OK) or (existing != path.absolute() and not existing.is_dir()):
         msg = f"{path}: can't be written, {existing} is not a writable folder"
         raise RefuError(msg)
+
+
+def require_distinct(written: Mapping[str, Path]) -> None:
+    """Raises `RefuError` where two options would write to one place."""
+    places: dict[str, str] = {}
+    for option, path in written.items():
+        other = places.setdefault(os.path.realpath(path), option)
+        if other != option:
+            msg = f"{path}: both {other} and {option} would be written there; name two places"
+            raise RefuError(msg)
 
 
 def require_apart(given: Path, written: Path) -> None:

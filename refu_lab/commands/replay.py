@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from msg_adapters import KEYPOINT_TYPES, InputAxes
+from msg_adapters import INPUT_TYPES, KEYPOINT_TYPES, InputAxes
 from refu_core import RefuError
 from refu_core.keypoints import LAYOUTS
 from refu_core.options import DressOptions, check, setting
@@ -24,11 +24,7 @@ class RecordingOptions(DressOptions):
 
     input: Path
     topic: str | None = setting(None, "input topic, where a bag has several of SMPL parameters", metavar="NAME")
-    input_type: str | None = setting(
-        None,
-        "multiarray, joint_state, pose_array, smpl_msgs, keypoint_poses or keypoint_markers",
-        metavar="TYPE",
-    )
+    input_type: str | None = setting(None, "type of the topic's messages", choices=(*INPUT_TYPES, *KEYPOINT_TYPES))
     keypoints: str = setting("zed38", "which points of the body, with keypoints as input", choices=LAYOUTS)
     person: str | None = setting(None, "whose motion, where the input has several people", metavar="NAME")
     input_axes: Axes = cli.axes_of("recorded", "those of the frame itself, left as they are")
@@ -128,7 +124,6 @@ def _replay_one(args: argparse.Namespace) -> int:
     output = None if args.output is None else Path(args.output)
     options = ReplayOptions(**cli.given(args, ReplayOptions) | {"input": Path(args.input[0]), "output": output})
     told = _print_progress if args.progress == "lines" else None
-    cli.check_writable(report)
     result = replay(options, progress=not args.quiet, told=told)
     cli.tell(args, replay_table(result), result.as_dict())
     if report is not None and result.frames:
@@ -146,6 +141,9 @@ def _replay_many(args: argparse.Namespace) -> int:
     from refu_lab.fleet import find_recordings, fleet_table, open_engine
     from refu_lab.fleet.replay import FleetOptions, replay_fleet
 
+    if args.output is not None and args.output.endswith(".mcap"):
+        msg = f"--output {args.output}: of several inputs that is a folder, which gets a bag of each; name one"
+        raise RefuError(msg)
     recordings = find_recordings(args.input, results=(args.output, args.report))
     each = ReplayOptions(**cli.given(args, ReplayOptions) | {"input": Path(), "output": None})
     options = FleetOptions(replay=each, output=args.output, report=args.report, again=args.again or args.overwrite)

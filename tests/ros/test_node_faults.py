@@ -14,6 +14,7 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy isn't installed (extra ros): the node isn't tested")
 
 from harness import CHEAP, GARMENTS, NodeProcess, Peer, frame
+from rcl_interfaces.srv import GetParameters
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -52,6 +53,36 @@ def test_a_clock_set_back_is_reported_and_everybody_stays_dressed(scene: Peer) -
     scene.dress(ahead)
     assert scene.dress(back).stamp_ns == back.stamp_ns
     scene.spin_until(lambda: scene.count("input", "stamps that went back") > 0, "the step back is counted")
+
+
+def test_a_body_that_cannot_be_loaded_is_taken_back(scene: Peer, tmp_path: Path) -> None:
+    def body() -> str:
+        request = GetParameters.Request(names=["body"])
+        return str(scene.call(GetParameters, "garment_node/get_parameters", request).values[0].string_value)
+
+    (tmp_path / "body.npz").write_bytes(b"no body")
+    assert scene.set(body=str(tmp_path / "body.npz"))[0].successful  # it is loaded beside the stream
+    assert body()
+    scene.spin_until(lambda: not body(), "the parameter says again what is worn")
+    for i, garment in enumerate((GARMENTS[1], GARMENTS[0])):
+        assert scene.set(garments=[garment])[0].successful
+        scene.garments.clear()
+
+        def is_worn(garment: str = garment, i: int = i) -> bool:
+            scene.send(frame(100 * i + len(scene.garments)))
+            return any(marker.ns == garment for markers in scene.garments for marker in markers)
+
+        scene.spin_until(is_worn, f"{garment} is worn")
+
+
+def test_two_publishers_and_leaps_are_reported(scene: Peer) -> None:
+    other = Peer()
+    try:
+        scene.spin_until(lambda: "2 publishers on" in scene.status("input")[1], "the second sender is seen")
+        assert scene.status("input")[0] == 1
+    finally:
+        other.close()
+    scene.spin_until(lambda: "publishers on" not in scene.status("input")[1], "it is gone")
 
 
 def test_a_subscriber_that_does_not_read_holds_nobody_up(scene: Peer) -> None:

@@ -177,7 +177,7 @@ def test_ends_with_the_motion(context: Context) -> None:
         ({"rate": -1}, "rate"),
         ({"rate": "fast"}, "rate: wanted a number, got 'fast'"),
         ({"spacing": ".nan"}, "spacing"),
-        ({"persons": "[ann, a b]"}, "persons: wanted names"),
+        ({"persons": "[ann, a b]"}, "persons: wanted distinct names"),
         ({"loop": 1}, "loop"),
         ({"input_axes": "left"}, "input_axes: wanted smpl or frame, got 'left'"),
     ],
