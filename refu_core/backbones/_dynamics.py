@@ -28,8 +28,7 @@ class DynamicsConfig:
 class Dynamics(nn.Module):
     """f(θ, β, γ, past) - f(θ, β, γ, 0): zero for whoever stands still, whatever was learnt.
 
-    It has no state, so it can't drift, and is told nothing beyond what it has learnt from: each number of the past is
-    clamped to the largest one in its training (`reach`).
+    It has no state, so it can't drift.
     """
 
     def __init__(self, config: DynamicsConfig, still: TailorNet) -> None:
@@ -47,12 +46,10 @@ class Dynamics(nn.Module):
         n_past = len(LAGS) * len(columns)
         n, m = still.features.size + N_STYLE_SHAPE + n_past, still.decoder.size
         self.net = Perceptron(n, config.hidden, m, activation=config.activation, dropout=config.dropout)
-        self.register_buffer("reach", torch.zeros(n_past))
-        self.reach: Tensor
 
     def forward(self, x: Tensor, s: Tensor, past: Tensor) -> Tensor:
         """Code, shape (B, C), of pose features (B, I), (β, γ) (B, 14) and the past (B, 4, 219)."""
-        moved = self.seen(past).clamp(-self.reach, self.reach)
+        moved = self.seen(past)
         now = torch.cat((x, s), 1)
         both = torch.cat((torch.cat((now, moved), 1), torch.cat((now, torch.zeros_like(moved)), 1)))
         with_past, without = self.net(both).chunk(2)
@@ -64,10 +61,8 @@ class Dynamics(nn.Module):
         return past[..., self._columns].flatten(1)
 
     def standardise(self, x: Tensor, s: Tensor, past: Tensor) -> None:
-        """Takes the inputs' sizes, and how far they reach, from the training set."""
-        moved = self.seen(past)
-        self.reach.copy_(moved.abs().amax(0))
-        self.net.standardise(torch.cat((x, s, moved), 1), self.groups)
+        """Takes the inputs' sizes from the training set."""
+        self.net.standardise(torch.cat((x, s, self.seen(past)), 1), self.groups)
 
 
 class Dynamic(nn.Module):

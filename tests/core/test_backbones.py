@@ -132,6 +132,17 @@ def test_tailornet_is_the_sum_that_the_paper_writes(
             torch.testing.assert_close(got[i], wanted, atol=2e-4, rtol=1e-3)
 
 
+def test_a_network_sees_nothing_beyond_its_training_set(garment: GarmentTemplate, basis: BasisDecoder) -> None:
+    """Legs far apart and a body of no sample: what is predicted is what the nearest known numbers give."""
+    net = tailornet(garment, basis).train(False)
+    known = torch.randn(50, net.features.size + 14)
+    net.low.standardise(known, net.features.groups)
+    x = 100 * torch.randn(8, known.shape[1])
+    torch.testing.assert_close(net.low(x), net.low(x.clamp(known.amin(0), known.amax(0))), rtol=0, atol=0)
+    torch.testing.assert_close(net.low(known), net.low(known + 0.0), rtol=0, atol=0)
+    assert net.low.seen(x).isfinite().all()
+
+
 def test_far_styles_have_a_mixture_too(garment: GarmentTemplate, basis: BasisDecoder) -> None:
     net = tailornet(garment, basis)
     mixture = net.mixture(torch.full((1, 14), 8.0))

@@ -30,6 +30,7 @@ from refu_core.backbones import (
     save_basis,
     save_dynamics,
 )
+from refu_core.backbones._features import N_STYLE_SHAPE
 from refu_core.errors import FrameError, WeightsError
 from refu_core.frames import LAGS, N_PAST
 from refu_core.metrics import CollisionChecker
@@ -204,7 +205,8 @@ def untrained(basis: BasisDecoder | None = None) -> Dynamic:
     assert isinstance(still, TailorNet)
     dynamics = Dynamics(DynamicsConfig(garment.card.joints, hidden=(16,)), still)
     with torch.no_grad():
-        dynamics.reach.fill_(1.0)
+        n_now = still.features.size + N_STYLE_SHAPE
+        dynamics.net.lowest[n_now:], dynamics.net.highest[n_now:] = -1.0, 1.0
     return Dynamic(still, dynamics).eval().requires_grad_(False)
 
 
