@@ -74,7 +74,6 @@ class GarmentPipeline:
         """The body model that the garments are worn on."""
         self.fit = outfit.fit
         """How well the built-in mesh lies on a body that was named; None where none was."""
-        """What there is to warn of before anything is dressed, for people."""
         self.garments = {name: one.template for name, one in outfit.wearables.items()}
         """The loaded garments by name."""
         self.untrained = tuple(n for n, one in outfit.wearables.items() if isinstance(one.backbone, Skinned))
