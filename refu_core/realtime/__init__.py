@@ -6,7 +6,6 @@ from refu_core.realtime._dress import Dressed as Dressed
 from refu_core.realtime._dress import dress as dress
 from refu_core.realtime._frame import Adjust as Adjust
 from refu_core.realtime._load import wearable_of as wearable_of
-from refu_core.realtime._outputs import SKIPS as SKIPS
 from refu_core.realtime._outputs import FrameStats as FrameStats
 from refu_core.realtime._outputs import GarmentMesh as GarmentMesh
 from refu_core.realtime._outputs import GarmentStats as GarmentStats

@@ -57,11 +57,10 @@ class ContactStage:
         outfit: Outfit,
         *,
         sdf: SdfMode,
-        uses_band: bool = True,
         certify: bool = True,
         settings: ContactSettings = DEFAULT_CONTACT,
     ) -> None:
-        """With the exact distance, within a band of the skin or everywhere, or with the approximate one.
+        """With the exact distance, or with the approximate one.
 
         Where it is to `certify`, vertices that winding numbers find inside leave, and those without a way out are
         counted.
@@ -69,7 +68,7 @@ class ContactStage:
         self._outfit, self._settings = outfit, settings
         body, garments = outfit.body, {name: one.template for name, one in outfit.wearables.items()}
         self._is_serial = body.device.type == "cpu"
-        self.sdf: MeshSdf = exact_sdf(body, uses_band=uses_band) if sdf is SdfMode.ACCURATE else ApproxSdf(body)
+        self.sdf: MeshSdf = exact_sdf(body) if sdf is SdfMode.ACCURATE else ApproxSdf(body)
         self.way_out = WayOut(body.faces, body.v_template, settings=settings) if certify else None
         self.order = inner_first(garments)
         """Names from the skin outwards."""

@@ -14,13 +14,6 @@ if TYPE_CHECKING:
 
     from refu_core.frames import SmplFrame
 
-SKIPS: Mapping[str, str] = {
-    "band": "distances of vertices that are farther off the skin than they matter (accurate)",
-    "rest": "bodies and garments of some (β, γ) before they are posed, while these are those of the last frame",
-    "unchanged": "persons whose (β, θ, γ) are those of the last frame: they keep their garments",
-}
-"""What is left out where it would change nothing, by name."""
-
 
 @dataclass(frozen=True)
 class SkinShift:
@@ -82,7 +75,9 @@ class FrameStats:
     """Whether "nothing inside" is promised for the frame (docs/reliability.md): joints and β are within a range, and no
     two parts of the body are in each other deeper than skin gives way (`shift.n_held`)."""
     skipped: Mapping[str, int] = field(default_factory=dict)
-    """How much of what `SKIPS` names was left out: vertices, networks, meshes and persons."""
+    """How much was left out since it would change nothing. `band`: vertices too far off the skin for their distance to
+    matter (accurate); `rest`: the body and garments of a (β, γ) before they are posed, known from an earlier frame;
+    `unchanged`: 1 for a person whose (β, θ, γ) are those of the last frame and who keeps those garments."""
     shift: SkinShift = field(default_factory=SkinShift)
     """How far the collider is from the skin; zeros without one."""
 

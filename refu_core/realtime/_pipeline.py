@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache, lru_cache, partial
 from numbers import Real
@@ -27,7 +27,7 @@ from refu_core.realtime._crew import Crew
 from refu_core.realtime._frame import FrameStep, StageClock
 from refu_core.realtime._graph import StepGraphs
 from refu_core.realtime._load import load_outfit
-from refu_core.realtime._outputs import SKIPS, FrameStats, GarmentMesh, GarmentStats, PipelineOutput, SkinShift
+from refu_core.realtime._outputs import FrameStats, GarmentMesh, GarmentStats, PipelineOutput, SkinShift
 from refu_core.realtime._promise import within_promise
 from refu_core.realtime._wearer import Wearer
 from refu_core.sdf import require_outward
@@ -64,7 +64,6 @@ class GarmentPipeline:
         *,
         margin: float | None,
         style: Tensor | None,
-        no_skip: Collection[str] = (),
         graph: bool = True,
     ) -> None:
         self._steps = steps
@@ -84,7 +83,6 @@ class GarmentPipeline:
         """How many calls may run at the same time."""
         self._margin = margin
         self._style = style
-        self._skips = frozenset(SKIPS) - frozenset(no_skip)
         on_gpu = outfit.body.device.type == "cuda"
         self._graphs = StepGraphs(steps[0].packed, outfit.body.device) if graph and on_gpu else None
         contact = steps[0].contact
@@ -136,7 +134,6 @@ class GarmentPipeline:
         margin: float | None = None,
         weights: str | PathLike[str] | None = None,
         device: str = "cpu",
-        no_skip: Collection[str] = (),
         graph: bool = True,
         certify: bool = True,
         collider: bool = True,
@@ -159,7 +156,6 @@ class GarmentPipeline:
             margin: clearance ε that is kept from the skin [m]; by default what the weights were trained with.
             weights: folder with a folder a garment of weights of one's own (`refu train`); those that ship by default.
             device: torch device, `cpu` or `cuda`.
-            no_skip: names of `SKIPS` that are computed nevertheless, to see what skipping them is worth.
             graph: on CUDA, capture the whole of a frame as a CUDA graph; without, it is launched stage by stage.
             certify: ask for the winding number of every vertex at the end, take those inside out, and count those that
                 have no way out (`n_unresolved`); for a twentieth of a frame's time. Without, what is counted are the
@@ -173,15 +169,10 @@ class GarmentPipeline:
             GarmentError: no garment, an unknown one, garments of two bodies, or a bad style.
             BodyError: no such body, or one that isn't in metres, upright, facing forward, in the T-pose and closed.
             WeightsError: no such backbone, or no weights of it for a garment, a mode, and the garment's body.
-            RefuError: an unknown mode, margin, device or skip, or fewer than one thread.
+            RefuError: an unknown mode, margin or device, or fewer than one thread.
         """
         mode = SdfMode.of(sdf, "sdf mode")
         _check_margin(margin)
-        require_type(no_skip, Collection, f"a collection of {', '.join(SKIPS)}")
-        unknown = sorted(map(str, {no_skip} if isinstance(no_skip, str) else set(no_skip) - set(SKIPS)))
-        if unknown:
-            msg = f"nothing is skipped by the name {', '.join(unknown)}: wanted a collection of {', '.join(SKIPS)}"
-            raise RefuError(msg)
         require_type(threads, int, "a number of threads")
         if threads < 1:
             msg = f"wanted at least one thread, got {threads}"
@@ -206,9 +197,9 @@ class GarmentPipeline:
             own = outfit.beside() if k else outfit
             stage = None
             if mode is not SdfMode.NONE:
-                stage = ContactStage(own, sdf=mode, uses_band="band" not in no_skip, certify=certify, settings=contact)
+                stage = ContactStage(own, sdf=mode, certify=certify, settings=contact)
             steps.append(FrameStep(own, stage))
-        return cls(steps, margin=margin, style=gamma, no_skip=no_skip, graph=graph)
+        return cls(steps, margin=margin, style=gamma, graph=graph)
 
     @overload
     def __call__(self, frames: SmplFrame) -> PipelineOutput: ...
@@ -252,7 +243,7 @@ class GarmentPipeline:
     def _dress_all(self, step: FrameStep, frames: Sequence[SmplFrame]) -> list[PipelineOutput]:
         margin, keys = self._margin, [_key(frame) for frame in frames]
         of_margin, known = self._last
-        if of_margin != margin or "unchanged" not in self._skips:
+        if of_margin != margin:
             known = {}
         new = {key: frame for key, frame in zip(keys, frames, strict=True) if key not in known}
         outputs = {key: known[key] for key in keys if key in known}
@@ -298,7 +289,7 @@ class GarmentPipeline:
     def _wearer(self, frame: SmplFrame) -> tuple[Wearer, dict[str, int]]:
         """What depends on the person's (β, γ), and how much of it was known."""
         key = _key(frame, of_pose=False)
-        known = self._wearers.pop(key, None) if "rest" in self._skips else None
+        known = self._wearers.pop(key, None)
         if known is not None:
             self._wearers[key] = known
             return known, {"rest": 1 + len(self.outfit.wearables)}

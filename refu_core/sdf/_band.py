@@ -202,12 +202,11 @@ class Scan:
         self._finish = Repeated(finish_kernel, (wp.vec3, wp.float32, *FOUND), [self._body, cells])
 
 
-def exact_sdf(body: SmplBody, *, uses_band: bool = True) -> BandSdf | ExactSdf:
+def exact_sdf(body: SmplBody) -> BandSdf | ExactSdf:
     """The exact signed distance to posed bodies of a model, the fastest for garments on its device.
 
-    On a CPU that is `BandSdf`, unless `uses_band` is false. A GPU walks the tree faster than it sorts out what needn't
-    be asked.
+    On a CPU that is `BandSdf`. A GPU walks the tree faster than it sorts out what needn't be asked.
     """
-    if body.device.type == "cpu" and uses_band:
+    if body.device.type == "cpu":
         return BandSdf(body.faces, rest=body.v_template)
     return ExactSdf(body.faces, device=body.device)

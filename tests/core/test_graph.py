@@ -163,11 +163,12 @@ LOADED = [
 
 
 @pytest.mark.parametrize(("garments", "sdf", "backbone"), LOADED, ids=lambda value: str(value).strip("[]"))
-def test_replayed_frames_are_those_of_the_pipeline(garments: list[str], sdf: str, backbone: str) -> None:
+def test_replayed_frames_are_those_of_the_pipeline(
+    garments: list[str], sdf: str, backbone: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Other poses, figures and styles than when it was captured, and another number of persons in between."""
-    replaying, usual = (
-        GarmentPipeline.load(garments, sdf=sdf, backbone=backbone, no_skip=["band", "unchanged"]) for _ in range(2)
-    )
+    monkeypatch.setattr("refu_core.realtime._contact.exact_sdf", lambda body: ExactSdf(body.faces))
+    replaying, usual = (GarmentPipeline.load(garments, sdf=sdf, backbone=backbone) for _ in range(2))
     tapes: list[Tape] = []
 
     def capture(run: Callable[[], Tensor], device: torch.device) -> Tape:
@@ -175,7 +176,7 @@ def test_replayed_frames_are_those_of_the_pipeline(garments: list[str], sdf: str
         return tapes[-1]
 
     replaying._graphs = StepGraphs(as_on_a_gpu(replaying).packed, CPU, capture=capture)
-    for seeds in ((0,), (1, 2), (1, 3), (4,), (5, 5), (0,)):
+    for seeds in ((0,), (1, 2), (3, 5), (4,), (0,)):
         given = frames(*seeds, style=seeds[0] == 4)
         for new, old in zip(replaying(given), usual(given), strict=True):
             np.testing.assert_allclose(new.body, old.body, atol=1e-6)
@@ -385,8 +386,7 @@ def test_on_a_gpu(sdf: str) -> None:
     garments = ["tshirt-male", "short-pant-male"]
     replaying = GarmentPipeline.load(garments, sdf=sdf, device="cuda")
     launching, usual = (
-        GarmentPipeline.load(garments, sdf=sdf, device=device, graph=False, no_skip=["band"])
-        for device in ("cuda", "cpu")
+        GarmentPipeline.load(garments, sdf=sdf, device=device, graph=False) for device in ("cuda", "cpu")
     )
     for seeds in ((0,), (1, 2), (1, 3), (0,)):
         people = frames(*seeds)
