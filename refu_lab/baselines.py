@@ -1,6 +1,8 @@
-"""The post-processes that the paper compares itself with: naive, and by optimisation. NumPy and SciPy, one garment."""
+"""The post-process by optimisation that the paper compares itself with. NumPy and SciPy, one garment."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -10,24 +12,11 @@ from scipy.sparse.linalg import cg
 from torch import Tensor
 
 from refu_core.mesh import Connectivity
-from refu_core.refu import repulse
-from refu_core.sdf import BodySdf
+from refu_core.sdf import SdfSample
 
 DRAPE_ROUNDS: tuple[tuple[float, float], ...] = ((4.0, 0.8), (2.0, 0.6), (1.0, 0.4))
 """(λ_s, λ_d) of each round of Guan et al. 2012."""
 _CLEARANCE = 0.001
-
-
-@torch.no_grad()
-def push_naively(points: Tensor, sdf: BodySdf, *, near: Tensor | None = None) -> Tensor:
-    """The naive post-process (paper, Sec. 4.5): x + |f(x)| ∇f/|∇f| for vertices inside, onto the skin exactly.
-
-    Args:
-        points: Garment vertices [m], shape (N, 3), in the frame of the body last given to `sdf`.
-        sdf: The body's signed distance.
-        near: A body face near each vertex, shape (N,), where `sdf` asks for such hints.
-    """
-    return repulse(points, sdf.query(points, near=near))
 
 
 class PostProcess:
@@ -42,11 +31,10 @@ class PostProcess:
     def optimise(
         self,
         points: Tensor,
-        sdf: BodySdf,
+        ask: Callable[[Tensor], SdfSample],
         *,
         clearance: float = _CLEARANCE,
         reach: float = 0.0,
-        near: Tensor | None = None,
     ) -> Tensor:
         """The optimisation of DRAPE (Guan et al. 2012), the paper's "Opt. Post-Process": garment vertices [m], (N, 3).
 
@@ -57,14 +45,13 @@ class PostProcess:
 
         Args:
             points: Garment vertices [m], shape (N, 3).
-            sdf: The body's signed distance.
+            ask: The signed distance of such vertices to the body.
             clearance: ε, how far outside the vertices are to end [m].
             reach: Vertices that are nearer to the skin than this are brought to `clearance`, too [m]. DRAPE's is 0:
                 only those inside are, and edges between others may still cut through the body.
-            near: As `push_naively`.
         """
         for smoothness, damping in DRAPE_ROUNDS:
-            sample = sdf.query(points, near=near)
+            sample = ask(points)
             rows = torch.nonzero(sample.distance < reach)[:, 0]
             if not len(rows):
                 break

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -19,9 +20,9 @@ from refu_core.errors import WeightsError
 from refu_core.frames import SmplFrame
 from refu_core.garments import load_garment, worn_on
 from refu_core.realtime import GarmentPipeline, Outfit, Wearable, Wearer, dress
-from refu_core.refu import Refu
+from refu_core.refu import Refu, repulse
 from refu_core.sdf import ApproxSdf, BodySdf, ExactSdf, RestFaces, SdfSample
-from refu_lab.baselines import PostProcess, push_naively
+from refu_lab.baselines import PostProcess
 from refu_lab.reproduction._load import Library
 from refu_lab.reproduction._methods import Method
 
@@ -36,6 +37,11 @@ class GarmentSetup:
         self.body = load_body(self.template.body) if fit is None else fit.body
         self.collider = Collider(self.body) if library.collider else None
         self.exact, self.approx = ExactSdf(self.body.faces), ApproxSdf(self.body)
+        self.ask = {
+            "accurate": self.exact.of_garment(self.template),
+            "approx": self.approx.of_garment(self.template),
+        }
+        """The distances of the garment's own vertices."""
         self.rest_faces = RestFaces(self.body)
         self.post_process = PostProcess(self.template.faces, self.template.n_vertices)
         self.blend = Blend.of_faces(self.template.faces, self.template.n_vertices)
@@ -123,19 +129,19 @@ class Predictor:
         ms = {"backbone": 1e3 * (ended["backbone"] - ended["body"])}
         if self._method.handling == "none" or self._method.sdf is None:
             return _outcome(points, ms)
-        sdf, update_ms = scene.sdf(self._method.sdf)
+        _, update_ms = scene.sdf(self._method.sdf)
         start = time.perf_counter()
-        near = self._setup.rest_faces(drape.on_mean[0]) if self._method.sdf == "approx" else None
+        ask = partial(self._setup.ask[self._method.sdf], on_mean=drape.on_mean[0])
         if self._refu is not None:
-            sample = sdf.query(points, near=near)
+            sample = ask(points)
             ms["sdf"] = update_ms + 1e3 * (time.perf_counter() - start)
             return self._push(self._refu, scene, points, sample, drape.feature, ms)
         if self._method.handling == "naive":
-            done = push_naively(points, sdf, near=near)
+            done = repulse(points, ask(points))  # onto the skin exactly (paper, Sec. 4.5)
         else:
             margin = self._method.margin
             kept = {} if margin is None else {"clearance": margin, "reach": margin if self._method.is_kept else 0.0}
-            done = self._setup.post_process.optimise(points, sdf, near=near, **kept)
+            done = self._setup.post_process.optimise(points, ask, **kept)
         ms["post-process"] = update_ms + 1e3 * (time.perf_counter() - start)
         return _outcome(done, ms)
 
