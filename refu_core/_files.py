@@ -112,6 +112,22 @@ def replacing(path: Path, *, sync: bool = False) -> Iterator[BinaryIO]:
             part.unlink()
 
 
+@contextlib.contextmanager
+def exclusive(path: Path, *, error: RefuError) -> Iterator[None]:
+    """Holds a lock file. The lock goes with the process, however that ends; the file stays.
+
+    Raises `error` when another process has it, `OSError` when the file can't be written.
+    """
+    import fcntl
+
+    with path.open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as cause:
+            raise error from cause
+        yield
+
+
 def _finite(text: str) -> float:
     number = float(text)
     if not math.isfinite(number):

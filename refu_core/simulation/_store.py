@@ -9,18 +9,17 @@ A row is written before its state is: what a killed process leaves half written 
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from refu_core._files import open_file, read_json, replacing
+from refu_core._files import exclusive, open_file, read_json, replacing
 from refu_core._npz import DAMAGE, check_npy
 from refu_core.errors import SimulationError
 from refu_core.simulation._selection import CAUSES
@@ -171,21 +170,10 @@ def _mapped(path: Path, mode: Literal["r", "r+"] = "r") -> NDArray[Any]:
     return array
 
 
-@contextlib.contextmanager
-def locked(output: Path) -> Iterator[None]:
-    """Keeps other runs out of a set's rows while they are written; the lock goes with the process, however that ends.
-
-    Raises `SimulationError` when another run has it.
-    """
-    import fcntl
-
-    with (output / _ROWS / "lock").open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            msg = f"{output}: another run writes this set; wait for it"
-            raise SimulationError(msg) from error
-        yield
+def locked(output: Path) -> AbstractContextManager[None]:
+    """Keeps other runs out of a set's rows while they are written. Raises `SimulationError` when another has it."""
+    msg = f"{output}: another run writes this set; wait for it"
+    return exclusive(output / _ROWS / "lock", error=SimulationError(msg))
 
 
 def read_card(directory: Path, *kinds: str) -> dict[str, Any]:

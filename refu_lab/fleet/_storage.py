@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from refu_core import RefuError
-from refu_core._files import parse_json
+from refu_core._files import exclusive, parse_json
 
 SCRATCH = ".partial"
 """Folder of what isn't finished."""
@@ -136,18 +136,12 @@ class Folder:
         if is_url(self.place):
             yield
             return
-        import fcntl
-
         folder = Path(self.place)
-        with self._errors():
-            folder.mkdir(parents=True, exist_ok=True)
-            file = (folder / ".lock").open("w")
-        with file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
-                msg = f"{self.place}: another run writes into this folder; wait for it, or give another one"
-                raise RefuError(msg) from error
+        msg = f"{self.place}: another run writes into this folder; wait for it, or give another one"
+        with contextlib.ExitStack() as stack:
+            with self._errors():
+                folder.mkdir(parents=True, exist_ok=True)
+                stack.enter_context(exclusive(folder / ".lock", error=RefuError(msg)))
             try:
                 yield
             finally:
