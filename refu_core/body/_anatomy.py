@@ -16,11 +16,11 @@ from refu_core.body import _part_kernels as parting
 from refu_core.body._aside import Aside
 from refu_core.body._bundles import bundled
 from refu_core.body._creases import LEVELS, find_creases
-from refu_core.body._kinematics import PARENTS
 from refu_core.body._model import SmplBody
 from refu_core.body._segments import SOFTNESS, Solids, cut, shares
 from refu_core.body._skinning import JointWeights
 from refu_core.mesh import Connectivity, vertex_normals
+from refu_core.skeleton import CARRIED, PARENTS
 
 DEFAULT_GAP = 0.012
 """Room between two parts of a body [m]: for two layers of cloth, each 4 mm off the skin, and some to spare."""
@@ -262,9 +262,8 @@ def _paths(weights: NDArray[np.float64], of_vertex: NDArray[np.int32]) -> NDArra
 
     Of skinning weights (V, 24) and the segment of each vertex.
     """
-    above = np.zeros(len(PARENTS), np.int64)  # each joint and those that it hangs on, but the root, which moves all
-    for joint in range(1, len(PARENTS)):
-        above[joint] = above[PARENTS[joint]] | (1 << joint)
+    # Each joint and those that it hangs on, but the root, which moves all.
+    above = CARRIED[:, 1:].astype(np.int64) @ (1 << np.arange(1, len(PARENTS)))
     move = [above[(weights[of_vertex == k] > 0).any(axis=0)] for k in range(len(SOFTNESS))]
     return np.array(
         [[np.bitwise_or.reduce(one[:, None] ^ other, axis=None) for other in move] for one in move], np.int32

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from refu_core.body._kinematics import JOINT_NAMES, PARENTS
 from refu_core.mesh import Connectivity
+from refu_core.skeleton import CARRIED, JOINT_NAMES, PARENTS
 
 if TYPE_CHECKING:
     from refu_core.body._model import SmplBody
@@ -67,7 +67,7 @@ def find_creases(body: SmplBody, reach: float) -> Creases:
     """The creases of a body. Skin farther than `reach` [m] from a seam isn't held by it."""
     rest, weights = (one.double().cpu().numpy() for one in (body.v_template, body.weights))
     edges = Connectivity.of(body.faces.cpu(), len(rest)).edges
-    moved_by = _moved_by(weights)
+    moved_by = weights @ CARRIED  # the share of each vertex that a joint moves, with all that hangs on it
     tree = cKDTree(rest)
     station_rows: list[tuple[NDArray[Any], NDArray[Any]]] = []
     rows: list[list[NDArray[Any]]] = []
@@ -111,14 +111,6 @@ def find_creases(body: SmplBody, reach: float) -> Creases:
         station_weight,
         *(np.concatenate(field)[order] for field in zip(*rows, strict=True)),
     )
-
-
-def _moved_by(weights: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The share of each vertex that a joint moves, with all that hangs on it, shape (V, 24)."""
-    total: NDArray[np.float64] = weights.copy()
-    for joint in range(weights.shape[1] - 1, 0, -1):
-        total[:, PARENTS[joint]] += total[:, joint]
-    return total
 
 
 def _spread_out(points: NDArray[np.float64]) -> list[int]:

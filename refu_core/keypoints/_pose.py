@@ -14,16 +14,11 @@ from refu_core._npz import read_npz
 from refu_core.errors import BodyError
 from refu_core.frames import N_BETAS, N_JOINTS
 from refu_core.keypoints._layouts import KeypointLayout
-from refu_core.skeleton import PARENTS
+from refu_core.skeleton import CARRIED, PARENTS
 
 Array = NDArray[np.float64]
 
 _ABOVE = np.array(PARENTS)
-CARRIES = np.eye(N_JOINTS, dtype=bool)
-"""Whether what hangs from a joint (row) moves when another (column) turns, shape (24, 24)."""
-for _joint in range(1, N_JOINTS):
-    CARRIES[_joint] |= CARRIES[_ABOVE[_joint]]
-_CHAINS = CARRIES.astype(np.float64)
 
 
 def _hops() -> list[NDArray[np.intp]]:
@@ -119,7 +114,7 @@ class Skeleton:
         above = np.maximum(_ABOVE, 0)
         bones, dirs = (given - given[above] for given in (proportions.joints, proportions.shapedirs))
         self._bones = np.concatenate([bones[:, :, None], dirs], axis=2)  # from its parent to each joint, and by beta
-        carried = CARRIES[layout.joints].astype(np.float64)
+        carried = CARRIED[layout.joints]
         carried[np.arange(len(layout)), layout.joints] *= layout.offsets.any(axis=1)
         self.turning = np.flatnonzero(carried.any(axis=0))
         """Joints that move a keypoint when they turn, shape (m,)."""
@@ -144,7 +139,7 @@ class Skeleton:
         for above in _HOPS:  # each turn is that of a chain twice as long after each round
             turns[:N_JOINTS] = turns[above] @ turns[:N_JOINTS]
         bones = turns[_HOPS[0]] @ self._bones
-        reach = (_CHAINS @ bones.reshape(N_JOINTS, -1)).reshape(bones.shape)
+        reach = (CARRIED @ bones.reshape(N_JOINTS, -1)).reshape(bones.shape)
         moves, turns = reach[:, :, 1:], turns[:N_JOINTS]
         joints = pose.pelvis + reach[:, :, 0] + moves @ pose.betas
         at = self.layout.joints

@@ -14,9 +14,9 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from refu_core.backbones import SEEN_TILT
-from refu_core.body import PARENTS
 from refu_core.errors import FrameError, MeshError, WeightsError
 from refu_core.frames import N_JOINTS
+from refu_core.skeleton import CARRIED
 from refu_core.weights import load_weights, save_weights, weights_folder
 
 if TYPE_CHECKING:
@@ -238,7 +238,7 @@ def _input_variance(
     posed = body.posed(pose, body.shape(torch.tensor(frame.betas, device=device, dtype=body.dtype)[None]))
     joints = posed.joints[0].cpu().double().numpy()
     turn = posed.transforms.rotation[0].cpu().double().numpy() @ _right_jacobians(frame.pose.astype(np.float64))
-    hangs = garment.weights.detach().cpu().double().numpy() @ _below()
+    hangs = garment.weights.detach().cpu().double().numpy() @ CARRIED
     arm = hangs[:, :, None] * (vertices[:, None].astype(np.float64) - joints)
     n = len(joints)
     if covariance.ndim == 3:
@@ -251,15 +251,6 @@ def _input_variance(
     form = np.einsum("ab,il->aibl", trace, np.eye(3)) - spread.transpose(0, 3, 1, 2)
     total = ((flat @ form.reshape(3 * n, 3 * n)) * flat).sum(1)
     return np.asarray(np.maximum(total, 0.0) / 3)
-
-
-def _below() -> NDArray[np.float64]:
-    """1 where a joint (row) hangs on another or is that one (column), shape (24, 24)."""
-    found = np.eye(len(PARENTS))
-    for joint, parent in enumerate(PARENTS):
-        if parent >= 0:
-            found[joint] += found[parent]
-    return found
 
 
 def _right_jacobians(pose: NDArray[np.float64]) -> NDArray[np.float64]:
