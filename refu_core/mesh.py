@@ -187,6 +187,13 @@ def vertex_normals(vertices: NDArray[_Float], faces: NDArray[np.int32]) -> NDArr
     return unit
 
 
+def vertex_areas(vertices: NDArray[np.floating[Any]], faces: NDArray[np.integer[Any]]) -> NDArray[np.float64]:
+    """A third of the area of the faces (F, 3) around each of the vertices (V, 3) [m²], shape (V,)."""
+    a, b, c = vertices[faces].astype(np.float64).transpose(1, 0, 2)
+    third = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
+    return np.bincount(faces.ravel(), np.repeat(third, 3), len(vertices)).astype(np.float64)
+
+
 def _grouped(owner: NDArray[Any], items: NDArray[Any], n: int) -> Adjacency:
     order = np.argsort(owner, kind="stable")
     start = np.concatenate(([0], np.cumsum(np.bincount(owner, minlength=n))))

@@ -22,9 +22,9 @@ from scipy.sparse import coo_array, csc_array, diags_array
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
-from refu_core.fitting._clean import components, face_normals, rim_of
+from refu_core.fitting._clean import components, rim_of
 from refu_core.fitting._posed import PosedBody
-from refu_core.mesh import vertex_normals
+from refu_core.mesh import vertex_areas, vertex_normals
 
 F64 = NDArray[np.float64]
 
@@ -79,10 +79,8 @@ class Transfer:
         is_small = np.array(sizes) < _RIGID
         rigid = tuple(np.flatnonzero(label == k) for k in range(n_pieces) if is_small[k] and not is_small.all())
         laplacian = _laplacian(vertices, faces, _seams(vertices, label, rim, n_pieces))
-        area = np.linalg.norm(face_normals(vertices, faces), axis=1) / 6
-        mass = np.bincount(faces.ravel(), weights=np.repeat(area, 3), minlength=len(vertices)).astype(np.float64)
         body_faces = body.body.faces.numpy()
-        return cls(face, barycentric, distance, is_trusted, body_faces, mass, laplacian, rigid)
+        return cls(face, barycentric, distance, is_trusted, body_faces, vertex_areas(vertices, faces), laplacian, rigid)
 
     def __call__(self, values: F64, *, length: float) -> F64:
         """Values of the body's vertices, shape (N, K), on the garment's, (V, K), smooth over `length` [m] at least."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from refu_core._warp import as_warp
 from refu_core.body import DEFAULT_GAP, SEGMENTS, part_of_faces
+from refu_core.mesh import vertex_areas
 from refu_core.outputs import _limbs_kernels as kernels
 
 if TYPE_CHECKING:
@@ -111,10 +112,7 @@ class LimbContacts:
         rows = np.flatnonzero(pair >= 0)
         if not len(rows):
             return pair[rows], np.empty((0, 5))
-        around = np.flatnonzero((pair[faces] >= 0).any(axis=1))
-        a, b, c = points[faces[around]].astype(np.float64).transpose(1, 0, 2)
-        third = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
-        area = np.bincount(faces[around].ravel(), weights=np.repeat(third, 3), minlength=n)
+        area = vertex_areas(points, faces[(pair[faces] >= 0).any(axis=1)])
         return pair[rows], np.column_stack((area[rows], depth[rows], points[rows]))
 
 

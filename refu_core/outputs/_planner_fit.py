@@ -11,7 +11,7 @@ from scipy.sparse import csc_array, csr_array, diags_array, eye_array
 from scipy.sparse.linalg import splu
 
 from refu_core.body import Surface
-from refu_core.mesh import Connectivity
+from refu_core.mesh import Connectivity, vertex_areas
 
 Points = NDArray[np.float64]
 _LEAST_WEIGHT = 0.01
@@ -56,10 +56,7 @@ def _means(rest: Points, mesh: Connectivity, kept: NDArray[np.intp], sheet: NDAr
     if len(kept) == len(rest):
         return own
     place = _placed(Surface(rest[kept], sheet), rest)
-    a, b, c = rest[mesh.faces].transpose(1, 0, 2)
-    double = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    area = np.bincount(mesh.faces.ravel(), weights=np.repeat(double / 6, 3), minlength=len(rest))
-    weighed = (place.T * area).toarray()
+    weighed = (place.T * vertex_areas(rest, mesh.faces)).toarray()
     normal = np.asarray(weighed @ place)
     firm = _FIRM * float(np.trace(normal)) / len(kept)
     dense = cho_solve(cho_factor(normal + firm * np.eye(len(kept))), weighed + firm * own.toarray())

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from refu_core.mesh import vertex_areas
 from refu_core.sdf import ExactSdf
 from refu_core.simulation._mesh import ClothTopology
 from refu_core.simulation._pairs import find_candidates, near_pairs
@@ -147,7 +148,7 @@ class SimulatedCloth:
         self._longest = np.minimum(longest, length * np.float32(1 + self.settings.most_ease))
         self._shortest = np.maximum(shortest, length * np.float32(1 - self.settings.most_crease))
         self._edge_length = float(np.median(length[-n_edges:]))
-        area = self.topology.vertex_areas(rest)
+        area = vertex_areas(rest, self.topology.mesh.faces)
         # Slivers would get next to no mass and soak up every correction of their neighbours.
         area = np.maximum(area, 0.25 * np.median(area))
         self._inverse_mass: F32 = (1 / (self.settings.density * area)).astype(np.float32)

@@ -61,14 +61,6 @@ class ClothTopology:
         graph = coo_array((length, (i, j)), shape=(self.n_vertices,) * 2).tocsr()
         return np.asarray(dijkstra(graph, directed=False, indices=sources, min_only=True))
 
-    def vertex_areas(self, vertices: NDArray[Any]) -> NDArray[np.float64]:
-        """A third of the area of the faces around each vertex [m²], shape (N,)."""
-        a, b, c = (vertices[self.mesh.faces[:, k]].astype(np.float64) for k in range(3))
-        area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
-        return np.bincount(self.mesh.faces.ravel(), weights=np.repeat(area, 3), minlength=self.n_vertices).astype(
-            np.float64
-        )
-
 
 def _by_colour(pairs: NDArray[np.int32]) -> NDArray[np.int32]:
     """The pairs in an order in which those of one colour (no shared vertex) follow each other; greedy."""

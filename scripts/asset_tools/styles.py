@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from refu_core.body import SmplBody
 from refu_core.frames import N_BETAS
 from refu_core.garments import N_STYLES, GarmentTemplate
+from refu_core.mesh import vertex_areas
 from refu_core.sdf import ExactSdf
 from refu_core.simulation._cloth import F32
 from refu_core.simulation._drape import Draper
@@ -207,7 +208,7 @@ def build_styles(garment: GarmentTemplate, body: SmplBody) -> dict[str, F32]:
     )
     draper = Draper(cut, body)
     drapes = np.stack([draper.canonical(np.zeros(N_BETAS), score)[0] for score in scores]).astype(np.float64)
-    weight = np.sqrt(draper.topology.vertex_areas(mean))[None, :, None]
+    weight = np.sqrt(vertex_areas(mean, draper.topology.mesh.faces))[None, :, None]
     centred = ((drapes - drapes.mean(0)) * weight).reshape(len(scores), -1)
     slope, *_ = np.linalg.lstsq(scores - scores.mean(0), centred, rcond=None)  # (4, 3N): drape a unit of each parameter
     rotation = np.linalg.svd(slope.T, full_matrices=False)[2].T  # p = A γ
