@@ -25,9 +25,9 @@ from refu_core.simulation._plan import TEST, TRAIN, names_of, truncated_normal
 from refu_core.simulation._poses import Clip, as_clips, split_clips
 from refu_core.simulation._produce import Progress, produce
 from refu_core.simulation._selection import CAUSES
-from refu_core.simulation._store import DONE, SEQUENCES, dequantise, quantise
+from refu_core.simulation._store import DONE, SEQUENCES
 from refu_core.simulation._summary import summarise
-from refu_core.simulation._worker import SimulationSettings, Simulator
+from refu_core.simulation._worker import FARTHEST, SimulationSettings, Simulator
 
 
 @dataclass(frozen=True)
@@ -155,15 +155,12 @@ class SequenceSimulator(Simulator):
                     self._draper.rebuild(bodies[k - 1])
                 careful = k % STEPS == 0  # where a frame is taken; elsewhere it would only take time
                 now = cloth.frame(bodies[k - 1], body, gravity=gravity[k], drag=s.drag, careful=careful)
-            if not np.isfinite(cloth.positions).all() or np.abs(cloth.positions).max() > 1.9:
+            if not np.abs(cloth.positions).max() <= FARTHEST:
                 break  # the cloth is lost, and with it the rest of the sequence
             if k % STEPS == 0:
                 t = k // STEPS
-                vertices[t] = quantise(cloth.positions)
-                stretch[t], speed[t] = cloth.stretch(), now
-                read = dequantise(vertices[t])  # rounding included, as for samples; a moving cloth may be fast
-                worst = max(float(stretch[t]), cloth.stretch(read))
-                found = self._selector.cause(read, body, stretch=worst)
+                stretch[t], speed[t] = cloth.stretch(), now  # a moving cloth may be fast
+                found, vertices[t] = self._examine(cloth.positions, body, stretch=float(stretch[t]))
                 cause[t] = 0 if found is None else 1 + CAUSES.index(found)
         return {"vertices": vertices, "cause": cause, "stretch": stretch, "speed": speed}
 

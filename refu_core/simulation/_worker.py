@@ -12,12 +12,16 @@ import numpy as np
 
 from refu_core.body import load_body, load_fit
 from refu_core.garments import load_garment, worn_on
-from refu_core.simulation._drape import Draper, DrapeSettings, SettledDrape
+from refu_core.simulation._cloth import F32
+from refu_core.simulation._drape import Draper, DrapeSettings
 from refu_core.simulation._joined import JoinedGarments
 from refu_core.simulation._plan import TEST, SamplePlan, garments_of
 from refu_core.simulation._poses import Clip
 from refu_core.simulation._selection import CAUSES, SelectionSettings, Selector
 from refu_core.simulation._store import DONE, FORMAT, GIVEN_UP, dequantise, quantise
+
+FARTHEST = 1.9
+"""Cloth farther off along an axis [m] is lost: `quantise` hasn't much more room."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +74,15 @@ class Simulator(ABC):
     def simulate(self, slot: int) -> dict[str, Any]:
         """The columns of a slot's row (see `_store`)."""
 
+    def _examine(self, vertices: F32, body: F32, *, stretch: float, speed: float = 0.0) -> tuple[str | None, Any]:
+        """The cause against cloth, and the cloth as it is stored: None where it is lost, not finite or too far off."""
+        if not np.abs(vertices).max() <= FARTHEST:
+            return "unsettled", None
+        stored = quantise(vertices)
+        read = dequantise(stored)  # What is checked is what will be read, rounding included.
+        stretch = max(stretch, self._draper.cloth.stretch(read))
+        return self._selector.cause(read, body, stretch=stretch, speed=speed), stored
+
 
 class SlotSimulator(Simulator):
     """Simulates samples."""
@@ -87,7 +100,8 @@ class SlotSimulator(Simulator):
         for attempt in range(self.settings.attempts):
             pose, clip, frame = plan.pose(slot, attempt, self.clips[split == TEST])
             drape = self._draper.drape(pose, betas, style)
-            cause, stored = self._examine(drape, pose, betas)
+            body = self._draper.bodies(pose[None], betas)[0]
+            cause, stored = self._examine(drape.vertices, body, stretch=drape.stretch, speed=drape.speed)
             if cause is not None:
                 dropped[CAUSES.index(cause)] += 1
                 continue
@@ -97,13 +111,3 @@ class SlotSimulator(Simulator):
         else:
             row["state"] = GIVEN_UP
         return row | {"dropped": dropped, "seconds": time.perf_counter() - start}
-
-    def _examine(self, drape: SettledDrape, pose: Any, betas: Any) -> tuple[str | None, Any]:
-        if not np.isfinite(drape.vertices).all() or np.abs(drape.vertices).max() > 1.9:
-            return "unsettled", None
-        stored = quantise(drape.vertices)
-        body = self._draper.bodies(pose[None], betas)[0]
-        # What is checked is what will be read, rounding included.
-        read = dequantise(stored)
-        stretch = max(drape.stretch, self._draper.cloth.stretch(read))
-        return self._selector.cause(read, body, stretch=stretch, speed=drape.speed), stored
