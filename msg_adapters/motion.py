@@ -30,17 +30,17 @@ class Motion(Recording):
         """Number of frames."""
         return len(self.poses)
 
-    def frame(self, index: int, *, start_ns: int = 0) -> SmplFrame:
-        """Frame `index`, stamped from `start_ns` on [ns].
+    def frame(self, index: int) -> SmplFrame:
+        """Frame `index`, stamped from 0 on.
 
         Raises `FrameError` (of `refu_core`) when its values aren't finite: recordings do have such frames.
         """
-        stamp_ns = start_ns + round(index * NS_PER_S / self.fps)
+        stamp_ns = round(index * NS_PER_S / self.fps)
         return SmplFrame(self.poses[index], betas=self.betas, transl=self.transl[index], stamp_ns=stamp_ns)
 
-    def frames(self, *, start_ns: int = 0) -> Iterator[SmplFrame]:
+    def frames(self) -> Iterator[SmplFrame]:
         """All frames in order; raises as `frame` does."""
-        return (self.frame(i, start_ns=start_ns) for i in range(len(self)))
+        return map(self.frame, range(len(self)))
 
     def resampled(self, fps: float) -> Motion:
         """The motion at another frame rate: rotations on the shorter arc, translations along straight lines.

@@ -98,7 +98,7 @@ class McapWriter:
         self._add(self._channels[-1])
         return number
 
-    def add_message(self, channel: int, data: bytes, *, log_time_ns: int, publish_time_ns: int, sequence: int) -> None:
+    def add_message(self, channel: int, data: bytes, *, log_time_ns: int, sequence: int) -> None:
         """Appends a message to the chunk under way."""
         n_earlier = sum(self._counts.values())
         self._first_ns = min(self._first_ns, log_time_ns) if n_earlier else log_time_ns
@@ -107,7 +107,7 @@ class McapWriter:
         self._chunk.times.append(log_time_ns)
         self._chunk.index.setdefault(channel, []).append(struct.pack("<QQ", log_time_ns, self._chunk.size))
         length = _MESSAGE_FIELDS_BYTES + len(data)
-        head = _MESSAGE.pack(MESSAGE, length, channel, sequence, log_time_ns, publish_time_ns)
+        head = _MESSAGE.pack(MESSAGE, length, channel, sequence, log_time_ns, log_time_ns)
         self._add(head, bytes(data))
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:

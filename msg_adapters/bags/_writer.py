@@ -115,24 +115,22 @@ class BagWriter:
             self._channels[topic] = self._writer.add_channel(topic, message_type, definition, metadata)
         self._topics[topic] = TopicSummary(topic, message_type, type_hash or "", qos)
 
-    def write(self, topic: str, data: bytes, *, log_time_ns: int, publish_time_ns: int | None = None) -> None:
-        """Append a message in CDR, received at `log_time_ns` and sent at `publish_time_ns` (None: the same).
+    def write(self, topic: str, data: bytes, *, log_time_ns: int) -> None:
+        """Append a message in CDR, sent and received at `log_time_ns`.
 
         Raises `BagError` for an undeclared topic, a time that rosbag2 can't hold, and when writing fails.
         """
         if topic not in self._topics:
             msg = f"{self.path}: {topic} isn't declared; call add_topic first"
             raise BagError(msg)
-        publish_time_ns = log_time_ns if publish_time_ns is None else publish_time_ns
-        if not (0 <= log_time_ns <= MAX_TIME_NS and 0 <= publish_time_ns <= MAX_TIME_NS):
-            msg = f"{self.path}: a bag's times are nanoseconds in [0, 2^63), got {log_time_ns} and {publish_time_ns}"
+        if not 0 <= log_time_ns <= MAX_TIME_NS:
+            msg = f"{self.path}: a bag's times are nanoseconds in [0, 2^63), got {log_time_ns}"
             raise BagError(msg)
         with self._writing():
             self._writer.add_message(
                 self._channels[topic],
                 data,
                 log_time_ns=log_time_ns,
-                publish_time_ns=publish_time_ns,
                 sequence=self._topics[topic].message_count & 0xFFFFFFFF,
             )
         self._topics[topic].message_count += 1

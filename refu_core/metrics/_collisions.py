@@ -67,12 +67,12 @@ class CollisionChecker:
     the face's border, by the faces beyond.
     """
 
-    def __init__(self, body_faces: Any, *, device: str | torch.device = "cpu") -> None:
+    def __init__(self, body_faces: Any) -> None:
         """Prepares for bodies of these faces, shape (F, 3).
 
         Raises `MeshError` when they aren't a closed, consistently oriented surface.
         """
-        self._body = ExactSdf(body_faces, device=device)
+        self._body = ExactSdf(body_faces)
         self._winding = Winding(self._body.faces)
         self._triangles: dict[tuple[int, int], Triangles] = {}
 
@@ -91,9 +91,9 @@ class CollisionChecker:
         found = crossings(self._body.mesh_id, vertices, self._triangles_of(garment_faces, vertices))
         points = torch.from_numpy(vertices)
         # 2 where limbs are in each other; where skin is turned inside out it is -1, and nobody's inside.
-        inside = (self._winding(points) > 0).cpu().numpy()
+        inside = (self._winding(points) > 0).numpy()
         depth = np.zeros(len(vertices), np.float32)
-        depth[inside] = self._body.query(points[inside]).distance.abs().cpu().numpy()
+        depth[inside] = self._body.query(points[inside]).distance.abs().numpy()
         is_vf = (found.edge_of_face.sum(axis=1) >= 2) | (found.edge_of_body.sum(axis=1) >= 2)
         return Collisions(found.pairs, is_vf, inside, depth)
 
@@ -103,5 +103,5 @@ class CollisionChecker:
         known = self._triangles.get(size)
         if known is None or not np.array_equal(known.faces, faces):
             checked = Connectivity.of(faces, len(vertices)).faces
-            known = self._triangles[size] = Triangles(checked, vertices, self._body.device)
+            known = self._triangles[size] = Triangles(checked, vertices)
         return known

@@ -9,7 +9,7 @@ import torch
 import warp as wp
 from numpy.typing import NDArray
 
-from refu_core._warp import as_warp, torch_stream
+from refu_core._warp import as_warp
 from refu_core.mesh import as_points, grouped
 from refu_core.metrics._intersect_kernels import intersect_kernel
 from refu_core.sdf._crossing_kernels import BLOCK
@@ -34,13 +34,13 @@ def as_vertices(name: str, values: Any) -> NDArray[np.float32]:
 class Triangles:
     """A mesh's faces, (G, 3), prepared to be looked at in blocks of neighbours."""
 
-    def __init__(self, faces: NDArray[np.int32], vertices: NDArray[np.float32], device: torch.device) -> None:
+    def __init__(self, faces: NDArray[np.int32], vertices: NDArray[np.float32]) -> None:
         """`vertices` [m], shape (N, 3), say who is near whom, in this pose and so mostly in others: a matter of speed
         alone."""
         self.faces = faces
         order = grouped(vertices[faces].mean(axis=1)) if len(faces) else np.empty(0, np.int64)
-        self.blocks = torch.as_tensor(faces[order], device=device)
-        self.numbers = torch.as_tensor(order.astype(np.int32), device=device)
+        self.blocks = torch.as_tensor(faces[order])
+        self.numbers = torch.as_tensor(order.astype(np.int32))
 
 
 def crossings(mesh_id: int, vertices: NDArray[np.float32], triangles: Triangles, *, is_body: bool = False) -> Crossings:
@@ -49,33 +49,31 @@ def crossings(mesh_id: int, vertices: NDArray[np.float32], triangles: Triangles,
     With `is_body` the mesh is that body: pairs are given once, those that share an edge not at all,
     those that share a vertex where they meet elsewhere, too.
     """
-    device = triangles.blocks.device
-    points = torch.as_tensor(vertices, device=device)
+    points = torch.as_tensor(vertices)
     n_faces = len(triangles.faces)
-    count = torch.zeros(1, dtype=torch.int32, device=device)
+    count = torch.zeros(1, dtype=torch.int32)
     room = max(1024, n_faces)
     while True:
-        found = torch.empty(room, 3, dtype=torch.int32, device=device)
+        found = torch.empty(room, 3, dtype=torch.int32)
         count.zero_()
-        with torch_stream(device):
-            wp.launch(
-                intersect_kernel,
-                dim=-(-n_faces // int(BLOCK)),
-                inputs=[
-                    mesh_id,
-                    as_warp(points, wp.vec3),
-                    as_warp(triangles.blocks, wp.vec3i),
-                    as_warp(triangles.numbers, wp.int32),
-                    is_body,
-                ],
-                outputs=[as_warp(count, wp.int32), as_warp(found, wp.vec3i)],
-                device=str(device),
-            )
+        wp.launch(
+            intersect_kernel,
+            dim=-(-n_faces // int(BLOCK)),
+            inputs=[
+                mesh_id,
+                as_warp(points, wp.vec3),
+                as_warp(triangles.blocks, wp.vec3i),
+                as_warp(triangles.numbers, wp.int32),
+                is_body,
+            ],
+            outputs=[as_warp(count, wp.int32), as_warp(found, wp.vec3i)],
+            device="cpu",
+        )
         n = int(count)
         if n <= room:
             break
         room = n  # nothing is cut off: once more, with room for all
-    rows = found[:n].cpu().numpy()
+    rows = found[:n].numpy()
     rows = rows[np.lexsort((rows[:, 1], rows[:, 0]))]
     bits = (rows[:, 2:] >> np.arange(6)) & 1 == 1
     return Crossings(np.ascontiguousarray(rows[:, :2]), bits[:, :3], bits[:, 3:])
@@ -100,11 +98,11 @@ class SheetChecker:
     def with_itself(self) -> NDArray[np.int32]:
         """The pairs of its faces that intersect, shape (K, 2); neighbours may meet at an edge or vertex."""
         points = self._points.numpy()
-        self._triangles = self._triangles or Triangles(self.faces, points, torch.device("cpu"))
+        self._triangles = self._triangles or Triangles(self.faces, points)
         return crossings(self._mesh.id, points, self._triangles, is_body=True).pairs
 
     def with_other(self, vertices: Any, faces: Any) -> NDArray[np.int32]:
         """Intersecting (other's face, own face), shape (K, 2), of a garment (M, 3) [m] and (F, 3)."""
         other = as_vertices("the other garment's vertices", vertices)
-        triangles = Triangles(np.ascontiguousarray(faces, dtype=np.int32), other, torch.device("cpu"))
+        triangles = Triangles(np.ascontiguousarray(faces, dtype=np.int32), other)
         return crossings(self._mesh.id, other, triangles).pairs

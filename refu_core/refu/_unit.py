@@ -14,14 +14,7 @@ MAX_DISPLACEMENT = 0.1
 _UP = (0.0, 1.0, 0.0)
 
 
-def repulse(
-    points: Tensor,
-    sample: SdfSample,
-    *,
-    scale: float | Tensor = 1.0,
-    margin: float = 0.0,
-    max_displacement: float = MAX_DISPLACEMENT,
-) -> Tensor:
+def repulse(points: Tensor, sample: SdfSample, *, scale: float | Tensor = 1.0, margin: float = 0.0) -> Tensor:
     """ReFU: the points [m], shape (N, 3), with those closer to the body than `margin` moved along the gradient.
 
     x' = x - α (f(x) - ε) ∇f/|∇f| where f(x) < ε, and x elsewhere: the paper's Eq. 2 to 4, with f - ε in the place of f.
@@ -34,18 +27,17 @@ def repulse(
             that is zero or not finite.
         scale: α, one number or shape (N,); 1 is the paper's "fixed scale".
         margin: ε ≥ 0 [m].
-        max_displacement: Bound on each point's movement [m].
 
     Raises:
-        MeshError: Arrays whose shapes don't belong together, or a negative margin or bound.
+        MeshError: Arrays whose shapes don't belong together, or a negative margin.
     """
-    _check(points, sample, scale, margin, max_displacement)
+    _check(points, sample, scale, margin)
     rows = pushed_rows(sample.distance, margin)
     if not len(rows):
         return points
     deficit = margin - sample.distance[rows]
     alpha = scale[rows] if isinstance(scale, Tensor) and scale.ndim else scale
-    offset = (alpha * deficit).clamp(-max_displacement, max_displacement)
+    offset = (alpha * deficit).clamp(-MAX_DISPLACEMENT, MAX_DISPLACEMENT)
     pushed: Tensor = points.index_add(0, rows, offset[:, None] * unit_direction(sample.gradient[rows]))
     return pushed
 
@@ -65,7 +57,7 @@ def unit_direction(gradient: Tensor) -> Tensor:
     return direction
 
 
-def _check(points: Tensor, sample: SdfSample, scale: float | Tensor, margin: float, max_displacement: float) -> None:
+def _check(points: Tensor, sample: SdfSample, scale: float | Tensor, margin: float) -> None:
     require_tensor("points", points)
     n = len(points)
     if points.shape != (n, 3) or sample.distance.shape != (n,) or sample.gradient.shape != (n, 3):
@@ -77,6 +69,6 @@ def _check(points: Tensor, sample: SdfSample, scale: float | Tensor, margin: flo
     if isinstance(scale, Tensor) and scale.shape not in ((), (n,)):
         msg = f"scale must be one number or have the shape ({n},), got {tuple(scale.shape)}"
         raise MeshError(msg)
-    if not (margin >= 0 and max_displacement >= 0):
-        msg = f"margin and max_displacement must not be negative, got {margin} and {max_displacement}"
+    if not margin >= 0:
+        msg = f"the margin must not be negative, got {margin}"
         raise MeshError(msg)

@@ -36,12 +36,12 @@ _IDLE_S = 0.5
 class Player:
     """One film in one server. What the panel's callbacks ask for is done by the thread that runs `run`."""
 
-    def __init__(self, server: viser.ViserServer, film: Film, *, playing: bool = True) -> None:
+    def __init__(self, server: viser.ViserServer, film: Film) -> None:
         self._server, self._film = server, film
         self._stage, self._marker = Stage(server), Marker()
         self._times = film.times
         self._moment, self._index = 0.0, 0
-        self._playing = playing and len(self._times) > 1
+        self._playing = len(self._times) > 1
         self._changed = threading.Event()
         self._seek: int | None = None
         self._failed = ""

@@ -18,7 +18,7 @@ from refu_core.errors import MeshError
 from refu_core.garments import GarmentTemplate, load_garment
 from refu_core.metrics import CollisionChecker, SelfContactDetector
 from refu_core.modes import DEFAULT_MARGIN
-from refu_core.refu import repulse
+from refu_core.refu import MAX_DISPLACEMENT, repulse
 from refu_core.sdf import ExactSdf, SdfSample
 
 
@@ -31,9 +31,10 @@ def random_sample(n: int, seed: int, dtype: torch.dtype = torch.float64) -> tupl
 @given(seed=st.integers(0, 2**31), margin=st.sampled_from([0.0, 0.004]), scale=st.floats(0, 3))
 def test_is_the_papers_equation(seed: int, margin: float, scale: float) -> None:
     points, sample = random_sample(30, seed)
-    pushed = repulse(points, sample, margin=margin, scale=scale, max_displacement=1.0)
+    pushed = repulse(points, sample, margin=margin, scale=scale)
     for x, f, gradient, moved in zip(points, sample.distance, sample.gradient, pushed, strict=True):
-        wanted = x - scale * (f - margin) * gradient / gradient.norm() if f < margin else x
+        way = min(scale * max(0.0, float(margin - f)), MAX_DISPLACEMENT)
+        wanted = x + way * gradient / gradient.norm()
         torch.testing.assert_close(moved, wanted)
 
 
@@ -53,8 +54,8 @@ def test_scale_of_each_vertex() -> None:
 def test_displacement_is_bounded() -> None:
     points = torch.zeros(3, 3)
     sample = SdfSample(torch.tensor([-5.0, -torch.inf, -0.01]), torch.eye(3))
-    pushed = repulse(points, sample, max_displacement=0.05)
-    torch.testing.assert_close(pushed.norm(dim=1), torch.tensor([0.05, 0.05, 0.01]))
+    pushed = repulse(points, sample)
+    torch.testing.assert_close(pushed.norm(dim=1), torch.tensor([MAX_DISPLACEMENT, MAX_DISPLACEMENT, 0.01]))
 
 
 @pytest.mark.parametrize("bad", [0.0, torch.nan, torch.inf, 1e-38])

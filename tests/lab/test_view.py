@@ -400,7 +400,7 @@ def test_a_browser_shows_somebody_in_a_green_t_shirt(tmp_path: Path) -> None:
 
 
 def test_an_empty_stage_has_no_colour(film: DressedFilm, server: Any, tmp_path: Path) -> None:
-    player = Player(server, film, playing=False)
+    player = Player(server, film)
     player._body.value = "hidden"
     player._stage.draw([], wireframe=False)
     with chromium(tmp_path / "profile") as page:

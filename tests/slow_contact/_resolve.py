@@ -151,9 +151,7 @@ def _push_blended(
     is_pushed = torch.zeros_like(goal, dtype=torch.bool)
     is_pushed[rows] = True
     push = torch.zeros_like(state.origin)
-    moved = repulse(
-        state.vertices[rows], sample, scale=scale, margin=state.margin, max_displacement=state.max_displacement
-    )
+    moved = repulse(state.vertices[rows], sample, scale=scale, margin=state.margin)
     push[rows] = moved - state.vertices[rows]
     least = torch.full_like(goal, torch.inf)
     least[rows] = state.margin - sample.distance
@@ -191,7 +189,7 @@ def _push(state: _State, rows: Tensor, sample: SdfSample, scale: Tensor, max_pus
     for round_ in range(max_pushes):
         if not len(rows):
             return round_
-        moved = repulse(here, sample, scale=push, margin=state.margin, max_displacement=state.max_displacement)
+        moved = repulse(here, sample, scale=push, margin=state.margin)
         here = state.bounded(moved, rows)
         last = sample.gradient
         sample = state.query(here, rows)
