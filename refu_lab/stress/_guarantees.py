@@ -11,13 +11,13 @@ import torch
 from numpy.typing import NDArray
 
 from refu_core.backbones import Skinned
+from refu_core.body import Surface
 from refu_core.contact import DEFAULT_CONTACT
 from refu_core.frames import SmplFrame
 from refu_core.garments import inner_first
 from refu_core.modes import DEFAULT_MARGIN
 from refu_core.realtime import GarmentMesh, GarmentPipeline, PipelineOutput, Wearer, dress
 from refu_core.refu import MAX_DISPLACEMENT
-from refu_lab.stress._closest_kernels import closest_on_sheet
 from refu_lab.stress._numbers import n_not_finite
 from refu_lab.stress._subject import Subject
 from refu_lab.stress._trial import Measurement, Trial
@@ -206,7 +206,7 @@ def _finite(out: PipelineOutput) -> Measurement:
 class _Aims:
     """Where collision handling takes the N vertices of a garment: to the skin, and to the sheets worn below."""
 
-    places: list[NDArray[np.float32]]
+    places: list[NDArray[np.floating]]
     """The closest point of each surface to each vertex before collision handling [m], (N, 3)."""
     is_pushed: list[NDArray[np.bool_]]
     """Whether a vertex is nearer to that surface than it may be, (N,)."""
@@ -237,15 +237,26 @@ def _aims(subject: Subject, pipeline: GarmentPipeline, out: PipelineOutput) -> d
     for name in inner_first(pipeline.garments):
         mesh = out[name]
         place, lack = _closest_skin(subject, out, mesh)
-        places, is_pushed = [place], [lack > 0]
+        places: list[NDArray[np.floating]] = [place]
+        is_pushed = [lack > 0]
         for below in worn:
-            closest, height = closest_on_sheet(mesh.raw, below.local, below.faces)
+            closest, height = _above(mesh.raw, below)
             places.append(closest)
             is_felt = np.linalg.norm(mesh.raw - closest, axis=1) < DEFAULT_CONTACT.layer_reach
             is_pushed.append((height < DEFAULT_CONTACT.gap) & is_felt)
         aims[name] = _Aims(places, is_pushed)
         worn.append(mesh)
     return aims
+
+
+def _above(points: NDArray[np.float32], sheet: GarmentMesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """A garment's closest points to `points` [m], both (N, 3), and how high the latter are above it [m], (N,)."""
+    surface = Surface(sheet.local.astype(np.float64), sheet.faces.astype(np.int32))
+    found = surface.closest(points.astype(np.float64))
+    closest = surface.at(found)
+    a, b, c = surface.vertices[surface.faces[found.face]].transpose(1, 0, 2)
+    up = np.cross(b - a, c - a)
+    return closest, ((points - closest) * up).sum(axis=1) / np.linalg.norm(up, axis=1)
 
 
 def _leap(before: _Aims, now: _Aims, edges: NDArray[np.int64]) -> NDArray[np.floating]:

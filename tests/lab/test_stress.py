@@ -31,7 +31,7 @@ from refu_lab.stress import (
     save_trial,
     soak,
 )
-from refu_lab.stress._closest_kernels import closest_on_sheet
+from refu_lab.stress._guarantees import _above
 
 TSHIRT = Wardrobe(garments=("tshirt-male",))
 Spoil = Callable[[GarmentMesh, SmplFrame, int], GarmentMesh]
@@ -319,7 +319,7 @@ def test_the_closest_points_of_a_sheet() -> None:
     vertices = rng.normal(size=(60, 3)).astype(np.float32)
     faces = np.stack([rng.choice(60, 3, replace=False) for _ in range(40)])
     points = 2 * rng.normal(size=(50, 3)).astype(np.float32)
-    closest, height = closest_on_sheet(points, vertices, faces)
+    closest, height = _above(points, GarmentMesh(vertices, lambda: vertices, faces, np.zeros(3)))
     squared, face, wanted = igl.point_mesh_squared_distance(points.astype(float), vertices.astype(float), faces)[:3]
     np.testing.assert_allclose(closest, wanted, atol=1e-5)
     a, b, c = vertices[faces[face]].transpose(1, 0, 2)
