@@ -94,7 +94,7 @@ class PipelineOptions:
 
     garments: tuple[str, ...] = setting(DEFAULT_GARMENTS, "Garments that every person wears.", metavar="A,B")
     body: str = setting(
-        "", "Who wears them: an SMPL file, or a built-in name; empty for the garments' own.", metavar="FILE"
+        "", "Body to dress: an SMPL file, or a built-in name; empty for the garments' own.", metavar="FILE"
     )
     betas_from: str = setting(
         "", "An SMPL file whose betas arrive: the built-in mesh follows them; empty for none.", metavar="FILE"
@@ -104,13 +104,11 @@ class PipelineOptions:
     )
     weights: str = setting(
         "",
-        "Folder with a folder a garment of weights of one's own (refu train); empty for those that ship.",
+        "Folder of your own weights (refu train), one subfolder per garment; empty for those that ship.",
         metavar="DIR",
     )
     sdf: str = setting("hybrid", "How collisions are found.", choices=tuple(SdfMode))
-    collider: bool = setting(
-        True, "Bring garments off a body whose overlaps are pulled apart, or off the body as it is posed."
-    )
+    collider: bool = setting(True, "Resolve collisions against the collider; if not, against the raw posed body.")
     device: str = setting("cpu", "Torch device: cpu or cuda.")
 
     def __str__(self) -> str:

@@ -218,21 +218,21 @@ def worn_by() -> Any:
     """The setting of commands that dress bodies: whose betas, and whose skin."""
     return setting(
         None,
-        "who wears it: an SMPL file (.npz, official .pkl), or a built-in body's name; garments and networks are "
-        "transferred (default: the garments' own)",
+        "body to dress: an SMPL file (.npz, official .pkl), or a built-in body's name; garments and networks are "
+        "transferred to it (default: the body the garments were made for)",
         parse=word,
         metavar="FILE",
     )
 
 
 def off_collider() -> Any:
-    """The setting of commands that dress bodies: what garments are brought off."""
-    return setting(True, "bring garments off a body whose overlaps are pulled apart, or off the posed body as it is")
+    """The setting of commands that dress bodies: what collisions are resolved against."""
+    return setting(True, "resolve collisions against the collider, or (--no-collider) against the raw posed body")
 
 
 def seeded() -> Any:
     """The setting of commands that draw."""
-    return setting(0, "of everything that is drawn", parse=seed, metavar="S")
+    return setting(0, "random seed", parse=seed, metavar="S")
 
 
 def add_cluster(parser: argparse.ArgumentParser) -> None:

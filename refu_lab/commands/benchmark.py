@@ -65,7 +65,7 @@ class BenchmarkOptions:
     quick: bool = setting(False, "a tiny round of one garment, as continuous integration runs it")
     output: Path = setting(Path("docs/results"), "where page, data and plot go", parse=cli.out_folder, metavar="DIR")
     weights: Path | None = setting(
-        None, "folder with a folder a garment of one's own weights", parse=cli.in_path, metavar="DIR"
+        None, "folder of your own weights, one subfolder per garment", parse=cli.in_path, metavar="DIR"
     )
     body: str | None = cli.worn_by()
     collider: bool = cli.off_collider()

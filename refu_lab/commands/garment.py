@@ -18,31 +18,31 @@ class AddOptions:
 
     mesh: Path
     body: str = setting("neutral", "male, female or neutral")
-    name: str | None = setting(None, "what it is called (default: as the mesh's file)")
+    name: str | None = setting(None, "its name (default: that of the mesh's file)")
     output: Path | None = setting(
-        None, "where it goes (default: NAME.npz in the user's folder)", parse=cli.out_file, metavar="FILE"
+        None, "file to write (default: NAME.npz in the user's folder)", parse=cli.out_file, metavar="FILE"
     )
-    layer: int = setting(1, "0 under 1 under 2 …", parse=int, metavar="N")
+    layer: int = setting(1, "lower layers are worn underneath", parse=int, metavar="N")
     color: tuple[float, float, float] | None = setting(
         None, "sRGB, each from 0 to 1", parse=cli.numbers(3), metavar="R,G,B"
     )
     held_at: str | None = setting(
-        None, "what holds it: waist or shoulders (default: as its place says)", choices=("waist", "shoulders")
+        None, "what holds it: waist or shoulders (default: found from where it lies)", choices=("waist", "shoulders")
     )
-    unit: str | None = setting(None, "of lengths: m, dm, cm, mm, in, or metres of one", metavar="U")
+    unit: str | None = setting(None, "unit of length: m, dm, cm, mm, in, or how many metres one is", metavar="U")
     up: str | None = setting(None, "the axis that is up", choices=("y", "z"))
-    pose: str | None = setting(None, "it was modelled in: t, degrees of hanging arms, or a motion .npz")
+    pose: str | None = setting(None, "pose it was modelled in: t, how far the arms hang [degrees], or a motion .npz")
     as_placed: bool = setting(False, "its origin is the body's own: don't look for another place")
     longest_edge: float = setting(0.02, "longer edges are split [m]", within=(0.005, 0.2), metavar="M")
     source: str = setting("a mesh of the user's", "author and licence", metavar="TEXT")
     picture: Path | None = setting(None, "write a picture (.png) of it, worn", parse=cli.out_file, metavar="FILE")
-    overwrite: bool = setting(False, "replace a garment that is there already")
+    overwrite: bool = setting(False, "replace an existing garment")
 
 
 def add(commands: Any) -> None:
     parser = commands.add_parser(
         "garment",
-        help="add a garment of your own, or list those that there are",
+        help="add a garment of your own, or list all garments",
         description="Garments are files. Some ship; yours are in a folder, and anywhere by their path.",
     )
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")

@@ -27,7 +27,7 @@ class StressOptions:
     backbone: str | None = setting(None, f"one mode (default: {', '.join(map(' '.join, MODES))})", metavar="NAME")
     sdf: str | None = setting(None, "accurate, hybrid, approx or none, with --backbone", metavar="MODE")
     weights: Path | None = setting(
-        None, "folder with a folder a garment of weights of one's own", parse=cli.in_path, metavar="DIR"
+        None, "folder of your own weights, one subfolder per garment", parse=cli.in_path, metavar="DIR"
     )
     frames: int | None = setting(None, "frames of each soak (3000)", parse=cli.positive, metavar="N")
     persons: int = setting(1, "persons of a soak, each one's frame counting", parse=cli.positive, metavar="P")

@@ -22,7 +22,7 @@ class ViewOptions:
     dressing: RecordingOptions
     """How motion is dressed; its input is left out of account."""
     dress: bool = setting(False, "dress the motion anew, though the bag has garments")
-    host: str = setting("localhost", "who may look; 0.0.0.0: all", metavar="NAME")
+    host: str = setting("localhost", "address to listen on; 0.0.0.0: all", metavar="NAME")
     port: int | None = setting(
         None, "where to listen: the first one free from 8080 on, if not given", parse=cli.port, metavar="N"
     )
