@@ -201,7 +201,7 @@ def axes_of(what: str, frame: str) -> Any:
     """The setting of commands that read files of motion: how their numbers are meant."""
     return setting(
         "auto",
-        f"axes of the {what} root: seen from the people, and said (auto); y up (smpl); z-up (AMASS); y-down (a "
+        f"axes of the {what} root: inferred from the people, and reported (auto); y up (smpl); z-up (AMASS); y-down (a "
         f"camera); or {frame} (frame)",
         choices=("auto", "smpl", "z-up", "y-down", "frame"),
     )
@@ -238,10 +238,13 @@ def seeded() -> Any:
 def add_cluster(parser: argparse.ArgumentParser) -> None:
     """What every command has that shares its work."""
     parser.add_argument(
-        "--jobs", type=positive, metavar="N", help="processes of this machine, a thread each (1; others: extra cluster)"
+        "--jobs", type=positive, metavar="N", help="local processes, one thread each (1; more need the extra cluster)"
     )
     parser.add_argument(
-        "--scheduler", type=word, metavar="ADDRESS", help="a Dask scheduler whose workers do it (docs/guide/fleets.md)"
+        "--scheduler",
+        type=word,
+        metavar="ADDRESS",
+        help="Dask scheduler whose workers do the work (docs/guide/fleets.md)",
     )
 
 

@@ -55,13 +55,13 @@ class BenchmarkOptions:
     """What to measure and how."""
 
     garments: tuple[str, ...] | None = setting(
-        None, "what is worn, the main one first (default: all)", parse=cli.names, metavar="A,B"
+        None, "garments to wear, the main one first (default: all)", parse=cli.names, metavar="A,B"
     )
     motions: Path | None = setting(
         None, "folder of AMASS-style .npz files (default: the bags)", parse=cli.in_path, metavar="DIR"
     )
     bags: Path = setting(Path("bags"), "the repository's bags", parse=cli.in_path, metavar="DIR")
-    rounds: int = setting(3, "times that all motion is run", parse=cli.positive, metavar="N")
+    rounds: int = setting(3, "how many times to run all motion", parse=cli.positive, metavar="N")
     quick: bool = setting(False, "a tiny round of one garment, as continuous integration runs it")
     output: Path = setting(Path("docs/results"), "where page, data and plot go", parse=cli.out_folder, metavar="DIR")
     weights: Path | None = setting(

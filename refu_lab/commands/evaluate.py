@@ -31,7 +31,7 @@ class EvaluateOptions:
 def add(commands: Any) -> None:
     parser = commands.add_parser(
         "evaluate",
-        help="make the paper's tables and figures on own data, beside the paper's figures",
+        help="make the paper's tables and figures on your own data, beside the paper's figures",
         description="Run every method on the test samples of data sets, and write a page and a JSON file a table. "
         "A method whose networks aren't trained stays in its table, with the command that trains it.",
     )
@@ -49,7 +49,7 @@ def add(commands: Any) -> None:
         type=cli.in_path,
         nargs="+",
         metavar="DIR",
-        help="folders with GARMENT/NAME.safetensors that are looked at before the weights that ship",
+        help="folders with GARMENT/NAME.safetensors that are searched before the weights that ship",
     )
     cli.add_cluster(parser)
     cli.add_common(parser, run)

@@ -50,7 +50,7 @@ def add(commands: Any) -> None:
         "add",
         help="make a garment of a mesh",
         description="Make a garment of a mesh (OBJ, PLY, STL, OFF, GLB) that was modelled round a body: its unit, "
-        "axes, place and pose are found out, unless they are given. It can be worn at once, simulated and trained.",
+        "axes, place and pose are inferred unless they are given. It can be worn at once, simulated and trained.",
     )
     adding.add_argument("mesh", type=cli.in_path, metavar="MESH", help="the mesh's file")
     cli.add_options(adding, AddOptions)

@@ -23,10 +23,10 @@ class RecordingOptions(DressOptions):
     """A recording, how it is read, and how who is in it is dressed."""
 
     input: Path
-    topic: str | None = setting(None, "input topic, where a bag has several of SMPL parameters", metavar="NAME")
+    topic: str | None = setting(None, "input topic, where a bag has several with SMPL parameters", metavar="NAME")
     input_type: str | None = setting(None, "type of the topic's messages", choices=(*INPUT_TYPES, *KEYPOINT_TYPES))
     keypoints: str = setting("zed38", "which points of the body, with keypoints as input", choices=LAYOUTS)
-    person: str | None = setting(None, "whose motion, where the input has several people", metavar="NAME")
+    person: str | None = setting(None, "person to dress, where the input has several", metavar="NAME")
     input_axes: Axes = cli.axes_of("recorded", "those of the frame itself, left as they are")
     fps: float | None = cli.rate_of_files()
 
@@ -49,10 +49,12 @@ class ReplayOptions(RecordingOptions):
 
     output: Path | None = None
     speed: Literal["max", "real"] = setting("max", "as fast as possible, or paced (real)", choices=("max", "real"))
-    frame_id: str = setting("", "frame_id of the markers; map, or with axes of the frame itself that one", metavar="ID")
+    frame_id: str = setting(
+        "", "frame_id of the markers (default: map, or the input's own with --input-axes frame)", metavar="ID"
+    )
     max_frames: int | None = setting(None, "stop after N frames", parse=cli.positive, metavar="N")
-    overwrite: bool = setting(False, "replace an output that is there already")
-    evaluate: bool = setting(True, "look for collisions; without, nothing is kept of a frame but its latency")
+    overwrite: bool = setting(False, "replace an existing output")
+    evaluate: bool = setting(True, "check every frame for collisions; if not, only its latency is kept")
     with_body: bool = True
     """Whether the output carries the body, too."""
 
@@ -82,14 +84,14 @@ def add(commands: Any) -> None:
         "--report",
         type=cli.place_for(cli.out_folder),
         metavar="DIR",
-        help="write DIR/index.html with plots and pictures; of several inputs: a row each, and a page of its own",
+        help="write DIR/index.html with plots and pictures; with several inputs, a row and a page for each",
     )
     cli.add_options(parser, ReplayOptions)
     parser.add_argument(
         "--no-body",
         dest="with_body",
         action="store_false",
-        help="leave the body out of the output, which is 40 %% smaller then",
+        help="leave the body out of the output, which makes it 40 %% smaller",
     )
     parser.add_argument(
         "--progress",
@@ -97,7 +99,7 @@ def add(commands: Any) -> None:
         default="bar",
         help="bar (default), or lines `progress DONE TOTAL` on the standard output, for programs; TOTAL 0: unknown",
     )
-    parser.add_argument("--again", action="store_true", help="of several inputs: also those that are finished")
+    parser.add_argument("--again", action="store_true", help="with several inputs: run finished ones again")
     cli.add_cluster(parser)
     cli.add_common(parser, run)
 

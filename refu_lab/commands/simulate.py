@@ -20,7 +20,10 @@ class SimulateOptions:
     count: int
     output: Path
     motions: Path | None = setting(
-        None, "folder of motion files, two at least; without, poses are drawn alone", parse=cli.in_path, metavar="DIR"
+        None,
+        "folder of at least two motion files; without one, poses are drawn at random",
+        parse=cli.in_path,
+        metavar="DIR",
     )
     input_axes: Axes = cli.axes_of("motions'", "z up, as ROS has it")
     fps: float | None = cli.rate_of_files()
@@ -36,7 +39,7 @@ def add(commands: Any) -> None:
         "simulate",
         help="make a data set of simulated garments",
         description="Simulate collision-free garments on bodies of many poses, shapes and styles. An interrupted run "
-        "goes on when the same command is given again.",
+        "continues when the same command is given again.",
     )
     parser.add_argument(
         "garments",

@@ -30,7 +30,7 @@ class StressOptions:
         None, "folder of your own weights, one subfolder per garment", parse=cli.in_path, metavar="DIR"
     )
     frames: int | None = setting(None, "frames of each soak (3000)", parse=cli.positive, metavar="N")
-    persons: int = setting(1, "persons of a soak, each one's frame counting", parse=cli.positive, metavar="P")
+    persons: int = setting(1, "persons in a soak; the frame of each counts", parse=cli.positive, metavar="P")
     rounds: int | None = setting(None, "turns of each check (3)", parse=cli.positive, metavar="N")
     hours: float | None = None
     quick: bool = False
@@ -70,16 +70,18 @@ def add(commands: Any) -> None:
     parser = commands.add_parser(
         "stress",
         help="try to break the pipeline: numbers, guarantees, invariance, endurance",
-        description="Run random and adversarial frames through the pipeline and hold the results against float64 and "
-        "against what is promised; the worst trial of each check is kept as a file. Exits with 1 where one failed.",
+        description="Run random and adversarial frames through the pipeline and compare the results with float64 and "
+        "with what is promised; the worst trial of each check is kept as a file. Exits with 1 where one failed.",
     )
     length = parser.add_mutually_exclusive_group()
     length.add_argument("--quick", action="store_true", help="each check once: for CI")
     length.add_argument(
-        "--hours", type=cli.between(0, 10_000), metavar="H", help="go on for so long (default: some minutes)"
+        "--hours", type=cli.between(0, 10_000), metavar="H", help="run for this long (default: some minutes)"
     )
     cli.add_options(parser, StressOptions)
-    parser.add_argument("--replay", type=cli.in_path, metavar="FILE", help="try one of them again, and nothing else")
+    parser.add_argument(
+        "--replay", type=cli.in_path, metavar="FILE", help="run one saved trial again, and nothing else"
+    )
     cli.add_common(parser, run)
 
 

@@ -57,7 +57,7 @@ class TrainOptions:
     )
     start: Path | None = setting(
         None,
-        "go on from a garment's weights in this folder, those that ship (refu_core/weights/GARMENT) or your own",
+        "continue from a garment's weights in this folder, those that ship (refu_core/weights/GARMENT) or your own",
         parse=cli.in_path,
         metavar="DIR",
     )
@@ -78,7 +78,7 @@ def add(commands: Any) -> None:
         "train",
         help="train a garment's networks on a data set",
         description="Train a backbone on a data set of refu simulate, alone or together with ReFU. An interrupted run "
-        "goes on when the same command is given again; torchrun shares it among GPUs.",
+        "continues when the same command is given again; torchrun shares it among GPUs.",
     )
     parser.add_argument("garment", metavar="GARMENT", help="a garment's name (refu garment list), or its .npz")
     parser.add_argument("--data", type=cli.in_path, required=True, metavar="DIR", help="the garment's data set")

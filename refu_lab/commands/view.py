@@ -21,7 +21,7 @@ class ViewOptions:
     """Topics of markers to look at, in place of inputs: none for the node's own; None: no topics, the inputs."""
     dressing: RecordingOptions
     """How motion is dressed; its input is left out of account."""
-    dress: bool = setting(False, "dress the motion anew, though the bag has garments")
+    dress: bool = setting(False, "dress the motion again, even if the bag has garments")
     host: str = setting("localhost", "address to listen on; 0.0.0.0: all", metavar="NAME")
     port: int | None = setting(
         None, "where to listen: the first one free from 8080 on, if not given", parse=cli.port, metavar="N"
@@ -32,7 +32,7 @@ class ViewOptions:
 def add(commands: Any) -> None:
     parser = commands.add_parser(
         "view",
-        help="look at recorded motion, dressed, or at a node that runs, in the browser",
+        help="show dressed motion, or a running node, in the browser",
         description="Serve a 3D view at http://localhost:8080. A bag with garments (of refu replay, or of the node) is "
         "shown as it was recorded; motion is dressed while you look; a running node is shown live. Needs the extra "
         "view.",
