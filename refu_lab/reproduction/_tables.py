@@ -284,7 +284,7 @@ def write_summary(folder: Path) -> Path:
     about = folder / "about.txt"
     parts = [
         "# Results",
-        "Every table and figure of the paper, on simulated data of this project; `refu evaluate` writes these pages.",
+        "The paper's tables and figures, on simulated data of this project; `refu evaluate` writes these pages.",
         *([about.read_text(encoding="utf-8").strip()] if about.exists() else []),
         "\n".join(links),
         _PAPER_NOTE,
