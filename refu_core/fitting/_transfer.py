@@ -38,6 +38,8 @@ _RIGID = 0.06
 """A piece no larger than this beside larger ones doesn't bend: a button, a buckle [m]."""
 _LEAST_TRUST = 1e-6
 """Of every vertex, so that the equation has one solution."""
+_OF_ITS_OWN = 0.05
+"""A mesh, or a piece of one, of which less than this share is trusted has no skin of its own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,12 +75,14 @@ class Transfer:
         # A closed piece is cloth with a thickness: its inner side faces the skin and follows it no less.
         agrees = np.where(is_open[label], agrees, np.abs(agrees))
         is_trusted = (agrees > _FACING) & (distance < _FARTHEST)
-        if is_trusted.mean() < 0.05:  # ruffles all over, or a single strap: the nearest skin is all there is
+        if is_trusted.mean() < _OF_ITS_OWN:  # ruffles all over, or a single strap: the nearest skin is all there is
             is_trusted = np.abs(distance) <= max(np.quantile(np.abs(distance), 0.5), 0.02)
         sizes = [np.linalg.norm(np.ptp(vertices[label == k], axis=0)) for k in range(n_pieces)]
         is_small = np.array(sizes) < _RIGID
         rigid = tuple(np.flatnonzero(label == k) for k in range(n_pieces) if is_small[k] and not is_small.all())
-        laplacian = _laplacian(vertices, faces, _seams(vertices, label, rim, n_pieces))
+        trusted = np.bincount(label, is_trusted) / np.bincount(label)
+        is_led = (trusted < _OF_ITS_OWN) | (is_small & ~is_small.all())
+        laplacian = _laplacian(vertices, faces, _seams(vertices, label, rim, is_led))
         body_faces = body.body.faces.numpy()
         return cls(face, barycentric, distance, is_trusted, body_faces, vertex_areas(vertices, faces), laplacian, rigid)
 
@@ -122,22 +126,24 @@ def _laplacian(v: F64, f: NDArray[np.int64], seams: NDArray[np.int64]) -> csc_ar
     return csc_array(diags_array(adjacent.sum(axis=1)) - adjacent)
 
 
-def _seams(v: F64, label: NDArray[np.int64], rim: NDArray[np.int64], n_pieces: int) -> NDArray[np.int64]:
-    """Pairs of vertices that move together: rims of two pieces that touch, and each piece with what is nearest."""
-    if n_pieces == 1:
-        return np.empty((0, 2), np.int64)
+def _seams(v: F64, label: NDArray[np.int64], rim: NDArray[np.int64], is_led: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Pairs of vertices that move together: rims of two pieces that touch, and each piece that is led with the nearest.
+
+    Pieces with skin of their own aren't tied to each other: two gloves follow two hands.
+    """
     found = [np.empty((0, 2), np.int64)]
-    if len(rim):
+    if len(rim) and len(is_led) > 1:
         close: Any = cKDTree(v).query_ball_point(v[rim], _SEAM)
         near = [(a, b) for a, others in zip(rim.tolist(), close, strict=True) for b in others if label[a] != label[b]]
         found.append(np.array(near, np.int64).reshape(-1, 2))
-    order = np.argsort(np.bincount(label))[::-1]
-    joined = label == order[0]
-    for piece in order[1:]:
+    size = np.bincount(label)
+    joined = ~is_led[label]
+    for piece in np.argsort(np.where(is_led, size, 0))[::-1][: is_led.sum()]:
         own = np.flatnonzero(label == piece)
         others = np.flatnonzero(joined)
-        distance, nearest = (np.asarray(one) for one in cKDTree(v[others]).query(v[own]))
-        few = np.argsort(distance)[:3]
-        found.append(np.stack((own[few], others[nearest[few]]), 1))
+        if len(others):
+            distance, nearest = (np.asarray(one) for one in cKDTree(v[others]).query(v[own]))
+            few = np.argsort(distance)[:3]
+            found.append(np.stack((own[few], others[nearest[few]]), 1))
         joined |= label == piece
     return np.unique(np.sort(np.concatenate(found), 1), axis=0)

@@ -29,7 +29,7 @@ from refu_core.fitting._clean import clean, components, split_long_edges
 from refu_core.fitting._pieces import unsewn
 from refu_core.fitting._place import find_places
 from refu_core.garments import UvMap, save_garment
-from refu_core.mesh import Connectivity
+from refu_core.mesh import Connectivity, vertex_normals
 
 
 def tube(rows: int = 12, columns: int = 24) -> tuple[np.ndarray, np.ndarray]:
@@ -204,6 +204,26 @@ def test_what_is_constant_stays_so_and_what_is_linear_is_followed(at_rest) -> No
     np.testing.assert_allclose(transfer(np.ones((len(skin), 1)), length=0.02), 1, atol=1e-9)
     height = transfer(skin[:, 1:2], length=0.012)[:, 0]
     assert np.abs(height - garment.v_template[:, 1].numpy()).mean() < 0.01
+
+
+@pytest.mark.parametrize(("joints", "reach"), [((20, 21, 22, 23), 0.0), ((7, 8, 10, 11), 0.0), ((1, 2, 4, 5), 0.5)])
+def test_pairs_of_pieces_follow_what_each_of_them_is_on(joints: tuple[int, ...], reach: float, at_rest) -> None:
+    """Gloves, socks, and stockings up to where thighs touch: the left one's weights are those of the left one alone."""
+    posed = at_rest["female"]
+    weights = posed.body.weights.double().numpy()
+    skin, faces = posed.vertices.double().numpy(), posed.body.faces.numpy()
+    skin = skin + 0.01 * vertex_normals(skin, faces.astype(np.int32))
+    is_on = (weights[:, list(joints)].sum(1) > 0.5) & (skin[:, 1] < skin[:, 1].max() * (1 - reach))
+    is_on &= np.abs(skin[:, 0]) > 0.01 + 0.02 * (reach > 0)  # 6 cm apart at least
+    kept = faces[is_on[faces].all(1)]
+    side = skin[kept].mean(1)[:, 0] > 0
+
+    def found(f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        used, local = np.unique(f, return_inverse=True)
+        return used, Transfer.of(skin[used], local.reshape(-1, 3), posed)(weights, length=0.012)
+
+    both, alone = found(kept), found(kept[side])
+    np.testing.assert_allclose(both[1][np.isin(both[0], alone[0])], alone[1], atol=1e-6)
 
 
 # -- placing
