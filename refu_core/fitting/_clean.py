@@ -33,6 +33,9 @@ def clean(mesh: SurfaceMesh) -> tuple[SurfaceMesh, list[str]]:
     Raises `GarmentError`: no surface is left, or it has one side only (a Möbius strip).
     """
     notes: list[str] = []
+    if mesh.uv is not None and not np.isfinite(mesh.uv.coordinates).all():
+        notes.append("the texture coordinates were left out: some are NaN or infinite")
+        mesh = replace(mesh, uv=None)
     mesh = _without_double_faces(_without_strays(mesh, notes), notes)
     mesh = _welded(mesh, notes)
     partner, n_crowded = _partners(mesh)
@@ -146,31 +149,36 @@ def _without_strays(mesh: SurfaceMesh, notes: list[str]) -> SurfaceMesh:
     return mesh.only(kept)
 
 
-def _groups_of_place(v: NDArray[np.float64]) -> Ints:
-    """The first vertex at the same place as each, shape (V,)."""
-    extent = float(np.linalg.norm(np.ptp(v, axis=0)))
-    _, label = _linked(cKDTree(v).query_pairs(_SAME_PLACE * extent, output_type="ndarray"), len(v))
-    _, first = np.unique(label, return_index=True)
-    found: Ints = first[label].astype(np.int64)
+def _groups_of_place(v: NDArray[np.float64], extent: float) -> Ints:
+    """The first vertex at the same place as each, shape (V,), in a mesh of some extent."""
+    # Those in a cell as small as a place are one before pairs are looked for: a crowd would make pairs without number.
+    cell = np.floor((v - v.min(0)) / (_SAME_PLACE * extent / np.sqrt(3)))
+    _, first, of_cell = np.unique(cell, axis=0, return_index=True, return_inverse=True)
+    pairs = cKDTree(v[first]).query_pairs(_SAME_PLACE * extent, output_type="ndarray")
+    label = _linked(pairs, len(first))[1][of_cell.ravel()]
+    _, first, of_group = np.unique(label, return_index=True, return_inverse=True)
+    found: Ints = first[of_group].astype(np.int64)
     return found
 
 
 def _without_double_faces(mesh: SurfaceMesh, notes: list[str]) -> SurfaceMesh:
-    mesh = mesh.compact()
-    place = _groups_of_place(mesh.vertices)[mesh.faces]
-    extent = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
-    is_flat = (place == np.roll(place, 1, 1)).any(1)
-    is_flat |= np.linalg.norm(face_normals(mesh.vertices, mesh.faces), axis=1) < (1e-7 * extent) ** 2
+    extent = float(np.linalg.norm(np.ptp(mesh.compact().vertices, axis=0)))
+    n = len(mesh.faces)
+    # First those without area: their corners may all be at one place, and pairs of them without number.
+    mesh = _only(mesh, np.linalg.norm(face_normals(mesh.vertices, mesh.faces), axis=1) >= (1e-7 * extent) ** 2)
+    place = _groups_of_place(mesh.vertices, extent)[mesh.faces]
+    has_area = (place != np.roll(place, 1, 1)).all(1)
+    mesh, place = _only(mesh, has_area), place[has_area]
+    if n > len(mesh.faces):
+        notes.append(f"{n - len(mesh.faces)} faces without area were left out")
     _, first = np.unique(np.sort(place, 1), axis=0, return_index=True)
-    kept = np.zeros(len(place), bool)
-    kept[first] = True
-    kept &= ~is_flat
-    n_double = int((~kept & ~is_flat).sum())
-    if n_double:
-        notes.append(f"{n_double} faces were there twice and are there once")
-    if is_flat.any():
-        notes.append(f"{int(is_flat.sum())} faces without area were left out")
-    return mesh.only(kept)
+    if len(first) < len(place):
+        notes.append(f"{len(place) - len(first)} faces were there twice and are there once")
+    return mesh.only(np.isin(np.arange(len(place)), first))
+
+
+def _only(mesh: SurfaceMesh, kept: NDArray[np.bool_]) -> SurfaceMesh:
+    return (mesh if kept.all() else mesh.only(kept)).compact()
 
 
 def _welded(mesh: SurfaceMesh, notes: list[str]) -> SurfaceMesh:
@@ -178,11 +186,8 @@ def _welded(mesh: SurfaceMesh, notes: list[str]) -> SurfaceMesh:
     on_rim = rim_of(mesh.faces)
     target = np.arange(len(mesh.vertices))
     if len(on_rim):
-        # Places are found among the rim's vertices alone, by the whole mesh's extent.
-        v = np.concatenate((mesh.vertices[on_rim], mesh.vertices.min(0)[None], mesh.vertices.max(0)[None]))
-        same = _groups_of_place(v)[: len(on_rim)]
-        inside = same < len(on_rim)
-        target[on_rim[inside]] = on_rim[same[inside]]
+        extent = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
+        target[on_rim] = on_rim[_groups_of_place(mesh.vertices[on_rim], extent)]
     n_welded = int((target != np.arange(len(target))).sum())
     if n_welded:
         notes.append(f"{n_welded} vertices lay on others, along seams, and were welded to them")

@@ -22,6 +22,8 @@ _MAX_FACES = 400_000
 """A larger mesh is refused before anything is computed: no garment that is worn in real time is as fine."""
 _MAX_CORNERS = 1000
 """Of one polygon: the lid of a fine tube has hundreds."""
+_SIZES = (1e-6, 1e9)
+"""The largest extent of a mesh in any unit: of a garment 1e-4 in kilometres, 1e6 in micrometres."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,15 +76,19 @@ def read_surface(path: str | os.PathLike[str]) -> SurfaceMesh:
             raise ValueError(msg)
         with np.errstate(all="ignore"):  # of what isn't finite; it is asked for below
             mesh = _parse_obj(content) if suffix == ".obj" else _by_trimesh(content, suffix)
-        if len(mesh.faces) > _MAX_FACES:
-            msg = f"it has {len(mesh.faces)} triangles, at most {_MAX_FACES} are read: decimate it"
-            raise ValueError(msg)
+        _require_few(len(mesh.faces))
     except ImportError:
         raise
     except Exception as error:  # trimesh raises whatever a damaged file makes of it
         msg = f"{source}: not a mesh that can be read: {error or type(error).__name__}"
         raise GarmentError(msg) from error
     return mesh
+
+
+def _require_few(n_triangles: int) -> None:
+    if n_triangles > _MAX_FACES:
+        msg = f"it has {n_triangles} triangles or more, at most {_MAX_FACES} are read: decimate it"
+        raise ValueError(msg)
 
 
 def _check(mesh: SurfaceMesh) -> None:
@@ -96,6 +102,10 @@ def _check(mesh: SurfaceMesh) -> None:
     if not np.isfinite(v[f]).all():
         msg = "it has vertices that are NaN or infinite"
         raise ValueError(msg)
+    largest, extent = float(np.abs(v[f]).max()), float(np.ptp(v[f].reshape(-1, 3), axis=0).max())
+    if largest > _SIZES[1] or extent < _SIZES[0]:
+        msg = f"it is {extent:.3g} large and reaches to {largest:.3g}: wanted sizes from {_SIZES[0]:g} to {_SIZES[1]:g}"
+        raise ValueError(msg)
     if mesh.uv is not None and (mesh.uv.faces.min() < 0 or mesh.uv.faces.max() >= len(mesh.uv.coordinates)):
         msg = "a face names texture coordinates that there aren't"
         raise ValueError(msg)
@@ -105,6 +115,8 @@ def _parse_obj(content: bytes) -> SurfaceMesh:
     vertices: list[list[float]] = []
     coordinates: list[list[float]] = []
     corners: list[list[tuple[int, int]]] = []
+    count = 0
+    _require_few(content.count(b"\nf "))  # before its vertices are read
     text = content.decode("utf-8-sig", errors="replace").replace("\\\n", " ")
     for number, line in enumerate(text.splitlines(), 1):
         kind, *words = line.partition("#")[0].split() or [""]
@@ -116,11 +128,13 @@ def _parse_obj(content: bytes) -> SurfaceMesh:
                 coordinates.append([float(x) for x in (*words[:2], "0")[:2]])
             elif kind == "f":
                 corners.append([_corner(word, len(vertices), len(coordinates)) for word in words])
+                count += max(0, len(words) - 2)
         except (ValueError, IndexError) as error:
             msg = f"line {number}: {line[:60]!r}"
             raise ValueError(msg) from error
+        _require_few(count)
     points = np.array(vertices, dtype=np.float64).reshape(-1, 3)
-    triangles = np.array(list(_triangles(corners, points)), dtype=np.int64).reshape(-1, 3, 2)
+    triangles = _triangles(corners, points)
     uv = None
     if coordinates and len(triangles) and (triangles[..., 1] >= 0).all():
         uv = UvMap(np.array(coordinates, dtype=np.float32), triangles[..., 1].copy())
@@ -141,22 +155,38 @@ def _corner(word: str, n_vertices: int, n_coordinates: int) -> tuple[int, int]:
     return found[0], found[1]
 
 
-def _triangles(
-    polygons: Iterable[list[tuple[int, int]]], points: NDArray[np.float64]
-) -> Iterable[tuple[tuple[int, int], ...]]:
-    """Polygons as triangles: quads are cut along the shorter diagonal, others by their ears."""
-    for polygon in polygons:
-        n = len(polygon)
-        if n < 3 or n > _MAX_CORNERS:
-            if n > _MAX_CORNERS:
-                msg = f"a polygon of {n} corners, at most {_MAX_CORNERS} are read: triangulate it"
-                raise ValueError(msg)
-            continue
-        if n == 3 or max(corner[0] for corner in polygon) >= len(points):
-            yield from ((polygon[0], polygon[k], polygon[k + 1]) for k in range(1, n - 1))
-            continue
-        places = points[[corner[0] for corner in polygon]]
-        yield from (tuple(polygon[k] for k in ear) for ear in _ears(places))
+def _triangles(polygons: list[list[tuple[int, int]]], points: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Polygons as triangles in their order, (T, 3, 2): quads are cut along the shorter diagonal, others by their ears."""
+    sizes = np.array([len(polygon) for polygon in polygons], dtype=np.int64)
+    if len(sizes) and sizes.max() > _MAX_CORNERS:
+        msg = f"a polygon of {sizes.max()} corners, at most {_MAX_CORNERS} are read: triangulate it"
+        raise ValueError(msg)
+    known = np.array([max((corner[0] for corner in polygon), default=0) < len(points) for polygon in polygons], bool)
+    # Of which polygon, and its corners.
+    found = [(np.flatnonzero(sizes == 3), np.array([p for p in polygons if len(p) == 3], np.int64).reshape(-1, 3, 2))]
+    rows = np.flatnonzero((sizes == 4) & known)
+    quads = np.array([polygons[row] for row in rows], dtype=np.int64).reshape(-1, 4, 2)
+    is_convex, cuts = _cut_quads(points[quads[..., 0]] if len(quads) else np.empty((0, 4, 3)))
+    which = np.arange(len(quads))[:, None]
+    found += [(rows[is_convex], quads[which, cuts[:, k]][is_convex]) for k in range(2)]
+    for row in (*rows[~is_convex], *np.flatnonzero((sizes > 4) | ((sizes == 4) & ~known))):
+        polygon = np.array(polygons[row], dtype=np.int64)
+        # Whose vertices aren't there is refused below.
+        ears = _ears(points[polygon[:, 0]]) if known[row] else [(0, k, k + 1) for k in range(1, len(polygon) - 1)]
+        found += [(np.array([row]), polygon[list(ear)][None]) for ear in ears]
+    order = np.argsort(np.concatenate([row for row, _ in found]), kind="stable")
+    return np.concatenate([corners for _, corners in found])[order]
+
+
+def _cut_quads(places: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """Which of quads (Q, 4, 3) are convex, and the corners of their halves, (Q, 2, 3), along the shorter diagonal."""
+    before, after = np.roll(places, 1, axis=1), np.roll(places, -1, axis=1)
+    normal = np.cross(places, after).sum(axis=1)
+    turns = (np.cross(places - before, after - places) * normal[:, None]).sum(2)
+    diagonal = np.square(after - before).sum(2)
+    first = (diagonal[:, 0] <= diagonal[:, 1])[:, None, None]
+    cuts: NDArray[np.int64] = np.where(first, [[3, 0, 1], [1, 2, 3]], [[0, 1, 2], [0, 2, 3]])
+    return (turns > 0).all(axis=1), cuts
 
 
 def _ears(places: NDArray[np.float64]) -> Iterable[tuple[int, int, int]]:

@@ -16,8 +16,9 @@ from scipy.spatial.transform import Rotation
 from refu_core import GarmentError, load_body, load_garment
 from refu_core.fitting import Placing, SurfaceMesh, fit_garment, read_surface
 from refu_core.fitting._clean import clean
+from refu_core.fitting._mesh_file import _cut_quads, _ears
 from refu_core.fitting._place import find_places
-from refu_core.garments import save_garment
+from refu_core.garments import UvMap, save_garment
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n"
 TSHIRT = Wanted(sleeve=0.35, step=0.028)
@@ -68,6 +69,45 @@ def test_a_gltf_whose_numbers_are_elsewhere_is_said(tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(content)
     with pytest.raises(GarmentError, match=r"in a file beside it; save it as one file, \.glb"):
         read_surface(tmp_path / "model.gltf")
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_quads_are_halved_as_any_polygon_is(seed: int) -> None:
+    """Convex or not, flat or not: those that are cut at once are cut where their ears would be."""
+    rng = np.random.default_rng(seed)
+    places = rng.normal(size=(200, 4, 3)) * [1, 1, 0.1]
+    is_convex, cuts = _cut_quads(places)
+    assert 20 < is_convex.sum() < 150
+    for quad, cut in zip(places[is_convex], cuts[is_convex], strict=True):
+        assert [tuple(corners) for corners in cut.tolist()] == list(_ears(quad))
+
+
+def test_a_mesh_that_is_too_fine_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_text("no vertex at all" + "\nf 1 2 3" * 400_001)
+    with pytest.raises(GarmentError, match="400001 triangles or more, at most 400000 are read"):
+        read_surface(tmp_path / "a.obj")
+
+
+def test_a_crowd_at_one_place_is_one_vertex() -> None:
+    """Faces without area, and tiny ones, by the thousand: pairs of all of them would be hundreds of millions."""
+    v, f = cloth(TSHIRT)
+    n = 5000
+    flat = np.tile([0.0, 1.0, 0.1], (3 * n, 1))
+    tiny = flat + [0.05, 0, 0] + np.random.default_rng(0).uniform(-1, 1, flat.shape) * 2e-6
+    faces = [f, len(v) + np.arange(6 * n).reshape(-1, 3)]
+    cleaned, notes = clean(SurfaceMesh(np.concatenate([v, flat, tiny]), np.concatenate(faces)))
+    assert (len(cleaned.vertices), len(cleaned.faces)) == (len(v), len(f))
+    assert notes == [f"{2 * n} faces without area were left out"]
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_textures_of_no_numbers_are_left_out(wrong: float) -> None:
+    v, f = cloth(TSHIRT)
+    uv = v[:, :2].astype(np.float32)
+    uv[7, 1] = wrong
+    cleaned, notes = clean(SurfaceMesh(v, f, UvMap(uv, f)))
+    assert cleaned.uv is None
+    assert notes == ["the texture coordinates were left out: some are NaN or infinite"]
 
 
 def test_a_stray_face_takes_nothing_with_it() -> None:
@@ -160,11 +200,14 @@ def test_what_is_placed_is_not_turned() -> None:
 @pytest.mark.parametrize(
     ("v", "f", "wanted"),
     [
-        (np.zeros((3, 3)), [[0, 1, 3]], "names vertex 4 of 3"),
+        (np.eye(3), [[0, 1, 3]], "names vertex 4 of 3"),
         (np.full((3, 3), np.nan), [[0, 1, 2]], "NaN or infinite"),
         (np.zeros((3, 3)), np.zeros((0, 3), int), "no faces"),
         (np.zeros((3, 3)), [[0.0, 1.0, 2.0]], "Cannot cast"),
         ("cloth", [[0, 1, 2]], "could not convert"),
+        (1e300 * np.eye(3), [[0, 1, 2]], r"it is 1e\+300 large and reaches to 1e\+300: wanted sizes from"),
+        (1e-200 * np.eye(3), [[0, 1, 2]], "it is 1e-200 large"),
+        (np.ones((3, 3)), [[0, 1, 2]], "it is 0 large"),
     ],
 )
 def test_meshes_that_make_no_sense_are_refused_where_they_are_made(v: Any, f: Any, wanted: str) -> None:
