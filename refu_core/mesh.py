@@ -150,7 +150,8 @@ def check_faces(faces: Any, *, n_vertices: int | None = None) -> NDArray[np.int3
         raise MeshError(msg)
     repeated = (array == np.roll(array, 1, axis=1)).any(axis=1)
     if repeated.any():
-        msg = f"every face needs three different vertices; {repeated.sum()} of {len(array)} repeat one"
+        msg = f"every face needs three different vertices; {repeated.sum()} of {len(array)} repeat one, "
+        msg += f"number {int(repeated.argmax())} (from 0) first: leave such faces out"
         raise MeshError(msg)
     return np.ascontiguousarray(array, dtype=np.int32)
 

@@ -7,8 +7,8 @@ from importlib import metadata
 from importlib.util import find_spec
 from typing import Any
 
-from refu_core import BodyError, MeshError, __version__
-from refu_core.body import BUILTIN_BODIES, POOR_FIT, load_body, load_fit
+from refu_core import BodyError, MeshError, RefuError, __version__
+from refu_core.body import BUILTIN_BODIES, load_body, load_fit
 from refu_core.garments import garment_files, load_garment
 from refu_core.mesh import Connectivity
 from refu_core.modes import BackboneName, SdfMode
@@ -29,8 +29,8 @@ def describe_body(source: str) -> dict[str, Any]:
     try:
         Connectivity.of(body.faces).require_closed()
         closed = "yes"
-    except MeshError as error:
-        closed = f"no, its signed distance can't be used: {error}"
+    except MeshError:
+        closed = "no"  # why not is said below
     low, high = body.v_template[:, 1].min(), body.v_template[:, 1].max()
     facts: dict[str, Any] = {
         "body": source,
@@ -44,9 +44,18 @@ def describe_body(source: str) -> dict[str, Any]:
         fit = load_fit(body)
     except BodyError as error:
         return facts | {"can be worn": f"no: {error}"}
-    poor = f"; more than {1e3 * POOR_FIT:g} mm is poor" if fit.is_poor else ""
-    facts["built-in mesh on it"] = f"{fit.text}{poor}"
-    return facts | fit_facts(fit)
+    facts["built-in mesh on it"] = fit.text
+    return facts | fit_facts(fit) | ({"warnings": fit.warnings} if fit.warnings else {})
+
+
+def describe_garment(name: str) -> str:
+    """What the file of a garment that has a name holds, or why it can't be loaded."""
+    try:
+        found = load_garment(name)
+        networks = networks_of(name)
+    except RefuError as error:
+        return f"can't be loaded: {error}"
+    return f"{found.n_vertices} vertices, {len(found.faces)} faces, for {found.body}; {networks}"
 
 
 def networks_of(garment: str) -> str:
@@ -68,7 +77,6 @@ def collect() -> dict[str, Any]:
         [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())] if torch.cuda.is_available() else []
     )
     bodies = (load_body(name) for name in BUILTIN_BODIES)
-    garments = (load_garment(name) for name in garment_files())
     return {
         "refu": __version__,
         "python": platform.python_version(),
@@ -77,10 +85,7 @@ def collect() -> dict[str, Any]:
         "rclpy": "importable" if find_spec("rclpy") else "not found (needed by the node only)",
         "devices": ["cpu", *(f"cuda: {name}" for name in cuda)],
         "bodies": {body.name: f"{body.n_vertices} vertices, {body.fingerprint}" for body in bodies},
-        "garments": {
-            g.name: f"{g.n_vertices} vertices, {len(g.faces)} faces, for {g.body}; {networks_of(g.name)}"
-            for g in garments
-        },
+        "garments": {name: describe_garment(name) for name in garment_files()},
         "backbones": [str(one) for one in BackboneName],
         "sdf modes": [str(one) for one in SdfMode],
     }

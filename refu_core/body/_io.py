@@ -18,6 +18,9 @@ from refu_core.errors import BodyError, require_type
 
 BUILTIN_BODIES: tuple[str, ...] = ("male", "female", "neutral")
 _KEYS = ("v_template", "f", "weights", "J_regressor", "kintree_table", "shapedirs", "posedirs")
+_MISNAMED = ("faces",)
+"""Asked for to say what they should be called."""
+_MESHES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf", ".fbx")
 _WANTED = "a body model, an .npz or an official .pkl file"
 
 
@@ -49,9 +52,11 @@ def load_body(
         raise BodyError(msg)
     if path.suffix.lower() not in (".npz", ".pkl"):
         msg = f"{path}: a body model must be an .npz or an official .pkl file, got {path.suffix!r}"
+        if path.suffix.lower() in _MESHES:
+            msg += ": a mesh or a scan has no joints and no shapes; fit SMPL to it and give SMPL's own file"
         raise BodyError(msg)
     read = read_npz if path.suffix.lower() == ".npz" else read_smpl_pickle
-    data = read(path, keys=_KEYS, error=BodyError, wanted=_WANTED)
+    data = read(path, keys=_KEYS + _MISNAMED, error=BodyError, wanted=_WANTED)
     return SmplBody(BodyArrays.from_mapping(data, source=str(path)), name=path.stem, device=device, dtype=dtype)
 
 

@@ -71,6 +71,10 @@ class BodyArrays:
         missing = sorted({"v_template", "f", "weights", "J_regressor", "kintree_table", "shapedirs"} - set(data))
         if missing:
             msg = f"{source}: not an SMPL-layout model, it lacks {', '.join(missing)}"
+            if missing == ["f"] and "faces" in data:
+                msg += ": SMPL's files call their faces f"
+            elif "weights" in missing and "shapedirs" in missing:
+                msg += ": a mesh or a scan has no joints and no shapes; fit SMPL to it and give SMPL's own file"
             raise BodyError(msg)
 
         def numbers(key: str) -> NDArray[np.float64]:
@@ -124,6 +128,8 @@ class BodyArrays:
                 raise BodyError(msg)
         if arrays.faces.min(initial=0) < 0 or arrays.faces.max(initial=0) >= n:
             msg = f"{source}: faces must index {n} vertices, got {arrays.faces.min()} to {arrays.faces.max()}"
+            if (arrays.faces.min(), arrays.faces.max()) == (1, n):
+                msg += ": they count from 1, wanted from 0; subtract 1"
             raise BodyError(msg)
         if np.abs(arrays.weights.sum(1) - 1).max() > 1e-3 or arrays.weights.min() < -1e-3:
             msg = f"{source}: the skinning weights of a vertex must sum to one, and none be negative"

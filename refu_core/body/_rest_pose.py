@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from refu_core.body._kinematics import JOINT_NAMES
 from refu_core.body._segments import SOFTNESS, segment_of_face, shares
@@ -31,6 +32,9 @@ _AT_LIMB = 0.08
 _FARTHEST = 1 / 3
 """How far a unit of shape, or of a pose's features, moves a vertex at most [of the body's height]: none does it by a
 tenth."""
+_OFF, _LONG = 1 / 3, 1 / 8
+"""How far skin is from the nearest joint at most, and how long an edge is [from the ankles to the neck]. Of the
+built-in bodies 0.17 and 0.03; what is farther off is a vertex that flew away."""
 _AXES = ("x", "y", "z")
 _WANTED = "wanted metres, y up, facing +z, the subject's left at +x, in the T-pose"
 
@@ -43,7 +47,8 @@ def require_rest_pose(body: SmplBody, *, closed: bool = True) -> None:
             are elsewhere.
     """
     joints = body.arrays.joint_regressor @ body.arrays.v_template
-    fault = _fault(body.arrays.v_template, joints) or _misled(body.arrays, joints) or _lacking(body.arrays)
+    fault = _fault(body.arrays.v_template, joints) or _misled(body.arrays, joints)
+    fault = fault or _lacking(body.arrays) or _loose(body.arrays, joints)
     if not fault:
         try:
             mesh = Connectivity.of(body.faces.cpu().numpy(), body.n_vertices)
@@ -62,6 +67,28 @@ def require_rest_pose(body: SmplBody, *, closed: bool = True) -> None:
     if fault:
         msg = f"body {body.name}: {fault}"
         raise BodyError(msg)
+
+
+def _loose(arrays: BodyArrays, joints: NDArray[np.float64]) -> str:
+    """Whether a vertex is where no skin can be; empty if none is."""
+    v = arrays.v_template
+    tall = float(np.linalg.norm(_upward(joints)))
+    off = np.asarray(cKDTree(joints).query(v)[0])
+    if off.max() > _OFF * tall:
+        return f"vertex {off.argmax()} of v_template is {off.max():.2f} m from every joint: put it where it belongs"
+    edges = np.concatenate((arrays.faces[:, :2], arrays.faces[:, 1:], arrays.faces[:, ::2]))
+    length = np.linalg.norm(v[edges[:, 0]] - v[edges[:, 1]], axis=1)
+    if length.max() > _LONG * tall:
+        a, b = edges[length.argmax()]
+        return f"the edge between its vertices {a} and {b} is {length.max():.2f} m long: one of them is out of place"
+    return ""
+
+
+def _upward(joints: NDArray[np.float64]) -> NDArray[np.float64]:
+    """From between the ankles to the neck [m], shape (3,)."""
+    ankles = joints[[JOINT_NAMES.index("left_ankle"), JOINT_NAMES.index("right_ankle")]]
+    found: NDArray[np.float64] = joints[JOINT_NAMES.index("neck")] - ankles.mean(0)
+    return found
 
 
 def _misled(arrays: BodyArrays, joints: NDArray[np.float64]) -> str:
@@ -96,7 +123,7 @@ def _lacking(arrays: BodyArrays) -> str:
 def _fault(vertices: NDArray[np.float64], joints: NDArray[np.float64]) -> str:
     """What is wrong with the places of vertices (V, 3) and joints (24, 3); empty if nothing is."""
     at = dict(zip(JOINT_NAMES, joints, strict=True))
-    up = at["neck"] - (at["left_ankle"] + at["right_ankle"]) / 2
+    up = _upward(joints)
     tall = float(np.linalg.norm(up))
     if not _TALL[0] <= tall <= _TALL[1]:
         unit = min(_UNITS, key=lambda name: abs(np.log(max(tall, 1e-9) / _UNITS[name] / 1.4)))

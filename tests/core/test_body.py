@@ -292,6 +292,9 @@ def save(path: Path, **changes: object) -> Path:
     ("changes", "wanted"),
     [
         ({"weights": None, "f": None}, "lacks f, weights"),
+        ({"f": None, "faces": np.zeros((9, 3), int)}, "lacks f: SMPL's files call their faces f"),
+        ({"weights": None, "shapedirs": None}, "a mesh or a scan has no joints and no shapes; fit SMPL to it"),
+        ({"f": np.arange(1, 61).reshape(-1, 3)}, "got 1 to 60: they count from 1, wanted from 0"),
         ({"v_template": np.zeros((60, 2))}, r"v_template must have the shape"),
         ({"v_template": np.zeros(60)}, r"v_template must have the shape"),
         ({"v_template": np.full((60, 3), np.nan)}, "NaN or infinite"),
@@ -323,7 +326,7 @@ def test_files_that_are_no_models(tmp_path: Path) -> None:
     with pytest.raises(BodyError, match="wanted one of male, female, neutral"):
         load_body("mail")
     (tmp_path / "model.obj").write_text("v 0 0 0\n")
-    with pytest.raises(BodyError, match=r"must be an .npz or an official .pkl file, got '.obj'"):
+    with pytest.raises(BodyError, match=r"must be an .npz or an official .pkl file, got '.obj': a mesh or a scan"):
         load_body(tmp_path / "model.obj")
     for suffix in ("npz", "pkl"):
         for content in (b"", b"garbage", b"PK\x03\x04garbage", pickle.dumps([1, 2])):

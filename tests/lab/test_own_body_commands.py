@@ -140,8 +140,14 @@ def test_info_says_how_garments_will_fit(body: Path, tmp_path: Path, capsys: pyt
         known = dict(arrays)
     np.savez(tmp_path / "holes.npz", **{**known, "f": known["f"][50:]})
     out = run(capsys, "info", "--body", tmp_path / "holes.npz")
-    assert "watertight  no" in out
+    assert "watertight  no\n" in out
     assert "can be worn  no" in out
+    assert out.count("open edges") == 1
+    small = {key: 0.5 * known[key] for key in ("v_template", "shapedirs", "posedirs")}
+    np.savez(tmp_path / "child.npz", **{**known, **small})
+    out = run(capsys, "info", "--body", tmp_path / "child.npz")
+    assert "warnings  child is 0.8" in out
+    assert "they stand off it, or are tight" in out
 
 
 def test_out_body_and_garments_are_at_one_place_with_transl(body: Path) -> None:
