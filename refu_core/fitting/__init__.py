@@ -4,6 +4,7 @@ from refu_core.fitting._fit import CLEARANCE as CLEARANCE
 from refu_core.fitting._fit import FittedGarment as FittedGarment
 from refu_core.fitting._fit import GarmentDetails as GarmentDetails
 from refu_core.fitting._fit import fit_garment as fit_garment
+from refu_core.fitting._fit import stretch as stretch
 from refu_core.fitting._mesh_file import SurfaceMesh as SurfaceMesh
 from refu_core.fitting._mesh_file import read_surface as read_surface
 from refu_core.fitting._place import UNITS as UNITS

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -39,6 +40,9 @@ _DEEP, _MOST_DEEP = 0.03, 0.04
 _FARTHEST, _MOST_FAR = 0.06, 0.003
 """No more than such a share of the vertices has to move so far [m] to be outside of the body: else a limb went through
 the cloth. The few are between toes or fingers, where there is no room for it."""
+_STRETCHED, _MOST_STRETCHED = 2.0, 0.02
+"""Cloth that is brought into the T-pose has no more than such a share of edges that become so many times as long: of
+sleeves in an A-pose, those under the arms."""
 _FELT = 0.02
 """A joint is felt where it has this share at some vertex."""
 _SHOULDERS = tuple(
@@ -71,6 +75,8 @@ class FittedGarment:
     template: GarmentTemplate
     notes: list[str] = field(default_factory=list)
     """What was found out about the mesh, and changed in it, a sentence each."""
+    warnings: list[str] = field(default_factory=list)
+    """Why it may not be worn as it was meant, a sentence each; empty where nothing says so."""
 
 
 def fit_garment(
@@ -114,21 +120,20 @@ def fit_garment(
         raise GarmentError(msg)
     _require_worn(cleaned)
     faults: list[GarmentError] = []
-    makeshifts: list[tuple[SurfaceMesh, list[str]]] = []
+    makeshift: _Worn | None = None
     for place in find_places(cleaned, body, replace(placing or Placing(), held_at=details.held_at)):
         try:
-            mesh, found, moved = _put_on(cleaned, place, body, longest_edge)
+            worn = _put_on(cleaned, place, body, longest_edge)
         except GarmentError as error:  # a limb goes through it there: is there another place?
             faults.append(error)
             continue
-        if moved <= _FARTHEST:
-            return _bound(mesh, body, name, details, notes + found)
-        doubt = f"it reached {1e3 * moved:.0f} mm into the body: does it lie as it is worn? --up or --pose may help"
-        makeshifts.append((mesh, [*found, doubt]))
-    if not makeshifts:
+        if worn.moved <= _FARTHEST:
+            return _bound(worn, body, name, details, notes)
+        if not faults and makeshift is None:  # what can't be where it belongs is no better off elsewhere
+            makeshift = worn
+    if makeshift is None:
         raise faults[0]  # there is a place, or `find_places` has said that there is none
-    mesh, found = makeshifts[0]
-    return _bound(mesh, body, name, details, notes + found)
+    return _bound(makeshift, body, name, details, notes)
 
 
 def _require_worn(mesh: SurfaceMesh) -> None:
@@ -145,16 +150,21 @@ def _require_worn(mesh: SurfaceMesh) -> None:
         raise GarmentError(msg)
 
 
-def _put_on(
-    mesh: SurfaceMesh, place: Place, body: SmplBody, longest_edge: float
-) -> tuple[SurfaceMesh, list[str], float]:
-    """The mesh on the body in the T-pose, what was done to it, and how far vertices had to move to be outside [m].
+class _Worn(NamedTuple):
+    """A mesh on the body in the T-pose, what was done to it, and what there is to warn of."""
 
-    Raises `GarmentError` where it can't be there.
-    """
+    mesh: SurfaceMesh
+    notes: list[str]
+    warnings: list[str]
+    moved: float
+    """How far vertices had to move to be outside of the body [m]."""
+
+
+def _put_on(mesh: SurfaceMesh, place: Place, body: SmplBody, longest_edge: float) -> _Worn:
+    """The mesh on the body at some place; raises `GarmentError` where it can't be there."""
     posed = PosedBody(body, place.pose)
     mesh, bodies = without_bodies(replace(mesh, vertices=place(mesh.vertices)), posed)
-    notes = [*place.notes, *bodies, *apart(mesh), *unsewn(mesh)]
+    notes, warnings = [*place.notes, *bodies, *apart(mesh), *unsewn(mesh)], []
     n = len(mesh.vertices)
     mesh = split_long_edges(mesh, longest_edge)
     if len(mesh.vertices) > n:
@@ -162,14 +172,32 @@ def _put_on(
         notes.append(f"edges longer than {1e3 * longest_edge:.0f} mm were split: {added} vertices were added to {n}")
     mesh = _outward(mesh, posed)
     if place.pose.any():
-        mesh = replace(mesh, vertices=_unposed(mesh, posed))
+        unposed = _unposed(mesh, posed)
+        long = float((stretch(mesh.faces, mesh.vertices, unposed) > _STRETCHED).mean())
+        if long > _MOST_STRETCHED:
+            what = f"stretched {100 * long:.0f} % of its edges to more than {_STRETCHED:g} times their length"
+            warnings.append(f"bringing it into the T-pose {what}: was it modelled in that pose? --pose says in which")
+        mesh = replace(mesh, vertices=unposed)
         posed = PosedBody(body, np.zeros((N_JOINTS, 3)))
     cleared = _cleared(mesh, posed, notes)
-    return replace(mesh, vertices=cleared), notes, float(np.linalg.norm(cleared - mesh.vertices, axis=1).max())
+    moved = float(np.linalg.norm(cleared - mesh.vertices, axis=1).max())
+    if moved > _FARTHEST:
+        doubt = "does it lie as it is worn? --unit, --up or --pose may help"
+        warnings.append(f"it reached {1e3 * moved:.0f} mm into the body: {doubt}")
+    return _Worn(replace(mesh, vertices=cleared), notes, warnings, moved)
 
 
-def _bound(mesh: SurfaceMesh, body: SmplBody, name: str, details: GarmentDetails, notes: list[str]) -> FittedGarment:
+def stretch(faces: Ints, before: F64, after: F64) -> F64:
+    """How many times as long each edge is as it was, shape (E,)."""
+    a, b = Connectivity.of(faces, len(before)).edges.T
+    was, now = (np.linalg.norm(v[a] - v[b], axis=1) for v in (before, after))
+    found: F64 = now / np.maximum(was, 1e-9)
+    return found
+
+
+def _bound(worn: _Worn, body: SmplBody, name: str, details: GarmentDetails, notes: list[str]) -> FittedGarment:
     """The garment of a mesh that is on the body: what it follows, and what is known of it."""
+    mesh, notes = worn.mesh, notes + worn.notes
     vertices, posed = mesh.vertices, PosedBody(body, np.zeros((N_JOINTS, 3)))
     transfer = Transfer.of(vertices, mesh.faces, posed)
     weights = _few(transfer(body.weights.double().numpy(), length=_SKIN_LENGTH))
@@ -198,7 +226,7 @@ def _bound(mesh: SurfaceMesh, body: SmplBody, name: str, details: GarmentDetails
         styledirs=None,
         uv=mesh.uv,
     )
-    return FittedGarment(template, notes)
+    return FittedGarment(template, notes, worn.warnings)
 
 
 def _shapedirs(body: SmplBody) -> F64:

@@ -156,7 +156,7 @@ def _corner(word: str, n_vertices: int, n_coordinates: int) -> tuple[int, int]:
 
 
 def _triangles(polygons: list[list[tuple[int, int]]], points: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Polygons as triangles in their order, (T, 3, 2): quads are cut along the shorter diagonal, others by their ears."""
+    """Polygons as triangles, in order, (T, 3, 2): quads are cut along the shorter diagonal, others by their ears."""
     sizes = np.array([len(polygon) for polygon in polygons], dtype=np.int64)
     if len(sizes) and sizes.max() > _MAX_CORNERS:
         msg = f"a polygon of {sizes.max()} corners, at most {_MAX_CORNERS} are read: triangulate it"

@@ -17,7 +17,7 @@ from refu_core.errors import GarmentError
 from refu_core.fitting._clean import face_normals, rim_of
 from refu_core.fitting._mesh_file import SurfaceMesh
 from refu_core.fitting._posed import LEFT_HIP, LEFT_SHOULDER, RIGHT_SHOULDER, PosedBody, standing_pose
-from refu_core.fitting._surround import Fit, Samples, fit_of, sample
+from refu_core.fitting._surround import NEAR, Fit, Samples, fit_of, parts_legs, sample
 from refu_core.frames import N_JOINTS
 
 F64 = NDArray[np.float64]
@@ -34,13 +34,16 @@ _N_POINTS = 400
 _TOLERANCE = 0.015
 """A mesh is taken as it is unless something else fits this much better, as a share of its size."""
 _UNIT_TOLERANCE = 0.005
-"""What had to be moved is of a known unit, if it fits, unless another size fits this much better, likewise."""
+"""What had to be moved is worn in no other size that fits less than this better, likewise."""
+_MISFIT = 2.0
+"""In a known unit it is believed, if it fits, unless another size fits this many times as well: whatever is loose would
+fit better if it were smaller."""
 _POSE_TOLERANCE = 0.002
 """It is taken to be in the T-pose unless another pose fits this much better, likewise."""
 _TRIED_SIZES = (0.25, 0.4, 0.6, 0.85, 1.2, 1.7)
 """Largest extents that a mesh of no known unit is tried with [m]."""
 _NOTHING = 0.01
-"""What fits has less than this share of it inside the body; like a glove, if it is less than 6 cm off, too."""
+"""What fits has less than this share of it inside the body."""
 _N_REFINED = 2
 _ASKEW = np.radians(10)
 """A garment's breadth lies along an axis as nearly as that, or it stands askew."""
@@ -138,7 +141,7 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
         size = f"{extent:.3g} units" + (f" = {placing.unit * extent:.3g} m" if placing.unit else "")
         msg = f"the mesh is {size} large: wanted a garment of {_SIZES[0]} to {_SIZES[1]} m; say its unit (--unit)"
         raise GarmentError(msg)
-    search = _Search(mesh, body, placing, extent)
+    search = _Search(mesh, body, placing, units)
     poses = [placing.pose] if placing.pose is not None else [standing_pose(arms) for arms in _ARMS]
     bodies = [PosedBody(body, pose) for pose in poses]
     turns = _turns(placing.up, mesh, is_placed=placing.is_placed)
@@ -157,33 +160,43 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
             refined = [search.refined(one, moves=False, scales=False) for one in likes[:2]]
             other = min(refined, key=lambda one: one.cost(extent))
             if other.cost(extent) < chosen.cost(extent) - _POSE_TOLERANCE or chosen.pose.any():
-                chosen = other
+                yield _told(other)  # and if a limb goes through it there:
         yield _told(chosen)
     found.sort(key=lambda one: (not one.fit.is_good, one.cost(extent)))
     tiers = found[:1]
     for one in tiers:
-        if one.fit.is_good and max(one.fit.inside, one.fit.distance / 6) < _NOTHING and not one.is_sideways:
+        if one.fit.is_good and one.fit.inside < _NOTHING and one.fit.distance < NEAR and not one.is_sideways:
             yield _told(one)  # of gloves much faces other fingers
     for tried in [None] if placing.unit else [None, [size / extent for size in _TRIED_SIZES]]:
         if not placing.is_placed:
             tiers += search.along(bodies, turns, tried or units, scales=tried is not None)
     # What was modelled by convention, or else in a known unit, unless it fits much worse.
+    has_unit = abs(np.log2(extent) - round(np.log2(extent))) > _OF_NO_UNIT
+    least = min((one.cost(extent) for one in tiers if one.fit.is_good and search.knows(one)), default=math.inf)
+    if has_unit:
+        tiers = [one for one in tiers if search.knows(one) or _MISFIT * one.cost(extent) < least]
     handicap = [
-        (k > 0) * _TOLERANCE + (k > 1 or one.fit.inside > _NOTHING) * _UNIT_TOLERANCE for k, one in enumerate(tiers)
+        (k > 0) * _TOLERANCE + (not search.knows(one) or one.fit.inside > _NOTHING) * _UNIT_TOLERANCE
+        for k, one in enumerate(tiers)
     ]
     ranked = sorted(range(len(tiers)), key=lambda k: tiers[k].cost(extent) + handicap[k])
     order = [tiers[k] for k in ranked if tiers[k].fit.is_good]
     tight = [one for one in found if one.fit.is_tight and not one.fit.is_good and not one.is_sideways]
-    if tight and not good and abs(np.log2(extent) - round(np.log2(extent))) > _OF_NO_UNIT:
+    if tight and not good and has_unit:
         # A sleeve that no arm is in costs less and faces the wrong way.
         best = min(tight, key=lambda one: one.cost(extent) + 4 * (1 - one.fit.facing))
         # Who models in metres and close to the skin means no garment that is a sixth larger, and none that lies.
-        known = [one for one in order if np.isclose(one.unit, units).any()]
-        first_of_all = [one for one in known if np.array_equal(one.turn, best.turn)]
-        order = [*first_of_all, best, *(one for one in order if one not in known)]
+        first = [one for one in order if search.knows(one) and np.array_equal(one.turn, best.turn)]
+        order = [*first, best, *(one for one in order if one not in first)]
     for one in order:
         yield _told(one)
-    if good or order or any(one.fit.is_good for one in tiers):
+    lying = [] if placing.up or placing.is_placed else search.along(bodies, _LYING, units, scales=False)
+    least = min((one.cost(extent) for one in (*good, *order)), default=math.inf)
+    # Nobody wears it on a hand, or upside down, that could wear it upright.
+    lying = [one for one in lying if one.fit.is_plain and _MISFIT * one.cost(extent) < least]
+    for one in lying:
+        yield _told(one)
+    if good or order or lying or any(one.fit.is_good for one in tiers):
         return
     fit = min((one.fit for one in tiers), key=lambda fit: fit.cost)
     msg = (
@@ -199,12 +212,17 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
 class _Search:
     """Looks for places of a mesh that isn't where it belongs."""
 
-    def __init__(self, mesh: SurfaceMesh, body: SmplBody, placing: Placing, extent: float) -> None:
-        self._mesh, self._body, self._placing, self._extent = mesh, body, placing, extent
+    def __init__(self, mesh: SurfaceMesh, body: SmplBody, placing: Placing, units: list[float]) -> None:
+        self._mesh, self._body, self._placing, self._units = mesh, body, placing, units
+        self._extent = float(np.ptp(mesh.vertices, axis=0).max())
         self.samples = sample(mesh, _N_POINTS)
         under_arms = float(body.joint_template[[LEFT_SHOULDER, RIGHT_SHOULDER], 1].mean()) - _UNDER_ARMS
         self.highest = under_arms if placing.held_at == "waist" else math.inf
         """What is higher reaches up between the arms [m]."""
+
+    def knows(self, place: Place) -> bool:
+        """Whether its unit is one that the mesh may be in."""
+        return bool(np.isclose(place.unit, self._units).any())
 
     def along(self, bodies: list[PosedBody], turns: list[F64], units: list[float], *, scales: bool) -> list[Place]:
         """The best of all heights along the body, moved on from there; none of no heights."""
@@ -226,8 +244,9 @@ class _Search:
         """The best place near one, by a simplex over pose, and place and size if wanted."""
         body, samples, turn = PosedBody(self._body, start.pose), self.samples, start.turn
         is_posed = self._placing.pose is not None
-        x0 = np.array([0.0, 0.0, 0.0, 0.0, float(start.pose[RIGHT_SHOULDER, 2]), 0.02])
-        steps = np.array([0.06 * scales, *(0.03 * moves,) * 3, *((0, 0) if is_posed else (0.1, 0.06))])
+        has_legs = parts_legs(start(self._mesh.vertices), self._mesh.faces, self._body)
+        x0 = np.array([0.0, 0.0, 0.0, 0.0, float(start.pose[RIGHT_SHOULDER, 2]), 0.02 * has_legs])
+        steps = np.array([0.06 * scales, *(0.03 * moves,) * 3, *((0, 0) if is_posed else (0.1, 0.06 * has_legs))])
         free = np.flatnonzero(steps)
         middle = samples.points.mean(0) @ turn.T
         floor = float(body.vertices[:, 1].min())
@@ -279,6 +298,19 @@ def _about_y(angle: float) -> F64:
     return np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
 
 
+_LYING = [
+    _about_y(quarters * np.pi / 2) @ np.array(base, np.float64)
+    for quarters in (0, 2, 1, -1)
+    for base in (
+        [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
+        [[0, 1, 0], [-1, 0, 0], [0, 0, 1]],
+        [[-1, 0, 0], [0, -1, 0], [0, 0, 1]],
+        [[-1, 0, 0], [0, 0, -1], [0, -1, 0]],
+    )
+]
+"""Rotations that may bring a mesh upright that lies on its side, x up or down, or stands on its head."""
+
+
 def _skew(mesh: SurfaceMesh, base: F64) -> float:
     """By how much a mesh that is turned upright by `base` is askew [rad]: people are broader than deep.
 
@@ -325,7 +357,8 @@ def _told(place: Place) -> Place:
         notes.append(f"lengths are {name}" if name else f"scaled by {place.unit:.4g}, which is no unit")
     turn = place.turn
     if not np.allclose(turn, np.eye(3)):
-        up = "y" if np.isclose(turn[1, 1], 1) else "z"
+        k = int(np.abs(turn[1]).argmax())
+        up = f"{'-' if turn[1, k] < 0 else ''}{'xyz'[k]}"
         front = turn.T @ [0.0, 0.0, 1.0]
         axis = int(np.abs(front).argmax())
         askew = np.degrees(np.arccos(min(1.0, abs(front[axis]))))

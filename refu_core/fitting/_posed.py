@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from refu_core.body import JOINT_NAMES, SmplBody
 from refu_core.frames import N_JOINTS
+from refu_core.mesh import vertex_areas
 from refu_core.sdf import ExactSdf
 
 F64 = NDArray[np.float64]
@@ -22,6 +23,8 @@ class PosedBody:
     def __init__(self, body: SmplBody, pose: F64) -> None:
         self.body = body
         self._sdf = ExactSdf(body.faces)
+        self.skin = vertex_areas(body.arrays.v_template, body.arrays.faces)
+        """Area of each vertex at rest [m²], shape (V,)."""
         self.move(pose)
 
     def move(self, pose: F64) -> None:

@@ -2,21 +2,31 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from refu_core.body import SmplBody
 from refu_core.fitting._clean import components, face_normals, rim_of
 from refu_core.fitting._mesh_file import SurfaceMesh
 from refu_core.fitting._posed import PosedBody
 
 F64 = NDArray[np.float64]
 
-_WIDE = 0.1
-"""What is worn far off the skin has this share of it within: a gown .45, a poncho .19, a cape .13, a sock .08."""
-_N_SKIN = 150
+NEAR = 0.06
+"""What is less far off on average lies on the skin, like a glove [m]; what is worn farther off is wide."""
+_WIDE = 0.2
+"""What is wide has skin of this share of its own area within: a crinoline .25, a cape .34, a gown .45, a shirt on the
+hand it hangs on .19."""
+_FACES, _WIDE_FACES, _PLAINLY_FACES = 0.85, 0.9, 0.93
+"""Share that faces outward: of a glove, between whose fingers much doesn't; of what is wide, by chance 0.89; of what
+leaves no doubt."""
+_N_SKIN = 600
 """Vertices of the skin that are asked for that."""
+_DOWN = np.array([0.3, 0.6, 0.9])
+"""Where thighs and shins are asked whether cloth is between them, from one joint to the next."""
 _ACROSS = 0.5
 """Cosine of an angle to the way off the skin from which on cloth lies across it."""
 
@@ -33,7 +43,7 @@ class Fit(NamedTuple):
     facing: float
     """Share of it that faces away from the body; half of what stands beside it does not."""
     around: float
-    """Share of the skin that it surrounds; none where it stands beside the body."""
+    """Area of the skin that it surrounds, as a share of its own; none where it stands beside the body."""
 
     @property
     def cost(self) -> float:
@@ -44,10 +54,13 @@ class Fit(NamedTuple):
     def is_good(self) -> bool:
         """Whether it may be worn like that. Garments that were made for a body have 0.00–0.05, < 0.08 and > 0.93.
 
-        A gown or a poncho is far off, but has much of the body in it.
+        A gown or a poncho is far off, but has much of the body in it: a shirt that hangs on a hand has not.
         """
-        is_on = self.around > (0 if self.distance < 0.16 else _WIDE)
-        return self.inside < 0.05 and is_on and self.facing > 0.85
+        if self.distance < NEAR:
+            is_on = self.around > 0 and self.facing > _FACES
+        else:
+            is_on = self.around > _WIDE and self.facing > _WIDE_FACES
+        return self.inside < 0.05 and is_on
 
     @property
     def is_tight(self) -> bool:
@@ -57,7 +70,7 @@ class Fit(NamedTuple):
     @property
     def is_plain(self) -> bool:
         """Whether nothing else need be tried."""
-        return self.is_good and self.facing > 0.93
+        return self.is_good and self.facing > _PLAINLY_FACES
 
 
 class Samples(NamedTuple):
@@ -113,14 +126,38 @@ def fit_of(points: F64, samples: Samples, body: PosedBody) -> Fit:
 
 
 def _around(points: F64, samples: Samples, is_outer: NDArray[np.bool_], body: PosedBody) -> float:
-    """Share of the skin whose winding number about the samples is above 0.4, each of the latter a piece of surface.
+    """Area of the skin whose winding number about the samples is above 0.4, as a share of theirs.
 
     Of a piece with two sides the inner one isn't counted: the two would cancel.
     """
     counts = samples.is_open | is_outer
-    places, normals = points[counts], samples.normals[counts]
-    skin = body.vertices.double().numpy()[:: max(1, len(body.vertices) // _N_SKIN)]
-    way = places[None] - skin[:, None]
-    cubed = np.maximum(np.linalg.norm(way, axis=2), 1e-3) ** 3
-    winding = (np.einsum("skc,kc->sk", way, normals) / cubed) @ samples.area[counts] / (4 * np.pi)
-    return float((np.abs(winding) > 0.4).mean())
+    places, normals, area = points[counts], samples.normals[counts], samples.area[counts]
+    each = max(1, len(body.vertices) // _N_SKIN)
+    skin = body.vertices.double().numpy()[::each]
+    # For each vertex and sample: the way from one to the other along the normal, and its length, squared.
+    along = (places * normals).sum(1) - skin @ normals.T
+    squared = (places**2).sum(1) + (skin**2).sum(1)[:, None] - 2 * skin @ places.T
+    winding = (along / np.maximum(squared, 1e-6) ** 1.5) @ area / (4 * np.pi)
+    return float(each * body.skin[::each][np.abs(winding) > 0.4].sum() / area.sum())
+
+
+def parts_legs(vertices: F64, faces: NDArray[np.int64], body: SmplBody) -> bool:
+    """Whether cloth of vertices (V, 3) [m] goes through between the legs of a body: a skirt says nothing of them."""
+    joints = body.joint_template.double().numpy()
+    left, right = (
+        np.concatenate([joints[a] + _DOWN[:, None] * (joints[b] - joints[a]) for a, b in pairwise(leg)])
+        for leg in ([1, 4, 7], [2, 5, 8])
+    )
+    corner, u, v = vertices[faces[:, 0]], vertices[faces[:, 1]], vertices[faces[:, 2]]
+    u, v = u - corner, v - corner
+    normal = np.cross(u, v)
+    for start, way in zip(left, right - left, strict=True):
+        # Möller and Trumbore 1997: where the way from leg to leg meets each triangle's plane, and whether in it.
+        steep = -(normal @ way)
+        steep = np.where(np.abs(steep) < 1e-15, np.inf, steep)
+        off = start - corner
+        along = np.cross(off, way)
+        t, a, b = (off * normal).sum(1) / steep, (v * along).sum(1) / steep, -(u * along).sum(1) / steep
+        if ((a >= 0) & (b >= 0) & (a + b <= 1) & (t >= 0) & (t <= 1)).any():
+            return True
+    return False

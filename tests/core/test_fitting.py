@@ -351,7 +351,7 @@ def test_what_is_held_at_the_waist_is_no_poncho() -> None:
     made = fit_garment(
         mesh, load_body("female"), name="cone", placing=Placing(unit=1.0), details=GarmentDetails(held_at="waist")
     )
-    np.testing.assert_allclose(made.template.v_template.mean(0), (places - away).mean(0), atol=0.03)
+    np.testing.assert_allclose(made.template.v_template.mean(0), (places - away).mean(0), atol=0.06)
 
 
 def test_a_childs_shirt_is_made_larger_and_not_worn_round_the_ankles() -> None:

@@ -1,0 +1,96 @@
+"""Where garments belong that were modelled loosely, lying down, or upside down; and what is doubted."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from outside_meshes import Wanted, cloth
+from scipy.spatial.transform import Rotation
+
+from refu_core import GarmentError, load_body, load_garment
+from refu_core.body import apply_transforms, blend_transforms
+from refu_core.fitting import Placing, SurfaceMesh, fit_garment, standing_pose
+from refu_core.fitting._place import find_places
+from refu_core.fitting._surround import parts_legs
+
+SHIRT = Wanted(low=0.66, sleeve=0.6, step=0.028)
+F64 = NDArray[np.float64]
+
+
+def cone(low: tuple[float, float], high: tuple[float, float], *, rows: int = 40, n: int = 64) -> SurfaceMesh:
+    """An open cone round the body, facing outward, of radii at heights above a floor at 0 [m]."""
+    t, angle = np.linspace(0, 1, rows)[:, None], np.linspace(0, 2 * np.pi, n, endpoint=False)
+    radius, height = low[0] + (high[0] - low[0]) * t, low[1] + (high[1] - low[1]) * t
+    v = np.stack((radius * np.sin(angle), height + 0 * angle, 0.035 + 0.9 * radius * np.cos(angle)), -1).reshape(-1, 3)
+    a = np.arange(n * (rows - 1)).reshape(rows - 1, n)
+    b = np.roll(a, -1, axis=1)
+    return SurfaceMesh(v, np.concatenate([np.stack(f, -1).reshape(-1, 3) for f in ((a, b, b + n), (a, b + n, a + n))]))
+
+
+@pytest.mark.parametrize("turn", ["x 180", "z 90", "z -90"])
+def test_a_shirt_that_lies_or_stands_on_its_head_is_put_upright(turn: str) -> None:
+    """It was worn on one hand, like a bucket."""
+    v, f = cloth(SHIRT)
+    axis, angle = turn.split()
+    lies = Rotation.from_euler(axis, int(angle), degrees=True).apply(v)
+    made = fit_garment(SurfaceMesh(lies, f), load_body("neutral"), name="shirt", longest_edge=0.1)
+    assert made.warnings == []
+    assert any("x is up" in note or "-y is up" in note for note in made.notes)
+    worn = made.template.v_template.double().numpy()
+    sleeves = worn[np.abs(worn[:, 0]) > 0.3]
+    assert sleeves[:, 1].mean() - worn[:, 1].mean() > 0.15
+    assert worn[:, 1].mean() == pytest.approx(0.04, abs=0.06)
+
+
+def test_a_shirt_isnt_worn_on_a_hand() -> None:
+    v, f = cloth(SHIRT)
+    lies = Rotation.from_euler("z", 90, degrees=True).apply(v)
+    with pytest.raises(GarmentError, match="doesn't surround the body"):
+        fit_garment(SurfaceMesh(lies, f), load_body("neutral"), name="shirt", placing=Placing(unit=1.0, up="y"))
+
+
+@pytest.mark.parametrize("name", ["trousers-female", "short-pant-male", "skirt-female", "dress-female"])
+@pytest.mark.parametrize("legs", [0.0, 0.1, 0.3])
+def test_cloth_between_legs_is_seen_however_they_stand(name: str, legs: float) -> None:
+    garment = load_garment(name)
+    body = load_body(garment.body)
+    transforms = body(torch.as_tensor(standing_pose(0.0, legs), dtype=torch.float32)[None]).transforms
+    posed = apply_transforms(garment.v_template[None], blend_transforms(garment.weights, transforms))[0]
+    assert parts_legs(posed.double().numpy(), garment.faces.numpy(), body) == (
+        "skirt" not in name and "dress" not in name
+    )
+
+
+@pytest.mark.parametrize(("low", "high"), [((0.45, 0.02), (0.16, 1.0)), ((0.8, 0.02), (0.16, 1.0))])
+def test_a_wide_skirt_says_nothing_of_legs(low: tuple[float, float], high: tuple[float, float]) -> None:
+    """A cone was taken for one that was modelled round spread legs, and creased when they were put together."""
+    place = next(find_places(cone(low, high), load_body("neutral"), Placing()))
+    assert not place.pose[1:3].any()
+    assert (place.unit, place.kind) == (1.0, "floor")
+
+
+@pytest.mark.parametrize(("low", "high"), [((0.30, 0.3), (0.155, 1.0)), ((0.42, 0.85), (0.075, 1.43))])
+def test_what_is_loose_is_not_made_smaller(low: tuple[float, float], high: tuple[float, float]) -> None:
+    """A skirt and a poncho in metres, each with its origin in its middle, fit better if they are smaller."""
+    mesh = cone(low, high)
+    centred = SurfaceMesh(mesh.vertices - (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2, mesh.faces)
+    made = fit_garment(centred, load_body("neutral"), name="loose", longest_edge=0.1)
+    assert not any("scaled by" in note for note in made.notes)
+
+
+def test_what_cannot_be_where_it_belongs_is_worn_nowhere_else() -> None:
+    """A dress that is narrower than the chest was made a quarter larger, and the arms went through it."""
+    mesh = cone((0.18, 0.13), (0.15, 1.26), rows=60)
+    narrow = SurfaceMesh(mesh.vertices * [1, 1, 0.75 / 0.9], mesh.faces)
+    with pytest.raises(GarmentError, match="was made for another body or pose"):
+        fit_garment(narrow, load_body("neutral"), name="strapless", longest_edge=0.1)
+
+
+def test_cloth_that_is_torn_as_arms_are_lifted_is_doubted() -> None:
+    """A loose cone over arms that hang: what lies on them goes with them, and what is beside them doesn't."""
+    placing = Placing(unit=1.0, pose=standing_pose(1.2))
+    mesh = cone((0.42, 0.85), (0.085, 1.43))
+    made = fit_garment(mesh, load_body("neutral"), name="loose", placing=placing, longest_edge=0.1)
+    assert any("bringing it into the T-pose stretched" in text for text in made.warnings)
