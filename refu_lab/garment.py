@@ -20,6 +20,7 @@ from refu_core.fitting import (
     fit_garment,
     read_surface,
     standing_pose,
+    stretch,
 )
 from refu_core.frames import N_JOINTS
 from refu_core.garments import garment_files, garments_folder, require_name, save_garment
@@ -30,6 +31,11 @@ from refu_core.weights import weights_folder
 from refu_lab.commands.garment import AddOptions
 from refu_lab.render import Camera, RenderMesh, render, save_png
 from refu_lab.tables import format_table
+
+_MOST_CUT = 20
+"""As many triangles of a garment may cut the body in one pose without a warning: at an armhole's rim there are some."""
+_MOST_STRETCHED = 3.0
+"""How many times as long as at rest all but a thousandth of the edges are at most, before there is a warning."""
 
 
 def _name_of(mesh: Path) -> str:
@@ -94,6 +100,7 @@ def add_garment(options: AddOptions) -> dict[str, Any]:
         "joints": list(template.card.joints),
         "notes": made.notes,
         "worn": worn,
+        "warnings": [*made.warnings, *warnings_of(worn)],
     }
 
 
@@ -131,7 +138,7 @@ def _pose(text: str | None) -> NDArray[np.float64] | None:
 
 
 def try_on(made: FittedGarment) -> dict[str, dict[str, Any]]:
-    """What is left of collisions with the body in each of a few poses, worn by skinning."""
+    """What is left of collisions with the body, and how far it is stretched, in each of a few poses, by skinning."""
     pipeline = GarmentPipeline.load([made.template], backbone="skinned")
     checker = CollisionChecker(pipeline.body.faces.numpy())
     found = {}
@@ -140,7 +147,23 @@ def try_on(made: FittedGarment) -> dict[str, dict[str, Any]]:
         checker.update(output.body)
         mesh = output[made.template.name]
         left = checker.check(mesh.local, mesh.faces)
-        found[pose_name] = {"inside": left.n_inside, "pairs": left.n_pairs}
+        rest = made.template.v_template.double().numpy()
+        long = stretch(made.template.faces.numpy(), rest, mesh.local.astype(np.float64))
+        found[pose_name] = {
+            "inside": left.n_inside,
+            "pairs": left.n_pairs,
+            "stretch": float(np.quantile(long, 0.999)),
+        }
+    return found
+
+
+def warnings_of(worn: dict[str, dict[str, Any]]) -> list[str]:
+    """What there is to warn of where a garment was tried on."""
+    found = []
+    if (most := max(left["pairs"] for left in worn.values())) > _MOST_CUT:
+        found.append(f"{most} of its triangles cut the body: look at it (--picture) before you use it")
+    if (most := max(left["stretch"] for left in worn.values())) > _MOST_STRETCHED:
+        found.append(f"it is torn to {most:.1f} times its length in places: look at it (--picture) before you use it")
     return found
 
 
@@ -196,4 +219,5 @@ def added_text(result: dict[str, Any]) -> str:
     for pose, left in result["worn"].items():
         lines.append(f"  worn in the pose {pose}: {left['inside']} vertices inside, {left['pairs']} triangles cut it")
     lines.append(f"wrote {result['file']}")
+    lines += [f"warning: {text}" for text in result["warnings"]]
     return "\n".join(lines)

@@ -21,7 +21,7 @@ from refu_core.training import PretrainSettings, pretrain
 from refu_lab.cli import main
 from refu_lab.commands.garment import AddOptions
 from refu_lab.export import ExportMesh, meshes_of, write_meshes
-from refu_lab.garment import add_garment, list_garments
+from refu_lab.garment import add_garment, list_garments, warnings_of
 from refu_ros._settings import NodeSettings
 
 ROOT = Path(__file__).parents[2]
@@ -93,6 +93,34 @@ def test_a_garment_is_added_listed_and_worn_by_name(folder: Path, kilt: Path, tm
     assert "is there already" in capsys.readouterr().err
     (folder / "torn.npz").write_bytes(b"no garment")
     assert [row["garment"] for row in list_garments() if "fault" in row] == ["torn"]
+    assert main(["info"]) == 0
+    assert "torn: can't be loaded: " in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("folder")
+def test_what_is_worn_badly_is_said_last(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A loose cone over arms that hang: it is worn, and the last lines say that it is torn as they are lifted."""
+    rows, n = 40, 64
+    t, angle = np.linspace(0, 1, rows)[:, None], 2 * np.pi * np.arange(n) / n
+    radius = 0.42 - 0.335 * t
+    v = np.stack((radius * np.sin(angle), 0.85 + 0.58 * t + 0 * angle, 0.03 + radius * np.cos(angle)), -1).reshape(
+        -1, 3
+    )
+    a = np.arange(n * (rows - 1)).reshape(rows - 1, n)
+    quads = np.stack((a, np.roll(a, -1, 1), np.roll(a, -1, 1) + n, a + n), -1).reshape(-1, 4)
+    path = write_obj(tmp_path / "loose.obj", Outside(v, quads.tolist()))
+    arguments = ["--unit", "m", "--pose", "69", "--longest-edge", "0.1", "--json", str(tmp_path / "told.json")]
+    assert main(["garment", "add", str(path), *arguments]) == 0
+    warnings = json.loads((tmp_path / "told.json").read_text())["warnings"]
+    assert "bringing it into the T-pose stretched" in warnings[0]
+    told = capsys.readouterr().out.splitlines()
+    assert told[-len(warnings) :] == [f"warning: {text}" for text in warnings]
+
+
+@pytest.mark.parametrize(("pairs", "long", "n"), [(20, 3.0, 0), (21, 1.0, 1), (0, 3.1, 1), (300, 9.0, 2)])
+def test_what_cuts_the_body_and_what_is_torn_is_warned_of(pairs: int, long: float, n: int) -> None:
+    good = {"inside": 0, "pairs": 0, "stretch": 1.0}
+    assert len(warnings_of({"stand": good, "walk": {"inside": 0, "pairs": pairs, "stretch": long}})) == n
 
 
 @pytest.mark.parametrize(
