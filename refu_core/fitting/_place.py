@@ -125,6 +125,8 @@ class Place:
 NO_OPENING = ". It has no opening: if faces close its neck, sleeves, legs or hem, delete those"
 _UNDER_ARMS = 0.1
 """How far below the joints of the shoulders a garment that is held at the waist ends [m]."""
+_HAT = 0.3
+"""How far above the body cloth reaches at most [m]: a tube that stood on the head was taken for wide."""
 
 
 def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator[Place]:
@@ -146,11 +148,11 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
     bodies = [PosedBody(body, pose) for pose in poses]
     turns = _turns(placing.up, mesh, is_placed=placing.is_placed)
     found = [
-        _at(search.samples, unit, turn, shift, here, kind)
+        one
         for here, turn, unit in itertools.product(bodies, turns, units)
         for kind, shift in _shifts(here, is_placed=placing.is_placed)
+        if not search.too_high(one := _at(search.samples, unit, turn, shift, here, kind), here)
     ]
-    found = [one for one in found if one.top <= search.highest]
     good = [one for one in found if one.fit.is_plain]
     if good:
         least = min(one.cost(extent) for one in good)
@@ -198,6 +200,9 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
         yield _told(one)
     if good or order or lying or any(one.fit.is_good for one in tiers):
         return
+    if not tiers:
+        msg = "it reaches higher than it can: between the arms, where it is held at the waist, or far above the head; "
+        raise GarmentError(msg + "say its --unit or --up, or place it on the body first")
     fit = min((one.fit for one in tiers), key=lambda fit: fit.cost)
     msg = (
         f"the mesh doesn't surround the body {body.name}: where it fits best, {100 * fit.inside:.0f} % of it is "
@@ -217,8 +222,11 @@ class _Search:
         self._extent = float(np.ptp(mesh.vertices, axis=0).max())
         self.samples = sample(mesh, _N_POINTS)
         under_arms = float(body.joint_template[[LEFT_SHOULDER, RIGHT_SHOULDER], 1].mean()) - _UNDER_ARMS
-        self.highest = under_arms if placing.held_at == "waist" else math.inf
-        """What is higher reaches up between the arms [m]."""
+        self._highest = under_arms if placing.held_at == "waist" else math.inf
+
+    def too_high(self, place: Place, body: PosedBody) -> bool:
+        """Whether it reaches up between the arms, where it is held at the waist, or far above the head."""
+        return place.top > min(self._highest, float(body.vertices[:, 1].max()) + _HAT)
 
     def knows(self, place: Place) -> bool:
         """Whether its unit is one that the mesh may be in."""
@@ -231,11 +239,11 @@ class _Search:
         if scales:  # there is much to try: what nobody does isn't
             bodies, turns = bodies[:3], [turn for turn in turns if not _is_sideways(turn)]
         found = [
-            _at(few, unit, turn, shift, here, "searched")
+            one
             for here, turn, unit in itertools.product(bodies[::2], turns, units)
             for shift in _heights(unit * self._mesh.vertices @ turn.T, here)
+            if not self.too_high(one := _at(few, unit, turn, shift, here, "searched"), here)
         ]
-        found = [one for one in found if one.top <= self.highest]
         found.sort(key=lambda one: one.cost(self._extent))
         refined = [self.refined(one, moves=True, scales=scales) for one in found[:_N_REFINED]]
         return sorted(refined, key=lambda one: (not one.fit.is_good, one.cost(self._extent)))[:1]
@@ -266,7 +274,7 @@ class _Search:
 
         def cost(values: F64) -> float:
             place = at(values)
-            return place.cost(extent) + (place.top > self.highest)
+            return place.cost(extent) + self.too_high(place, body)
 
         if not len(free):
             return start

@@ -94,3 +94,15 @@ def test_cloth_that_is_torn_as_arms_are_lifted_is_doubted() -> None:
     mesh = cone((0.42, 0.85), (0.085, 1.43))
     made = fit_garment(mesh, load_body("neutral"), name="loose", placing=placing, longest_edge=0.1)
     assert any("bringing it into the T-pose stretched" in text for text in made.warnings)
+
+
+def test_nothing_is_worn_above_the_head() -> None:
+    """A tube in metres on a floor has its middle where the head is, if its origin is taken for the body's."""
+    mesh = cone((0.18, 0.13), (0.16, 1.38))
+    tube = SurfaceMesh(mesh.vertices * [1, 1, 0.75 / 0.9], mesh.faces)
+    body = load_body("neutral")
+    head = float(body.v_template[:, 1].max())
+    for place in find_places(tube, body, Placing()):
+        assert place.top < head + 0.35
+    with pytest.raises(GarmentError, match="it reaches higher than it can"):
+        next(find_places(tube, body, Placing(unit=1.0, up="y", is_placed=True)))
