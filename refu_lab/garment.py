@@ -34,7 +34,7 @@ from refu_lab.tables import format_table
 
 _MOST_CUT = 20
 """As many triangles of a garment may cut the body in one pose without a warning: at an armhole's rim there are some."""
-_MOST_STRETCHED = 3.0
+_MOST_STRETCHED = 3.5
 """How many times as long as at rest all but a thousandth of the edges are at most, before there is a warning."""
 
 

@@ -80,12 +80,24 @@ def test_what_is_loose_is_not_made_smaller(low: tuple[float, float], high: tuple
     assert not any("scaled by" in note for note in made.notes)
 
 
+def narrow_tube(high: float) -> SurfaceMesh:
+    """A dress that is narrower than the chest, in metres, on a floor, up to some height [m]."""
+    mesh = cone((0.18, 0.13), (0.155, high), rows=60)
+    return SurfaceMesh(mesh.vertices * [1, 1, 0.75 / 0.9], mesh.faces)
+
+
+def test_a_narrow_dress_in_metres_is_not_made_larger() -> None:
+    """It was made a quarter larger, and the arms went through it."""
+    made = fit_garment(narrow_tube(1.26), load_body("neutral"), name="strapless", longest_edge=0.1)
+    assert made.warnings == []
+    assert "it stood with the floor at 0 and was moved to the body's feet" in made.notes
+    assert not any("scaled by" in note for note in made.notes)
+
+
 def test_what_cannot_be_where_it_belongs_is_worn_nowhere_else() -> None:
-    """A dress that is narrower than the chest was made a quarter larger, and the arms went through it."""
-    mesh = cone((0.18, 0.13), (0.15, 1.26), rows=60)
-    narrow = SurfaceMesh(mesh.vertices * [1, 1, 0.75 / 0.9], mesh.faces)
+    """A dress that is narrower than the shoulders, and reaches over them, was worn on the head."""
     with pytest.raises(GarmentError, match="was made for another body or pose"):
-        fit_garment(narrow, load_body("neutral"), name="strapless", longest_edge=0.1)
+        fit_garment(narrow_tube(1.38), load_body("neutral"), name="tube", longest_edge=0.1)
 
 
 def test_cloth_that_is_torn_as_arms_are_lifted_is_doubted() -> None:
@@ -98,8 +110,7 @@ def test_cloth_that_is_torn_as_arms_are_lifted_is_doubted() -> None:
 
 def test_nothing_is_worn_above_the_head() -> None:
     """A tube in metres on a floor has its middle where the head is, if its origin is taken for the body's."""
-    mesh = cone((0.18, 0.13), (0.16, 1.38))
-    tube = SurfaceMesh(mesh.vertices * [1, 1, 0.75 / 0.9], mesh.faces)
+    tube = narrow_tube(1.38)
     body = load_body("neutral")
     head = float(body.v_template[:, 1].max())
     for place in find_places(tube, body, Placing()):

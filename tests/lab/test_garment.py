@@ -117,7 +117,7 @@ def test_what_is_worn_badly_is_said_last(tmp_path: Path, capsys: pytest.CaptureF
     assert told[-len(warnings) :] == [f"warning: {text}" for text in warnings]
 
 
-@pytest.mark.parametrize(("pairs", "long", "n"), [(20, 3.0, 0), (21, 1.0, 1), (0, 3.1, 1), (300, 9.0, 2)])
+@pytest.mark.parametrize(("pairs", "long", "n"), [(20, 3.5, 0), (21, 1.0, 1), (0, 3.6, 1), (300, 9.0, 2)])
 def test_what_cuts_the_body_and_what_is_torn_is_warned_of(pairs: int, long: float, n: int) -> None:
     good = {"inside": 0, "pairs": 0, "stretch": 1.0}
     assert len(warnings_of({"stand": good, "walk": {"inside": 0, "pairs": pairs, "stretch": long}})) == n
