@@ -242,7 +242,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
                 settings.pipeline.check_files()
             recorded = settings.record == self.settings.record and self.recording.running
             if self._state == "active" and "record" in values and not recorded:
-                self.recording.start(settings.record) if settings.record else self.recording.stop()
+                self.recording.start(settings.record) if settings.record else self.recording.end()
         except RefuError as error:
             self.statistics.fault("refused parameters", printable(error))
             return SetParametersResult(successful=False, reason=printable(error))

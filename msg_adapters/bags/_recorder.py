@@ -62,7 +62,7 @@ def free_path(path: Path) -> Path:
     if not str(path).isprintable():
         msg = f"{path}: wanted a name of printable characters"
         raise BagError(msg)
-    if path.is_dir() and any(path.iterdir()) and not any(map(_is_of_bag, path.iterdir())):
+    if path.name and path.is_dir() and any(path.iterdir()) and not any(map(_is_of_bag, path.iterdir())):
         path /= "garments"
     names = (f"{path.stem}-{i}{path.suffix}" for i in itertools.count(1))
     for candidate in itertools.chain([path], map(path.with_name, names) if path.name else ()):

@@ -57,7 +57,7 @@ class Recording:
             refusal = "no directory: set the parameter record to one, which also starts the recording"
         if refusal:
             raise BagError(refusal)
-        bag = self.start(path) if on else self.stop()
+        bag = self.start(path) if on else self.end()
         return printable(f"recording to {bag}" if on else f"{bag} is being closed"), str(bag)
 
     def stop(self) -> Path | None:
@@ -66,8 +66,15 @@ class Recording:
         if recorder is None:
             return None
         recorder.stop()
+        if error := recorder.state().error:  # that it has ended with already
+            self._error = printable(error)
         self._closing = [*(one for one in self._closing if not one.finished), recorder]
         return recorder.path
+
+    def end(self) -> Path | None:
+        """As `stop`, on somebody's request: a recording that isn't wanted any more isn't missed."""
+        bag, self._error = self.stop(), ""
+        return bag
 
     def put(self, topic: str, message_type: str, data: bytes, qos: QosProfile) -> None:
         """Queues a message that was sent or received now."""

@@ -60,9 +60,11 @@ class Dynamics(nn.Module):
         """What it sees of the past (B, 4, 219), shape (B, P)."""
         return past[..., self._columns].flatten(1)
 
-    def standardise(self, x: Tensor, s: Tensor, past: Tensor) -> None:
-        """Takes the inputs' sizes from the training set."""
-        self.net.standardise(torch.cat((x, s, self.seen(past)), 1), self.groups)
+    def standardise(self, x: Tensor, s: Tensor, past: Tensor, is_bounded: Tensor) -> None:
+        """Takes the inputs' sizes from the training set; which of x and s `is_bounded` says, the past always is."""
+        moved = self.seen(past)
+        bounded = torch.cat((is_bounded, torch.ones(moved.shape[1], dtype=torch.bool)))
+        self.net.standardise(torch.cat((x, s, moved), 1), self.groups, is_bounded=bounded)
 
 
 class Dynamic(nn.Module):

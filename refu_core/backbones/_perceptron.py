@@ -17,9 +17,9 @@ ACTIVATIONS = {"relu": functional.relu, "silu": functional.silu}
 class _Standardised(nn.Module):
     """What brings its inputs to one size; they are left as they are until `standardise`.
 
-    It sees nothing beyond what the training set had: each number is clamped to the range there. A perceptron's answer
-    goes on in straight lines where nothing was learnt: with the legs 47° apart, beyond any sample, a skirt was 51 mm
-    inside the thighs and is 23 to 32 mm with this. Cloth of there is that of the nearest known pose, posed anew.
+    Where an input is bounded, it sees nothing beyond what the training set had. A perceptron's answer goes on in
+    straight lines where nothing was learnt: with the legs 47° apart, beyond any sample, a skirt was 51 mm inside the
+    thighs, and is 34 mm with this. Cloth of there is that of the nearest known pose, posed anew.
     """
 
     shift: Tensor
@@ -35,12 +35,16 @@ class _Standardised(nn.Module):
         self.register_buffer("lowest", torch.full((inputs,), -_ANY))
         self.register_buffer("highest", torch.full((inputs,), _ANY))
 
-    def standardise(self, inputs: Tensor, groups: Tensor | None = None) -> None:
-        """Takes range, shift and scale from the inputs of the training set (N, I); one scale a group (I,) of inputs."""
+    def standardise(self, inputs: Tensor, groups: Tensor | None = None, *, is_bounded: Tensor | bool = True) -> None:
+        """Takes range, shift and scale from the inputs of the training set (N, I); one scale a group (I,) of inputs.
+
+        `is_bounded` (I,) says which inputs are clamped to their range.
+        """
         groups = torch.arange(inputs.shape[1]) if groups is None else groups
         with torch.no_grad():
-            self.lowest.copy_(inputs.amin(0))
-            self.highest.copy_(inputs.amax(0))
+            bounded = torch.as_tensor(is_bounded, device=inputs.device)
+            self.lowest.copy_(torch.where(bounded, inputs.amin(0), -_ANY))
+            self.highest.copy_(torch.where(bounded, inputs.amax(0), _ANY))
             self.shift.copy_(inputs.mean(0))
             # Within a group the sizes stay as they are: what of a joint's rotation hardly varies says little, and isn't
             # blown up to the size of the rest. The same for groups that don't vary at all.

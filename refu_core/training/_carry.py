@@ -196,7 +196,7 @@ def carry_over(
     with torch.no_grad():  # one pivot: there is nothing to choose between
         for parameter in (*model.style_shape.parameters(), *model.high.parameters()):
             parameter.zero_()
-    _learn_carried(model, drawn, there, output, settings, described, quiet=quiet)
+    _learn_carried(model, template, drawn, there, output, settings, described, quiet=quiet)
     _add_linear(model, samples, settings.ridge)
     model.eval()
 
@@ -260,6 +260,7 @@ def _bodies(samples: TrainingSamples, settings: CarrySettings) -> tuple[Tensor, 
 
 def _learn_carried(
     model: TailorNet,
+    garment: GarmentTemplate,
     drawn: tuple[Tensor, Tensor],
     there: Tensor,
     output: Path,
@@ -272,7 +273,8 @@ def _learn_carried(
     betas, pose = drawn
     x, s = model.features(pose), torch.cat((betas, betas.new_zeros(len(betas), N_STYLES)), 1)
     code = in_chunks(model.decoder.encode, there, size=256)
-    model.low.standardise(torch.cat((x, s), 1), model.features.groups)
+    bounded = model.features.are_bounded(garment)
+    model.low.standardise(torch.cat((x, s), 1), model.features.groups, is_bounded=bounded)
     model.low.scale[-N_STYLES:] = 0  # a garment of one style doesn't hear of any
     held_out = len(x) // 12
     parts = [(x[rows], s[rows], code[rows]) for rows in (slice(held_out, None), slice(held_out))]

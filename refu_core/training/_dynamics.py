@@ -104,7 +104,7 @@ def train_dynamics(
     plain = _known(still, opened.samples, _pasts(rows, rows.train))
     turned = _known(still, mirrored(opened.samples, mirror), _pasts(rows, rows.train, is_mirrored=True))
     train, validation = _split(opened.samples, (plain, turned), settings)
-    dynamics.standardise(*train[:3])
+    dynamics.standardise(*train[:3], still.features.are_bounded(template))
     described = {
         **opened.identity,
         "mode": mode,

@@ -200,11 +200,13 @@ def stages(
     settings: PretrainSettings,
 ) -> list[TrainingStage]:
     """What is trained in which order."""
+    groups, bounded = model.features.groups, model.features.are_bounded(garment)
     if isinstance(model, Gcnn):
         mean = train.displacement.mean(0)
         model.mean.copy_(mean)
         model.scale.copy_((train.displacement - mean).std())
-        model.head.standardise(torch.cat((model.features(train.pose), train.style_shape), 1), model.features.groups)
+        inputs_of_head = torch.cat((model.features(train.pose), train.style_shape), 1)
+        model.head.standardise(inputs_of_head, groups, is_bounded=bounded)
         parts = [(s.betas, s.pose, s.style, s.displacement) for s in (train, validation)]
         objective = Objective([model], model, _vertex_loss)
         return [TrainingStage("all", objective, settings.steps, *parts)]
@@ -213,11 +215,12 @@ def stages(
     loss = CodeLoss(model)
     both = [(x, s, code) for (x, s), code in zip(inputs, codes, strict=True)]
     if isinstance(model, Mlp):
-        model.net.standardise(torch.cat(inputs[0], 1), model.features.groups)
+        model.net.standardise(torch.cat(inputs[0], 1), groups, is_bounded=bounded)
         return [TrainingStage("all", Objective([model.net], model.code, loss), settings.steps, *both)]
 
-    model.low.standardise(torch.cat(inputs[0], 1), model.features.groups)
-    model.high.standardise(inputs[0][0], model.features.groups[: model.features.size])
+    n_pose = model.features.size
+    model.low.standardise(torch.cat(inputs[0], 1), groups, is_bounded=bounded)
+    model.high.standardise(inputs[0][0], groups[:n_pose], is_bounded=bounded[:n_pose])
     model.style_shape.standardise(inputs[0][1])
     smooth = LaplacianSmoothing(garment)
     coarse = [low_frequency_code(model, smooth, garment, s) for s in (train, validation)]
