@@ -787,6 +787,17 @@ def test_who_wears_the_garments_is_a_parameter_that_needs_another_pipeline(how: 
         load(missing.pipeline)
 
 
+def test_a_clock_that_never_came_and_doubted_input_are_warned_of() -> None:
+    statistics = Statistics()
+    statistics.receive()
+    doubts: dict[str, Any] = {"has_no_clock": True, "doubted": "degrees?"}
+    now = Situation(node="n", state="active", persons=("",), recording=None, recording_error="", **doubts)
+    found = {one.name: one for one in statuses(statistics.report(), NodeSettings(), now)}
+    assert (found["n: node"].level, found["n: input"].level) == (1, 1)
+    assert "no /clock has come" in found["n: node"].message
+    assert found["n: input"].message == "degrees?"
+
+
 def test_betas_of_unknown_meaning_are_warned_of() -> None:
     statistics = Statistics()
     statistics.receive()

@@ -350,6 +350,28 @@ def all_bad_bag(path: Path) -> Path:
     return write_bag(path, motion(2), "multiarray", {0: b"", 1: nan_frame()})
 
 
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_a_replay_without_a_frame_leaves_what_was_there(tmp_path: Path, *, overwrite: bool) -> None:
+    bad, out = all_bad_bag(tmp_path / "bad.mcap"), tmp_path / "out.mcap"
+    if overwrite:
+        write_bag(out, motion(2), "multiarray")
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    options = ["--garments", "short-pant-male", "--backbone", "skinned", "--sdf", "none", "--quiet", "--no-evaluate"]
+    given = ["replay", str(bad), "--output", str(out), *options, *(["--overwrite"] if overwrite else [])]
+    assert main(given) == 2
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_two_outputs_of_one_place_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag, out = write_bag(tmp_path / "in.mcap", motion(2), "multiarray"), str(tmp_path / "out.mcap")
+    assert main(["replay", str(bag), "--output", out, "--json", out]) == 2
+    assert "both --json and --output would be written there" in capsys.readouterr().err
+    assert main(["replay", str(bag), str(bag), "--output", out]) == 2
+    assert "of several inputs that is a folder" in capsys.readouterr().err
+    assert main(["replay", str(bag), "--person", "ann"]) == 2
+    assert "--person is for keypoints and files of motion" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("name", "make", "options", "wanted"),
     [
