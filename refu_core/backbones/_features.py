@@ -110,7 +110,7 @@ class PoseFeatures(nn.Module):
         """
         carries = garment.weights.detach().cpu().mean(0) >= _CARRIES
         carries[0] = False  # up is limited already (`told_up`); bounded, it cost a skirt 0.4 mm on its test samples
-        joints = torch.tensor((0, *self.joints)) if self.encoding == "matrix" else torch.arange(24)
+        joints = self._index.cpu() if self.encoding == "matrix" else torch.arange(24)
         return torch.cat((carries[joints[self.groups[: self.size]]], torch.ones(N_STYLE_SHAPE, dtype=torch.bool)))
 
     def forward(self, pose: Tensor) -> Tensor:
