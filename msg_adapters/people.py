@@ -199,6 +199,11 @@ class Doubts:
         self._said |= found.keys()
         return new
 
+    def forget(self, sender: str) -> None:
+        """A sender has left: people come and go for days."""
+        self._tracks.pop(sender, None)
+        self.of_senders.pop(sender, None)
+
 
 IDS_LIST = "hri_msgs/msg/IdsList"
 

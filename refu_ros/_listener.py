@@ -302,3 +302,5 @@ class Listener:
         here = [person for person in self._inputs if not person.startswith("/")]
         for person in [person for person in here if not count(bodies.get(person, "/none"))]:
             self._node.destroy_subscription(self._inputs.pop(person))
+            self._frames.pop(person, None)
+            self.doubts.forget(person)

@@ -843,6 +843,9 @@ def test_numbers_in_other_units_are_doubted(changed: Callable[[int], Any], words
     assert len(said) == 1
     assert words in said[0]
     assert doubts.of_senders["ann"] == said[0]
+    doubts.forget("ann")
+    assert not doubts.of_senders
+    assert not doubts._tracks
 
 
 def test_a_style_that_a_garment_has_no_ear_for_is_told_once() -> None:
