@@ -119,16 +119,7 @@ def test_turned_persons_wear_the_same_where_limbs_run_into_each_other(subject: S
         assert max(deviations) < 0.025, deviations
 
 
-PARTED = pytest.mark.xfail(
-    reason="the shirt's networks of 4,565 samples lay it where Parting finds a cut in one frame and none in the next: "
-    "five vertices move by 15.2 mm, 8.8 are allowed",
-)
-
-
-@pytest.mark.parametrize(
-    "path",
-    [pytest.param(path, marks=PARTED if path.stem == "another-fold" else (), id=path.stem) for path in WORST],
-)
+@pytest.mark.parametrize("path", WORST, ids=[path.stem for path in WORST])
 def test_worst_cases_of_refu_stress_that_are_no_more(path: Path) -> None:
     """Shorts: a fold that sent a vertex through the thigh, and one that was left between crossed thighs. A turn that
     made a difference; a skirt of γ = -28, and one deep in the thighs, where the closest skin leaps. A shirt that
@@ -136,6 +127,11 @@ def test_worst_cases_of_refu_stress_that_are_no_more(path: Path) -> None:
     the other that was raised in vain, a walk that ended at another way out than the shortest, and a way out on the
     cloth's own side that became too long. And a shirt 2 cm below a fold of the T-shirt, of which another was found."""
     tally = replay_trial(path)
+    if path.stem == "another-fold" and tally.failures and tally.as_dict()["worst_share_of_limit"] < 1.8:
+        pytest.xfail(
+            "the shirt's networks of 4,565 samples lay it where Parting finds a cut in one frame and none in the next: "
+            "five vertices move by 15.2 mm, 8.8 are allowed"
+        )
     assert not tally.failures, tally.as_dict()
 
 
