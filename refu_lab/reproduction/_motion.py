@@ -51,9 +51,10 @@ _ABOUT = (
     "apart, which garments are brought off; the skin runs through itself where limbs meet, so no garment can be free "
     "of it there. *Collider cut* counts frames in which the collider runs through itself within "
     f"{1e3 * NEAR:g} mm of the garment where the rest pose doesn't. *Jumps* are of the vertex that goes farthest in "
-    f"1/{_RATE:g} s against the garment skinned to the same motion. *Layers cut* counts frames in which T-shirt and "
-    "short pants, worn together, cut through each other. *Crossings* are pairs of a garment's own faces that "
-    "intersect, a frame."
+    f"1/{_RATE:g} s against the garment skinned to the same motion. A hem that hangs still while a leg swings below it "
+    "jumps by that, too; *leaps* are how much farther a vertex goes than the skinned one does. *Layers cut* counts "
+    "frames in which T-shirt and short pants, worn together, cut through each other. *Crossings* are pairs of a "
+    "garment's own faces that intersect, a frame."
 )
 
 
@@ -165,6 +166,7 @@ class Judged:
     is_free_of_skin: bool
     is_collider_cut: bool
     jump_mm: float
+    leap_mm: float
     stretched: float
     """Share of the edges that are longer than `_STRETCHED` times their rest length."""
     n_crossings: int
@@ -186,6 +188,7 @@ def figures_of(judged: Sequence[Judged]) -> dict[str, float | None]:
         "jump_20_percent": 100 * float((jumps > 20).mean()),
         "jump_40_percent": 100 * float((jumps > 40).mean()),
         "jump_max_mm": float(jumps.max()),
+        "leap_20_percent": 100 * float(np.mean([one.leap_mm > 20 for one in judged])),
         "stretched_percent": 100 * float(np.mean([one.stretched for one in judged])),
         "self_crossings": float(np.mean([one.n_crossings for one in judged])),
         "layers_cut_percent": 100 * float(np.mean(layers)) if layers else None,
@@ -242,14 +245,18 @@ class OutfitJudge:
                 contact = self._detector(frames[0].betas.tobytes()).detect(now.body)
                 way = np.linalg.norm(now.body - now.skin, axis=1)
             for garment in now:
-                ahead = (then[garment].local - now[garment].local) - (
-                    skinned[1][garment].local - skinned[0][garment].local
-                )
-                judged[garment, method] = self._judge(garment, now, frames[0], contact, ahead)
+                ways = [last[garment].local - first[garment].local for first, last in ((now, then), skinned)]
+                judged[garment, method] = self._judge(garment, now, frames[0], contact, *ways)
         return judged, way
 
     def _judge(
-        self, garment: str, out: PipelineOutput, frame: SmplFrame, contact: SelfContact, ahead: NDArray[np.floating]
+        self,
+        garment: str,
+        out: PipelineOutput,
+        frame: SmplFrame,
+        contact: SelfContact,
+        way: NDArray[np.floating],
+        way_of_skinned: NDArray[np.floating],
     ) -> Judged:
         local, faces = out[garment].local, self._sheets[garment].faces
         sheet = self._sheets[garment]
@@ -260,7 +267,8 @@ class OutfitJudge:
             self._metrics[garment].add(local, self._collider.check(local, faces)),
             self._skin.check(local, faces).is_free,
             bool(contact.near(local, distance=NEAR).any()),
-            1e3 * float(np.linalg.norm(ahead, axis=1).max()),
+            1e3 * float(np.linalg.norm(way - way_of_skinned, axis=1).max()),
+            1e3 * float((np.linalg.norm(way, axis=1) - np.linalg.norm(way_of_skinned, axis=1)).max()),
             float((stretch > _STRETCHED).mean()),
             len(sheet.with_itself()),
             any(len(sheet.with_other(one.local, one.faces)) for one in others) if others else None,

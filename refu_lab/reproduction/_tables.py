@@ -94,6 +94,7 @@ METRICS: Mapping[str, Metric] = {
     "jump_20_percent": Metric("jumps > 20 mm [% of pairs]", 2, kind="cloth"),
     "jump_40_percent": Metric("> 40 mm [%]", 2, kind="cloth"),
     "jump_max_mm": Metric("largest [mm]", 1, kind="cloth"),
+    "leap_20_percent": Metric("leaps > 20 mm [%]", 2, kind="cloth"),
     "stretched_percent": Metric("edges > 2 x rest [%]", 3, kind="cloth"),
     "self_crossings": Metric("crossings a frame", 1, kind="cloth"),
     "layers_cut_percent": Metric("layers cut [% of frames]", 2, kind="cloth"),

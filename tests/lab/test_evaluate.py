@@ -7,15 +7,15 @@ import pickle
 import runpy
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 import torch
 
-from refu_core import SmplFrame, load_body, load_garment
+from refu_core import GarmentPipeline, PipelineOutput, SmplFrame, load_body, load_garment
 from refu_lab.cli import main
-from refu_lab.reproduction import Library, SampleSet, Study, _plots, _runs, run_methods
+from refu_lab.reproduction import Library, OutfitJudge, SampleSet, Study, _plots, _runs, run_methods
 
 BAGS = Path(__file__).parents[2] / "bags"
 GARMENT = "short-pant-male"
@@ -140,8 +140,33 @@ def test_motion_of_a_folder(tmp_path: Path) -> None:
     assert run(*arguments, "--json", file) == 0
     rows = json.loads(file.read_text(encoding="utf-8"))["rows"]
     assert {f"{GARMENT}, swing", "skirt-female, all clips"} <= {row["garment"] for row in rows}
-    assert {"skin_cfmp_percent", "jump_20_percent", "shift_max_mm"} <= {row["metric"] for row in rows}
+    metrics = {row["metric"] for row in rows}
+    assert {"skin_cfmp_percent", "jump_20_percent", "leap_20_percent", "shift_max_mm"} <= metrics
     assert "skin to collider" in (tmp_path / "out" / "motion.md").read_text(encoding="utf-8")
+
+
+def test_cloth_that_hangs_still_beside_a_swinging_leg_jumps_and_does_not_leap() -> None:
+    skinned = GarmentPipeline.load([GARMENT], backbone="skinned", sdf="none", collider=False)
+    pose = np.zeros((2, 24, 3))
+    pose[1, 0, 1] = 0.1  # the garment turns with the root
+    still, turned = (SmplFrame(pose=one) for one in pose)
+    standing = skinned([still, still])
+    as_skinned = OutfitJudge([GARMENT], {"as skinned": skinned})
+    hanging = OutfitJudge([GARMENT], {"hanging": cast("GarmentPipeline", Hanging(skinned, standing))})
+    found = [next(iter(one.judge([still, turned])[0].values())) for one in (as_skinned, hanging)]
+    assert found[0].jump_mm == found[0].leap_mm == 0
+    assert found[1].jump_mm > 10
+    assert found[1].leap_mm <= 0
+
+
+class Hanging:
+    """A pipeline whose garments stay where they are."""
+
+    def __init__(self, like: GarmentPipeline, outputs: list[PipelineOutput]) -> None:
+        self.body, self._outputs = like.body, outputs
+
+    def __call__(self, _frames: object) -> list[PipelineOutput]:
+        return self._outputs
 
 
 # ---- the figures that are kept ---------------------------------------------------------------------------------------
