@@ -90,8 +90,7 @@ class PlannerMesh:
         rest = garment.v_template.detach().cpu().double().numpy()
         self._n_vertices = len(rest)
         kept, self.sheet, self._take = _prepared(garment, rest, max_triangles, worn)
-        """`sheet`: faces of the sheet in the middle of the solid, counter-clockwise from outside, shape (S, 3)."""
-        """Faces of the sheet in the middle of the solid, counter-clockwise from outside, shape (S, 3)."""
+        # `sheet`: the faces in the middle of the solid, counter-clockwise from outside, shape (S, 3).
         self.faces: NDArray[np.int32] = _solid(self.sheet, len(kept))
         """Counter-clockwise from outside, shape (T, 3); the same in every frame."""
         if len(self.faces) > max_triangles:
