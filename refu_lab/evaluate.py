@@ -27,7 +27,7 @@ def _command(options: EvaluateOptions, table: str) -> str:
         parts += ["--motions motions/"]
         parts += [f"--motion-every {options.motion_every}"] if options.motion_every > 1 else []
     else:
-        parts += [f"--data {' '.join(f'data/{path.resolve().name}' for path in options.data)}"]
+        parts += [f"--data {' '.join('/'.join(path.resolve().parts[-2:]) for path in options.data)}"]
     parts += [f"--body {Path(options.body).name}"] if options.body is not None else []
     parts += [] if options.collider else ["--no-collider"]
     parts += [f"--weights {path.resolve().name}" for path in options.weights]

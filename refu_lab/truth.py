@@ -71,6 +71,14 @@ def _vertices(marker: adapters.Marker, faces: NDArray[np.int64]) -> NDArray[np.f
     return marker.points
 
 
+def garments_of(bag: Path) -> list[str]:
+    """Names of the garments whose truth a bag holds, sorted. Raises `AdapterError` for a bag that can't be read."""
+    with adapters.BagReader(bag) as reader:
+        if TOPIC not in {topic.name for topic in reader.topics}:
+            return []
+        return sorted({m.ns for found in reader.messages([TOPIC]) for m in adapters.decode_marker_array(found.data)})
+
+
 class Moment(NamedTuple):
     """One frame whose truth is known."""
 

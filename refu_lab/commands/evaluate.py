@@ -32,7 +32,7 @@ def add(commands: Any) -> None:
     parser = commands.add_parser(
         "evaluate",
         help="make the paper's tables and figures on your own data, beside the paper's figures",
-        description="Run every method on the test samples of data sets, and write a page and a JSON file a table. "
+        description="Run every method on test samples of data sets or bags, and write a page and a JSON file a table. "
         "A method whose networks aren't trained stays in its table, with the command that trains it.",
     )
     parser.add_argument(
@@ -41,7 +41,7 @@ def add(commands: Any) -> None:
         nargs="+",
         default=[],
         metavar="DIR",
-        help="data sets of refu simulate, one a garment, or folders and globs of them",
+        help="data sets of refu simulate or bags with ground truth, one a garment, or folders and globs of them",
     )
     cli.add_options(parser, EvaluateOptions)
     parser.add_argument(

@@ -12,14 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from msg_adapters import BAG_SUFFIXES
 from refu_core._engine import Engine, InProcess, Lost
 from refu_core.errors import RefuError
+from refu_core.frames import N_STYLES
+from refu_core.garments import load_garment
 from refu_core.metrics import CollisionChecker, Figures, FrameMetrics, GarmentMetrics
 from refu_core.simulation import GarmentDataset, GarmentSequences, open_dataset
 from refu_lab.reproduction._load import Library
 from refu_lab.reproduction._methods import METHODS
 from refu_lab.reproduction._predict import GarmentSetup, MethodOutput, Predictor, SampleScene
 from refu_lab.reproduction._tables import Missing
+from refu_lab.truth import garments_of, moments_of
 
 RATIO_EDGES: tuple[float, ...] = (0.0, 0.25, 0.75, 1.25, 1.75, 2.25, 2.75, 3.25, 3.75, 4.25, 4.75, float("inf"))
 """Groups of the ratio of approximate to accurate distance, as in the supplement's bar plot."""
@@ -63,11 +67,13 @@ class SampleSet:
 
     @classmethod
     def open(cls, path: Path) -> SampleSet:
-        """The test samples of the set in the folder `path`, finished so far.
+        """The test samples of the set in the folder `path`, finished so far, or those of a bag with ground truth.
 
         Raises:
-            RefuError: no such set, a damaged one, or one without a finished test sample.
+            RefuError: no such set or bag, a damaged one, or one without a finished test sample of one garment.
         """
+        if any(one.suffix in BAG_SUFFIXES for one in (path, *path.glob("*"))):
+            return _of_bag(path)
         dataset = open_dataset(path)
         samples = _of_sequences(dataset) if isinstance(dataset, GarmentSequences) else _of_poses(dataset)
         if not samples.count:
@@ -84,6 +90,21 @@ def _of_poses(dataset: GarmentDataset) -> SampleSet:
         return Sample(sample.vertices, sample.pose, sample.betas, sample.style, sample.unseen)
 
     return SampleSet(str(dataset.card["garment"]), len(rows), None, read)
+
+
+def _of_bag(path: Path) -> SampleSet:
+    names = garments_of(path)
+    if len(names) != 1:
+        msg = f"{path}: wanted the ground truth of one garment, got {', '.join(names) or 'none'}"
+        raise RefuError(msg)
+    moments = moments_of(path, load_garment(names[0]))
+
+    def read(number: int) -> Sample:
+        frame, truth, _ = moments[number]
+        style = np.zeros(N_STYLES, np.float32) if frame.style is None else frame.style
+        return Sample(truth.astype(np.float32), frame.pose, frame.betas, style, float("nan"))
+
+    return SampleSet(names[0], len(moments), None, read)
 
 
 def _of_sequences(dataset: GarmentSequences) -> SampleSet:

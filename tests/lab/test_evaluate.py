@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 import torch
 
-from refu_core import GarmentPipeline, PipelineOutput, SmplFrame, load_body, load_garment
+from refu_core import GarmentPipeline, PipelineOutput, RefuError, SmplFrame, load_body, load_garment
 from refu_lab.cli import main
 from refu_lab.reproduction import Library, OutfitJudge, SampleSet, Study, _plots, _runs, run_methods
+from refu_lab.truth import moments_of
 
 BAGS = Path(__file__).parents[2] / "bags"
 GARMENT = "short-pant-male"
@@ -225,6 +226,25 @@ def test_bad_input_is_one_line(
     error = capsys.readouterr().err
     assert message in error
     assert len(error.splitlines()) == 1
+
+
+def test_a_bag_with_ground_truth_is_a_set_of_samples() -> None:
+    bag = BAGS / "eval_short_pant_male"
+    samples = SampleSet.open(bag)
+    moments = moments_of(bag, load_garment(GARMENT))
+    assert (samples.garment, samples.count, samples.shapes) == (GARMENT, len(moments), None)
+    for number in (0, samples.count - 1):
+        sample, (frame, truth, _) = samples.read(number), moments[number]
+        np.testing.assert_array_equal(sample.pose, frame.pose)
+        np.testing.assert_array_equal(sample.betas, frame.betas)
+        np.testing.assert_array_equal(sample.style, frame.style)
+        np.testing.assert_allclose(sample.vertices, truth, atol=1e-6)
+
+
+@pytest.mark.parametrize(("bag", "got"), [("walk", "none"), ("eval_tshirt_male_over_short_pant_male", GARMENT + ", ")])
+def test_a_bag_without_truth_or_with_that_of_several_garments_is_refused(bag: str, got: str) -> None:
+    with pytest.raises(RefuError, match=f"{bag}: wanted the ground truth of one garment, got {got}"):
+        SampleSet.open(BAGS / bag)
 
 
 def test_two_sets_of_one_garment_are_refused(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
