@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 
 
 RESULT_TABLES = (
-    *("comparison", "ablation", "gcnn", "sequence", "alpha", "sdf", "time", "laplacian", "unseen", "energy", "motion"),
+    *("parts", "comparison", "ablation", "gcnn", "sequence", "alpha", "sdf", "time", "laplacian", "unseen", "energy"),
+    "motion",
 )
 """What `refu evaluate` makes, in the order of its summary; here, where a command line finds it without torch."""
 

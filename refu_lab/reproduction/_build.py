@@ -153,6 +153,17 @@ _OPTIMISATIONS = (
 )
 
 SAMPLE_TABLES: Mapping[str, SampleTable] = {
+    "parts": SampleTable(
+        "What each part contributes",
+        "The networks that ship, and one part of the way to the node more in each row: the paper's layer, as it is "
+        "(ReFU without blending and margin), the margin, blending, and all that the node does. No other networks "
+        "are needed.",
+        (
+            *("skinned", "tailornet", "naive-approx"),
+            *(f"refu-hybrid{kind}" for kind in ("-bare", "-unblended", "")),
+            *("node-hybrid", "node-accurate", "node-skinned"),
+        ),
+    ),
     "comparison": SampleTable(
         "Comparison: ways to handle collisions",
         "Test samples of each garment's set, each way of collision handling with the approximate and the "
