@@ -102,7 +102,8 @@ def _of_bag(path: Path) -> SampleSet:
     def read(number: int) -> Sample:
         frame, truth, _ = moments[number]
         style = np.zeros(N_STYLES, np.float32) if frame.style is None else frame.style
-        return Sample(truth.astype(np.float32), frame.pose, frame.betas, style, float("nan"))
+        # Copies, since a frame's arrays are read-only.
+        return Sample(truth.astype(np.float32), frame.pose.copy(), frame.betas.copy(), style.copy(), float("nan"))
 
     return SampleSet(names[0], len(moments), None, read)
 
