@@ -130,8 +130,10 @@ def test_frames_that_are_not_finite_are_known_by_their_error(tmp_path: Path) -> 
     for index in (3, 4):
         with pytest.raises(FrameError, match="NaN or infinite"):
             motion.frame(index)
-    with pytest.raises(MotionFileError, match=r"2 of 12 frames aren't finite \(the first: 3\)"):
+    with pytest.raises(MotionFileError, match=r"a\.npz: 2 of 12 frames aren't finite \(the first: 3\)"):
         motion.resampled(30)
+    with pytest.raises(MotionFileError, match=r"a\.npz: wanted a frame rate"):
+        motion.in_place(up=1).resampled(0)
 
 
 def test_resampling_ignores_jumps_of_full_turns() -> None:
