@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from refu_core._files import replacing
 from refu_core.errors import RefuError
 from refu_core.history import PoseHistory
 from refu_core.recordings import turn_from
@@ -87,7 +88,8 @@ def write_meshes(meshes: Sequence[ExportMesh], path: Path, *, fps: float = 30.0)
         digits = len(str(count - 1))
         paths = [path if count == 1 else path.with_name(f"{path.stem}_{k:0{digits}}{suffix}") for k in range(count)]
         for k, one in enumerate(paths):
-            one.write_bytes(_glb(meshes, k) if suffix == ".glb" else _obj(meshes, k))
+            with replacing(one) as file:
+                file.write(_glb(meshes, k) if suffix == ".glb" else _obj(meshes, k))
     except OSError as error:
         msg = f"{path}: can't be written: {error.strerror or error}"
         raise RefuError(msg) from error
