@@ -22,12 +22,16 @@ from msg_adapters import BagReader
 from refu_core import RefuError, SmplFrame
 from refu_core._engine import InProcess, Lost
 from refu_lab.cli import main
-from refu_lab.fleet import FleetError, find_recordings, is_plain, open_engine
+from refu_lab.fleet import FleetError, find_recordings, fleet_table, is_plain, open_engine
 from refu_lab.fleet._engine import DaskEngine, run_function
+from refu_lab.fleet._summary import FleetResult
 from tests.lab import fleet_tasks
 from tests.lab.test_replay import motion, write_bag
 
 FAST = ["--garments", "short-pant-male", "--backbone", "skinned", "--sdf", "none", "--no-collider", "--quiet"]
+
+
+ROW: dict[str, Any] = {"input": "", "frames": 1, "skipped": {}, "latency_ms": {"p50": 1.0, "p95": 1.0}, "garments": {}}
 
 
 def frames(shift: float = 0.0) -> list[SmplFrame]:
@@ -138,6 +142,20 @@ def alone(bags: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("alone") / "out"
     assert run(bags, "--output", folder) == 2
     return folder
+
+
+def test_what_there_is_to_warn_of_is_said_of_many_as_of_one() -> None:
+    """A night of files in centimetres, or in other axes, isn't taken for granted in silence."""
+    rows = [{"name": f"{i}", "input": "", "error": "bad"} for i in range(2)]
+    rows += [{"name": f"r{i}", **ROW, "warnings": ["z up <is> taken", *["cm"][: i == 1]]} for i in range(3)]
+    result = FleetResult(rows=rows)
+    said = ["z up <is> taken (r0 and 2 others)", "cm (r1)"]
+    assert [line for line in fleet_table(result).splitlines() if "warning" in line] == [
+        f"warning: {one}" for one in said
+    ]
+    assert '<p class="warn">z up &lt;is&gt; taken (r0 and 2 others)</p><p class="warn">cm (r1)</p>' in result.page()
+    many = FleetResult(rows=[{"name": "r", **ROW, "warnings": [str(i) for i in range(25)]}])
+    assert many.warnings()[-1] == "15 other warnings: --json names all"
 
 
 def test_a_bad_bag_is_reported_and_the_rest_is_done(bags: Path, alone: Path, tmp_path: Path, capsys: Any) -> None:
