@@ -110,6 +110,9 @@ def load_motion(path: str, *, axes: Axes = "auto", fps: float = 0.0) -> Motion:
         return march()
     if Path(path).suffix.lower() in SUFFIXES:
         return read_motion(path, axes=axes, fps=fps or None)
+    if fps:
+        msg = f"{path}: a frame rate is for files of motion ({', '.join(SUFFIXES)}); a bag's frames have stamps"
+        raise BagError(msg)
     frames = [record.frame for record in iter_smpl_frames(path) if record.frame is not None]
     if not frames:
         msg = f"{path}: no frame of its SMPL topic can be decoded; `refu replay {path}` says why"

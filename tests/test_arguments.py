@@ -48,6 +48,10 @@ PATHS = [
 ]
 
 
+USELESS = (["--seconds", "5"], ["--shapes", "3"], ["--fps", "30"], ["--input-axes", "z-up"])
+"""Options of `refu simulate` that do nothing without --sequences or --motions, for which they were meant."""
+
+
 def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     """The line that a command ends with."""
     try:
@@ -176,6 +180,10 @@ def test_bodies_and_inputs_that_are_no_files(
         ["info", "--body", "\ud800.npz"],
         ["info", "--body", "a\0b.pkl"],
         ["\x1b]0;x\x07" * 1000],
+        ["info", "--body", ""],
+        ["replay", BAG, "--betas", "1", "--betas-source", "message"],
+        ["export", BAG, "--output", "x.glb", "--betas", "1", "--betas-source", "builtin"],
+        *(["simulate", "tshirt-male", "--count", "1", "--output", "x", *more] for more in USELESS),
     ],
 )
 def test_values_that_no_command_takes(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:

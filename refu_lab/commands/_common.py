@@ -261,9 +261,18 @@ def given(args: argparse.Namespace, options: type) -> dict[str, Any]:
     """The arguments that are fields of a dataclass of options, by name; what wasn't given is left to its defaults."""
     known = {field.name for field in fields(options)}
     named = {name: value for name, value in vars(args).items() if name in known and value is not None}
-    if "betas" in named:  # whatever has been recorded
-        named.setdefault("betas_source", BetasSource.FIXED)
+    if "betas" in named and named.setdefault("betas_source", BetasSource.FIXED) != BetasSource.FIXED:
+        msg = f"--betas is everybody's shape, whatever arrives: leave it or --betas-source {named['betas_source']} out"
+        raise RefuError(msg)
     return {name: tuple(value) if isinstance(value, list) else value for name, value in named.items()}
+
+
+def require_use(args: argparse.Namespace, needed: Mapping[str, str]) -> None:
+    """Raises `RefuError` for an option that was given without the other one that it is `needed` for."""
+    for name, other in needed.items():
+        if getattr(args, name) is not None and not getattr(args, other):
+            msg = f"--{name.replace('_', '-')} is of no use without --{other}: give both, or leave it out"
+            raise RefuError(msg)
 
 
 def check_writable(path: Path) -> None:
