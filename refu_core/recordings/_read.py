@@ -281,7 +281,7 @@ def _chosen(names: Sequence[str], person: str | None, lengths: Sequence[int], no
     listing += " …" if len(names) > _SHOWN else ""
     if person is not None:
         if person not in names:
-            msg = f"no person {person!r}; the file has {listing}"
+            msg = f"no person {person!r}; the file has " + (listing if len(names) > 1 else "one: leave the person out")
             raise ValueError(msg)
         return names.index(person)
     best = max(range(len(names)), key=lambda i: lengths[i])
