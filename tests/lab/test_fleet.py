@@ -208,6 +208,24 @@ def test_what_is_finished_is_not_done_again(bags: Path, alone: Path, tmp_path: P
     assert "0 of them before" in capsys.readouterr().out
 
 
+def test_a_result_takes_the_place_of_results_alone(bags: Path, tmp_path: Path, capsys: Any) -> None:
+    """Recordings of the same names in the folder of outputs, and a page's folder that holds something else, stay."""
+    bag, record, page = (tmp_path / name for name in ("out/walk.mcap", "out2/walk.json", "report/walk/notes.txt"))
+    for mine in (bag, record, page):
+        mine.parent.mkdir(parents=True)
+        mine.write_text('{"years": "of work"}')
+    for more in (["--output", tmp_path / "out"], ["--output", tmp_path / "out2"], ["--report", tmp_path / "report"]):
+        assert run(bags / "b", *more, *(["--no-evaluate"] if "--output" in more else [])) == 2
+        assert "is there already, and no result of refu replay" in capsys.readouterr().out
+    assert {mine.read_text() for mine in (bag, record, page)} == {'{"years": "of work"}'}
+    assert run(bags / "b", "--output", tmp_path / "out", "--no-evaluate", "--overwrite") == 2
+    (tmp_path / "out" / "walk.json").unlink()  # as after a kill between the two
+    capsys.readouterr()
+    assert run(bags / "b", "--output", tmp_path / "out", "--no-evaluate") == 2
+    assert "no result of" not in capsys.readouterr().out
+    assert (tmp_path / "out" / "walk.json").exists()
+
+
 def test_results_by_url_are_those_by_path(bags: Path, tmp_path: Path, capsys: Any) -> None:
     arguments = [f"file://{bags}/a", "--output", f"file://{tmp_path}/out", "--no-evaluate"]
     assert run(bags / "a", "--output", tmp_path / "by-path", "--no-evaluate") == 0
