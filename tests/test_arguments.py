@@ -20,8 +20,10 @@ from refu_core._device import checked_device
 from refu_lab import cli
 from refu_lab.cli import main
 from refu_lab.commands._common import numbers, tell
+from refu_lab.commands.replay import _TITLE
 from refu_lab.render import save_png
 from refu_lab.replay import _paced
+from refu_lab.tables import html_page
 from tests.core.test_files import SPECIAL
 from tests.virtual_time import VirtualTime
 
@@ -106,6 +108,15 @@ def test_nothing_that_is_read_is_written_over(
     assert "written over the input own" in said
     assert Path("own").read_text() == "years of work"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["link", "own"]
+
+
+def test_a_report_takes_no_other_pages_place(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page = tmp_path / "index.html"
+    page.write_text("<title>My home</title>")
+    for inputs in ([BAG], [BAG, BAG]):
+        assert "no report of refu replay" in refused(["replay", *inputs, "--report", str(tmp_path)], capsys)
+    assert page.read_text() == "<title>My home</title>"
+    assert _TITLE in html_page("Replay of a", "", style="")
 
 
 @pytest.mark.parametrize("name", ["box.stl", "picture.jpg", "picture"])
