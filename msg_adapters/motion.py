@@ -26,6 +26,9 @@ _PAUSE_NS = NS_PER_S
 class Motion(Recording):
     """A recording as frames."""
 
+    source: str = "motion"
+    """What it was read from: errors begin with it."""
+
     def __len__(self) -> int:
         """Number of frames."""
         return len(self.poses)
@@ -52,12 +55,13 @@ class Motion(Recording):
         try:
             count = n_resampled(len(self), self.fps, fps)
         except ValueError as error:
-            msg = f"resampled motion: {error}"
+            msg = f"{self.source}: {error}"
             raise MotionFileError(msg) from error
         bad = np.flatnonzero(~(np.isfinite(self.poses).all(axis=(1, 2)) & np.isfinite(self.transl).all(axis=1)))
         if bad.size:
             msg = (
-                f"{bad.size} of {len(self)} frames aren't finite (the first: {bad[0]}); cut them out, or don't resample"
+                f"{self.source}: {bad.size} of {len(self)} frames aren't finite (the first: {bad[0]}); cut them out, "
+                f"or leave the rate at its own {self.fps:g} Hz"
             )
             raise MotionFileError(msg)
         at = np.minimum(np.arange(count) * (self.fps / fps), len(self) - 1)
@@ -93,7 +97,7 @@ def read_motion(
     Raises `MotionFileError` for a file that can't be read or isn't recognised, or whose arrays have other shapes.
     """
     recording = read_recording(path, error=MotionFileError, fps=fps, axes=axes, person=person, worn=worn)
-    return Motion(**{item.name: getattr(recording, item.name) for item in fields(recording)})
+    return Motion(**{item.name: getattr(recording, item.name) for item in fields(recording)}, source=str(path))
 
 
 def load_motion(path: str, *, axes: Axes = "auto", fps: float = 0.0) -> Motion:
@@ -106,6 +110,9 @@ def load_motion(path: str, *, axes: Axes = "auto", fps: float = 0.0) -> Motion:
         return march()
     if Path(path).suffix.lower() in SUFFIXES:
         return read_motion(path, axes=axes, fps=fps or None)
+    if fps:
+        msg = f"{path}: a frame rate is for files of motion ({', '.join(SUFFIXES)}); a bag's frames have stamps"
+        raise BagError(msg)
     frames = [record.frame for record in iter_smpl_frames(path) if record.frame is not None]
     if not frames:
         msg = f"{path}: no frame of its SMPL topic can be decoded; `refu replay {path}` says why"
@@ -125,7 +132,7 @@ def load_motion(path: str, *, axes: Axes = "auto", fps: float = 0.0) -> Motion:
     if any((frame.betas != frames[0].betas).any() for frame in frames):
         notes.append("betas differ between frames: a person has one shape, the first frame's")
     poses, transl = (np.stack(arrays) for arrays in zip(*((f.pose, f.transl) for f in frames), strict=True))
-    return Motion(poses, transl, frames[0].betas, fps, notes=tuple(notes))
+    return Motion(poses, transl, frames[0].betas, fps, notes=tuple(notes), source=path)
 
 
 MARCH_FPS = 30.0

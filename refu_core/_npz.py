@@ -43,6 +43,11 @@ DAMAGE = (
 """What readers of archives, arrays and pickles raise on damaged files."""
 
 
+def told(cause: BaseException) -> str:
+    """What damage an error tells of."""
+    return str(cause) or ("it is cut short" if isinstance(cause, EOFError) else type(cause).__name__)
+
+
 class ArrayBudget:
     """The numbers that may still be taken from a file."""
 
@@ -105,7 +110,7 @@ def _archive(path: Path, error: type[RefuError], wanted: str) -> Iterator[zipfil
             with zipfile.ZipFile(file) as archive:
                 yield archive
         except DAMAGE as cause:
-            msg = f"{path}: can't be read as .npz: {str(cause) or type(cause).__name__}"
+            msg = f"{path}: can't be read as .npz: {told(cause)}; wanted {wanted}"
             raise error(msg) from cause
 
 

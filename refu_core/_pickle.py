@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_array
 
 from refu_core._files import open_file
-from refu_core._npz import DAMAGE, ArrayBudget
+from refu_core._npz import DAMAGE, ArrayBudget, told
 from refu_core._pickle_machine import (
     MAX_PICKLE_BYTES,
     STREAM_MAGIC,
@@ -145,7 +145,7 @@ def read_smpl_pickle(
         try:
             content = Unpickler(file, is_model=True).load()
         except DAMAGE as cause:
-            msg = f"{path}: can't be read as an SMPL pickle: {str(cause) or type(cause).__name__}"
+            msg = f"{path}: can't be read as an SMPL pickle: {told(cause)}; wanted {wanted}"
             raise error(msg) from cause
     if type(content) is not dict:
         msg = f"{path}: an SMPL pickle holds a dictionary, this one a {type(content).__name__}"

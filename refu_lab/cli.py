@@ -53,10 +53,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for path in written.values():
             check_writable(path)
         require_distinct(written)
-        json = written.get("--json")
-        if json is not None and json.exists():
-            for given in _inputs(args):
-                require_apart(given, json)
+        for path in filter(Path.is_file, written.values()):
+            for given in _inputs(args, written=path):
+                require_apart(given, path)
         code: int = args.run(args)
     except RefuError as error:
         return _failed(f"error: {error}", EXIT_BAD_INPUT)
@@ -80,17 +79,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return code
 
 
+_WRITTEN = ("json", "output", "report", "picture")
+"""Options whose values are written to."""
+
+
 def _outputs(args: argparse.Namespace) -> dict[str, Path]:
     """What a command writes, of files and folders, by option."""
-    given = {name: getattr(args, name, None) for name in ("json", "output", "report", "picture")}
+    given = {name: getattr(args, name, None) for name in _WRITTEN}
     return {f"--{name}": Path(path) for name, path in given.items() if path is not None and "://" not in str(path)}
 
 
-def _inputs(args: argparse.Namespace) -> list[Path]:
-    """What a command reads, of files and folders."""
-    given = getattr(args, "input", None)
-    many = given if isinstance(given, list) else [] if given is None else [given]
-    return [Path(one) for one in many if "://" not in str(one)]
+def _inputs(args: argparse.Namespace, *, written: Path) -> list[Path]:
+    """What a command reads that may be lost to a file that is `written`: recordings, and whatever is that file."""
+    flat = [
+        (name, one)
+        for name, value in vars(args).items()
+        for one in (value if isinstance(value, (list, tuple)) else [value])
+        if name not in _WRITTEN and isinstance(one, (str, Path)) and os.path.exists(one)  # noqa: PTH110  (any text)
+    ]
+    return [Path(one) for name, one in flat if name == "input" or written.samefile(one)]
 
 
 def _failed(reason: str, code: int) -> int:

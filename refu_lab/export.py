@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from refu_core._files import replacing
 from refu_core.errors import RefuError
 from refu_core.history import PoseHistory
 from refu_core.recordings import turn_from
@@ -18,6 +19,7 @@ from refu_lab.render import SKIN
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from os import PathLike
 
     from numpy.typing import NDArray
 
@@ -59,7 +61,7 @@ def meshes_of(
     return found
 
 
-def write_meshes(meshes: Sequence[ExportMesh], path: Path, *, fps: float = 30.0) -> list[Path]:
+def write_meshes(meshes: Sequence[ExportMesh], path: str | PathLike[str], *, fps: float = 30.0) -> list[Path]:
     """Writes meshes of T frames: one USD stage that moves, or a GLB or OBJ file a frame, numbered if there are several.
 
     OBJ and USD keep the order of vertices, and texture coordinates apart from them. GLB has one of each: vertices on
@@ -71,6 +73,7 @@ def write_meshes(meshes: Sequence[ExportMesh], path: Path, *, fps: float = 30.0)
     Raises:
         RefuError: another suffix, no frame, a package that is missing, or a file that can't be written.
     """
+    path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in FORMATS:
         msg = f"{path}: wanted a file of {', '.join(FORMATS)}, got {suffix or 'no suffix'}"
@@ -87,7 +90,8 @@ def write_meshes(meshes: Sequence[ExportMesh], path: Path, *, fps: float = 30.0)
         digits = len(str(count - 1))
         paths = [path if count == 1 else path.with_name(f"{path.stem}_{k:0{digits}}{suffix}") for k in range(count)]
         for k, one in enumerate(paths):
-            one.write_bytes(_glb(meshes, k) if suffix == ".glb" else _obj(meshes, k))
+            with replacing(one) as file:
+                file.write(_glb(meshes, k) if suffix == ".glb" else _obj(meshes, k))
     except OSError as error:
         msg = f"{path}: can't be written: {error.strerror or error}"
         raise RefuError(msg) from error
@@ -113,8 +117,9 @@ def export(
     source = open_source(options, lambda: load().body)
     pipeline = load()
     source.history = PoseHistory() if pipeline.heeds_past else None
-    frames, outputs, left_out = [], [], list[str]()
+    frames, outputs, left_out, n_records = [], [], list[str](), 0
     for number, record in enumerate(islice(source.records, first + count)):
+        n_records = number + 1
         if number < first:  # what comes of the rest depends on it: the past, and where keypoints were
             with suppress(RefuError):
                 source.frame_of(record)
@@ -126,10 +131,12 @@ def export(
             left_out.append(f"frame {number} is left out: {error}")
         else:
             frames.append(frame)
+    if n_records < first + count:
+        left_out.append(f"it has {n_records} frames, wanted number {first} to {first + count - 1}")
     warnings = [*source.warnings(pipeline), *left_out]
     if not outputs:
-        why = f": {warnings[-1]}" if warnings else ""
-        msg = f"{options.input}: has no frame that can be dressed from number {first} on{why}"
+        why = left_out[-1]
+        msg = f"{options.input}: has no frame that can be dressed from number {first} on: {why}"
         raise RefuError(msg)
     step = 1e-9 * float(np.median(np.diff([frame.stamp_ns for frame in frames]))) if len(frames) > 1 else 0.0
     fps = round(1 / step, 3) if step > 0 else 30.0

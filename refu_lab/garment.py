@@ -69,20 +69,20 @@ def add_garment(options: AddOptions) -> dict[str, Any]:
     if target.exists() and not options.overwrite:
         msg = f"{target} is there already: give it another --name, or --overwrite it"
         raise GarmentError(msg)
-    body = load_body(options.body)
-    made = fit_garment(
-        read_surface(options.mesh),
-        body,
-        name=name,
-        placing=_placing(options),
-        details=GarmentDetails(
-            options.layer,
-            options.color or GarmentDetails().color,
-            options.held_at,
-            f"{options.source} ({options.mesh.name}), by refu garment add",
-        ),
-        longest_edge=options.longest_edge,
+    details = GarmentDetails(
+        options.layer,
+        options.color or GarmentDetails().color,
+        options.held_at,
+        f"{options.source} ({options.mesh.name}), by refu garment add",
     )
+    body, surface, placing = load_body(options.body), read_surface(options.mesh), _placing(options)
+    try:
+        made = fit_garment(
+            surface, body, name=name, placing=placing, details=details, longest_edge=options.longest_edge
+        )
+    except GarmentError as error:
+        msg = f"{options.mesh}: {error}"
+        raise GarmentError(msg) from error
     worn = try_on(made)
     save_garment(made.template, target)
     template = made.template
@@ -128,6 +128,9 @@ def _pose(text: str | None) -> NDArray[np.float64] | None:
         return None
     if Path(text).suffix.lower() in SUFFIXES:
         pose = np.array(read_recording(text, error=GarmentError, fps=30.0).poses[0], np.float64).reshape(N_JOINTS, 3)
+        if not np.isfinite(pose).all():
+            msg = f"{text}: its first frame isn't finite, and wanted is the pose of the mesh: cut it out"
+            raise GarmentError(msg)
         pose[0] = 0  # the mesh stands upright; where it faces is --up's business
         return pose
     angle = 0.0 if text == "t" else _number(text)

@@ -20,6 +20,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from refu_core._files import replacing
+
 if TYPE_CHECKING:
     import os
     from collections.abc import Sequence
@@ -247,10 +249,11 @@ def sky_light(meshes: Sequence[tuple[NDArray[np.float32], NDArray[np.int64]]]) -
 
 
 def save_png(image: NDArray[np.uint8], path: str | os.PathLike[str]) -> None:
-    """Writes a picture, shape (height, width, 3), as PNG; OSError when the file can't be written."""
+    """Writes a picture, shape (height, width, 3), as PNG, whole or not; OSError when the file can't be written."""
     from PIL import Image
 
-    Image.fromarray(image).save(Path(path), format="PNG")
+    with replacing(Path(path)) as file:
+        Image.fromarray(image).save(file, format="PNG")
 
 
 def _joined(meshes: Sequence[RenderMesh]) -> tuple[NDArray[np.float32], NDArray[np.int64]]:

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from refu_core import RefuError
+from refu_core._files import replacing
 from refu_core.metrics import CollisionChecker
 from refu_core.recordings import upright_turn
 from refu_lab.plots import new_axes, save_svg
@@ -62,7 +63,8 @@ def write_report(result: ReplayResult, folder: Path, *, progress: bool = False) 
         _plot(result, pipeline, folder)
         frames, turned = _draw_frames(result, pipeline, folder, progress=progress)
         page = folder / "index.html"
-        page.write_text(_page(result, frames, turned), encoding="utf-8")
+        with replacing(page) as file:
+            file.write(_page(result, frames, turned).encode())
     except OSError as error:
         msg = f"{folder}: the report can't be written: {error.strerror or error}"
         raise RefuError(msg) from error

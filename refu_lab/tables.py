@@ -7,6 +7,7 @@ import json
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from refu_core._files import replacing
 from refu_core.errors import RefuError
 
 if TYPE_CHECKING:
@@ -80,19 +81,20 @@ def picture_markdown(file: str, caption: str) -> str:
 
 
 def write_page(path: Path, parts: Sequence[str]) -> None:
-    """Writes the parts of a page. Raises `RefuError` where it can't be written."""
+    """Writes the parts of a page, all of it or nothing. Raises `RefuError` where it can't be written."""
     _write(path, "\n\n".join(parts))
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Writes plain values. Raises `RefuError` where the file can't be written."""
+    """Writes plain values, all of them or nothing. Raises `RefuError` where the file can't be written."""
     _write(path, json.dumps(content, indent=1, allow_nan=False))
 
 
 def _write(path: Path, text: str) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text + "\n", encoding="utf-8")
+        with replacing(path) as file:
+            file.write((text + "\n").encode())
     except OSError as error:
         msg = f"{path.parent}: the results can't be written: {error.strerror or error}"
         raise RefuError(msg) from error

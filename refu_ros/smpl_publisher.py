@@ -108,7 +108,7 @@ class SmplPublisher(GuardedNode):
             try:
                 frame = self.motion.frame((self._index + start) % len(self.motion))
             except FrameError as error:  # recordings have such frames; what is sent is always a person
-                self.get_logger().warning(f"frame left out: {error}", throttle_duration_sec=5.0)
+                self.get_logger().warning(f"{self.motion.source}: frame left out: {error}", throttle_duration_sec=5.0)
                 continue
             left = np.eye(3)[0 if self.options.input_axes == "smpl" else 1]
             frame = SmplFrame(

@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+import argparse
+import json
 import os
+import resource
 import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from refu_core import GarmentPipeline, RefuError
 from refu_core._device import checked_device
 from refu_lab import cli
 from refu_lab.cli import main
-from refu_lab.commands._common import numbers
+from refu_lab.commands._common import numbers, tell
+from refu_lab.commands.replay import _TITLE
+from refu_lab.render import save_png
 from refu_lab.replay import _paced
+from refu_lab.tables import html_page
 from tests.core.test_files import SPECIAL
 from tests.virtual_time import VirtualTime
 
@@ -41,6 +48,10 @@ PATHS = [
     ("stress", "--output"),
     ("info", "--json"),
 ]
+
+
+USELESS = (["--seconds", "5"], ["--shapes", "3"], ["--fps", "30"], ["--input-axes", "z-up"])
+"""Options of `refu simulate` that do nothing without --sequences or --motions, for which they were meant."""
 
 
 def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
@@ -72,6 +83,74 @@ def test_outputs_that_are_something_else(
     assert option in refused([*NEEDED[command], option, "x" * 5000], capsys)
     if option == "--json":
         assert "wanted a file" in refused([*NEEDED[command], option, str(tmp_path)], capsys)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["info", "--body", "own", "--json", "own"],
+        ["garment", "add", "own", "--json", "own"],
+        ["garment", "add", "mesh.obj", "--pose", "own", "--output", "own", "--overwrite"],
+        ["replay", BAG, "--body", "own", "--json", "link"],
+        ["replay", BAG, "--garments", "tshirt-male,own", "--report", "report", "--json", "own"],
+        ["export", BAG, "--betas-from", "own", "--output", "out.glb", "--json", "./own"],
+        ["simulate", "tshirt-male", "own", "--count", "1", "--output", "set", "--json", "own"],
+        ["stress", "--replay", "own", "--json", "own"],
+    ],
+)
+def test_nothing_that_is_read_is_written_over(
+    arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("own").write_text("years of work")
+    Path("link").symlink_to("own")
+    said = refused(arguments, capsys)
+    assert "written over the input own" in said
+    assert Path("own").read_text() == "years of work"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["link", "own"]
+
+
+def test_a_report_takes_no_other_pages_place(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page = tmp_path / "index.html"
+    page.write_text("<title>My home</title>")
+    for inputs in ([BAG], [BAG, BAG]):
+        assert "no report of refu replay" in refused(["replay", *inputs, "--report", str(tmp_path)], capsys)
+    assert page.read_text() == "<title>My home</title>"
+    assert _TITLE in html_page("Replay of a", "", style="")
+
+
+@pytest.mark.parametrize("name", ["box.stl", "picture.jpg", "picture"])
+def test_a_picture_takes_no_other_files_place(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "ends in .png" in refused(["garment", "add", "x.obj", "--picture", str(tmp_path / name)], capsys)
+
+
+def test_results_are_written_whole_and_before_they_are_printed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the disk is full what was there stays, and who has closed the pipe has the file nevertheless."""
+    args = argparse.Namespace(json=tmp_path / "a.json")
+
+    class Gone:
+        def write(self, _: str) -> int:
+            raise BrokenPipeError
+
+    with monkeypatch.context() as patch:
+        patch.setattr("sys.stdout", Gone())
+        with pytest.raises(BrokenPipeError):
+            tell(args, "text", {"a": 1})
+    before = args.json.read_bytes()
+    assert json.loads(before) == {"a": 1}
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 16, hard))
+    try:
+        for write in (
+            lambda: tell(args, "text", {"a": "b" * (1 << 17)}),
+            lambda: save_png(np.random.default_rng(0).integers(0, 255, (256, 256, 3), np.uint8), args.json),
+        ):
+            with pytest.raises((RefuError, OSError), match="File too large"):
+                write()
+            assert args.json.read_bytes() == before
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert [path.name for path in tmp_path.iterdir()] == ["a.json"]
 
 
 @pytest.mark.parametrize(
@@ -112,6 +191,10 @@ def test_bodies_and_inputs_that_are_no_files(
         ["info", "--body", "\ud800.npz"],
         ["info", "--body", "a\0b.pkl"],
         ["\x1b]0;x\x07" * 1000],
+        ["info", "--body", ""],
+        ["replay", BAG, "--betas", "1", "--betas-source", "message"],
+        ["export", BAG, "--output", "x.glb", "--betas", "1", "--betas-source", "builtin"],
+        *(["simulate", "tshirt-male", "--count", "1", "--output", "x", *more] for more in USELESS),
     ],
 )
 def test_values_that_no_command_takes(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,4 +13,5 @@ from msg_adapters.bags._smpl import FrameRecord as FrameRecord
 from msg_adapters.bags._smpl import SmplBag as SmplBag
 from msg_adapters.bags._smpl import iter_smpl_frames as iter_smpl_frames
 from msg_adapters.bags._smpl import open_smpl_bag as open_smpl_bag
+from msg_adapters.bags._writer import LIBRARY as LIBRARY
 from msg_adapters.bags._writer import BagWriter as BagWriter

@@ -22,6 +22,8 @@ from msg_adapters.bags._metadata import (
 from msg_adapters.definitions import full_type_name, message_definition
 from msg_adapters.errors import BagError
 
+LIBRARY = "refu-ros"
+"""What a bag says it was written by, among its first 64 bytes."""
 _DEFAULT_QOS = QosProfile()
 _PARTIAL = ".partial"
 """Ends the names of files that aren't whole yet."""
@@ -66,7 +68,7 @@ class BagWriter:
             with self._writing():
                 self._stream = self._open(overwrite=overwrite)
                 self._writer = McapWriter(self._stream, chunk_bytes=chunk_bytes, in_background=in_background)
-                self._writer.start(profile="ros2", library="refu-ros")
+                self._writer.start(profile="ros2", library=LIBRARY)
         except BagError:
             self.discard()
             raise

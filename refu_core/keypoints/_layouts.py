@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from refu_core.errors import RefuError
 from refu_core.skeleton import JOINT_NAMES as SMPL_JOINTS
 
 _POINTS: dict[str, tuple[str, tuple[float, float, float]]] = {
@@ -98,7 +99,10 @@ class KeypointLayout:
 
 @cache
 def keypoint_layout(name: str) -> KeypointLayout:
-    """A layout of `LAYOUTS`. Raises `KeyError` for another name."""
+    """A layout of `LAYOUTS`. Raises `RefuError` for another name."""
+    if name not in _NAMES:
+        msg = f"no layout of keypoints {name!r}: wanted {', '.join(LAYOUTS)}"
+        raise RefuError(msg)
     return layout_of(name, tuple(_NAMES[name].split()))
 
 

@@ -16,7 +16,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from refu_core._files import open_file
-from refu_core._npz import DAMAGE, ArrayBudget, check_npy, npz_names, read_npz
+from refu_core._npz import DAMAGE, ArrayBudget, check_npy, npz_names, read_npz, told
 from refu_core._pickle import PickledArrays
 from refu_core._pickle_machine import MAX_PICKLE_BYTES, STREAM_MAGIC, Record, Unpickler, read_stream
 from refu_core.errors import RefuError
@@ -77,7 +77,7 @@ class Content:
             else:
                 array = self._arrays.of(value)
         except DAMAGE as cause:
-            raise ValueError(str(cause) or type(cause).__name__) from cause
+            raise ValueError(told(cause)) from cause
         self._made[id(value)] = value, array  # held beside its array, so that the number stays its own
         return array
 
@@ -148,7 +148,7 @@ def open_content(path: Path, *, error: type[RefuError]) -> Content:
             return Content(root)
         except DAMAGE as cause:
             is_other = path.suffix and path.suffix.lower() not in SUFFIXES
-            why = f"no file of motion is a {path.suffix}" if is_other else str(cause) or type(cause).__name__
+            why = f"no file of motion is a {path.suffix}" if is_other else told(cause)
             msg = f"{path}: can't be read: {why}; wanted {WANTED}"
             raise error(msg) from cause
 
@@ -226,7 +226,7 @@ def _torch(path: Path, error: type[RefuError]) -> Content:
             tree = Unpickler(io.BytesIO(_member(archive, name))).load()
         return Content(tree, PickledArrays(storage))
     except DAMAGE as cause:
-        msg = f"{path}: can't be read as a file of torch: {str(cause) or type(cause).__name__}"
+        msg = f"{path}: can't be read as a file of torch: {told(cause)}; wanted {WANTED}"
         raise error(msg) from cause
 
 

@@ -77,7 +77,11 @@ def read_recording(
     if axes not in AXES or not isinstance(fps, (int, float, type(None))):
         msg = f"{path}: wanted axes of {', '.join(AXES)} and frames a second as a number, got {axes!r} and {fps!r}"
         raise error(msg)
+    person = None if person is None else str(person)
     if path.suffix.lower() == ".bvh":
+        if person is not None:
+            msg = f"{path}: no person {person!r}; a BVH file has one, without a name: leave the person out"
+            raise error(msg)
         return read_bvh(path, error=error, fps=fps, axes=axes, worn=worn)
     content = open_content(path, error=error)
     try:
@@ -102,7 +106,9 @@ def _recording(
     if layout.holds_places:
         arrays = {name: _by_time(array) for name, array in arrays.items()}
     n_persons = _persons(arrays)
-    which = _chosen([str(i) for i in range(n_persons)], person, [0] * n_persons, notes) if n_persons > 1 else 0
+    persons = [str(i) for i in range(n_persons)] or [_person(found.path)]
+    is_asked = n_persons > 1 or person is not None
+    which = _chosen(persons, person, [0] * len(persons), notes) if is_asked else 0
     if n_persons:
         arrays = {name: array[which] for name, array in arrays.items()}
     if layout.holds_places:
@@ -126,7 +132,7 @@ def _recording(
     if layout is table.MHR:
         (array,) = arrays.values()
         notes.append("MHR, another body than SMPL's: followed by its keypoints")
-        at = places_in_time(frames, len(array))
+        at = places_in_time(frames, len(array), notes)
         places = places_of_mhr(array, transl_of(one(layout.transl), layout, len(array), notes), at)
         return follow(POINTS, places, fps=rate(), axes=axes, usual="y-down", worn=worn, notes=notes)
     if layout.holds_places or _is_of_places(arrays):
@@ -275,7 +281,7 @@ def _chosen(names: Sequence[str], person: str | None, lengths: Sequence[int], no
     listing += " …" if len(names) > _SHOWN else ""
     if person is not None:
         if person not in names:
-            msg = f"no person {person!r}; the file has {listing}"
+            msg = f"no person {person!r}; the file has " + (listing if len(names) > 1 else "one: leave the person out")
             raise ValueError(msg)
         return names.index(person)
     best = max(range(len(names)), key=lambda i: lengths[i])

@@ -59,24 +59,41 @@ def _people(content: Content, frames: list[list[Mapping[Key, Any]]]) -> dict[str
     return {name: _stacked(content, layout, seen) for name, seen in persons.items()}
 
 
-def places_in_time(frames: NDArray[Any] | None, n: int) -> NDArray[np.int64] | None:
-    """Which frames n of them are, from 0 on, by their numbers; None where none is missing, or these aren't numbers."""
-    if frames is None or frames.dtype.kind not in "iu" or not frames.size == n > 0:
+def places_in_time(frames: NDArray[Any] | None, n: int, notes: list[str]) -> NDArray[np.int64] | None:
+    """Which frames n of them are, from 0 on, by their numbers; None where none is missing.
+
+    None, too, for numbers that can't be of one person's frames in time; `notes` gets why.
+    """
+    if frames is None:
         return None
-    at: NDArray[np.int64] = frames.reshape(-1).astype(np.int64)
-    at, gaps = at - at[0], np.diff(at)
-    return None if not len(gaps) or (gaps == 1).all() or gaps.min() < 1 or at[-1] >= MAX_FRAMES else at
+    given = frames.reshape(-1)
+    if given.dtype.kind not in "iu" or len(given) != n:
+        what = f"{given.dtype} {frames.shape}, wanted whole numbers ({n},)"
+    elif len(falls := np.flatnonzero(given[1:] <= given[:-1])):
+        first = falls[0]
+        what = f"{given[first]} is followed by {given[first + 1]}; wanted one person's, rising"
+    elif n and int(given[-1]) - int(given[0]) >= MAX_FRAMES:
+        what = f"from {given[0]} to {given[-1]}, at most {MAX_FRAMES} are read"
+    else:
+        at: NDArray[np.int64] = (given - given[:1]).astype(np.int64)
+        return None if n < 2 or at[-1] == n - 1 else at
+    notes.append(f"the frames' numbers are left out of account, and the frames taken as they come: {what}")
+    return None
 
 
 def filled(
     poses: NDArray[np.float64], transl: NDArray[np.float64], frames: NDArray[Any] | None, notes: list[str]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The frames that a tracker has lost in between, on the shorter arc between those around them."""
-    at = places_in_time(frames, len(poses))
-    if at is None or not (np.isfinite(poses).all() and np.isfinite(transl).all()):
+    at = places_in_time(frames, len(poses), notes)
+    if at is None:
         return poses, transl
     wanted = np.arange(at[-1] + 1)
-    notes.append(f"{len(wanted) - len(at)} of {len(wanted)} frames are missing: interpolated")
+    lost = f"{len(wanted) - len(at)} of {len(wanted)} frames are missing"
+    if not (np.isfinite(poses).all() and np.isfinite(transl).all()):
+        notes.append(f"{lost} and left out, since others aren't finite: the motion is too fast there")
+        return poses, transl
+    notes.append(f"{lost}: interpolated")
     return interpolated(poses, transl, at, wanted)
 
 

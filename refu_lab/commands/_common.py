@@ -112,6 +112,15 @@ def out_file(text: str) -> Path:
     return _output(text, "a file", stat.S_ISREG)
 
 
+def out_picture(text: str) -> Path:
+    """The path of a picture that is written: of another suffix, it may be something else than a picture."""
+    found = out_file(text)
+    if found.suffix.lower() != ".png":
+        msg = f"wanted a name that ends in .png, got {printable(text)}"
+        raise argparse.ArgumentTypeError(msg)
+    return found
+
+
 def out_folder(text: str) -> Path:
     """The path of a folder that is written to: what is there already is a folder."""
     return _output(text, "a folder", stat.S_ISDIR)
@@ -252,18 +261,33 @@ def given(args: argparse.Namespace, options: type) -> dict[str, Any]:
     """The arguments that are fields of a dataclass of options, by name; what wasn't given is left to its defaults."""
     known = {field.name for field in fields(options)}
     named = {name: value for name, value in vars(args).items() if name in known and value is not None}
-    if "betas" in named:  # whatever has been recorded
-        named.setdefault("betas_source", BetasSource.FIXED)
+    if "betas" in named and named.setdefault("betas_source", BetasSource.FIXED) != BetasSource.FIXED:
+        msg = f"--betas is everybody's shape, whatever arrives: leave it or --betas-source {named['betas_source']} out"
+        raise RefuError(msg)
     return {name: tuple(value) if isinstance(value, list) else value for name, value in named.items()}
 
 
+def require_use(args: argparse.Namespace, needed: Mapping[str, str]) -> None:
+    """Raises `RefuError` for an option that was given without the other one that it is `needed` for."""
+    for name, other in needed.items():
+        if getattr(args, name) is not None and not getattr(args, other):
+            msg = f"--{name.replace('_', '-')} is of no use without --{other}: give both, or leave it out"
+            raise RefuError(msg)
+
+
 def check_writable(path: Path) -> None:
-    """Raises `RefuError` before the work is done where its result couldn't be written."""
-    existing = path.absolute()
-    while not existing.exists():
-        existing = existing.parent
-    if not os.access(existing, os.W_OK) or (existing != path.absolute() and not existing.is_dir()):
-        msg = f"{path}: can't be written, {existing} is not a writable folder"
+    """Raises `RefuError` before the work is done where its result couldn't be written.
+
+    A file is written beside its place and then put there, so its folder must be writable, too.
+    """
+    folder = path.absolute() if path.is_dir() else path.absolute().parent
+    while not folder.exists():
+        folder = folder.parent
+    if not folder.is_dir() or not os.access(folder, os.W_OK):
+        msg = f"{path}: can't be written, {folder} is not a writable folder"
+        raise RefuError(msg)
+    if path.is_file() and not os.access(path, os.W_OK):
+        msg = f"{path}: can't be written over, it is read-only; name another place"
         raise RefuError(msg)
 
 
@@ -286,10 +310,10 @@ def require_apart(given: Path, written: Path) -> None:
 
 
 def tell(args: argparse.Namespace, text: str, content: dict[str, Any], *, code: int = 0) -> int:
-    """Prints the result, writes it as JSON where that was asked for, and gives the exit code back."""
-    print(text)
+    """Writes the result as JSON where that was asked for, prints it, and gives the exit code back."""
     if args.json is not None:
         from refu_lab.tables import write_json  # loads what tables are of
 
         write_json(args.json, content)
+    print(text)  # last: who reads it may have gone (| head)
     return code

@@ -35,7 +35,7 @@ class AddOptions:
     as_placed: bool = setting(False, "its origin is the body's own: don't look for another place")
     longest_edge: float = setting(0.02, "longer edges are split [m]", within=(0.005, 0.2), metavar="M")
     source: str = setting("a mesh of the user's", "author and licence", metavar="TEXT")
-    picture: Path | None = setting(None, "write a picture (.png) of it, worn", parse=cli.out_file, metavar="FILE")
+    picture: Path | None = setting(None, "write a picture (.png) of it, worn", parse=cli.out_picture, metavar="FILE")
     overwrite: bool = setting(False, "replace an existing garment")
 
 

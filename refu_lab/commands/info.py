@@ -12,7 +12,9 @@ def add(commands: Any) -> None:
     parser = commands.add_parser(
         "info", help="what is installed, built in and usable", description="What is installed."
     )
-    parser.add_argument("--body", metavar="FILE", help="say what a body model (.npz or official .pkl) holds instead")
+    parser.add_argument(
+        "--body", type=cli.word, metavar="FILE", help="say what a body model (.npz or official .pkl) holds instead"
+    )
     cli.add_common(parser, run)
 
 

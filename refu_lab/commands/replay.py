@@ -17,6 +17,9 @@ from refu_lab.commands import _common as cli
 if TYPE_CHECKING:
     from refu_core import GarmentPipeline
 
+_TITLE = "<title>Replay of "
+"""What the page of a report has, and another page hasn't."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingOptions(DressOptions):
@@ -110,6 +113,10 @@ def run(args: argparse.Namespace) -> int:
     if args.report is not None:
         if args.evaluate is False:
             msg = "a report is of evaluated frames: leave out --report or --no-evaluate"
+            raise RefuError(msg)
+        page = Path(args.report) / "index.html"
+        if not args.overwrite and page.is_file() and _TITLE.encode() not in page.read_bytes():
+            msg = f"{page}: is there already, and no report of refu replay; name another folder, or --overwrite it"
             raise RefuError(msg)
         import matplotlib  # noqa: F401, ICN001  (what is missing is said before the replay, not after it)
     urls = [text for text in (args.output, args.report) if text is not None and "://" in text]

@@ -64,6 +64,7 @@ def run(args: argparse.Namespace) -> int:
     from refu_lab.fleet import open_engine
     from refu_lab.simulate import simulate, simulation_table
 
+    cli.require_use(args, {"shapes": "sequences", "seconds": "sequences", "input_axes": "motions", "fps": "motions"})
     with open_engine(args.jobs, args.scheduler) as engine:
         options = SimulateOptions(**cli.given(args, SimulateOptions))
         card = simulate(options, engine=engine, progress=not args.quiet)

@@ -119,6 +119,16 @@ class Folder:
         except (OSError, ValueError, RecursionError):
             return None
 
+    def start(self, name: str) -> bytes | None:
+        """The first 64 bytes of a file; None where there is none."""
+        fs, path = filesystem(self.at(name))
+        try:
+            return bytes(fs.cat_file(path, 0, 64))
+        except FileNotFoundError:
+            return None
+        except OSError:
+            return b""
+
     def size(self, name: str) -> int | None:
         """Of a file [bytes]; None where there is none."""
         fs, path = filesystem(self.at(name))

@@ -13,7 +13,7 @@ from refu_lab.tables import REPLAY_HEADER, format_table, html_page, html_table, 
 _HEADER = ("recording", "frames", "skipped", "p50 ms", "p95 ms", "VFCP %", "free %", "depth mm", "")
 _WORST_HEADER = ("recording", "frame", "time s", "inside", "pairs", "depth mm")
 _SHOWN = 10
-"""Worst frames over all recordings that are shown."""
+"""Worst frames over all recordings, and warnings, that are shown."""
 
 
 @dataclass(eq=False)
@@ -36,6 +36,19 @@ class FleetResult:
         """The worst frames of all recordings, the worst first."""
         found = [{"name": row["name"], **frame} for row in self.rows for frame in row.get("worst", ())]
         return sorted(found, key=lambda frame: list(frame["badness"]), reverse=True)[:_SHOWN]
+
+    def warnings(self) -> list[str]:
+        """What there is to warn of, and in which recordings, what is most frequent first."""
+        of: dict[str, list[str]] = {}
+        for row in self.rows:
+            for warning in row.get("warnings", ()):
+                of.setdefault(warning, []).append(row["name"])
+        lines = [
+            f"{warning} ({names[0]}{f' and {len(names) - 1} others' if len(names) > 1 else ''})"
+            for warning, names in sorted(of.items(), key=lambda item: -len(item[1]))
+        ]
+        more = len(lines) - _SHOWN
+        return lines if more <= 0 else [*lines[:_SHOWN], f"{more} other warnings: --json names all"]
 
     def garments(self) -> dict[str, dict[str, Any]]:
         """Figures of each garment over all frames of all recordings, in the form of a replay's JSON."""
@@ -71,7 +84,9 @@ class FleetResult:
         ]
         frames = sum(row.get("frames", 0) for row in self.rows)
         left = f"; {self.n_left} not come to" if self.n_left else ""
+        warned = "".join(f'<p class="warn">{html.escape(warning)}</p>' for warning in self.warnings())
         body = f"""<p class="note">{frames} frames; {len(self.failed)} recordings couldn't be replayed{left}.</p>
+{warned}
 <h2>Garments, over all frames</h2>{garments}
 <h2>Recordings</h2>{html_table(_HEADER, recordings)}
 <p class="note">Free: frames in which no garment has a vertex inside the body or a triangle that cuts it.</p>
@@ -93,6 +108,7 @@ def fleet_table(result: FleetResult) -> str:
     done, kept = len(result.rows) - len(result.failed), sum(bool(row.get("kept")) for row in result.rows)
     lines += ["", f"{done} of {len(result.rows) + result.n_left} recordings replayed, {kept} of them before"]
     lines += [f"{row['name']}: {row['error']}" for row in result.failed]
+    lines += [f"warning: {warning}" for warning in result.warnings()]
     if result.interrupted:
         lines.append("interrupted: give the same command again to go on")
     return "\n".join(lines)

@@ -11,6 +11,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from msg_adapters.bags import LIBRARY
 from refu_core import GarmentPipeline, RefuError, __version__
 from refu_core._cache import code_hash
 from refu_core._engine import Engine, Lost
@@ -112,12 +113,32 @@ def _finished_or_new(job: _Job, path: Path) -> dict[str, Any]:
     records = None if options.records is None else Folder(options.records)
     if records is not None and not options.again:
         known = records.read_json(f"{name}.json")
-        if isinstance(known, dict) and known.get("key") == key and _is_there(known, job):
+        if not isinstance(known, dict) or "key" not in known:
+            _require_free(job, records)
+        elif known["key"] == key and _is_there(known, job):
             return known | {"kept": True}
     record = {"key": key, **_make(job, path)}
     if records is not None:
         records.put_json(record, f"{name}.json")
     return record
+
+
+def _require_free(job: _Job, records: Folder) -> None:
+    """Raises `RefuError` where results without a record would take the place of anything but such results.
+
+    A run that was killed leaves those.
+    """
+    options, name = job.options, job.recording.name
+    taken = {records.at(f"{name}.json"): records.size(f"{name}.json") is not None}
+    if options.output is not None:
+        start = Folder(options.output).start(f"{name}.mcap")
+        taken[Folder(options.output).at(f"{name}.mcap")] = start is not None and LIBRARY.encode() not in start
+    if options.report is not None:
+        folder = Folder(options.report)
+        taken[folder.at(name)] = folder.size(name) is not None and folder.size(f"{name}/index.html") is None
+    for place in (place for place, is_taken in taken.items() if is_taken):
+        msg = f"{place}: is there already, and no result of refu replay; choose another folder, or --overwrite it"
+        raise RefuError(msg)
 
 
 def _is_there(record: dict[str, Any], job: _Job) -> bool:

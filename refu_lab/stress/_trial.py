@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from refu_core._files import replacing
 from refu_core._npz import read_npz
 from refu_core.errors import RefuError
 from refu_core.frames import N_STYLES, SmplFrame
@@ -165,19 +166,20 @@ def save_trial(path: Path, check: str, wardrobe: Wardrobe, trial: Trial) -> Path
     """Writes a trial as `path`, an npz that `load_trial` reads."""
     frames = trial.frames
     path.parent.mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(
-        path,
-        check=np.array(check),
-        garments=np.array(wardrobe.garments),
-        backbone=np.array(wardrobe.backbone),
-        sdf=np.array(wardrobe.sdf),
-        pose=np.stack([frame.pose for frame in frames]),
-        betas=np.stack([frame.betas for frame in frames]),
-        transl=np.stack([frame.transl for frame in frames]),
-        style=np.stack([np.zeros(N_STYLES, np.float32) if f.style is None else f.style for f in frames]),
-        has_style=np.array([frame.style is not None for frame in frames]),
-        seed=np.array(trial.seed, np.int64),
-    )
+    with replacing(path) as file:
+        np.savez_compressed(
+            file,
+            check=np.array(check),
+            garments=np.array(wardrobe.garments),
+            backbone=np.array(wardrobe.backbone),
+            sdf=np.array(wardrobe.sdf),
+            pose=np.stack([frame.pose for frame in frames]),
+            betas=np.stack([frame.betas for frame in frames]),
+            transl=np.stack([frame.transl for frame in frames]),
+            style=np.stack([np.zeros(N_STYLES, np.float32) if f.style is None else f.style for f in frames]),
+            has_style=np.array([frame.style is not None for frame in frames]),
+            seed=np.array(trial.seed, np.int64),
+        )
     return path
 
 

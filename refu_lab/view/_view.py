@@ -76,7 +76,7 @@ def view(
 def open_film(options: ViewOptions, *, progress: bool = False) -> DressedFilm | RecordedFilm | LiveFilm:
     """What the inputs are: a bag of garments is shown as it is, motion is dressed. Raises `RefuError`."""
     if (options.live is None) == (not options.inputs):
-        msg = "wanted recordings to look at, or --live for a node that runs"
+        msg = "wanted either recordings to look at or --live, for a node that runs"
         raise RefuError(msg)
     if options.live is not None:
         return LiveFilm(options.live or TOPICS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from msg_adapters import (
     INPUT_TYPES,
+    BagError,
     BagWriter,
     Motion,
     MotionFileError,
@@ -130,8 +132,25 @@ def test_frames_that_are_not_finite_are_known_by_their_error(tmp_path: Path) -> 
     for index in (3, 4):
         with pytest.raises(FrameError, match="NaN or infinite"):
             motion.frame(index)
-    with pytest.raises(MotionFileError, match=r"2 of 12 frames aren't finite \(the first: 3\)"):
+    with pytest.raises(MotionFileError, match=r"a\.npz: 2 of 12 frames aren't finite \(the first: 3\)"):
         motion.resampled(30)
+    with pytest.raises(MotionFileError, match=r"a\.npz: wanted a frame rate"):
+        motion.in_place(up=1).resampled(0)
+
+
+def test_a_rate_is_not_left_out_of_account_where_a_bag_has_stamps(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "bag", [0, 10, 20])
+    with pytest.raises(BagError, match="a frame rate is for files of motion"):
+        load_motion(path, fps=30.0)
+
+
+def test_damaged_files_say_what_was_wanted(tmp_path: Path) -> None:
+    whole = pickle.dumps({"poses": np.zeros((T, 72))})
+    for name, data in (("a.npz", b"PK no archive"), ("a.pkl", whole[:40]), ("b.pkl", b"\x80"), ("c.npz", b"text")):
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(MotionFileError, match=r"wanted a motion: \.npz") as told:
+            read_motion(tmp_path / name)
+        assert "Error" not in str(told.value)
 
 
 def test_resampling_ignores_jumps_of_full_turns() -> None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from msg_adapters import iter_smpl_frames, read_motion
-from refu_core import FrameError, SmplFrame, load_body
+from refu_core import FrameError, RefuError, SmplFrame, load_body
 from refu_core.keypoints import LAYOUTS, KeypointTracker, People, Proportions, Skeleton, keypoint_layout
 from refu_core.keypoints._pose import Pose, exp_so3, log_so3
 from refu_core.skeleton import JOINT_NAMES
@@ -37,6 +37,11 @@ def proportions() -> Proportions:
 @cache
 def skeleton(name: str) -> Skeleton:
     return Skeleton(keypoint_layout(name), proportions())
+
+
+def test_a_layout_that_there_is_not_is_answered_with_those_there_are() -> None:
+    with pytest.raises(RefuError, match="no layout of keypoints 'openpose': wanted coco17"):
+        keypoint_layout("openpose")
 
 
 def pose_of(frame: SmplFrame) -> Pose:

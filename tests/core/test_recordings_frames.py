@@ -9,6 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
 from test_recordings import POSES, TRANSL, R, T, bvh, same, save
 
 from msg_adapters import MotionFileError, read_motion
@@ -51,6 +54,49 @@ def test_frames_become_a_clip(form: str, tmp_path: Path) -> None:
     said = "; ".join(motion.notes)
     assert "frame by frame" in said
     assert ("2 persons" in said) == ("people" in form or "person" in form)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    numbers=st.one_of(
+        st.lists(st.integers(-5, 60), min_size=T, max_size=T).map(np.array),
+        st.sets(st.integers(0, 200), min_size=T, max_size=T).map(lambda found: np.array(sorted(found))),
+        st.integers(1, T + 3).map(np.arange),
+        st.just(np.arange(T) / 2),
+        st.just(np.arange(T, dtype=np.uint64) + np.uint64(2**64 - 50)),
+        st.just(np.arange(T) * 10**6),
+    ),
+    has_gap=st.booleans(),
+)
+def test_frames_are_where_their_numbers_say_or_it_is_told(
+    numbers: NDArray[Any], has_gap: bool, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """Two tracks under one name, and frames that were lost, aren't joined in silence."""
+    path = tmp_path_factory.mktemp("numbers") / "a.npz"
+    poses = POSES.copy()
+    poses[T // 2] = np.nan if has_gap else poses[T // 2]
+    motion = read_motion(save(path, poses=poses, trans=TRANSL, frame_ids=numbers))
+    said = "; ".join(motion.notes)
+    rises = numbers.size == T and numbers.dtype.kind in "iu" and (numbers[1:] > numbers[:-1]).all()
+    span = int(numbers[-1]) - int(numbers[0]) + 1
+    if rises and span == T:
+        assert "frames" not in said
+        assert len(motion) == T
+    elif rises and span <= 10**6 and not has_gap:
+        assert f"{span - T} of {span} frames are missing: interpolated" in said
+        assert len(motion) == span
+    else:
+        assert ("as they come" in said) or ("too fast there" in said)
+        assert len(motion) == T
+
+
+@pytest.mark.parametrize("person", ["7", 7])
+def test_a_person_who_is_not_there_is_refused_in_a_file_of_one(tmp_path: Path, person: Any) -> None:
+    (tmp_path / "a.bvh").write_text("HIERARCHY")
+    for path in (save(tmp_path / "a.npz", poses=POSES), tmp_path / "a.bvh"):
+        with pytest.raises(MotionFileError, match=r"no person '7'; .* one.*: leave the person out"):
+            read_motion(path, person=person)
+    same(read_motion(tmp_path / "a.npz", person="0"))
 
 
 def test_frames_of_torch_and_of_parameters(tmp_path: Path) -> None:

@@ -22,12 +22,16 @@ from msg_adapters import BagReader
 from refu_core import RefuError, SmplFrame
 from refu_core._engine import InProcess, Lost
 from refu_lab.cli import main
-from refu_lab.fleet import FleetError, find_recordings, is_plain, open_engine
+from refu_lab.fleet import FleetError, find_recordings, fleet_table, is_plain, open_engine
 from refu_lab.fleet._engine import DaskEngine, run_function
+from refu_lab.fleet._summary import FleetResult
 from tests.lab import fleet_tasks
 from tests.lab.test_replay import motion, write_bag
 
 FAST = ["--garments", "short-pant-male", "--backbone", "skinned", "--sdf", "none", "--no-collider", "--quiet"]
+
+
+ROW: dict[str, Any] = {"input": "", "frames": 1, "skipped": {}, "latency_ms": {"p50": 1.0, "p95": 1.0}, "garments": {}}
 
 
 def frames(shift: float = 0.0) -> list[SmplFrame]:
@@ -140,6 +144,20 @@ def alone(bags: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def test_what_there_is_to_warn_of_is_said_of_many_as_of_one() -> None:
+    """A night of files in centimetres, or in other axes, isn't taken for granted in silence."""
+    rows = [{"name": f"{i}", "input": "", "error": "bad"} for i in range(2)]
+    rows += [{"name": f"r{i}", **ROW, "warnings": ["z up <is> taken", *["cm"][: i == 1]]} for i in range(3)]
+    result = FleetResult(rows=rows)
+    said = ["z up <is> taken (r0 and 2 others)", "cm (r1)"]
+    assert [line for line in fleet_table(result).splitlines() if "warning" in line] == [
+        f"warning: {one}" for one in said
+    ]
+    assert '<p class="warn">z up &lt;is&gt; taken (r0 and 2 others)</p><p class="warn">cm (r1)</p>' in result.page()
+    many = FleetResult(rows=[{"name": "r", **ROW, "warnings": [str(i) for i in range(25)]}])
+    assert many.warnings()[-1] == "15 other warnings: --json names all"
+
+
 def test_a_bad_bag_is_reported_and_the_rest_is_done(bags: Path, alone: Path, tmp_path: Path, capsys: Any) -> None:
     assert {path for path in content(alone) if path.endswith(".mcap")} == {"a/turn.mcap", "a/walk.mcap", "b/walk.mcap"}
     assert run(bags, "--output", alone, "--json", tmp_path / "all.json") == 2
@@ -188,6 +206,24 @@ def test_what_is_finished_is_not_done_again(bags: Path, alone: Path, tmp_path: P
     assert "0 of them before" in capsys.readouterr().out
     assert run(changed, "--output", out, "--frame-id", "world", "--again") == 2
     assert "0 of them before" in capsys.readouterr().out
+
+
+def test_a_result_takes_the_place_of_results_alone(bags: Path, tmp_path: Path, capsys: Any) -> None:
+    """Recordings of the same names in the folder of outputs, and a page's folder that holds something else, stay."""
+    bag, record, page = (tmp_path / name for name in ("out/walk.mcap", "out2/walk.json", "report/walk/notes.txt"))
+    for mine in (bag, record, page):
+        mine.parent.mkdir(parents=True)
+        mine.write_text('{"years": "of work"}')
+    for more in (["--output", tmp_path / "out"], ["--output", tmp_path / "out2"], ["--report", tmp_path / "report"]):
+        assert run(bags / "b", *more, *(["--no-evaluate"] if "--output" in more else [])) == 2
+        assert "is there already, and no result of refu replay" in capsys.readouterr().out
+    assert {mine.read_text() for mine in (bag, record, page)} == {'{"years": "of work"}'}
+    assert run(bags / "b", "--output", tmp_path / "out", "--no-evaluate", "--overwrite") == 2
+    (tmp_path / "out" / "walk.json").unlink()  # as after a kill between the two
+    capsys.readouterr()
+    assert run(bags / "b", "--output", tmp_path / "out", "--no-evaluate") == 2
+    assert "no result of" not in capsys.readouterr().out
+    assert (tmp_path / "out" / "walk.json").exists()
 
 
 def test_results_by_url_are_those_by_path(bags: Path, tmp_path: Path, capsys: Any) -> None:

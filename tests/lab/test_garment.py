@@ -143,6 +143,18 @@ def test_what_makes_no_garment_is_said(arguments: list[str], wanted: str, folder
     assert not folder.exists()
 
 
+def test_what_is_wrong_is_said_of_its_file(folder: Path, kilt: Path, tmp_path: Path, capsys) -> None:
+    """Of many meshes in a loop, or of a mesh and a pose, a sentence alone doesn't say which."""
+    flat, lost = tmp_path / "flat.obj", tmp_path / "lost.npz"
+    flat.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    assert main(["garment", "add", str(flat), "--quiet"]) == 2
+    assert f"{flat}: it is flat" in capsys.readouterr().err
+    np.savez(lost, poses=np.full((2, 72), np.nan), trans=np.zeros((2, 3)))
+    assert main(["garment", "add", str(kilt), "--pose", str(lost), "--quiet"]) == 2
+    assert f"{lost}: its first frame isn't finite" in capsys.readouterr().err
+    assert not folder.exists()
+
+
 def test_a_file_of_any_name_makes_a_garment_that_can_be_worn(folder: Path, kilt: Path, tmp_path: Path, capsys) -> None:
     mesh = tmp_path / "Männer-Kilt (1).obj"
     mesh.write_bytes(kilt.read_bytes())
@@ -218,6 +230,7 @@ def test_a_glb_has_names_places_colours_and_textures(dressed: list[ExportMesh], 
 def test_an_obj_comes_back_as_it_was(dressed: list[ExportMesh], tmp_path: Path) -> None:
     kilt = replace(dressed[1], vertices=dressed[1].vertices[:1])
     (path,) = write_meshes([kilt], tmp_path / "kilt.obj")
+    assert write_meshes([kilt], str(path)) == [path]
     mesh = read_surface(path)
     np.testing.assert_allclose(mesh.vertices, kilt.vertices[0], atol=1e-6)
     np.testing.assert_array_equal(mesh.faces, kilt.faces)
@@ -259,6 +272,22 @@ def test_frames_of_a_bag_are_exported(tmp_path: Path, capsys) -> None:
     assert "wanted a file of .glb, .obj" in capsys.readouterr().err
     assert main(["export", str(WALK), "--output", str(out), "--first", "100000"]) == 2
     assert "has no frame that can be dressed" in capsys.readouterr().err
+
+
+def test_frames_that_a_recording_has_not_are_said(tmp_path: Path, capsys) -> None:
+    np.savez(tmp_path / "a.npz", poses=np.zeros((3, 72)), trans=np.zeros((3, 3)), fps=30.0)
+    arguments = [
+        "export",
+        str(tmp_path / "a.npz"),
+        "--output",
+        str(tmp_path / "a.obj"),
+        "--garments",
+        "short-pant-male",
+    ]
+    assert main([*arguments, "--first", "7"]) == 2
+    assert "from number 7 on: it has 3 frames, wanted number 7 to 7" in capsys.readouterr().err
+    assert main([*arguments, "--first", "2", "--count", "2", "--sdf", "none"]) == 0
+    assert "warning: it has 3 frames, wanted number 2 to 3" in capsys.readouterr().out
 
 
 def test_an_export_takes_the_options_of_a_replay(tmp_path: Path, capsys) -> None:
