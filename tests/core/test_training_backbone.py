@@ -388,7 +388,7 @@ if __name__ == "__main__":
     config = LaunchConfig(1, 1, 2, rdzv_backend="c10d", rdzv_endpoint="localhost:0", start_method="fork")
     elastic_launch(config, train)(*sys.argv[1:])
 """
-"""What `torchrun --standalone --nproc-per-node 2` does, but for processes that import all that this one has imported."""
+"""As `torchrun --standalone --nproc-per-node 2`, but of processes that have imported what this one has."""
 
 
 @pytest.mark.skipif(not torch.distributed.is_available(), reason="this torch build has no torch.distributed")
