@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import pickle
@@ -28,6 +29,7 @@ from refu_core import GarmentPipeline, SmplFrame, load_body, load_garment
 from refu_core.garments import BUILTIN_GARMENTS, PAPER_GARMENTS
 from refu_core.modes import ONE_STYLE
 from refu_lab.cli import main
+from refu_lab.dressed_bag import DressedBag
 from refu_lab.touching_poses import touching_pose
 
 BAGS = Path(__file__).parents[2] / "bags"
@@ -471,29 +473,45 @@ def test_an_output_that_is_there_is_not_overwritten_unasked(
     assert len(raw_messages(out)) == 4 * len(motion())
 
 
-@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupted_replay_leaves_a_readable_bag(kind: signal.Signals, tmp_path: Path) -> None:
+def assert_closed(bag: Path, most: int) -> None:
+    """It has its closing records, and some garments, but not all of `most`."""
+    with bag.open("rb") as stream:
+        assert make_reader(stream).get_summary() is not None
+    assert 0 < [topic for topic, _, _ in raw_messages(bag)].count("/garments") < most
+
+
+def test_a_replay_that_is_terminated_leaves_a_readable_bag(tmp_path: Path) -> None:
     bag, out = write_bag(tmp_path / "long.mcap", motion(3000)), tmp_path / "out.mcap"  # a minute and a half
     command = [sys.executable, "-m", "refu_lab.cli", "replay", bag, "--output", out, "--speed", "real", "--quiet"]
-    process = subprocess.Popen(
-        [*map(str, command), "--garments", "short-pant-male", "--sdf", "none"],
-        stdout=subprocess.PIPE,
-        text=True,
-        # A shell's background jobs, and what they start, ignore SIGINT: so might this test run.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )
+    options = ["--garments", "short-pant-male", "--sdf", "none"]
+    process = subprocess.Popen([*map(str, command), *options], stdout=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 300
     while (not out.exists() or out.stat().st_size < 20_000) and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.05)
-    process.send_signal(kind)
+    process.terminate()
     printed, _ = process.communicate(timeout=300)
     assert process.returncode == 130
     assert "interrupted" in printed
-    with out.open("rb") as stream:
-        statistics = make_reader(stream).get_summary()
-        assert statistics is not None, "the file was closed properly"
-    topics = [topic for topic, _, _ in raw_messages(out)]
-    assert 0 < topics.count("/garments") < 3000
+    assert_closed(out, 3000)
+
+
+@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM])
+def test_either_signal_ends_a_replay_after_a_whole_frame(
+    kind: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    add_frame, n_added = DressedBag.add_frame, itertools.count(1)
+
+    def signalled(*frame: Any) -> None:
+        add_frame(*frame)
+        if next(n_added) == 3:
+            signal.raise_signal(kind)
+
+    monkeypatch.setattr(DressedBag, "add_frame", signalled)
+    bag, out = write_bag(tmp_path / "long.mcap", motion(20)), tmp_path / "out.mcap"
+    options = ("--garments", "short-pant-male", "--backbone", "skinned", "--sdf", "none", "--no-collider")
+    assert run(bag, "--output", out, *options) == 130
+    assert "interrupted" in capsys.readouterr().out
+    assert_closed(out, 20)
 
 
 def test_info_names_what_is_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
