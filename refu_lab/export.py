@@ -50,10 +50,9 @@ def meshes_of(
     pipeline: GarmentPipeline, outputs: Sequence[PipelineOutput], *, with_body: bool = True
 ) -> list[ExportMesh]:
     """The body and the garments of T outputs of a pipeline, which are of one person; the translation is added."""
-    transl = [next(iter(output.values())).transl for output in outputs]
     found = []
     if with_body:
-        bodies = np.stack([output.body + shift for output, shift in zip(outputs, transl, strict=True)])
+        bodies = np.stack([output.body + output.transl for output in outputs])
         found.append(ExportMesh("body", bodies.astype(np.float32), pipeline.body.faces.cpu().numpy(), SKIN))
     for name, template in pipeline.garments.items():
         vertices = np.stack([output[name].vertices for output in outputs]).astype(np.float32)

@@ -41,8 +41,7 @@ def run_limited(call: Callable[[], Any]) -> Ending:
     if not child:
         try:
             before = time.process_time(), _peak_kb()
-            said = _said(call)
-            ending = said, time.process_time() - before[0], (_peak_kb() - before[1]) / 1e3
+            ending = said(call), time.process_time() - before[0], (_peak_kb() - before[1]) / 1e3
             os.write(send, pickle.dumps(ending))
         finally:
             os._exit(0)
@@ -71,7 +70,8 @@ def refusal(call: Callable[[], Any]) -> str:
     return message
 
 
-def _said(call: Callable[[], Any]) -> tuple[str, str]:
+def said(call: Callable[[], Any]) -> tuple[str, str]:
+    """What `call` fails with that isn't the project's error, empty for none, and the message of either."""
     try:
         call()
     except RefuError as error:

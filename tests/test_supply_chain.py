@@ -26,10 +26,16 @@ def script() -> dict[str, Any]:
     return runpy.run_path(str(ROOT / "scripts" / "dependencies.py"))
 
 
-def test_all_licences_permit_commercial_use(script: dict[str, Any]) -> None:
-    found = script["dependencies"]()
-    assert {"numpy", "torch", "warp-lang"} <= {row.name for row in found if row.is_used}
-    assert [(row.name, row.licence) for row in found if not row.is_allowed] == []
+@pytest.fixture(scope="module")
+def installed(script: dict[str, Any]) -> list[Any]:
+    """All that is installed for the project, which takes seconds to find."""
+    found: list[Any] = script["dependencies"]()
+    return found
+
+
+def test_all_licences_permit_commercial_use(installed: list[Any]) -> None:
+    assert {"numpy", "torch", "warp-lang"} <= {row.name for row in installed if row.is_used}
+    assert [(row.name, row.licence) for row in installed if not row.is_allowed] == []
 
 
 @pytest.mark.parametrize(
@@ -91,18 +97,17 @@ def test_the_lock_names_no_places() -> None:
     assert "@" not in LOCK.read_text()
 
 
-def test_the_lock_covers_what_is_installed(script: dict[str, Any]) -> None:
+def test_the_lock_covers_what_is_installed(installed: list[Any]) -> None:
     found = pins(f"{sys.version_info[0]}.{sys.version_info[1]}")
-    assert sorted({row.name for row in script["dependencies"]()} - set(found)) == []
+    assert sorted({row.name for row in installed} - set(found)) == []
 
 
-def test_the_bill_of_materials_has_all_that_is_installed(script: dict[str, Any]) -> None:
-    rows = script["dependencies"]()
-    bom = json.loads(script["bill_of_materials"](rows))
+def test_the_bill_of_materials_has_all_that_is_installed(script: dict[str, Any], installed: list[Any]) -> None:
+    bom = json.loads(script["bill_of_materials"](installed))
     assert (bom["bomFormat"], bom["specVersion"]) == ("CycloneDX", "1.6")
     assert bom["metadata"]["component"]["name"] == "refu-ros"
     listed = {part["name"]: part for part in bom["components"]}
-    assert sorted(listed) == sorted(row.name for row in rows)
+    assert sorted(listed) == sorted(row.name for row in installed)
     assert all(part["licenses"] and part["purl"] for part in listed.values())
     assert (listed["numpy"]["scope"], listed["pytest"]["scope"]) == ("required", "excluded")
 

@@ -37,8 +37,8 @@ def start_row(
         "backbone": backbone,
         "body": options.body,
         "collider": options.collider,
+        "weights": None if options.weights is None else str(options.weights),
     }
-    asked["weights"] = None if options.weights is None else str(options.weights)
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     with tempfile.TemporaryDirectory() as empty:
         if first_ever:

@@ -20,7 +20,6 @@ _SHOWN = 10
 class FleetResult:
     """The records of recordings in the order of the command."""
 
-    with_report: bool = False
     rows: list[dict[str, Any]] = field(default_factory=list)
     """Each with `name` and `input`, and what `ReplayResult.as_dict` gives, or `error`."""
     n_left: int = 0

@@ -30,11 +30,12 @@ _NOT_CONTENT = ("input", "output", "overwrite", "speed")
 _CODE = (
     "refu_core/**/*.py",
     "refu_core/assets/*.npz",
-    "refu_core/weights/**/*",
+    "refu_core/weights/**/*.json",
+    "refu_core/weights/**/*.safetensors",
     "msg_adapters/**/*.py",
     "refu_lab/*.py",
 )
-"""Files of the project that results depend on."""
+"""Files of the project that results depend on: not what Python compiles of them, whenever it is written."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +75,7 @@ def replay_fleet(
             engine that is out of reach.
     """
     pipeline_for(options.replay)  # what no recording could be replayed with is said once, and now
-    result = FleetResult(with_report=options.report is not None)
+    result = FleetResult()
     rows: dict[int, dict[str, Any]] = {}
     with ExitStack() as stack:
         for place in dict.fromkeys((options.output, options.report)):

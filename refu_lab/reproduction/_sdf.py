@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -26,36 +25,22 @@ MISS = 2e-3
 """An error above this [m] counts as a miss."""
 
 
-@dataclass(frozen=True)
-class SdfErrors:
-    """Errors over some points; None where there are none."""
+def sdf_errors(approximate: ArrayLike, accurate: ArrayLike) -> dict[str, float | None]:
+    """Errors of distances f against s [m], both of shape (P,), by metric; None where there are no points for it."""
+    f, s = np.asarray(approximate, np.float64), np.asarray(accurate, np.float64)
+    error: NDArray[np.float64] = np.abs(f - s)
+    off = np.abs(s) > _AT_SURFACE
 
-    mean_absolute_mm: float | None
-    """Mean of |f - s| [mm] (supplement, Eq. 12)."""
-    mean_relative_percent: float | None
-    """Mean of |f - s| / |s| [%] (supplement, Eq. 15), over the points more than 0.1 mm from the skin."""
-    p99_mm: float | None
-    """99th percentile of |f - s| [mm]."""
-    missed_percent: float | None
-    """Points with |f - s| above 2 mm [%]."""
-    hidden_percent: float | None
-    """Points more than 2 mm inside, s < -2 mm, that are taken for outside, f ≥ 0 [%]: a collision nobody sees."""
+    def mean(factor: float, values: NDArray[Any]) -> float | None:
+        return factor * float(values.mean()) if len(values) else None
 
-    @staticmethod
-    def between(approximate: ArrayLike, accurate: ArrayLike) -> SdfErrors:
-        """Compares distances f and s [m], both of shape (P,)."""
-        f, s = np.asarray(approximate, np.float64), np.asarray(accurate, np.float64)
-        error: NDArray[np.float64] = np.abs(f - s)
-        off = np.abs(s) > _AT_SURFACE
-        if not len(error):
-            return SdfErrors(None, None, None, None, None)
-        return SdfErrors(
-            mean_absolute_mm=1e3 * float(error.mean()),
-            mean_relative_percent=100.0 * float((error[off] / np.abs(s[off])).mean()) if off.any() else None,
-            p99_mm=1e3 * float(np.percentile(error, 99)),
-            missed_percent=100.0 * float((error > MISS).mean()),
-            hidden_percent=100.0 * float(((s < -MISS) & (f >= 0)).mean()),
-        )
+    return {
+        "mean_absolute_mm": mean(1e3, error),  # supplement, Eq. 12
+        "mean_relative_percent": mean(100.0, error[off] / np.abs(s[off])),  # Eq. 15
+        "p99_mm": 1e3 * float(np.percentile(error, 99)) if len(error) else None,
+        "missed_percent": mean(100.0, error > MISS),
+        "hidden_percent": mean(100.0, (s < -MISS) & (f >= 0)),  # inside and taken for outside: nobody sees it
+    }
 
 
 DISTURBANCE = 0.01
@@ -68,7 +53,6 @@ _FOLDED_SHAPES = 8
 """Body shapes that each of them is taken with."""
 _POINTS_ASKED = 8
 """The network is asked for every so-many-th vertex: it takes a second a thousand points on one core."""
-_METRICS = ("mean_absolute_mm", "mean_relative_percent", "p99_mm", "missed_percent", "hidden_percent")
 _CLOSE = ", within 2 cm"
 _NAMES = {"approx": "walk over the posed mesh (real time)", "neural": "the paper's network"}
 
@@ -106,7 +90,7 @@ def sdf_table(sets: Sequence[SampleSet], *, library: Library, progress: bool = F
         except WeightsError as error:
             command = f"refu train {garment} --data DIR --network sdf --preset paper"
             table.missing.append(Missing(garment, "neural", str(error), command))
-            table.rows += [ResultRow.of("sdf", garment, "neural", metric, None) for metric in _METRICS]
+            table.rows += [ResultRow.of("sdf", garment, "neural", metric, None) for metric in sdf_errors([], [])]
         questions = _Questions(setup, sdfs)
         bodies: dict[bytes, Sample] = {}
         numbers = tqdm(range(len(samples)), desc=f"sdf, {garment}", unit="sample", disable=None if progress else True)
@@ -163,5 +147,5 @@ class _Questions:
 
 def _rows(garment: str, method: str, asked: _Asked, *, is_close: bool = False) -> list[ResultRow]:
     close = asked.accurate.abs() < (NEAR_SKIN if is_close else float("inf"))
-    errors = SdfErrors.between(asked.approximate[close].numpy(), asked.accurate[close].numpy())
-    return [ResultRow.of("sdf", garment, method, metric, getattr(errors, metric)) for metric in _METRICS]
+    errors = sdf_errors(asked.approximate[close].numpy(), asked.accurate[close].numpy())
+    return [ResultRow.of("sdf", garment, method, metric, value) for metric, value in errors.items()]

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -11,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from refu_core import GarmentError, load_body, load_garment
 from refu_core.body import apply_transforms, blend_transforms
-from refu_core.fitting import Placing, SurfaceMesh, fit_garment, standing_pose
-from refu_core.fitting._place import find_places
+from refu_core.fitting import Placing, SurfaceMesh, _fit, fit_garment, standing_pose
+from refu_core.fitting._place import Place, find_places
 from refu_core.fitting._surround import parts_legs
 
 SHIRT = Wanted(low=0.66, sleeve=0.6, step=0.028)
@@ -94,10 +97,25 @@ def test_a_narrow_dress_in_metres_is_not_made_larger() -> None:
     assert not any("scaled by" in note for note in made.notes)
 
 
-def test_what_cannot_be_where_it_belongs_is_worn_nowhere_else() -> None:
-    """A dress that is narrower than the shoulders, and reaches over them, was worn on the head."""
+def test_what_cannot_be_where_it_belongs_is_worn_nowhere_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A dress that is narrower than the shoulders, and reaches over them, was worn on the head, and above it: in metres
+    on a floor it has its middle there, if its origin is taken for the body's."""
+    tried = []
+
+    def told(*asked: Any) -> Iterator[Place]:
+        for place in find_places(*asked):
+            tried.append(place)
+            yield place
+
+    monkeypatch.setattr(_fit, "find_places", told)
+    body = load_body("neutral")
     with pytest.raises(GarmentError, match="was made for another body or pose"):
-        fit_garment(narrow_tube(1.38), load_body("neutral"), name="tube", longest_edge=0.1)
+        fit_garment(narrow_tube(1.38), body, name="tube", longest_edge=0.1)
+    assert tried
+    head = float(body.v_template[:, 1].max())
+    assert max(place.top for place in tried) < head + 0.35
+    with pytest.raises(GarmentError, match="it reaches higher than it can"):
+        next(find_places(narrow_tube(1.38), body, Placing(unit=1.0, up="y", is_placed=True)))
 
 
 def test_cloth_that_is_torn_as_arms_are_lifted_is_doubted() -> None:
@@ -106,14 +124,3 @@ def test_cloth_that_is_torn_as_arms_are_lifted_is_doubted() -> None:
     mesh = cone((0.42, 0.85), (0.085, 1.43))
     made = fit_garment(mesh, load_body("neutral"), name="loose", placing=placing, longest_edge=0.1)
     assert any("bringing it into the T-pose stretched" in text for text in made.warnings)
-
-
-def test_nothing_is_worn_above_the_head() -> None:
-    """A tube in metres on a floor has its middle where the head is, if its origin is taken for the body's."""
-    tube = narrow_tube(1.38)
-    body = load_body("neutral")
-    head = float(body.v_template[:, 1].max())
-    for place in find_places(tube, body, Placing()):
-        assert place.top < head + 0.35
-    with pytest.raises(GarmentError, match="it reaches higher than it can"):
-        next(find_places(tube, body, Placing(unit=1.0, up="y", is_placed=True)))

@@ -11,6 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from refu_core import GarmentPipeline
@@ -75,7 +76,7 @@ def test_is_what_a_look_from_the_skin_says(knows_arms: bool) -> None:
     parts = (joints_of("trunk", "head", "left_thigh"), *ARMS)
     of_face = part_of_faces(outfit().body.weights, outfit().body.faces, parts).numpy()
     rest = outfit().wearables[SKIRT].template.v_template.numpy()
-    to_skin = np.linalg.norm(rest[:, None] - outfit().body.v_template.numpy()[None], axis=2).min(1)
+    to_skin = cKDTree(outfit().body.v_template.numpy()).query(rest)[0]
     is_asked = outfit().wearables[SKIRT].template.mesh.independent() | (to_skin > DEFAULT_CONTACT.press_lies[0])
     how, moved = DEFAULT_CONTACT, np.linalg.norm(pressed - x, axis=1)
     farthest = outfit().wearables[SKIRT].template.edge_length if knows_arms else how.press_beside

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import cycle
 from pathlib import Path
 
 import igl
@@ -204,11 +205,11 @@ def wearer(request: pytest.FixtureRequest) -> Wearer:
 
 def test_no_vertex_stays_inside_on_recorded_motion(wearer: Wearer, motions: list[Path]) -> None:
     shares = []
-    for clip in motions:
+    for quarter, clip in zip(cycle((1, 3)), motions, strict=False):
         with np.load(clip) as data:
             poses = torch.tensor(data["poses"], dtype=torch.float32).view(-1, 1, 24, 3)
         poses[:, :, 0] = 0
-        shares += [wearer.assert_resolved(poses[len(poses) * k // 4], torch.zeros(1, 10)) for k in (1, 3)]
+        shares.append(wearer.assert_resolved(poses[len(poses) * quarter // 4], torch.zeros(1, 10)))
     assert np.mean(shares) > 0.8  # or the claim is about too little of the garment
 
 

@@ -7,10 +7,8 @@ import importlib.util
 import json
 import os
 import shutil
-import signal
 import sys
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import asdict
 from functools import cache, partial
 from pathlib import Path
@@ -55,6 +53,7 @@ from refu_core.simulation._store import DONE, FORMAT, QUANTUM, TO_DO, Rows, dequ
 from refu_lab.cli import main
 from refu_lab.contact_sheet import contact_sheet
 from refu_lab.fleet import open_engine
+from tests.lab import fleet_tasks
 
 GARMENT = "short-pant-male"
 COUNT = 5
@@ -313,20 +312,6 @@ def test_interrupted_run_goes_on_to_the_same_samples(simulated: Path, clips: Pat
     assert {path.name: path.read_bytes() for path in (output / "shard-0-of-1").glob("*.npy")} == before
 
 
-def _dying(make: Callable[[], Any], mark: Path) -> Callable[[list[int]], Any]:
-    """The function of a worker that is killed after its first block, once among all workers."""
-    function = make()
-
-    def work(slots: list[int]) -> Any:
-        made = function(slots)
-        with suppress(FileExistsError):
-            mark.mkdir()
-            os.kill(os.getpid(), signal.SIGKILL)
-        return made
-
-    return work
-
-
 class Deadly:
     """An engine whose workers die."""
 
@@ -334,7 +319,7 @@ class Deadly:
         self._engine, self._mark = engine, mark
 
     def run(self, make: Callable[[], Any], tasks: Any) -> Any:
-        return self._engine.run(partial(_dying, make, self._mark), tasks)
+        return self._engine.run(partial(fleet_tasks.dying, make, self._mark), tasks)
 
 
 def test_workers_that_are_killed_make_the_same_samples(simulated: Path, clips: Path, tmp_path: Path) -> None:

@@ -100,6 +100,20 @@ def dataset(tmp_path_factory: pytest.TempPathFactory, garment: GarmentTemplate, 
 
 
 @pytest.fixture(scope="module")
+def small_set(tmp_path_factory: pytest.TempPathFactory, garment: GarmentTemplate, body: SmplBody) -> Path:
+    """The same with fewer samples: to read a set takes longer than some steps of training."""
+    return write_set(
+        tmp_path_factory.mktemp("small") / GARMENT,
+        garment,
+        body,
+        pairs=12,
+        poses=6,
+        spread=0.4,
+        displacement=lambda pose: cloth(garment, pose),
+    )
+
+
+@pytest.fixture(scope="module")
 def samples(dataset: Path, garment: GarmentTemplate, body: SmplBody) -> TrainingSamples:
     """What the set is trained with."""
     return read_samples(GarmentDataset(dataset), body, garment, split="train")
@@ -267,14 +281,14 @@ def weights(folder: Path) -> dict[str, Tensor]:
 
 @pytest.mark.usefixtures("no_curves")
 def test_interrupted_it_resumes_to_the_same_weights(
-    tmp_path: Path, dataset: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, small_set: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def train(folder: Path, seed: int = 0) -> None:
         loop = replace(QUICK.loop, seed=seed, check_every=10)
         settings = PretrainSettings(
             loop, rank=8, style_shape_steps=20, low_steps=20, steps=20, is_mirrored=False, validation_share=0.2
         )
-        pretrain(GARMENT, dataset, folder, settings=settings, config=SMALL, quiet=True)
+        pretrain(GARMENT, small_set, folder, settings=settings, config=SMALL, quiet=True)
 
     random_state = torch.get_rng_state()
     train(tmp_path / "whole")
@@ -321,17 +335,17 @@ def test_low_frequency_targets_are_smoothed_garments(samples: TrainingSamples, g
 
 
 @pytest.mark.usefixtures("no_curves")
-def test_it_stops_when_nothing_gets_better(tmp_path: Path, dataset: Path) -> None:
+def test_it_stops_when_nothing_gets_better(tmp_path: Path, small_set: Path) -> None:
     loop = replace(QUICK.loop, learning_rate=0.0, check_every=5, patience=2)
     settings = replace(QUICK, loop=loop, is_mirrored=False)
-    pretrain(GARMENT, dataset, tmp_path, settings=settings, config=SMALL, quiet=True)
+    pretrain(GARMENT, small_set, tmp_path, settings=settings, config=SMALL, quiet=True)
     entries = [json.loads(line) for line in (tmp_path / "tailornet-none.jsonl").read_text().splitlines()]
     assert max(entry["step"] for entry in entries) == 15
 
 
-def test_bad_settings_and_files_are_refused(tmp_path: Path, dataset: Path) -> None:
+def test_bad_settings_and_files_are_refused(tmp_path: Path, small_set: Path) -> None:
     with pytest.raises(WeightsError, match="no backbone 'bert'"):
-        pretrain(GARMENT, dataset, tmp_path, backbone="bert", quiet=True)
+        pretrain(GARMENT, small_set, tmp_path, backbone="bert", quiet=True)
     (tmp_path / "x.checkpoint").write_bytes(b"PK\x03\x04nothing")
     with pytest.raises(WeightsError, match="damaged checkpoint"):
         load_checkpoint(tmp_path / "x.checkpoint")
@@ -357,8 +371,11 @@ def test_a_log_goes_on_where_its_run_was_interrupted(tmp_path: Path) -> None:
 
 _PARALLEL = """
 import sys, torch
+from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 from refu_core.backbones import MlpConfig
-from refu_core.training import LoopSettings, PretrainSettings, pretrain
+from refu_core.training import LoopSettings, PretrainSettings, TrainingLog, pretrain
+
+TrainingLog.draw = lambda _: None
 
 def train(dataset, folder):
     loop = LoopSettings(batch_size=16, weight_decay=0.01, check_every=10)
@@ -368,23 +385,21 @@ def train(dataset, folder):
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    train(*sys.argv[1:])
+    config = LaunchConfig(1, 1, 2, rdzv_backend="c10d", rdzv_endpoint="localhost:0", start_method="fork")
+    elastic_launch(config, train)(*sys.argv[1:])
 """
+"""As `torchrun --standalone --nproc-per-node 2`, but of processes that have imported what this one has."""
 
 
 @pytest.mark.skipif(not torch.distributed.is_available(), reason="this torch build has no torch.distributed")
 @pytest.mark.usefixtures("no_curves")
-def test_two_processes_make_the_training_of_one(tmp_path: Path, garment: GarmentTemplate, body: SmplBody) -> None:
-    dataset = write_set(
-        tmp_path / GARMENT, garment, body, pairs=12, poses=6, spread=0.4, displacement=lambda pose: cloth(garment, pose)
-    )
+def test_two_processes_make_the_training_of_one(tmp_path: Path, small_set: Path) -> None:
     script = tmp_path / "train.py"
     script.write_text(_PARALLEL)
-    torchrun = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
-    command = [*torchrun, str(script), str(dataset), str(tmp_path / "two")]
+    command = [sys.executable, str(script), str(small_set), str(tmp_path / "two")]
     done = subprocess.run(command, capture_output=True, text=True, timeout=1200, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
-    runpy.run_path(str(script))["train"](str(dataset), str(tmp_path / "one"))
+    runpy.run_path(str(script))["train"](str(small_set), str(tmp_path / "one"))
     curves = [
         [json.loads(line) for line in next((tmp_path / folder).glob("*.jsonl")).read_text().splitlines()]
         for folder in ("one", "two")

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -179,20 +181,36 @@ def pretrained(tmp_path_factory: pytest.TempPathFactory, dataset: Path) -> Path:
     return folder
 
 
+Tuned = Callable[[str], tuple[Path, dict[str, Any]]]
+
+
+@pytest.fixture(scope="module")
+def tuned(tmp_path_factory: pytest.TempPathFactory, dataset: Path, pretrained: Path) -> Tuned:
+    """Folder and card of a quick training in a mode, made when it is first asked for."""
+
+    @cache
+    def of(mode: str) -> tuple[Path, dict[str, Any]]:
+        folder = tmp_path_factory.mktemp(mode)
+        card = finetune(GARMENT, dataset, pretrained, folder, mode=mode, backbone="mlp", settings=QUICK, quiet=True)
+        return folder, card
+
+    return of
+
+
 @pytest.mark.parametrize("mode", FINETUNE_MODES)
 def test_every_mode_writes_what_can_be_read(
-    tmp_path: Path, dataset: Path, pretrained: Path, garment: GarmentTemplate, body: SmplBody, mode: str
+    tuned: Tuned, pretrained: Path, garment: GarmentTemplate, body: SmplBody, mode: str
 ) -> None:
-    card = finetune(GARMENT, dataset, pretrained, tmp_path, mode=mode, backbone="mlp", settings=QUICK, quiet=True)
+    folder, card = tuned(mode)
     expect = {"garment": GARMENT, "body_fingerprint": body.fingerprint}
-    stem = tmp_path / f"mlp-{mode}"
+    stem = folder / f"mlp-{mode}"
     network, refu = trained_from_weights(load_weights(stem, expect=expect), garment)
     betas, pose, style = bodies(2)
     before = backbone_from_weights(load_weights(pretrained / "mlp-none", expect=expect), garment)
     assert not torch.equal(network(betas, pose, style), before(betas, pose, style))
     assert card["mode"] == load_weights(stem).card["mode"] == mode
-    assert (tmp_path / f"mlp-{mode}.png").exists()
-    assert not (tmp_path / f"mlp-{mode}.checkpoint").exists()
+    assert (folder / f"mlp-{mode}.png").exists()
+    assert not (folder / f"mlp-{mode}.checkpoint").exists()
     if mode.startswith("collision"):
         assert refu is None
         return
@@ -203,15 +221,13 @@ def test_every_mode_writes_what_can_be_read(
 
 @pytest.mark.usefixtures("no_curves")
 def test_interrupted_it_resumes_to_the_same_weights(
-    tmp_path: Path, dataset: Path, pretrained: Path, monkeypatch: pytest.MonkeyPatch
+    tuned: Tuned, tmp_path: Path, dataset: Path, pretrained: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def train(folder: str) -> dict[str, Tensor]:
-        finetune(
-            GARMENT, dataset, pretrained, tmp_path / folder, mode="accurate", backbone="mlp", settings=QUICK, quiet=True
-        )
-        return dict(load_weights(tmp_path / folder / "mlp-accurate").tensors)
+    def train() -> dict[str, Tensor]:
+        finetune(GARMENT, dataset, pretrained, tmp_path, mode="accurate", backbone="mlp", settings=QUICK, quiet=True)
+        return dict(load_weights(tmp_path / "mlp-accurate").tensors)
 
-    whole = train("whole")
+    whole = load_weights(tuned("accurate")[0] / "mlp-accurate").tensors
     real = loop_module.save_checkpoint
 
     def interrupted(*args: Any) -> None:
@@ -221,28 +237,28 @@ def test_interrupted_it_resumes_to_the_same_weights(
     with monkeypatch.context() as patch:
         patch.setattr(loop_module, "save_checkpoint", interrupted)
         with pytest.raises(KeyboardInterrupt):
-            train("parts")
+            train()
     torch.manual_seed(99)
-    parts = train("parts")
+    parts = train()
     assert whole.keys() == parts.keys()
     assert any(name.startswith("refu.") for name in whole)
     assert all(torch.equal(whole[name], parts[name]) for name in whole)
 
 
 @pytest.mark.usefixtures("no_curves")
-def test_training_brings_the_cloth_out_and_nearer_to_the_truth(tmp_path: Path, dataset: Path, pretrained: Path) -> None:
+def test_training_brings_the_cloth_out_and_nearer_to_the_truth(
+    tuned: Tuned, tmp_path: Path, dataset: Path, pretrained: Path
+) -> None:
     settings = replace(QUICK, steps=40, loop=replace(QUICK.loop, check_every=20))
     finetune(GARMENT, dataset, pretrained, tmp_path, mode="hybrid", backbone="mlp", settings=settings, quiet=True)
     lines = [json.loads(line) for line in (tmp_path / "mlp-hybrid.jsonl").read_text().splitlines()]
-    finetune(GARMENT, dataset, pretrained, tmp_path / "x", mode="hybrid", backbone="mlp", settings=QUICK, quiet=True)
-    first = json.loads((tmp_path / "x" / "mlp-hybrid.jsonl").read_text().splitlines()[0])
+    first = json.loads((tuned("hybrid")[0] / "mlp-hybrid.jsonl").read_text().splitlines()[0])
     assert lines[-1]["validation"] < 0.8 * first["validation"]
 
 
 @pytest.mark.usefixtures("no_curves")
-def test_goes_on_from_trained_weights_and_their_layer(tmp_path: Path, dataset: Path, pretrained: Path) -> None:
-    first = tmp_path / "first"
-    finetune(GARMENT, dataset, pretrained, first, mode="hybrid", backbone="mlp", settings=QUICK, quiet=True)
+def test_goes_on_from_trained_weights_and_their_layer(tuned: Tuned, tmp_path: Path, dataset: Path) -> None:
+    first, _ = tuned("hybrid")
     settings = replace(QUICK, steps=1, loop=replace(QUICK.loop, learning_rate=1e-9, weight_decay=0.0))
     card = finetune(
         GARMENT, dataset, first, tmp_path, mode="hybrid", backbone="mlp", settings=settings, goes_on=True, quiet=True

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +26,20 @@ def square_unless_first(number: int) -> int:
 def die(_: int) -> None:
     """Kills whoever calls it."""
     os.kill(os.getpid(), signal.SIGKILL)
+
+
+def dying(make: Callable[[], Any], mark: Path) -> Callable[[Any], Any]:
+    """The function that `make` makes, of a worker that is killed after its first task, once among all workers."""
+    function = make()
+
+    def work(task: Any) -> Any:
+        done = function(task)
+        with suppress(FileExistsError):
+            mark.mkdir()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return done
+
+    return work
 
 
 def allow_no_failure(dask_scheduler: Any) -> None:

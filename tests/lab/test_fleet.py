@@ -25,6 +25,7 @@ from refu_lab.cli import main
 from refu_lab.fleet import FleetError, find_recordings, fleet_table, is_plain, open_engine
 from refu_lab.fleet._engine import DaskEngine, run_function
 from refu_lab.fleet._summary import FleetResult
+from refu_lab.fleet.replay import _CODE
 from tests.lab import fleet_tasks
 from tests.lab.test_replay import motion, write_bag
 
@@ -246,6 +247,12 @@ def messages(path: Path) -> list[tuple[str, int, bytes]]:
         every = [(one.topic, one.log_time_ns, bytes(one.data)) for one in bag.messages()]
     assert {topic for topic, *_ in every} > {"/garments", "/body"}
     return [one for one in every if one[0] != "/diagnostics"]
+
+
+def test_finished_results_stay_so_when_modules_are_compiled() -> None:
+    root = Path(__file__).parents[2]
+    kinds = {path.suffix for pattern in _CODE for path in root.glob(pattern) if path.is_file()}
+    assert kinds == {".py", ".npz", ".json", ".safetensors"}
 
 
 def test_conversion_alone_gives_the_same_bag(bags: Path, alone: Path, tmp_path: Path, capsys: Any) -> None:

@@ -15,7 +15,7 @@ from small_set import write_set
 
 from refu_core import GarmentError, GarmentPipeline, RefuError, SmplFrame, load_body, load_garment
 from refu_core.fitting import fit_garment, read_surface
-from refu_core.garments import garment_files, save_garment
+from refu_core.garments import GarmentTemplate, garment_files, save_garment
 from refu_core.simulation import open_dataset, simulate_dataset
 from refu_core.training import PretrainSettings, pretrain
 from refu_lab.cli import main
@@ -41,6 +41,12 @@ def kilt(tmp_path_factory: pytest.TempPathFactory) -> Path:
     v, quads = quads_of_a_skirt(12, 40)
     uv = np.stack((np.arctan2(v[:, 0], v[:, 2]), v[:, 1]), 1)
     return write_obj(tmp_path_factory.mktemp("mesh") / "kilt.obj", Outside(v, quads, uv, quads))
+
+
+@pytest.fixture(scope="module")
+def template(kilt: Path) -> GarmentTemplate:
+    """The garment that it makes."""
+    return fit_garment(read_surface(kilt), load_body("female"), name="kilt", longest_edge=0.1).template
 
 
 @pytest.mark.parametrize("name", MESHES)
@@ -169,9 +175,8 @@ def test_a_file_of_any_name_makes_a_garment_that_can_be_worn(folder: Path, kilt:
         GarmentPipeline.load(["tshirt"])
 
 
-def test_a_node_takes_a_garment_by_its_path(kilt: Path, tmp_path: Path) -> None:
-    result = add_garment(AddOptions(mesh=kilt, body="female", longest_edge=0.1, output=tmp_path / "kilt.npz"))
-    settings = NodeSettings(garments=(result["file"],))
+def test_a_node_takes_a_garment_by_its_path(template: GarmentTemplate, tmp_path: Path) -> None:
+    settings = NodeSettings(garments=(str(save_garment(template, tmp_path / "kilt.npz")),))
     settings.check_files()
     assert settings.pipeline.load().untrained == ("kilt",)
     with pytest.raises(RefuError, match="no weights of tailornet hybrid"):
@@ -179,14 +184,12 @@ def test_a_node_takes_a_garment_by_its_path(kilt: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("no_curves")
-def test_a_garment_of_ones_own_is_simulated_and_trained(kilt: Path, tmp_path: Path) -> None:
+def test_a_garment_of_ones_own_is_simulated_and_trained(template: GarmentTemplate, tmp_path: Path) -> None:
     """The whole journey with few samples: a mesh, cloth, networks, and those in the pipeline."""
-    body = load_body("female")
-    template = fit_garment(read_surface(kilt), body, name="kilt", longest_edge=0.1).template
     path = save_garment(template, tmp_path / "kilt.npz")
     card = simulate_dataset(str(path), 2, tmp_path / "simulated", test_share=0.5)
     assert card["counts"]["to_do"] == 0
-    data = write_set(tmp_path / "set", template, body)
+    data = write_set(tmp_path / "set", template, load_body("female"))
     settings = PretrainSettings.of("mlp", "realtime")
     settings = replace(settings, style_shape_steps=2, low_steps=2, steps=2)
     pretrain(
@@ -206,9 +209,8 @@ def test_a_garment_of_ones_own_is_simulated_and_trained(kilt: Path, tmp_path: Pa
 
 
 @pytest.fixture(scope="module")
-def dressed(kilt: Path) -> list[ExportMesh]:
+def dressed(template: GarmentTemplate) -> list[ExportMesh]:
     """A body in a textured skirt, two frames."""
-    template = fit_garment(read_surface(kilt), load_body("female"), name="kilt", longest_edge=0.1).template
     pipeline = GarmentPipeline.load([template])
     frames = [SmplFrame(pose=np.zeros((24, 3)), transl=[0, k, 0]) for k in range(2)]
     return meshes_of(pipeline, pipeline(frames))

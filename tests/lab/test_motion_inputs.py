@@ -59,6 +59,7 @@ def test_z_up_is_seen_and_pictures_stand(tmp_path: Path, monkeypatch: pytest.Mon
         return np.zeros((4, 4, 3), np.uint8)
 
     monkeypatch.setattr("refu_lab.report.render", draw)
+    monkeypatch.setattr("refu_lab.report._plot", lambda *_: None)  # nor do the curves
     path = z_up(tmp_path / "a.npz")
     seen, left = run(path, max_frames=1), run(path, max_frames=1, input_axes="frame")
     assert heights(seen)[0] > 0.6
