@@ -136,8 +136,9 @@ def _around(points: F64, samples: Samples, is_outer: NDArray[np.bool_], body: Po
     skin = body.vertices.double().numpy()[::each]
     # For each vertex and sample: the way from one to the other along the normal, and its length, squared.
     along = (places * normals).sum(1) - skin @ normals.T
-    squared = (places**2).sum(1) + (skin**2).sum(1)[:, None] - 2 * skin @ places.T
-    winding = (along / np.maximum(squared, 1e-6) ** 1.5) @ area / (4 * np.pi)
+    squared = np.maximum((places**2).sum(1) + (skin**2).sum(1)[:, None] - 2 * skin @ places.T, 1e-6)
+    squared *= np.sqrt(squared)  # six times as fast as the power 1.5
+    winding = (along / squared) @ area / (4 * np.pi)
     return float(each * body.skin[::each][np.abs(winding) > 0.4].sum() / area.sum())
 
 
