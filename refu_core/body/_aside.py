@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-from refu_core._warp import Repeated, as_warp, is_plain, torch_stream
+from refu_core._warp import Repeated, as_warp, is_plain, memory, torch_stream
 from refu_core.body import _aside_kernels as kernels
 from refu_core.body._collider_gradient import weights_at
 from refu_core.body._collider_kernels import Means
@@ -77,9 +77,9 @@ class Aside:
         self._other = self._tensor(np.flatnonzero(solids.of_vertex == 0))
         self._faces = self._tensor(solids.faces[0].astype(np.int64))
         """Of the body without its arms, closed, shape (F, 3)."""
-        self._box = torch.zeros(2, 1, 3, device=device)
+        self._box = memory(2, 1, 3, device=device)
         self._corners = [as_warp(corner, wp.vec3) for corner in self._box]
-        self._points = torch.zeros(len(rest) + len(rows) - self._first_cap, 3, device=device)
+        self._points = memory(len(rest) + len(rows) - self._first_cap, 3, device=device)
         indices = wp.array(np.ascontiguousarray(solids.faces[0].ravel()), dtype=wp.int32, device=str(device))
         self._tree: Any = wp.Mesh(as_warp(self._points, wp.vec3), indices)
         self._find = Repeated(kernels.inside_kernel, (wp.vec3, wp.int32, wp.vec3), [self._tree.id, *self._corners])
@@ -138,7 +138,7 @@ class Aside:
             for one in (start, self._vertex, np.cumsum([0, *map(len, corners)]), np.concatenate(corners))
         )
         means.weight = wp.array(self._weight.numpy(), dtype=wp.float32, device="cpu")
-        places, self._n_near = torch.zeros(len(start) - 1, 3), torch.zeros(1, dtype=torch.int32)
+        places, self._n_near = memory(len(start) - 1, 3), memory(1, dtype=torch.int32)
         self._places = places[:n_middles]
         means.mean = as_warp(places, wp.vec3)
         inputs = [as_warp(self._points, wp.vec3), mesh.n_vertices, n_middles, means, segment_start, corner]

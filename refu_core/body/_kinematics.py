@@ -22,7 +22,7 @@ def rotvec_to_rotmat(rotvec: Tensor) -> Tensor:
     """
     if is_plain(rotvec):
         flat = rotvec.reshape(-1, 3).contiguous()
-        matrices = torch.empty(*rotvec.shape, 3, device=rotvec.device)
+        matrices = rotvec.new_empty(*rotvec.shape, 3)
         if len(flat):
             _rotate((len(flat),), flat, matrices.view(-1, 3, 3))
         return matrices
@@ -72,7 +72,7 @@ def forward_kinematics(rotations: Tensor, joints: Tensor) -> tuple[Tensor, Rigid
 
 def _chained(rotations: Tensor, joints: Tensor) -> tuple[Tensor, RigidTransforms]:
     turned = torch.empty_like(rotations)
-    translation, posed = torch.empty(2, *rotations.shape[:3], device=rotations.device).unbind(0)
+    translation, posed = rotations.new_empty(2, *rotations.shape[:3])
     if len(rotations):
         _chain((len(rotations),), rotations, joints, _parents(rotations.device), turned, translation, posed)
     return posed, RigidTransforms(turned, translation)

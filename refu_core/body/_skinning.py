@@ -69,7 +69,7 @@ class Skinning:
         if not is_plain(points, rotation, translation, self._weights):
             return apply_transforms(points, blend_transforms(self._weights, transforms))
         points, stacked = points.contiguous(), _stacked(transforms)
-        posed = torch.empty(len(rotation), *points.shape[1:], device=points.device)
+        posed = points.new_empty(len(rotation), *points.shape[1:])
         if len(rotation):
             n_strips, each = strips(posed.shape[1], posed.device)
             _skin((len(posed), n_strips), points, *self._by_joint, stacked, each, posed)

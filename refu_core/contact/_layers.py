@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from refu_core._warp import as_warp, ints, recorded, torch_stream
+from refu_core._warp import as_warp, ints, memory, recorded, torch_stream
 from refu_core.contact import _layers_kernels as kernels
 from refu_core.contact._parting import Parting
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
@@ -51,8 +51,8 @@ class Layer:
         self.parting = Parting(mesh, above, self._below, settings=settings)
         """What is done where triangles of this garment and the inner one of the last call cut each other after all."""
         n = len(above)
-        self._given, self._points, self._push, *self._fields = torch.zeros(5, n, 3, device=self.device)
-        self._count = torch.zeros(1, dtype=torch.int32, device=self.device)
+        self._given, self._points, self._push, *self._fields = memory(5, n, 3, device=self.device)
+        self._count = memory(1, dtype=torch.int32, device=self.device)
         data = kernels.Above()
         data.given, data.points, data.push, data.field, data.smoother = (
             as_warp(rows, wp.vec3) for rows in (self._given, self._points, self._push, *self._fields)

@@ -10,7 +10,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import as_warp, ints, recorded, torch_stream
+from refu_core._warp import as_warp, ints, memory, recorded, torch_stream
 from refu_core.contact import _edge_kernels, _resolver_kernels, _round_kernels, _state
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
 from refu_core.errors import MeshError
@@ -74,15 +74,15 @@ class Resolver:
         self._n_edges = e = len(mesh.edges)
         self._cloth = _cloth(mesh, self.device)
         self._state = state = _state.State()
-        self._vectors = {name: torch.zeros(n, 3, device=self.device) for name in _VECTORS}
-        self._floats = {name: torch.zeros(n, device=self.device) for name in _FLOATS}
-        self._ints = {name: torch.zeros(n, dtype=torch.int32, device=self.device) for name in _INTS}
+        self._vectors = {name: memory(n, 3, device=self.device) for name in _VECTORS}
+        self._floats = {name: memory(n, device=self.device) for name in _FLOATS}
+        self._ints = {name: memory(n, device=self.device, dtype=torch.int32) for name in _INTS}
         for tensors, kind in ((self._vectors, wp.vec3), (self._floats, wp.float32), (self._ints, wp.int32)):
             for name, tensor in tensors.items():
                 setattr(state, name, as_warp(tensor, kind))
         n_counts = _state.CUTTING + 1 + settings.max_pushes
-        self._counts = torch.zeros(n_counts, dtype=torch.int32, device=self.device)
-        self._bounds = torch.full((2, n_counts), 2**31 - 1, dtype=torch.int32, device=self.device)
+        self._counts = memory(n_counts, dtype=torch.int32, device=self.device)
+        self._bounds = memory(2, n_counts, dtype=torch.int32, device=self.device).fill_(2**31 - 1)
         state.counts, state.begins, state.ends = (as_warp(one, wp.int32) for one in (self._counts, *self._bounds))
         state.suspects, *self._low = (wp.zeros(e, dtype=wp.int32, device=str(self.device)) for _ in range(3))
         state.deficit = wp.zeros(e, dtype=wp.float32, device=str(self.device))

@@ -10,7 +10,7 @@ import torch
 import warp as wp
 from numpy.typing import NDArray
 
-from refu_core._warp import as_warp
+from refu_core._warp import as_warp, memory
 from refu_core.body import DEFAULT_GAP, SEGMENTS, part_of_faces
 from refu_core.mesh import vertex_areas
 from refu_core.outputs import _limbs_kernels as kernels
@@ -57,7 +57,7 @@ class LimbContacts:
         """For garments on a body, on the CPU."""
         self._faces = {name: garment.faces.cpu().numpy() for name, garment in garments.items()}
         n = body.n_vertices
-        self._points, self._shift = torch.zeros(2, n, 3)
+        self._points, self._shift = memory(2, n, 3)
         self._points.copy_(body.v_template.detach())
         part = part_of_faces(body.weights.cpu(), body.faces.cpu(), list(SEGMENTS.values())).numpy()
         faces = body.faces.cpu().numpy().astype(np.int32)

@@ -10,7 +10,7 @@ import warp as wp
 from numpy.typing import NDArray
 from torch import Tensor
 
-from refu_core._warp import Repeated, as_warp, torch_stream
+from refu_core._warp import Repeated, as_warp, memory, torch_stream
 from refu_core.errors import MeshError
 from refu_core.sdf._closest_kernels import closest_kernel
 from refu_core.sdf._mesh import FOUND, Found, MeshSdf, ask
@@ -69,7 +69,7 @@ class ExactSdf(MeshSdf):
         super().__init__(faces, device=device)
         self._by_winding = sign == "winding"
         self._rebuild_distance = rebuild_distance
-        self._built_at = torch.empty(0, 3)  # the pose the BVH was built for
+        self._built_at = memory(0, 3)  # the pose the BVH was built for
         self._mesh: Any = None
         self._none = torch.empty(0, dtype=torch.int32, device=self.device)
 
@@ -126,5 +126,5 @@ class ExactSdf(MeshSdf):
         return ClosestPoints(found.face, barycentrics, found.distance.abs(), sign)
 
     def _find(self, points: Tensor, near: Tensor | None, max_distance: float = _UNLIMITED) -> Found:
-        farthest = torch.full((1,), max_distance, device=self.device)
+        farthest = points.new_full((1,), max_distance)
         return ask(self._ask, points, self._none if near is None else near, farthest)

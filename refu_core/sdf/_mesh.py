@@ -11,7 +11,7 @@ import warp as wp
 from numpy.typing import NDArray
 from torch import Tensor
 
-from refu_core._warp import Repeated, as_warp
+from refu_core._warp import Repeated, as_warp, memory
 from refu_core.errors import MeshError
 from refu_core.mesh import Connectivity
 from refu_core.sdf._analytic import Feature, signed_distance
@@ -46,7 +46,7 @@ def ask(kernel: Repeated, points: Tensor, *more: Tensor) -> Found:
     """What a kernel says of points (N, 3) [m]; it takes them, `more`, and the fields of `Found` to be filled."""
     n, device = len(points), points.device
     face = torch.empty(n, dtype=torch.int32, device=device)
-    found = Found(face, torch.empty(n, device=device), torch.empty(n, 3, device=device))
+    found = Found(face, points.new_empty(n), points.new_empty(n, 3))
     if n:
         kernel((n,), points, *more, *found)
     return found
@@ -86,7 +86,7 @@ class MeshSdf(ABC):
         is_new = self._points is None or len(vertices) != len(self._points)
         if self._points is None or is_new:
             require_outward(vertices.detach().to(self.device).double()[None], self.faces)
-            self._points = torch.empty(len(vertices), 3, device=self.device)
+            self._points = memory(len(vertices), 3, device=self.device)
             self._posed.points = as_warp(self._points, wp.vec3)
             kinds = (wp.vec3, wp.int32, wp.int32, wp.vec3, wp.vec3)
             self._find_features = Repeated(feature_kernel, kinds, [self._posed])
@@ -122,7 +122,7 @@ class MeshSdf(ABC):
     def _features(self, points: Tensor, face: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Of each point's closest face: `Feature.kind`, int32 (N,), barycentrics and unit pseudo-normals, (N, 3)."""
         kind = torch.empty_like(face)
-        barycentrics, normal = torch.empty(2, len(face), 3, device=self.device)
+        barycentrics, normal = points.new_empty(2, len(face), 3)
         if len(face):
             self._find_features((len(face),), points, face, kind, barycentrics, normal)
         return kind, barycentrics, normal
