@@ -139,7 +139,7 @@ class Resolver:
             else:
                 self._floats["first"].copy_(start.distance)
                 self._vectors["first_gradient"].copy_(start.gradient)
-                self._ints["first_face"].copy_(start.face)
+                torch.clamp(start.face, max=len(sdf.faces) - 1, out=self._ints["first_face"])  # nor of another body
                 self._run("begin")
             if not sdf.is_exact:
                 self._reconcile()

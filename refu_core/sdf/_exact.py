@@ -111,7 +111,7 @@ class ExactSdf(MeshSdf):
     def closest(self, points: Tensor, *, max_distance: float = math.inf, near: Tensor | None = None) -> ClosestPoints:
         """The closest point of the body to each of `points` [m], shape (N, 3), where one is within `max_distance` [m].
 
-        `near`, int32 of shape (N,), may name a body face near each point, or -1: then less is looked at.
+        `near`, integers of shape (N,), may name a body face near each point, or -1: then less is looked at.
 
         Not differentiable; raises as `query`.
         """
@@ -120,6 +120,7 @@ class ExactSdf(MeshSdf):
             raise MeshError(msg)
         self._require_update()
         where = self._checked(points)
+        near = None if near is None else self._checked_faces(near, len(where), least=-1)
         found = self._find(where, near, min(max_distance, _UNLIMITED))
         _, barycentrics, _ = self._features(where, found.face)
         sign = torch.where(found.distance < 0, -1.0, 1.0)

@@ -154,14 +154,14 @@ class MeshSdf(ABC):
         require_points(points)
         return points.detach().to(device=self.device, dtype=torch.float32).contiguous()
 
-    def _checked_faces(self, near: Tensor, n: int) -> Tensor:
+    def _checked_faces(self, near: Tensor, n: int, *, least: int = 0) -> Tensor:
         if not isinstance(near, Tensor) or near.shape != (n,) or near.is_floating_point():
             got = f"{near.dtype} of shape {tuple(near.shape)}" if isinstance(near, Tensor) else type(near).__name__
             msg = f"near must be integers of the shape ({n},), got {got}"
             raise MeshError(msg)
         near = near.to(device=self.device, dtype=torch.int32).contiguous()
         # Clamped and not checked: a device would have to be waited for, and no kernel may read beyond the faces.
-        return near.clamp(0, len(self.faces) - 1)
+        return near.clamp(least, len(self.faces) - 1)
 
     def _require_update(self) -> Tensor:
         if self._points is None:
