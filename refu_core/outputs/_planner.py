@@ -91,7 +91,6 @@ class PlannerMesh:
         self._n_vertices = len(rest)
         kept, self.sheet, self._take = _prepared(garment, rest, max_triangles, worn)
         """`sheet`: faces of the sheet in the middle of the solid, counter-clockwise from outside, shape (S, 3)."""
-        """Faces of the sheet in the middle of the solid, counter-clockwise from outside, shape (S, 3)."""
         self.faces: NDArray[np.int32] = _solid(self.sheet, len(kept))
         """Counter-clockwise from outside, shape (T, 3); the same in every frame."""
         if len(self.faces) > max_triangles:

@@ -10,7 +10,7 @@ import warp as wp
 from numpy.typing import NDArray
 from torch import Tensor
 
-from refu_core._warp import Repeated, memory
+from refu_core._warp import Repeated, memory, recorded
 from refu_core.errors import MeshError
 from refu_core.mesh import Adjacency
 from refu_core.sdf._band_kernels import (
@@ -198,7 +198,7 @@ class Scan:
         cells.points = wp.empty(n, dtype=wp.vec3, device="cpu")
         cells.squared = wp.empty(n, dtype=wp.float32, device="cpu")
         self._sort = Repeated(sort_kernel, (wp.vec3, wp.int32), [cells])
-        self._scan = wp.launch(scan_kernel, self._n_faces, [self._body, cells], device="cpu", record_cmd=True)
+        self._scan = recorded(scan_kernel, self._n_faces, [self._body, cells], "cpu")
         self._finish = Repeated(finish_kernel, (wp.vec3, wp.float32, *FOUND), [self._body, cells])
 
 

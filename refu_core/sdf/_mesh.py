@@ -11,7 +11,7 @@ import warp as wp
 from numpy.typing import NDArray
 from torch import Tensor
 
-from refu_core._warp import Repeated, as_warp, memory
+from refu_core._warp import Repeated, as_warp, ints, memory
 from refu_core.errors import MeshError
 from refu_core.mesh import Connectivity
 from refu_core.sdf._analytic import Feature, signed_distance
@@ -67,7 +67,7 @@ class MeshSdf(ABC):
         self._posed.faces = as_warp(self.faces, wp.int32)
         fan_start, fan_face = mesh.fan
         for name, array in (("across", mesh.across), ("fan_start", fan_start), ("fan_face", fan_face)):
-            setattr(self._posed, name, wp.array(array, dtype=wp.int32, device=str(self.device)))
+            setattr(self._posed, name, ints(array, self.device))
         self._vertices: Tensor | None = None  # as given, with its graph
         self._points: Tensor | None = None  # float32 copy that the kernels read
         self._skin: Any = None
