@@ -41,9 +41,9 @@ class ExactSdf(MeshSdf):
     """Exact signed distance to a watertight body, on CPU and CUDA with the same kernels (the paper's "Acc. SDF").
 
     The distance is that to the closest triangle. Its sign is that of the angle-weighted pseudo-normal at the closest
-    point, which is right wherever the body doesn't intersect itself, or (`sign="winding"`) of the winding number,
-    six times slower and right within intersecting limbs too. The gradient is the unit direction to or from the closest
-    point; on the surface, the pseudo-normal; it is finite everywhere, the medial axis included.
+    point, which is right wherever the body doesn't intersect itself and no two of its vertices are at one place, or
+    (`sign="winding"`) of the winding number, six times slower and right there, too. The gradient is the unit direction
+    to or from the closest point; on the surface, the pseudo-normal; it is finite everywhere, the medial axis included.
 
     Both are differentiable with respect to the points and the body's vertices: where either requires a gradient (and
     for float64), they are computed again in torch from the closest face, edge or vertex found.
