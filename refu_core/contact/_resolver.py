@@ -91,6 +91,7 @@ class Resolver:
         self._is_serial = self.device.type == "cpu"
         self._read_counts = self._counts.numpy() if self._is_serial else np.zeros(0)
         self._known: dict[tuple[Any, float], dict[str, Any]] = {}
+        self._last_sdf: MeshSdf | None = None
 
     @torch.no_grad()
     def __call__(
@@ -114,7 +115,8 @@ class Resolver:
             scale: α of the first push: one number, or a function of vertices and their distances.
 
         Raises:
-            MeshError: points of another number or type, a negative margin, or a distance that isn't one to faces.
+            MeshError: points of another number or type, a negative margin, a distance that isn't one to faces, or no
+                start though the last call wasn't for this `sdf`.
         """
         require_tensor("points", points)
         distances = self._floats["distance"] if start is None else start.distance
@@ -125,6 +127,10 @@ class Resolver:
         if not 0 <= margin < math.inf:
             msg = f"wanted a margin of 0 m or more, got {margin}"
             raise MeshError(msg)
+        if start is None and sdf is not self._last_sdf:
+            msg = "nothing to go on from: the last call wasn't for this sdf; give what it says of the points as start"
+            raise MeshError(msg)
+        self._last_sdf = sdf
         with torch_stream(self.device):
             self._commands = self._launches(sdf.skin(), margin)
             self._counts.zero_()

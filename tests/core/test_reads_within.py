@@ -105,6 +105,19 @@ def test_distances_to_another_body_name_no_face_of_this_one() -> None:
     assert float(sdf.query(done.vertices).distance.min()) > 0
 
 
+def test_who_goes_on_does_so_on_the_same_body() -> None:
+    (vertices, faces), (many, fine) = _ball(), _ball(6)
+    sdf, other, resolver = ExactSdf(faces), ExactSdf(fine), Resolver(faces, len(vertices))
+    sdf.update(vertices)
+    other.update(many)
+    with pytest.raises(MeshError, match="nothing to go on from"):
+        resolver(vertices, sdf, None)
+    resolver(vertices, other, other.query(vertices))
+    with pytest.raises(MeshError, match="nothing to go on from"):
+        resolver(0.9 * vertices, sdf, None)
+    resolver(0.9 * vertices, other, None)
+
+
 def test_a_sheet_has_the_vertices_that_its_faces_name() -> None:
     vertices, faces = _ball()
     checker = SheetChecker(faces.numpy())
