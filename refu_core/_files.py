@@ -77,10 +77,10 @@ def read_file(path: str | os.PathLike[str], *, most: int, error: type[RefuError]
             raise error(msg) from cause
 
 
-def read_json(path: str | os.PathLike[str], *, error: type[RefuError], wanted: str, most: int = MAX_JSON_BYTES) -> Any:
+def read_json(path: str | os.PathLike[str], *, error: type[RefuError], wanted: str) -> Any:
     """The content of a JSON file of finite numbers. Raises `error` as `open_file`, and where it isn't one."""
     try:
-        return parse_json(read_file(path, most=most, error=error, wanted=wanted))
+        return parse_json(read_file(path, most=MAX_JSON_BYTES, error=error, wanted=wanted))
     except (ValueError, RecursionError) as cause:
         if isinstance(cause, error):
             raise

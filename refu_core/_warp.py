@@ -54,6 +54,15 @@ def as_warp(tensor: Tensor, dtype: Any) -> Any:
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
 
 
+def memory(*shape: int, device: Any = "cpu", dtype: torch.dtype = torch.float32) -> Tensor:
+    """Zeros that call after call is computed in.
+
+    Their type, their device and whether they are inference tensors don't hang on what the caller has set torch to.
+    """
+    with torch.inference_mode(False):
+        return torch.zeros(*shape, device=device, dtype=dtype)
+
+
 def ints(values: Any, device: Any) -> Any:
     """Whole numbers as a Warp array."""
     return wp.array(np.ascontiguousarray(values, np.int32), dtype=wp.int32, device=str(device))
@@ -81,7 +90,7 @@ class Repeated(threading.local):
     def __call__(self, dim: Sequence[int], *tensors: Tensor) -> None:
         """Launches with contiguous tensors of one device, which are kept until the next launch of their sizes."""
         device = tensors[0].device
-        key = (device, *dim, *(tensor.shape for tensor in tensors))
+        key = (device, *dim, *(tensor.shape for tensor in tensors), *(tensor.dtype for tensor in tensors))
         if key not in self._known:
             if len(self._known) >= _MOST_SIZES:
                 self._known.clear()

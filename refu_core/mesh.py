@@ -156,6 +156,13 @@ def check_faces(faces: Any, *, n_vertices: int | None = None) -> NDArray[np.int3
     return np.ascontiguousarray(array, dtype=np.int32)
 
 
+def rim_of(faces: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """Which edges (0, 1), (1, 2), (2, 0) of faces (F, 3) have no face that goes along them the other way, (F, 3)."""
+    start, end = faces.astype(np.int64), np.roll(faces, -1, axis=1).astype(np.int64)
+    n = int(faces.max(initial=0)) + 1
+    return ~np.isin(start * n + end, end * n + start)
+
+
 def as_points(
     name: str, values: Any, n: int | None = None, *, dtype: type[np.floating[Any]] = np.float64
 ) -> NDArray[Any]:

@@ -190,7 +190,7 @@ class _Strips:
     def __call__(self, code: Tensor) -> Tensor:
         """Displacements, shape (B, V, 3), of codes (B, R)."""
         n_strips = len(self._parts[0])
-        decoded = torch.empty(len(code), n_strips, WIDTH)
+        decoded = code.new_empty(len(code), n_strips, WIDTH)
         _decode((n_strips,), code.contiguous(), *self._parts, decoded)
         return decoded.view(len(code), n_strips * WIDTH)[:, : self._n].view(len(code), self._n // 3, 3)
 

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from refu_core._warp import memory
 from refu_core.backbones._decoder import BasisDecoder
 from refu_core.backbones._dynamics import Dynamic, Dynamics, DynamicsConfig
 from refu_core.backbones._gcnn import Gcnn
@@ -94,7 +95,8 @@ def backbone_from_weights(weights: Weights, garment: GarmentTemplate, *, device:
         raise WeightsError(msg) from error
     module = module.float().to(device).eval()
     with torch.no_grad():
-        at_rest = module(torch.zeros(1, N_BETAS, device=device), torch.zeros(1, N_JOINTS, 3, device=device), None)
+        rest = memory(1, N_BETAS, device=device), memory(1, N_JOINTS, 3, device=device)
+        at_rest = module(*rest, None)
     offset = 0.0 if at_rest is None else float(at_rest.abs().max())
     if not offset <= MAX_OFFSET:  # nor NaN
         msg = f"{weights.path}: wanted a garment within {MAX_OFFSET:g} m of a body at rest, this one is "

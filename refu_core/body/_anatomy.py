@@ -10,7 +10,7 @@ import torch
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from refu_core._warp import as_warp
+from refu_core._warp import as_warp, memory
 from refu_core.body import _collider_kernels as kernels
 from refu_core.body import _part_kernels as parting
 from refu_core.body._aside import Aside
@@ -229,13 +229,13 @@ class Memory:
     """What a call works in, as torch sees it and, as `work`, the kernels."""
 
     def __init__(self, n_vertices: int, n_middles: int, n_edges: int, n_rounds: int, device: torch.device) -> None:
-        self.rotation = torch.zeros(len(PARENTS), 3, 3, device=device)
-        self.places = torch.zeros(4, n_vertices + n_middles, 3, device=device)
+        self.rotation = memory(len(PARENTS), 3, 3, device=device)
+        self.places = memory(4, n_vertices + n_middles, 3, device=device)
         self.skin, self.here, self.there = self.places[:3, :n_vertices].unbind()
         self.points = self.places[3]
         by_vertex = ("is_moved", "is_end", "is_front", "touched", "outside")
         n_ints = len(by_vertex) * n_vertices
-        self.ints = torch.zeros(n_ints + kernels.FRONT + n_rounds + 1, dtype=torch.int32, device=device)
+        self.ints = memory(n_ints + kernels.FRONT + n_rounds + 1, dtype=torch.int32, device=device)
         """What every call begins with as zeros."""
         self.counts = self.ints[n_ints:]
         self.work = work = kernels.Work()

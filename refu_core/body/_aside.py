@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-from refu_core._warp import Repeated, as_warp, is_plain, torch_stream
+from refu_core._warp import Repeated, as_warp, ints, is_plain, memory, recorded, torch_stream
 from refu_core.body import _aside_kernels as kernels
 from refu_core.body._collider_gradient import weights_at
 from refu_core.body._collider_kernels import Means
@@ -77,11 +77,10 @@ class Aside:
         self._other = self._tensor(np.flatnonzero(solids.of_vertex == 0))
         self._faces = self._tensor(solids.faces[0].astype(np.int64))
         """Of the body without its arms, closed, shape (F, 3)."""
-        self._box = torch.zeros(2, 1, 3, device=device)
+        self._box = memory(2, 1, 3, device=device)
         self._corners = [as_warp(corner, wp.vec3) for corner in self._box]
-        self._points = torch.zeros(len(rest) + len(rows) - self._first_cap, 3, device=device)
-        indices = wp.array(np.ascontiguousarray(solids.faces[0].ravel()), dtype=wp.int32, device=str(device))
-        self._tree: Any = wp.Mesh(as_warp(self._points, wp.vec3), indices)
+        self._points = memory(len(rest) + len(rows) - self._first_cap, 3, device=device)
+        self._tree: Any = wp.Mesh(as_warp(self._points, wp.vec3), ints(solids.faces[0].ravel(), device))
         self._find = Repeated(kernels.inside_kernel, (wp.vec3, wp.int32, wp.vec3), [self._tree.id, *self._corners])
         if self._is_serial:
             self._look = self._recorded_look(mesh, weights)
@@ -133,17 +132,15 @@ class Aside:
         corners = [np.unique(mesh.faces[part_of == k]) for k in range(len(body)) if (part_of == k).any()]
         means, n_middles = Means(), len(self._arm)
         start = np.append(self._start.numpy(), len(self._vertex))[len(ARMS) :]  # of all but the shoulders
-        means.start, means.vertex, segment_start, corner = (
-            wp.array(one, dtype=wp.int32, device="cpu")
-            for one in (start, self._vertex, np.cumsum([0, *map(len, corners)]), np.concatenate(corners))
-        )
+        means.start, means.vertex = ints(start, "cpu"), ints(self._vertex, "cpu")
+        segments = ints(np.cumsum([0, *map(len, corners)]), "cpu"), ints(np.concatenate(corners), "cpu")
         means.weight = wp.array(self._weight.numpy(), dtype=wp.float32, device="cpu")
-        places, self._n_near = torch.zeros(len(start) - 1, 3), torch.zeros(1, dtype=torch.int32)
+        places, self._n_near = memory(len(start) - 1, 3), memory(1, dtype=torch.int32)
         self._places = places[:n_middles]
         means.mean = as_warp(places, wp.vec3)
-        inputs = [as_warp(self._points, wp.vec3), mesh.n_vertices, n_middles, means, segment_start, corner]
-        outputs = [*self._corners, as_warp(self._n_near, wp.int32)]
-        return wp.launch(kernels.near_kernel, 1, inputs, outputs, device="cpu", record_cmd=True)
+        arguments = [as_warp(self._points, wp.vec3), mesh.n_vertices, n_middles, means, *segments]
+        arguments += [*self._corners, as_warp(self._n_near, wp.int32)]
+        return recorded(kernels.near_kernel, 1, arguments, "cpu")
 
     def _is_any_inside(self, skin: Tensor) -> bool:
         """Whether any middle is inside the body. First by boxes of its segments: no tree is asked where none is near.

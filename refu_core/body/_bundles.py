@@ -10,6 +10,7 @@ import torch
 import warp as wp
 from numpy.typing import NDArray
 
+from refu_core._warp import ints
 from refu_core.body._bundle_kernels import Bundles
 from refu_core.mesh import grouped
 
@@ -29,14 +30,8 @@ def bundled(rest: NDArray[np.floating[Any]], faces: Sequence[NDArray[np.integer[
         first.append(len(corners))
     bundles = Bundles()
     bundles.first, bundles.start, bundles.corner = (
-        wp.array(np.asarray(values, np.int32), dtype=wp.int32, device=str(device))
-        for values in (first, np.cumsum([0, *map(len, corners)]), np.concatenate(corners))
+        ints(values, device) for values in (first, np.cumsum([0, *map(len, corners)]), np.concatenate(corners))
     )
-    for name, n in (
-        ("low", len(corners)),
-        ("high", len(corners)),
-        ("group_low", len(faces)),
-        ("group_high", len(faces)),
-    ):
-        setattr(bundles, name, wp.zeros(n, dtype=wp.vec3, device=str(device)))
+    bundles.low, bundles.high = (wp.zeros(len(corners), dtype=wp.vec3, device=str(device)) for _ in range(2))
+    bundles.group_low, bundles.group_high = (wp.zeros(len(faces), dtype=wp.vec3, device=str(device)) for _ in range(2))
     return bundles

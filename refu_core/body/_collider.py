@@ -9,7 +9,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import Repeated, as_warp, is_plain, strips, torch_stream
+from refu_core._warp import Repeated, as_warp, is_plain, recorded, strips, torch_stream
 from refu_core.body import _collider_kernels as kernels
 from refu_core.body import _step_kernels as steps
 from refu_core.body._anatomy import DEFAULT_GAP, Anatomy, ColliderSettings
@@ -130,17 +130,14 @@ class Collider:
             "touch": (steps.touch_kernel, 1 + how.deepen_rounds, [work, segments, rings, how.deepen_rounds]),
             "part": (steps.part_kernel, 2 + how.smooth_last + 2 * how.edge_rounds, part),
         }
-        commands = {"between": [self._recorded(kernels.between_kernel, len(PARENTS), [work, bones])]}
+        commands = {"between": [recorded(kernels.between_kernel, len(PARENTS), [work, bones], self.device)]}
         n = len(work.skin)
         for name, (kernel, n_steps, inputs) in kernel_of.items():
             if self._is_serial:
-                commands[name] = [self._recorded(kernel, 1, [-1, 1, *inputs])]
+                commands[name] = [recorded(kernel, 1, [-1, 1, *inputs], self.device)]
             else:
-                commands[name] = [self._recorded(kernel, n, [step, n, *inputs]) for step in range(n_steps)]
+                commands[name] = [recorded(kernel, n, [step, n, *inputs], self.device) for step in range(n_steps)]
         return commands
-
-    def _recorded(self, kernel: Any, dim: int, inputs: list[Any]) -> Any:
-        return wp.launch(kernel, dim, inputs, device=str(self.device), record_cmd=True)
 
     @torch.no_grad()
     def shift(self, skin: Tensor, aside: Tensor, apart: Tensor) -> Tensor:

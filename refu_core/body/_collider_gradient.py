@@ -8,7 +8,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import as_warp, torch_stream
+from refu_core._warp import as_warp, memory, torch_stream
 from refu_core.body import _collider_kernels as kernels
 from refu_core.body._creases import LEVELS
 from refu_core.body._kinematics import PARENTS
@@ -156,7 +156,7 @@ def _closest(known: Anatomy, points: Tensor, segment: Tensor) -> tuple[Tensor, T
     """
     n, device = len(points), points.device
     face = torch.zeros(n, dtype=torch.int32, device=device)
-    weights, sign = torch.zeros(n, 3, device=device), torch.zeros(n, device=device)
+    weights, sign = memory(n, 3, device=device), memory(n, device=device)
     asked = as_warp(points.float().contiguous(), wp.vec3), as_warp(segment.int(), wp.int32)
     outputs = [as_warp(face, wp.int32), as_warp(weights, wp.vec3), as_warp(sign, wp.float32)]
     if n:

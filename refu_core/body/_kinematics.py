@@ -11,6 +11,7 @@ from torch import Tensor
 
 from refu_core._warp import Repeated, is_plain
 from refu_core.body._pose_kernels import chain_kernel, rotation_kernel
+from refu_core.errors import FrameError
 from refu_core.skeleton import JOINT_NAMES as JOINT_NAMES
 from refu_core.skeleton import PARENTS as PARENTS
 
@@ -18,11 +19,14 @@ from refu_core.skeleton import PARENTS as PARENTS
 def rotvec_to_rotmat(rotvec: Tensor) -> Tensor:
     """Rotation matrices of rotation vectors [rad]: shape (..., 3) -> (..., 3, 3) (Rodrigues' formula).
 
-    Smooth, with finite derivatives at the zero rotation.
+    Smooth, with finite derivatives at the zero rotation. Raises `FrameError` for another shape.
     """
+    if rotvec.shape[-1:] != (3,):
+        msg = f"rotation vectors must have the shape (..., 3), got {tuple(rotvec.shape)}"
+        raise FrameError(msg)
     if is_plain(rotvec):
         flat = rotvec.reshape(-1, 3).contiguous()
-        matrices = torch.empty(*rotvec.shape, 3, device=rotvec.device)
+        matrices = rotvec.new_empty(*rotvec.shape, 3)
         if len(flat):
             _rotate((len(flat),), flat, matrices.view(-1, 3, 3))
         return matrices
@@ -58,7 +62,15 @@ def forward_kinematics(rotations: Tensor, joints: Tensor) -> tuple[Tensor, Rigid
     Args:
         rotations: rotation of each joint relative to its parent, shape (B, 24, 3, 3).
         joints: rest positions of the joints [m], shape (B, 24, 3), or (1, 24, 3) for bodies of one shape.
+
+    Raises:
+        FrameError: a shape is wrong.
     """
+    n, batch = len(PARENTS), len(rotations)
+    if rotations.shape != (batch, n, 3, 3) or joints.shape not in ((batch, n, 3), (1, n, 3)):
+        msg = f"wanted rotations (B, {n}, 3, 3) of joints (B, {n}, 3) or (1, {n}, 3), "
+        msg += f"got {tuple(rotations.shape)} and {tuple(joints.shape)}"
+        raise FrameError(msg)
     if is_plain(rotations, joints):
         return _chained(rotations.contiguous(), joints.contiguous())
     turns, places = [rotations[:, 0]], [joints[:, 0].expand(len(rotations), 3)]
@@ -72,7 +84,7 @@ def forward_kinematics(rotations: Tensor, joints: Tensor) -> tuple[Tensor, Rigid
 
 def _chained(rotations: Tensor, joints: Tensor) -> tuple[Tensor, RigidTransforms]:
     turned = torch.empty_like(rotations)
-    translation, posed = torch.empty(2, *rotations.shape[:3], device=rotations.device).unbind(0)
+    translation, posed = rotations.new_empty(2, *rotations.shape[:3])
     if len(rotations):
         _chain((len(rotations),), rotations, joints, _parents(rotations.device), turned, translation, posed)
     return posed, RigidTransforms(turned, translation)

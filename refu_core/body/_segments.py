@@ -10,6 +10,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from refu_core.body._parts import joints_of
+from refu_core.mesh import rim_of
 
 SOFTNESS: tuple[tuple[tuple[int, ...], float], ...] = (
     ((0, 3), 1.0),
@@ -68,7 +69,8 @@ def cut(faces: NDArray[np.int32], share: NDArray[np.float64]) -> Solids:
     n_points = n_vertices
     for segment in range(n_segments):
         own = faces[of_face == segment]
-        start, end = _rim(own, n_vertices)
+        on_rim = rim_of(own)
+        start, end = own[on_rim], np.roll(own, -1, axis=1)[on_rim]
         _, loop = connected_components(coo_array((np.ones(len(start)), (start, end)), (n_vertices, n_vertices)), False)
         caps = []
         for one in np.unique(loop[start]):
@@ -81,10 +83,3 @@ def cut(faces: NDArray[np.int32], share: NDArray[np.float64]) -> Solids:
     return Solids(
         of_vertex, closed, np.cumsum([0, *sizes]).astype(np.int32), np.concatenate([*loops, []]).astype(np.int32)
     )
-
-
-def _rim(faces: NDArray[np.int32], n_vertices: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Start and end of the edges that have a face on their left only."""
-    start, end = faces.ravel().astype(np.int64), np.roll(faces, -1, axis=1).ravel().astype(np.int64)
-    open_ = ~np.isin(start * n_vertices + end, end * n_vertices + start)
-    return start[open_], end[open_]

@@ -11,6 +11,7 @@ from torch import Tensor
 from refu_core._warp import Repeated, is_plain, strips
 from refu_core.body._kinematics import RigidTransforms
 from refu_core.body._pose_kernels import Transform, skin_kernel
+from refu_core.errors import MeshError
 
 _MIN_DETERMINANT = 1e-4
 """Blends of rotations almost half a turn apart collapse; below this determinant unposing is bounded, not exact."""
@@ -24,9 +25,8 @@ def blend_transforms(weights: Tensor, transforms: RigidTransforms) -> RigidTrans
 
     Leading shape (B, V); the "rotation" of a blend isn't orthonormal.
     """
-    batch = transforms.rotation.shape[0]
     blended = weights @ _stacked(transforms)
-    return RigidTransforms(blended[..., :9].view(batch, -1, 3, 3), blended[..., 9:])
+    return RigidTransforms(blended[..., :9].view(*blended.shape[:2], 3, 3), blended[..., 9:])
 
 
 def _stacked(transforms: RigidTransforms) -> Tensor:
@@ -63,16 +63,20 @@ class Skinning:
     def __call__(self, points: Tensor, transforms: RigidTransforms) -> Tensor:
         """Posed points [m], shape (B, V, 3), of rest-pose points (B, V, 3), or (1, V, 3) for bodies of one shape.
 
-        `transforms` are the joints', leading shape (B, 24). Differentiable.
+        `transforms` are the joints', leading shape (B, 24). Differentiable. Raises `MeshError` for other points.
         """
         rotation, translation = transforms
+        batch, n = len(rotation), len(self._weights)
+        if points.shape not in ((batch, n, 3), (1, n, 3)):
+            msg = f"wanted points of the shape ({batch}, {n}, 3) or (1, {n}, 3), got {tuple(points.shape)}"
+            raise MeshError(msg)
         if not is_plain(points, rotation, translation, self._weights):
             return apply_transforms(points, blend_transforms(self._weights, transforms))
         points, stacked = points.contiguous(), _stacked(transforms)
-        posed = torch.empty(len(rotation), *points.shape[1:], device=points.device)
-        if len(rotation):
-            n_strips, each = strips(posed.shape[1], posed.device)
-            _skin((len(posed), n_strips), points, *self._by_joint, stacked, each, posed)
+        posed = points.new_empty(batch, n, 3)
+        if batch:
+            n_strips, each = strips(n, posed.device)
+            _skin((batch, n_strips), points, *self._by_joint, stacked, each, posed)
         return posed
 
 

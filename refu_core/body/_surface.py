@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from refu_core._warp import ints
 from refu_core.body._part_kernels import nearest_kernel
 from refu_core.mesh import vertex_normals
 
@@ -30,7 +31,7 @@ class Surface:
         self.normals = vertex_normals(vertices, faces)
         """Unit normals at the vertices, shape (V, 3)."""
         points = wp.array(vertices.astype(np.float32), dtype=wp.vec3, device="cpu")
-        self._tree = wp.Mesh(points, wp.array(faces.ravel(), dtype=wp.int32, device="cpu"))
+        self._tree = wp.Mesh(points, ints(faces.ravel(), "cpu"))
 
     def closest(self, points: NDArray[np.float64]) -> OnSurface:
         """What points (N, 3) [m] are closest to."""

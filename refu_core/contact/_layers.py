@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from refu_core._warp import as_warp, ints, recorded, torch_stream
+from refu_core._warp import as_warp, ints, memory, recorded, torch_stream
 from refu_core.contact import _layers_kernels as kernels
 from refu_core.contact._parting import Parting
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
@@ -51,15 +51,16 @@ class Layer:
         self.parting = Parting(mesh, above, self._below, settings=settings)
         """What is done where triangles of this garment and the inner one of the last call cut each other after all."""
         n = len(above)
-        self._given, self._points, self._push, *self._fields = torch.zeros(5, n, 3, device=self.device)
-        self._count = torch.zeros(1, dtype=torch.int32, device=self.device)
+        self._given, self._points, self._push, *self._fields = memory(5, n, 3, device=self.device)
+        self._count = memory(1, dtype=torch.int32, device=self.device)
         data = kernels.Above()
         data.given, data.points, data.push, data.field, data.smoother = (
             as_warp(rows, wp.vec3) for rows in (self._given, self._points, self._push, *self._fields)
         )
         data.cut, data.count = self.parting.cut, as_warp(self._count, wp.int32)
         rest, rest_below = (one.detach().cpu().numpy() for one in (above, below))
-        data.start, data.near = (ints(one, self.device) for one in _starts(rest, rest_below, settings))
+        starts = _starts(rest, rest_below, self._below.mesh, settings)
+        data.start, data.near = (ints(one, self.device) for one in starts)
         for name in ("looks", "found", "moved", "reached", "is_reached"):
             setattr(data, name, wp.zeros(n, dtype=wp.int32, device=str(self.device)))
         self._commands = self._recorded(data, _rules(settings, rest_below[self._below.mesh.edges]))
@@ -116,22 +117,23 @@ def _rules(settings: ContactSettings, edges: NDArray[np.float32]) -> Any:
 
 
 def _starts(
-    above: NDArray[np.float32], below: NDArray[np.float32], settings: ContactSettings
+    above: NDArray[np.float32], below: NDArray[np.float32], mesh: Connectivity, settings: ContactSettings
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Vertices of the sheet below, (U, 3) [m], that each vertex above, (V, 3), looks from: starts (V + 1,) and them.
 
-    None where it isn't near the sheet at rest.
+    None where it isn't near the sheet at rest. From a vertex without a face there is nowhere to go.
     """
-    tree, is_free, places = cKDTree(below), np.ones(len(below), np.bool_), []
-    for vertex in range(len(below)):
-        if is_free[vertex]:
+    has_face = np.unique(mesh.faces)
+    tree, is_free, places = cKDTree(below[has_face]), np.ones(len(has_face), np.bool_), []
+    for i, vertex in enumerate(has_face):
+        if is_free[i]:
             places.append(vertex)
             is_free[tree.query_ball_point(below[vertex], settings.layer_reach)] = False
     distance, closest = (np.asarray(found) for found in tree.query(above))
     around = cKDTree(below[places]).query_ball_point(above, settings.layer_meets)
     each = [
         np.append(first, np.array(places)[others]) if near else np.zeros(0, np.int64)
-        for first, others, near in zip(closest, around, distance < settings.layer_meets, strict=True)
+        for first, others, near in zip(has_face[closest], around, distance < settings.layer_meets, strict=True)
     ]
     found = np.concatenate((*each, np.zeros(0, np.int64))).astype(np.int64)
     return np.append(0, np.cumsum([len(one) for one in each])).astype(np.int64), found

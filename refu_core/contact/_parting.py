@@ -8,7 +8,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import as_warp, ints, recorded, torch_stream
+from refu_core._warp import as_warp, ints, memory, recorded, torch_stream
 from refu_core.contact import _parting_kernels as kernels
 from refu_core.contact._level_kernels import level_kernel, widen_kernel
 from refu_core.contact._settings import ContactSettings
@@ -31,11 +31,11 @@ class Parting:
         self._settings, self._device, self._sheet = settings, rest.device, sheet
         self._is_serial = rest.device.type == "cpu"
         n, n_faces = len(rest), len(cut.faces)
-        self._points = torch.zeros(n, 3, device=rest.device)
-        self._other = torch.zeros_like(self._points)
-        self._marked, self._wider = torch.zeros(2, n, device=rest.device)
-        self._count = torch.zeros(1, dtype=torch.int32, device=rest.device)
-        self._ways = torch.zeros(2, n_faces, 3, device=rest.device)
+        self._points = memory(n, 3, device=rest.device)
+        self._other = memory(n, 3, device=rest.device)
+        self._marked, self._wider = memory(2, n, device=rest.device)
+        self._count = memory(1, dtype=torch.int32, device=rest.device)
+        self._ways = memory(2, n_faces, 3, device=rest.device)
         data = kernels.Outer()
         data.points, data.way, data.place = (as_warp(rows, wp.vec3) for rows in (self._points, *self._ways))
         data.order = ints(grouped(rest.cpu().numpy()[mesh.faces].mean(axis=1)), rest.device)

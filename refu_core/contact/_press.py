@@ -10,7 +10,7 @@ import warp as wp
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from refu_core._warp import as_warp, ints, recorded, torch_stream
+from refu_core._warp import as_warp, ints, memory, recorded, torch_stream
 from refu_core.body import ARMS, LEGS, SmplBody, joints_of, part_of_faces, weight_of_parts
 from refu_core.body._bundle_kernels import bound_kernel, enclose_kernel
 from refu_core.body._bundles import bundled
@@ -29,7 +29,7 @@ class LimbMeshes:
     def __init__(self, body: SmplBody) -> None:
         """For poses of this body, on its device."""
         self._device = str(body.device)
-        self._vertices = torch.zeros_like(body.v_template).copy_(body.v_template)
+        self._vertices = memory(*body.v_template.shape, device=body.device).copy_(body.v_template)
         self._is_late = np.zeros(len(_LIMBS), np.bool_)
         self.rest = body.v_template.cpu().numpy()
         """The body's vertices in the rest pose [m], shape (V, 3)."""
@@ -81,9 +81,9 @@ class Press:
         self._limbs = limbs  # their memory is read
         n, self.device = garment.n_vertices, garment.v_template.device
         self._is_serial = self.device.type == "cpu"
-        self._skin, self._points = torch.zeros(2, n, 3, device=self.device)
-        self._cut = torch.zeros(2, n, device=self.device)
-        self._counts = torch.zeros(kernels.N_COUNTS, dtype=torch.int32, device=self.device)
+        self._skin, self._points = memory(2, n, 3, device=self.device)
+        self._cut = memory(2, n, device=self.device)
+        self._counts = memory(kernels.N_COUNTS, dtype=torch.int32, device=self.device)
         own = weight_of_parts(garment.weights, _LIMBS) > 0
         foreign = (~own).cpu().numpy() @ (1 << np.arange(len(_LIMBS)))
         # Cloth that lies on the skin gives way as one piece: of its vertices a few are asked, and others follow those.

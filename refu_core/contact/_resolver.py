@@ -10,7 +10,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import as_warp, ints, recorded, torch_stream
+from refu_core._warp import as_warp, ints, memory, recorded, torch_stream
 from refu_core.contact import _edge_kernels, _resolver_kernels, _round_kernels, _state
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
 from refu_core.errors import MeshError
@@ -74,15 +74,15 @@ class Resolver:
         self._n_edges = e = len(mesh.edges)
         self._cloth = _cloth(mesh, self.device)
         self._state = state = _state.State()
-        self._vectors = {name: torch.zeros(n, 3, device=self.device) for name in _VECTORS}
-        self._floats = {name: torch.zeros(n, device=self.device) for name in _FLOATS}
-        self._ints = {name: torch.zeros(n, dtype=torch.int32, device=self.device) for name in _INTS}
+        self._vectors = {name: memory(n, 3, device=self.device) for name in _VECTORS}
+        self._floats = {name: memory(n, device=self.device) for name in _FLOATS}
+        self._ints = {name: memory(n, device=self.device, dtype=torch.int32) for name in _INTS}
         for tensors, kind in ((self._vectors, wp.vec3), (self._floats, wp.float32), (self._ints, wp.int32)):
             for name, tensor in tensors.items():
                 setattr(state, name, as_warp(tensor, kind))
         n_counts = _state.CUTTING + 1 + settings.max_pushes
-        self._counts = torch.zeros(n_counts, dtype=torch.int32, device=self.device)
-        self._bounds = torch.full((2, n_counts), 2**31 - 1, dtype=torch.int32, device=self.device)
+        self._counts = memory(n_counts, dtype=torch.int32, device=self.device)
+        self._bounds = memory(2, n_counts, dtype=torch.int32, device=self.device).fill_(2**31 - 1)
         state.counts, state.begins, state.ends = (as_warp(one, wp.int32) for one in (self._counts, *self._bounds))
         state.suspects, *self._low = (wp.zeros(e, dtype=wp.int32, device=str(self.device)) for _ in range(3))
         state.deficit = wp.zeros(e, dtype=wp.float32, device=str(self.device))
@@ -91,6 +91,7 @@ class Resolver:
         self._is_serial = self.device.type == "cpu"
         self._read_counts = self._counts.numpy() if self._is_serial else np.zeros(0)
         self._known: dict[tuple[Any, float], dict[str, Any]] = {}
+        self._last_sdf: MeshSdf | None = None
 
     @torch.no_grad()
     def __call__(
@@ -114,7 +115,8 @@ class Resolver:
             scale: α of the first push: one number, or a function of vertices and their distances.
 
         Raises:
-            MeshError: points of another number or type, a negative margin, or a distance that isn't one to faces.
+            MeshError: points of another number or type, a negative margin, a distance that isn't one to faces, or no
+                start though the last call wasn't for this `sdf`.
         """
         require_tensor("points", points)
         distances = self._floats["distance"] if start is None else start.distance
@@ -125,6 +127,10 @@ class Resolver:
         if not 0 <= margin < math.inf:
             msg = f"wanted a margin of 0 m or more, got {margin}"
             raise MeshError(msg)
+        if start is None and sdf is not self._last_sdf:
+            msg = "nothing to go on from: the last call wasn't for this sdf; give what it says of the points as start"
+            raise MeshError(msg)
+        self._last_sdf = sdf
         with torch_stream(self.device):
             self._commands = self._launches(sdf.skin(), margin)
             self._counts.zero_()
@@ -139,7 +145,7 @@ class Resolver:
             else:
                 self._floats["first"].copy_(start.distance)
                 self._vectors["first_gradient"].copy_(start.gradient)
-                self._ints["first_face"].copy_(start.face)
+                torch.clamp(start.face, max=len(sdf.faces) - 1, out=self._ints["first_face"])  # nor of another body
                 self._run("begin")
             if not sdf.is_exact:
                 self._reconcile()

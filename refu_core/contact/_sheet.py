@@ -9,7 +9,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import as_warp, ints, recorded, torch_stream
+from refu_core._warp import as_warp, ints, memory, recorded, torch_stream
 from refu_core.contact import _layers_kernels as kernels
 from refu_core.mesh import Connectivity
 
@@ -20,10 +20,10 @@ class Sheet:
     def __init__(self, mesh: Connectivity, rest: Tensor) -> None:
         """For a mesh with vertices (U, 3) [m] in the rest pose."""
         self.mesh = mesh
-        self.vertices = rest.detach().to(torch.float32, copy=True).contiguous()
+        self.vertices = memory(*rest.shape, device=rest.device).copy_(rest.detach())
         """[m], shape (U, 3)."""
         self._normals = torch.empty_like(self.vertices)
-        self._extent = torch.zeros(2, 3, device=rest.device)
+        self._extent = memory(2, 3, device=rest.device)
         self.data = data = kernels.Below()
         """As kernels read it; `fit` its tree first."""
         data.points, data.normals, data.extent = (

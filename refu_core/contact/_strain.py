@@ -6,7 +6,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import as_warp, recorded, torch_stream
+from refu_core._warp import as_warp, memory, recorded, torch_stream
 from refu_core.contact import _strain_kernels as kernels
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
 from refu_core.contact._sheet import cut_of
@@ -27,8 +27,8 @@ class StrainLimit:
         self._settings, self._device = settings, device
         self._is_serial = device.type == "cpu"
         n = mesh.n_vertices
-        self._rest, self._before, self._points, self._other = torch.zeros(4, n, 3, device=device)
-        self._count = torch.zeros(1, dtype=torch.int32, device=device)
+        self._rest, self._before, self._points, self._other = memory(4, n, 3, device=device)
+        self._count = memory(1, dtype=torch.int32, device=device)
         net = kernels.Net()
         net.cut = cut_of(mesh, device)
         net.rest, net.before, net.points, net.other = (

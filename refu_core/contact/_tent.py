@@ -8,7 +8,7 @@ import warp as wp
 from numpy.typing import NDArray
 from torch import Tensor
 
-from refu_core._warp import as_warp, ints, recorded, strips, torch_stream
+from refu_core._warp import as_warp, ints, memory, recorded, strips, torch_stream
 from refu_core.body import LEGS, SmplBody, weight_of_parts
 from refu_core.contact import _tent_kernels as kernels
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
@@ -26,7 +26,7 @@ class Shins:
     def __init__(self, body: SmplBody) -> None:
         """For poses of this body, on its device."""
         self._device = body.device
-        self._vertices = torch.zeros_like(body.v_template).copy_(body.v_template)
+        self._vertices = memory(*body.v_template.shape, device=body.device).copy_(body.v_template)
         skin, self._joints = (one.detach().cpu().double().numpy() for one in (body.v_template, body.joint_template))
         owner = body.weights.argmax(1).cpu().numpy()
         of_legs, shares, radii = [], [], []
@@ -88,7 +88,7 @@ class Tent:
         hanging.vertex = ints(rows, name)
         hanging.at_rest = wp.array2d(at_rest[rows], dtype=wp.float32, device=name)
         hanging.weight = wp.array2d(weight[rows], dtype=wp.float32, device=name)
-        self._cloth = torch.zeros_like(garment.v_template, dtype=torch.float32)
+        self._cloth = memory(*garment.v_template.shape, device=self._device)
         n_strips, each = strips(len(rows), self._device)
         inputs = [hanging, shins.data, int(each), as_warp(self._cloth, wp.vec3)]
         self._pitch = recorded(kernels.tent_kernel, n_strips, inputs, name)

@@ -11,7 +11,7 @@ import warp as wp
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from refu_core._warp import as_warp, recorded, torch_stream
+from refu_core._warp import as_warp, memory, recorded, torch_stream
 from refu_core.body import PARENTS, JointWeights
 from refu_core.contact import _layers_kernels as layers
 from refu_core.contact import _unfold_kernels as kernels
@@ -41,9 +41,9 @@ class Unfold:
         device, n = rest.device, garment.n_vertices
         self._settings, self._device = settings, device
         self._is_serial = device.type == "cpu"
-        self._points, self._other, self._origin, normals = torch.zeros(4, n, 3, device=device)
-        self._rotation = torch.zeros(len(PARENTS), 3, 3, device=device)
-        self._count = torch.zeros(1, dtype=torch.int32, device=device)
+        self._points, self._other, self._origin, normals = memory(4, n, 3, device=device)
+        self._rotation = memory(len(PARENTS), 3, 3, device=device)
+        self._count = memory(1, dtype=torch.int32, device=device)
         fold = kernels.Fold()
         fold.points, fold.leveller, fold.origin, fold.normal = (
             as_warp(one, wp.vec3) for one in (self._points, self._other, self._origin, normals)

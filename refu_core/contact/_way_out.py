@@ -6,7 +6,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import as_warp, ints, recorded, torch_stream
+from refu_core._warp import as_warp, ints, memory, recorded, torch_stream
 from refu_core.contact import _way_out_kernels as kernels
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
 from refu_core.mesh import Connectivity
@@ -29,12 +29,12 @@ class WayOut:
         self._settings, self.device = settings, body.device
         self._is_serial = body.device.type == "cpu"
         self._winding = Winding(faces)
-        self._body = torch.zeros_like(body, dtype=torch.float32).copy_(body)
+        self._body = memory(*body.shape, device=body.device).copy_(body)
         mesh, n_places = Connectivity.of(faces.cpu(), len(body)), len(body) + len(faces)
         self._points = as_warp(self._body, wp.vec3)
         self._faces, fan_start, fan = (ints(one, body.device) for one in (mesh.faces, *mesh.fan))
         self._tree = wp.Mesh(self._points, self._faces.flatten())
-        self._above = torch.zeros(n_places, 3, device=body.device)
+        self._above = memory(n_places, 3, device=body.device)
         inputs = [settings.tolerance, self._points, self._faces, fan_start, fan, as_warp(self._above, wp.vec3)]
         self._lift = recorded(kernels.above_kernel, n_places, inputs, body.device)
 
@@ -93,7 +93,7 @@ class WayOut:
 
         `above` are the `_winding_above`; with `of_samples` no other place than these samples is taken.
         """
-        foot, normal = torch.zeros(2, len(points), 3, device=self.device)
+        foot, normal = points.new_zeros(2, len(points), 3)
         points, asked = points.contiguous(), is_inside.int()
         inputs = [self._tree.id, self._settings.max_displacement, self._points, self._faces]
         inputs += [as_warp(self._above, wp.vec3), as_warp(above, wp.int32), of_samples]

@@ -61,7 +61,7 @@ class SkinBelow:
         """How far cloth goes along [m], shape (B, N, 3), with skin that moves by `shift` (B, V, 3). Differentiable."""
         if is_plain(shift, self.weight) and len(shift):
             n_strips, each = strips(len(self.vertex), shift.device)
-            cloth = torch.empty(len(shift), len(self.vertex), 3, device=shift.device)
+            cloth = shift.new_empty(len(shift), len(self.vertex), 3)
             _follow((len(shift), n_strips), self.vertex, self.weight, shift.contiguous(), each, cloth)
             return cloth
         by_vertex = shift.transpose(0, 1).flatten(1)

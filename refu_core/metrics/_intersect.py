@@ -10,7 +10,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from refu_core._warp import as_warp
-from refu_core.mesh import as_points, grouped
+from refu_core.mesh import as_points, check_faces, grouped
 from refu_core.metrics._intersect_kernels import intersect_kernel
 from refu_core.sdf._crossing_kernels import BLOCK
 
@@ -83,16 +83,18 @@ class SheetChecker:
     """A garment as an open sheet: where it cuts through itself or another one."""
 
     def __init__(self, faces: Any) -> None:
-        """For a garment of these faces, shape (G, 3)."""
-        self.faces = np.ascontiguousarray(faces, dtype=np.int32)
+        """For a garment of these faces, shape (G, 3). Raises `MeshError` as `check_faces`."""
+        self.faces = check_faces(faces)
         self._flat = torch.from_numpy(self.faces.reshape(-1).copy())
         self._points = torch.zeros(0, 3)
         self._mesh: Any = None
         self._triangles: Triangles | None = None
 
     def update(self, vertices: Any) -> None:
-        """Takes over a garment's vertices [m], shape (N, 3). Raises `MeshError` as `as_vertices`."""
-        self._points = torch.from_numpy(as_vertices("the garment's vertices", vertices).copy())
+        """Takes over a garment's vertices [m], shape (N, 3). Raises `MeshError` for others, or faces of more."""
+        points = as_vertices("the garment's vertices", vertices).copy()
+        check_faces(self.faces, n_vertices=len(points))
+        self._points = torch.from_numpy(points)
         self._mesh = wp.Mesh(as_warp(self._points, wp.vec3), as_warp(self._flat, wp.int32))
 
     def with_itself(self) -> NDArray[np.int32]:
@@ -102,7 +104,10 @@ class SheetChecker:
         return crossings(self._mesh.id, points, self._triangles, is_body=True).pairs
 
     def with_other(self, vertices: Any, faces: Any) -> NDArray[np.int32]:
-        """Intersecting (other's face, own face), shape (K, 2), of a garment (M, 3) [m] and (F, 3)."""
+        """Intersecting (other's face, own face), shape (K, 2), of a garment (M, 3) [m] and (F, 3).
+
+        Raises `MeshError` for others.
+        """
         other = as_vertices("the other garment's vertices", vertices)
-        triangles = Triangles(np.ascontiguousarray(faces, dtype=np.int32), other)
+        triangles = Triangles(check_faces(faces, n_vertices=len(other)), other)
         return crossings(self._mesh.id, other, triangles).pairs

@@ -10,7 +10,7 @@ import torch
 import warp as wp
 from numpy.typing import NDArray
 
-from refu_core._warp import as_warp
+from refu_core._warp import as_warp, ints, memory
 from refu_core.body import DEFAULT_GAP, SEGMENTS, part_of_faces
 from refu_core.mesh import vertex_areas
 from refu_core.outputs import _limbs_kernels as kernels
@@ -57,18 +57,17 @@ class LimbContacts:
         """For garments on a body, on the CPU."""
         self._faces = {name: garment.faces.cpu().numpy() for name, garment in garments.items()}
         n = body.n_vertices
-        self._points, self._shift = torch.zeros(2, n, 3)
+        self._points, self._shift = memory(2, n, 3)
         self._points.copy_(body.v_template.detach())
         part = part_of_faces(body.weights.cpu(), body.faces.cpu(), list(SEGMENTS.values())).numpy()
         faces = body.faces.cpu().numpy().astype(np.int32)
-        own = [np.ascontiguousarray(faces[part == k]) for k in range(len(_PARTS))]
+        own = [faces[part == k] for k in range(len(_PARTS))]
         points = as_warp(self._points, wp.vec3)
-        self._meshes = [wp.Mesh(points, wp.array(one.ravel(), dtype=wp.int32, device="cpu")) for one in own]
+        self._meshes = [wp.Mesh(points, ints(one.ravel(), "cpu")) for one in own]
         parts = kernels.Parts()
         parts.mesh = wp.array([mesh.id for mesh in self._meshes], dtype=wp.uint64, device="cpu")
-        starts = np.cumsum([0, *map(len, own)]).astype(np.int32)
-        parts.face_start = wp.array(starts, dtype=wp.int32, device="cpu")
-        parts.face = wp.array(np.concatenate(own).ravel(), dtype=wp.int32, device="cpu")
+        parts.face_start = ints(np.cumsum([0, *map(len, own)]), "cpu")
+        parts.face = ints(np.concatenate(own).ravel(), "cpu")
         parts.low, parts.high = (wp.zeros(len(_PARTS), dtype=wp.vec3, device="cpu") for _ in range(2))
         parts.points, parts.shift = points, as_warp(self._shift, wp.vec3)
         self._parts = parts

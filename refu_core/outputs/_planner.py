@@ -13,7 +13,7 @@ from scipy.sparse import csr_array
 from refu_core._cache import keep, recall
 from refu_core.errors import MeshError
 from refu_core.frames import N_JOINTS, SmplFrame
-from refu_core.mesh import as_points
+from refu_core.mesh import as_points, rim_of
 from refu_core.outputs._planner_fit import fitted_means
 from refu_core.outputs._simplify import simplify
 from refu_core.skeleton import JOINT_NAMES
@@ -90,7 +90,7 @@ class PlannerMesh:
         rest = garment.v_template.detach().cpu().double().numpy()
         self._n_vertices = len(rest)
         kept, self.sheet, self._take = _prepared(garment, rest, max_triangles, worn)
-        # `sheet`: the faces in the middle of the solid, counter-clockwise from outside, shape (S, 3).
+        """`sheet`: faces of the sheet in the middle of the solid, counter-clockwise from outside, shape (S, 3)."""
         self.faces: NDArray[np.int32] = _solid(self.sheet, len(kept))
         """Counter-clockwise from outside, shape (T, 3); the same in every frame."""
         if len(self.faces) > max_triangles:
@@ -162,9 +162,8 @@ def _prepared(
 
 def _solid(sheet: NDArray[np.int32], n: int) -> NDArray[np.int32]:
     """Both sides of a sheet of n vertices, and walls along its rims."""
-    start, end = sheet.ravel().astype(np.int64), np.roll(sheet, -1, axis=1).ravel().astype(np.int64)
-    rim = ~np.isin(start * n + end, end * n + start)
-    a, b = start[rim], end[rim]
+    on_rim = rim_of(sheet)
+    a, b = sheet[on_rim], np.roll(sheet, -1, axis=1)[on_rim]
     walls = np.concatenate((np.stack((b, a, a + n), 1), np.stack((b, a + n, b + n), 1)))
     return np.concatenate((sheet, sheet[:, ::-1] + n, walls)).astype(np.int32)
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from refu_core.body import ARMS, LEGS, joints_of
+from refu_core.mesh import rim_of
 
 if TYPE_CHECKING:
     from refu_core.garments import GarmentTemplate
@@ -78,12 +79,9 @@ def newell(points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _loops(faces: NDArray[np.int32]) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp]]]:
     """Each boundary loop, against its faces, and the vertices across its edges."""
-    start = faces.ravel().astype(np.int64)
-    end, across = np.roll(faces, -1, axis=1).ravel().astype(np.int64), np.roll(faces, -2, axis=1).ravel()
-    n = int(faces.max()) + 1
-    is_rim = ~np.isin(start * n + end, end * n + start)
+    on_rim = rim_of(faces)
     onward: dict[int, list[tuple[int, int]]] = {}
-    for a, b, c in zip(start[is_rim].tolist(), end[is_rim].tolist(), across[is_rim].tolist(), strict=True):
+    for a, b, c in zip(*(np.roll(faces, -k, axis=1)[on_rim].tolist() for k in range(3)), strict=True):
         onward.setdefault(b, []).append((a, c))
     while onward:
         first = vertex = next(iter(onward))

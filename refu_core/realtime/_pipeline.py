@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from refu_core._device import checked_device
+from refu_core._device import checked_device, own_settings
 from refu_core.backbones import Skinned
 from refu_core.contact import DEFAULT_CONTACT, ContactSettings
 from refu_core.errors import FrameError, GarmentError, RefuError, require_type
@@ -33,6 +33,7 @@ from refu_core.realtime._wearer import Wearer
 from refu_core.sdf import require_outward
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from os import PathLike
 
     from numpy.typing import ArrayLike, NDArray
@@ -122,6 +123,7 @@ class GarmentPipeline:
         raise RefuError(msg)
 
     @classmethod
+    @own_settings()
     def load(
         cls,
         garments: Sequence[str | PathLike[str] | GarmentTemplate],
@@ -207,7 +209,6 @@ class GarmentPipeline:
     @overload
     def __call__(self, frames: Sequence[SmplFrame]) -> list[PipelineOutput]: ...
 
-    @torch.no_grad()
     def __call__(self, frames: SmplFrame | Sequence[SmplFrame]) -> PipelineOutput | list[PipelineOutput]:
         """Dresses one person, or a batch of persons (one frame each).
 
@@ -256,7 +257,7 @@ class GarmentPipeline:
             for key, frame in zip(keys, frames, strict=True)
         ]
 
-    @torch.no_grad()  # each thread's own setting
+    @own_settings()  # of each thread
     def _run(
         self, step: FrameStep, frames: Sequence[SmplFrame], margin: float | None, adjust: Adjust | None = None
     ) -> list[PipelineOutput]:
@@ -312,15 +313,17 @@ class GarmentPipeline:
             made: NDArray[np.float32] = turn(points).cpu().numpy()
             return made
 
+        def later(points: Tensor) -> Callable[[], NDArray[np.float32]]:
+            return cache(own_settings()(partial(on_host, points)))
+
         for name in self.outfit.wearables:
             vertices, raw, numbers, _ = person.garments[name]
-            later = cache(partial(on_host, raw))
-            meshes[name] = GarmentMesh(on_host(vertices), later, self._faces[name], frame.transl)
+            meshes[name] = GarmentMesh(on_host(vertices), later(raw), self._faces[name], frame.transl)
             stats[name] = GarmentStats.of(numbers.tolist(), ms=0.0 if clock is None else clock.garments[name])
         shift, stage_ms = SkinShift.of(person.shift.tolist()), {} if clock is None else clock.stages
         promised = within_promise(frame) and not shift.n_held
         took = FrameStats(stage_ms, stats, self._is_certified, promised, skipped, shift)
-        return PipelineOutput(meshes, cache(partial(on_host, person.body)), cache(partial(on_host, person.skin)), took)
+        return PipelineOutput(meshes, later(person.body), later(person.skin), took)
 
 
 def _past(frames: Sequence[SmplFrame]) -> Tensor:

@@ -48,4 +48,4 @@ def refu_from_weights(weights: Weights, *, device: str | torch.device = "cpu") -
     except WeightsError as error:
         msg = f"{weights.path}: its ReFU layer doesn't fit its card: {error}"
         raise WeightsError(msg) from error
-    return refu.to(device)
+    return refu.float().to(device)

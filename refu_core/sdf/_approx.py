@@ -11,7 +11,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import Repeated, as_warp
+from refu_core._warp import Repeated, as_warp, memory
 from refu_core.body import SEGMENTS, part_of_faces
 from refu_core.errors import MeshError
 from refu_core.sdf._exact import ExactSdf
@@ -95,7 +95,7 @@ class ApproxSdf(MeshSdf):
         chosen = np.sort(np.unique(np.column_stack([self._cube, part]), axis=0, return_index=True)[1])
         rows = np.column_stack([faces[chosen], (part[chosen] << FACE_BITS) | chosen]).astype(np.int32)
         self._guide_rows = torch.from_numpy(rows).to(self.device)
-        self._table = torch.empty(ROWS, COLUMNS, dtype=torch.int32, device=self.device)
+        self._table = memory(ROWS, COLUMNS, dtype=torch.int32, device=self.device)
         self._guides = Guides()
         self._guides.links = as_warp(self._links.view(-1, 4), wp.vec4i)
         self._guides.table, self._guides.cell = as_warp(self._table, wp.int32), _CELL

@@ -10,7 +10,7 @@ import warp as wp
 from numpy.typing import NDArray
 from torch import Tensor
 
-from refu_core._warp import Repeated
+from refu_core._warp import Repeated, memory, recorded
 from refu_core.errors import MeshError
 from refu_core.mesh import Adjacency
 from refu_core.sdf._band_kernels import (
@@ -169,7 +169,7 @@ class Scan:
         cells.rows = wp.empty(_N_ROWS, dtype=wp.int32, device="cpu")
         cells.occupied = wp.empty(_N_ROWS, dtype=wp.uint64, device="cpu")
         cells.extent = wp.zeros(2, dtype=wp.vec3, device="cpu")
-        self._sizes = torch.zeros(3, dtype=torch.int32)
+        self._sizes = memory(3, dtype=torch.int32)
         self._spread = Repeated(spread_sides_kernel, (wp.vec3, *[wp.int32] * 3, wp.float32, *[wp.int32] * 4))
         self._room = 0
 
@@ -181,7 +181,7 @@ class Scan:
         self._sizes[0] = n
         self._sort((1,), points, self._sizes)
         self._scan.launch()
-        return ask(self._finish, points, torch.full((1,), beyond))
+        return ask(self._finish, points, points.new_full((1,), beyond))
 
     def spread(self, points: Tensor, found: Found, ring: Adjacency) -> tuple[Tensor, Tensor]:
         """The state of each point, shape (N,), by its edges, and one point of each patch that nothing reaches."""
@@ -198,7 +198,7 @@ class Scan:
         cells.points = wp.empty(n, dtype=wp.vec3, device="cpu")
         cells.squared = wp.empty(n, dtype=wp.float32, device="cpu")
         self._sort = Repeated(sort_kernel, (wp.vec3, wp.int32), [cells])
-        self._scan = wp.launch(scan_kernel, self._n_faces, [self._body, cells], device="cpu", record_cmd=True)
+        self._scan = recorded(scan_kernel, self._n_faces, [self._body, cells], "cpu")
         self._finish = Repeated(finish_kernel, (wp.vec3, wp.float32, *FOUND), [self._body, cells])
 
 

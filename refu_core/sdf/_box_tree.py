@@ -9,7 +9,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import Repeated, as_warp
+from refu_core._warp import Repeated, as_warp, memory
 from refu_core.errors import MeshError
 from refu_core.mesh import grouped
 from refu_core.sdf._box_kernels import MAX_FACES, WIDTH, Boxes, Eight, fit_kernel
@@ -37,7 +37,7 @@ class BoxTree:
         n_above = sum(_WIDTH**level for level in range(depth))  # nodes whose children are nodes
         corners = rest.detach().cpu().numpy()[faces.numpy()]
         self._order = torch.from_numpy(grouped(0.5 * (corners.min(1) + corners.max(1)), _WIDTH).astype(np.int32))
-        self._bounds = torch.empty(n_above + -(-n // _WIDTH), 6, _WIDTH)
+        self._bounds = memory(n_above + -(-n // _WIDTH), 6, _WIDTH)
         self._bounds[:, :3], self._bounds[:, 3:] = torch.inf, -torch.inf
         self.boxes: Any = Boxes()
         """As kernels take them."""

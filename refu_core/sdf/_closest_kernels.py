@@ -47,7 +47,7 @@ def closest_on_triangle(p: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> tuple
         return wp.vec3(0.0, 1.0, 0.0), VERTEX + 1
 
     weight_c = ab_ap * ac_bp - ab_bp * ac_ap
-    if weight_c <= 0.0 and ab_ap >= 0.0 and ab_bp <= 0.0:
+    if weight_c <= 0.0 and ab_ap >= 0.0 and ab_bp <= 0.0 and ab_ap > ab_bp:  # else a and b are one
         t = ab_ap / (ab_ap - ab_bp)
         return wp.vec3(1.0 - t, t, 0.0), EDGE
 

@@ -10,7 +10,7 @@ import warp as wp
 from numpy.typing import NDArray
 from torch import Tensor
 
-from refu_core._warp import Repeated, as_warp, torch_stream
+from refu_core._warp import Repeated, as_warp, memory, torch_stream
 from refu_core.errors import MeshError
 from refu_core.sdf._closest_kernels import closest_kernel
 from refu_core.sdf._mesh import FOUND, Found, MeshSdf, ask
@@ -41,9 +41,9 @@ class ExactSdf(MeshSdf):
     """Exact signed distance to a watertight body, on CPU and CUDA with the same kernels (the paper's "Acc. SDF").
 
     The distance is that to the closest triangle. Its sign is that of the angle-weighted pseudo-normal at the closest
-    point, which is right wherever the body doesn't intersect itself, or (`sign="winding"`) of the winding number,
-    six times slower and right within intersecting limbs too. The gradient is the unit direction to or from the closest
-    point; on the surface, the pseudo-normal; it is finite everywhere, the medial axis included.
+    point, which is right wherever the body doesn't intersect itself and no two of its vertices are at one place, or
+    (`sign="winding"`) of the winding number, six times slower and right there, too. The gradient is the unit direction
+    to or from the closest point; on the surface, the pseudo-normal; it is finite everywhere, the medial axis included.
 
     Both are differentiable with respect to the points and the body's vertices: where either requires a gradient (and
     for float64), they are computed again in torch from the closest face, edge or vertex found.
@@ -69,7 +69,7 @@ class ExactSdf(MeshSdf):
         super().__init__(faces, device=device)
         self._by_winding = sign == "winding"
         self._rebuild_distance = rebuild_distance
-        self._built_at = torch.empty(0, 3)  # the pose the BVH was built for
+        self._built_at = memory(0, 3)  # the pose the BVH was built for
         self._mesh: Any = None
         self._none = torch.empty(0, dtype=torch.int32, device=self.device)
 
@@ -111,7 +111,7 @@ class ExactSdf(MeshSdf):
     def closest(self, points: Tensor, *, max_distance: float = math.inf, near: Tensor | None = None) -> ClosestPoints:
         """The closest point of the body to each of `points` [m], shape (N, 3), where one is within `max_distance` [m].
 
-        `near`, int32 of shape (N,), may name a body face near each point, or -1: then less is looked at.
+        `near`, integers of shape (N,), may name a body face near each point, or -1: then less is looked at.
 
         Not differentiable; raises as `query`.
         """
@@ -120,11 +120,12 @@ class ExactSdf(MeshSdf):
             raise MeshError(msg)
         self._require_update()
         where = self._checked(points)
+        near = None if near is None else self._checked_faces(near, len(where), least=-1)
         found = self._find(where, near, min(max_distance, _UNLIMITED))
         _, barycentrics, _ = self._features(where, found.face)
         sign = torch.where(found.distance < 0, -1.0, 1.0)
         return ClosestPoints(found.face, barycentrics, found.distance.abs(), sign)
 
     def _find(self, points: Tensor, near: Tensor | None, max_distance: float = _UNLIMITED) -> Found:
-        farthest = torch.full((1,), max_distance, device=self.device)
+        farthest = points.new_full((1,), max_distance)
         return ask(self._ask, points, self._none if near is None else near, farthest)

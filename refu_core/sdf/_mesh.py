@@ -11,7 +11,7 @@ import warp as wp
 from numpy.typing import NDArray
 from torch import Tensor
 
-from refu_core._warp import Repeated, as_warp
+from refu_core._warp import Repeated, as_warp, ints, memory
 from refu_core.errors import MeshError
 from refu_core.mesh import Connectivity
 from refu_core.sdf._analytic import Feature, signed_distance
@@ -46,7 +46,7 @@ def ask(kernel: Repeated, points: Tensor, *more: Tensor) -> Found:
     """What a kernel says of points (N, 3) [m]; it takes them, `more`, and the fields of `Found` to be filled."""
     n, device = len(points), points.device
     face = torch.empty(n, dtype=torch.int32, device=device)
-    found = Found(face, torch.empty(n, device=device), torch.empty(n, 3, device=device))
+    found = Found(face, points.new_empty(n), points.new_empty(n, 3))
     if n:
         kernel((n,), points, *more, *found)
     return found
@@ -67,7 +67,7 @@ class MeshSdf(ABC):
         self._posed.faces = as_warp(self.faces, wp.int32)
         fan_start, fan_face = mesh.fan
         for name, array in (("across", mesh.across), ("fan_start", fan_start), ("fan_face", fan_face)):
-            setattr(self._posed, name, wp.array(array, dtype=wp.int32, device=str(self.device)))
+            setattr(self._posed, name, ints(array, self.device))
         self._vertices: Tensor | None = None  # as given, with its graph
         self._points: Tensor | None = None  # float32 copy that the kernels read
         self._skin: Any = None
@@ -86,7 +86,7 @@ class MeshSdf(ABC):
         is_new = self._points is None or len(vertices) != len(self._points)
         if self._points is None or is_new:
             require_outward(vertices.detach().to(self.device).double()[None], self.faces)
-            self._points = torch.empty(len(vertices), 3, device=self.device)
+            self._points = memory(len(vertices), 3, device=self.device)
             self._posed.points = as_warp(self._points, wp.vec3)
             kinds = (wp.vec3, wp.int32, wp.int32, wp.vec3, wp.vec3)
             self._find_features = Repeated(feature_kernel, kinds, [self._posed])
@@ -122,7 +122,7 @@ class MeshSdf(ABC):
     def _features(self, points: Tensor, face: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Of each point's closest face: `Feature.kind`, int32 (N,), barycentrics and unit pseudo-normals, (N, 3)."""
         kind = torch.empty_like(face)
-        barycentrics, normal = torch.empty(2, len(face), 3, device=self.device)
+        barycentrics, normal = points.new_empty(2, len(face), 3)
         if len(face):
             self._find_features((len(face),), points, face, kind, barycentrics, normal)
         return kind, barycentrics, normal
@@ -154,14 +154,14 @@ class MeshSdf(ABC):
         require_points(points)
         return points.detach().to(device=self.device, dtype=torch.float32).contiguous()
 
-    def _checked_faces(self, near: Tensor, n: int) -> Tensor:
+    def _checked_faces(self, near: Tensor, n: int, *, least: int = 0) -> Tensor:
         if not isinstance(near, Tensor) or near.shape != (n,) or near.is_floating_point():
             got = f"{near.dtype} of shape {tuple(near.shape)}" if isinstance(near, Tensor) else type(near).__name__
             msg = f"near must be integers of the shape ({n},), got {got}"
             raise MeshError(msg)
         near = near.to(device=self.device, dtype=torch.int32).contiguous()
         # Clamped and not checked: a device would have to be waited for, and no kernel may read beyond the faces.
-        return near.clamp(0, len(self.faces) - 1)
+        return near.clamp(least, len(self.faces) - 1)
 
     def _require_update(self) -> Tensor:
         if self._points is None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, distance_transform_edt
 from torch import Tensor
 
-from refu_core._warp import Repeated
+from refu_core._warp import Repeated, ints
 from refu_core.sdf._exact import ExactSdf
 from refu_core.sdf._walk_kernels import grid_lookup_kernel
 
@@ -41,7 +41,7 @@ class RestFaces:
         """Around the mean shape of `body`, on its device."""
         low, face = _grid_of(body)
         self._device = torch.device(body.device)
-        fixed = [wp.vec3(*low), _CELL, wp.array(face, dtype=wp.int32, device=str(self._device))]
+        fixed = [wp.vec3(*low), _CELL, ints(face, self._device)]
         self._look_up = Repeated(grid_lookup_kernel, (wp.vec3, wp.int32), fixed)
 
     def under(self, unposed: Tensor, betas: Tensor, shapedirs: Tensor) -> Tensor:

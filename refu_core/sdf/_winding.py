@@ -6,7 +6,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import Repeated, as_warp, strips
+from refu_core._warp import Repeated, as_warp, memory, strips
 from refu_core.mesh import Connectivity
 from refu_core.sdf._winding_kernels import CELLS, bin_kernel, crossings_kernel, extent_kernel
 
@@ -28,11 +28,11 @@ class Winding:
         mesh = Connectivity.of(faces.cpu())
         mesh.require_closed()
         device = faces.device
-        self._body = torch.zeros(mesh.n_vertices, 3, device=device)
+        self._body = memory(mesh.n_vertices, 3, device=device)
         # The first point of each cell, its least distance, and the box of all.
         n = 2 * _N_CELLS**2
-        self._first = torch.empty(n, dtype=torch.int32, device=device)
-        self._farthest_in, self._box = torch.empty(n, device=device), torch.empty(2, 3, device=device)
+        self._first = memory(n, dtype=torch.int32, device=device)
+        self._farthest_in, self._box = memory(n, device=device), memory(2, 3, device=device)
         # A CPU's compiler keeps more in registers within a loop than from call to call.
         n_faces = len(mesh.faces)
         each = n_faces if device.type == "cpu" else 1
