@@ -20,6 +20,8 @@ HISTORY_NS = 10 * 10**9
 """How far back transforms are kept, as tf2 does [ns]."""
 _MOST_FRAMES = _MOST_STAMPS = 10_000
 """Of all, and of one in the time that is kept: stamps are the sender's."""
+_LONGEST_WAY = 100
+"""Frames above one another. Robots have a few dozen; the way is gone anew for each input."""
 _UNIT_TOLERANCE = 1e-2
 """A quaternion's length is no farther from 1, as tf2 wants it."""
 _MIN_TRANSFORM_BYTES = 72
@@ -208,6 +210,6 @@ class TransformBuffer:
     def _way(self, frame: str) -> list[str]:
         """The frame and what is above it, up to a root or, where they form a ring, once around."""
         way = [frame]
-        while (track := self._tracks.get(way[-1])) is not None and track.parent not in way:
+        while len(way) <= _LONGEST_WAY and (track := self._tracks.get(way[-1])) is not None and track.parent not in way:
             way.append(track.parent)
         return way

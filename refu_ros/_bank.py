@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from rclpy.event_handler import PublisherEventCallbacks
-from rclpy.exceptions import InvalidHandle
+from rclpy.exceptions import InvalidHandle, NameValidationException
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 import msg_adapters as adapters
@@ -32,7 +32,7 @@ class Bank:
         """Has publishers of these topics, by message type, and no others but those that were `lasting`.
 
         Only those have overrides of their QoS: they are parameters, which never go. A type whose package isn't there is
-        left out, and said once.
+        left out, and said once; so is a topic whose name is too long, and is a fault.
         """
         for topic, kind in wanted.items():
             if topic in self._publishers or kind in self._refused:
@@ -43,13 +43,15 @@ class Bank:
                 self._refused.add(kind)
                 self._node.get_logger().info(f"no {topic}: {error}")
                 continue
-            publisher = self._node.create_lifecycle_publisher(
-                message_class,
-                topic,
-                ros_qos(QOS),
-                qos_overriding_options=QoSOverridingOptions.with_default_policies() if lasting else None,
-                event_callbacks=PublisherEventCallbacks(matched=lambda _: self._on_match()),
-            )
+            options = QoSOverridingOptions.with_default_policies() if lasting else None
+            told = PublisherEventCallbacks(matched=lambda _: self._on_match())
+            try:
+                publisher = self._node.create_lifecycle_publisher(
+                    message_class, topic, ros_qos(QOS), qos_overriding_options=options, event_callbacks=told
+                )
+            except NameValidationException as error:  # peers name people
+                self._node.fault("topics", error)
+                continue
             publisher.lasts = lasting
             if self._node.is_active:
                 publisher.on_activate(None)
@@ -63,11 +65,10 @@ class Bank:
 
     def watchers(self, topic: str) -> int:
         """How many subscribe to a topic."""
-        publisher = self._publishers.get(topic)
-        try:
-            return 0 if publisher is None else int(publisher.get_subscription_count())
-        except InvalidHandle:  # destroyed meanwhile
-            return 0
+        with contextlib.suppress(InvalidHandle):  # destroyed meanwhile
+            if (publisher := self._publishers.get(topic)) is not None:
+                return int(publisher.get_subscription_count())
+        return 0
 
     def is_watched(self) -> bool:
         """Whether anybody subscribes to anything."""

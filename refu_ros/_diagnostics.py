@@ -185,7 +185,7 @@ def _recording(_: Report, settings: NodeSettings, now: Situation) -> Judgement:
     is_at_risk = state.at_risk_s > settings.record_sync_period
     rules += [
         (is_nearly_full, WARN, f"disk nearly full: {free} MB left"),
-        (state.dropped, WARN, f"{state.dropped} messages not recorded: the disk is too slow"),
+        (state.dropped, WARN, f"{state.dropped} messages not recorded: a disk too slow, or too many topics"),
         (is_at_risk, WARN, f"a power cut would take the last {state.at_risk_s:.1f} s: the disk is too slow"),
         (True, OK, f"{state.written} messages in {state.path}"),
     ]

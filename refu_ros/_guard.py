@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import time
+import weakref
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
@@ -37,6 +38,9 @@ class GuardedNode(Node):  # type: ignore[misc]
         self.statistics = Statistics()
         self._said: dict[str, float] = {}
         super().__init__(name, **options)
+        # rclpy's own never forgets what there was: topics of everybody who has come and gone.
+        group, there = self.default_callback_group, self.default_callback_group.entities
+        group.add_entity = lambda entity: there.add(weakref.ref(entity, there.discard))
         for service in self.services:  # rclpy's own: parameters, lifecycle, type description
             what = service.srv_name.rsplit("/", 1)[-1]
             service.callback = self.guarded(what, _bounded(service.callback), answer_no)

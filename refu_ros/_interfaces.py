@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.type_support import check_for_type_support
 
 from msg_adapters import QosProfile
@@ -32,5 +32,4 @@ def interface(name: str) -> Any:
 
 def ros_qos(profile: QosProfile) -> QoSProfile:
     """The same as rclpy has it."""
-    reliability = ReliabilityPolicy.RELIABLE if profile.reliability == "reliable" else ReliabilityPolicy.BEST_EFFORT
-    return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=profile.depth, reliability=reliability)
+    return QoSProfile(depth=profile.depth, reliability=ReliabilityPolicy.get_from_short_key(profile.reliability))

@@ -17,6 +17,7 @@ import msg_adapters as adapters
 from msg_adapters.axes import up_of_sender
 from refu_core import FrameError, RefuError
 from refu_core.errors import printable
+from refu_core.keypoints import MOST_PEOPLE
 from refu_ros._interfaces import interface, ros_qos
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     from refu_ros._settings import NodeSettings
 
 INPUT_QOS = adapters.QosProfile(reliability="best_effort", depth=5)
-_HUMANS = re.compile(r"/humans/bodies/([A-Za-z0-9_]+)/joint_states")
+_HUMANS = re.compile(r"/humans/bodies/([A-Za-z][A-Za-z0-9_]{0,99})/joint_states")
 _TRACKED = "/humans/bodies/tracked"
 _LOG_PERIOD_S = 5.0
 _GRACE_S = 5.0
@@ -46,6 +47,8 @@ class Listener:
     def __init__(self, node: GarmentNode) -> None:
         self._node = node
         self.stream, self.doubts = adapters.InputStream(node.settings.input_type), adapters.Doubts()
+        self.room = max(MOST_PEOPLE, len(node.settings.persons))
+        """How many people may be here at once."""
         self.scene: Scene | None = None
         """Where people go who have come; None while nobody is dressed."""
         self.since: float | None = None
@@ -55,7 +58,7 @@ class Listener:
         self._wanted_at = 0.0
         self._inputs: dict[str, Any] = {}
         self._frames: dict[str, str] = {}
-        self._tracked: list[str] | None = None
+        self._tracked: set[str] | None = None
         self._tf = adapters.TransformBuffer()
         self._tf_asked_at: float | None = None
         self._is_warned = self._is_refused = False
@@ -123,8 +126,9 @@ class Listener:
         """Listens no longer."""
         if self._inputs:
             self._node.get_logger().info("listening to nobody")
-        for subscription in self._inputs.values():
+        for name, subscription in self._inputs.items():
             self._node.destroy_subscription(subscription)
+            self.doubts.forget(name)
         self._inputs.clear()
         self._frames.clear()
         self.since = self._tracked = self._tf_asked_at = self._camera = None
@@ -141,8 +145,7 @@ class Listener:
         self, name: str, kind: str, topic: str, take: Callable[[bytes], object], qos: QoSProfile, **options: Any
     ) -> None:
         """Subscribes; what isn't a person's has a name that begins with a slash. Raises `RefuError`."""
-        subscription = self._node.create_subscription(interface(kind), topic, take, qos, raw=True, **options)
-        self._inputs[name] = subscription
+        self._inputs[name] = self._node.create_subscription(interface(kind), topic, take, qos, raw=True, **options)
 
     def _on_input(self, person: str, topic: str, data: bytes) -> None:
         node = self._node
@@ -164,10 +167,11 @@ class Listener:
             for doubt in self.doubts.of(person, frame, self._settings, is_y_up=self._settings.axes == "smpl"):
                 node.get_logger().warning(f"{topic}: {doubt}")
         self.input_frame = next((one for one in given.values() if self._need_transforms(topic, one)), "")
-        for name, frame in frames.items():
-            self._frames[name] = given[name]
-            if not self.is_steady:
-                self._put(name, frame, topic)
+        known = {name: frame_id for name, frame_id in self._frames.items() if name not in given}
+        # A tracker's names may never come again: the oldest are forgotten.
+        self._frames = dict([*known.items(), *given.items()][-self.room :])
+        for name, frame in frames.items() if not self.is_steady else ():
+            self._put(name, frame, topic)
 
     def _refuse(self, source: str, error: Exception) -> None:
         self._node.statistics.drop("invalid", str(error))
@@ -279,15 +283,17 @@ class Listener:
 
     def _bodies(self) -> dict[str, str]:
         """The topic of each body that there is: those that somebody says are tracked, else all."""
-        topics = (topic for topic, _ in self._node.get_topic_names_and_types())
-        bodies = {match[1]: topic for topic in topics if (match := _HUMANS.fullmatch(topic))}
-        if self._tracked is not None:
-            bodies = {person: topic for person, topic in bodies.items() if person in self._tracked}
-        return bodies
+        names, count, tracked = self._node.get_topic_names_and_types(), self._node.count_publishers, self._tracked
+        found = ((match[1], topic) for topic, _ in names if (match := _HUMANS.fullmatch(topic)))
+        bodies = [one for one in found if (tracked is None or one[0] in tracked) and count(one[1])]
+        if len(bodies) > self.room:
+            self._node.statistics.drop("crowd", f"{len(bodies)} bodies, up to {self.room} are dressed")
+            bodies.sort(key=lambda one: one[0] not in self._inputs)
+        return dict(bodies[: self.room])
 
     def _listen_to_tracked(self) -> None:
         def take(data: bytes) -> None:
-            self._tracked = adapters.decode_ids(data)
+            self._tracked = {*adapters.decode_ids(data)}
             self._follow_humans()
 
         with suppress(RefuError):  # without its type, whoever has a topic is there
@@ -295,12 +301,10 @@ class Listener:
 
     def _follow_humans(self) -> None:
         """Listens to bodies that have come and no longer to those that have gone."""
-        bodies, count = self._bodies(), self._node.count_publishers
-        for person, topic in bodies.items():
-            if person not in self._inputs and count(topic):
-                self._listen(person, topic)
-        here = [person for person in self._inputs if not person.startswith("/")]
-        for person in [person for person in here if not count(bodies.get(person, "/none"))]:
+        bodies = self._bodies()
+        for person in [person for person in self._inputs if not person.startswith("/") and person not in bodies]:
             self._node.destroy_subscription(self._inputs.pop(person))
-            self._frames.pop(person, None)
             self.doubts.forget(person)
+        for person, topic in bodies.items():
+            if person not in self._inputs:
+                self._listen(person, topic)

@@ -17,7 +17,6 @@ from msg_adapters.outputs import GARMENTS, make_outputs
 from msg_adapters.scene import Scene
 from refu_core import RefuError
 from refu_core.errors import printable
-from refu_core.keypoints import MOST_PEOPLE
 from refu_core.options import PIPELINE_OPTIONS, PipelineOptions, specs_of
 from refu_ros._bank import QOS, Bank
 from refu_ros._beside import PipelineLoader, load
@@ -110,8 +109,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         if self.settings.record:
             self.recording.try_start(self.settings.record)  # where it can't: no reason to leave people undressed
         result = super().on_activate(state)
-        room = max(MOST_PEOPLE, len(self.settings.persons))
-        scene = self._listener.scene = Scene(self.statistics, most=room)
+        scene = self._listener.scene = Scene(self.statistics, most=self._listener.room)
         from refu_ros._worker import Worker  # loads torch
 
         self._worker = Worker(scene, self.statistics, self, settings=self.settings, pipeline=self._pipeline)

@@ -58,12 +58,14 @@ def _refuse(program: str, text: str) -> int:
 
 
 def _on_signals(handler: Any) -> None:
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, handler)
+    """SIGHUP comes of a terminal that is lost; `nohup` has it ignored, and so it stays."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, handler)
 
 
 def hear(told: list[bool]) -> None:
-    """From now on `told` gets a SIGINT or SIGTERM: no Event, as one handler may interrupt the other in its lock."""
+    """From now on `told` gets any of these signals: no Event, as one handler may interrupt the other in its lock."""
     _on_signals(lambda *_: told.append(True))
 
 

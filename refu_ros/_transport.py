@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import os
 import shutil
+from contextlib import suppress
 from pathlib import Path
 
 PROFILES = Path(__file__).with_name("fastdds.xml")
 SEGMENT_BYTES = 40_000_000
 """The segment of `fastdds.xml`: 512 pieces of 65,500 bytes, and some."""
 _VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE", "FASTDDS_BUILTIN_TRANSPORTS")
-_FILE_IN_FOLDER = "DEFAULT_FASTRTPS_PROFILES.xml"
-_SHARED_MEMORY = "/dev/shm"
 
 
 def make_room() -> bool:
@@ -25,15 +24,9 @@ def make_room() -> bool:
     Who has configured Fast DDS in any of its ways keeps what they have chosen, and where the memory isn't there (a
     container with little of it) everything stays as Fast DDS has it. Other middleware doesn't read the variable.
     """
-    chosen = any(os.environ.get(name) for name in _VARIABLES) or Path(_FILE_IN_FOLDER).exists()
-    if chosen or not _has_room():
-        return False
-    os.environ[_VARIABLES[0]] = str(PROFILES)
-    return True
-
-
-def _has_room() -> bool:
-    try:
-        return shutil.disk_usage(_SHARED_MEMORY).free > SEGMENT_BYTES
-    except OSError:
-        return False
+    chosen = any(os.environ.get(name) for name in _VARIABLES) or Path("DEFAULT_FASTRTPS_PROFILES.xml").exists()
+    with suppress(OSError):  # there is no such memory
+        if not chosen and shutil.disk_usage("/dev/shm").free > SEGMENT_BYTES:
+            os.environ[_VARIABLES[0]] = str(PROFILES)
+            return True
+    return False

@@ -81,16 +81,14 @@ class SmplPublisher(GuardedNode):
         self.finished = False
         self._index = 0
         message_type = INPUT_TYPES[self.options.input_type]
-        message_class = interface(message_type)
-        names = [name for name in self.options.persons if name]
         self._outputs = [
             self.create_publisher(
-                message_class,
+                interface(message_type),
                 f"{name}/{TOPIC}" if name else TOPIC,
                 QoSProfile(depth=1),
                 qos_overriding_options=QoSOverridingOptions.with_default_policies(),
             )
-            for name in names or ("",)
+            for name in [*filter(None, self.options.persons)] or ("",)
         ]
         self.create_timer(1 / self.motion.fps, self.guarded("tick", self._tick))
         self.get_logger().info(

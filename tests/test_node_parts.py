@@ -38,6 +38,7 @@ from msg_adapters import (
 )
 from msg_adapters.bags import Recorder, RecorderState, Recording, free_path
 from msg_adapters.cdr import CdrReader, CdrWriter
+from msg_adapters.outputs._topics import is_due
 from msg_adapters.scene import Scene
 from msg_adapters.statistics import Statistics
 from refu_core import BodyError, FrameError, GarmentPipeline, MeshError, RefuError, SmplFrame, load_body
@@ -962,6 +963,15 @@ def test_obstacles_are_whole_whoever_hears_them(pipeline: GarmentPipeline) -> No
         setup.tick(**{person: frame() for person in persons})
         assert [data[-1] for _, data in setup.viewer.sent] == [0] * len(persons)  # ADD
         assert all(len(data) > 10_000 for _, data in setup.viewer.sent)
+
+
+def test_what_is_due_again_is_not_remembered() -> None:
+    """People come and go for days, and each of their planners' meshes was."""
+    due: dict[str, float] = {}
+    often, seldom = (SimpleNamespace(planner_rate=rate) for rate in (0.0, 0.001))
+    assert all(is_due(due, f"p{i}/mesh", often) for i in range(100))  # type: ignore[arg-type]
+    assert len(due) < 2
+    assert [is_due(due, "p/mesh", seldom) for _ in range(3)] == [True, False, False]  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("fields", [["colour"], ["normal", "x"]])

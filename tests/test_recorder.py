@@ -100,6 +100,19 @@ def test_a_path_that_cannot_be_recorded_to_is_one_line(
     assert sorted(tmp_path.iterdir()) == before  # nothing is left of what didn't begin
 
 
+def test_ever_new_topics_end_no_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of people who come and go: MCAP numbers topics in 16 bits."""
+    monkeypatch.setattr("msg_adapters.bags._recorder._MOST_TOPICS", 3)
+    recorder = Recorder(tmp_path / "bag")
+    for i in range(6):
+        recorder.put(f"/p{i}", TYPE, FRAME, time_ns=2 * i, qos=QosProfile())
+        recorder.put("/p0", TYPE, FRAME, time_ns=2 * i + 1, qos=QosProfile())
+    recorder.close()
+    state = recorder.state()
+    assert (state.written, state.dropped, state.error) == (9, 3, "")
+    assert times(tmp_path / "bag") == [0, 1, 2, 3, 4, 5, 7, 9, 11]
+
+
 def test_a_read_only_place_cannot_be_recorded_to(tmp_path: Path) -> None:
     if os.geteuid() == 0:
         place = Path("/proc/sys")  # root may write wherever permissions say no, but not here

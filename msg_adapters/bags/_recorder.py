@@ -17,6 +17,8 @@ from msg_adapters.bags._writer import BagWriter
 from msg_adapters.errors import BagError
 
 _MAX_QUEUED_MESSAGES = 10_000
+_MOST_TOPICS = 10_000
+"""Of one bag: those of people come and go, and MCAP, which numbers them in 16 bits, would end the recording."""
 
 
 @dataclass(frozen=True)
@@ -194,13 +196,17 @@ class Recorder:
             )
 
     def _run(self) -> None:
+        known = set[str]()
         try:
             with self._bag:
                 while (message := self._next()) is not None:
                     if message is _SYNC:
                         self._bag.sync()
                         self._unsynced = None
+                    elif message.topic not in known and len(known) >= _MOST_TOPICS:
+                        self._dropped += 1
                     else:
+                        known.add(message.topic)
                         self._bag.add_topic(message.topic, message.message_type, qos=message.qos)
                         self._bag.write(message.topic, message.data, log_time_ns=message.time_ns)
                         self._written += 1

@@ -62,7 +62,6 @@ class Obstacles(Output):
 
     def gone(self, persons: Sequence[str], moment: Moment) -> Messages:
         for person in persons:
-            self._due.pop(person, None)
             yield from self._remove(self._sent.pop(person, ()), moment)
 
     def _remove(self, names: Iterable[str], moment: Moment) -> Messages:

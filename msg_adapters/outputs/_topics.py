@@ -159,9 +159,11 @@ class Apart(Output):
 
 
 def is_due(due: dict[str, float], key: str, moment: Moment) -> bool:
-    """Whether so much time has gone by; if so, it begins anew."""
+    """Whether so much time has gone by; if so, it begins anew. Nothing is kept of what is due: people leave."""
     now = time.monotonic()
-    if now < due.get(key, 0.0):
+    for passed in [name for name, at in due.items() if at <= now]:
+        del due[passed]
+    if key in due:
         return False
     due[key] = now + (1 / moment.planner_rate if moment.planner_rate else 0.0)
     return True

@@ -146,6 +146,17 @@ def test_what_makes_no_sense_is_left_out_and_counted() -> None:
     buffer.lookup("a", "b", 0)
 
 
+def test_no_way_is_so_long_that_nobody_else_is_served() -> None:
+    buffer = TransformBuffer()
+    put(buffer, *(transform(f"f{i + 1}", f"f{i}") for i in range(9_999)), is_static=True)
+    assert len(buffer) == 9_999
+    assert len(buffer._way("f0")) <= 200
+    buffer.lookup("f50", "f0", 0)
+    buffer.lookup("f0", "f50", 0)
+    with pytest.raises(TransformError, match="no transform leads from f0 to f9999"):
+        buffer.lookup("f9999", "f0", 0)
+
+
 def test_history_is_bounded_and_a_clock_may_go_back() -> None:
     buffer = TransformBuffer()
     for i in range(3000):

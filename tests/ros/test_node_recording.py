@@ -64,8 +64,8 @@ def recorded(path: Path) -> tuple[set[int], set[int], bool]:
 
 @pytest.mark.parametrize(
     "signals",
-    [(signal.SIGINT,), (signal.SIGTERM,), (signal.SIGINT, signal.SIGINT)],
-    ids=["SIGINT", "SIGTERM", "double SIGINT"],
+    [(signal.SIGINT,), (signal.SIGTERM,), (signal.SIGHUP,), (signal.SIGINT, signal.SIGINT)],
+    ids=["SIGINT", "SIGTERM", "SIGHUP", "double SIGINT"],
 )
 def test_signals_lose_nothing(peer: Peer, tmp_path: Path, signals: tuple[signal.Signals, ...]) -> None:
     bag = tmp_path / "bag"

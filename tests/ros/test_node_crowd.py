@@ -1,0 +1,98 @@
+"""Names that peers choose: they come and go for days, in crowds, and as long as a name can be."""
+
+from __future__ import annotations
+
+import gc
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="rclpy isn't installed (extra ros): the node isn't tested")
+
+from harness import CHEAP, NodeProcess, Peer
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import JointState
+from visualization_msgs.msg import MarkerArray
+
+from msg_adapters import MARKER_ARRAY
+from msg_adapters.markers import encode_lists
+from msg_adapters.scene import Scene
+from refu_core import load_body
+from refu_core.keypoints import MOST_PEOPLE, Proportions, Skeleton, keypoint_layout
+from refu_core.keypoints._pose import Pose, exp_so3
+from refu_ros._node import GarmentNode
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")
+BODY = "/humans/bodies/{}/joint_states"
+LONGEST = "x" * 219
+"""The longest id whose topic is one; its garments' would be none."""
+
+
+@pytest.fixture
+def node(ros: None) -> Iterator[Any]:  # noqa: ARG001
+    values = {"input_type": "keypoint_markers", "keypoints": "coco17", "garments": CHEAP["garments"]}
+    node = GarmentNode(parameter_overrides=[Parameter(name, value=value) for name, value in values.items()])
+    yield node
+    node.close()
+    node.destroy_node()
+
+
+def test_nothing_is_kept_of_topics_that_have_gone(node: Any) -> None:
+    """rclpy kept a reference to each: three kilobytes of each person who came and went."""
+    before = len(node.default_callback_group.entities)
+    for i in range(20):
+        node._bank.hold({f"person_{i}/{name}": MARKER_ARRAY for name in ("points", "contacts")})
+        node.destroy_subscription(node.create_subscription(MarkerArray, f"person_{i}", lambda _: None, 1))
+    node._bank.hold({})
+    gc.collect()
+    assert len(node.default_callback_group.entities) == before
+
+
+def test_a_topic_with_too_long_a_name_is_left_out_alone(node: Any) -> None:
+    node._bank.hold({f"{LONGEST}/openings/tshirt_male/left_sleeve": MARKER_ARRAY, "bob/points": MARKER_ARRAY})
+    assert node._bank.name("bob/points") == "/bob/points"
+    report = node.statistics.report()
+    assert report.group("fault") == {"topics": 1}
+    assert "should not exceed" in report.reasons["fault"]
+
+
+def test_who_has_left_a_tracker_is_forgotten(node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    bones, turns = Skeleton(keypoint_layout("coco17"), Proportions.builtin("male")), np.zeros((24, 3))
+    turns[0, 0], turns[16, 2], turns[17, 2] = np.pi, -1.0, 1.0
+    points = bones.posed(Pose(np.array([0.0, 0, 3]), exp_so3(turns), np.zeros(10))).points
+    listener = node._listener
+    listener.follow(load_body("male"))
+    listener.scene = Scene(node.statistics)
+    monkeypatch.setattr(node, "is_watched", lambda: True)
+    for i in range(MOST_PEOPLE + 10):
+        seen = [(f"p{i}", 10**9 + i, [0, 0, 0, 0, 0, 0, 1], points)]
+        data = encode_lists(7, seen, frame_id="camera", color=(1, 1, 1, 1), size=0.01)
+        listener._on_input("", "/smpl_params", data)
+    assert len(listener._frames) == MOST_PEOPLE
+    assert listener._frames[f"p{MOST_PEOPLE + 9}"] == "camera"  # who came first is forgotten
+    assert "p9" not in listener._frames
+
+
+def test_a_crowd_of_bodies_and_a_long_name_take_nothing_from_others(ros: None, tmp_path: Path) -> None:  # noqa: ARG001
+    """Once a second the topics of all were made, and of a name too long for one nothing came any more."""
+    peer = Peer("p0", topic=BODY)
+    with NodeProcess(tmp_path / "log.txt", **CHEAP, follow_humans=True) as node:
+        peer.wait_for_node()
+        names = [LONGEST, *(f"p{i}" for i in range(1, MOST_PEOPLE + 6))]
+        crowd = [peer.node.create_publisher(JointState, BODY.format(name), 1) for name in names]
+        said = f"{MOST_PEOPLE + 6} bodies, up to {MOST_PEOPLE} are dressed"
+        peer.spin_until(lambda: said in peer.status("input")[1], "it says how many there are")
+        peer.spin_until(lambda: sum(one.get_subscription_count() for one in crowd) >= MOST_PEOPLE - 1, "it listens")
+        for _ in range(2):
+            peer.diagnostics.clear()
+            peer.spin_until(lambda: peer.status("node")[1] == "active", "it says how it is")
+        assert sum(one.get_subscription_count() for one in crowd) == MOST_PEOPLE - 1
+        assert peer.listeners("p0")  # who was here stays
+        assert not crowd[0].get_subscription_count()
+        assert "Traceback" not in node.log
+    peer.close()
