@@ -348,7 +348,8 @@ def _check_margin(margin: float | None) -> None:
 
 def _style(value: ArrayLike, device: torch.device) -> Tensor:
     try:
-        style = checked_numbers("style", value, (N_STYLES,), np.float32, MAX_COEFFICIENT)
+        with torch.enable_grad():  # a tensor that tracks gradients is refused, which would come to nothing here
+            style = checked_numbers("style", value, (N_STYLES,), np.float32, MAX_COEFFICIENT)
     except FrameError as error:
         raise GarmentError(*error.args) from error
     return torch.tensor(style, device=device)[None]

@@ -110,6 +110,7 @@ def _serve() -> None:
         if pid == 0:
             signal.signal(signal.SIGCHLD, signal.SIG_DFL)
             signal.signal(signal.SIGINT, signal.default_int_handler)
+            signal.signal(signal.SIGHUP, signal.SIG_DFL)  # also where `nohup` runs the tests
             signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGCHLD])
             file = os.open(order["log"], os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
             for stream in (1, 2):
