@@ -17,7 +17,7 @@ from refu_core.recordings import upright_turn
 from refu_lab.plots import new_axes, save_svg
 from refu_lab.render import SKIN, Camera, RenderMesh, colliding_vertices, collision_mesh, render, save_png
 from refu_lab.replay import Found, FrameResult, ReplayResult, When
-from refu_lab.tables import REPLAY_HEADER, html_page, html_table, replay_rows
+from refu_lab.tables import REPLAY_HEADER, REPLAY_TITLE, html_page, html_table, replay_rows
 from refu_lab.turntable import STYLE as TURNTABLE_STYLE
 from refu_lab.turntable import Frame, Mesh, Pose, turntable
 
@@ -189,7 +189,7 @@ and vertices inside the body.</p>
 <h2>Latency</h2>
 <div class="wide"><img class="plot" src="latency.svg" alt="latency over time"></div>
 <h2>Pictures</h2><div class="pictures">{figures}</div>"""
-    return html_page(f"Replay of {result.options.input.name}", body, style=STYLE + TURNTABLE_STYLE)
+    return html_page(f"{REPLAY_TITLE}{result.options.input.name}", body, style=STYLE + TURNTABLE_STYLE)
 
 
 def _figure(frame: Frame) -> str:

@@ -62,6 +62,10 @@ def html_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return f"<table>{body}</table>"
 
 
+REPLAY_TITLE = "Replay of "
+"""Begins the titles of replays' pages, and tells them from others."""
+
+
 def html_page(title: str, body: str, *, style: str) -> str:
     """A page that refers to nothing outside its folder; `title` is text, the rest HTML and CSS."""
     head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'

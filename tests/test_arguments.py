@@ -20,10 +20,9 @@ from refu_core._device import checked_device
 from refu_lab import cli
 from refu_lab.cli import main
 from refu_lab.commands._common import numbers, tell
-from refu_lab.commands.replay import _TITLE
 from refu_lab.render import save_png
 from refu_lab.replay import _paced
-from refu_lab.tables import html_page
+from refu_lab.tables import REPLAY_TITLE, html_page
 from tests.core.test_files import SPECIAL
 from tests.virtual_time import VirtualTime
 
@@ -116,7 +115,7 @@ def test_a_report_takes_no_other_pages_place(tmp_path: Path, capsys: pytest.Capt
     for inputs in ([BAG], [BAG, BAG]):
         assert "no report of refu replay" in refused(["replay", *inputs, "--report", str(tmp_path)], capsys)
     assert page.read_text() == "<title>My home</title>"
-    assert _TITLE in html_page("Replay of a", "", style="")
+    assert f"<title>{REPLAY_TITLE}" in html_page("Replay of a", "", style="")
 
 
 @pytest.mark.parametrize("name", ["box.stl", "picture.jpg", "picture"])

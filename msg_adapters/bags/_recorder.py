@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from msg_adapters.bags._metadata import METADATA_FILE, QosProfile
+from msg_adapters.bags._reader import BAG_SUFFIXES
 from msg_adapters.bags._writer import BagWriter
 from msg_adapters.errors import BagError
 
@@ -77,7 +78,7 @@ def free_path(path: Path) -> Path:
 
 
 def _is_of_bag(file: Path) -> bool:
-    return file.is_file() and (file.name == METADATA_FILE or file.suffix in (".mcap", ".db3"))
+    return file.is_file() and (file.name == METADATA_FILE or file.suffix in BAG_SUFFIXES)
 
 
 def _opened(path: Path, open_bag: Callable[[Path], BagWriter]) -> tuple[Path, BagWriter]:
@@ -196,17 +197,15 @@ class Recorder:
             )
 
     def _run(self) -> None:
-        known = set[str]()
         try:
             with self._bag:
                 while (message := self._next()) is not None:
                     if message is _SYNC:
                         self._bag.sync()
                         self._unsynced = None
-                    elif message.topic not in known and len(known) >= _MOST_TOPICS:
+                    elif message.topic not in (topics := self._bag.topics) and len(topics) >= _MOST_TOPICS:
                         self._dropped += 1
                     else:
-                        known.add(message.topic)
                         self._bag.add_topic(message.topic, message.message_type, qos=message.qos)
                         self._bag.write(message.topic, message.data, log_time_ns=message.time_ns)
                         self._written += 1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
@@ -82,6 +82,11 @@ class BagWriter:
             return
         with suppress(BagError):  # the error under way says more
             self.finish()
+
+    @property
+    def topics(self) -> Collection[str]:
+        """Names of the topics that it has."""
+        return self._topics.keys()
 
     def add_topic(
         self,

@@ -13,12 +13,10 @@ from refu_core.keypoints import LAYOUTS
 from refu_core.options import DressOptions, check, setting
 from refu_core.recordings import Axes
 from refu_lab.commands import _common as cli
+from refu_lab.tables import REPLAY_TITLE
 
 if TYPE_CHECKING:
     from refu_core import GarmentPipeline
-
-_TITLE = "<title>Replay of "
-"""What the page of a report has, and another page hasn't."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,7 +113,7 @@ def run(args: argparse.Namespace) -> int:
             msg = "a report is of evaluated frames: leave out --report or --no-evaluate"
             raise RefuError(msg)
         page = Path(args.report) / "index.html"
-        if not args.overwrite and page.is_file() and _TITLE.encode() not in page.read_bytes():
+        if not args.overwrite and page.is_file() and f"<title>{REPLAY_TITLE}".encode() not in page.read_bytes():
             msg = f"{page}: is there already, and no report of refu replay; name another folder, or --overwrite it"
             raise RefuError(msg)
         import matplotlib  # noqa: F401, ICN001  (what is missing is said before the replay, not after it)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 from urllib.parse import quote
 
-from refu_lab.tables import REPLAY_HEADER, format_table, html_page, html_table, replay_rows
+from refu_lab.tables import REPLAY_HEADER, REPLAY_TITLE, format_table, html_page, html_table, replay_rows
 
 _HEADER = ("recording", "frames", "skipped", "p50 ms", "p95 ms", "VFCP %", "free %", "depth mm", "")
 _WORST_HEADER = ("recording", "frame", "time s", "inside", "pairs", "depth mm")
@@ -90,7 +90,7 @@ class FleetResult:
 <h2>Recordings</h2>{html_table(_HEADER, recordings)}
 <p class="note">Free: frames in which no garment has a vertex inside the body or a triangle that cuts it.</p>
 <h2>Worst frames of all</h2>{html_table(_WORST_HEADER, worst)}"""
-        return html_page(f"Replay of {len(self.rows)} recordings", body, style=STYLE)
+        return html_page(f"{REPLAY_TITLE}{len(self.rows)} recordings", body, style=STYLE)
 
     def _link(self, row: Mapping[str, Any]) -> str:
         text = html.escape(row["name"])

@@ -7,6 +7,7 @@ import runpy
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -84,33 +85,22 @@ def cloth(garment: GarmentTemplate, pose: Tensor) -> Tensor:
     return torch.stack((torch.zeros_like(height[..., 0]), height[..., 0], height[..., 1]), -1)
 
 
+def waves_of(folder: Path, garment: GarmentTemplate, body: SmplBody, **sizes: int) -> Path:
+    displacement = partial(cloth, garment)
+    return write_set(folder, garment, body, spread=0.4, displacement=displacement, **sizes)
+
+
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory, garment: GarmentTemplate, body: SmplBody) -> Path:
     """Shorts with waves that knees and hips make."""
-    return write_set(
-        tmp_path_factory.mktemp("set") / GARMENT,
-        garment,
-        body,
-        pairs=N_PAIRS,
-        poses=N // N_PAIRS,
-        test_pairs=N_PAIRS - 20,
-        spread=0.4,
-        displacement=lambda pose: cloth(garment, pose),
-    )
+    folder = tmp_path_factory.mktemp("set") / GARMENT
+    return waves_of(folder, garment, body, pairs=N_PAIRS, poses=N // N_PAIRS, test_pairs=N_PAIRS - 20)
 
 
 @pytest.fixture(scope="module")
 def small_set(tmp_path_factory: pytest.TempPathFactory, garment: GarmentTemplate, body: SmplBody) -> Path:
     """The same with fewer samples: to read a set takes longer than some steps of training."""
-    return write_set(
-        tmp_path_factory.mktemp("small") / GARMENT,
-        garment,
-        body,
-        pairs=12,
-        poses=6,
-        spread=0.4,
-        displacement=lambda pose: cloth(garment, pose),
-    )
+    return waves_of(tmp_path_factory.mktemp("small") / GARMENT, garment, body, pairs=12, poses=6)
 
 
 @pytest.fixture(scope="module")
