@@ -146,7 +146,7 @@ def write_collider(clips: list[Motion], every: int, folder: Path) -> None:
 # ---- contact ---------------------------------------------------------------------------------------------------------
 
 TOGETHER, SKIRT = ("shirt-male", "short-pant-male"), ("skirt-female",)
-OF_TOGETHER = ("`layer_", "`unfold_", "`parting")
+OF_TOGETHER = ("`layer_", "`alike", "`levellings")
 """Beginnings of names of what matters to garments worn together alone."""
 OF_CONTACT = {
     "cfmp_percent": ("free %", "{:.1f}"),

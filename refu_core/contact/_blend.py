@@ -13,7 +13,7 @@ from torch.nn import functional
 from refu_core.contact._settings import DEFAULT_CONTACT
 from refu_core.mesh import Connectivity
 
-_STEPS = DEFAULT_CONTACT.blend_steps * DEFAULT_CONTACT.blend_pairs
+_STEPS = DEFAULT_CONTACT.blend_steps * (DEFAULT_CONTACT.around // 2)
 
 
 @dataclass(frozen=True, eq=False)

@@ -111,7 +111,7 @@ class Layer:
 def _rules(settings: ContactSettings, edges: NDArray[np.float32]) -> Any:
     """For a sheet whose edges have these ends at rest [m], (E, 2, 3)."""
     rules = kernels.LayerRules()
-    rules.gap, rules.reach, rules.agreement = settings.gap, settings.layer_reach, settings.layer_agreement
+    rules.gap, rules.reach, rules.alike = settings.gap, settings.layer_reach, settings.alike
     rules.longest = float(np.linalg.norm(edges[:, 0] - edges[:, 1], axis=1).max(initial=0.0))
     return rules
 
@@ -130,10 +130,10 @@ def _starts(
             places.append(vertex)
             is_free[tree.query_ball_point(below[vertex], settings.layer_reach)] = False
     distance, closest = (np.asarray(found) for found in tree.query(above))
-    around = cKDTree(below[places]).query_ball_point(above, settings.layer_meets)
+    around = cKDTree(below[places]).query_ball_point(above, settings.max_displacement)
     each = [
         np.append(first, np.array(places)[others]) if near else np.zeros(0, np.int64)
-        for first, others, near in zip(has_face[closest], around, distance < settings.layer_meets, strict=True)
+        for first, others, near in zip(has_face[closest], around, distance < settings.max_displacement, strict=True)
     ]
     found = np.concatenate((*each, np.zeros(0, np.int64))).astype(np.int64)
     return np.append(0, np.cumsum([len(one) for one in each])).astype(np.int64), found

@@ -78,7 +78,7 @@ class LayerRules:
     gap: wp.float32
     reach: wp.float32
     longest: wp.float32
-    agreement: wp.float32
+    alike: wp.float32
 
 
 @wp.func
@@ -235,7 +235,7 @@ def lift_off(i: int, face: int, faces_it: bool, below: Below, above: Above, rule
     agreement = wp.dot(normal_at(i, above.points, above.cut), normal)
     # A stranger's outside may face the sheet's: a sleeve that hangs beside shorts.
     agreement = wp.where(faces_it, wp.abs(agreement), agreement)
-    share = wp.clamp(agreement / rules.agreement, 0.0, 1.0)
+    share = wp.clamp(agreement / rules.alike, 0.0, 1.0)
     # Whatever ends does so gradually, or cloth would jump from frame to frame.
     share *= wp.min(1.0, 4.0 * (1.0 - far / rules.reach))
     if (below.cut.rim[face] >> feature) & 1 != 0:

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from refu_core._warp import as_warp, ints, memory, recorded, torch_stream
 from refu_core.contact import _parting_kernels as kernels
-from refu_core.contact._level_kernels import level_kernel, widen_kernel
 from refu_core.contact._settings import ContactSettings
 from refu_core.contact._sheet import Sheet, cut_of
 from refu_core.mesh import Connectivity, grouped
@@ -20,9 +19,9 @@ from refu_core.sdf._crossing_kernels import BLOCK
 class Parting:
     """Parts one garment from another one that is worn below it, where their triangles cut each other.
 
-    Three steps, which the caller calls in this order, and the body has the last word after them: faces that cut are
-    found, exactly; around them the outer garment is levelled; what still cuts is brought apart, each face by the
-    shortest way along the normal of the sheet that clears what it cuts deepest. The sheet stays where it is.
+    Two steps, which the caller calls in this order, and the body has the last word after them: faces that cut are
+    found, exactly; and they are brought apart, each by the shortest way along the normal of the sheet that clears what
+    it cuts deepest. The sheet stays where it is.
     """
 
     def __init__(self, mesh: Connectivity, rest: Tensor, sheet: Sheet, *, settings: ContactSettings) -> None:
@@ -32,24 +31,18 @@ class Parting:
         self._is_serial = rest.device.type == "cpu"
         n, n_faces = len(rest), len(cut.faces)
         self._points = memory(n, 3, device=rest.device)
-        self._other = memory(n, 3, device=rest.device)
-        self._marked, self._wider = memory(2, n, device=rest.device)
+        self._marked = memory(n, device=rest.device)
         self._count = memory(1, dtype=torch.int32, device=rest.device)
         self._ways = memory(2, n_faces, 3, device=rest.device)
         data = kernels.Outer()
         data.points, data.way, data.place = (as_warp(rows, wp.vec3) for rows in (self._points, *self._ways))
         data.order = ints(grouped(rest.cpu().numpy()[mesh.faces].mean(axis=1)), rest.device)
         data.cut, data.count = cut, as_warp(self._count, wp.int32)
-        data.marked, wider = (as_warp(one, wp.float32) for one in (self._marked, self._wider))
+        data.marked = as_warp(self._marked, wp.float32)
         data.pulled = wp.zeros(n, dtype=wp.int32, device=str(rest.device))
-        other, alike = as_warp(self._other, wp.vec3), wp.ones(n, dtype=wp.float32, device=str(rest.device))
         bounds = [settings.tolerance, settings.gap]
         launches: dict[str, tuple[Any, int, list[Any]]] = {
             "find": (kernels.find_kernel, -(-n_faces // int(BLOCK)), [sheet.data, data]),
-            "widen0": (widen_kernel, n, [data.marked, alike, cut, 1.0, wider]),
-            "widen1": (widen_kernel, n, [wider, alike, cut, 1.0, data.marked]),
-            "level0": (level_kernel, n, [data.points, data.marked, cut, other]),
-            "level1": (level_kernel, n, [other, data.marked, cut, data.points]),
             "measure": (kernels.measure_kernel, n_faces, [sheet.data, data, *bounds]),
             "part": (kernels.part_kernel, n, [data]),
         }
@@ -64,16 +57,6 @@ class Parting:
             self._points.copy_(above)
             self._commands["find"].launch()
         return self._count.clone()
-
-    def level(self, above: Tensor) -> Tensor:
-        """The outer garment, (V, 3) [m], levelled around the faces that were found to cut."""
-        with torch_stream(self._device):
-            self._points.copy_(above)
-            for k in range(self._settings.near):
-                self._commands[f"widen{k % 2}"].launch()
-            for k in range(self._settings.levellings):
-                self._commands[f"level{k % 2}"].launch()
-        return self._points.clone()
 
     def part(self, above: Tensor) -> Tensor:
         """The outer garment, (V, 3) [m], with faces around there brought to the outer side of what they cut.

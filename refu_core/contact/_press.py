@@ -88,7 +88,7 @@ class Press:
         foreign = (~own).cpu().numpy() @ (1 << np.arange(len(_LIMBS)))
         # Cloth that lies on the skin gives way as one piece: of its vertices a few are asked, and others follow those.
         rest = garment.v_template.cpu().numpy()
-        is_loose = cKDTree(limbs.rest).query(rest)[0] > settings.press_lies[0]
+        is_loose = cKDTree(limbs.rest).query(rest)[0] > settings.limb_reach
         is_asked = is_loose | garment.mesh.independent()
         order, ring = grouped(rest), garment.mesh.ring
         order = order[is_asked[order]]
@@ -108,9 +108,8 @@ class Press:
         for name, values in lists.items():
             setattr(fabric, name, ints(values, self.device))
         feel = kernels.Feel()
-        feel.room, feel.flat, feel.looks = settings.gap, settings.press_flat, settings.press_looks
-        feel.beside = garment.edge_length if knows_arms else settings.press_beside
-        feel.lies = wp.vec2(*settings.press_lies)
+        feel.room, feel.lies = settings.gap, settings.limb_reach
+        feel.beside = garment.edge_length if knows_arms else settings.limb_reach
         meshes = wp.array([mesh.id for mesh in limbs.meshes], dtype=wp.uint64, device=str(self.device))
         sweeps, near = settings.around, settings.near
         launches: dict[str, tuple[Any, int, list[Any]]] = {

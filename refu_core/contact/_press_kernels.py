@@ -18,9 +18,7 @@ class Feel:
 
     room: wp.float32
     beside: wp.float32
-    flat: wp.float32
-    lies: wp.vec2
-    looks: wp.int32
+    lies: wp.float32
 
 
 @wp.struct
@@ -56,7 +54,7 @@ class Fabric:
 @wp.func
 def beside(height: float, feel: Feel) -> float:
     """How far beside a limb cloth at such a height feels it [m]."""
-    return wp.min(feel.beside, height * height / feel.flat)
+    return wp.min(feel.beside, height * height / feel.lies)
 
 
 @wp.kernel
@@ -88,7 +86,7 @@ def look_kernel(fabric: Fabric, bundles: Bundles, feel: Feel) -> None:
         high = greater(fabric.points[v], fabric.skin[v])
         height = wp.length(fabric.points[v] - fabric.skin[v])
         boxed = int(0)
-        if height > feel.room and height < feel.lies[1]:
+        if height > feel.room and height < 2.0 * feel.lies:
             for k in range(bundles.group_low.shape[0]):
                 if ((fabric.foreign[v] & found) >> k) & 1 == 1 and is_near(low, high, k, beside(height, feel), bundles):
                     boxed |= 1 << k
@@ -114,7 +112,7 @@ def press(v: int, fabric: Fabric, limbs: wp.array[wp.uint64], feel: Feel) -> Non
     for k in range(limbs.shape[0]):
         if (fabric.boxed[v] >> k) & 1 == 1:
             at = float(0.0)
-            for _ in range(feel.looks):
+            while at < least:
                 here = fabric.skin[v] + (at / height) * way
                 off = aside * (least - at) / (whole - at)  # what is farther off than that says nothing new
                 hit = wp.mesh_query_point_no_sign(limbs[k], here, off)
@@ -122,11 +120,9 @@ def press(v: int, fabric: Fabric, limbs: wp.array[wp.uint64], feel: Feel) -> Non
                     off = wp.min(off, wp.length(wp.mesh_eval_position(limbs[k], hit.face, hit.u, hit.v) - here))
                     least = wp.min(least, at + (whole - at) * off / aside)
                 at += wp.max(off, feel.room)
-                if at >= least:
-                    break
     if least < whole:
         # Cloth at the skin has nothing to give, and cloth far off doesn't lie on this skin.
-        lies = wp.clamp((feel.lies[1] - height) / (feel.lies[1] - feel.lies[0]), 0.0, 1.0)
+        lies = wp.clamp(2.0 - height / feel.lies, 0.0, 1.0)
         lies *= wp.clamp(height / feel.room - 1.0, 0.0, 1.0)
         cut = lies * (height - wp.max(least - feel.room, 0.5 * least))
         if cut > 0.0:

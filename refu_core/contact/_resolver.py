@@ -190,7 +190,7 @@ class Resolver:
                 self._close(_state.REACHED)
                 self._run("reach")
             self._close(_state.REACHED)
-            for sweep in range(2 * self._settings.blend_pairs):
+            for sweep in range(self._settings.around):
                 self._run(f"spread{sweep % 2}")
             self._close(_state.REACHED)
         self._run("settle")
@@ -258,7 +258,7 @@ class Resolver:
         }
         long_step, short_step = how.blend_steps
         if self._is_serial:
-            numbers = [how.near, how.blend_pairs, long_step, short_step]
+            numbers = [how.near, how.around, long_step, short_step]
             steps["blend"] = (_resolver_kernels.blend_kernel, [state, cloth, *numbers])
             steps["raise edges"] = (_edge_kernels.raise_edges_kernel, [state, cloth, skin, rules])
             return {name: recorded(kernel, 1, inputs, self.device) for name, (kernel, inputs) in steps.items()}

@@ -201,16 +201,16 @@ def spread(
 
 
 @wp.kernel
-def blend_kernel(state: State, cloth: Cloth, rings: int, pairs: int, long_step: float, short_step: float) -> None:
-    """All sweeps, in pairs, by one thread: the lists are short, and a launch costs what hundreds of steps do."""
+def blend_kernel(state: State, cloth: Cloth, near: int, sweeps: int, long_step: float, short_step: float) -> None:
+    """All sweeps, in pairs, by one thread: lists are short, a launch costs what hundreds of steps do."""
     first = int(0)
-    for _ring in range(rings):
+    for _ring in range(near):
         last = int(state.counts[REACHED])
         for k in range(first, last):
             reach(state.reached[k], state, cloth)
         first = last
     n = int(state.counts[REACHED])
-    for _pair in range(pairs):
+    for _pair in range(sweeps // 2):
         for k in range(n):
             spread(state.reached[k], state, cloth, long_step, state.field, state.smoother)
         for k in range(n):

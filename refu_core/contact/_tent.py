@@ -11,7 +11,6 @@ from torch import Tensor
 from refu_core._warp import as_warp, ints, memory, recorded, strips, torch_stream
 from refu_core.body import LEGS, SmplBody, weight_of_parts
 from refu_core.contact import _tent_kernels as kernels
-from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
 from refu_core.garments import GarmentTemplate
 from refu_core.skeleton import JOINT_NAMES
 
@@ -71,17 +70,17 @@ class Shins:
 class Tent:
     """Keeps cloth that hangs behind the legs at rest behind the shins in any pose (docs/architecture.md).
 
-    It goes backwards, out of a tent over each shin, by the shortest way out of both: by `tent_share` where at rest it
+    It goes backwards, out of a tent over each shin, by the shortest way out of both: all the way where at rest it
     is farther behind the bone than the tent is wide, other cloth by less, and none at rest.
     """
 
-    def __init__(self, garment: GarmentTemplate, shins: Shins, *, settings: ContactSettings = DEFAULT_CONTACT) -> None:
+    def __init__(self, garment: GarmentTemplate, shins: Shins) -> None:
         """For a garment on the body whose shins these are."""
         self._device = garment.v_template.device
         at_rest = shins.behind(garment.v_template.detach().cpu().double().numpy())
         # What hangs from both legs goes as far with either.
         follows = np.minimum(2 * weight_of_parts(garment.weights, LEGS).cpu().numpy(), 1)
-        weight = settings.tent_share * np.clip(at_rest / shins.radius, 0, 1) * follows
+        weight = np.clip(at_rest / shins.radius, 0, 1) * follows
         (rows,) = np.nonzero(weight.max(1))
         name = str(self._device)
         hanging = kernels.Hanging()

@@ -15,7 +15,6 @@ from refu_core._warp import as_warp, memory, recorded, torch_stream
 from refu_core.body import PARENTS, JointWeights
 from refu_core.contact import _layers_kernels as layers
 from refu_core.contact import _unfold_kernels as kernels
-from refu_core.contact._level_kernels import level_kernel, widen_kernel
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
 from refu_core.contact._sheet import cut_of
 from refu_core.garments import GarmentTemplate
@@ -51,7 +50,7 @@ class Unfold:
         fold.rotation, fold.count = as_warp(self._rotation, wp.mat33), as_warp(self._count, wp.int32)
         fold.cut = cut = cut_of(garment.mesh, device)
         wp.launch(layers.normals_kernel, n, [as_warp(rest, wp.vec3), cut, fold.normal], device=str(device))
-        share = _share(garment, others, settings.layer_meets).to(device)
+        share = _share(garment, others, settings.max_displacement).to(device)
         may = torch.nonzero(share)[:, 0].int()
         fold.share, fold.may = as_warp(share, wp.float32), as_warp(may, wp.int32)
         start, joint, of_joint = JointWeights.of(garment.weights)
@@ -59,14 +58,14 @@ class Unfold:
         fold.weight_of_joint = as_warp(of_joint, wp.float32)
         fold.rows, fold.is_listed = (wp.zeros(n, dtype=wp.int32, device=str(device)) for _ in range(2))
         fold.weight, fold.wider = (wp.zeros(n, dtype=wp.float32, device=str(device)) for _ in range(2))
-        fade, rounds, farthest = settings.unfold_fade, settings.levellings, settings.max_displacement
+        fade, rounds, farthest = settings.fade, settings.levellings, settings.max_displacement
         n_strips, each = (1, len(may)) if self._is_serial else (len(may), 1)
         launches: dict[str, tuple[Any, int, list[Any]]] = {
-            "fold": (kernels.fold_kernel, n_strips, [each, fold, *settings.unfold_cosines]),
-            "widen0": (widen_kernel, n, [fold.weight, fold.share, cut, fade, fold.wider]),
-            "widen1": (widen_kernel, n, [fold.wider, fold.share, cut, fade, fold.weight]),
-            "level0": (level_kernel, n, [fold.points, fold.weight, cut, fold.leveller]),
-            "level1": (level_kernel, n, [fold.leveller, fold.weight, cut, fold.points]),
+            "fold": (kernels.fold_kernel, n_strips, [each, fold, settings.alike]),
+            "widen0": (kernels.widen_kernel, n, [fold.weight, fold.share, cut, fade, fold.wider]),
+            "widen1": (kernels.widen_kernel, n, [fold.wider, fold.share, cut, fade, fold.weight]),
+            "level0": (kernels.level_kernel, n, [fold.points, fold.weight, cut, fold.leveller]),
+            "level1": (kernels.level_kernel, n, [fold.leveller, fold.weight, cut, fold.points]),
             "bound": (kernels.bound_kernel, n, [fold, farthest]),
             "unfold all": (kernels.unfold_all_kernel, 1, [fold, fade, settings.around, rounds, farthest]),
         }

@@ -4,7 +4,6 @@ import warp as wp
 
 from refu_core.body._pose_kernels import turned
 from refu_core.contact._layers_kernels import Cut, gather
-from refu_core.contact._level_kernels import levelled, widest
 from refu_core.contact._state import bounded
 
 wp.set_module_options({"enable_backward": False})
@@ -59,7 +58,7 @@ def facing(i: int, fold: Fold, way: wp.vec3) -> float:
 
 
 @wp.kernel
-def fold_kernel(each: int, fold: Fold, flat: float, folded: float) -> None:
+def fold_kernel(each: int, fold: Fold, alike: float) -> None:
     """How far each vertex has folded over, 0 to its share: by where it is `facing`, and where it should be.
 
     Those that have are listed. `each` vertices a thread (`strips`).
@@ -69,10 +68,49 @@ def fold_kernel(each: int, fold: Fold, flat: float, folded: float) -> None:
         i = fold.may[k]
         way = turned(i, fold.start, fold.joint, fold.weight_of_joint, fold.rotation, fold.normal)
         cosine = facing(i, fold, way)
-        weight = fold.share[i] * wp.clamp((flat - cosine) / (flat - folded), 0.0, 1.0)
+        weight = fold.share[i] * wp.clamp(1.0 - cosine / alike, 0.0, 1.0)
         fold.weight[i] = weight
         if weight > 0.0:
             fold.rows[wp.atomic_add(fold.count, 0, 1)] = i
+
+
+@wp.func
+def levelled(i: int, points: wp.array[wp.vec3], weight: float, cut: Cut) -> wp.vec3:
+    """A vertex by its weight towards the middle of its neighbours."""
+    place = points[i]
+    start = cut.ring_start[i]
+    end = cut.ring_start[i + 1]
+    if weight > 0.0 and end > start:
+        total = wp.vec3()
+        for r in range(start, end):
+            total += points[cut.ring[r]]
+        place += weight * (total / float(end - start) - place)
+    return place
+
+
+@wp.kernel
+def level_kernel(points: wp.array[wp.vec3], weight: wp.array[float], cut: Cut, leveller: wp.array[wp.vec3]) -> None:
+    """`levelled` of one vertex a thread."""
+    i = wp.tid()
+    leveller[i] = levelled(i, points, weight[i], cut)
+
+
+@wp.func
+def widest(i: int, weight: wp.array[float], share: wp.array[float], cut: Cut, fade: float) -> float:
+    """The weight of a vertex, or what is left of the largest of its neighbours', up to its share."""
+    most = float(0.0)
+    for r in range(cut.ring_start[i], cut.ring_start[i + 1]):
+        most = wp.max(most, weight[cut.ring[r]])
+    return wp.max(weight[i], wp.min(fade * most, share[i]))
+
+
+@wp.kernel
+def widen_kernel(
+    weight: wp.array[float], share: wp.array[float], cut: Cut, fade: float, wider: wp.array[float]
+) -> None:
+    """`widest` of one vertex a thread."""
+    i = wp.tid()
+    wider[i] = widest(i, weight, share, cut, fade)
 
 
 @wp.kernel

@@ -77,7 +77,7 @@ class ContactStage:
         if outfit.collider is not None:
             self._shins, self._limbs = Shins(body), LimbMeshes(body)
             self._skin = Sheet(outfit.collider.anatomy.mesh, body.v_template)
-            self._tents = {name: Tent(one, self._shins, settings=settings) for name, one in garments.items()}
+            self._tents = {name: Tent(one, self._shins) for name, one in garments.items()}
             self._press = {
                 name: Press(one.template, self._limbs, knows_arms=one.knows_arms, settings=settings)
                 for name, one in outfit.wearables.items()
@@ -173,7 +173,7 @@ class ContactStage:
         if was_torn:
             done = resolver(vertices, self.sdf, None, margin=kept)
         if worn:
-            done = self._part(name, done, worn, margin=kept)
+            done = self._part(name, done, margin=kept)
         vertices, numbers[_N_UNRESOLVED] = done.vertices, torch.count_nonzero(done.distance < 0)
         if self._is_tight:
             vertices = self._off_skin[name].parted(vertices)
@@ -183,23 +183,19 @@ class ContactStage:
             vertices, numbers[_N_UNRESOLVED] = self.way_out(vertices, pressed, margin)
         return Worn(vertices, raw, torch.cat((numbers, n_layered)), n_clipped)
 
-    def _part(self, name: str, done: Resolution, worn: Mapping[str, Worn], *, margin: float) -> Resolution:
-        """A garment off the body, off the `worn` inner ones where triangles cut each other after all.
+    def _part(self, name: str, done: Resolution, *, margin: float) -> Resolution:
+        """A garment off the body, off the inner ones where triangles cut each other after all.
 
         As often as that leaves fewer cuts: in a crease without room the way out of one fold leads into the next.
         """
         partings = [layer.parting for layer in self._below[name].values()]
         resolver, before = self.resolvers[name], done.vertices
         n_cut = torch.stack([parting.find(before) for parting in partings])
-        for round_ in range(self._settings.max_pushes):
+        for _ in range(self._settings.max_pushes):
             if self._is_serial and not int(n_cut.sum()):
                 break
             cut_by = [one for one, n in zip(partings, n_cut, strict=True) if not self._is_serial or int(n)]
             vertices = done.vertices
-            for parting in cut_by:
-                vertices = parting.level(vertices)
-            if not round_:  # Later on there is no room for a gap, or there would be no cut.
-                vertices, _ = self.lift(name, vertices, worn, goes_on=True)
             for parting in cut_by:
                 vertices = parting.part(vertices)
             vertices = before + torch.renorm(vertices - before, 2, 0, self._settings.parting_most)

@@ -77,29 +77,27 @@ def test_is_what_a_look_from_the_skin_says(knows_arms: bool) -> None:
     of_face = part_of_faces(outfit().body.weights, outfit().body.faces, parts).numpy()
     rest = outfit().wearables[SKIRT].template.v_template.numpy()
     to_skin = cKDTree(outfit().body.v_template.numpy()).query(rest)[0]
-    is_asked = outfit().wearables[SKIRT].template.mesh.independent() | (to_skin > DEFAULT_CONTACT.press_lies[0])
+    is_asked = outfit().wearables[SKIRT].template.mesh.independent() | (to_skin > DEFAULT_CONTACT.limb_reach)
     how, moved = DEFAULT_CONTACT, np.linalg.norm(pressed - x, axis=1)
-    farthest = outfit().wearables[SKIRT].template.edge_length if knows_arms else how.press_beside
+    farthest = outfit().wearables[SKIRT].template.edge_length if knows_arms else how.limb_reach
     near = np.flatnonzero((moved > 0) | (np.arange(len(x)) % 40 == 0))
     height = np.linalg.norm(x - at, axis=1)
     arms = [body.double().numpy()[outfit().body.faces.numpy()[of_face == arm]] for arm in (1, 2)]
     wanted = x.copy()
     for v in near:
         h, whole = height[v], height[v] + how.gap
-        if not (is_asked[v] and how.gap < h < how.press_lies[1]):
+        if not (is_asked[v] and how.gap < h < 2 * how.limb_reach):
             continue
-        aside = min(farthest, h * h / how.press_flat)
+        aside = min(farthest, h * h / how.limb_reach)
         least = whole
         for triangles in arms:
             go = 0.0
-            for _ in range(how.press_looks):
+            while go < least:
                 off = distances((at[v] + go / h * (x[v] - at[v]))[None], triangles)[0]
                 off = min(off, aside * (least - go) / (whole - go))
                 least = min(least, go + (whole - go) * off / aside)
                 go += max(off, how.gap)
-                if go >= least:
-                    break
-        lies = np.clip((how.press_lies[1] - h) / (how.press_lies[1] - how.press_lies[0]), 0, 1)
+        lies = np.clip(2 - h / how.limb_reach, 0, 1)
         lies *= np.clip(h / how.gap - 1, 0, 1)
         cut = max(lies * (h - max(least - how.gap, least / 2)), 0)
         wanted[v] += (max(h - cut, how.gap / 2) / h - 1) * (x[v] - at[v])

@@ -122,5 +122,5 @@ def test_one_list_does_what_the_same_launches_in_every_frame_do() -> None:
 
 def test_no_sweeps_change_nothing() -> None:
     points = torn(1)
-    still = StrainLimit(SHORTS.mesh, CPU, settings=replace(DEFAULT_CONTACT, sweeps=0))
+    still = StrainLimit(SHORTS.mesh, CPU, settings=replace(DEFAULT_CONTACT, around=0))
     assert torch.equal(still(points, REST, REST), points)

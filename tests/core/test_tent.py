@@ -15,7 +15,7 @@ from torch import Tensor
 
 from refu_core import load_body, load_garment
 from refu_core.body import LEGS, SmplBody, weight_of_parts
-from refu_core.contact import DEFAULT_CONTACT, Shins, Tent
+from refu_core.contact import Shins, Tent
 from refu_core.garments import BUILTIN_GARMENTS, GarmentTemplate
 
 HIPS, KNEES, ANKLES = (1, 2), (4, 5), (7, 8)
@@ -90,7 +90,7 @@ def slow(cloth: NDArray[np.float64], posed: NDArray[np.float64]) -> NDArray[np.f
             was = at_rest[ANKLES[leg]] - at_rest[KNEES[leg]]
             rest = garment.v_template[v].double().numpy() - at_rest[KNEES[leg]]
             behind = -(rest - np.clip(rest @ was / (was @ was), 0, 1) * was)[2]
-            weight = DEFAULT_CONTACT.tent_share * np.clip(behind / radius, 0, 1) * min(1, 2 * follows[v, leg])
+            weight = np.clip(behind / radius, 0, 1) * min(1, 2 * follows[v, leg])
             needs.append(weight * (min(tent, behind) - off @ back))
         if max(needs) > 0:
             out[v] += shortest(ways[0], ways[1], np.array(needs))
