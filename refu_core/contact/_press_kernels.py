@@ -54,7 +54,7 @@ class Fabric:
 @wp.func
 def beside(height: float, feel: Feel) -> float:
     """How far beside a limb cloth at such a height feels it [m]."""
-    return wp.min(feel.beside, height * height / feel.lies)
+    return wp.min(feel.beside, 2.0 * height * height / feel.lies)
 
 
 @wp.kernel

@@ -39,12 +39,12 @@ class ContactSettings:
     2.3 % cut, 32 and 48 leave 0.3 %, 100 none. With 48 a T-shirt jumps by more than 20 mm in 1.5 % of frame pairs, as
     its network alone does, with 100 in 2.9 %."""
     limb_reach: float = 0.08
-    """How far beside a limb cloth still feels it, less and less [m]: a hand that swings goes 30 mm in a frame. Cloth at
-    a height below that feels it as far as the height squared is of this. Up to this height cloth lies on its skin; at
-    twice the height it doesn't, since there neighbours lie on different legs, and pressed to them they tear. With 70 mm
-    a skirt jumps by more than 40 mm in 1.7 % of 343 recorded frame pairs, with 80 mm in 0.9 %. Cloth whose networks
-    know where arms are (`Wearable.knows_arms`) feels limbs as far as one of its edges is long: what those predict is
-    nearer to the truth than where a limb from afar draws it."""
+    """How far beside a limb cloth still feels it, less and less [m]: a hand that swings goes 30 mm in a frame. Near
+    its skin cloth feels it from less far: twice its height squared, by this. Up to this height cloth lies on its skin;
+    at twice the height it doesn't, since there neighbours lie on different legs, and pressed to them they tear. With
+    70 mm a skirt jumps by more than 40 mm in 1.5 % of 343 recorded frame pairs, with 80 mm in 0.9 %; its error is 6.9
+    and 7.0 mm. Cloth whose networks know where arms are (`Wearable.knows_arms`) feels limbs as far as one of its edges
+    is long: what those predict is nearer to the truth than where a limb from afar draws it."""
     strain_limit: float = 1.6
     """How many times their rest length edges may be, unless they were predicted longer, before their ends are drawn
     together. Of 116 recorded frames .0018 % of a T-shirt's edges are twice as long as at rest, without a limit .013 %;
