@@ -32,7 +32,7 @@ def cone(low: tuple[float, float], high: tuple[float, float], *, rows: int = 40,
     return SurfaceMesh(v, np.concatenate([np.stack(f, -1).reshape(-1, 3) for f in ((a, b, b + n), (a, b + n, a + n))]))
 
 
-@pytest.mark.parametrize("turn", ["x 180", "z 90", "z -90"])
+@pytest.mark.parametrize("turn", ["x 180", "z 90"])
 def test_a_shirt_that_lies_or_stands_on_its_head_is_put_upright(turn: str) -> None:
     """It was worn on one hand, like a bucket."""
     v, f = cloth(SHIRT)

@@ -52,6 +52,7 @@ _TRIED = [
     for name, check in CHECKS.items()
     for mode, wardrobe in WARDROBES.items()
     if check.holds_for(wardrobe) and (mode != "tailornet/accurate" or check.part == "guarantees")
+    if mode != "skinned/accurate" or check.part != "numbers"  # of a body, and of networks
     if not name.endswith("worn together")  # one garment alone: of two there are worst cases below
 ]
 

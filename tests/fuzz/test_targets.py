@@ -61,7 +61,7 @@ def hang(_: Any) -> None:
 
 
 def fill(_: Any) -> None:
-    np.ones(600 << 17)  # far more than what anything else in the process may free meanwhile
+    np.ones(1000 << 17)  # far more than what anything else in the process may free meanwhile
 
 
 def call(_: Any) -> None:
