@@ -48,7 +48,7 @@ class ContactSettings:
     strain_limit: float = 1.6
     """How many times their rest length edges may be, unless they were predicted longer, before their ends are drawn
     together. Of 116 recorded frames .0026 % of a skirt's edges are twice as long as at rest, with a limit of 3.2 ten
-    times as many, and it jumps in 12 % of frame pairs (10). Without slack, at 1, a T-shirt's frame takes 45 % longer."""
+    times as many, and it jumps in 12 % of frame pairs (10). With a limit of 1 a T-shirt's frame takes 45 % longer."""
     alike: float = 0.5
     """Cosine from which on two sheets face alike; at a right angle they don't at all. So much does a push off a garment
     below count, and so much is cloth left as it is that faces where skinning turns it: what faces elsewhere has folded
