@@ -11,7 +11,7 @@ from slow_contact import resolve
 from torch import Tensor
 
 from refu_core import GarmentTemplate, SmplBody, load_body, load_garment
-from refu_core.contact import Blend, Resolution, Resolver
+from refu_core.contact import Blend, ContactSettings, Resolution, Resolver
 from refu_core.errors import MeshError
 from refu_core.sdf import ApproxSdf, BandSdf, ExactSdf, RestFaces, SdfSample
 
@@ -166,3 +166,9 @@ def test_a_margin_that_is_none_is_refused(margin: float) -> None:
     points = garment.v_template.float()
     with pytest.raises(MeshError, match="margin of 0 m or more"):
         Resolver(garment.faces, len(points))(points, sdf, sdf.query(points), margin=margin)
+
+
+@pytest.mark.parametrize("given", [{"gap": 0.0}, {"gap": math.nan}, {"around": 3}, {"levellings": 47}])
+def test_settings_that_never_end_or_end_elsewhere_are_refused(given: dict[str, float]) -> None:
+    with pytest.raises(MeshError, match=str(next(iter(given.values())))):
+        ContactSettings(**given)  # type: ignore[arg-type]
