@@ -92,14 +92,14 @@ class ContactSettings:
         as wide as cloth gives way on both sides. The long one levels what is wide, and the short one the ripples that
         the long one overdoes.
         """
-        finest, widest = 1.5, (math.pi / (2 * self.around)) ** 2
+        finest, widest = 1.5, (math.pi / (2 * max(self.around, 1))) ** 2
         middle, half = (finest + widest) / 2, (finest - widest) / 2 * math.sqrt(0.5)
         return 1 / (middle - half), 1 / (middle + half)
 
     @property
     def fade(self) -> float:
         """What is left from edge to edge of how much cloth gives way."""
-        return 1 - 1 / self.around
+        return 1 - 1 / max(self.around, 1)
 
     @property
     def parting_most(self) -> float:
