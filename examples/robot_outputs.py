@@ -29,7 +29,7 @@ def main() -> None:
         centre, normal = opening.centre.round(2), opening.rotation[:, 2].round(2)
         print(f"{opening.name}: at {centre}, opens to {normal}, {1e3 * opening.perimeter:.0f} mm round")
     distance = clearance(out)[garment.name]
-    print(f"nearest to the skin: {1e3 * distance.min():.2f} mm; {(distance < 0.01).mean():.0%} within 10 mm")
+    print(f"nearest to the skin: {1e3 * distance.min():.3f} mm; {(distance < 0.01).mean():.0%} within 10 mm")
     for contact in contacts(out):
         print(f"between {contact.parts}: {1e4 * contact.area:.0f} cm², {1e3 * contact.depth:.0f} mm deep")
     solid = planner.solid(worn.vertices)

@@ -97,7 +97,7 @@ def test_robot_outputs(run) -> None:
     said = run("robot_outputs")
     for name in ("waist", "left_leg", "right_leg"):
         assert f"{name}: at " in said
-    assert numbers(r"nearest to the skin: (\S+) mm", said)[0] >= 0
+    assert numbers(r"nearest to the skin: (\S+) mm", said)[0] > 0
     assert "between ('trunk', 'left_thigh')" in said
     assert numbers(r"planner: (\d+) triangles", said)[0] <= 2000
     seen, sigma = numbers(r"seen: (\d+)%; sigma (\S+) mm", said)

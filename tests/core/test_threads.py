@@ -177,7 +177,7 @@ def test_a_number_of_threads_that_is_none_is_refused(threads: object) -> None:
         GarmentPipeline.load(_GARMENTS, threads=threads)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("n", [2, 8])
+@pytest.mark.parametrize("n", [1, 2, 3, 8])
 def test_a_batch_is_shared_out_among_threads(pipeline: GarmentPipeline, n: int) -> None:
     shared = GarmentPipeline.load(_GARMENTS, threads=3)
     frames = _frames(n, seed=n)

@@ -88,9 +88,9 @@ def test_equals_the_slow_one_and_whether_it_is_asked_or_not_plays_no_role() -> N
 
 def test_no_vertex_goes_farther_than_any_may() -> None:
     points, rotation = shorts_in(1.8)
-    giant = 20 * points
+    giant = 4 * points
     moved = (made()(giant, rotation) - giant).norm(dim=1)
-    assert 0.0999 < moved.max() <= DEFAULT_CONTACT.max_displacement + 1e-5
+    assert 0.0999 < moved.max() <= DEFAULT_CONTACT.max_displacement + 1e-7
 
 
 def test_cloth_that_faces_where_skinning_turns_it_is_left_as_it_is() -> None:
