@@ -66,6 +66,7 @@ def evaluate(options: EvaluateOptions, *, progress: bool, engine: Engine | None 
     study, tables = rp.Study(), []
     of_study = [name for name in wanted if name in rp.SAMPLE_TABLES and name != "sequence"]
     methods = list(dict.fromkeys(method for name in of_study for method in rp.SAMPLE_TABLES[name].methods))
+    methods += [name for name in rp.POSTURE_METHODS if "postures" in wanted and name not in methods]
     for samples in posed if methods else ():
         rp.run_methods(study, samples, methods, engine=engine, **how)
     for name in wanted:
@@ -80,6 +81,8 @@ def evaluate(options: EvaluateOptions, *, progress: bool, engine: Engine | None 
         elif name == "motion":
             table = rp.motion_table(read_clips(options.motions or Path()), every=options.motion_every, **how)
             n_samples = {}
+        elif name == "postures":
+            table = rp.posture_table(study)
         elif name == "sdf":
             table = rp.sdf_table(posed, **how)
         elif name == "time":  # with nothing else in the same run

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 RESULT_TABLES = (
     *("parts", "comparison", "ablation", "gcnn", "sequence", "alpha", "sdf", "time", "laplacian", "unseen", "energy"),
-    "motion",
+    *("postures", "motion"),
 )
 """What `refu evaluate` makes, in the order of its summary; here, where a command line finds it without torch."""
 

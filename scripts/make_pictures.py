@@ -25,11 +25,10 @@ from refu_core import GarmentPipeline, PipelineOutput, SmplFrame, load_body, loa
 from refu_core.body import joints_of
 from refu_core.modes import DEFAULT_GARMENTS
 from refu_core.recordings import interpolated
-from refu_core.simulation import GarmentDataset
+from refu_core.simulation import SELF_TOUCHING, GarmentDataset, posture
 from refu_lab.contact_sheet import contact_sheet
 from refu_lab.garment import picture
 from refu_lab.render import SKIN, Backdrop, Camera, RenderMesh, render
-from refu_lab.touching_poses import TOUCHING_POSES, touching_pose
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -139,7 +138,7 @@ _MOST = 0.02  # [m]
 
 def collider_sheet(
     garments: Sequence[str] = DEFAULT_GARMENTS,
-    poses: Sequence[str] = tuple(TOUCHING_POSES),
+    poses: Sequence[str] = SELF_TOUCHING,
     size: tuple[int, int] = (230, 270),
     samples: int = 9,
 ) -> NDArray[np.uint8]:
@@ -153,7 +152,7 @@ def collider_sheet(
     is_framed = ~torch.isin(pipeline.body.weights.argmax(1), torch.tensor(lower)).numpy()
     columns = []
     for name in poses:
-        out = pipeline(SmplFrame(pose=touching_pose(name)))
+        out = pipeline(SmplFrame(pose=posture(name)))
         camera = Camera.framing(out.skin[is_framed], size=size, yaw=25.0, pitch=20.0)
         share = np.clip(np.linalg.norm(out.body - out.skin, axis=1) / _MOST, 0, 1)[:, None]
         moved = (1 - share) * np.array(SKIN) + share * np.array(_MOVED)

@@ -17,6 +17,9 @@ from refu_core.simulation._poses import Clip as Clip
 from refu_core.simulation._poses import load_clips as load_clips
 from refu_core.simulation._poses import random_pose as random_pose
 from refu_core.simulation._poses import split_clips as split_clips
+from refu_core.simulation._postures import POSTURES as POSTURES
+from refu_core.simulation._postures import SELF_TOUCHING as SELF_TOUCHING
+from refu_core.simulation._postures import posture as posture
 from refu_core.simulation._produce import Progress as Progress
 from refu_core.simulation._produce import simulate_dataset as simulate_dataset
 from refu_core.simulation._selection import CAUSES as CAUSES

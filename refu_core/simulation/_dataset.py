@@ -13,6 +13,7 @@ from refu_core.errors import SimulationError
 from refu_core.simulation._joined import slices_of
 from refu_core.simulation._motion import FPS
 from refu_core.simulation._plan import TEST
+from refu_core.simulation._postures import POSTURES
 from refu_core.simulation._selection import CAUSES
 from refu_core.simulation._store import DONE, FORMAT, SEQUENCES, Rows, dequantise, read_card, read_unseen
 
@@ -39,6 +40,8 @@ class GarmentSample:
     """Name of the motion that the pose is from; None for a drawn pose."""
     frame: int | None
     """Number of that motion's frame; None for a drawn pose."""
+    posture: str | None
+    """Which of `POSTURES` was varied; None for another pose."""
     unseen: float
     """Distance in (θ, β, γ) to the nearest training sample; NaN for those and until the set is summarised."""
 
@@ -188,7 +191,7 @@ class GarmentDataset(_Finished):
         Raises `SimulationError` when there is no such sample.
         """
         row, split = self._row(index)
-        clip = int(row["clip"])
+        clip, frame = int(row["clip"]), int(row["frame"])
         return GarmentSample(
             vertices=dequantise(row["vertices"]),
             pose=np.array(row["pose"]),
@@ -198,7 +201,8 @@ class GarmentDataset(_Finished):
             pair=int(row["pair"]),
             split=split,
             clip=None if clip < 0 else self._clips[split][clip],
-            frame=None if clip < 0 else int(row["frame"]),
+            frame=None if clip < 0 else frame,
+            posture=tuple(POSTURES)[frame] if clip < 0 <= frame < len(POSTURES) else None,
             unseen=float(self._unseen[row["slot"]]),
         )
 

@@ -18,6 +18,7 @@ from refu_core.errors import SimulationError
 from refu_core.frames import N_BETAS
 from refu_core.garments import N_STYLES, garment_name
 from refu_core.simulation._poses import Clip, clip_pose, random_pose
+from refu_core.simulation._postures import drawn_posture
 
 TRAIN, TEST = 0, 1
 MAX_PIVOTS_SHARE = 0.5
@@ -58,7 +59,10 @@ class SamplePlan:
     pivots: int = 20
     poses_per_pair: int = 6
     recorded_share: float = 0.6
-    """Share of poses that are frames of motions; the others are drawn within the limits of human joints."""
+    """Share of poses that are frames of motions."""
+    posture_share: float = 0.0
+    """Share of poses that are everyday postures, varied (`POSTURES`); the rest are drawn within the limits of human
+    joints."""
     spread: float = 1.2
     """Standard deviation of β and γ before they are cut off at ±2."""
     block: int = 12
@@ -69,8 +73,10 @@ class SamplePlan:
         if self.count < 1 or self.pivots < 1 or self.poses_per_pair < 1 or self.block < 1:
             msg = f"count, pivots, poses_per_pair and block must be at least 1, got {asdict(self)}"
             raise SimulationError(msg)
-        if not (0 <= self.test_share < 1 and 0 <= self.recorded_share <= 1 and self.spread > 0):
-            msg = f"shares must lie in [0, 1) and the spread above 0, got {asdict(self)}"
+        shares = self.recorded_share, self.posture_share
+        if not (0 <= self.test_share < 1 and min(shares) >= 0 and sum(shares) <= 1 and self.spread > 0):
+            wanted = "shares must lie in [0, 1), those of poses sum up to 1 at most, and the spread be above 0"
+            msg = f"{wanted}, got {asdict(self)}"
             raise SimulationError(msg)
 
     @property
@@ -126,8 +132,15 @@ class SamplePlan:
         return value[:N_BETAS], value[N_BETAS:]
 
     def pose(self, slot: int, attempt: int, clips: Sequence[Clip]) -> tuple[NDArray[np.float32], int, int]:
-        """The pose that a slot tries at its `attempt`: (24, 3) [rad], the clip's number and frame, or -1 and -1."""
+        """The pose that a slot tries at its `attempt`: (24, 3) [rad], the clip's number and frame.
+
+        The clip is -1 where it is none, and the frame the posture's number, or -1 where it is none either.
+        """
         rng = np.random.default_rng(self._key(3, slot, attempt))
-        if rng.random() < self.recorded_share and clips:
+        kind = rng.random()
+        if kind < self.recorded_share and clips:
             return clip_pose(clips, rng)
+        if self.recorded_share <= kind < self.recorded_share + self.posture_share:
+            pose, which = drawn_posture(rng)
+            return pose, -1, which
         return random_pose(rng), -1, -1

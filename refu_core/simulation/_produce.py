@@ -155,6 +155,7 @@ def simulate_dataset(
     engine: Engine | None = None,
     test_share: float = 1 / 6,
     recorded_share: float = SamplePlan.recorded_share,
+    posture_share: float = SamplePlan.posture_share,
     pivots: int = SamplePlan.pivots,
     settings: SimulationSettings | None = None,
     progress: Callable[[Progress], None] | None = None,
@@ -173,7 +174,8 @@ def simulate_dataset(
         seed: of everything that is drawn.
         engine: what shares the work among processes (`refu_lab.fleet.open_engine`); None for this one alone.
         test_share: share of the samples that is kept for the test.
-        recorded_share: share of the poses that are frames of the motions; the others are drawn.
+        recorded_share: share of the poses that are frames of the motions.
+        posture_share: share of the poses that are everyday postures, varied; the others are drawn.
         pivots: style-shape pairs that half of the training samples share.
         settings: of simulation and selection.
         progress: called in this process after each slot.
@@ -190,7 +192,9 @@ def simulate_dataset(
     """
     clips: tuple[list[Clip], list[Clip]] = ([], []) if motions is None else split_clips(as_clips(motions))
     recorded_share = 0.0 if motions is None else recorded_share
-    plan = SamplePlan(garment, count, seed=seed, test_share=test_share, recorded_share=recorded_share, pivots=pivots)
+    plan = SamplePlan(
+        garment, count, seed, test_share, pivots, SamplePlan.poses_per_pair, recorded_share, posture_share
+    )
     make = partial(SlotSimulator, plan, clips, settings or SimulationSettings(), body)
     produce(make, Path(output), engine=engine, progress=progress)
     return summarise(output)

@@ -1,7 +1,9 @@
 """The paper's tables and figures on our own data, each figure beside the paper's; `refu evaluate` is made of this."""
 
+from refu_lab.reproduction._build import POSTURE_METHODS as POSTURE_METHODS
 from refu_lab.reproduction._build import SAMPLE_TABLES as SAMPLE_TABLES
 from refu_lab.reproduction._build import TIMED_METHODS as TIMED_METHODS
+from refu_lab.reproduction._build import posture_table as posture_table
 from refu_lab.reproduction._build import sample_table as sample_table
 from refu_lab.reproduction._build import time_table as time_table
 from refu_lab.reproduction._load import Library as Library

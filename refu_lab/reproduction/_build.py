@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from refu_core.metrics import Figures
+from refu_core.simulation import POSTURES
 from refu_lab.reproduction._methods import SEQUENCE_SHAPES
 from refu_lab.reproduction._runs import RATIO_EDGES, MethodRun, Study
 from refu_lab.reproduction._tables import ALL, Missing, ResultRow, ResultTable, weighted
@@ -68,6 +70,39 @@ def _missing_sets(study: Study) -> Iterator[Missing]:
         for method in (f"mlp-{shapes}", f"mlp-{shapes}-refu-approx"):
             if (garment, method) not in study.runs and (garment, method) not in study.missing:
                 yield Missing(garment, method, f"no set of {shapes} shapes was given", command)
+
+
+def posture_table(study: Study) -> ResultTable:
+    """The node in each everyday posture, garment by garment and over all of them."""
+    table = ResultTable(
+        "postures",
+        "Everyday postures",
+        "The node, hybrid, in the postures that a set was asked for (`posture_share`), each as other people would hold "
+        "it: arms on the body, overhead, crossed, sitting, kneeling, on all fours. MPVE beside that of all these "
+        "samples says in which of them the networks are at a loss.",
+    )
+    table.missing = list(study.missing.values())
+    found = {garment: [study.runs.get((garment, name)) for name in POSTURE_METHODS] for garment in study.n_samples}
+    if len(found) > 1:
+        found[ALL] = [MethodRun.joined(ALL, name, study.pooled(name)) for name in POSTURE_METHODS]
+    for garment, (before, after) in found.items():
+        if before is None or after is None:
+            continue
+        postures = [posture for posture in POSTURES if posture in after.postures]
+        whole = Figures.over(after.of_postures(postures)).mpve_mm if postures else None
+        groups = {**{posture: [posture] for posture in postures}, "all of them": postures}
+        for title, group in groups.items() if whole else ():
+            samples = after.of_postures(group)
+            figures = Figures.over(samples)
+            values = {
+                "n_samples": float(len(samples)),
+                "network_mpve_mm": Figures.over(before.of_postures(group)).mpve_mm,
+                "mpve_mm": figures.mpve_mm,
+                "share_of_mean": None if figures.mpve_mm is None or whole is None else figures.mpve_mm / whole,
+                "cfmp_percent": figures.cfmp_percent,
+            }
+            table.rows += [ResultRow.of("postures", garment, title, metric, value) for metric, value in values.items()]
+    return table
 
 
 def time_table(study: Study) -> ResultTable:
@@ -144,6 +179,8 @@ def unseen_groups(runs: Sequence[MethodRun]) -> list[tuple[np.ndarray, np.ndarra
     return [(distance[rows], error[rows]) for rows in groups]
 
 
+POSTURE_METHODS = ("tailornet", "node-hybrid")
+"""What must be run for the table of postures."""
 _SDFS = ("approx", "accurate")
 _MODES = (*_SDFS, "hybrid")
 _OPTIMISATIONS = (

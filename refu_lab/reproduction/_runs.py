@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -44,6 +44,8 @@ class Sample(NamedTuple):
     """γ, shape (4,)."""
     unseen: float
     """Distance to the nearest training sample in (θ, β, γ); NaN where it isn't known."""
+    posture: str | None = None
+    """Which of `POSTURES` the pose is one of; None where it is another, or isn't known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +89,7 @@ def _of_poses(dataset: GarmentDataset) -> SampleSet:
 
     def read(number: int) -> Sample:
         sample = dataset.sample(int(rows[number]))
-        return Sample(sample.vertices, sample.pose, sample.betas, sample.style, sample.unseen)
+        return Sample(sample.vertices, sample.pose, sample.betas, sample.style, sample.unseen, sample.posture)
 
     return SampleSet(str(dataset.card["garment"]), len(rows), None, read)
 
@@ -153,6 +155,8 @@ class MethodRun:
     """The figures of each sample, in the set's order."""
     unseen: list[float] = field(default_factory=list)
     """Each sample's distance to the training set in (θ, β, γ)."""
+    postures: list[str | None] = field(default_factory=list)
+    """Each sample's posture."""
     ms: dict[str, list[float]] = field(default_factory=dict)
     """Wall time of each sample by component [ms]."""
     scales: ScaleByRatio = field(default_factory=ScaleByRatio)
@@ -172,10 +176,23 @@ class MethodRun:
             return None
         return float(np.median(np.sum([self.ms[component] for component in components], axis=0)))
 
+    def of_postures(self, postures: Sequence[str]) -> list[FrameMetrics]:
+        """The figures of the samples in these postures."""
+        return [sample for sample, posture in zip(self.samples, self.postures, strict=True) if posture in postures]
+
+    @classmethod
+    def joined(cls, garment: str, method: str, runs: Iterable[MethodRun]) -> MethodRun:
+        """All samples of `runs`, in their order."""
+        whole = cls(garment, method)
+        for run in runs:
+            whole.join(run)
+        return whole
+
     def join(self, other: MethodRun) -> None:
         """Takes in the samples that follow."""
         self.samples += other.samples
         self.unseen += other.unseen
+        self.postures += other.postures
         for component, ms in other.ms.items():
             self.ms.setdefault(component, []).extend(ms)
         self.scales.join(other.scales)
@@ -235,9 +252,8 @@ def run_methods(
             parts[index] = part
             bar.update(len(next(iter(part.values())).samples))
     for name in ready:
-        study.runs[garment, name] = joined = MethodRun(garment, name)
-        for index in sorted(parts):  # in the samples' order, whoever was first
-            joined.join(parts[index][name])
+        in_order = (parts[index][name] for index in sorted(parts))  # whoever was first
+        study.runs[garment, name] = MethodRun.joined(garment, name, in_order)
 
 
 @dataclass
@@ -296,6 +312,7 @@ def _run_samples(
             frame = metrics[name].add(output.vertices, found, truth=sample.vertices, resolved=colliding[base])
             run.samples.append(frame)
             run.unseen.append(sample.unseen)
+            run.postures.append(sample.posture)
             run.scales.add(output)
             for component, ms in output.ms.items():
                 run.ms.setdefault(component, []).append(ms)

@@ -13,11 +13,11 @@ from tqdm import tqdm
 
 from refu_core.errors import WeightsError
 from refu_core.sdf import BodySdf
+from refu_core.simulation import posture
 from refu_lab.reproduction._load import Library
 from refu_lab.reproduction._predict import GarmentSetup, SampleScene
 from refu_lab.reproduction._runs import Sample, SampleSet
 from refu_lab.reproduction._tables import Missing, ResultRow, ResultTable
-from refu_lab.touching_poses import touching_pose
 
 _AT_SURFACE = 1e-4
 """Closer to the skin than this [m], a relative error says nothing."""
@@ -48,7 +48,7 @@ DISTURBANCE = 0.01
 NEAR_SKIN = 0.02
 """Within this of the skin [m] the distance decides what ReFU does."""
 FOLDED_POSES = ("squat", "crossed arms", "hands on hips")
-"""Of `TOUCHING_POSES`."""
+"""Of `POSTURES`."""
 _FOLDED_SHAPES = 8
 """Body shapes that each of them is taken with."""
 _POINTS_ASKED = 8
@@ -102,7 +102,7 @@ def sdf_table(sets: Sequence[SampleSet], *, library: Library, progress: bool = F
             table.rows += _rows(garment, name, asked)
             table.rows += _rows(garment, name + _CLOSE, asked, is_close=True)
         for title in FOLDED_POSES:
-            pose = touching_pose(title)
+            pose = posture(title)
             for sample in list(bodies.values())[:_FOLDED_SHAPES]:
                 scene = SampleScene(setup, pose, sample.betas, sample.style)
                 unposed = setup.template.rest(scene.betas, scene.style)

@@ -23,6 +23,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 import refu_core
 from refu_core._engine import Engine
@@ -32,6 +33,7 @@ from refu_core.garments import load_garment
 from refu_core.metrics import CollisionChecker, SheetChecker
 from refu_core.simulation import (
     CAUSES,
+    POSTURES,
     Draper,
     GarmentDataset,
     GarmentSample,
@@ -42,6 +44,7 @@ from refu_core.simulation import (
     _produce,
     colliders,
     load_clips,
+    posture,
     simulate_dataset,
     split_clips,
     summarise,
@@ -503,6 +506,36 @@ def test_recorded_and_drawn_poses_are_mixed(clips: Path) -> None:
     first, second = (plan.pose(3, attempt, train)[0] for attempt in (0, 1))
     assert np.abs(first - second).max() > 0.01
     np.testing.assert_array_equal(first, plan.pose(3, 0, train)[0])
+
+
+def test_postures_have_their_share_and_are_held_as_others_would() -> None:
+    plan = SamplePlan(GARMENT, 400, posture_share=0.4)
+    drawn = [plan.pose(slot, 0, []) for slot in range(400)]
+    numbers = np.array([frame for _, _, frame in drawn])
+    assert {clip for _, clip, _ in drawn} == {-1}
+    assert np.mean(numbers >= 0) == pytest.approx(plan.posture_share, abs=0.1)
+    assert set(numbers) == {-1, *range(len(POSTURES))}
+    elbows, names = [18, 19], tuple(POSTURES)
+    for pose, _, number in drawn:
+        forward = Rotation.from_rotvec(pose[0]).apply([0.0, 0.0, 1.0])
+        assert number < 0 or abs(forward[0]) < 1e-5 or abs(forward[2]) < 0.1  # it has no heading, or lies
+        if number >= 0:
+            wanted = np.linalg.norm(posture(names[number])[elbows], axis=1)
+            bent = np.linalg.norm(pose[elbows], axis=1)
+            assert min(np.abs(bent - wanted).max(), np.abs(bent[::-1] - wanted).max()) < np.radians(45)
+
+
+def test_a_plan_without_postures_is_as_it_was() -> None:
+    """Weights say which plan they were trained on: its samples can be simulated again."""
+    old, new = SamplePlan(GARMENT, 30), SamplePlan(GARMENT, 30, posture_share=0.0)
+    assert all(np.array_equal(old.pose(slot, 0, [])[0], new.pose(slot, 0, [])[0]) for slot in range(30))
+    assert old.pose(3, 0, [])[0][18, 1] == pytest.approx(-0.8027, abs=1e-3)
+
+
+@pytest.mark.parametrize("shares", [{"posture_share": -0.1}, {"recorded_share": 0.7, "posture_share": 0.4}])
+def test_shares_that_are_no_shares_are_refused(shares: dict[str, float]) -> None:
+    with pytest.raises(SimulationError, match="shares"):
+        SamplePlan(GARMENT, 10, **shares)  # type: ignore[arg-type]
 
 
 @given(st.lists(st.floats(-1.99, 1.99), min_size=3, max_size=30))

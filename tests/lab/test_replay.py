@@ -28,9 +28,9 @@ from msg_adapters.markers import encode_delete
 from refu_core import GarmentPipeline, SmplFrame, load_body, load_garment
 from refu_core.garments import BUILTIN_GARMENTS, PAPER_GARMENTS
 from refu_core.modes import ONE_STYLE
+from refu_core.simulation import posture
 from refu_lab.cli import main
 from refu_lab.dressed_bag import DressedBag
-from refu_lab.touching_poses import touching_pose
 
 BAGS = Path(__file__).parents[2] / "bags"
 SHIPPED = [BAGS / "walk", BAGS / "reach_squat"]
@@ -181,7 +181,7 @@ def test_nothing_is_inside_the_body(garment: str, backbone: str, sampled: list[S
 
 def test_figures_are_against_the_collider_and_beside_it_against_the_skin(tmp_path: Path) -> None:
     """Hanging arms: a T-shirt that is free of the collider is between an arm and a flank that overlap."""
-    bag = write_bag(tmp_path / "hanging.mcap", [SmplFrame(pose=touching_pose("hanging arms"))])
+    bag = write_bag(tmp_path / "hanging.mcap", [SmplFrame(pose=posture("hanging arms"))])
     results = {}
     for name, options in (("with", ()), ("without", ("--no-collider",))):
         file = tmp_path / f"{name}.json"

@@ -67,7 +67,7 @@ def test_every_figure_of_the_paper_stands_beside_a_method_of_ours() -> None:
     for table, _, method, metric in rp.PAPER:
         assert method in built[table], (table, method)
         assert metric in _tables.METRICS
-    assert set(rp.SAMPLE_TABLES) | {"time", "sdf", "motion"} == set(RESULT_TABLES)
+    assert set(rp.SAMPLE_TABLES) | {"time", "sdf", "postures", "motion"} == set(RESULT_TABLES)
 
 
 # ---- emulated networks -----------------------------------------------------------------------------------------------
@@ -335,6 +335,29 @@ def test_two_garments_are_weighted_by_their_samples(study: rp.Study) -> None:
         every = [s.mpve_mm for g in (GARMENT, "shirt-male") for s in both.runs[g, method].samples]
         assert table.value(rp.ALL, method, "mpve_mm") == pytest.approx(np.mean(every))
     assert table.value(rp.ALL, "collision-loss-approx", "mpve_mm") is None
+
+
+def test_postures_against_a_loop(study: rp.Study) -> None:
+    """In a study whose methods stand for the network and for the node."""
+    alone, node = (study.runs[GARMENT, name] for name in ("tailornet", "refu-hybrid"))
+    postures = [*("squat", "sitting", None) * N_SAMPLES][:N_SAMPLES]
+    small = rp.Study(n_samples={GARMENT: N_SAMPLES})
+    for name, run in (("tailornet", alone), ("node-hybrid", node)):
+        small.runs[GARMENT, name] = rp.MethodRun(GARMENT, name, run.samples, postures=postures)
+    table = rp.posture_table(small)
+    assert {row.method for row in table.rows} == {"squat", "sitting", "all of them"}
+    known = [one for one, name in zip(node.samples, postures, strict=True) if name]
+    whole = np.mean([one.mpve_mm for one in known])
+    assert table.value(GARMENT, "all of them", "mpve_mm") == pytest.approx(whole)
+    squats = [k for k, name in enumerate(postures) if name == "squat"]
+    error = np.mean([node.samples[k].mpve_mm for k in squats])
+    assert table.value(GARMENT, "squat", "n_samples") == len(squats)
+    assert table.value(GARMENT, "squat", "mpve_mm") == pytest.approx(error)
+    assert table.value(GARMENT, "squat", "share_of_mean") == pytest.approx(error / whole)
+    before = np.mean([alone.samples[k].mpve_mm for k in squats])
+    assert table.value(GARMENT, "squat", "network_mpve_mm") == pytest.approx(before)
+    free = 100 * np.mean([node.samples[k].is_free for k in squats])
+    assert table.value(GARMENT, "squat", "cfmp_percent") == pytest.approx(free)
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ import pytest
 from refu_core import GarmentPipeline, SmplFrame
 from refu_core.body import JOINT_NAMES
 from refu_core.metrics import SelfContactDetector
-from refu_lab.touching_poses import TOUCHING_POSES, touching_pose
+from refu_core.simulation import SELF_TOUCHING, posture
 
 
 @pytest.fixture(scope="module")
@@ -19,10 +19,10 @@ def pipeline() -> GarmentPipeline:
     return GarmentPipeline.load(["short-pant-male"], backbone="skinned", sdf="none")
 
 
-@pytest.mark.parametrize("name", TOUCHING_POSES)
+@pytest.mark.parametrize("name", SELF_TOUCHING)
 def test_skin_runs_through_itself_and_the_collider_by_far_less(name: str, pipeline: GarmentPipeline) -> None:
     """Between fingers, where nothing is worn, anything may happen."""
-    out = pipeline(SmplFrame(pose=touching_pose(name)))
+    out = pipeline(SmplFrame(pose=posture(name)))
     body = pipeline.body
     detector = SelfContactDetector(body.faces, body.v_template)
     hands = [JOINT_NAMES.index(f"{side}_{name}") for side in ("left", "right") for name in ("wrist", "hand")]

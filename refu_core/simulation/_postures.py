@@ -1,0 +1,120 @@
+"""Postures of everyday life that recorded walks lack: limbs on the body, arms overhead, sitting, kneeling, crawling."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from refu_core.simulation._poses import mirrored, without_heading
+from refu_core.skeleton import JOINT_NAMES
+
+Angles = Mapping[str, tuple[float, float, float]]
+
+
+def _both(**left: tuple[float, float, float]) -> dict[str, tuple[float, float, float]]:
+    """Joints of the left side, and of the right one as its mirror image."""
+    return {
+        f"{side}_{name}": (x, s * y, s * z)
+        for side, s in (("left", 1), ("right", -1))
+        for name, (x, y, z) in left.items()
+    }
+
+
+_HANGING = {"right_shoulder": (18.0, 16.0, 83.0), "right_elbow": (0.0, 9.0, 0.0)}
+_KNEELING = _both(hip=(-10, 0, 6), knee=(95, 0, 0), ankle=(20, 0, 0))
+
+POSTURES: Mapping[str, Angles] = {
+    "hanging arms": _both(shoulder=(18, -16, -83), elbow=(0, -9, 0)),
+    "crossed arms": {
+        "left_shoulder": (38, -67, -54),
+        "left_elbow": (0, -95, 0),
+        "right_shoulder": (28, 68, 52),
+        "right_elbow": (0, 87, 0),
+    },
+    "hands on hips": _both(shoulder=(72, -19, -52), elbow=(0, -85, 0)),
+    "hands in the lap": _both(shoulder=(17, -35, -76), elbow=(0, -61, 0), hip=(-88, 0, 5), knee=(85, 0, 0)),
+    "squat": {
+        "pelvis": (30, 0, 0),
+        "spine1": (10, 0, 0),
+        "spine2": (10, 0, 0),
+        "neck": (-15, 0, 0),
+        **_both(shoulder=(-36, -56, -64), elbow=(0, -28, 0), hip=(-118, 0, 14), knee=(125, 0, 0), ankle=(-30, 0, 0)),
+    },
+    "sitting": _both(shoulder=(-4, -13, -80), elbow=(0, -59, 0), hip=(-85, 0, 8), knee=(82, 0, 0)),
+    "prayer": _both(shoulder=(18, -37, -66), elbow=(0, -117, 0)),
+    "lying curled up": {
+        "pelvis": (0, 0, 90),
+        "spine1": (18, 0, 0),
+        "spine2": (18, 0, 0),
+        "spine3": (12, 0, 0),
+        "neck": (22, 0, 0),
+        "head": (12, 0, 0),
+        **_both(shoulder=(-25, -55, -73), elbow=(0, -91, 0), hip=(-115, 0, -10), knee=(122, 0, 0), ankle=(15, 0, 0)),
+    },
+    "arms overhead": _both(collar=(0, 0, 22), shoulder=(8, -14, 62), elbow=(0, -15, 0)),
+    "one arm overhead": {
+        "left_collar": (0, 0, 22),
+        "left_shoulder": (8, -14, 62),
+        "left_elbow": (0, -20, 0),
+        **_HANGING,
+    },
+    "hands behind the head": _both(collar=(0, 0, 12), shoulder=(-90, -32, 22), elbow=(0, -125, 0)),
+    "hands behind the back": _both(shoulder=(67, 14, -72), elbow=(0, -70, 0)),
+    "hand at the ear": {"left_shoulder": (-67, 12, -68), "left_elbow": (0, -135, 0), **_HANGING},
+    "reaching forward": _both(collar=(0, -10, 0), shoulder=(3, -75, -4), elbow=(0, -15, 0)),
+    "bent to the floor": {
+        "pelvis": (45, 0, 0),
+        "spine1": (25, 0, 0),
+        "spine2": (15, 0, 0),
+        "spine3": (10, 0, 0),
+        **_both(shoulder=(7, -75, -9), elbow=(0, -10, 0), hip=(-60, 0, 3), knee=(20, 0, 0)),
+    },
+    "kneeling": {**_KNEELING, **_both(shoulder=(18, -30, -76), elbow=(0, -35, 0))},
+    "crawling": {
+        "pelvis": (80, 0, 0),
+        "neck": (-20, 0, 0),
+        "head": (-15, 0, 0),
+        **_both(shoulder=(0, -80, 0), elbow=(0, -10, 0), hip=(-75, 0, 4), knee=(85, 0, 0), ankle=(25, 0, 0)),
+    },
+    "lunge": {
+        "left_hip": (-75, 0, 4),
+        "left_knee": (80, 0, 0),
+        "right_hip": (20, 0, -4),
+        "right_knee": (55, 0, 0),
+        **_both(shoulder=(10, -25, -70), elbow=(0, -40, 0)),
+    },
+}
+"""By name: rotation vectors of joints [degrees], zero for those that aren't named; SMPL's axes, x to the left."""
+SELF_TOUCHING = tuple(POSTURES)[:8]
+"""Those in which the skin runs through itself."""
+_SPREAD = 8.0
+"""Standard deviation of a drawn posture's joints about the named one, in each coordinate [degrees]."""
+_STIFF = tuple(JOINT_NAMES.index(f"{side}_{name}") for side in ("left", "right") for name in ("foot", "wrist", "hand"))
+"""Joints that no garment feels."""
+
+
+def posture(name: str) -> NDArray[np.float32]:
+    """One of `POSTURES`, rotation vectors [rad], shape (24, 3). Raises `KeyError` for another name."""
+    pose = np.zeros((len(JOINT_NAMES), 3), np.float32)
+    for joint, angles in POSTURES[name].items():
+        pose[JOINT_NAMES.index(joint)] = np.radians(angles)
+    return pose
+
+
+def drawn_posture(rng: np.random.Generator) -> tuple[NDArray[np.float32], int]:
+    """One of `POSTURES` as somebody else would hold it, mirrored or not, without heading; and its number.
+
+    Rotation vectors [rad], shape (24, 3).
+    """
+    names = tuple(POSTURES)
+    which = int(rng.integers(len(names)))
+    noise = np.radians(rng.normal(0.0, _SPREAD, (len(JOINT_NAMES), 3)))
+    noise[_STIFF, :] = 0.0
+    named = Rotation.from_rotvec(posture(names[which]).astype(np.float64))
+    pose = (Rotation.from_rotvec(noise) * named).as_rotvec().astype(np.float32)
+    if rng.random() < 0.5:
+        pose = mirrored(pose)
+    return without_heading(pose), which
