@@ -19,6 +19,7 @@ from refu_core.training import (
     DynamicsSettings,
     FinetuneSettings,
     PretrainSettings,
+    Rehearsal,
     SdfSettings,
     carry_over,
     finetune,
@@ -59,15 +60,16 @@ def train(options: TrainOptions, *, progress: bool) -> dict[str, Any]:
     of_all = {} if options.steps is None else dict.fromkeys(("style_shape_steps", "low_steps", "steps"), options.steps)
     first = PretrainSettings.of(options.backbone, options.preset, samples=int(dataset.train.sum()))
     first = _seeded(first, options, **of_all)
+    common["rehearsal"] = None if options.rehearse is None else Rehearsal(options.rehearse, options.motions)
     if options.mode == "none":
-        return pretrain(*given, settings=first, **common)
+        return pretrain(*given, settings=first, start=options.start, **common)
     source: Path | None = options.folder
     if options.start is not None:
         source = options.start
     elif options.backbone == "gcnn":
         source = None
     elif not (options.folder / f"{options.backbone}-none.json").exists():
-        pretrain(*given, settings=first, **common)
+        pretrain(*given, settings=first, **common | {"rehearsal": None})
     changes: dict[str, Any] = {"scale": None} if options.scale == "fixed" else {"scale_kind": options.scale}
     changes |= {} if options.margin is None else {"margin": options.margin}
     changes |= {"is_blended": False} if options.unblended else {}
@@ -82,8 +84,8 @@ def _check(options: TrainOptions) -> None:
     if options.like is not None and not is_plain:
         msg = "--like makes a tailornet of the preset realtime: leave --network, --backbone and --preset out"
         raise RefuError(msg)
-    if options.start is not None and (options.mode == "none" or options.like is not None):
-        msg = "--start goes on with a mode that has ReFU: leave --like and --mode none out"
+    if options.like is not None and (options.start is not None or options.rehearse is not None):
+        msg = "--like trains networks of its own: leave --start and --rehearse out"
         raise RefuError(msg)
     presets = SDF_PRESETS if options.network == "sdf" else PRESETS
     if options.preset not in presets:

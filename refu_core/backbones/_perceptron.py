@@ -51,6 +51,12 @@ class _Standardised(nn.Module):
             variance = inputs.new_zeros(int(groups.max()) + 1).index_add(0, groups, inputs.var(0))
             self.scale.copy_(1 / ((variance / torch.bincount(groups)).sqrt() + 1e-3)[groups])
 
+    def widen(self, inputs: Tensor) -> None:
+        """Takes in the range of further samples (N, I), where inputs are clamped; shift and scale stay as they are."""
+        with torch.no_grad():
+            self.lowest.copy_(torch.where(self.lowest > -_ANY, inputs.amin(0).minimum(self.lowest), -_ANY))
+            self.highest.copy_(torch.where(self.highest < _ANY, inputs.amax(0).maximum(self.highest), _ANY))
+
     def seen(self, x: Tensor) -> Tensor:
         """The inputs (B, I) as the first layer has them."""
         return (x.clamp(self.lowest, self.highest) - self.shift) * self.scale

@@ -25,5 +25,6 @@ from refu_core.training._pretrain import MANY as MANY
 from refu_core.training._pretrain import PretrainSettings as PretrainSettings
 from refu_core.training._pretrain import pretrain as pretrain
 from refu_core.training._progress import TrainingLog as TrainingLog
+from refu_core.training._rehearsal import Rehearsal as Rehearsal
 from refu_core.training._sdf import SdfSettings as SdfSettings
 from refu_core.training._sdf import train_sdf as train_sdf

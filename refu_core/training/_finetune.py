@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -29,7 +28,8 @@ from refu_core.training._dresser import Dresser, Sdf
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, start_parallel
 from refu_core.training._losses import refu_loss
 from refu_core.training._mirror import Mirror
-from refu_core.training._pretrain import PretrainSettings, basis_of, pivots_of, stages
+from refu_core.training._pretrain import PretrainSettings, basis_of, bring_basis, pivots_of, stages, take_inputs
+from refu_core.training._rehearsal import Rehearsal, beside, plan_of
 from refu_core.weights import load_weights
 
 _UNIT = 1e3
@@ -101,6 +101,7 @@ def finetune(
     preset: str = "realtime",
     settings: FinetuneSettings | None = None,
     goes_on: bool = False,
+    rehearsal: Rehearsal | None = None,
     body: SmplBody | None = None,
     device: str = "cpu",
     quiet: bool = False,
@@ -117,6 +118,7 @@ def finetune(
         backbone: `tailornet`, `mlp` or `gcnn`.
         preset: `realtime` or `paper`, of ReFU and of a backbone from scratch.
         goes_on: start from <backbone>-<mode> in `weights` with its ReFU, in place of <backbone>-none.
+        rehearsal: what the weights are asked for, as they are before, beside the samples.
         garment, dataset, settings, body, device, quiet: as in `pretrain`.
 
     Returns:
@@ -139,6 +141,7 @@ def finetune(
     train, validation = split_validation(samples, share=settings.validation_share, seed=settings.loop.seed)
     if settings.is_mirrored:
         train = train.joined(mirrored(train, Mirror.of(template)))
+    n_samples = len(train)
     network: Network
     stored = None
     with torch.random.fork_rng(devices=[]):
@@ -154,19 +157,26 @@ def finetune(
         else:
             stored = load_weights(Path(weights) / f"{backbone}-{mode if goes_on else 'none'}", expect=identity)
             network = backbone_from_weights(stored, template)
-            _bring_basis(Path(weights), output)
+            bring_basis(Path(weights), output)
         refu = _layer(mode, settings, template.n_vertices)
         if stored is not None and goes_on:
             refu = refu_from_weights(stored)
+    if stored is not None:
+        take_inputs(network, train, template, widen=True)
+    rehearsed: dict[str, Any] = {}
+    if stored is not None and rehearsal is not None:
+        old = rehearsal.of(stored.card, network)
+        train, rehearsed = beside(train, old), {"rehearsed": {"count": len(old), "plan": plan_of(stored.card)}}
     described = {
         **identity,
         "backbone": backbone,
         "preset": preset,
         "mode": mode,
         "settings": asdict(settings),
-        "samples": len(train),
+        "samples": n_samples,
         "from_scratch": weights is None,
         **({"goes_on_from": stored.card["sha256"]} if stored is not None and goes_on else {}),
+        **rehearsed,
     }
     found = _MODES[mode]
     dresser = Dresser(
@@ -229,12 +239,3 @@ def _layer(mode: str, settings: FinetuneSettings, n_vertices: int) -> Refu | Non
         scale=None if settings.scale is None else replace(SCALE_PRESETS[settings.scale], kind=settings.scale_kind),
         margin=settings.margin,
     )
-
-
-def _bring_basis(source: Path, target: Path) -> None:
-    """Copies the output basis beside the weights that will need it."""
-    if not is_writer() or source.resolve() == target.resolve() or not (source / "basis.json").exists():
-        return
-    target.mkdir(parents=True, exist_ok=True)
-    for name in ("basis.safetensors", "basis.json"):
-        shutil.copyfile(source / name, target / name)

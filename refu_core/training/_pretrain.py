@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,11 @@ from refu_core.backbones import (
     Gcnn,
     LaplacianSmoothing,
     Mlp,
+    Network,
     TailorNet,
     TailorNetConfig,
     backbone_config,
+    backbone_from_weights,
     build_backbone,
     load_basis,
     save_backbone,
@@ -25,6 +28,7 @@ from refu_core.backbones import (
     uses_basis,
 )
 from refu_core.body import SmplBody
+from refu_core.errors import RefuError
 from refu_core.garments import GarmentTemplate
 from refu_core.simulation import GarmentDataset, GarmentSequences
 from refu_core.training._data import (
@@ -39,6 +43,8 @@ from refu_core.training._data import (
 from refu_core.training._figures import backbone_figures
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, start_parallel
 from refu_core.training._mirror import Mirror
+from refu_core.training._rehearsal import Rehearsal, beside, plan_of
+from refu_core.weights import load_weights
 
 MANY = 4000
 """Samples from which on a tailornet is trained longer and held back less. On validation samples of shorts' 6,000 the
@@ -94,6 +100,8 @@ def pretrain(
     preset: str = "realtime",
     settings: PretrainSettings | None = None,
     config: BackboneConfig | None = None,
+    start: str | Path | None = None,
+    rehearsal: Rehearsal | None = None,
     body: SmplBody | None = None,
     device: str = "cpu",
     quiet: bool = False,
@@ -111,6 +119,8 @@ def pretrain(
         preset: `realtime` or `paper`.
         settings: the backbone's own in the preset if not given.
         config: sizes of the network; the preset's if not given.
+        start: folder of the weights and basis to go on from, with the last stage alone; None to start from scratch.
+        rehearsal: what those weights are asked for beside the new samples.
         body: the body that the set was simulated on; the garment's built-in one if not given.
         device: `cpu` or `cuda`.
         quiet: show no progress.
@@ -126,25 +136,40 @@ def pretrain(
     template, body, samples, identity = opened.garment, opened.body, opened.samples, opened.identity
     test = read_samples(opened.rows, body, template, split="test")  # what there is none of is said before hours of work
     settings = PretrainSettings.of(backbone, preset, samples=len(samples)) if settings is None else settings
+    if start is None and rehearsal is not None:
+        msg = "there is nothing to rehearse without weights to start from"
+        raise RefuError(msg)
     config = backbone_config(backbone, template, preset=preset) if config is None else config
     if settings.dropout is not None and isinstance(config, TailorNetConfig):
         config = replace(config, dropout=settings.dropout, high_dropout=2 * settings.dropout)
     torch_device = start_parallel(device)
     output = Path(output)
 
-    basis, mirror = None, Mirror.of(template) if settings.is_mirrored else None
-    if uses_basis(config, preset):
+    basis, mirror, stored = None, Mirror.of(template) if settings.is_mirrored else None, None
+    if start is not None:
+        stored = load_weights(Path(start) / f"{backbone}-none", expect=identity)
+        bring_basis(Path(start), output)
+    elif uses_basis(config, preset):
         basis = basis_of(output, opened, mirror, settings.rank)
     # Which pairs are held out mustn't depend on what is made of the samples afterwards.
     train, validation = split_validation(samples, share=settings.validation_share, seed=settings.loop.seed)
     if mirror is not None:
         train = train.joined(mirrored(train, mirror))
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(settings.loop.seed)
-        model = build_backbone(config, template, basis=basis, pivots=pivots_of(samples, opened.n_pivots))
-    mean = samples.displacement.mean(0)
     described = {**identity, "backbone": backbone, "preset": preset}
     described |= {"settings": asdict(settings), "samples": len(train)}
+    mean = samples.displacement.mean(0)
+    if stored is None:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(settings.loop.seed)
+            model = build_backbone(config, template, basis=basis, pivots=pivots_of(samples, opened.n_pivots))
+    else:
+        model = backbone_from_weights(stored, template)
+        config = model.config
+        described["goes_on_from"] = stored.card["sha256"]
+        if rehearsal is not None:
+            rehearsed = rehearsal.of(stored.card, model)
+            train = beside(train, rehearsed)
+            described["rehearsed"] = {"count": len(rehearsed), "plan": plan_of(stored.card)}
     loop = Loop(
         model,
         settings.loop,
@@ -154,7 +179,7 @@ def pretrain(
         device=torch_device,
         quiet=quiet,
     )
-    found = stages(model, train, validation, template, settings)
+    found = stages(model, train, validation, template, settings, goes_on=stored is not None)
     model.to(torch_device)
     for stage in found:
         loop.run(stage)
@@ -185,6 +210,15 @@ def basis_of(folder: Path, opened: TrainingSet, mirror: Mirror | None, rank: int
     return basis
 
 
+def bring_basis(source: Path, target: Path) -> None:
+    """Copies the output basis beside the weights that will need it."""
+    if not is_writer() or source.resolve() == target.resolve() or not (source / "basis.json").exists():
+        return
+    target.mkdir(parents=True, exist_ok=True)
+    for name in ("basis.safetensors", "basis.json"):
+        shutil.copyfile(source / name, target / name)
+
+
 def pivots_of(samples: TrainingSamples, n_pivots: int) -> Tensor:
     """(β, γ) of a set's pivots, its first `n_pivots` pairs, shape (K, 14); of as many others where it has none."""
     pairs = [k for k in torch.unique(samples.pair).tolist() if k < n_pivots]
@@ -193,35 +227,36 @@ def pivots_of(samples: TrainingSamples, n_pivots: int) -> Tensor:
 
 
 def stages(
-    model: TailorNet | Mlp | Gcnn,
+    model: Network,
     train: TrainingSamples,
     validation: TrainingSamples,
     garment: GarmentTemplate,
     settings: PretrainSettings,
+    *,
+    goes_on: bool = False,
 ) -> list[TrainingStage]:
-    """What is trained in which order."""
-    groups, bounded = model.features.groups, model.features.are_bounded(garment)
+    """What is trained in which order; of a network that `goes_on` the last stage alone."""
     if isinstance(model, Gcnn):
-        mean = train.displacement.mean(0)
-        model.mean.copy_(mean)
-        model.scale.copy_((train.displacement - mean).std())
-        inputs_of_head = torch.cat((model.features(train.pose), train.style_shape), 1)
-        model.head.standardise(inputs_of_head, groups, is_bounded=bounded)
+        if not goes_on:
+            mean = train.displacement.mean(0)
+            model.mean.copy_(mean)
+            model.scale.copy_((train.displacement - mean).std())
+        take_inputs(model, train, garment, widen=goes_on)
         parts = [(s.betas, s.pose, s.style, s.displacement) for s in (train, validation)]
         objective = Objective([model], model, _vertex_loss)
         return [TrainingStage("all", objective, settings.steps, *parts)]
+    take_inputs(model, train, garment, widen=goes_on)
     inputs = [(model.features(s.pose), s.style_shape) for s in (train, validation)]
     codes = [in_chunks(model.decoder.encode, s.displacement, size=256) for s in (train, validation)]
     loss = CodeLoss(model)
     both = [(x, s, code) for (x, s), code in zip(inputs, codes, strict=True)]
     if isinstance(model, Mlp):
-        model.net.standardise(torch.cat(inputs[0], 1), groups, is_bounded=bounded)
         return [TrainingStage("all", Objective([model.net], model.code, loss), settings.steps, *both)]
+    joint = Objective([model.low, model.high], model.code, loss)
+    together = TrainingStage("joint", joint, settings.steps, *both, rate=settings.joint_rate)
+    if goes_on:
+        return [together]
 
-    n_pose = model.features.size
-    model.low.standardise(torch.cat(inputs[0], 1), groups, is_bounded=bounded)
-    model.high.standardise(inputs[0][0], groups[:n_pose], is_bounded=bounded[:n_pose])
-    model.style_shape.standardise(inputs[0][1])
     smooth = LaplacianSmoothing(garment)
     coarse = [low_frequency_code(model, smooth, garment, s) for s in (train, validation)]
     drape = [(s, code) for _, s, code in both]
@@ -232,14 +267,32 @@ def stages(
         TrainingStage("low", Objective([model.low], model.low_code, loss), settings.low_steps, *low),
     ]
     if settings.is_joint:
-        joint = Objective([model.low, model.high], model.code, loss)
-        return [*found, TrainingStage("joint", joint, settings.steps, *both, rate=settings.joint_rate)]
+        return [*found, together]
     fine = []
     for (x, s, code), low_code in zip(both, coarse, strict=True):
         own = (s[:, None] == model.pivots).all(-1)  # (N, K): whose sample it is
         kept = own.any(1)
         fine.append((x[kept], own[kept].float(), (code - low_code)[kept]))
     return [*found, TrainingStage("high", Objective([model.high], model.high, loss), settings.steps, *fine)]
+
+
+def take_inputs(model: Network, train: TrainingSamples, garment: GarmentTemplate, *, widen: bool) -> None:
+    """Standardises a network's inputs by those of the samples; of a trained one, only widens the range that it sees."""
+    x, s = model.features(train.pose), train.style_shape
+    both = torch.cat((x, s), 1)
+    if isinstance(model, TailorNet):
+        seen = [(model.low, both), (model.high, x), (model.style_shape, s)]
+    else:
+        seen = [(model.head if isinstance(model, Gcnn) else model.net, both)]
+    groups, bounded = model.features.groups, model.features.are_bounded(garment)
+    for net, inputs in seen:
+        n = inputs.shape[1]
+        if widen:
+            net.widen(inputs)
+        elif net is getattr(model, "style_shape", None):
+            net.standardise(inputs)
+        else:
+            net.standardise(inputs, groups[:n], is_bounded=bounded[:n])
 
 
 class CodeLoss:

@@ -61,6 +61,13 @@ class TrainOptions:
         parse=cli.in_path,
         metavar="DIR",
     )
+    rehearse: int | None = setting(
+        None,
+        "ask those weights for so many bodies of the plan that they were trained on, too, lest they forget",
+        parse=cli.positive,
+        metavar="N",
+    )
+    motions: Path | None = setting(None, "the motions of that plan", parse=cli.in_path, metavar="DIR")
     seed: int = cli.seeded()
     steps: int | None = setting(None, "steps of each stage (default: the preset's)", parse=cli.positive, metavar="N")
     device: str = setting("cpu", "cpu or cuda")

@@ -1,0 +1,147 @@
+"""Training that goes on from trained weights: with wider inputs, and with what they knew rehearsed."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from small_set import write_set
+from torch import Tensor
+
+from refu_core import load_body, load_garment
+from refu_core.backbones import MlpConfig, backbone_from_weights
+from refu_core.errors import RefuError
+from refu_core.simulation import Clip, SamplePlan, split_clips
+from refu_core.training import FinetuneSettings, LoopSettings, PretrainSettings, Rehearsal, finetune, pretrain
+from refu_core.training._data import TrainingSamples
+from refu_core.training._rehearsal import beside
+from refu_core.weights import Weights, load_weights
+
+GARMENT = "short-pant-male"
+PLAN = SamplePlan(GARMENT, 60, pivots=4, recorded_share=0.0)
+LOOP = LoopSettings(batch_size=16, learning_rate=1e-2, weight_decay=0.01, check_every=20)
+QUICK = PretrainSettings(LOOP, rank=8, steps=300, validation_share=0.2)
+
+
+def lifted(pose: Tensor, *, by: float) -> Tensor:
+    """Shorts that a bent hip lifts as a whole (N, V, 3) [m]."""
+    n = load_garment(GARMENT).n_vertices
+    return (by * pose[:, 1, 0])[:, None, None] * torch.tensor([0.0, 1.0, 0.0]).expand(len(pose), n, 3)
+
+
+def made(folder: Path, *, spread: float, by: float) -> Path:
+    """A small set that says which plan it is of."""
+    garment = load_garment(GARMENT)
+    body = load_body(garment.body)
+    write_set(folder, garment, body, pairs=12, poses=5, spread=spread, displacement=lambda pose: lifted(pose, by=by))
+    card = json.loads((folder / "card.json").read_text())
+    (folder / "card.json").write_text(json.dumps(card | {"plan": asdict(PLAN)}))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def first(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Weights of hips bent by .2, where cloth is lifted."""
+    folder = tmp_path_factory.mktemp("first")
+    data = made(folder / "set", spread=0.2, by=0.05)
+    config = MlpConfig((0, 1, 2, 4, 5), hidden=(16,))
+    pretrain(GARMENT, data, folder, backbone="mlp", settings=QUICK, config=config, quiet=True)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def further(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Samples of hips bent by .6, where cloth is lowered."""
+    return made(tmp_path_factory.mktemp("further"), spread=0.6, by=-0.05)
+
+
+def test_bodies_of_the_plan_are_what_is_rehearsed(first: Path) -> None:
+    stored = load_weights(first / "mlp-none")
+    network = backbone_from_weights(stored, load_garment(GARMENT))
+    samples = Rehearsal(7).of(stored.card, network)
+    slots = np.linspace(0, PLAN.count - PLAN.n_test - 1, 7).round().astype(int)
+    for k, slot in enumerate(slots):
+        pose, _, _ = PLAN.pose(int(slot), 0, [])
+        betas, style = PLAN.style_shape(PLAN.pair_of(int(slot)))
+        np.testing.assert_array_equal(samples.pose[k], pose)
+        predicted = network(*(torch.as_tensor(one)[None] for one in (betas, pose, style)))
+        assert predicted is not None
+        torch.testing.assert_close(samples.displacement[k], predicted[0], atol=1e-6, rtol=0)
+    assert len(Rehearsal(1000).of(stored.card, network)) == PLAN.count - PLAN.n_test
+
+
+def test_recorded_poses_are_those_of_the_training_motions(first: Path) -> None:
+    stored = load_weights(first / "mlp-none")
+    network = backbone_from_weights(stored, load_garment(GARMENT))
+    plan = asdict(replace(PLAN, recorded_share=1.0))
+    clips = [Clip(name, np.full((5, 24, 3), k, np.float32), np.zeros((5, 3)), 30.0) for k, name in enumerate("abc")]
+    samples = Rehearsal(20, clips).of({"dataset": {"plan": plan}}, network)
+    training = {float(clip.poses[0, 5, 0]) for clip in split_clips(clips)[0]}
+    assert {float(pose[5, 0]) for pose in samples.pose} == training
+    with pytest.raises(RefuError, match=r"100% of what is to be rehearsed are recorded poses: give those motions"):
+        Rehearsal(20).of({"dataset": {"plan": plan}}, network)
+
+
+@pytest.mark.parametrize("card", [{}, {"dataset": {}}, {"dataset": {"plan": {"count": 3}}}])
+def test_weights_without_a_plan_have_nothing_to_rehearse(first: Path, card: dict[str, Any]) -> None:
+    network = backbone_from_weights(load_weights(first / "mlp-none"), load_garment(GARMENT))
+    with pytest.raises(RefuError, match="nothing to rehearse"):
+        Rehearsal(3).of(card, network)
+
+
+def test_half_of_what_is_trained_on_is_new() -> None:
+    def some(n: int) -> TrainingSamples:
+        return TrainingSamples(*(torch.full((n, k), float(n)) for k in (72, 10, 4, 3)), torch.full((n,), n))
+
+    assert (beside(some(5), some(20)).pair == 5).sum() == 20
+    assert len(beside(some(20), some(5))) == 25
+
+
+@torch.no_grad()
+def errors(stored: Weights, spread: float, by: float) -> float:
+    network = backbone_from_weights(stored, load_garment(GARMENT))
+    pose = torch.zeros(9, 24, 3)
+    pose[:, 1, 0] = torch.linspace(-spread, spread, 9)
+    predicted = network(torch.zeros(9, 10), pose, torch.zeros(9, 4))
+    assert predicted is not None
+    return float((predicted - lifted(pose, by=by)).norm(dim=-1).mean())
+
+
+@pytest.mark.usefixtures("no_curves")
+def test_learns_beyond_what_it_saw_and_forgets_less(first: Path, further: Path, tmp_path: Path) -> None:
+    before = load_weights(first / "mlp-none")
+    how: dict[str, Any] = {"backbone": "mlp", "settings": QUICK, "start": first, "quiet": True}
+    card = pretrain(GARMENT, further, tmp_path / "a", **how)
+    alone = load_weights(tmp_path / "a" / "mlp-none")
+    assert card["goes_on_from"] == before.card["sha256"]
+    assert alone.card["config"] == before.card["config"]
+    assert alone.card["basis_sha256"] == before.card["basis_sha256"]
+    assert (alone.tensors["backbone.net.highest"] >= before.tensors["backbone.net.highest"]).all()
+    assert (alone.tensors["backbone.net.highest"] > before.tensors["backbone.net.highest"]).any()
+    assert torch.equal(alone.tensors["backbone.net.scale"], before.tensors["backbone.net.scale"])
+    assert errors(alone, 0.6, -0.05) < 0.7 * errors(before, 0.6, -0.05)
+    again = pretrain(GARMENT, further, tmp_path / "b", rehearsal=Rehearsal(50), **how)
+    assert again["rehearsed"] == {"count": 50, "plan": asdict(PLAN)}
+    rehearsed = load_weights(tmp_path / "b" / "mlp-none")
+    assert errors(rehearsed, 0.2, 0.05) < errors(alone, 0.2, 0.05)
+
+
+@pytest.mark.usefixtures("no_curves")
+def test_with_refu_it_rehearses_what_its_backbone_knew(first: Path, further: Path, tmp_path: Path) -> None:
+    settings = replace(FinetuneSettings(), steps=2, loop=replace(LOOP, learning_rate=1e-9, weight_decay=0.0))
+    card = finetune(
+        GARMENT, further, first, tmp_path, backbone="mlp", settings=settings, rehearsal=Rehearsal(12), quiet=True
+    )
+    assert card["rehearsed"] == {"count": 12, "plan": asdict(PLAN)}
+    before, after = load_weights(first / "mlp-none"), load_weights(tmp_path / "mlp-hybrid")
+    assert (after.tensors["backbone.net.lowest"] < before.tensors["backbone.net.lowest"]).any()
+
+
+def test_there_must_be_weights_to_rehearse(further: Path, tmp_path: Path) -> None:
+    with pytest.raises(RefuError, match="nothing to rehearse without weights to start from"):
+        pretrain(GARMENT, further, tmp_path, backbone="mlp", settings=QUICK, rehearsal=Rehearsal(3))
