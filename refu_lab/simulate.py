@@ -11,7 +11,14 @@ from tqdm import tqdm
 
 from refu_core._engine import Engine
 from refu_core.errors import SimulationError
-from refu_core.simulation import GarmentDataset, Progress, load_clips, simulate_dataset, simulate_sequences
+from refu_core.simulation import (
+    GarmentDataset,
+    Progress,
+    SamplePlan,
+    load_clips,
+    simulate_dataset,
+    simulate_sequences,
+)
 from refu_lab.commands.simulate import SimulateOptions
 from refu_lab.contact_sheet import contact_sheet
 from refu_lab.render import save_png
@@ -46,7 +53,8 @@ def simulate(options: SimulateOptions, *, engine: Engine | None = None, progress
         how["engine"] = engine
         if options.sequences:
             return simulate_sequences(*what, shapes=options.shapes, seconds=options.seconds, **how)
-        card = simulate_dataset(*what, **how)
+        recorded = SamplePlan.recorded_share * (1 - options.postures)
+        card = simulate_dataset(*what, recorded_share=recorded, posture_share=options.postures, **how)
     if not card["counts"]["to_do"]:
         if card["counts"]["given_up"] == options.count:
             causes = ", ".join(f"{n} {cause.replace('_', ' ')}" for cause, n in card["yield"]["dropped"].items() if n)

@@ -49,8 +49,15 @@ PATHS = [
 ]
 
 
-USELESS = (["--seconds", "5"], ["--shapes", "3"], ["--fps", "30"], ["--input-axes", "z-up"])
-"""Options of `refu simulate` that do nothing without --sequences or --motions, for which they were meant."""
+USELESS = (
+    ["--seconds", "5"],
+    ["--shapes", "3"],
+    ["--fps", "30"],
+    ["--input-axes", "z-up"],
+    ["--sequences", "--postures", "0.5"],
+)
+"""Options of `refu simulate` that do nothing without --sequences or --motions, for which they were meant, or with
+them."""
 
 
 def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
@@ -194,6 +201,7 @@ def test_bodies_and_inputs_that_are_no_files(
         ["replay", BAG, "--betas", "1", "--betas-source", "message"],
         ["export", BAG, "--output", "x.glb", "--betas", "1", "--betas-source", "builtin"],
         *(["simulate", "tshirt-male", "--count", "1", "--output", "x", *more] for more in USELESS),
+        ["train", "tshirt-male", "--data", "x", "--motions", "."],
     ],
 )
 def test_values_that_no_command_takes(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:

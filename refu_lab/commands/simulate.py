@@ -29,6 +29,13 @@ class SimulateOptions:
     fps: float | None = cli.rate_of_files()
     body: str | None = cli.worn_by()
     seed: int = cli.seeded()
+    postures: float = setting(
+        0.0,
+        "share of poses that are everyday postures which recordings lack: arms crossed, overhead, sitting, kneeling, "
+        "on all fours",
+        parse=cli.between(0.0, 1.0),
+        metavar="SHARE",
+    )
     sequences: bool = setting(False, "continuous motions at 30 Hz with dynamics, instead of poses at rest")
     shapes: int = setting(5, "body shapes of the sequences", parse=cli.positive, metavar="K")
     seconds: float = setting(10.0, "length of each sequence [s]", within=(0.1, 3600.0), metavar="T")
@@ -61,9 +68,13 @@ def add(commands: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    from refu_core import RefuError
     from refu_lab.fleet import open_engine
     from refu_lab.simulate import simulate, simulation_table
 
+    if args.sequences and args.postures:
+        msg = "--postures are for poses at rest: leave --sequences out"
+        raise RefuError(msg)
     cli.require_use(args, {"shapes": "sequences", "seconds": "sequences", "input_axes": "motions", "fps": "motions"})
     with open_engine(args.jobs, args.scheduler) as engine:
         options = SimulateOptions(**cli.given(args, SimulateOptions))

@@ -96,6 +96,7 @@ def add(commands: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     from refu_lab.train import train, training_table
 
+    cli.require_use(args, {"motions": "rehearse"})
     options = TrainOptions(**cli.given(args, TrainOptions))
     card = train(options, progress=not args.quiet)
     return cli.tell(args, training_table(card, options), card)

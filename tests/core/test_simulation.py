@@ -582,6 +582,16 @@ def test_set_without_motions_has_drawn_poses(tmp_path: Path) -> None:
     assert plan.n_test == 1
 
 
+def test_the_command_takes_the_share_of_postures_from_both_other_kinds(
+    clips: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_produce.InProcess, "run", lambda *_: iter(()))
+    output = ["--output", str(tmp_path / "set"), "--motions", str(clips), "--quiet"]
+    assert main(["simulate", GARMENT, "--count", "7", "--postures", "0.5", *output]) == 0
+    plan = json.loads((tmp_path / "set" / "card.json").read_text())["plan"]
+    assert (plan["posture_share"], plan["recorded_share"]) == (0.5, SamplePlan.recorded_share / 2)
+
+
 @pytest.mark.parametrize("typed", ["kilt.npz", "./here/kilt.npz", "/there/garment_kilt.npz"])
 def test_draws_depend_on_a_garments_name_and_not_on_the_way_to_its_file(typed: str) -> None:
     plan, other = SamplePlan("kilt", 7), SamplePlan("gown", 7)
