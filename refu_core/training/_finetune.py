@@ -29,7 +29,7 @@ from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStag
 from refu_core.training._losses import refu_loss
 from refu_core.training._mirror import Mirror
 from refu_core.training._pretrain import PretrainSettings, basis_of, bring_basis, pivots_of, stages, take_inputs
-from refu_core.training._rehearsal import Rehearsal, beside, plan_of
+from refu_core.training._rehearsal import Rehearsal, plan_of
 from refu_core.weights import load_weights
 
 _UNIT = 1e3
@@ -166,7 +166,7 @@ def finetune(
     rehearsed: dict[str, Any] = {}
     if stored is not None and rehearsal is not None:
         old = rehearsal.of(stored.card, network)
-        train, rehearsed = beside(train, old), {"rehearsed": {"count": len(old), "plan": plan_of(stored.card)}}
+        train, rehearsed = train.joined(old), {"rehearsed": {"count": len(old), "plan": plan_of(stored.card)}}
     described = {
         **identity,
         "backbone": backbone,

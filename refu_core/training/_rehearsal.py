@@ -62,9 +62,3 @@ def plan_of(card: Mapping[str, Any]) -> Mapping[str, Any] | None:
     rehearsed = card.get("rehearsed") or {}
     found = rehearsed.get("plan") or (card.get("dataset") or {}).get("plan")
     return found if isinstance(found, Mapping) else None
-
-
-def beside(new: TrainingSamples, old: TrainingSamples) -> TrainingSamples:
-    """New samples, repeated until they are about as many as those rehearsed, and these: half of a batch is of each."""
-    repeated = new.take(torch.arange(len(new)).repeat(max(1, round(len(old) / max(len(new), 1)))))
-    return repeated.joined(old)

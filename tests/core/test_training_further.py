@@ -18,8 +18,6 @@ from refu_core.backbones import MlpConfig, backbone_from_weights
 from refu_core.errors import RefuError
 from refu_core.simulation import Clip, SamplePlan, split_clips
 from refu_core.training import FinetuneSettings, LoopSettings, PretrainSettings, Rehearsal, finetune, pretrain
-from refu_core.training._data import TrainingSamples
-from refu_core.training._rehearsal import beside
 from refu_core.weights import Weights, load_weights
 
 GARMENT = "short-pant-male"
@@ -92,14 +90,6 @@ def test_weights_without_a_plan_have_nothing_to_rehearse(first: Path, card: dict
     network = backbone_from_weights(load_weights(first / "mlp-none"), load_garment(GARMENT))
     with pytest.raises(RefuError, match="nothing to rehearse"):
         Rehearsal(3).of(card, network)
-
-
-def test_half_of_what_is_trained_on_is_new() -> None:
-    def some(n: int) -> TrainingSamples:
-        return TrainingSamples(*(torch.full((n, k), float(n)) for k in (72, 10, 4, 3)), torch.full((n,), n))
-
-    assert (beside(some(5), some(20)).pair == 5).sum() == 20
-    assert len(beside(some(20), some(5))) == 25
 
 
 @torch.no_grad()
