@@ -60,22 +60,21 @@ def train(options: TrainOptions, *, progress: bool) -> dict[str, Any]:
     of_all = {} if options.steps is None else dict.fromkeys(("style_shape_steps", "low_steps", "steps"), options.steps)
     first = PretrainSettings.of(options.backbone, options.preset, samples=int(dataset.train.sum()))
     first = _seeded(first, options, **of_all)
-    common["rehearsal"] = None if options.rehearse is None else Rehearsal(options.rehearse, options.motions)
-    if options.mode == "none":
-        return pretrain(*given, settings=first, start=options.start, **common)
-    source: Path | None = options.folder
     if options.start is not None:
-        source = options.start
-    elif options.backbone == "gcnn":
+        rehearsal = None if options.rehearse is None else Rehearsal(options.rehearse, options.motions)
+        return pretrain(*given, settings=first, start=options.start, mode=options.mode, rehearsal=rehearsal, **common)
+    if options.mode == "none":
+        return pretrain(*given, settings=first, **common)
+    source: Path | None = options.folder
+    if options.backbone == "gcnn":
         source = None
     elif not (options.folder / f"{options.backbone}-none.json").exists():
-        pretrain(*given, settings=first, **common | {"rehearsal": None})
+        pretrain(*given, settings=first, **common)
     changes: dict[str, Any] = {"scale": None} if options.scale == "fixed" else {"scale_kind": options.scale}
     changes |= {} if options.margin is None else {"margin": options.margin}
     changes |= {"is_blended": False} if options.unblended else {}
     last = _seeded(FinetuneSettings.of(options.backbone, options.preset), options, **changes, **steps)
-    common |= {"settings": last, "goes_on": options.start is not None}
-    return finetune(template, dataset, source, options.folder, mode=options.mode, **common)
+    return finetune(template, dataset, source, options.folder, mode=options.mode, settings=last, **common)
 
 
 def _check(options: TrainOptions) -> None:
@@ -84,8 +83,8 @@ def _check(options: TrainOptions) -> None:
     if options.like is not None and not is_plain:
         msg = "--like makes a tailornet of the preset realtime: leave --network, --backbone and --preset out"
         raise RefuError(msg)
-    if options.like is not None and (options.start is not None or options.rehearse is not None):
-        msg = "--like trains networks of its own: leave --start and --rehearse out"
+    if options.like is not None and options.start is not None:
+        msg = "--like trains networks of its own: leave --start out"
         raise RefuError(msg)
     presets = SDF_PRESETS if options.network == "sdf" else PRESETS
     if options.preset not in presets:

@@ -201,7 +201,8 @@ def test_bodies_and_inputs_that_are_no_files(
         ["replay", BAG, "--betas", "1", "--betas-source", "message"],
         ["export", BAG, "--output", "x.glb", "--betas", "1", "--betas-source", "builtin"],
         *(["simulate", "tshirt-male", "--count", "1", "--output", "x", *more] for more in USELESS),
-        ["train", "tshirt-male", "--data", "x", "--motions", "."],
+        ["train", "tshirt-male", "--data", ".", "--motions", "."],
+        ["train", "tshirt-male", "--data", ".", "--rehearse", "10"],
     ],
 )
 def test_values_that_no_command_takes(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:

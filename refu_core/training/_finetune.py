@@ -21,15 +21,14 @@ from refu_core.body import SmplBody
 from refu_core.errors import RefuError
 from refu_core.garments import GarmentTemplate
 from refu_core.modes import DEFAULT_MARGIN
-from refu_core.refu import SCALE_PRESETS, Refu, ScaleKind, refu_from_weights, refu_tensors
+from refu_core.refu import SCALE_PRESETS, Refu, ScaleKind, refu_tensors
 from refu_core.simulation import GarmentDataset, GarmentSequences
 from refu_core.training._data import TakenAlong, TrainingSamples, TrainingSet, in_chunks, mirrored, split_validation
 from refu_core.training._dresser import Dresser, Sdf
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, start_parallel
 from refu_core.training._losses import refu_loss
 from refu_core.training._mirror import Mirror
-from refu_core.training._pretrain import PretrainSettings, basis_of, bring_basis, pivots_of, stages, take_inputs
-from refu_core.training._rehearsal import Rehearsal, plan_of
+from refu_core.training._pretrain import PretrainSettings, basis_of, bring_basis, pivots_of, stages
 from refu_core.weights import load_weights
 
 _UNIT = 1e3
@@ -100,8 +99,6 @@ def finetune(
     backbone: str = "tailornet",
     preset: str = "realtime",
     settings: FinetuneSettings | None = None,
-    goes_on: bool = False,
-    rehearsal: Rehearsal | None = None,
     body: SmplBody | None = None,
     device: str = "cpu",
     quiet: bool = False,
@@ -117,8 +114,6 @@ def finetune(
         mode: one of `FINETUNE_MODES`.
         backbone: `tailornet`, `mlp` or `gcnn`.
         preset: `realtime` or `paper`, of ReFU and of a backbone from scratch.
-        goes_on: start from <backbone>-<mode> in `weights` with its ReFU, in place of <backbone>-none.
-        rehearsal: what the weights are asked for, as they are before, beside the samples.
         garment, dataset, settings, body, device, quiet: as in `pretrain`.
 
     Returns:
@@ -141,9 +136,7 @@ def finetune(
     train, validation = split_validation(samples, share=settings.validation_share, seed=settings.loop.seed)
     if settings.is_mirrored:
         train = train.joined(mirrored(train, Mirror.of(template)))
-    n_samples = len(train)
     network: Network
-    stored = None
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.loop.seed)
         if weights is None:
@@ -155,28 +148,18 @@ def finetune(
             # For the scale of inputs and outputs, which it sets; the stages themselves aren't run.
             stages(network, train, validation, template, PretrainSettings())
         else:
-            stored = load_weights(Path(weights) / f"{backbone}-{mode if goes_on else 'none'}", expect=identity)
+            stored = load_weights(Path(weights) / f"{backbone}-none", expect=identity)
             network = backbone_from_weights(stored, template)
             bring_basis(Path(weights), output)
         refu = _layer(mode, settings, template.n_vertices)
-        if stored is not None and goes_on:
-            refu = refu_from_weights(stored)
-    if stored is not None:
-        take_inputs(network, train, template, widen=True)
-    rehearsed: dict[str, Any] = {}
-    if stored is not None and rehearsal is not None:
-        old = rehearsal.of(stored.card, network)
-        train, rehearsed = train.joined(old), {"rehearsed": {"count": len(old), "plan": plan_of(stored.card)}}
     described = {
         **identity,
         "backbone": backbone,
         "preset": preset,
         "mode": mode,
         "settings": asdict(settings),
-        "samples": n_samples,
+        "samples": len(train),
         "from_scratch": weights is None,
-        **({"goes_on_from": stored.card["sha256"]} if stored is not None and goes_on else {}),
-        **rehearsed,
     }
     found = _MODES[mode]
     dresser = Dresser(

@@ -30,6 +30,7 @@ from refu_core.backbones import (
 from refu_core.body import SmplBody
 from refu_core.errors import RefuError
 from refu_core.garments import GarmentTemplate
+from refu_core.refu import refu_from_weights, refu_tensors
 from refu_core.simulation import GarmentDataset, GarmentSequences
 from refu_core.training._data import (
     TrainingSamples,
@@ -101,12 +102,13 @@ def pretrain(
     settings: PretrainSettings | None = None,
     config: BackboneConfig | None = None,
     start: str | Path | None = None,
+    mode: str = "none",
     rehearsal: Rehearsal | None = None,
     body: SmplBody | None = None,
     device: str = "cpu",
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """Trains the backbone of one garment and writes `output`/basis and `output`/<backbone>-none.
+    """Trains the backbone of one garment and writes `output`/basis and `output`/<backbone>-<mode>.
 
     A basis that is there already is used, so that all backbones and modes in a folder share it. Interrupted, the same
     call goes on from the last checkpoint. Under `torchrun` all processes make one training.
@@ -120,6 +122,7 @@ def pretrain(
         settings: the backbone's own in the preset if not given.
         config: sizes of the network; the preset's if not given.
         start: folder of the weights and basis to go on from, with the last stage alone; None to start from scratch.
+        mode: which of the weights in `start` go on, and what is written; a ReFU layer stays as it is.
         rehearsal: what those weights are asked for beside the new samples.
         body: the body that the set was simulated on; the garment's built-in one if not given.
         device: `cpu` or `cuda`.
@@ -136,8 +139,8 @@ def pretrain(
     template, body, samples, identity = opened.garment, opened.body, opened.samples, opened.identity
     test = read_samples(opened.rows, body, template, split="test")  # what there is none of is said before hours of work
     settings = PretrainSettings.of(backbone, preset, samples=len(samples)) if settings is None else settings
-    if start is None and rehearsal is not None:
-        msg = "there is nothing to rehearse without weights to start from"
+    if start is None and (rehearsal is not None or mode != "none"):
+        msg = "there is nothing to go on from or to rehearse without weights to start from"
         raise RefuError(msg)
     config = backbone_config(backbone, template, preset=preset) if config is None else config
     if settings.dropout is not None and isinstance(config, TailorNetConfig):
@@ -147,7 +150,7 @@ def pretrain(
 
     basis, mirror, stored = None, Mirror.of(template) if settings.is_mirrored else None, None
     if start is not None:
-        stored = load_weights(Path(start) / f"{backbone}-none", expect=identity)
+        stored = load_weights(Path(start) / f"{backbone}-{mode}", expect=identity)
         bring_basis(Path(start), output)
     elif uses_basis(config, preset):
         basis = basis_of(output, opened, mirror, settings.rank)
@@ -165,7 +168,7 @@ def pretrain(
     else:
         model = backbone_from_weights(stored, template)
         config = model.config
-        described["goes_on_from"] = stored.card["sha256"]
+        described |= {"goes_on_from": stored.card["sha256"], "refu": stored.card.get("refu")}
         if rehearsal is not None:
             rehearsed = rehearsal.of(stored.card, model)
             train = train.joined(rehearsed)
@@ -174,7 +177,7 @@ def pretrain(
         model,
         settings.loop,
         folder=output,
-        name=f"{backbone}-none",
+        name=f"{backbone}-{mode}",
         identity=[described, asdict(config)],
         device=torch_device,
         quiet=quiet,
@@ -186,13 +189,15 @@ def pretrain(
     model.to("cpu").eval()
     card = {
         **described,
-        "mode": "none",
+        "mode": mode,
         "dataset": opened.card,
         "knows_limbs": opened.knows_limbs,
         "figures": backbone_figures(model, test, body, template, mean=mean),
     }
     if is_writer():
-        save_backbone(output / f"{backbone}-none", model, card, half=preset != "paper")
+        refu = None if stored is None else refu_from_weights(stored)
+        layer = None if refu is None else refu_tensors(refu, half=preset != "paper")
+        save_backbone(output / f"{backbone}-{mode}", model, card, others=layer, half=preset != "paper")
         loop.checkpoint.unlink(missing_ok=True)
     return card
 

@@ -57,7 +57,8 @@ class TrainOptions:
     )
     start: Path | None = setting(
         None,
-        "continue from a garment's weights in this folder, those that ship (refu_core/weights/GARMENT) or your own",
+        "the backbone goes on learning from a garment's weights in this folder, those that ship "
+        "(refu_core/weights/GARMENT) or your own; a ReFU layer stays as it is",
         parse=cli.in_path,
         metavar="DIR",
     )
@@ -96,7 +97,7 @@ def add(commands: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     from refu_lab.train import train, training_table
 
-    cli.require_use(args, {"motions": "rehearse"})
+    cli.require_use(args, {"motions": "rehearse", "rehearse": "start"})
     options = TrainOptions(**cli.given(args, TrainOptions))
     card = train(options, progress=not args.quiet)
     return cli.tell(args, training_table(card, options), card)

@@ -257,14 +257,15 @@ def test_training_brings_the_cloth_out_and_nearer_to_the_truth(
 
 
 @pytest.mark.usefixtures("no_curves")
-def test_goes_on_from_trained_weights_and_their_layer(tuned: Tuned, tmp_path: Path, dataset: Path) -> None:
+def test_goes_on_from_trained_weights_and_keeps_their_layer(tuned: Tuned, tmp_path: Path, dataset: Path) -> None:
     first, _ = tuned("hybrid")
-    settings = replace(QUICK, steps=1, loop=replace(QUICK.loop, learning_rate=1e-9, weight_decay=0.0))
-    card = finetune(
-        GARMENT, dataset, first, tmp_path, mode="hybrid", backbone="mlp", settings=settings, goes_on=True, quiet=True
-    )
+    settings = PretrainSettings(replace(QUICK.loop, learning_rate=1e-9, weight_decay=0.0), steps=1)
+    how: dict[str, Any] = {"backbone": "mlp", "settings": settings, "quiet": True}
+    card = pretrain(GARMENT, dataset, tmp_path, start=first, mode="hybrid", **how)
     before, after = (load_weights(folder / "mlp-hybrid") for folder in (first, tmp_path))
     assert card["goes_on_from"] == before.card["sha256"]
+    assert after.card["refu"] == before.card["refu"]
+    assert any(name.startswith("refu.") for name in before.tensors)
     for name, tensor in before.tensors.items():
         assert torch.allclose(after.tensors[name].float(), tensor.float(), atol=1e-3), name
 
