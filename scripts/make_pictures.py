@@ -25,7 +25,7 @@ from refu_core import GarmentPipeline, PipelineOutput, SmplFrame, load_body, loa
 from refu_core.body import joints_of
 from refu_core.modes import DEFAULT_GARMENTS
 from refu_core.recordings import interpolated
-from refu_core.simulation import SELF_TOUCHING, GarmentDataset, posture
+from refu_core.simulation import POSTURES, SELF_TOUCHING, GarmentDataset, posture
 from refu_lab.contact_sheet import contact_sheet
 from refu_lab.garment import picture
 from refu_lab.render import SKIN, Backdrop, Camera, RenderMesh, render
@@ -166,6 +166,12 @@ def draw_collider() -> None:
     save_jpeg(collider_sheet(), "collider")
 
 
+def draw_postures() -> None:
+    """Everyday postures, dressed; rows of nine."""
+    rows = [collider_sheet(poses=tuple(POSTURES)[i : i + 9], size=(170, 210), samples=4)[-210:] for i in (0, 9)]
+    save_jpeg(np.concatenate(rows), "postures")
+
+
 def draw_ros() -> None:
     """Three persons of `smpl_publisher`, as a viewer shows them."""
     pipeline, walk, size = GarmentPipeline.load(DEFAULT_GARMENTS), recorded("walk"), (900, 480)
@@ -227,7 +233,13 @@ def draw_carried(folder: Path) -> None:
     save_jpeg(np.concatenate(sheet), "carried")
 
 
-OF_SHIPPED = {"replay": draw_replay, "collider": draw_collider, "ros": draw_ros, "wardrobe": draw_wardrobe}
+OF_SHIPPED = {
+    "replay": draw_replay,
+    "collider": draw_collider,
+    "postures": draw_postures,
+    "ros": draw_ros,
+    "wardrobe": draw_wardrobe,
+}
 OF_SET = {"dataset": draw_dataset, "carried": draw_carried}
 
 
