@@ -16,7 +16,7 @@ def main(n_persons: int = 4) -> list[dict[str, int]]:
     rng = np.random.default_rng(0)
     frames = []
     for person in range(n_persons):
-        pose = 0.1 * rng.standard_normal((24, 3))  # rotation vectors, SMPL joint order [rad]
+        pose = 0.15 * rng.standard_normal((24, 3))  # rotation vectors, SMPL joint order [rad]
         pose[0] = 0  # the root: upright, facing z
         pose[16, 2], pose[17, 2] = -0.8, 0.8  # arms lowered
         frames.append(SmplFrame(pose=pose, betas=rng.standard_normal(10), transl=[1.5 * person, 1.16, 0.0]))
