@@ -44,7 +44,7 @@ from refu_core.training._data import (
 from refu_core.training._figures import backbone_figures
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, start_parallel
 from refu_core.training._mirror import Mirror
-from refu_core.training._rehearsal import Rehearsal, plan_of
+from refu_core.training._rehearsal import Rehearsal, plans_of
 from refu_core.weights import load_weights
 
 MANY = 4000
@@ -172,7 +172,7 @@ def pretrain(
         if rehearsal is not None:
             rehearsed = rehearsal.of(stored.card, model)
             train = train.joined(rehearsed)
-            described["rehearsed"] = {"count": len(rehearsed), "plan": plan_of(stored.card)}
+            described["rehearsed"] = {"count": len(rehearsed), "plans": plans_of(stored.card)}
     loop = Loop(
         model,
         settings.loop,

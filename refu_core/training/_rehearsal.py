@@ -18,47 +18,46 @@ from refu_core.training._data import TrainingSamples, in_chunks
 
 @dataclass(frozen=True)
 class Rehearsal:
-    """Bodies of the plan that a network was trained on, with what it predicts on them in place of the truth.
+    """Bodies of the plans that a network was trained on, with what it predicts on them in place of the truth.
 
     Their samples aren't needed: a plan says pose, shape and style of each.
     """
 
     count: int
-    """Bodies, evenly spread over the plan's training split."""
+    """Bodies, evenly spread over the training splits of all plans."""
     motions: str | Path | Sequence[Clip] | None = None
-    """The motions of that plan; None where it has drawn poses alone."""
+    """The motions of those plans; None where they have drawn poses alone."""
 
     def of(self, card: Mapping[str, Any], network: Network) -> TrainingSamples:
-        """Of a trained `network` and the card of its weights; of as many bodies as the plan has at most.
+        """Of a trained `network` and the card of its weights; of as many bodies as its plans have at most.
 
         Raises `RefuError` for a card without a plan, and `SimulationError` for motions that aren't there.
         """
         known = {field.name for field in fields(SamplePlan)}
-        found = plan_of(card)
-        if found is None or not {"garment", "count"} <= set(found):
+        plans = [SamplePlan(**{key: value for key, value in one.items() if key in known}) for one in plans_of(card)]
+        if not plans:
             msg = "nothing to rehearse: the weights' card doesn't say what plan they were trained on"
             raise RefuError(msg)
-        plan = SamplePlan(**{key: value for key, value in found.items() if key in known})
         clips: Sequence[Clip] = []
-        if plan.recorded_share > 0:
+        recorded = max(plan.recorded_share for plan in plans)
+        if recorded > 0:
             if self.motions is None:
-                msg = f"{plan.recorded_share:.0%} of what is to be rehearsed are recorded poses: give those motions"
+                msg = f"up to {recorded:.0%} of what is to be rehearsed are recorded poses: give those motions"
                 raise RefuError(msg)
             all_clips = load_clips(self.motions) if isinstance(self.motions, (str, Path)) else self.motions
             clips = split_clips(all_clips)[0]
-        n = plan.count - plan.n_test
-        slots = np.unique(np.linspace(0, n - 1, min(self.count, n)).round().astype(int)).tolist()
-        pair = [plan.pair_of(slot) for slot in slots]
-        pose = torch.as_tensor(np.stack([plan.pose(slot, 0, clips)[0] for slot in slots]))
-        shapes = zip(*(plan.style_shape(one) for one in pair), strict=True)
+        slots = [(plan, slot) for plan in plans for slot in range(plan.count - plan.n_test)]
+        rows = np.unique(np.linspace(0, len(slots) - 1, min(self.count, len(slots))).round().astype(int))
+        chosen = [slots[row] for row in rows]
+        pose = torch.as_tensor(np.stack([plan.pose(slot, 0, clips)[0] for plan, slot in chosen]))
+        shapes = zip(*(plan.style_shape(plan.pair_of(slot)) for plan, slot in chosen), strict=True)
         betas, style = (torch.as_tensor(np.stack(values)) for values in shapes)
         with torch.no_grad():
             displacement = in_chunks(network, betas, pose, style)
-        return TrainingSamples(pose, betas, style, displacement, torch.tensor(pair))
+        return TrainingSamples(pose, betas, style, displacement, torch.arange(len(chosen)))
 
 
-def plan_of(card: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    """The plan that weights were trained on first, by their card; None where it doesn't say."""
-    rehearsed = card.get("rehearsed") or {}
-    found = rehearsed.get("plan") or (card.get("dataset") or {}).get("plan")
-    return found if isinstance(found, Mapping) else None
+def plans_of(card: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """The plans that weights were trained on, by their card: those rehearsed, and that of their samples."""
+    found = [*(card.get("rehearsed") or {}).get("plans", ()), (card.get("dataset") or {}).get("plan")]
+    return [one for one in found if isinstance(one, Mapping) and {"garment", "count"} <= set(one)]

@@ -64,11 +64,11 @@ class TrainOptions:
     )
     rehearse: int | None = setting(
         None,
-        "ask those weights for so many bodies of the plan that they were trained on, too, lest they forget",
+        "ask those weights for so many bodies of the plans that they were trained on, too, lest they forget",
         parse=cli.positive,
         metavar="N",
     )
-    motions: Path | None = setting(None, "the motions of that plan", parse=cli.in_path, metavar="DIR")
+    motions: Path | None = setting(None, "the motions of those plans", parse=cli.in_path, metavar="DIR")
     seed: int = cli.seeded()
     steps: int | None = setting(None, "steps of each stage (default: the preset's)", parse=cli.positive, metavar="N")
     device: str = setting("cpu", "cpu or cuda")
