@@ -23,11 +23,10 @@ def _both(**left: tuple[float, float, float]) -> dict[str, tuple[float, float, f
     }
 
 
-_HANGING = {"right_shoulder": (18.0, 16.0, 83.0), "right_elbow": (0.0, 9.0, 0.0)}
-_KNEELING = _both(hip=(-10, 0, 6), knee=(95, 0, 0), ankle=(20, 0, 0))
+_HANGING = _both(shoulder=(18, -16, -83), elbow=(0, -9, 0))
 
 POSTURES: Mapping[str, Angles] = {
-    "hanging arms": _both(shoulder=(18, -16, -83), elbow=(0, -9, 0)),
+    "hanging arms": _HANGING,
     "crossed arms": {
         "left_shoulder": (38, -67, -54),
         "left_elbow": (0, -95, 0),
@@ -56,14 +55,14 @@ POSTURES: Mapping[str, Angles] = {
     },
     "arms overhead": _both(collar=(0, 0, 22), shoulder=(8, -14, 62), elbow=(0, -15, 0)),
     "one arm overhead": {
+        **_HANGING,
         "left_collar": (0, 0, 22),
         "left_shoulder": (8, -14, 62),
         "left_elbow": (0, -20, 0),
-        **_HANGING,
     },
     "hands behind the head": _both(collar=(0, 0, 12), shoulder=(-90, -32, 22), elbow=(0, -125, 0)),
     "hands behind the back": _both(shoulder=(67, 14, -72), elbow=(0, -70, 0)),
-    "hand at the ear": {"left_shoulder": (-67, 12, -68), "left_elbow": (0, -135, 0), **_HANGING},
+    "hand at the ear": {**_HANGING, "left_shoulder": (-67, 12, -68), "left_elbow": (0, -135, 0)},
     "reaching forward": _both(collar=(0, -10, 0), shoulder=(3, -75, -4), elbow=(0, -15, 0)),
     "bent to the floor": {
         "pelvis": (45, 0, 0),
@@ -72,7 +71,7 @@ POSTURES: Mapping[str, Angles] = {
         "spine3": (10, 0, 0),
         **_both(shoulder=(7, -75, -9), elbow=(0, -10, 0), hip=(-60, 0, 3), knee=(20, 0, 0)),
     },
-    "kneeling": {**_KNEELING, **_both(shoulder=(18, -30, -76), elbow=(0, -35, 0))},
+    "kneeling": _both(shoulder=(18, -30, -76), elbow=(0, -35, 0), hip=(-10, 0, 6), knee=(95, 0, 0), ankle=(20, 0, 0)),
     "crawling": {
         "pelvis": (80, 0, 0),
         "neck": (-20, 0, 0),

@@ -120,7 +120,7 @@ def pretrain(
         backbone: `tailornet`, `mlp` or `gcnn`.
         preset: `realtime` or `paper`.
         settings: the backbone's own in the preset if not given.
-        config: sizes of the network; the preset's if not given.
+        config: sizes of the network; the preset's if not given. One that goes on has its own.
         start: folder of the weights and basis to go on from, with the last stage alone; None to start from scratch.
         mode: which of the weights in `start` go on, and what is written; a ReFU layer stays as it is.
         rehearsal: what those weights are asked for beside the new samples.
@@ -142,30 +142,28 @@ def pretrain(
     if start is None and (rehearsal is not None or mode != "none"):
         msg = "there is nothing to go on from or to rehearse without weights to start from"
         raise RefuError(msg)
-    config = backbone_config(backbone, template, preset=preset) if config is None else config
-    if settings.dropout is not None and isinstance(config, TailorNetConfig):
-        config = replace(config, dropout=settings.dropout, high_dropout=2 * settings.dropout)
     torch_device = start_parallel(device)
     output = Path(output)
 
-    basis, mirror, stored = None, Mirror.of(template) if settings.is_mirrored else None, None
-    if start is not None:
-        stored = load_weights(Path(start) / f"{backbone}-{mode}", expect=identity)
-        bring_basis(Path(start), output)
-    elif uses_basis(config, preset):
-        basis = basis_of(output, opened, mirror, settings.rank)
+    mirror = Mirror.of(template) if settings.is_mirrored else None
     # Which pairs are held out mustn't depend on what is made of the samples afterwards.
     train, validation = split_validation(samples, share=settings.validation_share, seed=settings.loop.seed)
     if mirror is not None:
         train = train.joined(mirrored(train, mirror))
     described = {**identity, "backbone": backbone, "preset": preset}
     described |= {"settings": asdict(settings), "samples": len(train)}
-    mean = samples.displacement.mean(0)
-    if stored is None:
+    mean, stored = samples.displacement.mean(0), None
+    if start is None:
+        config = backbone_config(backbone, template, preset=preset) if config is None else config
+        if settings.dropout is not None and isinstance(config, TailorNetConfig):
+            config = replace(config, dropout=settings.dropout, high_dropout=2 * settings.dropout)
+        basis = basis_of(output, opened, mirror, settings.rank) if uses_basis(config, preset) else None
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(settings.loop.seed)
             model = build_backbone(config, template, basis=basis, pivots=pivots_of(samples, opened.n_pivots))
     else:
+        stored = load_weights(Path(start) / f"{backbone}-{mode}", expect=identity)
+        bring_basis(Path(start), output)
         model = backbone_from_weights(stored, template)
         config = model.config
         described |= {"goes_on_from": stored.card["sha256"], "refu": stored.card.get("refu")}
