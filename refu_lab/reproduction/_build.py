@@ -72,6 +72,16 @@ def _missing_sets(study: Study) -> Iterator[Missing]:
                 yield Missing(garment, method, f"no set of {shapes} shapes was given", command)
 
 
+def _missing_postures(study: Study) -> Iterator[Missing]:
+    """The node, of each garment whose samples are in none of the postures."""
+    method = POSTURE_METHODS[-1]
+    for garment in study.n_samples:
+        run = study.runs.get((garment, method))
+        if run is not None and not any(run.postures):
+            command = f"refu simulate {garment} --postures 1 --count N --output DIR"
+            yield Missing(garment, method, "none of its test samples is in an everyday posture", command)
+
+
 def posture_table(study: Study) -> ResultTable:
     """The node in each everyday posture, garment by garment and over all of them."""
     table = ResultTable(
@@ -81,7 +91,7 @@ def posture_table(study: Study) -> ResultTable:
         "it: arms on the body, overhead, crossed, sitting, kneeling, on all fours. MPVE beside that of all these "
         "samples says in which of them the networks are at a loss.",
     )
-    table.missing = list(study.missing.values())
+    table.missing = [*study.missing.values(), *_missing_postures(study)]
     found = {garment: [study.runs.get((garment, name)) for name in POSTURE_METHODS] for garment in study.n_samples}
     if len(found) > 1:
         found[ALL] = [MethodRun.joined(ALL, name, study.pooled(name)) for name in POSTURE_METHODS]

@@ -358,6 +358,17 @@ def test_postures_against_a_loop(study: rp.Study) -> None:
     assert table.value(GARMENT, "squat", "network_mpve_mm") == pytest.approx(before)
     free = 100 * np.mean([node.samples[k].is_free for k in squats])
     assert table.value(GARMENT, "squat", "cfmp_percent") == pytest.approx(free)
+    assert table.missing == []
+
+
+def test_samples_without_postures_have_no_rows_and_the_page_says_what_makes_some(study: rp.Study) -> None:
+    node = study.runs[GARMENT, "refu-hybrid"]
+    small = rp.Study(n_samples={GARMENT: N_SAMPLES})
+    for name in rp.POSTURE_METHODS:
+        small.runs[GARMENT, name] = rp.MethodRun(GARMENT, name, node.samples, postures=[None] * N_SAMPLES)
+    table = rp.posture_table(small)
+    assert table.rows == []
+    assert f"`refu simulate {GARMENT} --postures 1" in "\n".join(table.markdown(source=""))
 
 
 @pytest.fixture(scope="module")
