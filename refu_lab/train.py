@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,8 @@ from typing import Any
 from refu_core import RefuError, load_garment
 from refu_core._device import checked_device
 from refu_core.backbones import PRESETS
-from refu_core.body import load_fit
+from refu_core.body import JOINT_NAMES, load_fit
+from refu_core.errors import printable
 from refu_core.garments import worn_on
 from refu_core.options import check
 from refu_core.sdf import SDF_PRESETS
@@ -62,7 +64,8 @@ def train(options: TrainOptions, *, progress: bool) -> dict[str, Any]:
     first = _seeded(first, options, **of_all)
     if options.start is not None:
         rehearsal = None if options.rehearse is None else Rehearsal(options.rehearse, options.motions)
-        return pretrain(*given, settings=first, start=options.start, mode=options.mode, rehearsal=rehearsal, **common)
+        common |= {"start": options.start, "mode": options.mode, "joints": _numbers(options.joints)}
+        return pretrain(*given, settings=first, rehearsal=rehearsal, **common)
     if options.mode == "none":
         return pretrain(*given, settings=first, **common)
     source: Path | None = options.folder
@@ -91,6 +94,14 @@ def _check(options: TrainOptions) -> None:
         msg = f"no preset {options.preset!r} of training: wanted {', '.join(presets)}"
         raise RefuError(msg)
     check(options)
+
+
+def _numbers(joints: Sequence[str]) -> list[int]:
+    unknown = [name for name in joints if name not in JOINT_NAMES]
+    if unknown:
+        msg = f"no joint {printable(unknown[0])}: wanted some of {', '.join(JOINT_NAMES)}"
+        raise RefuError(msg)
+    return [JOINT_NAMES.index(name) for name in joints]
 
 
 def _seeded(settings: Any, options: TrainOptions, **changes: Any) -> Any:

@@ -26,6 +26,8 @@ from refu_core.backbones._gcnn import Gcnn as Gcnn
 from refu_core.backbones._gcnn import GcnnConfig as GcnnConfig
 from refu_core.backbones._mlp import Mlp as Mlp
 from refu_core.backbones._mlp import MlpConfig as MlpConfig
+from refu_core.backbones._perceptron import Perceptron as Perceptron
+from refu_core.backbones._perceptron import StackedPerceptrons as StackedPerceptrons
 from refu_core.backbones._presets import PRESETS as PRESETS
 from refu_core.backbones._presets import TRAINABLE as TRAINABLE
 from refu_core.backbones._presets import BackboneConfig as BackboneConfig

@@ -39,18 +39,21 @@ class Dynamics(nn.Module):
         of_joints = np.arange(9 * N_JOINTS).reshape(N_JOINTS, 9)[list(joints)].ravel()
         columns = np.concatenate((of_joints, np.arange(9 * N_JOINTS, N_PAST)))
         self.register_buffer("_columns", torch.from_numpy(columns), persistent=False)
+        self.register_buffer("_now", still.features.columns_of(config.joints), persistent=False)
         self._columns: Tensor
-        now = still.features.groups.numpy()
+        self._now: Tensor
+        groups = still.features.groups
+        now = torch.cat((groups[self._now], groups[still.features.size :])).numpy()
         self.groups = torch.from_numpy(np.concatenate((now, np.tile(now.max() + 1 + columns // 9, len(LAGS)))))
         """Which inputs belong together, as `PoseFeatures.groups`: of all lags those of a joint."""
         n_past = len(LAGS) * len(columns)
-        n, m = still.features.size + N_STYLE_SHAPE + n_past, still.decoder.size
+        n, m = len(self._now) + N_STYLE_SHAPE + n_past, still.decoder.size
         self.net = Perceptron(n, config.hidden, m, activation=config.activation, dropout=config.dropout)
 
     def forward(self, x: Tensor, s: Tensor, past: Tensor) -> Tensor:
         """Code, shape (B, C), of pose features (B, I), (β, γ) (B, 14) and the past (B, 4, 219)."""
         moved = self.seen(past)
-        now = torch.cat((x, s), 1)
+        now = torch.cat((x[:, self._now], s), 1)
         both = torch.cat((torch.cat((now, moved), 1), torch.cat((now, torch.zeros_like(moved)), 1)))
         with_past, without = self.net(both).chunk(2)
         code: Tensor = with_past - without
@@ -63,8 +66,9 @@ class Dynamics(nn.Module):
     def standardise(self, x: Tensor, s: Tensor, past: Tensor, is_bounded: Tensor) -> None:
         """Takes the inputs' sizes from the training set; which of x and s `is_bounded` says, the past always is."""
         moved = self.seen(past)
-        bounded = torch.cat((is_bounded, torch.ones(moved.shape[1], dtype=torch.bool)))
-        self.net.standardise(torch.cat((x, s, moved), 1), self.groups, is_bounded=bounded)
+        bounded = (is_bounded[self._now], is_bounded[x.shape[1] :], torch.ones(moved.shape[1], dtype=torch.bool))
+        now = x[:, self._now]
+        self.net.standardise(torch.cat((now, s, moved), 1), self.groups, is_bounded=torch.cat(bounded))
 
 
 class Dynamic(nn.Module):

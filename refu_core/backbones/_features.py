@@ -102,6 +102,13 @@ class PoseFeatures(nn.Module):
         self._keep: Tensor
         self._eye: Tensor
 
+    def columns_of(self, joints: tuple[int, ...]) -> Tensor:
+        """Which numbers of the features are of these joints, and of up. Raises `ValueError` for one that it lacks."""
+        if self.encoding != "matrix":
+            return torch.arange(self.size)
+        first = [3 + 9 * self.joints.index(joint) for joint in joints if joint != 0]
+        return torch.cat([torch.arange(3), *(torch.arange(at, at + 9) for at in first)])
+
     def are_bounded(self, garment: GarmentTemplate) -> Tensor:
         """Which numbers of (features, β, γ) a network of a garment should see within their range alone, (size + 14,).
 

@@ -41,21 +41,27 @@ class _Standardised(nn.Module):
         `is_bounded` (I,) says which inputs are clamped to their range.
         """
         groups = torch.arange(inputs.shape[1]) if groups is None else groups
-        with torch.no_grad():
-            bounded = torch.as_tensor(is_bounded, device=inputs.device)
-            self.lowest.copy_(torch.where(bounded, inputs.amin(0), -_ANY))
-            self.highest.copy_(torch.where(bounded, inputs.amax(0), _ANY))
-            self.shift.copy_(inputs.mean(0))
-            # Within a group the sizes stay as they are: what of a joint's rotation hardly varies says little, and isn't
-            # blown up to the size of the rest. The same for groups that don't vary at all.
-            variance = inputs.new_zeros(int(groups.max()) + 1).index_add(0, groups, inputs.var(0))
-            self.scale.copy_(1 / ((variance / torch.bincount(groups)).sqrt() + 1e-3)[groups])
+        for name, values in _measured(inputs, groups, is_bounded).items():
+            getattr(self, name).copy_(values)
 
     def widen(self, inputs: Tensor) -> None:
         """Takes in the range of further samples (N, I), where inputs are clamped; shift and scale stay as they are."""
         with torch.no_grad():
             self.lowest.copy_(torch.where(self.lowest > -_ANY, inputs.amin(0).minimum(self.lowest), -_ANY))
             self.highest.copy_(torch.where(self.highest < _ANY, inputs.amax(0).maximum(self.highest), _ANY))
+
+    def take_in(self, inputs: Tensor, groups: Tensor, *, at: int) -> None:
+        """Takes further inputs at the place `at`, which say nothing yet; range and sizes are those of samples (N, J).
+
+        They are clamped: no skinning goes on from there, as no joint that carries the cloth comes later.
+        """
+        for name, values in _measured(inputs, groups, is_bounded=True).items():
+            setattr(self, name, _inserted(getattr(self, name), values, at))
+        self._take_in(inputs.shape[1], at)
+
+    def _take_in(self, count: int, at: int) -> None:
+        """Makes room for `count` inputs in the first layer."""
+        raise NotImplementedError
 
     def seen(self, x: Tensor) -> Tensor:
         """The inputs (B, I) as the first layer has them."""
@@ -70,6 +76,13 @@ class Perceptron(_Standardised):
     ) -> None:
         super().__init__(inputs, activation, dropout)
         self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise((inputs, *hidden, outputs)))
+
+    def _take_in(self, count: int, at: int) -> None:
+        first = self.layers[0]
+        assert isinstance(first, nn.Linear)
+        weight = first.weight.detach()
+        first.weight = nn.Parameter(_inserted(weight, weight.new_zeros(len(weight), count), at))
+        first.in_features += count
 
     def forward(self, x: Tensor) -> Tensor:
         """Shape (B, I) -> (B, O)."""
@@ -96,6 +109,10 @@ class StackedPerceptrons(_Standardised):
             self.weights.append(nn.Parameter(torch.empty(count, a, b).uniform_(-bound, bound)))
             self.biases.append(nn.Parameter(torch.empty(count, b).uniform_(-bound, bound)))
 
+    def _take_in(self, count: int, at: int) -> None:
+        first = self.weights[0].detach().mT
+        self.weights[0] = nn.Parameter(_inserted(first, first.new_zeros(*first.shape[:2], count), at).mT.contiguous())
+
     def forward(self, x: Tensor, mixture: Tensor) -> Tensor:
         """Σ_k mixture[:, k] · perceptron_k(x), shape (B, O), of x (B, I) and mixture (B, K)."""
         layers = list(zip(self.weights, self.biases, strict=True))
@@ -107,3 +124,23 @@ class StackedPerceptrons(_Standardised):
         # Mixing before the last layer makes one product of it, and no (K, B, O) array, large with dense heads.
         mixed = (h * mixture.T[..., None]).transpose(0, 1).flatten(1)  # (B, K * H)
         return torch.addmm(mixture @ bias, mixed, weight.flatten(0, 1))
+
+
+@torch.no_grad()
+def _measured(inputs: Tensor, groups: Tensor, is_bounded: Tensor | bool) -> dict[str, Tensor]:
+    """Range, shift and scale of the inputs (N, I) of samples; one scale a group (I,) of them."""
+    bounded = torch.as_tensor(is_bounded, device=inputs.device)
+    # Within a group the sizes stay as they are: what of a joint's rotation hardly varies says little, and isn't blown
+    # up to the size of the rest. The same for groups that don't vary at all.
+    variance = inputs.new_zeros(int(groups.max()) + 1).index_add(0, groups, inputs.var(0))
+    return {
+        "lowest": torch.where(bounded, inputs.amin(0), -_ANY),
+        "highest": torch.where(bounded, inputs.amax(0), _ANY),
+        "shift": inputs.mean(0),
+        "scale": 1 / ((variance / torch.bincount(groups)).sqrt() + 1e-3)[groups],
+    }
+
+
+def _inserted(values: Tensor, new: Tensor, at: int) -> Tensor:
+    """Values (…, I) with new ones (…, J) before number `at`."""
+    return torch.cat((values[..., :at], new, values[..., at:]), -1)

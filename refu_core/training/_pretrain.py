@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,9 @@ from refu_core.backbones import (
     LaplacianSmoothing,
     Mlp,
     Network,
+    Perceptron,
+    PoseFeatures,
+    StackedPerceptrons,
     TailorNet,
     TailorNetConfig,
     backbone_config,
@@ -27,8 +31,9 @@ from refu_core.backbones import (
     save_basis,
     uses_basis,
 )
-from refu_core.body import SmplBody
+from refu_core.body import JOINT_NAMES, SmplBody
 from refu_core.errors import RefuError
+from refu_core.frames import N_JOINTS
 from refu_core.garments import GarmentTemplate
 from refu_core.refu import refu_from_weights, refu_tensors
 from refu_core.simulation import GarmentDataset, GarmentSequences
@@ -103,6 +108,7 @@ def pretrain(
     config: BackboneConfig | None = None,
     start: str | Path | None = None,
     mode: str = "none",
+    joints: Sequence[int] = (),
     rehearsal: Rehearsal | None = None,
     body: SmplBody | None = None,
     device: str = "cpu",
@@ -123,6 +129,7 @@ def pretrain(
         config: sizes of the network; the preset's if not given. One that goes on has its own.
         start: folder of the weights and basis to go on from, with the last stage alone; None to start from scratch.
         mode: which of the weights in `start` go on, and what is written; a ReFU layer stays as it is.
+        joints: numbers of joints that those weights are told of from now on, too; at first they change nothing.
         rehearsal: what those weights are asked for beside the new samples.
         body: the body that the set was simulated on; the garment's built-in one if not given.
         device: `cpu` or `cuda`.
@@ -139,7 +146,7 @@ def pretrain(
     template, body, samples, identity = opened.garment, opened.body, opened.samples, opened.identity
     test = read_samples(opened.rows, body, template, split="test")  # what there is none of is said before hours of work
     settings = PretrainSettings.of(backbone, preset, samples=len(samples)) if settings is None else settings
-    if start is None and (rehearsal is not None or mode != "none"):
+    if start is None and (rehearsal is not None or joints or mode != "none"):
         msg = "there is nothing to go on from or to rehearse without weights to start from"
         raise RefuError(msg)
     torch_device = start_parallel(device)
@@ -171,6 +178,9 @@ def pretrain(
             rehearsed = rehearsal.of(stored.card, model)
             train = train.joined(rehearsed)
             described["rehearsed"] = {"count": len(rehearsed), "plans": plans_of(stored.card)}
+        if joints:
+            tell_of(model, joints, train.pose)
+            config = model.config
     loop = Loop(
         model,
         settings.loop,
@@ -279,14 +289,40 @@ def stages(
     return [*found, TrainingStage("high", Objective([model.high], model.high, loss), settings.steps, *fine)]
 
 
+def tell_of(model: Network, joints: Sequence[int], pose: Tensor) -> None:
+    """Makes a network see further joints, which say nothing at first, in the range that poses (N, 24, 3) [rad] have.
+
+    Raises `RefuError` for joints that it sees already or that there aren't, and for a network of rotation vectors.
+    """
+    config, before = model.config, model.features.size
+    others = [joint for joint in range(1, N_JOINTS) if joint not in config.joints]
+    if config.encoding != "matrix":
+        msg = f"a network that sees the pose as {config.encoding} can't be told of further joints: train a new one"
+        raise RefuError(msg)
+    if len(set(joints)) < len(joints) or not set(joints) <= set(others):
+        msg = f"wanted joints that the network isn't told of, each once ({', '.join(JOINT_NAMES[j] for j in others)}), "
+        msg += f"got {', '.join(JOINT_NAMES[j] if 0 <= j < N_JOINTS else str(j) for j in joints)}"
+        raise RefuError(msg)
+    model.config = replace(config, joints=(*config.joints, *joints))
+    model.features = PoseFeatures(model.config.joints, config.encoding)
+    further = model.features(pose)[:, before:]
+    groups = torch.arange(further.shape[1]) // 9
+    for net in _of_pose(model):
+        net.take_in(further, groups, at=before)
+
+
+def _of_pose(model: Network) -> tuple[Perceptron | StackedPerceptrons, ...]:
+    """The networks whose first inputs are pose features."""
+    if isinstance(model, TailorNet):
+        return model.low, model.high
+    return (model.head if isinstance(model, Gcnn) else model.net,)
+
+
 def take_inputs(model: Network, train: TrainingSamples, garment: GarmentTemplate, *, widen: bool) -> None:
     """Standardises a network's inputs by those of the samples; of a trained one, only widens the range that it sees."""
     x, s = model.features(train.pose), train.style_shape
-    both = torch.cat((x, s), 1)
-    if isinstance(model, TailorNet):
-        seen = [(model.low, both), (model.high, x), (model.style_shape, s)]
-    else:
-        seen = [(model.head if isinstance(model, Gcnn) else model.net, both)]
+    seen = [(net, x if net is getattr(model, "high", None) else torch.cat((x, s), 1)) for net in _of_pose(model)]
+    seen += [(model.style_shape, s)] if isinstance(model, TailorNet) else []
     groups, bounded = model.features.groups, model.features.are_bounded(garment)
     for net, inputs in seen:
         n = inputs.shape[1]

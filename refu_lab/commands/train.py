@@ -62,6 +62,12 @@ class TrainOptions:
         parse=cli.in_path,
         metavar="DIR",
     )
+    joints: tuple[str, ...] = setting(
+        (),
+        "joints that those weights are told of from now on, too, as spine1,left_shoulder",
+        parse=cli.names,
+        metavar="A,B",
+    )
     rehearse: int | None = setting(
         None,
         "ask those weights for so many bodies of the plans that they were trained on, too, lest they forget",
@@ -97,7 +103,7 @@ def add(commands: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     from refu_lab.train import train, training_table
 
-    cli.require_use(args, {"motions": "rehearse", "rehearse": "start"})
+    cli.require_use(args, {"motions": "rehearse", "rehearse": "start", "joints": "start"})
     options = TrainOptions(**cli.given(args, TrainOptions))
     card = train(options, progress=not args.quiet)
     return cli.tell(args, training_table(card, options), card)

@@ -14,10 +14,11 @@ from small_set import write_set
 from torch import Tensor
 
 from refu_core import load_body, load_garment
-from refu_core.backbones import MlpConfig, backbone_from_weights
+from refu_core.backbones import Mlp, MlpConfig, backbone_from_weights
 from refu_core.errors import RefuError
 from refu_core.simulation import Clip, SamplePlan, split_clips
 from refu_core.training import LoopSettings, PretrainSettings, Rehearsal, pretrain
+from refu_core.training._pretrain import tell_of
 from refu_core.weights import Weights, load_weights
 
 GARMENT = "short-pant-male"
@@ -142,3 +143,49 @@ def test_learns_beyond_what_it_saw_and_forgets_less(first: Path, further: Path, 
 def test_there_must_be_weights_to_rehearse(further: Path, tmp_path: Path) -> None:
     with pytest.raises(RefuError, match="nothing to go on from or to rehearse"):
         pretrain(GARMENT, further, tmp_path, backbone="mlp", settings=QUICK, rehearsal=Rehearsal(3))
+
+
+def test_joints_that_it_is_told_of_say_nothing_at_first(first: Path) -> None:
+    """Then their samples' range is what it sees of them."""
+    network = backbone_from_weights(load_weights(first / "mlp-none"), load_garment(GARMENT))
+    pose = 0.3 * torch.randn(30, 24, 3, generator=torch.Generator().manual_seed(0))
+    before = network(torch.zeros(30, 10), pose, torch.zeros(30, 4))
+    tell_of(network, (16, 3), pose)
+    assert isinstance(network, Mlp)
+    assert network.config.joints == (0, 1, 2, 4, 5, 16, 3)
+    after = network(torch.zeros(30, 10), pose, torch.zeros(30, 4))
+    assert before is not None
+    assert after is not None
+    torch.testing.assert_close(after, before, rtol=0, atol=1e-6)
+    told = network.features(pose)[:, -18:]
+    at = slice(network.features.size - 18, network.features.size)
+    torch.testing.assert_close(network.net.lowest[at], told.amin(0))
+    torch.testing.assert_close(network.net.highest[at], told.amax(0))
+    seen = network.net.seen(torch.cat((network.features(pose), torch.zeros(30, 14)), 1))[:, at]
+    assert float(seen.mean(0).abs().max()) < 1e-5
+    assert 0.5 < float(seen.view(30, 2, 9).var(0).mean(1).sqrt().min()) < 1.1
+
+
+@pytest.mark.parametrize("joints", [(1,), (0,), (24,), (16, 16)])
+def test_only_joints_that_it_does_not_know_can_be_told(first: Path, joints: tuple[int, ...]) -> None:
+    network = backbone_from_weights(load_weights(first / "mlp-none"), load_garment(GARMENT))
+    with pytest.raises(RefuError, match=r"wanted joints that the network isn't told of, each once \(spine1, "):
+        tell_of(network, joints, torch.zeros(3, 24, 3))
+
+
+@pytest.mark.usefixtures("no_curves")
+def test_learns_what_a_joint_does_that_it_was_not_told_of(first: Path, tmp_path: Path) -> None:
+    """Shorts that a raised arm lifts."""
+    garment = load_garment(GARMENT)
+
+    def by_arm(pose: Tensor) -> Tensor:
+        return 0.05 * pose[:, 16, :1, None] * torch.tensor([0.0, 1.0, 0.0]).expand(len(pose), garment.n_vertices, 3)
+
+    write_set(tmp_path / "set", garment, load_body(garment.body), pairs=40, poses=5, spread=0.3, displacement=by_arm)
+    how: dict[str, Any] = {"backbone": "mlp", "settings": QUICK, "start": first, "quiet": True}
+    told = pretrain(GARMENT, tmp_path / "set", tmp_path / "told", joints=(16,), **how)
+    deaf = pretrain(GARMENT, tmp_path / "set", tmp_path / "deaf", **how)
+    assert told["figures"]["mpve_mm"] < 0.7 * deaf["figures"]["mpve_mm"]
+    stored = load_weights(tmp_path / "told" / "mlp-none")
+    assert list(stored.card["config"]["joints"]) == [0, 1, 2, 4, 5, 16]
+    backbone_from_weights(stored, garment)
