@@ -29,7 +29,7 @@ _MAX_FILE_BYTES = 1 << 32
 """Of which only the directory and the arrays that are wanted are read."""
 _MAX_READ = 1 << 20
 """A directory of more is cut off there, and so refused; the arrays are read in smaller steps."""
-_MAX_TEXT_BYTES = 1 << 15
+MAX_TEXT_BYTES = 1 << 15
 """Names of a skeleton's joints take a quarter of it."""
 _MAX_AXES = 32
 _MAX_HEADER_BYTES = 1 << 14
@@ -62,8 +62,8 @@ class ArrayBudget:
         # An axis of length 0 makes no array small: code loops over the others.
         count = math.prod(max(n, 1) for n in shape)
         is_text = dtype.kind in "US"
-        if is_text and count * max(dtype.itemsize, 1) > _MAX_TEXT_BYTES:
-            msg = f"an array {shape} of {dtype}, at most {_MAX_TEXT_BYTES} bytes of text are read"
+        if is_text and count * max(dtype.itemsize, 1) > MAX_TEXT_BYTES:
+            msg = f"an array {shape} of {dtype}, at most {MAX_TEXT_BYTES} bytes of text are read"
             raise ValueError(msg)
         if not is_text and (dtype.kind not in "biuf" or dtype.itemsize > 8):
             msg = f"an array of {dtype}, wanted plain numbers of at most 64 bits"

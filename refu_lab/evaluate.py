@@ -47,6 +47,10 @@ def evaluate(options: EvaluateOptions, *, progress: bool, engine: Engine | None 
         need = "--motions DIR" if options.table == "motion" else "--data DIR"
         msg = f"nothing to evaluate: the table {options.table} needs {need}"
         raise RefuError(msg)
+    page = options.output / "README.md"
+    if page.exists() and not rp.is_summary(page):
+        msg = f"{page}: is there already, and no page of refu evaluate; name another folder with --output"
+        raise RefuError(msg)
     sets = [rp.SampleSet.open(path) for path in options.data]
     _check_sets(sets)
     posed = [samples for samples in sets if samples.shapes is None]

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 FORMATS: tuple[str, ...] = (".glb", ".obj", ".usda", ".usdc", ".usd")
 """Suffixes of what is written."""
 _USD = (".usda", ".usdc", ".usd")
+_FAR = 100.0
+"""From here on float32 has steps of 8 µm and more [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +39,7 @@ class ExportMesh:
     """A mesh that may move."""
 
     name: str
-    vertices: NDArray[np.float32]
+    vertices: NDArray[np.float64]
     """SMPL axes (y up, z forward), which are those of glTF [m], shape (T, V, 3)."""
     faces: NDArray[np.int64]
     """Counter-clockwise from outside, shape (F, 3)."""
@@ -53,9 +55,9 @@ def meshes_of(
     found = []
     if with_body:
         bodies = np.stack([output.body + output.transl for output in outputs])
-        found.append(ExportMesh("body", bodies.astype(np.float32), pipeline.body.faces.cpu().numpy(), SKIN))
+        found.append(ExportMesh("body", bodies, pipeline.body.faces.cpu().numpy(), SKIN))
     for name, template in pipeline.garments.items():
-        vertices = np.stack([output[name].vertices for output in outputs]).astype(np.float32)
+        vertices = np.stack([output[name].vertices for output in outputs])
         found.append(ExportMesh(name, vertices, template.faces.cpu().numpy(), template.card.color, template.uv))
     return found
 
@@ -64,7 +66,8 @@ def write_meshes(meshes: Sequence[ExportMesh], path: str | PathLike[str], *, fps
     """Writes meshes of T frames: one USD stage that moves, or a GLB or OBJ file a frame, numbered if there are several.
 
     OBJ and USD keep the order of vertices, and texture coordinates apart from them. GLB has one of each: vertices on
-    the seams of a texture are there twice.
+    the seams of a texture are there twice. GLB and USD have numbers of seven digits: more than `_FAR` from the origin,
+    meshes are stored about where they are first, and moved there by their node.
 
     Returns:
         The files.
@@ -81,16 +84,18 @@ def write_meshes(meshes: Sequence[ExportMesh], path: str | PathLike[str], *, fps
     if not count:
         msg = f"{path}: there is no frame to write"
         raise RefuError(msg)
+    origin = meshes[0].vertices[0].mean(0).round()
+    origin *= np.abs(origin).max() > _FAR
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         if suffix in _USD:
-            _write_usd(meshes, path, fps)
+            _write_usd(meshes, path, fps, origin)
             return [path]
         digits = len(str(count - 1))
         paths = [path if count == 1 else path.with_name(f"{path.stem}_{k:0{digits}}{suffix}") for k in range(count)]
         for k, one in enumerate(paths):
             with replacing(one) as file:
-                file.write(_glb(meshes, k) if suffix == ".glb" else _obj(meshes, k))
+                file.write(_glb(meshes, k, origin) if suffix == ".glb" else _obj(meshes, k))
     except OSError as error:
         msg = f"{path}: can't be written: {error.strerror or error}"
         raise RefuError(msg) from error
@@ -142,16 +147,16 @@ def export(
     turn = turn_from(frames[0].up.astype(np.float64))
     meshes = meshes_of(pipeline, outputs, with_body=with_body)
     if turn[1, 1] != 1:
-        meshes = [replace(mesh, vertices=mesh.vertices @ turn.T.astype(np.float32)) for mesh in meshes]
+        meshes = [replace(mesh, vertices=mesh.vertices @ turn.T) for mesh in meshes]
     return write_meshes(meshes, path, fps=fps), warnings
 
 
-def _glb(meshes: Sequence[ExportMesh], frame: int) -> bytes:
+def _glb(meshes: Sequence[ExportMesh], frame: int, origin: NDArray[np.float64]) -> bytes:
     import trimesh
 
     scene = trimesh.Scene()
     for mesh in meshes:
-        vertices, faces, coordinates = mesh.vertices[frame], mesh.faces, None
+        vertices, faces, coordinates = mesh.vertices[frame] - origin, mesh.faces, None
         if mesh.uv is not None:
             # A vertex for each pair of place and texture coordinates.
             pairs = np.stack((mesh.faces, mesh.uv.faces), -1).reshape(-1, 2)
@@ -167,7 +172,10 @@ def _glb(meshes: Sequence[ExportMesh], frame: int) -> bytes:
         )
         visual = trimesh.visual.TextureVisuals(uv=coordinates, material=material)
         scene.add_geometry(
-            trimesh.Trimesh(vertices, faces, visual=visual, process=False), geom_name=mesh.name, node_name=mesh.name
+            trimesh.Trimesh(vertices, faces, visual=visual, process=False),
+            geom_name=mesh.name,
+            node_name=mesh.name,
+            transform=trimesh.transformations.translation_matrix(origin),
         )
     data: bytes = scene.export(file_type="glb")
     return data
@@ -194,7 +202,7 @@ def _obj(meshes: Sequence[ExportMesh], frame: int) -> bytes:
     return ("\n".join(lines) + "\n").encode()
 
 
-def _write_usd(meshes: Sequence[ExportMesh], path: Path, fps: float) -> None:
+def _write_usd(meshes: Sequence[ExportMesh], path: Path, fps: float, origin: NDArray[np.float64]) -> None:
     try:
         from pxr import Gf, Sdf, Usd, UsdGeom, Vt
     except ImportError as error:
@@ -205,6 +213,7 @@ def _write_usd(meshes: Sequence[ExportMesh], path: Path, fps: float) -> None:
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     root = UsdGeom.Xform.Define(stage, "/person")
     stage.SetDefaultPrim(root.GetPrim())
+    root.AddTranslateOp().Set(Gf.Vec3d(*origin.tolist()))
     frames = len(meshes[0].vertices)
     if frames > 1:
         stage.SetTimeCodesPerSecond(fps)
@@ -219,7 +228,7 @@ def _write_usd(meshes: Sequence[ExportMesh], path: Path, fps: float) -> None:
         linear = tuple(channel**2.2 for channel in mesh.color)  # display colours are linear
         prim.CreateDisplayColorAttr(Vt.Vec3fArray([Gf.Vec3f(*linear)]))
         points, extent = prim.CreatePointsAttr(), prim.CreateExtentAttr()
-        for k, vertices in enumerate(mesh.vertices):
+        for k, vertices in enumerate((mesh.vertices - origin).astype(np.float32)):
             time = Usd.TimeCode(k) if frames > 1 else Usd.TimeCode.Default()
             points.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(vertices)), time)
             bounds = np.stack((vertices.min(0), vertices.max(0)))

@@ -234,7 +234,8 @@ def replay(
         source = open_source(options, lambda: load().body)  # whose faults are told at once
         options = replace(options, frame_id=options.frame_id or source.frame_id)
         pipeline = load()
-        pipeline(SmplFrame(pose=np.zeros((24, 3), np.float32)))  # compiles kernels, or the first frame would be late
+        # Kernels are compiled, or the first frame would be late; in a pose that nobody sends, or it would be known.
+        pipeline(SmplFrame(pose=np.full((24, 3), 1e-3, np.float32)))
         result = ReplayResult(options, source.description, body=body_facts(pipeline))
         if options.backbone == BackboneName.AUTO:
             result.warnings += [f"{name} has no trained weights: worn by skinning" for name in pipeline.untrained]

@@ -89,6 +89,12 @@ def _check(options: TrainOptions) -> None:
     if options.like is not None and options.start is not None:
         msg = "--like trains networks of its own: leave --start out"
         raise RefuError(msg)
+    if options.start is not None:
+        given = options.scale, options.margin, options.unblended, options.network, options.preset
+        if given != ("vertex", None, False, "garment", "realtime"):
+            msg = "--start goes on with networks as they are: leave --scale, --margin, --unblended, --network and "
+            msg += "--preset out"
+            raise RefuError(msg)
     presets = SDF_PRESETS if options.network == "sdf" else PRESETS
     if options.preset not in presets:
         msg = f"no preset {options.preset!r} of training: wanted {', '.join(presets)}"

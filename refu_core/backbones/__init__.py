@@ -17,6 +17,7 @@ from refu_core.backbones._files import backbone_from_weights as backbone_from_we
 from refu_core.backbones._files import backbone_weights as backbone_weights
 from refu_core.backbones._files import load_backbone as load_backbone
 from refu_core.backbones._files import load_basis as load_basis
+from refu_core.backbones._files import require_basis as require_basis
 from refu_core.backbones._files import save_backbone as save_backbone
 from refu_core.backbones._files import save_basis as save_basis
 from refu_core.backbones._files import save_dynamics as save_dynamics

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from refu_core._files import read_json
 from refu_core._warp import memory
 from refu_core.backbones._decoder import BasisDecoder
 from refu_core.backbones._dynamics import Dynamic, Dynamics, DynamicsConfig
@@ -30,6 +31,21 @@ _PREFIX = "backbone."
 def save_basis(folder: Path, basis: BasisDecoder, card: Mapping[str, Any]) -> Path:
     """Writes the output basis of a garment, `folder`/basis. Raises `WeightsError` where that can't be done."""
     return save_weights(folder / "basis", basis.tensors(), {**card, "rank": basis.size})
+
+
+def require_basis(folder: Path, digest: str | None, *, written: Sequence[str]) -> None:
+    """Raises `WeightsError` where another basis would be taken from under weights that aren't `written` anew.
+
+    The basis that will be there has this `digest`; None is one that no weights there know.
+    """
+    for path in sorted(folder.glob("*.json")):
+        if path.stem in (*written, "basis"):
+            continue
+        card = read_json(path, error=WeightsError, wanted="the card of weights")
+        known = card.get("basis_sha256", digest) if isinstance(card, dict) else digest
+        if known != digest:
+            msg = f"{path}: was trained with another basis than what would be written beside it; use a new folder"
+            raise WeightsError(msg)
 
 
 def load_basis(folder: Path, garment: GarmentTemplate, *, expect: Mapping[str, Any]) -> tuple[BasisDecoder, str]:

@@ -117,7 +117,7 @@ def _parse_obj(content: bytes) -> SurfaceMesh:
     corners: list[list[tuple[int, int]]] = []
     count = 0
     _require_few(content.count(b"\nf "))  # before its vertices are read
-    text = content.decode("utf-8-sig", errors="replace").replace("\\\n", " ")
+    text = content.decode("utf-8-sig", errors="replace").replace("\\\r\n", " ").replace("\\\n", " ")
     for number, line in enumerate(text.splitlines(), 1):
         kind, *words = line.partition("#")[0].split() or [""]
         try:

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from refu_core._files import replacing
-from refu_core._npz import read_npz
+from refu_core._npz import MAX_TEXT_BYTES, read_npz
 from refu_core.body import BUILTIN_BODIES
 from refu_core.errors import GarmentError, MeshError, require_type
 from refu_core.frames import N_BETAS, N_JOINTS, N_STYLES
@@ -143,6 +143,10 @@ def save_garment(template: GarmentTemplate, path: str | os.PathLike[str]) -> Pat
         msg = f"{target}: wanted the path of an .npz"
         raise GarmentError(msg)
     require_name(target.stem)  # it is the garment's when it is read
+    card = card_to_json(template.card).encode()
+    if len(card) > MAX_TEXT_BYTES:
+        msg = f"{target}: wanted a card of at most {MAX_TEXT_BYTES} bytes, got {len(card)}: say less of its provenance"
+        raise GarmentError(msg)
     n = template.n_vertices
     weights = _rounded(template.weights, 16)
     arrays: dict[str, Any] = {
@@ -151,7 +155,7 @@ def save_garment(template: GarmentTemplate, path: str | os.PathLike[str]) -> Pat
         "weights": (weights / weights.sum(1, keepdims=True)).astype(np.float32),
         "shapedirs": _rounded(template.shapedirs, 20).reshape(n, 3, N_BETAS),
         "body": np.array(template.body),
-        "card": np.array(card_to_json(template.card).encode()),
+        "card": np.array(card),
     }
     if template.styledirs is not None:
         arrays["styledirs"] = _rounded(template.styledirs, 20).reshape(n, 3, N_STYLES)

@@ -11,12 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from refu_core._warp import as_warp, ints
 from refu_core.body import blend_transforms
-from refu_core.errors import FrameError
+from refu_core.errors import FrameError, require_type
+from refu_core.frames import SmplFrame
 from refu_core.observation._cloth import Measured, ObservedCloth, averaged, within
 from refu_core.observation._settings import DEFAULT_OBSERVATION, ObservationSettings
 
 if TYPE_CHECKING:
-    from refu_core.frames import SmplFrame
     from refu_core.realtime import Dressed, GarmentPipeline, PipelineOutput, RootTurn
 
 _LONGEST_GAP = 10.0
@@ -70,6 +70,7 @@ class Observer:
             FrameError: points or eye of another shape, or not finite. What was learnt stays.
             RefuError: as the pipeline does.
         """
+        require_type(frame, SmplFrame, "a SmplFrame", error=FrameError)
         measured = np.empty((0, 3)) if points is None else _finite("points", points, 2)
         camera = None if eye is None else _finite("eye", eye, 1)
         self._wait(frame)

@@ -79,7 +79,7 @@ class LimbContacts:
 
     def __call__(self, output: PipelineOutput) -> tuple[LimbContact, ...]:
         """The contacts in the output of the pipeline, that of the largest area first."""
-        self._points.copy_(torch.from_numpy(output.body))
+        self._points.copy_(torch.tensor(output.body))
         self._shift.copy_(torch.from_numpy(output.body - output.skin))
         for mesh in self._meshes:
             mesh.refit()

@@ -168,7 +168,7 @@ class Sigma:
         """σ of each garment's vertices in a coordinate [m], by name, shape (V,), for a frame and what was made of it.
 
         A ball of `RADIUS_90` σ holds the true vertex in nine cases of ten, if the input is as it says; σ is never NaN.
-        Raises `FrameError` for a covariance of another shape, not finite, or with a negative variance.
+        Raises `FrameError` for a covariance of another shape, not finite, too large, or with a negative variance.
 
         Args:
             frame: that was dressed.
@@ -203,6 +203,10 @@ def _unseen_tilt(frame: SmplFrame) -> float:
     return float(np.clip((tilt - low) / (high - low), 0, 1))
 
 
+_LARGEST = 1e12
+"""Numbers of a covariance; joints turn by 1e4 rad at most, and people are no farther than 1e6 m off."""
+
+
 def _covariance(name: str, value: Any, *shapes: tuple[int, ...]) -> NDArray[np.float64]:
     try:
         array = np.asarray(value, np.float64)
@@ -214,6 +218,9 @@ def _covariance(name: str, value: Any, *shapes: tuple[int, ...]) -> NDArray[np.f
         raise FrameError(msg)
     if (np.diagonal(array, axis1=-2, axis2=-1) < 0).any():
         msg = f"{name} has a negative variance on its diagonal"
+        raise FrameError(msg)
+    if np.abs(array).max() > _LARGEST:
+        msg = f"{name}: wanted numbers up to {_LARGEST:g}, got {np.abs(array).max():g}: leave out what isn't known"
         raise FrameError(msg)
     return array
 

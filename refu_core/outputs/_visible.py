@@ -125,6 +125,8 @@ def all_visible(
     meshes: Sequence[Mesh], camera: PinholeCamera, *, buffer_width: int = BUFFER_WIDTH
 ) -> list[NDArray[np.bool_]]:
     """`visible` of several meshes that hide each other, for the price of one. Raises `MeshError` as that does."""
+    if not meshes:
+        return []
     drawn = _draw(meshes, camera.scaled(min(camera.width, buffer_width)))
     seen = np.zeros(len(drawn.seen), np.bool_)
     wp.launch(
@@ -142,6 +144,8 @@ def depth_image(meshes: Sequence[Mesh], camera: PinholeCamera) -> NDArray[np.flo
 
     Infinite where nothing is. Raises `MeshError` as `visible`.
     """
+    if not meshes:
+        return np.full((camera.height, camera.width), np.inf, np.float32)
     found = _draw(meshes, camera).buffer.numpy()
     return np.where(found == np.iinfo(np.int64).max, np.inf, (found >> 32) * 1e-6).astype(np.float32)
 

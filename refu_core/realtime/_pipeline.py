@@ -212,7 +212,7 @@ class GarmentPipeline:
     def __call__(self, frames: SmplFrame | Sequence[SmplFrame]) -> PipelineOutput | list[PipelineOutput]:
         """Dresses one person, or a batch of persons (one frame each).
 
-        A person whose (β, θ, γ) are among those of the last call gets the arrays of that call: copy them to write in.
+        Arrays are read-only: persons of one (β, θ, γ) share them, in a batch and with the last call.
 
         Raises:
             FrameError: what was given isn't a frame, or holds something else.
@@ -311,6 +311,7 @@ class GarmentPipeline:
 
         def on_host(points: Tensor) -> NDArray[np.float32]:
             made: NDArray[np.float32] = turn(points).cpu().numpy()
+            made.flags.writeable = False  # whoever is in the same pose gets it, too
             return made
 
         def later(points: Tensor) -> Callable[[], NDArray[np.float32]]:
@@ -321,7 +322,8 @@ class GarmentPipeline:
             meshes[name] = GarmentMesh(on_host(vertices), later(raw), self._faces[name], frame.transl)
             stats[name] = GarmentStats.of(numbers.tolist(), ms=0.0 if clock is None else clock.garments[name])
         shift, stage_ms = SkinShift.of(person.shift.tolist()), {} if clock is None else clock.stages
-        promised = within_promise(frame) and not shift.n_held
+        style = self._style[0].tolist() if frame.style is None and self._style is not None else frame.style
+        promised = within_promise(frame, style) and not shift.n_held
         took = FrameStats(stage_ms, stats, self._is_certified, promised, skipped, shift)
         return PipelineOutput(meshes, later(person.body), later(person.skin), took)
 

@@ -13,6 +13,7 @@ from refu_core.simulation._drape import SettledDrape as SettledDrape
 from refu_core.simulation._drape import canonical_pose as canonical_pose
 from refu_core.simulation._drape import colliders as colliders
 from refu_core.simulation._plan import SamplePlan as SamplePlan
+from refu_core.simulation._plan import names_of as names_of
 from refu_core.simulation._poses import Clip as Clip
 from refu_core.simulation._poses import load_clips as load_clips
 from refu_core.simulation._poses import random_pose as random_pose
@@ -27,5 +28,6 @@ from refu_core.simulation._selection import SelectionSettings as SelectionSettin
 from refu_core.simulation._sequences import SequencePlan as SequencePlan
 from refu_core.simulation._sequences import SequenceSettings as SequenceSettings
 from refu_core.simulation._sequences import simulate_sequences as simulate_sequences
+from refu_core.simulation._store import dequantise as dequantise
 from refu_core.simulation._summary import summarise as summarise
 from refu_core.simulation._worker import SimulationSettings as SimulationSettings

@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from refu_core.errors import SimulationError
+from refu_core.frames import MAX_ANGLE, MAX_COEFFICIENT
 from refu_core.simulation._joined import slices_of
 from refu_core.simulation._motion import FPS
 from refu_core.simulation._plan import TEST
 from refu_core.simulation._postures import POSTURES
 from refu_core.simulation._selection import CAUSES
-from refu_core.simulation._store import DONE, FORMAT, SEQUENCES, Rows, dequantise, read_card, read_unseen
+from refu_core.simulation._store import DONE, FORMAT, QUANTUM, SEQUENCES, Rows, dequantise, read_card, read_unseen
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +112,11 @@ class _Finished:
         self.train: NDArray[np.bool_] = ~self.test
         """Which rows are for training, shape (M,)."""
         self._check("clip", first_clip, np.where(self.test, len(self._clips["test"]), len(self._clips["train"])))
+        if self.card.get("quantum_m") != QUANTUM:
+            msg = f"{path}: wanted positions in units of {QUANTUM} m, got {str(self.card.get('quantum_m'))[:80]}"
+            raise SimulationError(msg)
+        for name, largest in (("pose", MAX_ANGLE), ("betas", MAX_COEFFICIENT), ("style", MAX_COEFFICIENT)):
+            self._check_numbers(name, largest)
 
     def _parts(self, n_vertices: int) -> dict[str, slice]:
         """Raises `SimulationError` for a card whose garments don't have that many vertices."""
@@ -142,6 +148,15 @@ class _Finished:
             msg += f"wanted {low} to {high.flat[bad[0]] - 1}; simulate it again"
             raise SimulationError(msg)
 
+    def _check_numbers(self, name: str, largest: float) -> None:
+        """Raises `SimulationError` where a column has numbers that no `SmplFrame` takes."""
+        values = self.column(name).reshape(len(self), -1)
+        bad = np.flatnonzero(~(np.abs(values) <= largest).all(1))  # NaN isn't
+        if bad.size:
+            msg = f"{self._path}: damaged: {name} of sample {bad[0]} isn't finite and at most {largest:g}; "
+            msg += "simulate it again"
+            raise SimulationError(msg)
+
     def __len__(self) -> int:
         """Finished rows."""
         return len(self._rows)
@@ -149,7 +164,7 @@ class _Finished:
     def column(self, name: str) -> NDArray[Any]:
         """A column of all rows as it is stored, shape (M, ...): `pose`, `betas` and so on.
 
-        `vertices` comes in units of `card["quantum_m"]`, and is as large as the set.
+        `vertices` comes as `dequantise` takes it, and is as large as the set.
 
         Raises `SimulationError` for a name that is no column.
         """

@@ -9,6 +9,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from numbers import Real
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ from refu_core.simulation._postures import drawn_posture
 
 TRAIN, TEST = 0, 1
 MAX_PIVOTS_SHARE = 0.5
+_MOST = 10**9
 
 
 def garments_of(garment: str | Sequence[str]) -> list[str]:
@@ -69,12 +71,20 @@ class SamplePlan:
     """Slots that are simulated together, one after the other, from one canonical drape."""
 
     def __post_init__(self) -> None:
-        """Raises `SimulationError` for numbers that make no plan."""
+        """Raises `SimulationError` for what makes no plan: they are read from cards, too."""
+        whole = self.count, self.seed, self.pivots, self.poses_per_pair, self.block
+        shares = self.test_share, self.recorded_share, self.posture_share, self.spread
+        is_named = isinstance(self.garment, (str, list, tuple)) and all(isinstance(name, str) for name in self.garment)
+        is_whole = all(isinstance(number, int) and 0 <= number <= _MOST for number in whole)
+        if not (is_named and is_whole and all(isinstance(share, Real) for share in shares)):
+            wanted = f"names of garments, whole numbers from 0 to {_MOST}, and shares"
+            msg = f"a plan is made of {wanted}, got {str(asdict(self))[:400]}"
+            raise SimulationError(msg)
         if self.count < 1 or self.pivots < 1 or self.poses_per_pair < 1 or self.block < 1:
             msg = f"count, pivots, poses_per_pair and block must be at least 1, got {asdict(self)}"
             raise SimulationError(msg)
-        shares = self.recorded_share, self.posture_share
-        if not (0 <= self.test_share < 1 and min(shares) >= 0 and sum(shares) <= 1 and self.spread > 0):
+        of_poses = self.recorded_share, self.posture_share
+        if not (0 <= self.test_share < 1 and min(of_poses) >= 0 and sum(of_poses) <= 1 and self.spread > 0):
             wanted = "shares must lie in [0, 1), those of poses sum up to 1 at most, and the spread be above 0"
             msg = f"{wanted}, got {asdict(self)}"
             raise SimulationError(msg)

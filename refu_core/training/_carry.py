@@ -24,6 +24,7 @@ from refu_core.backbones import (
     TailorNetConfig,
     build_backbone,
     load_backbone,
+    require_basis,
     save_backbone,
     save_basis,
 )
@@ -173,12 +174,13 @@ def carry_over(
         WeightsError: no networks of the related garment ship, or `output` can't be written.
     """
     settings = CarrySettings() if settings is None else settings
+    output = Path(output)
+    require_basis(output, None, written=[f"tailornet-{mode}" for mode in SdfMode])
     opened = TrainingSet.of(garment, dataset, body)
     template, body = opened.garment, opened.body
     test = read_samples(opened.rows, body, template, split="test")
     carried = Carried(load_garment(like), template, body, settings)
     samples = opened.samples.joined(mirrored(opened.samples, Mirror.of(template)))
-    output = Path(output)
     controls = Controls.spread(template, settings.controls)
     share = _borne_out(carried(samples.betas, samples.pose), samples.displacement, controls)
     drawn = _bodies(opened.samples, settings)

@@ -17,7 +17,7 @@ from refu_core.body import Collider, SmplBody, load_body
 from refu_core.errors import RefuError
 from refu_core.garments import GarmentTemplate, SkinBelow, load_garment
 from refu_core.realtime import RootTurn
-from refu_core.simulation import GarmentDataset, GarmentSequences, SamplePlan, open_dataset
+from refu_core.simulation import GarmentDataset, GarmentSequences, SamplePlan, dequantise, open_dataset
 from refu_core.training._mirror import Mirror, mirror_pose
 
 _SPARE = 32
@@ -94,8 +94,12 @@ class TrainingSet:
 
     @property
     def n_pivots(self) -> int:
-        """Pairs of the plan that have many poses each."""
-        return int(self.rows.card["plan"].get("pivots", SamplePlan.pivots))
+        """Pairs of the plan that have many poses each. Raises `RefuError` for a card that doesn't say how many."""
+        found = self.rows.card["plan"].get("pivots", SamplePlan.pivots)
+        if not isinstance(found, int) or found < 1:
+            msg = f"wanted a set whose card says in plan.pivots how many pairs have many poses, got {str(found)[:80]}"
+            raise RefuError(msg)
+        return found
 
     @property
     def knows_limbs(self) -> bool:
@@ -161,7 +165,7 @@ def read_samples(
     along = TakenAlong(body, garment)
 
     def displacement(units: NDArray[np.int16], pose: Tensor, betas: Tensor, style: Tensor) -> Tensor:
-        posed = torch.as_tensor(units.astype(np.float32) * float(dataset.card["quantum_m"]))
+        posed = torch.as_tensor(dequantise(units))
         whole = garment.unpose(posed, body(pose, betas).transforms) - garment.rest(betas, garment.own(style))
         return along.without(whole, betas, pose, style)
 

@@ -150,7 +150,7 @@ def finetune(
         else:
             stored = load_weights(Path(weights) / f"{backbone}-none", expect=identity)
             network = backbone_from_weights(stored, template)
-            bring_basis(Path(weights), output)
+            bring_basis(Path(weights), output, written=f"{backbone}-{mode}")
         refu = _layer(mode, settings, template.n_vertices)
     described = {
         **identity,

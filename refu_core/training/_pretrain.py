@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from refu_core._files import replacing
 from refu_core.backbones import (
     BackboneConfig,
     BasisDecoder,
@@ -27,12 +27,13 @@ from refu_core.backbones import (
     backbone_from_weights,
     build_backbone,
     load_basis,
+    require_basis,
     save_backbone,
     save_basis,
     uses_basis,
 )
 from refu_core.body import JOINT_NAMES, SmplBody
-from refu_core.errors import RefuError
+from refu_core.errors import RefuError, WeightsError
 from refu_core.frames import N_JOINTS
 from refu_core.garments import GarmentTemplate
 from refu_core.refu import refu_from_weights, refu_tensors
@@ -170,17 +171,21 @@ def pretrain(
             model = build_backbone(config, template, basis=basis, pivots=pivots_of(samples, opened.n_pivots))
     else:
         stored = load_weights(Path(start) / f"{backbone}-{mode}", expect=identity)
-        bring_basis(Path(start), output)
         model = backbone_from_weights(stored, template)
         config = model.config
         described |= {"goes_on_from": stored.card["sha256"], "refu": stored.card.get("refu")}
         if rehearsal is not None:
-            rehearsed = rehearsal.of(stored.card, model)
+            known = opened.card["plan"]
+            rehearsed = rehearsal.of(stored.card, model, known=known)
             train = train.joined(rehearsed)
-            described["rehearsed"] = {"count": len(rehearsed), "plans": plans_of(stored.card)}
+            plans = [plan for plan in plans_of(stored.card) if plan != known]
+            described["rehearsed"] = {"count": len(rehearsed), "plans": plans}
+            for net in _of_pose(model):
+                net.dropout = 0.0  # what is rehearsed has no noise: with dropout a T-shirt was off by 0.2 mm more
         if joints:
             tell_of(model, joints, train.pose)
             config = model.config
+        bring_basis(Path(start), output, written=f"{backbone}-{mode}")
     loop = Loop(
         model,
         settings.loop,
@@ -223,13 +228,27 @@ def basis_of(folder: Path, opened: TrainingSet, mirror: Mirror | None, rank: int
     return basis
 
 
-def bring_basis(source: Path, target: Path) -> None:
-    """Copies the output basis beside the weights that will need it."""
-    if not is_writer() or source.resolve() == target.resolve() or not (source / "basis.json").exists():
+def bring_basis(source: Path, target: Path, *, written: str) -> None:
+    """Copies the output basis beside the weights that will be `written` there and need it.
+
+    Raises `WeightsError` where other weights need the one that is there, and where it can't be copied.
+    """
+    if not is_writer() or not (source / "basis.json").exists():
         return
-    target.mkdir(parents=True, exist_ok=True)
+    basis = load_weights(source / "basis")
+    require_basis(target, str(basis.card["sha256"]), written=(written,))
     for name in ("basis.safetensors", "basis.json"):
-        shutil.copyfile(source / name, target / name)
+        there = target / name
+        try:
+            if there.exists() and there.samefile(source / name):
+                continue
+            target.mkdir(parents=True, exist_ok=True)
+            content = (source / name).read_bytes()
+            with replacing(there, sync=True) as file:
+                file.write(content)
+        except OSError as error:
+            msg = f"{there}: can't be written: {error.strerror or error}"
+            raise WeightsError(msg) from error
 
 
 def pivots_of(samples: TrainingSamples, n_pivots: int) -> Tensor:

@@ -12,7 +12,7 @@ import torch
 
 from refu_core.backbones import Network
 from refu_core.errors import RefuError
-from refu_core.simulation import Clip, SamplePlan, load_clips, split_clips
+from refu_core.simulation import Clip, SamplePlan, load_clips, names_of, split_clips
 from refu_core.training._data import TrainingSamples, in_chunks
 
 
@@ -28,15 +28,21 @@ class Rehearsal:
     motions: str | Path | Sequence[Clip] | None = None
     """The motions of those plans; None where they have drawn poses alone."""
 
-    def of(self, card: Mapping[str, Any], network: Network) -> TrainingSamples:
+    def of(
+        self, card: Mapping[str, Any], network: Network, *, known: Mapping[str, Any] | None = None
+    ) -> TrainingSamples:
         """Of a trained `network` and the card of its weights; of as many bodies as its plans have at most.
 
-        Raises `RefuError` for a card without a plan, and `SimulationError` for motions that aren't there.
+        The plan whose truth is `known`, that of the new samples, is left out.
+
+        Raises `RefuError` for a card without a plan of its garment, and `SimulationError` for a plan that is none or
+        motions that aren't there.
         """
-        known = {field.name for field in fields(SamplePlan)}
-        plans = [SamplePlan(**{key: value for key, value in one.items() if key in known}) for one in plans_of(card)]
-        if not plans:
-            msg = "nothing to rehearse: the weights' card doesn't say what plan they were trained on"
+        names = {field.name for field in fields(SamplePlan)}
+        given = [one for one in plans_of(card) if one != known]
+        plans = [SamplePlan(**{key: value for key, value in one.items() if key in names}) for one in given]
+        if not plans or not all(str(card["garment"]) in names_of(plan.garment).split("+") for plan in plans):
+            msg = "nothing to rehearse: the weights' card doesn't say what plan of their garment they were trained on"
             raise RefuError(msg)
         clips: Sequence[Clip] = []
         recorded = max(plan.recorded_share for plan in plans)
@@ -46,9 +52,10 @@ class Rehearsal:
                 raise RefuError(msg)
             all_clips = load_clips(self.motions) if isinstance(self.motions, (str, Path)) else self.motions
             clips = split_clips(all_clips)[0]
-        slots = [(plan, slot) for plan in plans for slot in range(plan.count - plan.n_test)]
-        rows = np.unique(np.linspace(0, len(slots) - 1, min(self.count, len(slots))).round().astype(int))
-        chosen = [slots[row] for row in rows]
+        ends = np.cumsum([plan.count - plan.n_test for plan in plans])
+        rows = np.unique(np.linspace(0, ends[-1] - 1, min(self.count, ends[-1])).round().astype(int))
+        of = np.searchsorted(ends, rows, side="right")
+        chosen = [(plans[k], int(row - (ends[k - 1] if k else 0))) for k, row in zip(of, rows, strict=True)]
         pose = torch.as_tensor(np.stack([plan.pose(slot, 0, clips)[0] for plan, slot in chosen]))
         shapes = zip(*(plan.style_shape(plan.pair_of(slot)) for plan, slot in chosen), strict=True)
         betas, style = (torch.as_tensor(np.stack(values)) for values in shapes)
@@ -59,5 +66,8 @@ class Rehearsal:
 
 def plans_of(card: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     """The plans that weights were trained on, by their card: those rehearsed, and that of their samples."""
-    found = [*(card.get("rehearsed") or {}).get("plans", ()), (card.get("dataset") or {}).get("plan")]
+    rehearsed, dataset = card.get("rehearsed"), card.get("dataset")
+    earlier = rehearsed.get("plans") if isinstance(rehearsed, Mapping) else None
+    last = dataset.get("plan") if isinstance(dataset, Mapping) else None
+    found = [*(earlier if isinstance(earlier, (list, tuple)) else ()), last]
     return [one for one in found if isinstance(one, Mapping) and {"garment", "count"} <= set(one)]

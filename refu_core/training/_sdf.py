@@ -274,6 +274,7 @@ def train_sdf(
     log.end()
     if is_writer():
         save_sdf_network(output / name, network, card)
+        checkpoint.unlink(missing_ok=True)
     return card
 
 

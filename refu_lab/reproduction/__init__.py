@@ -28,6 +28,7 @@ from refu_lab.reproduction._tables import PAPER as PAPER
 from refu_lab.reproduction._tables import Missing as Missing
 from refu_lab.reproduction._tables import ResultTable as ResultTable
 from refu_lab.reproduction._tables import format_value as format_value
+from refu_lab.reproduction._tables import is_summary as is_summary
 from refu_lab.reproduction._tables import label_of as label_of
 from refu_lab.reproduction._tables import paper_figure as paper_figure
 from refu_lab.reproduction._tables import published_modes as published_modes

@@ -179,7 +179,7 @@ class Predictor:
         output = pipeline(frame)
         ms = {"node": 1e3 * (time.perf_counter() - start)}
         ms |= {f"node {stage}": spent for stage, spent in output.stats.stage_ms.items()}
-        return _outcome(torch.from_numpy(output[self._setup.template.name].local), ms)
+        return _outcome(torch.tensor(output[self._setup.template.name].local), ms)
 
 
 def _with_margin(refu: Refu, margin: float | None) -> Refu:

@@ -19,6 +19,7 @@ from refu_lab.tables import RESULT_TABLES, TextTable, picture_markdown, write_js
 ALL = "all"
 """Stands for all garments, weighted by their numbers of test samples."""
 _NO_VALUE = "–"
+_SUMMARY = "The paper's tables and figures, on simulated data of this project; `refu evaluate` writes these pages."
 _PAPER_NOTE = (
     "*Figures of the paper, in italics, were measured on other data (TailorNet's, of which the authors selected "
     "samples) and other hardware (a server with V100 GPUs): compare orders and ratios, not absolute figures.*"
@@ -266,6 +267,15 @@ def read_table(folder: Path, name: str) -> ResultTable | None:
         raise RefuError(msg) from error
 
 
+def is_summary(page: Path) -> bool:
+    """Whether a page is one that `write_summary` has written. Raises `RefuError` for one that can't be read."""
+    try:
+        return _SUMMARY in page.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        msg = f"{page}: can't be read: {error.strerror}"
+        raise RefuError(msg) from error
+
+
 def write_summary(folder: Path) -> Path:
     """Writes `README.md`: all tables that are in the folder, the main one's figures, the pictures.
 
@@ -288,7 +298,7 @@ def write_summary(folder: Path) -> Path:
     about = folder / "about.txt"
     parts = [
         "# Results",
-        "The paper's tables and figures, on simulated data of this project; `refu evaluate` writes these pages.",
+        _SUMMARY,
         *([about.read_text(encoding="utf-8").strip()] if about.exists() else []),
         "\n".join(links),
         _PAPER_NOTE,

@@ -219,7 +219,7 @@ def _closest_skin(
 
     Where limbs overlap the closest skin may be inside: it is the closest that isn't.
     """
-    raw, body = torch.from_numpy(mesh.raw), torch.from_numpy(out.body)
+    raw, body = torch.tensor(mesh.raw), torch.tensor(out.body)
     sdf, stage = subject.distances["exact"], subject.contact_stage
     sdf.update(body)
     stage.update(body)

@@ -33,8 +33,9 @@ TSHIRT = Wanted(sleeve=0.35, step=0.028)
         SQUARE.replace("\n", "  # said beside it\n"),
         SQUARE.replace("v ", "  v  ").replace(" 0\n", " 0 0.5 0.5 0.5\n"),
         SQUARE.replace("f 1 2 3 4", "f 1//7 2//7 \\\n 3//7 4//7"),
+        SQUARE.replace("f 1 2 3 4", "f 1//7 2//7 \\\n 3//7 4//7").replace("\n", "\r\n"),
     ],
-    ids=["mark", "line ends", "tabs", "comments", "colours", "broken line"],
+    ids=["mark", "line ends", "tabs", "comments", "colours", "broken line", "broken line with other ends"],
 )
 def test_dialects_of_obj(text: str, tmp_path: Path) -> None:
     (tmp_path / "a.obj").write_bytes(text.encode())

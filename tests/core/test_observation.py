@@ -202,5 +202,7 @@ def test_nothing_drifts_in_an_hour_of_bad_measurements() -> None:
     ],
 )
 def test_bad_points_get_a_sentence(observer: Observer, points: object, eye: object, said: str) -> None:
+    with pytest.raises(FrameError, match="wanted a SmplFrame, got list"):
+        observer([SmplFrame(pose=np.zeros(72))], points)  # type: ignore[arg-type]
     with pytest.raises(FrameError, match=said):
         observer(SmplFrame(pose=np.zeros(72)), points, eye=eye)

@@ -271,15 +271,15 @@ def test_clearance_is_exact_where_it_says_so(pipeline: GarmentPipeline) -> None:
     out = pipeline(standing(arms=1.4))
     ask = Clearance.of(pipeline)
     slow = ExactSdf(pipeline.body.faces)
-    slow.update(torch.from_numpy(out.body))
+    slow.update(torch.tensor(out.body))
     for name, found in ask(out).items():
-        true = slow.query(torch.from_numpy(out[name].local)).distance.numpy()
+        true = slow.query(torch.tensor(out[name].local)).distance.numpy()
         near = true < ask.reach
         assert near.any()
         assert np.abs(found[near] - true[near]).max() < 1e-6
         assert (found[~near] == np.float32(ask.reach)).all()
         raw = ask.of_garment(name, out[name].raw)  # before it was brought off the body
-        inside = slow.query(torch.from_numpy(out[name].raw)).distance.numpy()
+        inside = slow.query(torch.tensor(out[name].raw)).distance.numpy()
         assert (inside < 0).any()
         assert np.abs(raw[inside < 0] - inside[inside < 0]).max() < 1e-6
     with pytest.raises(MeshError, match="no garment 'cap' here: wanted one of tshirt-male, short-pant-male"):
@@ -324,6 +324,13 @@ def first_hits(eye: np.ndarray, targets: np.ndarray, vertices: np.ndarray, faces
                 hit &= (np.cross(q - p, there - p) * normal).sum(1) >= 0
         found.append(t[hit].min() if hit.any() else np.inf)
     return np.array(found)
+
+
+def test_where_nobody_is_nothing_is_seen() -> None:
+    camera = PinholeCamera.looking_at(np.zeros(3), np.array([0.0, 0.0, 2.0]))
+    assert all_visible([], camera) == []
+    assert np.isinf(depth_image([], camera)).all()
+    assert depth_image([], camera).shape == (camera.height, camera.width)
 
 
 def test_visible_agrees_with_rays(pipeline: GarmentPipeline) -> None:

@@ -123,6 +123,7 @@ def test_the_inputs_covariance_is_that_of_samples(pipeline: GarmentPipeline, is_
         ({"pose_covariance": -np.eye(72)}, "negative variance"),
         ({"transl_covariance": np.full((3, 3), np.nan)}, "transl_covariance must be finite"),
         ({"transl_covariance": "wide"}, "transl_covariance must be finite numbers"),
+        ({"pose_covariance": 1e300 * np.eye(72)}, r"pose_covariance: wanted numbers up to 1e\+12, got 1e\+300"),
     ],
 )
 def test_a_bad_covariance_gets_a_sentence(pipeline: GarmentPipeline, given: dict[str, object], said: str) -> None:

@@ -61,10 +61,10 @@ def test_what_comes_out(pipeline: GarmentPipeline) -> None:
 def test_garments_are_pushed_to_the_margin_and_no_farther(pipeline: GarmentPipeline) -> None:
     out = pipeline(frame(1, spread=0.12))
     sdf = ExactSdf(pipeline.body.faces)
-    sdf.update(torch.as_tensor(out.body))
+    sdf.update(torch.tensor(out.body))
     for name, mesh in out.items():
-        before = sdf.query(torch.as_tensor(mesh.raw)).distance.numpy()
-        after = sdf.query(torch.as_tensor(mesh.local)).distance.numpy()
+        before = sdf.query(torch.tensor(mesh.raw)).distance.numpy()
+        after = sdf.query(torch.tensor(mesh.local)).distance.numpy()
         moved = np.linalg.norm(mesh.local - mesh.raw, axis=1)
         assert after.min() > 0, name
         clear = (before > 0.02) & (moved == 0)
@@ -112,10 +112,29 @@ def test_garments_are_brought_off_the_collider(sdf: str) -> None:
     np.testing.assert_allclose(apart["tshirt-male"].raw, through["tshirt-male"].raw + taken_along, atol=2e-6)
     if sdf != "none":
         inside = Winding(with_one.body.faces)
-        inside.update(torch.as_tensor(apart.body))
-        found = inside(torch.as_tensor(apart["tshirt-male"].local)).count_nonzero()
+        inside.update(torch.tensor(apart.body))
+        found = inside(torch.tensor(apart["tshirt-male"].local)).count_nonzero()
         assert apart.stats.garments["tshirt-male"].n_unresolved == found, "certified by the collider"
         assert found == 0
+
+
+def test_nobody_can_write_in_what_others_get(pipeline: GarmentPipeline) -> None:
+    frame = SmplFrame(pose=np.zeros((24, 3)))
+    for out in (pipeline(frame), *pipeline([frame, frame])):
+        mesh = next(iter(out.values()))
+        for array in (mesh.local, mesh.raw, mesh.faces, out.body, out.skin):
+            with pytest.raises(ValueError, match="read-only"):
+                array[0] = 1
+        mesh.vertices[0] = 1  # is made anew each time
+
+
+def test_a_style_beyond_the_promise_is_not_promised() -> None:
+    frame = SmplFrame(pose=np.zeros((24, 3)))
+    assert within_promise(frame, [3, -3, 0, 0])
+    assert not within_promise(frame, [0, 0, 0, -3.1])
+    pipeline = GarmentPipeline.load(["tshirt-male"], backbone="skinned", style=[5, 0, 0, 0])
+    assert not pipeline(frame).stats.within_promise
+    assert pipeline(SmplFrame(pose=np.zeros((24, 3)), style=np.zeros(4))).stats.within_promise
 
 
 def test_a_body_deeper_in_itself_than_flesh_gives_way_is_no_promised_one() -> None:

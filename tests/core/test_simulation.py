@@ -408,15 +408,19 @@ def test_damaged_sets_are_refused(simulated: Path, tmp_path: Path) -> None:
     shutil.copy(simulated / "card.json", tmp_path)
     with pytest.raises(SimulationError, match="no shard"):
         GarmentDataset(tmp_path)
-    for damage in ("missing", "shape", "unseen"):
+    for damage in ("missing", "shape", "unseen", "betas", "unit"):
         path = shutil.copytree(simulated, tmp_path / damage)
         if damage == "missing":
             (path / "shard-0-of-1" / "betas.npy").unlink()
-        elif damage == "shape":
-            np.save(path / "shard-0-of-1" / "betas.npy", np.zeros((COUNT, 9), np.float32))
+        elif damage in ("shape", "betas"):
+            values = np.zeros((COUNT, 9), np.float32) if damage == "shape" else np.full((COUNT, 10), np.nan, np.float32)
+            np.save(path / "shard-0-of-1" / "betas.npy", values)
+        elif damage == "unit":
+            card = json.loads((path / "card.json").read_text())
+            (path / "card.json").write_text(json.dumps(card | {"quantum_m": 1.0}))
         else:
             (path / "unseen.npy").write_bytes(b"not an array")
-        with pytest.raises(SimulationError, match=r"betas|unseen"):
+        with pytest.raises(SimulationError, match=r"betas|unseen|wanted positions in units of 6.1"):
             GarmentDataset(path)
     (tmp_path / "card.json").write_text('{"format": "other"}')
     with pytest.raises(SimulationError, match="format"):
@@ -668,7 +672,14 @@ def test_full_disk_is_said_before_anything_is_simulated(
     assert not list((tmp_path / "set").glob("shard-*"))
 
 
-@pytest.mark.parametrize("numbers", [{"count": 0}, {"pivots": 0}, {"block": 0}, {"test_share": 1.0}, {"spread": 0.0}])
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        *({"count": 0}, {"pivots": 0}, {"block": 0}, {"test_share": 1.0}, {"spread": 0.0}),
+        *({"count": "10"}, {"count": 10.5}, {"count": 10**12}, {"seed": -1}, {"seed": "x"}, {"recorded_share": "0.5"}),
+        *({"pivots": None}, {"spread": None}),
+    ],
+)
 def test_impossible_plans_are_refused(numbers: dict[str, Any]) -> None:
     with pytest.raises(SimulationError, match="got"):
         SamplePlan(GARMENT, **({"count": 10} | numbers))

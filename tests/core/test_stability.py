@@ -140,8 +140,8 @@ def test_where_the_closest_skin_leaps_both_ways_out_are_as_long() -> None:
     points, bodies, found = [], [], []
     for frame in trial.frames:
         out = subject.pipeline(frame)
-        points.append(torch.from_numpy(out["skirt-female"].raw))
-        bodies.append(torch.from_numpy(out.body))
+        points.append(torch.tensor(out["skirt-female"].raw))
+        bodies.append(torch.tensor(out.body))
         sdf.update(bodies[-1])
         found.append(sdf.closest(points[-1]))
     before, now = ((one.barycentrics[..., None] * bodies[-1][sdf.faces[one.face.long()]]).sum(1) for one in found)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from refu_core import load_body, load_garment
 from refu_core.backbones import Mlp, MlpConfig, backbone_from_weights
-from refu_core.errors import RefuError
+from refu_core.errors import RefuError, WeightsError
 from refu_core.simulation import Clip, SamplePlan, split_clips
 from refu_core.training import LoopSettings, PretrainSettings, Rehearsal, pretrain
 from refu_core.training._pretrain import tell_of
@@ -33,13 +33,13 @@ def lifted(pose: Tensor, *, by: float) -> Tensor:
     return (by * pose[:, 1, 0])[:, None, None] * torch.tensor([0.0, 1.0, 0.0]).expand(len(pose), n, 3)
 
 
-def made(folder: Path, *, spread: float, by: float) -> Path:
+def made(folder: Path, *, spread: float, by: float, plan: SamplePlan = PLAN) -> Path:
     """A small set that says which plan it is of."""
     garment = load_garment(GARMENT)
     body = load_body(garment.body)
     write_set(folder, garment, body, pairs=12, poses=5, spread=spread, displacement=lambda pose: lifted(pose, by=by))
     card = json.loads((folder / "card.json").read_text())
-    (folder / "card.json").write_text(json.dumps(card | {"plan": asdict(PLAN)}))
+    (folder / "card.json").write_text(json.dumps(card | {"plan": asdict(plan)}))
     return folder
 
 
@@ -56,7 +56,7 @@ def first(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def further(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Samples of hips bent by .6, where cloth is lowered."""
-    return made(tmp_path_factory.mktemp("further"), spread=0.6, by=-0.05)
+    return made(tmp_path_factory.mktemp("further"), spread=0.6, by=-0.05, plan=replace(PLAN, seed=1))
 
 
 def test_bodies_of_the_plan_are_what_is_rehearsed(first: Path) -> None:
@@ -79,9 +79,19 @@ def test_what_was_learnt_later_is_rehearsed_too(first: Path) -> None:
     network = backbone_from_weights(stored, load_garment(GARMENT))
     later = replace(PLAN, count=24, seed=5)
     card = {"rehearsed": {"count": 3, "plans": [asdict(PLAN)]}, "dataset": {"plan": asdict(later)}}
-    samples = Rehearsal(1000).of(card, network)
+    samples = Rehearsal(1000).of({"garment": GARMENT, **card}, network)
     wanted = [plan.pose(slot, 0, [])[0] for plan in (PLAN, later) for slot in range(plan.count - plan.n_test)]
     np.testing.assert_array_equal(samples.pose, np.stack(wanted))
+
+
+def test_bodies_whose_truth_is_known_are_not_asked_about(first: Path) -> None:
+    stored = load_weights(first / "mlp-none")
+    network = backbone_from_weights(stored, load_garment(GARMENT))
+    later = asdict(replace(PLAN, count=24, seed=5))
+    card = {"garment": GARMENT, "rehearsed": {"plans": [asdict(PLAN)]}, "dataset": {"plan": later}}
+    assert len(Rehearsal(1000).of(card, network, known=later)) == PLAN.count - PLAN.n_test
+    with pytest.raises(RefuError, match="nothing to rehearse"):
+        Rehearsal(3).of(stored.card, network, known=asdict(PLAN))
 
 
 def test_recorded_poses_are_those_of_the_training_motions(first: Path) -> None:
@@ -89,18 +99,58 @@ def test_recorded_poses_are_those_of_the_training_motions(first: Path) -> None:
     network = backbone_from_weights(stored, load_garment(GARMENT))
     plan = asdict(replace(PLAN, recorded_share=1.0))
     clips = [Clip(name, np.full((5, 24, 3), k, np.float32), np.zeros((5, 3)), 30.0) for k, name in enumerate("abc")]
-    samples = Rehearsal(20, clips).of({"dataset": {"plan": plan}}, network)
+    card = {"garment": GARMENT, "dataset": {"plan": plan}}
+    samples = Rehearsal(20, clips).of(card, network)
     training = {float(clip.poses[0, 5, 0]) for clip in split_clips(clips)[0]}
     assert {float(pose[5, 0]) for pose in samples.pose} == training
     with pytest.raises(RefuError, match=r"up to 100% of what is to be rehearsed are recorded poses: give"):
-        Rehearsal(20).of({"dataset": {"plan": plan}}, network)
+        Rehearsal(20).of(card, network)
 
 
 @pytest.mark.parametrize("card", [{}, {"dataset": {}}, {"dataset": {"plan": {"count": 3}}}])
 def test_weights_without_a_plan_have_nothing_to_rehearse(first: Path, card: dict[str, Any]) -> None:
     network = backbone_from_weights(load_weights(first / "mlp-none"), load_garment(GARMENT))
     with pytest.raises(RefuError, match="nothing to rehearse"):
-        Rehearsal(3).of(card, network)
+        Rehearsal(3).of({"garment": GARMENT, **card}, network)
+
+
+@pytest.mark.parametrize(
+    "card",
+    [
+        *({"rehearsed": "x"}, {"rehearsed": []}, {"rehearsed": {"plans": 5}}, {"dataset": "x"}),
+        {"dataset": {"plan": asdict(PLAN) | {"garment": "skirt-female"}}},
+        {"dataset": {"plan": asdict(PLAN) | {"garment": 5}}},
+        {"dataset": {"plan": asdict(PLAN) | {"count": None}}},
+    ],
+)
+def test_damaged_cards_get_a_sentence(first: Path, card: dict[str, Any]) -> None:
+    network = backbone_from_weights(load_weights(first / "mlp-none"), load_garment(GARMENT))
+    with pytest.raises(RefuError, match=r"nothing to rehearse|a plan is made of"):
+        Rehearsal(3).of({"garment": GARMENT, **card}, network)
+
+
+def test_a_plan_without_end_is_not_counted_out(first: Path) -> None:
+    network = backbone_from_weights(load_weights(first / "mlp-none"), load_garment(GARMENT))
+    plan = replace(PLAN, count=10**9, recorded_share=0.0)
+    assert len(Rehearsal(5).of({"garment": GARMENT, "dataset": {"plan": asdict(plan)}}, network)) == 5
+
+
+@pytest.mark.usefixtures("no_curves")
+def test_weights_that_need_another_basis_keep_theirs(first: Path, further: Path, tmp_path: Path) -> None:
+    """Those of a folder that were trained from scratch before."""
+    folder = tmp_path / "own"
+    config = MlpConfig((0, 1, 2, 4, 5), hidden=(8,))
+    few = replace(QUICK, rank=4, steps=3)
+    pretrain(GARMENT, further, folder, backbone="mlp", settings=few, config=config, quiet=True)
+    before = (folder / "basis.safetensors").read_bytes()
+    how: dict[str, Any] = {"backbone": "mlp", "settings": few, "start": first, "quiet": True}
+    (folder / "tailornet-none.json").write_text((folder / "mlp-none.json").read_text())
+    with pytest.raises(WeightsError, match=r"tailornet-none.json: was trained with another basis .* use a new folder"):
+        pretrain(GARMENT, further, folder, **how)
+    assert (folder / "basis.safetensors").read_bytes() == before
+    (folder / "tailornet-none.json").unlink()
+    pretrain(GARMENT, further, folder, **how)
+    assert (folder / "basis.safetensors").read_bytes() == (first / "basis.safetensors").read_bytes()
 
 
 @torch.no_grad()

@@ -248,6 +248,13 @@ def test_a_bag_without_truth_or_with_that_of_several_garments_is_refused(bag: st
         SampleSet.open(BAGS / bag)
 
 
+def test_a_page_of_somebody_else_stays(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "README.md").write_text("# My robot\n")
+    assert run("--data", dataset, "--table", "postures", "--output", tmp_path) == 2
+    assert "is there already, and no page of refu evaluate" in capsys.readouterr().err
+    assert (tmp_path / "README.md").read_text() == "# My robot\n"
+
+
 def test_two_sets_of_one_garment_are_refused(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("--data", dataset, dataset, "--output", tmp_path / "out") == 2
     assert "one data set a garment" in capsys.readouterr().err

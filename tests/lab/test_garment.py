@@ -11,6 +11,7 @@ import pytest
 import torch
 import trimesh
 from outside_meshes import MESHES, Outside, quads_of_a_skirt, write_obj
+from scipy.spatial import cKDTree
 from small_set import write_set
 
 from refu_core import GarmentError, GarmentPipeline, RefuError, SmplFrame, load_body, load_garment
@@ -69,7 +70,7 @@ def test_meshes_from_elsewhere_are_worn(name: str, tmp_path: Path) -> None:
     pipeline = GarmentPipeline.load([garment], sdf="none")
     pose = np.zeros((24, 3), np.float32)
     pose[16, 2], pose[17, 2], pose[1, 0], pose[2, 0] = -1.0, 1.0, -0.5, 0.4
-    now = torch.from_numpy(pipeline(SmplFrame(pose=pose))["worn"].local)
+    now = torch.tensor(pipeline(SmplFrame(pose=pose))["worn"].local)
     stretch = (now[edges[:, 0]] - now[edges[:, 1]]).norm(dim=-1) / was
     assert float(stretch.quantile(0.99)) < 1.8
 
@@ -242,6 +243,23 @@ def test_an_obj_comes_back_as_it_was(dressed: list[ExportMesh], tmp_path: Path) 
         write_meshes([replace(dressed[0], vertices=dressed[0].vertices[:1]), kilt], tmp_path / "b.obj")[0]
     )
     np.testing.assert_array_equal(both.faces[-len(kilt.faces) :] - dressed[0].vertices.shape[1], kilt.faces)
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".obj"])
+def test_far_from_the_origin_nothing_is_rounded_away(dressed: list[ExportMesh], tmp_path: Path, suffix: str) -> None:
+    """In a map's frame people are a thousand kilometres off."""
+    far = [replace(one, vertices=one.vertices[:1] + np.array([4e5, 0.0, -6e6])) for one in dressed]
+    (path,) = write_meshes(far, tmp_path / f"far{suffix}")
+    if suffix == ".glb":
+        mesh = trimesh.load_scene(path, process=False).to_geometry()
+        (place,) = {tuple(np.round(t[:3, 3])) for t, _ in map(trimesh.load_scene(path).graph.get, ("body", "kilt"))}
+        assert np.abs(np.array(place) - (4e5, 0, -6e6)).max() < 2
+        vertices = np.unique(np.round(mesh.vertices, 5), axis=0)
+    else:
+        vertices = np.unique(np.round(read_surface(path).vertices, 5), axis=0)
+    wanted = np.unique(np.round(np.concatenate([one.vertices[0] for one in far]), 5), axis=0)
+    distance, _ = cKDTree(vertices - (4e5, 0, -6e6)).query(wanted - (4e5, 0, -6e6))
+    assert distance.max() < 2e-5
 
 
 def test_a_usd_stage_moves(dressed: list[ExportMesh], tmp_path: Path) -> None:

@@ -88,6 +88,10 @@ def test_weights_that_are_not_there_are_refused(tmp_path: Path) -> None:
         ([GARMENT, "--margin", "-1"], "margin"),
         ([GARMENT, "--steps", "0"], "above zero"),
         ([GARMENT, "--device", "quantum"], "quantum"),
+        ([GARMENT, "--start", ".", "--margin", "0.01"], "goes on with networks as they are: leave --scale, --margin"),
+        ([GARMENT, "--start", ".", "--network", "sdf"], "goes on with networks as they are"),
+        ([GARMENT, "--start", ".", "--joints", "spine1,thumb"], "no joint thumb: wanted some of pelvis, left_hip"),
+        ([GARMENT, "--joints", "spine1"], "--start"),
     ],
 )
 def test_bad_options_are_one_line(
