@@ -183,7 +183,8 @@ def as_points(
         bad = int((~np.isfinite(points)).any(axis=1).sum())
         msg = f"{name} must be finite, got {bad} of {len(points)} with NaN or infinite coordinates"
         raise MeshError(msg)
-    return points
+    # Torch warns of arrays that are read-only, as a pipeline's are.
+    return points if points.flags.writeable else points.copy()
 
 
 def vertex_normals(vertices: NDArray[_Float], faces: NDArray[np.int32]) -> NDArray[_Float]:

@@ -145,9 +145,9 @@ def with_dynamics(name: str, network: Backbone, weights: Weights) -> Backbone:
     expect = {key: weights.card.get(key) for key in ("garment", "body_fingerprint", "basis_sha256")}
     stored = load_weights(weights.path.with_name("dynamics"), expect=expect)
     config = config_of_card(DynamicsConfig, stored.card.get("config"))
-    if not all(joint < N_JOINTS for joint in config.joints):
-        msg = f"{stored.path}: wanted joints below {N_JOINTS}, got {config.joints}; train it again"
-        raise WeightsError(msg)
+    if not set(config.joints) <= {0, *network.config.joints}:
+        msg = f"{stored.path}: wanted joints below {N_JOINTS} that the tailornet knows ({network.config.joints}), got "
+        raise WeightsError(f"{msg}{config.joints}; train it again")
     try:
         dynamics = build_for(stored.tensors, lambda: Dynamics(config, network))
     except WeightsError as error:

@@ -99,7 +99,7 @@ def train_dynamics(
     torch_device = start_parallel(device)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.loop.seed)
-        dynamics = Dynamics(DynamicsConfig(template.card.joints), still)
+        dynamics = Dynamics(DynamicsConfig(still.config.joints), still)
     mirror = Mirror.of(template)
     plain = _known(still, opened.samples, _pasts(rows, rows.train))
     turned = _known(still, mirrored(opened.samples, mirror), _pasts(rows, rows.train, is_mirrored=True))

@@ -42,6 +42,7 @@ from refu_core.training import (
     read_samples,
     train_dynamics,
 )
+from refu_core.training._pretrain import tell_of
 from refu_core.weights import load_weights
 from refu_lab.stress._frames import promised
 
@@ -243,6 +244,19 @@ def test_joints_that_do_not_move_the_garment_say_nothing() -> None:
     assert torch.equal(network_code(betas, pose, past), network_code(betas, pose, torch.zeros_like(past)))
 
 
+def test_what_a_tailornet_learns_of_later_changes_no_dynamics() -> None:
+    """They are told of the joints that they were trained with."""
+    network, draw = untrained(), torch.Generator().manual_seed(0)
+    shapes = (10,), (24, 3), (len(LAGS), N_PAST)
+    betas, pose, past = (0.3 * torch.randn(4, *shape, generator=draw) for shape in shapes)
+    before = network(betas, pose, None, past=past)
+    tell_of(network.still, (16, 17), pose)
+    later = Dynamics(network.dynamics.config, network.still)
+    later.load_state_dict(network.dynamics.state_dict())
+    after = Dynamic(network.still, later).eval()(betas, pose, None, past=past)
+    torch.testing.assert_close(after, before, atol=1e-6, rtol=0)
+
+
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """Weights of `NETWORK`, where `GarmentPipeline.load` finds them."""
@@ -285,6 +299,7 @@ def test_what_does_not_belong_together_is_refused(folder: Path) -> None:
         ({"basis_sha256": "another"}, "basis_sha256"),
         ({"garment": "skirt-female"}, "garment"),
         ({"config": {"joints": [0, 24]}}, "joints below 24"),
+        ({"config": {"joints": [0, 16]}}, "that the tailornet knows"),
         ({"config": {"joints": [0, 1], "hidden": [16]}}, "doesn't fit tailornet-hybrid"),
         ({"config": {"joints": [0, 1], "depth": 3}}, "doesn't know"),
     ):
