@@ -147,7 +147,8 @@ def with_dynamics(name: str, network: Backbone, weights: Weights) -> Backbone:
     config = config_of_card(DynamicsConfig, stored.card.get("config"))
     if not set(config.joints) <= {0, *network.config.joints}:
         msg = f"{stored.path}: wanted joints below {N_JOINTS} that the tailornet knows ({network.config.joints}), got "
-        raise WeightsError(f"{msg}{config.joints}; train it again")
+        msg += f"{config.joints}; train it again"
+        raise WeightsError(msg)
     try:
         dynamics = build_for(stored.tensors, lambda: Dynamics(config, network))
     except WeightsError as error:

@@ -116,6 +116,7 @@ def test_the_output_shows_who_wears_it_and_says_how_it_fits(small_bag: Path, tmp
     assert run(small_bag, "--output", out, "--garments", "short-pant-male") == 0
     pipeline = GarmentPipeline.load(["short-pant-male"])
     bodies, reports = ([ros for _, _, ros in decoded(out, name)] for name in ("/body", "/diagnostics"))
+    n_inside = 0
     for array, report, frame in zip(bodies, reports, motion(), strict=True):
         (marker,) = array.markers
         wanted = pipeline(frame)
@@ -127,10 +128,12 @@ def test_the_output_shows_who_wears_it_and_says_how_it_fits(small_bag: Path, tmp
         assert (received.name, received.message) == ("refu replay: input", "/smpl_params")
         assert shorts.name == "refu replay: short-pant-male"
         said = {pair.key: pair.value for pair in shorts.values}
-        assert int(said["vertices inside before"]) > 0
+        assert int(said["vertices inside before"]) == wanted.stats.garments["short-pant-male"].n_inside
+        n_inside += int(said["vertices inside before"])
         assert said["vertices inside"] == "0"
         is_free = said["intersecting pairs of triangles"] == "0"
         assert (shorts.level, shorts.message == "free of collisions") == (0 if is_free else 1, is_free)
+    assert n_inside > 0
     assert run(small_bag, "--output", bare, "--garments", "short-pant-male", "--no-body", "--no-evaluate") == 0
     kept = [message for message in raw_messages(out) if message[0] in ("/garments", "/smpl_params")]
     assert [message for message in raw_messages(bare) if message[0] != "/diagnostics"] == kept
