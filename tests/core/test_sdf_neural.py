@@ -220,12 +220,13 @@ def test_training_lowers_the_error_and_resumes_to_the_same_weights(
         patch.setattr("refu_core.training._sdf.sdf_figures", _FailsAt(3))
         with pytest.raises(KeyboardInterrupt):
             train_sdf(dataset, body, garment, tmp_path / "twice", settings=settings, quiet=True)
+    with pytest.raises(RefuError, match=r"other settings or data"):
+        train_sdf(dataset, body, garment, tmp_path / "twice", settings=SdfSettings(preset="tiny", seed=1), quiet=True)
     train_sdf(dataset, body, garment, tmp_path / "twice", settings=settings, quiet=True)
+    assert not list((tmp_path / "twice").glob("*.checkpoint"))
     resumed = load_sdf_network(tmp_path / "twice" / "sdf-tiny", body)
     for name, tensor in trained.state_dict().items():
         assert torch.equal(tensor, resumed.state_dict()[name]), name
-    with pytest.raises(RefuError, match=r"other settings or data"):
-        train_sdf(dataset, body, garment, tmp_path / "twice", settings=SdfSettings(preset="tiny", seed=1), quiet=True)
 
 
 def test_rates_are_the_papers_or_fall_to_nothing() -> None:
