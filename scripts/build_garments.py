@@ -116,7 +116,7 @@ _TRUNK = (0, 1, 2, 3, 6, 9, 12, 13, 14)
 """Joints between hips and neck."""
 _BELOW = (0, 1, 2, 3, 4, 5, 6, 9)
 """What is worn below the waist feels how the trunk bends: without the spine, shorts were off by 11 mm in everyday
-postures, with it by 8."""
+postures, with it by 7."""
 _PROVENANCE = (
     "MakeHuman's clothes helpers, targets and skinning weights (CC0 1.0), cut and draped by scripts/build_garments.py, "
     "styles by scripts/build_styles.py; CC0 1.0"

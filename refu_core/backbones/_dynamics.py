@@ -67,8 +67,8 @@ class Dynamics(nn.Module):
         """Takes the inputs' sizes from the training set; which of x and s `is_bounded` says, the past always is."""
         moved = self.seen(past)
         bounded = (is_bounded[self._now], is_bounded[x.shape[1] :], torch.ones(moved.shape[1], dtype=torch.bool))
-        now = x[:, self._now]
-        self.net.standardise(torch.cat((now, s, moved), 1), self.groups, is_bounded=torch.cat(bounded))
+        inputs = torch.cat((x[:, self._now], s, moved), 1)
+        self.net.standardise(inputs, self.groups, is_bounded=torch.cat(bounded))
 
 
 class Dynamic(nn.Module):

@@ -78,7 +78,7 @@ class CollisionChecker:
 
     def update(self, body_vertices: Any) -> None:
         """Takes over a new pose: the body's vertices [m], shape (V, 3). Raises `MeshError` as `ExactSdf.update`."""
-        vertices = torch.tensor(as_vertices("the body's vertices", body_vertices))
+        vertices = torch.from_numpy(as_vertices("the body's vertices", body_vertices))
         self._body.update(vertices)
         self._winding.update(vertices)
 
@@ -89,7 +89,7 @@ class CollisionChecker:
         """
         vertices = as_vertices("the garment's vertices", garment_vertices)
         found = crossings(self._body.mesh_id, vertices, self._triangles_of(garment_faces, vertices))
-        points = torch.tensor(vertices)
+        points = torch.from_numpy(vertices)
         # 2 where limbs are in each other; where skin is turned inside out it is -1, and nobody's inside.
         inside = (self._winding(points) > 0).numpy()
         depth = np.zeros(len(vertices), np.float32)

@@ -49,7 +49,7 @@ def crossings(mesh_id: int, vertices: NDArray[np.float32], triangles: Triangles,
     With `is_body` the mesh is that body: pairs are given once, those that share an edge not at all,
     those that share a vertex where they meet elsewhere, too.
     """
-    points = torch.tensor(vertices)
+    points = torch.as_tensor(vertices)
     n_faces = len(triangles.faces)
     count = torch.zeros(1, dtype=torch.int32)
     room = max(1024, n_faces)

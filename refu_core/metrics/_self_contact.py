@@ -107,6 +107,6 @@ class SelfContactDetector:
 
 
 def _are_inside(winding: Winding, vertices: NDArray[np.float32], points: NDArray[np.float32]) -> NDArray[np.bool_]:
-    winding.update(torch.tensor(vertices))
+    winding.update(torch.from_numpy(vertices))
     inside: NDArray[np.bool_] = (winding(torch.from_numpy(points)) > 0).numpy()
     return inside

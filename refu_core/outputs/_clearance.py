@@ -49,7 +49,7 @@ class Clearance:
 
     def update(self, body: Any) -> None:
         """Takes over a posed collider, vertices (V, 3) [m]. Raises `MeshError` for what is none."""
-        self._sdf.update(torch.tensor(as_points("the body's vertices", body, dtype=np.float32)))
+        self._sdf.update(torch.from_numpy(as_points("the body's vertices", body, dtype=np.float32)))
 
     def of_garment(self, name: str, vertices: Any) -> NDArray[np.float32]:
         """Distance of a garment's vertices (V, 3) [m] to the collider, negative inside [m], shape (V,).

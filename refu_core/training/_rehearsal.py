@@ -39,7 +39,7 @@ class Rehearsal:
         motions that aren't there.
         """
         names = {field.name for field in fields(SamplePlan)}
-        given = [one for one in plans_of(card) if one != known]
+        given = plans_of(card, known=known)
         plans = [SamplePlan(**{key: value for key, value in one.items() if key in names}) for one in given]
         if not plans or not all(str(card["garment"]) in names_of(plan.garment).split("+") for plan in plans):
             msg = "nothing to rehearse: the weights' card doesn't say what plan of their garment they were trained on"
@@ -64,10 +64,10 @@ class Rehearsal:
         return TrainingSamples(pose, betas, style, displacement, torch.arange(len(chosen)))
 
 
-def plans_of(card: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """The plans that weights were trained on, by their card: those rehearsed, and that of their samples."""
+def plans_of(card: Mapping[str, Any], *, known: Mapping[str, Any] | None = None) -> list[Mapping[str, Any]]:
+    """The plans that weights were trained on, by their card: those rehearsed, and that of their samples; not `known`."""
     rehearsed, dataset = card.get("rehearsed"), card.get("dataset")
     earlier = rehearsed.get("plans") if isinstance(rehearsed, Mapping) else None
     last = dataset.get("plan") if isinstance(dataset, Mapping) else None
     found = [*(earlier if isinstance(earlier, (list, tuple)) else ()), last]
-    return [one for one in found if isinstance(one, Mapping) and {"garment", "count"} <= set(one)]
+    return [one for one in found if isinstance(one, Mapping) and {"garment", "count"} <= set(one) and one != known]
