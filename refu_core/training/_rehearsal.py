@@ -65,7 +65,7 @@ class Rehearsal:
 
 
 def plans_of(card: Mapping[str, Any], *, known: Mapping[str, Any] | None = None) -> list[Mapping[str, Any]]:
-    """The plans that weights were trained on, by their card, but for `known`: those rehearsed, then that of their set."""
+    """The plans that weights were trained on, by their card, but for `known`: those rehearsed, then their set's."""
     rehearsed, dataset = card.get("rehearsed"), card.get("dataset")
     earlier = rehearsed.get("plans") if isinstance(rehearsed, Mapping) else None
     last = dataset.get("plan") if isinstance(dataset, Mapping) else None
