@@ -35,7 +35,7 @@ from refu_core.outputs import (
     load_sigma,
     visible,
 )
-from refu_lab.truth import Moment, coverage, cross_checked, held_out, moments_of
+from refu_lab.truth import TrueFrame, coverage, cross_checked, held_out, moments_of
 
 BAGS = Path(__file__).parents[1] / "bags"
 GARMENTS = ("tshirt-male", "shirt-male", "short-pant-male", "skirt-female")
@@ -153,7 +153,7 @@ def observation() -> None:
     _follow(pipeline, "tshirt-male", moments, keeps=True)
 
 
-def _follow(pipeline: GarmentPipeline, garment: str, moments: list[Moment], *, keeps: bool) -> None:
+def _follow(pipeline: GarmentPipeline, garment: str, moments: list[TrueFrame], *, keeps: bool) -> None:
     observer, faces = Observer(pipeline), pipeline.garments[garment].faces.numpy()
     skin_faces, rng = pipeline.body.faces.numpy(), np.random.default_rng(0)
     plain, compared, followed, foreseen, inside = [], [], [], [], 0

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
+from scipy.sparse.csgraph import connected_components
 
 from refu_core.errors import MeshError
 
@@ -154,6 +155,13 @@ def check_faces(faces: Any, *, n_vertices: int | None = None) -> NDArray[np.int3
         msg += f"number {int(repeated.argmax())} (from 0) first: leave such faces out"
         raise MeshError(msg)
     return np.ascontiguousarray(array, dtype=np.int32)
+
+
+def linked(pairs: NDArray[np.integer], n: int) -> tuple[int, NDArray[np.int64]]:
+    """How many groups the links (L, 2) make of n things, and the group of each, numbered from the first thing on."""
+    graph = sparse.coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+    count, label = connected_components(graph, directed=False)
+    return int(count), label.astype(np.int64)
 
 
 def rim_of(faces: NDArray[np.int32]) -> NDArray[np.bool_]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from refu_core.body import Collider, load_body
 from refu_core.garments import load_garment
 from refu_core.simulation import GarmentDataset, SimulationError, colliders
-from refu_lab.render import Backdrop, Camera, RenderMesh, render
+from refu_lab.render import Backdrop, RenderMesh, Viewpoint, render
 
 _CLOTH = ((0.36, 0.52, 0.66), (0.72, 0.42, 0.36), (0.42, 0.56, 0.42), (0.62, 0.54, 0.36))
 _TILE = (128, 160)
@@ -48,7 +48,7 @@ def contact_sheet(
             for n, (name, part) in enumerate(dataset.parts.items())
         ]
         for yaw in (20.0, 200.0):
-            camera = Camera.framing(sample.vertices, size=_TILE, yaw=yaw, margin=1.45)
+            camera = Viewpoint.framing(sample.vertices, size=_TILE, yaw=yaw, margin=1.45)
             backdrop = Backdrop(show_ground=False)
             tiles.append(render(meshes, camera=camera, size=_TILE, samples=4, backdrop=backdrop))
     columns = min(2 * _COLUMNS, len(tiles))

@@ -29,7 +29,7 @@ from refu_core.modes import BUILTIN_GARMENTS
 from refu_core.recordings import SUFFIXES, read_recording
 from refu_core.weights import weights_folder
 from refu_lab.commands.garment import AddOptions
-from refu_lab.render import Camera, RenderMesh, render, save_png
+from refu_lab.render import RenderMesh, Viewpoint, render, save_png
 from refu_lab.tables import format_table
 
 _MOST_CUT = 20
@@ -178,7 +178,7 @@ def picture(garments: Sequence[str], *, size: tuple[int, int] = (260, 400), samp
     for yaw, pose in zip((25.0, 40.0, -160.0), try_on_poses().values(), strict=True):
         output = pipeline(SmplFrame(pose=pose))
         worn = [RenderMesh(mesh.local, mesh.faces, pipeline.garments[name].card.color) for name, mesh in output.items()]
-        camera = Camera.framing(output.body, size=size, yaw=yaw)
+        camera = Viewpoint.framing(output.body, size=size, yaw=yaw)
         views.append(render([RenderMesh(output.body, faces), *worn], camera=camera, size=size, samples=samples))
     return np.concatenate(views, axis=1)
 

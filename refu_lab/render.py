@@ -1,9 +1,9 @@
 """Pictures of bodies and garments without a display: a small ray caster for reports and documentation.
 
 ```python
-from refu_lab.render import Camera, RenderMesh, render, save_png
+from refu_lab.render import Viewpoint, RenderMesh, render, save_png
 body = RenderMesh(vertices, faces)                               # SMPL axes: y up, z forward, metres
-image = render([body], camera=Camera.framing(vertices, yaw=25.0))  # uint8, (640, 480, 3)
+image = render([body], camera=Viewpoint.framing(vertices, yaw=25.0))  # uint8, (640, 480, 3)
 ```
 
 Soft daylight from a warm sun disc and a cool sky. How much of either a vertex sees is found once per vertex and
@@ -45,7 +45,7 @@ _CREASE = math.cos(math.radians(55.0))
 
 
 @dataclass(frozen=True)
-class Camera:
+class Viewpoint:
     """A pinhole camera in the world of the meshes, upright."""
 
     eye: tuple[float, float, float]
@@ -64,7 +64,7 @@ class Camera:
         yaw: float = 20.0,
         pitch: float = 8.0,
         vertical_fov: float = 26.0,
-    ) -> Camera:
+    ) -> Viewpoint:
         """A camera `distance` metres from `target` [m], shape (3,), in front (+z) of it.
 
         It has gone round towards the subject's left (+x) by `yaw`, and looks down by `pitch` [degrees].
@@ -85,7 +85,7 @@ class Camera:
         pitch: float = 8.0,
         margin: float = 1.12,
         vertical_fov: float = 26.0,
-    ) -> Camera:
+    ) -> Viewpoint:
         """A camera that sees all `vertices` [m], shape (V, 3), as large as a picture of `size` (width, height) lets it.
 
         `margin` is the free room around them, `yaw` and `pitch` are those of `looking_at`.
@@ -160,7 +160,7 @@ class Backdrop:
 def render(
     meshes: Sequence[RenderMesh],
     *,
-    camera: Camera,
+    camera: Viewpoint,
     size: tuple[int, int] = (480, 640),
     samples: int = 9,
     backdrop: Backdrop | None = None,

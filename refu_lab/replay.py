@@ -39,7 +39,7 @@ _LONGEST_PAUSE_S = 60.0
 _TOLD_S = 0.2
 
 
-class Found(NamedTuple):
+class Findings(NamedTuple):
     """What exact checks find in a frame: of one garment, or of all."""
 
     n_inside: int
@@ -55,8 +55,8 @@ class GarmentRecord:
     """One garment in one frame, before and after collision handling."""
 
     latency_ms: float
-    before: Found
-    after: Found
+    before: Findings
+    after: Findings
 
 
 @dataclass(frozen=True)
@@ -69,11 +69,11 @@ class FrameResult:
     stage_ms: Mapping[str, float]
     garments: Mapping[str, GarmentRecord]
 
-    def total(self, when: When) -> Found:
+    def total(self, when: When) -> Findings:
         """Of all garments."""
-        found: list[Found] = [getattr(one, when) for one in self.garments.values()]
+        found: list[Findings] = [getattr(one, when) for one in self.garments.values()]
         deepest = max((one.max_depth for one in found), default=0.0)
-        return Found(sum(one.n_inside for one in found), sum(one.n_pairs for one in found), deepest)
+        return Findings(sum(one.n_inside for one in found), sum(one.n_pairs for one in found), deepest)
 
     @property
     def badness(self) -> tuple[int, float, int, float]:
@@ -195,8 +195,8 @@ class Evaluator:
             self._on_skin[name].add(mesh.local, self._skin.check(mesh.local, self._faces[name]))
             records[name] = GarmentRecord(
                 latency_ms=latency_ms - sum(own_ms.values()) + own_ms[name],
-                before=Found(raw.n_inside, raw.n_pairs, raw.max_depth),
-                after=Found(done.n_inside, done.n_pairs, done.max_depth),
+                before=Findings(raw.n_inside, raw.n_pairs, raw.max_depth),
+                after=Findings(done.n_inside, done.n_pairs, done.max_depth),
             )
         return records
 

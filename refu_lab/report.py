@@ -15,11 +15,11 @@ from refu_core._files import replacing
 from refu_core.metrics import CollisionChecker
 from refu_core.recordings import upright_turn
 from refu_lab.plots import new_axes, save_svg
-from refu_lab.render import SKIN, Camera, RenderMesh, colliding_vertices, collision_mesh, render, save_png
-from refu_lab.replay import Found, FrameResult, ReplayResult, When
+from refu_lab.render import SKIN, RenderMesh, Viewpoint, colliding_vertices, collision_mesh, render, save_png
+from refu_lab.replay import Findings, FrameResult, ReplayResult, When
 from refu_lab.tables import REPLAY_HEADER, REPLAY_TITLE, html_page, html_table, replay_rows
 from refu_lab.turntable import STYLE as TURNTABLE_STYLE
-from refu_lab.turntable import Frame, Mesh, Pose, turntable
+from refu_lab.turntable import Frame, Mesh, MeshInFrame, turntable
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -132,17 +132,17 @@ def _draw_frames(
             output = pipeline(frame.frame)
             checker.update(output.body)
             body, yaw = output.body @ turn.T, _front(frame, turn)
-            camera = Camera.framing(body, size=_PICTURE, yaw=yaw)
+            camera = Viewpoint.framing(body, size=_PICTURE, yaw=yaw)
             title = f"{name.capitalize()} frame, number {index}, {1e-9 * (frame.frame.stamp_ns - start):.2f} s"
             poses = []
             for when in ("before", "after"):
-                drawn, posed = [RenderMesh(body, body_faces)], [Pose(body)]
+                drawn, posed = [RenderMesh(body, body_faces)], [MeshInFrame(body)]
                 for garment, mesh in output.items():
                     vertices = mesh.raw if when == "before" else mesh.local
                     found = checker.check(vertices, mesh.faces)
                     colour = pipeline.garments[garment].card.color
                     drawn.append(collision_mesh(vertices @ turn.T, mesh.faces, found, colour=colour))
-                    posed.append(Pose(vertices @ turn.T, colliding_vertices(mesh.faces, found)))
+                    posed.append(MeshInFrame(vertices @ turn.T, colliding_vertices(mesh.faces, found)))
                 save_png(render(drawn, camera=camera, size=_PICTURE), folder / f"{name}_{when}.png")
                 poses.append(posed)
                 bar.update()
@@ -158,7 +158,7 @@ def _front(frame: FrameResult, turn: NDArray[np.float32]) -> float:
 
 
 def _caption(frame: FrameResult, when: When) -> str:
-    found: dict[str, Found] = {name: getattr(record, when) for name, record in frame.garments.items()}
+    found: dict[str, Findings] = {name: getattr(record, when) for name, record in frame.garments.items()}
     return "; ".join(
         f"{name}: {one.n_inside} vertices inside, {one.n_pairs} intersecting pairs" for name, one in found.items()
     )

@@ -79,7 +79,7 @@ def garments_of(bag: Path) -> list[str]:
         return sorted({m.ns for found in reader.messages([TOPIC]) for m in adapters.decode_marker_array(found.data)})
 
 
-class Moment(NamedTuple):
+class TrueFrame(NamedTuple):
     """One frame whose truth is known."""
 
     frame: SmplFrame
@@ -89,7 +89,7 @@ class Moment(NamedTuple):
     """Number of the frame's style-shape pair."""
 
 
-def moments_of(bag: Path, garment: GarmentTemplate) -> list[Moment]:
+def moments_of(bag: Path, garment: GarmentTemplate) -> list[TrueFrame]:
     """The frames of a bag that have the garment's truth.
 
     Raises:
@@ -109,7 +109,7 @@ def moments_of(bag: Path, garment: GarmentTemplate) -> list[Moment]:
         raise GarmentError(msg)
     keys = [np.concatenate((one.betas, np.zeros(4) if one.style is None else one.style)) for one, _ in found]
     _, pairs = np.unique(np.round(np.stack(keys), 4), axis=0, return_inverse=True)
-    return [Moment(*one, int(pair)) for one, pair in zip(found, pairs.reshape(-1), strict=True)]
+    return [TrueFrame(*one, int(pair)) for one, pair in zip(found, pairs.reshape(-1), strict=True)]
 
 
 class HeldOut(NamedTuple):

@@ -53,7 +53,7 @@ class Mesh:
 
 
 @dataclass(frozen=True, eq=False)
-class Pose:
+class MeshInFrame:
     """A mesh in a frame."""
 
     vertices: NDArray[np.float32]
@@ -68,9 +68,9 @@ class Frame:
 
     name: str
     title: str
-    before: Sequence[Pose]
+    before: Sequence[MeshInFrame]
     """A pose a mesh, before collision handling; the first mesh is the body."""
-    after: Sequence[Pose]
+    after: Sequence[MeshInFrame]
     before_caption: str
     after_caption: str
     yaw: float
@@ -132,7 +132,7 @@ class _Quantised(NamedTuple):
 
 
 def _quantised(
-    meshes: Sequence[Mesh], poses: Sequence[Pose], low: NDArray[np.float32], step: float
+    meshes: Sequence[Mesh], poses: Sequence[MeshInFrame], low: NDArray[np.float32], step: float
 ) -> list[_Quantised]:
     light = sky_light([(pose.vertices, mesh.faces) for mesh, pose in zip(meshes, poses, strict=True)])
     found = []

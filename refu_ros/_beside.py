@@ -45,14 +45,14 @@ def load(options: PipelineOptions, *, threads: int = 1) -> GarmentPipeline:
 
     Kernels are loaded when they first run, and the frames that come meanwhile would be lost. Raises `RefuError`.
     """
-    from refu_core.outputs import Dressed, Fittings  # loads torch
+    from refu_core.outputs import DressedPerson, Fittings  # loads torch
 
     pipeline = options.load(threads=threads)
     frame, fittings = (
         SmplFrame(np.zeros((N_JOINTS, 3), np.float32)),
         Fittings(pipeline, weights=options.weights or None),
     )
-    worn = Dressed("", frame, pipeline(frame), fittings, np.eye(3), np.zeros(3))
+    worn = DressedPerson("", frame, pipeline(frame), fittings, np.eye(3), np.zeros(3))
     for ask in (worn.normals, worn.clearance, worn.sigma, worn.contacts):
         ask()
     return pipeline
@@ -94,7 +94,7 @@ class PipelineLoader:
             self._use(pipeline, options)
 
 
-class Dresser:
+class RequestDresser:
     """`ask` belongs to one thread. What it makes doesn't depend on who is on the node's topics, or was."""
 
     def __init__(self) -> None:

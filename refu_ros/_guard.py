@@ -24,7 +24,8 @@ _CLOCK = "/clock"
 _MOST_ITEMS = 1000
 """Entries of a list in a request to rclpy's own services: it works through them one by one, and nobody else is served
 meanwhile."""
-_LOG_PERIOD_S = 5.0
+LOG_PERIOD_S = 5.0
+"""How often the log says one thing [s]."""
 
 
 class GuardedNode(Node):  # type: ignore[misc]
@@ -49,7 +50,7 @@ class GuardedNode(Node):  # type: ignore[misc]
         """Counts and logs what has gone wrong in a callback, and not only there."""
         text, now = printable(f"{what}: {_reason(error)}"), time.monotonic()
         self.statistics.fault(what, text)
-        if now > self._said.get(what, -math.inf) + _LOG_PERIOD_S:  # one kind's flood doesn't hide another
+        if now > self._said.get(what, -math.inf) + LOG_PERIOD_S:  # one kind's flood doesn't hide another
             self._said[what] = now
             self.get_logger().warning(text)
 

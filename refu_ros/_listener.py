@@ -18,6 +18,7 @@ from msg_adapters.axes import up_of_sender
 from refu_core import FrameError, RefuError
 from refu_core.errors import printable
 from refu_core.keypoints import MOST_PEOPLE
+from refu_ros._guard import LOG_PERIOD_S
 from refu_ros._interfaces import interface, ros_qos
 
 if TYPE_CHECKING:
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
 INPUT_QOS = adapters.QosProfile(reliability="best_effort", depth=5)
 _HUMANS = re.compile(r"/humans/bodies/([A-Za-z][A-Za-z0-9_]{0,99})/joint_states")
 _TRACKED = "/humans/bodies/tracked"
-_LOG_PERIOD_S = 5.0
 _GRACE_S = 5.0
 """How long the inputs stay subscribed to when nobody is left: many a viewer is only restarted [s]."""
 _TF_DEPTH = 100
@@ -175,7 +175,7 @@ class Listener:
 
     def _refuse(self, source: str, error: Exception) -> None:
         self._node.statistics.drop("invalid", str(error))
-        self._node.get_logger().warning(f"{source}: {printable(error)}", throttle_duration_sec=_LOG_PERIOD_S)
+        self._node.get_logger().warning(f"{source}: {printable(error)}", throttle_duration_sec=LOG_PERIOD_S)
 
     def predict(self) -> None:
         """Everybody whose keypoints are followed, by now."""

@@ -12,7 +12,7 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.node import SetParametersResult
 
 import msg_adapters as adapters
-from msg_adapters.bags import Recording
+from msg_adapters.bags import RunningRecording
 from msg_adapters.outputs import GARMENTS, make_outputs
 from msg_adapters.scene import Scene
 from refu_core import RefuError
@@ -21,7 +21,7 @@ from refu_core.options import PIPELINE_OPTIONS, PipelineOptions, specs_of
 from refu_ros._bank import QOS, Bank
 from refu_ros._beside import PipelineLoader, load
 from refu_ros._diagnostics import Situation, statuses
-from refu_ros._guard import GuardedNode, transition
+from refu_ros._guard import LOG_PERIOD_S, GuardedNode, transition
 from refu_ros._interfaces import interface
 from refu_ros._listener import Listener
 from refu_ros._parameters import declare, parameter
@@ -36,7 +36,6 @@ NODE_NAME = "garment_node"
 DIAGNOSTICS_TOPIC = "/diagnostics"
 _BEAT_S = 1.0
 """How often the node says how it is, and looks for whoever came or left unheard."""
-_LOG_PERIOD_S = 5.0
 _LAST_WORDS_S = 0.3
 """Time for the answer to a shutdown request to leave."""
 
@@ -54,7 +53,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         self.failed = False
         """Whether it ended because its device did."""
         self.settings = declare(self, NodeSettings)
-        self.recording = Recording(self.get_logger(), sync_period=self.settings.record_sync_period)
+        self.recording = RunningRecording(self.get_logger(), sync_period=self.settings.record_sync_period)
         self._state = "unconfigured"
         self._worker: Worker | None = None
         self._loader: PipelineLoader | None = None
@@ -311,7 +310,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         if error:
             self.get_logger().error(f"not recording: {error}", throttle_duration_sec=60.0)
         if report.recent["drop.failed"]:
-            self.get_logger().error(report.reasons["failed"], throttle_duration_sec=_LOG_PERIOD_S)
+            self.get_logger().error(report.reasons["failed"], throttle_duration_sec=LOG_PERIOD_S)
         now = Situation(
             node=self.get_fully_qualified_name().lstrip("/"),
             state=self._state,

@@ -21,7 +21,7 @@ from msg_adapters.bags import free_path
 from refu_core import RefuError
 from refu_core.errors import printable
 from refu_ros._bag_job import BagJob
-from refu_ros._beside import Dresser, asked_frame, asked_path, asked_settings
+from refu_ros._beside import RequestDresser, asked_frame, asked_path, asked_settings
 from refu_ros._guard import answer_no
 from refu_ros._interfaces import interface
 
@@ -40,7 +40,7 @@ class Requests:
 
     def __init__(self, node: GarmentNode) -> None:
         self._node = node
-        self._dresser = Dresser()
+        self._dresser = RequestDresser()
         self._job: BagJob | None = None
         self._goal: Any = None
         self._offer(interface("std_srvs/srv/SetBool"), "record", self._on_switch)

@@ -20,7 +20,7 @@ from msg_adapters.statistics import Statistics
 from refu_core import GarmentPipeline, RefuError, SmplFrame
 from refu_core._device import is_device_loss
 from refu_core.history import PoseHistory
-from refu_core.outputs import Dressed, Fittings
+from refu_core.outputs import DressedPerson, Fittings
 from refu_core.realtime import PipelineOutput
 from refu_ros._settings import NodeSettings
 
@@ -42,7 +42,7 @@ class _Known(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class _Job:
+class _Batch:
     """A frame each of some persons, from when they were taken until they are sent."""
 
     turn: int
@@ -172,7 +172,7 @@ class Worker:
                     self._n_done += 1
                     self._in_order.notify_all()
 
-    def _plan(self, arrivals: Mapping[str, Arrival]) -> _Job:
+    def _plan(self, arrivals: Mapping[str, Arrival]) -> _Batch:
         """What there is to do for these people, and with what."""
         settings = self.settings
         pipeline, fittings = self._next
@@ -195,7 +195,7 @@ class Worker:
                 person: self._told(frame, person, _there(near[person], settings)) for person, frame in frames.items()
             }
         known: dict[str, _Known] = {}
-        job = _Job(self._n_taken, settings, pipeline, fittings, near, frames, known, gone)
+        job = _Batch(self._n_taken, settings, pipeline, fittings, near, frames, known, gone)
         for person, frame in frames.items():
             last = self._dressed.get(person)
             if last is not None and last.inputs == job.inputs(frame):
@@ -213,7 +213,7 @@ class Worker:
         place = there.rotation @ (frame.transl + pelvis) + there.translation
         return replace(frame, past=self._history(replace(frame, pose=pose, transl=place), person).past)
 
-    def _finish(self, job: _Job, outputs: Mapping[str, PipelineOutput]) -> None:
+    def _finish(self, job: _Batch, outputs: Mapping[str, PipelineOutput]) -> None:
         """Sends what came of a job."""
         self._remove(job.gone)
         found, unresolved = self._remember(job, outputs)
@@ -236,7 +236,7 @@ class Worker:
                 near[person] = arrival
         return near
 
-    def _remember(self, job: _Job, outputs: Mapping[str, PipelineOutput]) -> tuple[int, int]:
+    def _remember(self, job: _Batch, outputs: Mapping[str, PipelineOutput]) -> tuple[int, int]:
         """Brings `_dressed` up to date; returns how many vertices were inside, and still are."""
         found = unresolved = 0
         for person, frame in job.frames.items():
@@ -276,7 +276,7 @@ class Worker:
             self._is_lost = True
             self._outlet.device_lost(str(error))
 
-    def _send(self, job: _Job, frames: Mapping[str, SmplFrame]) -> None:
+    def _send(self, job: _Batch, frames: Mapping[str, SmplFrame]) -> None:
         """What anybody wants to know of these people."""
         if job.fittings is not self._sent_with:
             self._sent_with = job.fittings
@@ -287,7 +287,7 @@ class Worker:
             arrival, output = job.arrivals[person], self._dressed[person].output
             there = _there(arrival, job.settings)
             offset = there.rotation @ frame.transl + there.translation
-            worn.append(Dressed(person, frame, output, job.fittings, there.rotation, offset, arrival.camera))
+            worn.append(DressedPerson(person, frame, output, job.fittings, there.rotation, offset, arrival.camera))
         self._here.update(frames)
         for row in self._outputs:
             self._publish(row.messages(worn, self._moment(job.settings)))

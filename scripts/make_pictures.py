@@ -28,7 +28,7 @@ from refu_core.recordings import interpolated
 from refu_core.simulation import POSTURES, SELF_TOUCHING, GarmentDataset, posture
 from refu_lab.contact_sheet import contact_sheet
 from refu_lab.garment import picture
-from refu_lab.render import SKIN, Backdrop, Camera, RenderMesh, render
+from refu_lab.render import SKIN, Backdrop, RenderMesh, Viewpoint, render
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -119,7 +119,7 @@ def draw_replay() -> None:
     """Three people, as a loop."""
     pipelines = [GarmentPipeline.load(person.garments) for person in PEOPLE]
     motions = [looped(person.bag, person.first) for person in PEOPLE]
-    camera = Camera.looking_at((0.02, 0.9, 0.0), distance=6.2, yaw=4.0, pitch=6.0, vertical_fov=19.0)
+    camera = Viewpoint.looking_at((0.02, 0.9, 0.0), distance=6.2, yaw=4.0, pitch=6.0, vertical_fov=19.0)
     pictures = []
     for index in tqdm(range(0, LENGTH, STEP), unit="picture"):
         people = zip(PEOPLE, pipelines, motions, strict=True)
@@ -153,7 +153,7 @@ def collider_sheet(
     columns = []
     for name in poses:
         out = pipeline(SmplFrame(pose=posture(name)))
-        camera = Camera.framing(out.skin[is_framed], size=size, yaw=25.0, pitch=20.0)
+        camera = Viewpoint.framing(out.skin[is_framed], size=size, yaw=25.0, pitch=20.0)
         share = np.clip(np.linalg.norm(out.body - out.skin, axis=1) / _MOST, 0, 1)[:, None]
         moved = (1 - share) * np.array(SKIN) + share * np.array(_MOVED)
         scenes = ([RenderMesh(out.skin, faces)], [RenderMesh(out.body, faces, moved)], dressed(pipeline, out))
@@ -181,7 +181,7 @@ def draw_ros() -> None:
         place = np.array([left, frame.transl[1], 0.0])
         output = pipeline(SmplFrame(frame.pose, betas=frame.betas))
         meshes += [replace(mesh, vertices=mesh.vertices + place) for mesh in dressed(pipeline, output)]
-    camera = Camera.framing(np.concatenate([mesh.vertices for mesh in meshes]), size=size, yaw=28.0, pitch=10.0)
+    camera = Viewpoint.framing(np.concatenate([mesh.vertices for mesh in meshes]), size=size, yaw=28.0, pitch=10.0)
     Image.fromarray(render(meshes, camera=camera, size=size, samples=16)).save(IMAGES / "ros.png", optimize=True)
 
 
@@ -222,7 +222,7 @@ def draw_carried(folder: Path) -> None:
         shown = [*(out[name].local for out in worn), sample.vertices]
         views = []
         for yaw in (20.0, 200.0):
-            camera = Camera.framing(sample.vertices, size=size, yaw=yaw, margin=1.3)
+            camera = Viewpoint.framing(sample.vertices, size=size, yaw=yaw, margin=1.3)
             for one in shown:
                 cloth = RenderMesh(one, template.faces.numpy(), colour=(0.36, 0.52, 0.66))
                 meshes, backdrop = [RenderMesh(worn[1].body, faces), cloth], Backdrop(show_ground=False)

@@ -36,7 +36,7 @@ from msg_adapters import (
     check_plausible,
     decode_marker_array,
 )
-from msg_adapters.bags import Recorder, RecorderState, Recording, free_path
+from msg_adapters.bags import Recorder, RecorderState, RunningRecording, free_path
 from msg_adapters.cdr import CdrReader, CdrWriter
 from msg_adapters.outputs._topics import is_due
 from msg_adapters.scene import Scene
@@ -46,7 +46,7 @@ from refu_core.keypoints import Proportions, Skeleton, keypoint_layout
 from refu_core.keypoints._pose import Pose
 from refu_core.modes import FOREIGN_BETAS, ONE_STYLE
 from refu_core.options import SettingsError, specs_of
-from refu_ros._beside import Dresser, PipelineLoader, asked_path, load
+from refu_ros._beside import PipelineLoader, RequestDresser, asked_path, load
 from refu_ros._diagnostics import Situation, statuses
 from refu_ros._settings import NodeSettings
 from refu_ros._transport import PROFILES, SEGMENT_BYTES, make_room
@@ -292,7 +292,7 @@ def test_a_bag_that_is_taken_away_is_an_error(tmp_path: Path, sync_period: float
     """While it is written, or where the disk isn't waited for, as it is closed; nobody else's file is touched."""
     said: list[str] = []
     logger = SimpleNamespace(info=said.append, error=lambda text: said.append(f"ERROR {text}"))
-    recording = Recording(logger, sync_period=sync_period)
+    recording = RunningRecording(logger, sync_period=sync_period)
     recording.start(str(tmp_path / "bag"))
     recording.put("/t", "std_msgs/msg/Float32MultiArray", b"\0\1\0\0", QosProfile())
     file = tmp_path / "bag" / "bag_0.mcap"
@@ -1020,7 +1020,7 @@ def test_without_a_folder_no_file_may_be_named() -> None:
 
 
 def test_who_asks_too_often_is_told_so() -> None:
-    dresser, go = Dresser(), threading.Event()
+    dresser, go = RequestDresser(), threading.Event()
     settings = NodeSettings(garments=("short-pant-male",), backbone="skinned")
     frame = SmplFrame(np.zeros((24, 3)))
     try:

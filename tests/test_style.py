@@ -102,6 +102,15 @@ def test_every_layer_exists() -> None:
     assert set().union(*CORE) <= names
 
 
+def test_no_class_has_the_name_of_another() -> None:
+    where: dict[str, list[str]] = {}
+    for path in FILES:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef):
+                where.setdefault(node.name, []).append(str(path.relative_to(ROOT)))
+    assert {name: paths for name, paths in where.items() if len(paths) > 1} == {}
+
+
 def test_no_file_is_longer_than_400_lines() -> None:
     lines = {path.relative_to(ROOT): path.read_text(encoding="utf-8").count("\n") for path in FILES}
     assert {path: n for path, n in lines.items() if n > 400} == {}

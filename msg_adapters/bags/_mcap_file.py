@@ -15,7 +15,7 @@ from msg_adapters.cdr import Buffer
 from msg_adapters.definitions import full_type_name
 from msg_adapters.errors import BagError
 
-Found = tuple[TopicInfo, int, int, Buffer]
+StoredMessage = tuple[TopicInfo, int, int, Buffer]
 """A message's topic, log time and publish time [ns], and the message."""
 
 
@@ -82,7 +82,7 @@ class McapFile:
         found = ((catalogue.topic(number), counts.get(number, 0)) for number in catalogue.numbers)
         return [(topic, count) for topic, count in found if topic is not None], claimed
 
-    def messages(self, budget: Budget) -> Iterator[Found]:
+    def messages(self, budget: Budget) -> Iterator[StoredMessage]:
         """The messages in the order they were recorded."""
         catalogue, _ = self._summary(budget)
         for channel, log_ns, publish_ns, data in self._all_messages(catalogue, budget):

@@ -12,7 +12,7 @@ from msg_adapters.errors import BagError
 from refu_core.errors import printable
 
 
-class Recording:
+class RunningRecording:
     """All of it belongs to one thread, but for `put` and `running`; `logger` is told what has been recorded."""
 
     def __init__(self, logger: Any, *, sync_period: float) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 from urllib.parse import quote
 
 from msg_adapters.bags._mcap import MAX_CHUNK_BYTES, Budget, DamageError
-from msg_adapters.bags._mcap_file import Found
+from msg_adapters.bags._mcap_file import StoredMessage
 from msg_adapters.bags._metadata import TopicInfo
 from msg_adapters.definitions import full_type_name
 from msg_adapters.errors import BagError
@@ -106,7 +106,7 @@ class SqliteFile:
                 found[full_type_name(kind)] = text
         return found
 
-    def messages(self, budget: Budget) -> Iterator[Found]:
+    def messages(self, budget: Budget) -> Iterator[StoredMessage]:
         """The messages in the order they were recorded."""
         try:
             with self._opened() as database:

@@ -12,7 +12,7 @@ from msg_adapters.transforms import Placement
 
 if TYPE_CHECKING:
     from msg_adapters.outputs._topics import Messages, Moment
-    from refu_core.outputs import Dressed, Fittings
+    from refu_core.outputs import DressedPerson, Fittings
 
 
 class Obstacles(Output):
@@ -32,7 +32,7 @@ class Obstacles(Output):
     def topics(self, persons: Iterable[str], fittings: Fittings | None) -> list[str]:  # noqa: ARG002 - one topic for all
         return [self.topic]
 
-    def messages(self, worn: Sequence[Dressed], moment: Moment) -> Messages:
+    def messages(self, worn: Sequence[DressedPerson], moment: Moment) -> Messages:
         if not moment.watchers(self.topic):
             return
         if not all(_is_prepared(one.fittings, name) for one in worn for name in one.fittings.names):

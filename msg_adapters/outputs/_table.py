@@ -17,7 +17,7 @@ from msg_adapters.outputs._topics import Apart, Layouts, Moment, Output, Togethe
 from msg_adapters.transforms import TF_MESSAGE
 
 if TYPE_CHECKING:
-    from refu_core.outputs import Dressed, Fittings
+    from refu_core.outputs import DressedPerson, Fittings
 
 GARMENTS, BODY, OPENINGS = "garments", "body", "openings"
 
@@ -28,17 +28,17 @@ def _token(name: str) -> str:
     return word if word[:1].isalpha() else f"garment_{word}"
 
 
-def _mesh_of(one: Dressed, name: str) -> MarkerMesh:
+def _mesh_of(one: DressedPerson, name: str) -> MarkerMesh:
     fittings = one.fittings
     color = fittings.colors[name]
     return MarkerMesh(garment_namespace(name, one.person), fittings.faces[name], fittings.counts[name], color=color)
 
 
-def _body_of(one: Dressed) -> MarkerMesh:
+def _body_of(one: DressedPerson) -> MarkerMesh:
     return MarkerMesh(garment_namespace("body", one.person), *one.fittings.body, color=SKIN)
 
 
-def _rims_of(one: Dressed) -> list[Rim]:
+def _rims_of(one: DressedPerson) -> list[Rim]:
     return [
         Rim(
             f"{garment_namespace(name, one.person)}/{opening.name}",
@@ -53,9 +53,9 @@ def _rims_of(one: Dressed) -> list[Rim]:
 
 
 def _markers(
-    meshes: Callable[[Dressed], list[MarkerMesh]], vertices: Callable[[Dressed], list[Any]]
-) -> Callable[[Sequence[Dressed], Moment, Layouts], bytes]:
-    def encode(worn: Sequence[Dressed], moment: Moment, layouts: Layouts) -> bytes:
+    meshes: Callable[[DressedPerson], list[MarkerMesh]], vertices: Callable[[DressedPerson], list[Any]]
+) -> Callable[[Sequence[DressedPerson], Moment, Layouts], bytes]:
+    def encode(worn: Sequence[DressedPerson], moment: Moment, layouts: Layouts) -> bytes:
         frame_id, lifetime_ns = moment.frame_id, moment.lifetime_ns
 
         def make() -> MarkerArrayEncoder:
@@ -78,16 +78,16 @@ def _delete_markers(names: Sequence[str], moment: Moment) -> bytes:
     return encode_delete(names, stamp_ns=moment.now_ns, frame_id=moment.frame_id)
 
 
-def _garment_names(one: Dressed) -> list[str]:
+def _garment_names(one: DressedPerson) -> list[str]:
     return [garment_namespace(name, one.person) for name in one.fittings.names]
 
 
-def _encode_rims(worn: Sequence[Dressed], moment: Moment, _: Layouts) -> bytes:
+def _encode_rims(worn: Sequence[DressedPerson], moment: Moment, _: Layouts) -> bytes:
     rims = [rim for one in worn for rim in _rims_of(one)]
     return encode_rims(rims, frame_id=moment.frame_id, lifetime_ns=moment.lifetime_ns)
 
 
-def _encode_scene(worn: Sequence[Dressed], moment: Moment, layouts: Layouts) -> bytes:
+def _encode_scene(worn: Sequence[DressedPerson], moment: Moment, layouts: Layouts) -> bytes:
     entities = [
         Entity(layouts.get((one.person, name), partial(_mesh_of, one, name)), points, one.offset, one.stamp_ns)
         for one in worn
@@ -100,11 +100,11 @@ def _delete_entities(names: Sequence[str], moment: Moment) -> bytes:
     return encode_scene([], deleted=names, stamp_ns=moment.now_ns, frame_id=moment.frame_id)
 
 
-def _encode_tf(worn: Sequence[Dressed], moment: Moment, _: Layouts) -> bytes:
+def _encode_tf(worn: Sequence[DressedPerson], moment: Moment, _: Layouts) -> bytes:
     return encode_frames([rim for one in worn for rim in _rims_of(one)], frame_id=moment.frame_id)
 
 
-def _encode_points(layouts: Layouts, one: Dressed, _: Any, moment: Moment) -> bytes:
+def _encode_points(layouts: Layouts, one: DressedPerson, _: Any, moment: Moment) -> bytes:
     fields = [name for name in POINT_FIELDS if name in moment.points_fields and (name != "visible" or one.camera)]
     counts = tuple(len(points) for points in one.vertices.values())
     encoder: PointCloudEncoder = layouts.get(
@@ -121,7 +121,7 @@ def _encode_points(layouts: Layouts, one: Dressed, _: Any, moment: Moment) -> by
     return encoder.encode([*one.vertices.values()], stamp_ns=one.stamp_ns, offset=one.offset, values=values)
 
 
-def _encode_contacts(one: Dressed, _: Any, moment: Moment) -> bytes:
+def _encode_contacts(one: DressedPerson, _: Any, moment: Moment) -> bytes:
     """A status each two parts: geometry, from which no force follows."""
     statuses = []
     for contact in one.contacts():
@@ -140,7 +140,7 @@ def _opening_places(fittings: Fittings) -> Iterator[tuple[str, tuple[str, int]]]
             yield f"{OPENINGS}/{_token(name)}/{opening}", (name, i)
 
 
-def _encode_polygon(one: Dressed, place: tuple[str, int], moment: Moment) -> bytes:
+def _encode_polygon(one: DressedPerson, place: tuple[str, int], moment: Moment) -> bytes:
     name, i = place
     ring = one.openings[name][i].ring + one.offset
     return encode_polygon(ring, stamp_ns=one.stamp_ns, frame_id=moment.frame_id)
@@ -150,7 +150,7 @@ def _mesh_places(fittings: Fittings) -> list[tuple[str, str]]:
     return [(f"mesh/{_token(name)}", name) for name in fittings.names]
 
 
-def _encode_mesh(one: Dressed, name: str, moment: Moment) -> bytes:  # noqa: ARG001 - a mesh has no header
+def _encode_mesh(one: DressedPerson, name: str, moment: Moment) -> bytes:  # noqa: ARG001 - a mesh has no header
     vertices, faces = one.solid(name)
     return encode_mesh(vertices + one.offset, faces)
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from msg_adapters.markers import garment_namespace
 
 if TYPE_CHECKING:
-    from refu_core.outputs import Dressed, Fittings
+    from refu_core.outputs import DressedPerson, Fittings
 
 _MOST_LAID_OUT = 64
 """People in all layouts that are kept, but for one of more; of each a layout has the bytes, and takes a millisecond."""
@@ -43,7 +43,7 @@ class Output:
         """Where it goes for these people in these garments; None: before anything is known of them."""
         raise NotImplementedError
 
-    def messages(self, worn: Sequence[Dressed], moment: Moment) -> Messages:
+    def messages(self, worn: Sequence[DressedPerson], moment: Moment) -> Messages:
         """What is to be sent of one tick, and where; nothing is computed for a topic that nobody wants."""
         raise NotImplementedError
 
@@ -90,8 +90,8 @@ class Together(Output):
         self,
         topic: str,
         message_type: str,
-        names: Callable[[Dressed], Sequence[str]],
-        encode: Callable[[Sequence[Dressed], Moment, Layouts], bytes],
+        names: Callable[[DressedPerson], Sequence[str]],
+        encode: Callable[[Sequence[DressedPerson], Moment, Layouts], bytes],
         delete: Callable[[Sequence[str], Moment], bytes],
     ) -> None:
         self.topic, self.message_type = topic, message_type
@@ -102,7 +102,7 @@ class Together(Output):
     def topics(self, persons: Iterable[str], fittings: Fittings | None) -> list[str]:  # noqa: ARG002 - one topic for all
         return [self.topic]
 
-    def messages(self, worn: Sequence[Dressed], moment: Moment) -> Messages:
+    def messages(self, worn: Sequence[DressedPerson], moment: Moment) -> Messages:
         if not moment.watchers(self.topic):
             return
         yield self.topic, self._encode(worn, moment, self._layouts)
@@ -135,7 +135,7 @@ class Apart(Output):
 
     message_type: str
     places: Callable[[Fittings], Iterable[tuple[str, Any]]]
-    encode: Callable[[Dressed, Any, Moment], bytes]
+    encode: Callable[[DressedPerson, Any, Moment], bytes]
     slow: bool = False
     due: dict[str, float] = field(default_factory=dict)
     """When each topic of planners' meshes is next."""
@@ -145,7 +145,7 @@ class Apart(Output):
             return []
         return [garment_namespace(place, person) for person in persons for place, _ in self.places(fittings)]
 
-    def messages(self, worn: Sequence[Dressed], moment: Moment) -> Messages:
+    def messages(self, worn: Sequence[DressedPerson], moment: Moment) -> Messages:
         for one in worn:
             for place, what in self.places(one.fittings):
                 topic = garment_namespace(place, one.person)

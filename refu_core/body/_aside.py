@@ -8,8 +8,6 @@ import numpy as np
 import torch
 import warp as wp
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
@@ -21,7 +19,7 @@ from refu_core.body._kinematics import rotvec_to_rotmat
 from refu_core.body._model import SmplBody
 from refu_core.body._parts import ARMS, joints_of, part_of_faces
 from refu_core.body._segments import SOFTNESS, cut
-from refu_core.mesh import Connectivity
+from refu_core.mesh import Connectivity, linked
 
 Array = NDArray[np.float64]
 
@@ -180,8 +178,7 @@ def _pieces(rest: Array, mesh: Connectivity, is_fore: NDArray[np.bool_], along: 
     slices = np.full(len(rest), -1)
     slices[on] = np.digitize(height, np.linspace(height.min(), height.max(), _SLICES + 1)[1:-1])
     of_ends = slices[mesh.edges]
-    start, end = mesh.edges[(of_ends[:, 0] == of_ends[:, 1]) & (of_ends[:, 0] >= 0)].T
-    _, piece = connected_components(coo_array((np.ones(len(start)), (start, end)), (len(rest), len(rest))), False)
+    _, piece = linked(mesh.edges[(of_ends[:, 0] == of_ends[:, 1]) & (of_ends[:, 0] >= 0)], len(rest))
     names, sizes = np.unique(piece[on], return_counts=True)
     return [(piece == name).astype(np.float64) for name in names[sizes >= _FEWEST]]
 

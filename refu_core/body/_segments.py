@@ -6,11 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from refu_core.body._parts import joints_of
-from refu_core.mesh import rim_of
+from refu_core.mesh import linked, rim_of
 
 SOFTNESS: tuple[tuple[tuple[int, ...], float], ...] = (
     ((0, 3), 1.0),
@@ -71,7 +69,7 @@ def cut(faces: NDArray[np.int32], share: NDArray[np.float64]) -> Solids:
         own = faces[of_face == segment]
         on_rim = rim_of(own)
         start, end = own[on_rim], np.roll(own, -1, axis=1)[on_rim]
-        _, loop = connected_components(coo_array((np.ones(len(start)), (start, end)), (n_vertices, n_vertices)), False)
+        _, loop = linked(np.stack((start, end), axis=1), n_vertices)
         caps = []
         for one in np.unique(loop[start]):
             on = loop[start] == one

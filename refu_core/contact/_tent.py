@@ -41,7 +41,7 @@ class Shins:
         self.radius = np.array(radii)
         """How far the skin of each is from its bone at rest, on average [m]."""
         name = str(self._device)
-        self.data = data = kernels.Shins()
+        self.data = data = kernels.ShinMeans()
         """As kernels read it."""
         data.start = ints(np.cumsum([0, *map(len, of_legs)]), name)
         data.vertex = ints(np.concatenate(of_legs), name)

@@ -13,7 +13,7 @@ N_PLACES = 3
 
 
 @wp.struct
-class Shins:
+class ShinMeans:
     """The lower legs of a posed body, as affine means of their skin."""
 
     start: wp.array[int]
@@ -28,7 +28,7 @@ class Shins:
 
 
 @wp.kernel
-def stand_kernel(body: wp.array[wp.vec3], shins: Shins) -> None:
+def stand_kernel(body: wp.array[wp.vec3], shins: ShinMeans) -> None:
     """Knee, ankle, and the way backwards, a unit vector square to the bone, of one leg a thread."""
     leg = wp.tid()
     knee = wp.vec3()
@@ -47,7 +47,7 @@ def stand_kernel(body: wp.array[wp.vec3], shins: Shins) -> None:
 
 
 @wp.func
-def lack_behind(at: wp.vec3, at_rest: float, leg: int, shins: Shins) -> float:
+def lack_behind(at: wp.vec3, at_rest: float, leg: int, shins: ShinMeans) -> float:
     """How far a place is before the tent over a leg, seen along the way backwards [m]; negative behind it.
 
     The tent is a circle around the bone, and from its sides on the tangents at 45 degrees. Nothing has to be farther
@@ -97,7 +97,7 @@ class Hanging:
 
 
 @wp.kernel
-def tent_kernel(hanging: Hanging, shins: Shins, each: int, cloth: wp.array[wp.vec3]) -> None:
+def tent_kernel(hanging: Hanging, shins: ShinMeans, each: int, cloth: wp.array[wp.vec3]) -> None:
     """Brings `each` of the hanging vertices a thread out of the tents over both legs."""
     first = wp.tid() * each
     for i in range(first, wp.min(first + each, hanging.vertex.shape[0])):

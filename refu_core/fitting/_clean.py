@@ -6,13 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from refu_core.errors import GarmentError
 from refu_core.fitting._mesh_file import SurfaceMesh
 from refu_core.garments import UvMap
+from refu_core.mesh import linked
 
 Ints = NDArray[np.int64]
 
@@ -51,14 +50,7 @@ def clean(mesh: SurfaceMesh) -> tuple[SurfaceMesh, list[str]]:
 
 def components(faces: Ints, n: int) -> tuple[int, Ints]:
     """The number of pieces, and the piece of each of the n vertices."""
-    return _linked(np.concatenate((faces[:, :2], faces[:, 1:])), n)
-
-
-def _linked(pairs: Ints, n: int) -> tuple[int, Ints]:
-    """How many groups links (L, 2) make of n things, and the group of each, numbered from the first thing on."""
-    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
-    count, label = connected_components(graph, directed=False)
-    return count, label.astype(np.int64)
+    return linked(np.concatenate((faces[:, :2], faces[:, 1:])), n)
 
 
 def face_normals(v: NDArray[np.float64], f: Ints) -> NDArray[np.float64]:
@@ -67,7 +59,7 @@ def face_normals(v: NDArray[np.float64], f: Ints) -> NDArray[np.float64]:
     return found
 
 
-def rim_of(f: Ints) -> Ints:
+def rim_vertices(f: Ints) -> Ints:
     """Vertices of edges of one face."""
     edges, of_corner = _edges(f)
     return np.unique(edges[np.bincount(of_corner.ravel()) == 1])
@@ -155,7 +147,7 @@ def _groups_of_place(v: NDArray[np.float64], extent: float) -> Ints:
     cell = np.floor((v - v.min(0)) / (_SAME_PLACE * extent / np.sqrt(3)))
     _, first, of_cell = np.unique(cell, axis=0, return_index=True, return_inverse=True)
     pairs = cKDTree(v[first]).query_pairs(_SAME_PLACE * extent, output_type="ndarray")
-    label = _linked(pairs, len(first))[1][of_cell.ravel()]
+    label = linked(pairs, len(first))[1][of_cell.ravel()]
     _, first, of_group = np.unique(label, return_index=True, return_inverse=True)
     found: Ints = first[of_group].astype(np.int64)
     return found
@@ -183,7 +175,7 @@ def _only(mesh: SurfaceMesh, kept: NDArray[np.bool_]) -> SurfaceMesh:
 
 def _welded(mesh: SurfaceMesh, notes: list[str]) -> SurfaceMesh:
     """Vertices of open edges that are at one place become one; sheets that only touch stay apart."""
-    on_rim = rim_of(mesh.faces)
+    on_rim = rim_vertices(mesh.faces)
     target = np.arange(len(mesh.vertices))
     if len(on_rim):
         extent = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
@@ -226,7 +218,7 @@ def _oriented(f: Ints, pairs: Ints, notes: list[str]) -> NDArray[np.bool_]:
     # Each face is there twice, as it is (k) and turned over (n + k), and tied to what faces the same way beside it.
     a, b = (pairs // 3).T
     same, other = np.where(agrees, b, b + n), np.where(agrees, b + n, b)
-    _, label = _linked(np.concatenate((np.stack((a, same), 1), np.stack((a + n, other), 1))), 2 * n)
+    _, label = linked(np.concatenate((np.stack((a, same), 1), np.stack((a + n, other), 1))), 2 * n)
     as_is, turned = label[:n], label[n:]
     if (as_is == turned).any():
         msg = "the mesh has one side only: following it round (a Möbius strip), inside becomes outside; cut it open"
@@ -257,7 +249,7 @@ def _cut_apart(mesh: SurfaceMesh, pairs: Ints) -> SurfaceMesh:
     one, other = pairs.T
     # Oriented alike, an edge begins in one face where it ends in the other.
     links = np.concatenate((np.stack((one, following[other]), 1), np.stack((following[one], other), 1)))
-    count, label = _linked(links, n)
+    count, label = linked(links, n)
     vertices = np.empty((count, 3))
     vertices[label] = mesh.vertices[f.ravel()]
     order = np.full(count, n, np.int64)

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from refu_core.body import JOINT_NAMES
 from refu_core.errors import GarmentError
-from refu_core.fitting._clean import components, face_normals, rim_of
+from refu_core.fitting._clean import components, face_normals, rim_vertices
 from refu_core.fitting._mesh_file import SurfaceMesh
 from refu_core.fitting._posed import PosedBody
 from refu_core.frames import N_JOINTS
@@ -57,7 +57,7 @@ def without_bodies(mesh: SurfaceMesh, posed: PosedBody) -> tuple[SurfaceMesh, li
 def unsewn(mesh: SurfaceMesh) -> list[str]:
     """A note of pieces whose rims lie along each other, for a mesh in metres."""
     _, label = components(mesh.faces, len(mesh.vertices))
-    rim = rim_of(mesh.faces)
+    rim = rim_vertices(mesh.faces)
     label = label[rim]
     gap = _gaps(mesh.vertices[rim], label)
     near = np.bincount(label, weights=gap < _SEAM)

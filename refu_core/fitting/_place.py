@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 
 from refu_core.body import SmplBody
 from refu_core.errors import GarmentError
-from refu_core.fitting._clean import face_normals, rim_of
+from refu_core.fitting._clean import face_normals, rim_vertices
 from refu_core.fitting._mesh_file import SurfaceMesh
 from refu_core.fitting._posed import LEFT_HIP, LEFT_SHOULDER, RIGHT_SHOULDER, PosedBody, standing_pose
 from refu_core.fitting._surround import NEAR, Fit, Samples, fit_of, parts_legs, sample
@@ -209,7 +209,7 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
         f"inside the body, it is {1e3 * fit.distance:.0f} mm off on average, and {100 * fit.facing:.0f} % of it faces "
         "outward; is it a garment for this body? Say its --unit, --up or --pose, or place it on the body first"
     )
-    if not len(rim_of(mesh.faces)):
+    if not len(rim_vertices(mesh.faces)):
         msg += NO_OPENING
     raise GarmentError(msg)
 

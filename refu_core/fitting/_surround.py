@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from refu_core.body import SmplBody
-from refu_core.fitting._clean import components, face_normals, rim_of
+from refu_core.fitting._clean import components, face_normals, rim_vertices
 from refu_core.fitting._mesh_file import SurfaceMesh
 from refu_core.fitting._posed import PosedBody
 
@@ -100,7 +100,7 @@ def sample(mesh: SurfaceMesh, count: int, seed: int = 0) -> Samples:
     a, b, c = (mesh.vertices[mesh.faces[face, k]] for k in range(3))
     points = a + u[:, None] * (b - a) + v[:, None] * (c - a)
     _, label = components(mesh.faces, len(mesh.vertices))
-    open_pieces = np.unique(label[rim_of(mesh.faces)])
+    open_pieces = np.unique(label[rim_vertices(mesh.faces)])
     is_open = np.isin(label[mesh.faces[face, 0]], open_pieces)
     unit = normals[face] / np.maximum(area[face], 1e-300)[:, None]
     each = np.full(count, 0.5 * area.sum() / count)

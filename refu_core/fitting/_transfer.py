@@ -22,7 +22,7 @@ from scipy.sparse import coo_array, csc_array, diags_array
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
-from refu_core.fitting._clean import components, rim_of
+from refu_core.fitting._clean import components, rim_vertices
 from refu_core.fitting._posed import PosedBody
 from refu_core.mesh import vertex_areas, vertex_normals
 
@@ -70,7 +70,7 @@ class Transfer:
         normals = vertex_normals(vertices, faces.astype(np.int32))
         agrees = (normals * gradient).sum(1)
         n_pieces, label = components(faces, len(vertices))
-        rim = rim_of(faces)
+        rim = rim_vertices(faces)
         is_open = np.isin(np.arange(n_pieces), label[rim])
         # A closed piece is cloth with a thickness: its inner side faces the skin and follows it no less.
         agrees = np.where(is_open[label], agrees, np.abs(agrees))

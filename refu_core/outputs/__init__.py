@@ -2,7 +2,7 @@
 
 from refu_core.outputs._clearance import REACH as REACH
 from refu_core.outputs._clearance import Clearance as Clearance
-from refu_core.outputs._dressed import Dressed as Dressed
+from refu_core.outputs._dressed import DressedPerson as DressedPerson
 from refu_core.outputs._dressed import Fittings as Fittings
 from refu_core.outputs._limbs import PRESSED as PRESSED
 from refu_core.outputs._limbs import LimbContact as LimbContact

@@ -97,7 +97,7 @@ class Fittings:
 
 
 @dataclass(frozen=True, eq=False)
-class Dressed:
+class DressedPerson:
     """One person in one frame; vertices are relative to `offset`, in the axes that `rotation` leads to.
 
     One thread at a time may ask those of one `fittings`.

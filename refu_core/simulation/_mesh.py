@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.sparse.csgraph import dijkstra
 
 from refu_core.errors import MeshError
-from refu_core.mesh import Connectivity
+from refu_core.mesh import Connectivity, linked
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,8 +48,7 @@ class ClothTopology:
         """Vertices of each hem (waist, cuff, neckline), each sorted by index, in the order of their lowest index."""
         rim = self.mesh.boundary
         n = self.n_vertices
-        graph = coo_array((np.ones(len(rim)), (rim[:, 0], rim[:, 1])), shape=(n, n))
-        _, label = connected_components(graph, directed=False)
+        _, label = linked(rim, n)
         on_rim = np.zeros(n, bool)
         on_rim[rim] = True
         return [np.flatnonzero((label == k) & on_rim) for k in dict.fromkeys(label[on_rim])]

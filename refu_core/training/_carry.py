@@ -44,7 +44,7 @@ from refu_core.training._data import (
 )
 from refu_core.training._figures import backbone_figures, mpve
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage
-from refu_core.training._mirror import Mirror, OnSurface
+from refu_core.training._mirror import Mirror, SurfaceMixture
 from refu_core.training._pretrain import CodeLoss
 from refu_core.weights import load_weights, save_weights
 
@@ -107,13 +107,13 @@ class Carried:
         self._betas = None if fit is None else fit.difference(related.body).betas
         worn = worn_on(related, fit)
         vertices = garment.v_template.double().numpy()
-        nearest, place, distance = OnSurface.nearest(worn, vertices)
+        nearest, place, distance = SurfaceMixture.nearest(worn, vertices)
         share = _smooth((settings.reach + settings.fade - distance) / settings.fade)
         # Trousers go on where shorts end: a hem that swings there would be a step in them.
         ends = _from_rim(worn, place)
         goes_on = _smooth((_from_rim(garment, vertices) - ends) / settings.hem)
         share *= 1 - goes_on * _smooth(1 - ends / settings.hem)
-        self._mixed = OnSurface(nearest.corners, nearest.weights * torch.as_tensor(share)[:, None])
+        self._mixed = SurfaceMixture(nearest.corners, nearest.weights * torch.as_tensor(share)[:, None])
         self._garment, self._body = garment, body
         kept = torch.as_tensor(1 - share, dtype=torch.float32)[:, None]
         self._posed_as = replace(garment, weights=self._mixed(worn.weights[None])[0] + kept * garment.weights)

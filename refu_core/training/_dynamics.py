@@ -41,7 +41,7 @@ class DynamicsSettings:
     """Of the sequences, whole ones."""
 
 
-class _Known(NamedTuple):
+class _Prepared(NamedTuple):
     """What the loop draws from."""
 
     features: Tensor
@@ -157,21 +157,23 @@ def _pasts(dataset: GarmentSequences, rows: NDArray[np.bool_], *, is_mirrored: b
 
 
 @torch.no_grad()
-def _known(still: TailorNet, samples: TrainingSamples, past: Tensor) -> _Known:
+def _known(still: TailorNet, samples: TrainingSamples, past: Tensor) -> _Prepared:
     def owed(pose: Tensor, style_shape: Tensor, displacement: Tensor) -> Tensor:
         return still.decoder.encode(displacement) - still.code(still.features(pose), style_shape)
 
     code = in_chunks(owed, samples.pose, samples.style_shape, samples.displacement)
-    return _Known(in_chunks(still.features, samples.pose), samples.style_shape, past, code)
+    return _Prepared(in_chunks(still.features, samples.pose), samples.style_shape, past, code)
 
 
-def _split(samples: TrainingSamples, known: tuple[_Known, _Known], settings: DynamicsSettings) -> tuple[_Known, _Known]:
+def _split(
+    samples: TrainingSamples, known: tuple[_Prepared, _Prepared], settings: DynamicsSettings
+) -> tuple[_Prepared, _Prepared]:
     """To learn from, mirrored ones included, and to choose by."""
     which = replace(samples, displacement=torch.arange(len(samples)))  # their numbers, to split those
     train, validation = split_validation(which, share=settings.validation_share, seed=settings.loop.seed)
     plain, turned = known
     to_learn = [torch.cat((a[train.displacement], b[train.displacement])) for a, b in zip(plain, turned, strict=True)]
-    return _Known(*to_learn), _Known(*(one[validation.displacement] for one in plain))
+    return _Prepared(*to_learn), _Prepared(*(one[validation.displacement] for one in plain))
 
 
 @torch.no_grad()
@@ -179,7 +181,7 @@ def _figures(
     still: TailorNet,
     dynamics: Dynamics,
     test: TrainingSamples,
-    known: _Known,
+    known: _Prepared,
     body: SmplBody,
     garment: GarmentTemplate,
 ) -> dict[str, Any]:

@@ -19,7 +19,7 @@ MAX_ASYMMETRY = 5e-3
 
 
 @dataclass(frozen=True, eq=False)
-class OnSurface:
+class SurfaceMixture:
     """Places on a garment: each lies in a triangle, and takes a mixture of its three corners."""
 
     corners: Tensor
@@ -30,13 +30,13 @@ class OnSurface:
     @staticmethod
     def nearest(
         garment: GarmentTemplate, points: NDArray[np.float64]
-    ) -> tuple[OnSurface, NDArray[np.float64], NDArray[np.float64]]:
+    ) -> tuple[SurfaceMixture, NDArray[np.float64], NDArray[np.float64]]:
         """Those nearest to points (P, 3) [m]; where they are [m], (P, 3), and how far off, (P,)."""
         vertices, faces = garment.v_template.cpu().double().numpy(), garment.faces.cpu().numpy()
         mesh = trimesh.Trimesh(vertices, faces, process=False)
         places, distance, triangle = trimesh.proximity.closest_point(mesh, points)
         barycentrics = trimesh.triangles.points_to_barycentric(vertices[faces[triangle]], places)
-        return OnSurface(torch.as_tensor(faces[triangle]), torch.as_tensor(barycentrics)), places, distance
+        return SurfaceMixture(torch.as_tensor(faces[triangle]), torch.as_tensor(barycentrics)), places, distance
 
     def __call__(self, values: Tensor) -> Tensor:
         """Of values at the garment's vertices (B, V, K) those at the places, shape (B, P, K)."""
@@ -58,13 +58,13 @@ class Mirror:
     mixture of its three corners. The body and the bases of shape and style are symmetric, so β and γ stay.
     """
 
-    image: OnSurface
+    image: SurfaceMixture
 
     @staticmethod
     def of(garment: GarmentTemplate) -> Mirror:
         """The mirror image of a garment. Raises `GarmentError` where it isn't symmetric."""
         mirrored = garment.v_template.cpu().double().numpy() * np.array((-1.0, 1.0, 1.0))
-        image, _, distance = OnSurface.nearest(garment, mirrored)
+        image, _, distance = SurfaceMixture.nearest(garment, mirrored)
         if distance.max() > MAX_ASYMMETRY:
             msg = f"{garment.name} is off its mirror image by {1e3 * distance.max():.1f} mm; train it without mirroring"
             raise GarmentError(msg)

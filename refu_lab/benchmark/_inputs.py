@@ -22,7 +22,7 @@ Stretch = Sequence[SmplFrame]
 
 
 @dataclass(frozen=True, eq=False)
-class Moment:
+class EncodedFrame:
     """One frame in every form that a contender may want."""
 
     frame: SmplFrame
@@ -34,7 +34,7 @@ class Moment:
     """Whether it doesn't follow the frame before it."""
 
 
-Window = Sequence[Moment]
+Window = Sequence[EncodedFrame]
 
 
 def read_stretches(motions: Path | None, bags: Path, *, count: int, length: int) -> list[Stretch]:
@@ -72,7 +72,7 @@ def moments(stretches: Sequence[Stretch], pipeline: GarmentPipeline) -> list[Win
         raw = [torch.tensor(pipeline(frame)[name].raw) for frame in stretch]
         worn = [sdf_frame(pipeline.body, garment, frame, posed) for frame, posed in zip(stretch, raw, strict=True)]
         windows.append(
-            [Moment(f, encode(f), w, is_jump=i == 0) for i, (f, w) in enumerate(zip(stretch, worn, strict=True))]
+            [EncodedFrame(f, encode(f), w, is_jump=i == 0) for i, (f, w) in enumerate(zip(stretch, worn, strict=True))]
         )
     return windows
 

@@ -32,7 +32,7 @@ class PaperSettings:
     """Of the networks; bfloat16 and float16 are for GPUs."""
 
 
-class _InPrecision(WithoutWearerCode):
+class _LowPrecision(WithoutWearerCode):
     """A backbone in a precision of its own."""
 
     def __init__(self, backbone: Backbone, dtype: torch.dtype) -> None:
@@ -72,7 +72,7 @@ class PaperStructure:
         n = self._garment.n_vertices
         backbone = backbone.to(device, self._dtype).eval().requires_grad_(False)
         self._networks: list[nn.Module] = [backbone]
-        wearable = Wearable(self._garment, _InPrecision(backbone, self._dtype), None, margin=0.0)
+        wearable = Wearable(self._garment, _LowPrecision(backbone, self._dtype), None, margin=0.0)
         self._outfit = Outfit(self._body, {garment.name: wearable})
         self._distance = (
             SdfNetwork(SdfNetworkConfig(width=settings.width)).to(device, self._dtype).requires_grad_(False)

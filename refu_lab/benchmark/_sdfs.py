@@ -152,18 +152,6 @@ def _libigl(faces: NDArray[np.int32]) -> Ask:
     return ask
 
 
-def _open3d(faces: NDArray[np.int32]) -> Ask:
-    open3d: Any = importlib.import_module("open3d")
-    core = open3d.core
-
-    def ask(frame: SdfFrame) -> Any:
-        scene = open3d.t.geometry.RaycastingScene(nthreads=1)
-        scene.add_triangles(core.Tensor(frame.body), core.Tensor(faces.astype(np.uint32)))
-        return scene.compute_signed_distance(core.Tensor(frame.garment), nthreads=1).numpy()
-
-    return ask
-
-
 def _trimesh(faces: NDArray[np.int32]) -> Ask:
     trimesh: Any = importlib.import_module("trimesh")
 
@@ -179,7 +167,6 @@ def _trimesh(faces: NDArray[np.int32]) -> Ask:
 _Make = Callable[[NDArray[np.int32]], Ask]
 _OTHERS: tuple[tuple[str, str, str, _Make, bool], ...] = (
     ("libigl signed_distance, pseudo-normal", "igl", "libigl", _libigl, False),
-    ("open3d RaycastingScene", "open3d", "open3d", _open3d, False),
     ("trimesh closest_point", "rtree", "rtree", _trimesh, True),
 )
 """Name, module that must be there, package that brings it, maker, whether it is slow."""

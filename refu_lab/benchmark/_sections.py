@@ -14,7 +14,7 @@ import torch
 
 import msg_adapters as adapters
 from refu_core import GarmentPipeline, SmplFrame, WeightsError, load_garment
-from refu_lab.benchmark._inputs import Moment, Window
+from refu_lab.benchmark._inputs import EncodedFrame, Window
 from refu_lab.benchmark._measure import Timing, measure, processor_clock
 from refu_lab.benchmark._paper import PaperSettings, PaperStructure
 from refu_lab.benchmark._rows import BenchmarkResult, BenchmarkRow
@@ -56,7 +56,7 @@ class Section:
                 **how,
             )
 
-    def plain(self) -> Callable[[Moment], object]:
+    def plain(self) -> Callable[[EncodedFrame], object]:
         """The plain query on this section's device."""
         garment, body = self.options.on_body(self.garment)
         methods, _ = sdf_methods(body, garment, network=False, device=self.device)
@@ -94,9 +94,9 @@ class FrameRunner:
         self.stages: list[dict[str, float]] = []
         """What each stage took in each frame that wasn't a jump, by the clock that `time.perf_counter` is [ms]."""
 
-    def __call__(self, moments: Moment | Sequence[Moment]) -> bytes:
+    def __call__(self, moments: EncodedFrame | Sequence[EncodedFrame]) -> bytes:
         """The message that goes out."""
-        given = [moments] if isinstance(moments, Moment) else moments
+        given = [moments] if isinstance(moments, EncodedFrame) else moments
         laps = [time.perf_counter()]
         frames = [self._decode(given[i].raw) for i in self._persons]
         laps.append(time.perf_counter())
@@ -116,15 +116,15 @@ class FrameRunner:
         return data
 
 
-def _of_sdf(ask: Callable[[SdfFrame], object]) -> Callable[[Moment], object]:
+def _of_sdf(ask: Callable[[SdfFrame], object]) -> Callable[[EncodedFrame], object]:
     return lambda moment: ask(moment.sdf)
 
 
-def _of_frame(pipeline: Callable[[SmplFrame], object]) -> Callable[[Moment], object]:
+def _of_frame(pipeline: Callable[[SmplFrame], object]) -> Callable[[EncodedFrame], object]:
     return lambda moment: pipeline(moment.frame)
 
 
-def _always(run: Callable[[Moment], object], held: Moment) -> Callable[[Moment], object]:
+def _always(run: Callable[[EncodedFrame], object], held: EncodedFrame) -> Callable[[EncodedFrame], object]:
     return lambda _: run(held)
 
 
@@ -151,7 +151,7 @@ def measure_frames(
     """Whole frames of every pipeline, and the stages of the main ones. `figures` are added to the rows."""
     runners = frame_runners(section, pipelines)
     names = {key: ", ".join(filter(None, key)) for key in runners}
-    contenders: dict[str, Callable[[Moment], object]] = {PLAIN_QUERY: section.plain()}
+    contenders: dict[str, Callable[[EncodedFrame], object]] = {PLAIN_QUERY: section.plain()}
     times = section.measure(contenders | {names[key]: runner for key, runner in runners.items()}, section.windows)
     plain = times[PLAIN_QUERY]
     n = load_garment(section.garment).n_vertices
@@ -199,7 +199,7 @@ def measure_persons(section: Section, pipelines: Pipelines) -> None:
 
 def measure_still(section: Section, pipelines: Pipelines) -> None:
     """The same pose again and again, beside one that moves: the whole frame, and the pipeline alone."""
-    contenders: dict[str, Callable[[Moment], object]] = {PLAIN_QUERY: section.plain()}
+    contenders: dict[str, Callable[[EncodedFrame], object]] = {PLAIN_QUERY: section.plain()}
     backbone, held = _backbone(pipelines), section.windows[0][1]
     for mode in MAIN_MODES:
         moving = pipelines[backbone, mode]
@@ -225,7 +225,10 @@ def measure_paper(section: Section, pipelines: Pipelines) -> None:
     for dtype in types:
         settings = PaperSettings(dtype=dtype) if full else PaperSettings(pivots=2, width=64, dtype=dtype)
         paper = PaperStructure(*section.options.on_body(section.garment, device=section.device), settings=settings)
-        contenders: dict[str, Callable[[Moment], object]] = {PLAIN_QUERY: section.plain(), "paper": _of_frame(paper)}
+        contenders: dict[str, Callable[[EncodedFrame], object]] = {
+            PLAIN_QUERY: section.plain(),
+            "paper": _of_frame(paper),
+        }
         contenders |= {mode: FrameRunner(pipelines[_backbone(pipelines), mode]) for mode in MAIN_MODES}
         times = section.measure(contenders, section.windows[:2], slow={"paper"} if full else ())
         plain = times[PLAIN_QUERY]

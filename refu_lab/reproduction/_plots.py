@@ -13,7 +13,7 @@ import numpy as np
 
 from refu_core.metrics import CollisionChecker
 from refu_lab.plots import COLOURS, new_axes, save_svg
-from refu_lab.render import Camera, RenderMesh, collision_mesh, render, save_png
+from refu_lab.render import RenderMesh, Viewpoint, collision_mesh, render, save_png
 from refu_lab.reproduction._build import ENERGY_ZOOM, unseen_groups
 from refu_lab.reproduction._load import Library
 from refu_lab.reproduction._methods import METHODS
@@ -132,7 +132,7 @@ def _draw(samples: SampleSet, number: int, methods: Sequence[str], path: Path, l
     body, faces = RenderMesh(scene.vertices.numpy(), setup.body.faces.numpy()), setup.template.faces.numpy()
     checker = CollisionChecker(setup.body.faces)
     checker.update(scene.vertices)
-    camera = Camera.framing(sample.vertices, size=_SHOT, yaw=25.0)
+    camera = Viewpoint.framing(sample.vertices, size=_SHOT, yaw=25.0)
     images = []
     for vertices in (*shots, sample.vertices):
         found = checker.check(vertices, faces)

@@ -18,7 +18,7 @@ from refu_core.history import PoseHistory
 from refu_core.recordings import SUFFIXES, upright_turn
 from refu_lab.render import SKIN as SKIN_COLOUR
 from refu_lab.sources import open_source
-from refu_lab.view._film import BODY, SKIN, Cache, Shape
+from refu_lab.view._film import BODY, SKIN, Cache, SceneMesh
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -35,7 +35,7 @@ _USUAL = "smpl_params"
 
 
 @dataclass(frozen=True, eq=False)
-class Track:
+class PersonMotion:
     """One person's motion."""
 
     person: str
@@ -114,7 +114,7 @@ class DressedFilm:
         self._cache.clear()
         self._facts.clear()
 
-    def shapes(self, index: int) -> Sequence[Shape]:
+    def shapes(self, index: int) -> Sequence[SceneMesh]:
         """Everybody in a frame, dressed. Raises `RefuError`."""
         return self._cache.get(index, self._dress)
 
@@ -122,7 +122,7 @@ class DressedFilm:
         """What collision handling says of a frame, and how long it took."""
         return self._facts.get(index, [])
 
-    def _dress(self, index: int) -> Sequence[Shape]:
+    def _dress(self, index: int) -> Sequence[SceneMesh]:
         present = [(track, frame) for track in self._tracks if (frame := track.at(self._moments[index])) is not None]
         begun = time.perf_counter()
         outputs = self._pipeline([frame for _, frame in present])
@@ -138,7 +138,7 @@ class DressedFilm:
             lines.append(f"{name}: {inside} vertices inside, {left} afterwards")
         return lines if self.sdf != "none" else [f"{name}: as the network says" for name in self.garments]
 
-    def _of(self, track: Track, output: PipelineOutput) -> list[Shape]:
+    def _of(self, track: PersonMotion, output: PipelineOutput) -> list[SceneMesh]:
         shift = track.turn @ output.transl - self._origin
         turn = track.turn.astype(np.float32)
 
@@ -147,15 +147,15 @@ class DressedFilm:
             return there
 
         shapes = [
-            Shape(BODY, track.person, placed(output.body), self._body_faces, SKIN_COLOUR),
-            Shape(SKIN, track.person, placed(output.skin), self._body_faces, SKIN_COLOUR),
+            SceneMesh(BODY, track.person, placed(output.body), self._body_faces, SKIN_COLOUR),
+            SceneMesh(SKIN, track.person, placed(output.skin), self._body_faces, SKIN_COLOUR),
         ]
         for name, mesh in output.items():
             color = self._pipeline.garments[name].card.color
-            shapes.append(Shape(name, track.person, placed(mesh.local), mesh.faces, color))
+            shapes.append(SceneMesh(name, track.person, placed(mesh.local), mesh.faces, color))
         return shapes
 
-    def _read(self, path: Path, name: str) -> list[Track]:
+    def _read(self, path: Path, name: str) -> list[PersonMotion]:
         """Everybody in a file, who is called `name` where there are other files."""
         options = replace(self._options, input=path)
         topics = _topics_of_people(path) if options.topic is None and options.input_type is None else []
@@ -167,7 +167,7 @@ class DressedFilm:
         tracks = []
         for person, frames in found.items():
             times = np.array([1e-9 * (frame.stamp_ns - start) for frame in frames])
-            tracks.append(Track(person, frames, times, _turn(options, frames)))
+            tracks.append(PersonMotion(person, frames, times, _turn(options, frames)))
         return tracks
 
     def _frames(self, options: RecordingOptions) -> list[SmplFrame]:

@@ -16,7 +16,7 @@ _CACHE_BYTES = 512 << 20
 
 
 @dataclass(frozen=True, eq=False)
-class Shape:
+class SceneMesh:
     """A mesh of one person in one frame."""
 
     name: str
@@ -51,7 +51,7 @@ class Film(Protocol):
     def front(self) -> float:
         """Where the first person faces at the beginning: the angle from x towards y [rad]."""
 
-    def shapes(self, index: int) -> Sequence[Shape]:
+    def shapes(self, index: int) -> Sequence[SceneMesh]:
         """Everything in a frame; somebody who isn't there has no shapes. Raises `RefuError`."""
 
     def facts(self, index: int) -> list[str]:
@@ -62,10 +62,10 @@ class Cache:
     """The shapes of frames that were made last, up to half a gigabyte of vertices."""
 
     def __init__(self) -> None:
-        self._shapes: OrderedDict[int, Sequence[Shape]] = OrderedDict()
+        self._shapes: OrderedDict[int, Sequence[SceneMesh]] = OrderedDict()
         self._bytes = 0
 
-    def get(self, index: int, make: Callable[[int], Sequence[Shape]]) -> Sequence[Shape]:
+    def get(self, index: int, make: Callable[[int], Sequence[SceneMesh]]) -> Sequence[SceneMesh]:
         """Those of a frame, made unless they are known."""
         found = self._shapes.get(index)
         if found is None:
@@ -82,5 +82,5 @@ class Cache:
         self._bytes = 0
 
 
-def _size(shapes: Sequence[Shape]) -> int:
+def _size(shapes: Sequence[SceneMesh]) -> int:
     return sum(shape.vertices.nbytes for shape in shapes)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 import msg_adapters as adapters
 from refu_core import RefuError
-from refu_lab.view._film import Shape
+from refu_lab.view._film import SceneMesh
 from refu_lab.view._markers import MarkerScene
 
 TOPICS = ("garments", "body")
@@ -36,7 +36,7 @@ class LiveFilm:
         self.told: Callable[[], object] = lambda: None
         """Called, from another thread, when there is something new."""
         self._changed = threading.Condition()
-        self._scene: MarkerScene[Shape] = MarkerScene(lambda shape: shape)
+        self._scene: MarkerScene[SceneMesh] = MarkerScene(lambda shape: shape)
         self._stamp_ns = self._n_frames = self._n_bad = 0
         self._since: float | None = None
         self._heard = {*topics}
@@ -59,7 +59,7 @@ class LiveFilm:
         is_late = self._since is not None and time.monotonic() > self._since + _TOGETHER_S
         return bool(self._scene.topics) and (is_late or self._scene.topics == self._heard)
 
-    def shapes(self, index: int) -> Sequence[Shape]:  # noqa: ARG002
+    def shapes(self, index: int) -> Sequence[SceneMesh]:  # noqa: ARG002
         """What was published last of each topic; nothing of who has left."""
         with self._changed:
             return self._scene.shown(time.monotonic_ns())

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from msg_adapters import Marker, decode_marker_array
 from msg_adapters.errors import DecodeError
 from msg_adapters.markers import ADD, DELETE, DELETE_ALL, TRIANGLE_LIST
-from refu_lab.view._film import Shape
+from refu_lab.view._film import SceneMesh
 
 _FARTHEST = 1e6
 """A marker that is farther off is no thing to look at [m]."""
@@ -61,7 +61,7 @@ class MarkerScene(Generic[_Kept]):
     What doesn't change from marker to marker stays one array, and the first vertex of all is the origin.
     """
 
-    def __init__(self, keep: Callable[[Shape], _Kept]) -> None:
+    def __init__(self, keep: Callable[[SceneMesh], _Kept]) -> None:
         """What is kept of a shape is up to `keep`."""
         self._keep = keep
         self._shown: dict[tuple[str, str, int], tuple[_Kept, float]] = {}
@@ -96,7 +96,7 @@ class MarkerScene(Generic[_Kept]):
             self._shown[topic, marker.ns, marker.id] = self._keep(self.shape(marker)), until_ns
         return max((marker.stamp_ns or now_ns for marker in drawable), default=0), len(meshes) - len(drawable)
 
-    def shape(self, marker: Marker) -> Shape:
+    def shape(self, marker: Marker) -> SceneMesh:
         """A marker of triangles as a shape."""
         key, points = (marker.ns, marker.id), marker.points
         topology = self._topologies.get(key)
@@ -107,7 +107,7 @@ class MarkerScene(Generic[_Kept]):
             self._origin = vertices[0].copy()
         person, _, name = marker.ns.rpartition("/")
         color = (marker.color[0], marker.color[1], marker.color[2])
-        return Shape(name, person, (vertices - self._origin).astype(np.float32), topology.faces, color)
+        return SceneMesh(name, person, (vertices - self._origin).astype(np.float32), topology.faces, color)
 
 
 def shows_meshes(data: bytes) -> bool:

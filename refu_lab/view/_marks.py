@@ -13,7 +13,7 @@ from refu_core.metrics import CollisionChecker
 from refu_core.modes import Choice
 from refu_core.sdf import ExactSdf
 from refu_lab.render import COLLIDING
-from refu_lab.view._film import Shape
+from refu_lab.view._film import SceneMesh
 
 Colour = tuple[float, float, float]
 
@@ -51,13 +51,13 @@ class Band:
     color: Colour
 
 
-class Marker:
+class BandFinder:
     """Finds the bands of garments on one person's body after the other; what it prepares for a topology it keeps."""
 
     def __init__(self) -> None:
         self._checkers: dict[int, tuple[NDArray[np.int64], CollisionChecker, ExactSdf]] = {}
 
-    def bands(self, marking: Marking, garments: Sequence[Shape], body: Shape | None) -> list[list[Band]]:
+    def bands(self, marking: Marking, garments: Sequence[SceneMesh], body: SceneMesh | None) -> list[list[Band]]:
         """The bands of each garment of a person: always as many for one marking.
 
         Raises `MeshError` for a body that isn't a closed surface.
@@ -80,7 +80,7 @@ class Marker:
         return known[1:]
 
 
-def _colliding(checker: CollisionChecker, garment: Shape) -> list[Band]:
+def _colliding(checker: CollisionChecker, garment: SceneMesh) -> list[Band]:
     found = checker.check(garment.vertices, garment.faces)
     bad: NDArray[np.bool_] = np.zeros(len(garment.faces), bool)
     bad[found.pairs[:, 0]] = True
@@ -88,7 +88,7 @@ def _colliding(checker: CollisionChecker, garment: Shape) -> list[Band]:
     return [Band(garment.faces[~bad], garment.color), Band(garment.faces[bad], COLLIDING)]
 
 
-def _clearance(sdf: ExactSdf, garment: Shape) -> list[Band]:
+def _clearance(sdf: ExactSdf, garment: SceneMesh) -> list[Band]:
     distance = sdf.query(torch.from_numpy(garment.vertices)).distance.numpy()
     limits = [limit for limit, _ in CLEARANCE[:-1]]
     band = np.searchsorted(limits, distance[garment.faces].min(1))

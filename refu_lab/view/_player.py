@@ -14,7 +14,7 @@ from refu_core.modes import SdfMode
 from refu_lab.view._dressed import DressedFilm
 from refu_lab.view._film import BODY, SKIN
 from refu_lab.view._live import LiveFilm
-from refu_lab.view._marks import CLEARANCE, Band, Marker, Marking
+from refu_lab.view._marks import CLEARANCE, Band, BandFinder, Marking
 from refu_lab.view._stage import Stage
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     import viser
 
-    from refu_lab.view._film import Film, Shape
+    from refu_lab.view._film import Film, SceneMesh
 
 _SPEEDS = {"¼ ×": 0.25, "½ ×": 0.5, "1 ×": 1.0, "2 ×": 2.0, "4 ×": 4.0}
 _HIDDEN = "hidden"
@@ -38,7 +38,7 @@ class Player:
 
     def __init__(self, server: viser.ViserServer, film: Film) -> None:
         self._server, self._film = server, film
-        self._stage, self._marker = Stage(server), Marker()
+        self._stage, self._marker = Stage(server), BandFinder()
         self._times = film.times
         self._moment, self._index = 0.0, 0
         self._playing = len(self._times) > 1
@@ -113,10 +113,10 @@ class Player:
             facts = [f"frame {index} of {len(self._times)}, {self._times[index]:.2f} s", *facts]
         self._said.content = "  \n".join(facts)
 
-    def _bands(self, shapes: Sequence[Shape]) -> list[tuple[Shape, Sequence[Band]]]:
+    def _bands(self, shapes: Sequence[SceneMesh]) -> list[tuple[SceneMesh, Sequence[Band]]]:
         shown = _BODIES[self._body.value]
         marking = Marking(self._marking.value)
-        found: list[tuple[Shape, Sequence[Band]]] = []
+        found: list[tuple[SceneMesh, Sequence[Band]]] = []
         for person in dict.fromkeys(shape.person for shape in shapes):
             own = [shape for shape in shapes if shape.person == person]
             garments = [shape for shape in own if shape.is_garment and self._is_shown(shape.name)]
@@ -156,7 +156,7 @@ class Player:
 
     # ---- the panel ---------------------------------------------------------------------------------------------------
 
-    def _build(self, first: Sequence[Shape]) -> None:
+    def _build(self, first: Sequence[SceneMesh]) -> None:
         gui, film = self._server.gui, self._film
         gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(44, 98, 150))
         gui.set_panel_label(f"refu view: {printable(film.title)}")

@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 import msg_adapters as adapters
 from refu_core import RefuError
-from refu_lab.view._film import Cache, Shape
+from refu_lab.view._film import Cache, SceneMesh
 from refu_lab.view._markers import MarkerScene, shows_meshes
 
 _LONGEST_PAUSE_S = 1.0
@@ -26,7 +26,7 @@ _LOOKED_AT = 100
 
 
 @dataclass(frozen=True)
-class _Stored:
+class _RecordedMesh:
     name: str
     person: str
     color: tuple[float, float, float]
@@ -47,8 +47,8 @@ class RecordedFilm:
         """What there is to warn of, for people."""
         self._spool = tempfile.TemporaryFile()  # noqa: SIM115  (as long as the film)
         self._size = 0
-        scene: MarkerScene[_Stored] = MarkerScene(self._store)
-        moments: list[tuple[int, list[_Stored]]] = []
+        scene: MarkerScene[_RecordedMesh] = MarkerScene(self._store)
+        moments: list[tuple[int, list[_RecordedMesh]]] = []
         stamp_ns = n_bad = n_odd = 0
         with adapters.BagReader(path) as reader:
             topics = {topic.name: topic.message_count for topic in marker_topics(reader)}
@@ -87,7 +87,7 @@ class RecordedFilm:
         """From the first frame on [s], shape (T,)."""
         return self._times
 
-    def shapes(self, index: int) -> Sequence[Shape]:
+    def shapes(self, index: int) -> Sequence[SceneMesh]:
         """What was recorded of a moment."""
         return self._cache.get(index, self._read)
 
@@ -99,8 +99,8 @@ class RecordedFilm:
         """Gives the temporary file back."""
         self._spool.close()
 
-    def _store(self, shape: Shape) -> _Stored:
-        stored = _Stored(shape.name, shape.person, shape.color, shape.faces, len(shape.vertices), self._size)
+    def _store(self, shape: SceneMesh) -> _RecordedMesh:
+        stored = _RecordedMesh(shape.name, shape.person, shape.color, shape.faces, len(shape.vertices), self._size)
         data = shape.vertices.tobytes()
         try:
             self._spool.write(data)
@@ -110,13 +110,13 @@ class RecordedFilm:
         self._size += len(data)
         return stored
 
-    def _read(self, index: int) -> Sequence[Shape]:
+    def _read(self, index: int) -> Sequence[SceneMesh]:
         self._spool.flush()
         found = []
         for one in self._frames[index]:
             data = os.pread(self._spool.fileno(), 12 * one.n_vertices, one.offset)
             vertices = np.frombuffer(data, np.float32).reshape(-1, 3).copy()
-            found.append(Shape(one.name, one.person, vertices, one.faces, one.color))
+            found.append(SceneMesh(one.name, one.person, vertices, one.faces, one.color))
         return found
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from msg_adapters import vertices_ros_from_smpl, vertices_smpl_from_ros
-from refu_lab.render import Camera
+from refu_lab.render import Viewpoint
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import viser
     from numpy.typing import NDArray
 
-    from refu_lab.view._film import Shape
+    from refu_lab.view._film import SceneMesh
     from refu_lab.view._marks import Band
 
 _FOV = 30.0
@@ -32,7 +32,7 @@ Key = tuple[str, str, int]
 
 
 @dataclass(eq=False)
-class _Drawn:
+class _Shown:
     mesh: viser.MeshHandle
     faces: NDArray[np.int64]
     n_vertices: int
@@ -44,7 +44,7 @@ class Stage:
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
-        self._drawn: dict[Key, _Drawn] = {}
+        self._drawn: dict[Key, _Shown] = {}
         scene = server.scene
         scene.set_up_direction("+z")
         scene.world_axes.visible = False
@@ -53,7 +53,7 @@ class Stage:
         scene.add_light_hemisphere("/light/sky", sky_color=_SKY, ground_color=_EARTH, intensity=1.9)
         self._world = scene.add_frame("/world", show_axes=False)
 
-    def set(self, shapes: Sequence[Shape], *, ground: float, front: float) -> None:
+    def set(self, shapes: Sequence[SceneMesh], *, ground: float, front: float) -> None:
         """Puts the ground under the first frame, and the camera before it.
 
         `ground` is its height [m]; `front` is where the person faces, from x towards y [rad].
@@ -89,7 +89,7 @@ class Stage:
                 position=(3.0 * math.cos(angle), 3.0 * math.sin(angle), height),
             )
         yaw = math.degrees(front + _SIDE)
-        framed = Camera.framing(
+        framed = Viewpoint.framing(
             vertices_smpl_from_ros(points), size=(640, 760), yaw=yaw, pitch=9.0, margin=1.25, vertical_fov=_FOV
         )
         shift = np.array([centre[0], centre[1], 0.0])
@@ -99,14 +99,14 @@ class Stage:
         camera.look_at = vertices_ros_from_smpl(np.array(framed.target)) - shift
         camera.near = 0.02
 
-    def follow(self, shapes: Sequence[Shape]) -> None:
+    def follow(self, shapes: Sequence[SceneMesh]) -> None:
         """Brings the world to where the camera is: the middle of a person over the origin."""
         if shapes:
             low, high = (np.stack([at(shape.vertices, 0) for shape in shapes]) for at in (np.min, np.max))
             middle = (low.min(0) + high.max(0)) / 2
             self._world.position = (-float(middle[0]), -float(middle[1]), 0.0)
 
-    def draw(self, bands: Iterable[tuple[Shape, Sequence[Band]]], *, wireframe: bool) -> None:
+    def draw(self, bands: Iterable[tuple[SceneMesh, Sequence[Band]]], *, wireframe: bool) -> None:
         """Shows these, and nothing else."""
         with self._server.atomic():
             left = set(self._drawn)
@@ -119,7 +119,7 @@ class Stage:
             for key in left:
                 self._drawn.pop(key).mesh.remove()
 
-    def _put(self, key: Key, shape: Shape, band: Band, *, wireframe: bool) -> None:
+    def _put(self, key: Key, shape: SceneMesh, band: Band, *, wireframe: bool) -> None:
         drawn = self._drawn.get(key)
         if drawn is not None and drawn.n_vertices == len(shape.vertices):
             drawn.mesh.vertices = shape.vertices
@@ -143,7 +143,7 @@ class Stage:
             wireframe=wireframe,
             receive_shadow=False,  # maps of a few thousand texels draw stripes on cloth that is seen from near
         )
-        self._drawn[key] = _Drawn(mesh, band.faces, len(shape.vertices), band.color)
+        self._drawn[key] = _Shown(mesh, band.faces, len(shape.vertices), band.color)
 
 
 def _node(name: str) -> str:

@@ -13,7 +13,7 @@ from refu_core import FrameError, GarmentPipeline, SmplFrame
 from refu_core.observation import DEFAULT_OBSERVATION, Observer
 from refu_core.observation._estimate import Estimate
 from refu_core.outputs import Clearance, PinholeCamera, depth_image, visible
-from refu_lab.truth import Moment, moments_of
+from refu_lab.truth import TrueFrame, moments_of
 
 BAG = Path(__file__).parents[2] / "bags" / "eval_short_pant_male"
 NAME = "short-pant-male"
@@ -32,7 +32,7 @@ def observer(pipeline: GarmentPipeline, tmp_path_factory: pytest.TempPathFactory
 
 
 @pytest.fixture(scope="module")
-def moments(pipeline: GarmentPipeline) -> list[Moment]:
+def moments(pipeline: GarmentPipeline) -> list[TrueFrame]:
     """Of the pairs that nothing was tuned on."""
     return [one for one in moments_of(BAG, pipeline.garments[NAME]) if one.pair % 2 == 1]
 
@@ -48,7 +48,7 @@ def seen_by(camera: PinholeCamera, meshes: list, rng: np.random.Generator) -> np
 
 
 def test_the_visible_error_is_a_third_less(
-    pipeline: GarmentPipeline, observer: Observer, moments: list[Moment]
+    pipeline: GarmentPipeline, observer: Observer, moments: list[TrueFrame]
 ) -> None:
     faces, skin_faces = pipeline.garments[NAME].faces.numpy(), pipeline.body.faces.numpy()
     rng, before, after = np.random.default_rng(0), [], []
@@ -82,7 +82,7 @@ def test_points_of_an_outer_garment_move_no_inner_one(pipeline: GarmentPipeline)
 
 
 def test_without_points_it_is_the_prediction(
-    pipeline: GarmentPipeline, observer: Observer, moments: list[Moment]
+    pipeline: GarmentPipeline, observer: Observer, moments: list[TrueFrame]
 ) -> None:
     observer.reset()
     plain, out = pipeline(moments[0].frame), observer(moments[0].frame)
@@ -91,7 +91,7 @@ def test_without_points_it_is_the_prediction(
 
 
 def test_it_follows_whichever_way_the_person_faces(
-    pipeline: GarmentPipeline, observer: Observer, moments: list[Moment]
+    pipeline: GarmentPipeline, observer: Observer, moments: list[TrueFrame]
 ) -> None:
     """Points of the true vertices, turned and moved with the person: the same cloth, turned and moved."""
     frame, truth = moments[1].frame, moments[1].truth

@@ -20,7 +20,7 @@ from refu_core import ExactSdf, GarmentPipeline, GarmentTemplate, MeshError, Smp
 from refu_core.garments import BUILTIN_GARMENTS
 from refu_core.outputs import (
     Clearance,
-    Dressed,
+    DressedPerson,
     Fittings,
     LimbContacts,
     Openings,
@@ -229,7 +229,7 @@ def test_a_garment_that_planners_cannot_have_keeps_no_other_from_them() -> None:
     worn = GarmentPipeline.load([torn, shorts], backbone="skinned", certify=False)
     fittings, obstacles = Fittings(worn), Obstacles()
     frame = SmplFrame(pose=np.zeros((24, 3)))
-    dressed = Dressed("", frame, worn(frame), fittings, np.eye(3), np.zeros(3))
+    dressed = DressedPerson("", frame, worn(frame), fittings, np.eye(3), np.zeros(3))
     moment = Moment("map", 0, (), 0.0, lambda _: 1, 0)
     deadline = time.monotonic() + 120
     while not (sent := list(obstacles.messages([dressed], moment))) and time.monotonic() < deadline:

@@ -11,7 +11,7 @@ import pytest
 import trimesh
 
 from refu_core import RefuError
-from refu_lab.turntable import STYLE, Frame, Mesh, Pose, turntable
+from refu_lab.turntable import STYLE, Frame, Mesh, MeshInFrame, turntable
 
 RED, BLUE = (0.9, 0.15, 0.1), (0.1, 0.2, 0.9)
 
@@ -22,8 +22,8 @@ def page(folder: Path) -> Path:
     half = ball.faces[ball.triangles_center[:, 0] > 0]
     meshes = [Mesh("body", ball.faces, RED), Mesh("half", half, BLUE)]
     inner = np.float32(ball.vertices)
-    before = [Pose(inner), Pose(1.2 * inner)]
-    after = [Pose(inner), Pose(np.float32([-1.5, 1.5, 1.5]) * inner, np.arange(len(inner)) < 0)]
+    before = [MeshInFrame(inner), MeshInFrame(1.2 * inner)]
+    after = [MeshInFrame(inner), MeshInFrame(np.float32([-1.5, 1.5, 1.5]) * inner, np.arange(len(inner)) < 0)]
     frames = [Frame("one", "<One>", before, after, "was <b>", "is", 0.0)]
     path = folder / "page.html"
     path.write_text(f"<!doctype html><style>{STYLE}</style>{turntable(meshes, frames)}", encoding="utf-8")
@@ -66,7 +66,7 @@ def test_a_page_without_network_draws_turns_and_switches(chromium: browser.Brows
 
 
 def test_too_many_vertices_are_refused() -> None:
-    many = Pose(np.zeros((40_000, 3), np.float32))
+    many = MeshInFrame(np.zeros((40_000, 3), np.float32))
     frame = Frame("one", "One", [many], [many], "", "", 0.0)
     with pytest.raises(RefuError, match="40000 vertices"):
         turntable([Mesh("body", np.array([[0, 1, 2]]), RED)], [frame])

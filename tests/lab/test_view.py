@@ -29,10 +29,10 @@ from refu_lab.cli import main
 from refu_lab.commands.replay import RecordingOptions
 from refu_lab.commands.view import ViewOptions
 from refu_lab.view import view
-from refu_lab.view._dressed import DressedFilm, Track
-from refu_lab.view._film import BODY, SKIN, Cache, Shape
+from refu_lab.view._dressed import DressedFilm, PersonMotion
+from refu_lab.view._film import BODY, SKIN, Cache, SceneMesh
 from refu_lab.view._markers import MarkerScene, Topology, is_drawable
-from refu_lab.view._marks import CLEARANCE, Marker, Marking
+from refu_lab.view._marks import CLEARANCE, BandFinder, Marking
 from refu_lab.view._player import Player
 from refu_lab.view._recorded import RecordedFilm
 from refu_lab.view._view import open_film
@@ -71,7 +71,7 @@ def film(bag: Path) -> DressedFilm:
     return DressedFilm([bag], RecordingOptions(input=Path(), garments=SHORTS))
 
 
-def by_name(shapes: Any, person: str = "") -> dict[str, Shape]:
+def by_name(shapes: Any, person: str = "") -> dict[str, SceneMesh]:
     return {shape.name: shape for shape in shapes if shape.person == person}
 
 
@@ -218,7 +218,7 @@ def test_topology_is_found_from_corners(seed: int, n_faces: int, n_vertices: int
 @given(st.lists(st.integers(0, 5000), min_size=1, max_size=20, unique=True), st.integers(-1000, 6000))
 def test_the_nearest_frame_of_a_person_is_shown_if_it_is_near(stamps: list[int], at: int) -> None:
     times = np.sort(stamps) / 1000
-    track = Track("", [SmplFrame(np.zeros((24, 3)), stamp_ns=int(1e9 * t)) for t in times], times, np.eye(3))
+    track = PersonMotion("", [SmplFrame(np.zeros((24, 3)), stamp_ns=int(1e9 * t)) for t in times], times, np.eye(3))
     found, gaps = track.at(at / 1000), np.abs(times - at / 1000)
     if gaps.min() > 0.2501:
         assert found is None
@@ -231,9 +231,9 @@ def test_the_cache_forgets_what_was_shown_longest_ago(monkeypatch: pytest.Monkey
     monkeypatch.setattr("refu_lab.view._film._CACHE_BYTES", 3 * 120)
     cache, made = Cache(), []
 
-    def make(index: int) -> list[Shape]:
+    def make(index: int) -> list[SceneMesh]:
         made.append(index)
-        return [Shape(BODY, "", np.zeros((10, 3), np.float32), np.zeros((1, 3), np.int64), (0, 0, 0))]
+        return [SceneMesh(BODY, "", np.zeros((10, 3), np.float32), np.zeros((1, 3), np.int64), (0, 0, 0))]
 
     for index in (0, 1, 2, 0, 3, 0, 1):
         cache.get(index, make)
@@ -248,7 +248,7 @@ def test_bands_have_each_face_once_and_say_what_is_so(film: DressedFilm) -> None
     body, shorts = shapes[BODY], shapes[SHORTS[0]]
     middle = shorts.vertices.mean(0)
     shorts = replace(shorts, vertices=middle + np.float32(0.93) * (shorts.vertices - middle))  # some of it is inside
-    marker = Marker()
+    marker = BandFinder()
     for marking in Marking:
         (bands,) = marker.bands(marking, [shorts], body)
         joined = np.concatenate([band.faces for band in bands])
