@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 from refu_core import RefuError, load_garment
 from refu_core._device import checked_device
+from refu_core._files import exclusive
 from refu_core.backbones import PRESETS
 from refu_core.body import JOINT_NAMES, load_fit
 from refu_core.errors import printable
@@ -39,9 +41,20 @@ def train(options: TrainOptions, *, progress: bool) -> dict[str, Any]:
     A mode with ReFU starts from the backbone alone, which is trained first where the output folder has none; the gcnn
     starts from scratch in every mode, as in the paper's supplement.
 
-    Raises `RefuError` for options that name nothing, and where training does.
+    Raises `RefuError` for options that name nothing, for a folder that another run writes to, and where training does.
     """
     _check(options)
+    dataset = GarmentDataset(options.data) if options.network == "sdf" else open_dataset(options.data)
+    folder = options.folder
+    folder.mkdir(parents=True, exist_ok=True)
+    if os.environ.get("RANK", "0") != "0":  # of a torchrun, whose first process holds the folder
+        return _train(options, dataset, progress=progress)
+    busy = RefuError(f"{folder}: another training writes here; wait for it, or give another --output")
+    with exclusive(folder / "lock", error=busy):
+        return _train(options, dataset, progress=progress)
+
+
+def _train(options: TrainOptions, dataset: Any, *, progress: bool) -> dict[str, Any]:
     template = load_garment(options.garment)
     fit = load_fit(options.body or template.body)
     template, body = worn_on(template, fit), fit.body
@@ -49,8 +62,8 @@ def train(options: TrainOptions, *, progress: bool) -> dict[str, Any]:
     common: dict[str, Any] = {"device": options.device, "quiet": not progress}
     if options.network == "sdf":
         to_sdf = replace(SdfSettings.of(options.preset), seed=options.seed, **steps)
-        return train_sdf(GarmentDataset(options.data), body, template, options.folder, settings=to_sdf, **common)
-    dataset, common["body"] = open_dataset(options.data), body
+        return train_sdf(dataset, body, template, options.folder, settings=to_sdf, **common)
+    common["body"] = body
     given = template, dataset, options.folder
     if options.network == "dynamics":
         moving = _seeded(DynamicsSettings(), options, **steps)

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from small_set import write_set
 
-from refu_core import GarmentPipeline, SmplFrame, load_body, load_garment
+from refu_core import GarmentPipeline, RefuError, SmplFrame, load_body, load_garment
+from refu_core._files import exclusive
 from refu_lab.cli import main
 
 pytestmark = pytest.mark.usefixtures("no_curves_in_module")
@@ -71,6 +72,14 @@ def test_weights_that_are_not_there_are_refused(tmp_path: Path) -> None:
 
     with pytest.raises(WeightsError, match=r"no such weights.*refu train"):
         GarmentPipeline.load([GARMENT], sdf="hybrid", backbone="tailornet", weights=tmp_path)
+
+
+def test_two_trainings_do_not_share_a_folder(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["train", GARMENT, "--data", str(data), "--mode", "none", "--steps", "1", "--quiet"]
+    with exclusive(tmp_path / "lock", error=RefuError("taken")):
+        assert main([*arguments, "--output", str(tmp_path)]) == 2
+    assert "another training writes here" in capsys.readouterr().err
+    assert not (tmp_path / "tailornet-none.json").exists()
 
 
 @pytest.mark.parametrize(
