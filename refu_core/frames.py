@@ -89,8 +89,8 @@ class SmplFrame:
     stamp_ns: int = 0
     """Time of the measurement [ns since the epoch of the sender's clock]."""
     up: NDArray[np.floating] = field(default_factory=lambda: np.array([0, 1, 0], np.float32))
-    """Away from the ground, in the axes of the root and `transl`, shape (3,); of any length, kept as a unit vector.
-    Cloth hangs the other way."""
+    """Away from the ground, in the axes of the root and `transl`, shape (3,); of a length from 1e-6 to
+    1e6, kept as a unit vector. Cloth hangs the other way."""
     past: NDArray[np.float32] | None = None
     """How the person moved until now, as `PoseHistory` says it, shape (4, 219): see there; None for not at all."""
 
@@ -104,9 +104,10 @@ class SmplFrame:
                 self, "style", checked_numbers("style", self.style, (N_STYLES,), np.float32, MAX_COEFFICIENT)
             )
         up = checked_numbers("up", self.up, (3,), np.float64)
-        length = float(np.linalg.norm(up))
+        with np.errstate(over="ignore"):  # which is no direction, either
+            length = float(np.linalg.norm(up))
         if not 1e-6 <= length <= 1e6:
-            msg = f"up must be a direction, got {self.up!r}"
+            msg = f"up must be a direction, of a length from 1e-6 to 1e6, got {self.up!r}"
             raise FrameError(msg)
         object.__setattr__(self, "up", checked_numbers("up", up / length, (3,), np.float32))
         if self.past is not None:

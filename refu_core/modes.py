@@ -15,6 +15,8 @@ PAPER_GARMENTS: tuple[str, ...] = ("shirt-male", "tshirt-male", "short-pant-male
 _FILES = (Path(__file__).parent / "assets").glob(GARMENT_FILE.format("*"))
 BUILTIN_GARMENTS = (*PAPER_GARMENTS, *sorted({p.stem.removeprefix("garment_") for p in _FILES} - set(PAPER_GARMENTS)))
 """Garments that ship."""
+BUILTIN_BODIES: tuple[str, ...] = ("male", "female", "neutral")
+"""Bodies that ship."""
 DEFAULT_GARMENTS: tuple[str, ...] = ("tshirt-male", "short-pant-male")
 """What a person wears of whom nothing else is said."""
 

@@ -16,7 +16,15 @@ import numpy as np
 
 from refu_core.errors import RefuError
 from refu_core.frames import N_BETAS, N_STYLES, SmplFrame
-from refu_core.modes import DEFAULT_GARMENTS, DEFAULT_MARGIN, MAX_MARGIN, BackboneName, BetasSource, SdfMode
+from refu_core.modes import (
+    BUILTIN_BODIES,
+    DEFAULT_GARMENTS,
+    DEFAULT_MARGIN,
+    MAX_MARGIN,
+    BackboneName,
+    BetasSource,
+    SdfMode,
+)
 
 if TYPE_CHECKING:
     from refu_core.garments import GarmentTemplate
@@ -145,7 +153,6 @@ class PipelineOptions:
     def check_files(self) -> None:
         """Raises `RefuError` for a device, a body or weights that there aren't, as far as that shows at once."""
         from refu_core._device import checked_device
-        from refu_core.body import BUILTIN_BODIES
         from refu_core.weights import weights_folder
 
         checked_device(self.device)
@@ -196,7 +203,7 @@ class DressOptions(PipelineOptions):
     )
     betas: tuple[float, ...] = setting(
         (0.0,) * N_BETAS,
-        "Shape of everybody in standard deviations, where betas_source is fixed.",
+        "Shape of everybody in standard deviations, where betas_source is fixed; commands take --betas as that.",
         within=(-20.0, 20.0),
         metavar="B0,…",
     )

@@ -8,7 +8,6 @@ from refu_core.body._fit import BodyFit as BodyFit
 from refu_core.body._fit import Difference as Difference
 from refu_core.body._fit import ShapeMap as ShapeMap
 from refu_core.body._fit import load_fit as load_fit
-from refu_core.body._io import BUILTIN_BODIES as BUILTIN_BODIES
 from refu_core.body._io import load_body as load_body
 from refu_core.body._kinematics import RigidTransforms as RigidTransforms
 from refu_core.body._kinematics import forward_kinematics as forward_kinematics
@@ -31,5 +30,6 @@ from refu_core.body._skinning import apply_transforms as apply_transforms
 from refu_core.body._skinning import blend_transforms as blend_transforms
 from refu_core.body._skinning import unapply_transforms as unapply_transforms
 from refu_core.body._surface import Surface as Surface
+from refu_core.modes import BUILTIN_BODIES as BUILTIN_BODIES
 from refu_core.skeleton import JOINT_NAMES as JOINT_NAMES
 from refu_core.skeleton import PARENTS as PARENTS

@@ -13,12 +13,13 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from refu_core._cache import keep, recall
-from refu_core.body._io import BUILTIN_BODIES, load_body
+from refu_core.body._io import load_body
 from refu_core.body._model import BodyArrays, SmplBody
 from refu_core.body._register import ENDS, Registration, derivatives, register
 from refu_core.body._rest_pose import require_rest_pose
 from refu_core.body._surface import OnSurface
 from refu_core.frames import N_BETAS, N_JOINTS
+from refu_core.modes import BUILTIN_BODIES
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -15,8 +15,8 @@ from refu_core._npz import read_npz
 from refu_core._pickle import read_smpl_pickle
 from refu_core.body._model import BodyArrays, SmplBody
 from refu_core.errors import BodyError, require_type
+from refu_core.modes import BUILTIN_BODIES
 
-BUILTIN_BODIES: tuple[str, ...] = ("male", "female", "neutral")
 _KEYS = ("v_template", "f", "weights", "J_regressor", "kintree_table", "shapedirs", "posedirs")
 _MISNAMED = ("faces",)
 """Asked for to say what they should be called."""

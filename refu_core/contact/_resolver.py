@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 import warp as wp
+from numpy.typing import NDArray
 from torch import Tensor
 
 from refu_core._warp import as_warp, ints, memory, recorded, torch_stream
@@ -17,7 +18,7 @@ from refu_core.errors import MeshError
 from refu_core.mesh import Connectivity
 from refu_core.modes import DEFAULT_MARGIN
 from refu_core.refu import VertexScale
-from refu_core.sdf import MeshSdf, SdfSample, require_tensor
+from refu_core.sdf import MeshSdf, SdfSample, require_finite, require_tensor
 
 
 class Resolution(NamedTuple):
@@ -62,12 +63,15 @@ class Resolver:
     launches in every frame, as a CUDA graph needs them, and the numbers of a `Resolution` stay there.
     """
 
-    def __init__(self, faces: Tensor, n_vertices: int, *, settings: ContactSettings = DEFAULT_CONTACT) -> None:
+    def __init__(
+        self, faces: Tensor | NDArray[Any], n_vertices: int, *, settings: ContactSettings = DEFAULT_CONTACT
+    ) -> None:
         """For garments of these `faces`, shape (G, 3), and `n_vertices` N, on the device of the faces.
 
         Raises:
             MeshError: a face that names a vertex there isn't.
         """
+        faces = faces if isinstance(faces, Tensor) else torch.tensor(np.asarray(faces))
         self._settings, self.device = settings, faces.device
         self._n_vertices = n = n_vertices
         mesh = Connectivity.of(faces.cpu(), n)
@@ -115,8 +119,8 @@ class Resolver:
             scale: α of the first push: one number, or a function of vertices and their distances.
 
         Raises:
-            MeshError: points of another number or type, a negative margin, a distance that isn't one to faces, or no
-                start though the last call wasn't for this `sdf`.
+            MeshError: points of another number or type, or not finite, a negative margin, a distance that isn't one to
+                faces, or no start though the last call wasn't for this `sdf`.
         """
         require_tensor("points", points)
         distances = self._floats["distance"] if start is None else start.distance
@@ -124,6 +128,7 @@ class Resolver:
             shapes = f"{tuple(points.shape)} and {tuple(distances.shape)}"
             msg = f"wanted {self._n_vertices} points and their distances, got the shapes {shapes}"
             raise MeshError(msg)
+        require_finite("points", points)
         if not 0 <= margin < math.inf:
             msg = f"wanted a margin of 0 m or more, got {margin}"
             raise MeshError(msg)

@@ -70,12 +70,13 @@ class Placing:
 
     def __post_init__(self) -> None:
         """Raises `GarmentError` for what is no unit, no axis or no pose."""
-        is_unit = self.unit is None or (isinstance(self.unit, (int, float)) and 0 < self.unit < math.inf)
+        is_number = isinstance(self.unit, (int, float)) and not isinstance(self.unit, bool)
+        is_unit = self.unit is None or (is_number and 0 < self.unit < math.inf)
         if not is_unit or self.up not in (None, *UP_AXES):
             msg = f"wanted a unit in metres (0.01 for cm) and y or z up, got {self.unit!r} and {self.up!r}"
             raise GarmentError(msg)
-        if self.pose is not None and np.shape(self.pose) != (N_JOINTS, 3):
-            msg = f"wanted a pose of {N_JOINTS} rotation vectors, got {np.shape(self.pose)}"
+        if self.pose is not None and not (np.shape(self.pose) == (N_JOINTS, 3) and np.isfinite(self.pose).all()):
+            msg = f"wanted a pose of {N_JOINTS} finite rotation vectors, got {self.pose!r}"
             raise GarmentError(msg)
 
 
@@ -164,6 +165,9 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
             if other.cost(extent) < chosen.cost(extent) - _POSE_TOLERANCE or chosen.pose.any():
                 yield _told(other)  # and if a limb goes through it there:
         yield _told(chosen)
+    rings = [one for one in found if one.fit.is_ring and not one.kind and not one.is_sideways]
+    if rings and not good:  # what is around the body where it was modelled isn't looked for elsewhere
+        yield _told(rings[0])
     found.sort(key=lambda one: (not one.fit.is_good, one.cost(extent)))
     tiers = found[:1]
     for one in tiers:

@@ -23,6 +23,8 @@ hand it hangs on .19."""
 _FACES, _WIDE_FACES, _PLAINLY_FACES = 0.85, 0.9, 0.93
 """Share that faces outward: of a glove, between whose fingers much doesn't; of what is wide, by chance 0.89; of what
 leaves no doubt."""
+_RING_FACES = 0.99
+"""Share of a ring that faces outward: a band 8 cm high and 8 cm off the hips 1.00."""
 _N_SKIN = 600
 """Vertices of the skin that are asked for that."""
 _DOWN = np.array([0.3, 0.6, 0.9])
@@ -61,6 +63,11 @@ class Fit(NamedTuple):
         else:
             is_on = self.around > _WIDE and self.facing > _WIDE_FACES
         return self.inside < 0.05 and is_on
+
+    @property
+    def is_ring(self) -> bool:
+        """Whether it is around the body and clear of it, however little of the skin it encloses: a belt, a hoop."""
+        return self.inside == 0 and self.facing > _RING_FACES and self.distance < 2 * NEAR
 
     @property
     def is_tight(self) -> bool:

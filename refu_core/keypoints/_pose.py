@@ -14,6 +14,7 @@ from refu_core._npz import read_npz
 from refu_core.errors import BodyError
 from refu_core.frames import N_BETAS, N_JOINTS
 from refu_core.keypoints._layouts import KeypointLayout
+from refu_core.modes import BUILTIN_BODIES
 from refu_core.skeleton import CARRIED, PARENTS
 
 Array = NDArray[np.float64]
@@ -50,6 +51,9 @@ class Proportions:
     def builtin(cls, name: str) -> Proportions:
         """Those of a built-in body. Raises `BodyError`."""
         keys = ("v_template", "J_regressor", "shapedirs")
+        if name not in BUILTIN_BODIES:
+            msg = f"no built-in body {name!r}: wanted one of {', '.join(BUILTIN_BODIES)}"
+            raise BodyError(msg)
         with resources.as_file(resources.files("refu_core") / "assets" / f"body_{name}.npz") as path:
             data = read_npz(path, keys=keys, error=BodyError, wanted="a body model")
         regressor = np.asarray(data["J_regressor"], np.float64)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from refu_core.errors import MeshError
 from refu_core.mesh import as_points
+from refu_core.outputs._worn import require_worn
 from refu_core.sdf import BandSdf
 
 if TYPE_CHECKING:
@@ -44,6 +45,7 @@ class Clearance:
 
     def __call__(self, output: PipelineOutput) -> dict[str, NDArray[np.float32]]:
         """Of each garment in a pipeline's output: as `of_garment`, by name."""
+        require_worn(output, self._rings)
         self.update(output.body)
         return {name: self.of_garment(name, garment.local) for name, garment in output.items()}
 

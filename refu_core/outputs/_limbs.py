@@ -14,6 +14,7 @@ from refu_core._warp import as_warp, ints, memory
 from refu_core.body import DEFAULT_GAP, SEGMENTS, part_of_faces
 from refu_core.mesh import vertex_areas
 from refu_core.outputs import _limbs_kernels as kernels
+from refu_core.outputs._worn import require_worn
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -78,7 +79,11 @@ class LimbContacts:
         return cls(pipeline.body, pipeline.garments)
 
     def __call__(self, output: PipelineOutput) -> tuple[LimbContact, ...]:
-        """The contacts in the output of the pipeline, that of the largest area first."""
+        """The contacts in the output of the pipeline, that of the largest area first.
+
+        Raises `MeshError` for what is no output, or one of other garments.
+        """
+        require_worn(output, self._faces)
         self._points.copy_(torch.tensor(output.body))
         self._shift.copy_(torch.from_numpy(output.body - output.skin))
         for mesh in self._meshes:

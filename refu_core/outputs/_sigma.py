@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from refu_core.backbones import SEEN_TILT
 from refu_core.errors import FrameError, MeshError, WeightsError
 from refu_core.frames import N_JOINTS
+from refu_core.outputs._worn import require_worn
 from refu_core.skeleton import CARRIED
 from refu_core.weights import load_weights, save_weights, weights_folder
 
@@ -168,7 +169,8 @@ class Sigma:
         """σ of each garment's vertices in a coordinate [m], by name, shape (V,), for a frame and what was made of it.
 
         A ball of `RADIUS_90` σ holds the true vertex in nine cases of ten, if the input is as it says; σ is never NaN.
-        Raises `FrameError` for a covariance of another shape, not finite, too large, or with a negative variance.
+        Raises `FrameError` for a covariance of another shape, not finite, too large, or with a negative variance, and
+        `MeshError` for what is no output, or one of other garments.
 
         Args:
             frame: that was dressed.
@@ -177,6 +179,7 @@ class Sigma:
                 independent; it is pushed through the kinematics.
             transl_covariance: of the translation [m²], shape (3, 3).
         """
+        require_worn(output, self._garments)
         pose = None
         if pose_covariance is not None:
             pose = _covariance("pose_covariance", pose_covariance, (3 * N_JOINTS, 3 * N_JOINTS), (N_JOINTS, 3, 3))
@@ -184,7 +187,8 @@ class Sigma:
         if transl_covariance is not None:
             transl = float(np.trace(_covariance("transl_covariance", transl_covariance, (3, 3)))) / 3
         found, unseen = {}, _unseen_tilt(frame)
-        for name, garment in self._garments.items():
+        for name in output:
+            garment = self._garments[name]
             sigma = self.maps[name].at(float(bend_of(garment, frame.pose)))
             sigma = sigma + np.float32(unseen) * np.maximum(UNKNOWN_SIGMA - sigma, 0).astype(np.float32)
             if pose is not None or transl > 0:

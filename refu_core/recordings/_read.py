@@ -174,6 +174,9 @@ def _recording(
             poses[:, 0] = roots
     hertz = rate()
     tell_pace(transl, hertz, notes)
+    (bad,) = np.nonzero(~(np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(transl).all(axis=1)))
+    if len(bad):
+        notes.append(f"{len(bad)} of {n} frames aren't finite (the first: {bad[0]}): nobody is dressed there")
     gender = gender_of(word_of(content, _first(above, table.GENDERS), which), notes)
     with np.errstate(over="ignore", invalid="ignore"):  # becomes inf or NaN, which the frame refuses
         return Recording(poses.astype(np.float32), transl, betas, hertz, gender, tuple(notes))

@@ -7,6 +7,7 @@ from refu_core.sdf._band import exact_sdf as exact_sdf
 from refu_core.sdf._exact import ClosestPoints as ClosestPoints
 from refu_core.sdf._exact import ExactSdf as ExactSdf
 from refu_core.sdf._mesh import MeshSdf as MeshSdf
+from refu_core.sdf._mesh import require_finite as require_finite
 from refu_core.sdf._mesh import require_outward as require_outward
 from refu_core.sdf._mesh import require_tensor as require_tensor
 from refu_core.sdf._neural import SDF_PRESETS as SDF_PRESETS

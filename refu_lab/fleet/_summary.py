@@ -25,6 +25,8 @@ class FleetResult:
     n_left: int = 0
     """Recordings that weren't come to."""
     interrupted: bool = False
+    is_kept: bool = False
+    """Whether what is finished is in a folder, so that the same command goes on from there."""
 
     @property
     def failed(self) -> list[dict[str, Any]]:
@@ -109,7 +111,8 @@ def fleet_table(result: FleetResult) -> str:
     lines += [f"{row['name']}: {row['error']}" for row in result.failed]
     lines += [f"warning: {warning}" for warning in result.warnings()]
     if result.interrupted:
-        lines.append("interrupted: give the same command again to go on")
+        goes_on = "give the same command again to go on" if result.is_kept else "nothing is kept without --output"
+        lines.append(f"interrupted: {goes_on}")
     return "\n".join(lines)
 
 

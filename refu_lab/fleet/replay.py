@@ -75,7 +75,7 @@ def replay_fleet(
             engine that is out of reach.
     """
     pipeline_for(options.replay)  # what no recording could be replayed with is said once, and now
-    result = FleetResult()
+    result = FleetResult(is_kept=(options.output or options.report) is not None)
     rows: dict[int, dict[str, Any]] = {}
     with ExitStack() as stack:
         for place in dict.fromkeys((options.output, options.report)):

@@ -97,6 +97,20 @@ def test_a_narrow_dress_in_metres_is_not_made_larger() -> None:
     assert not any("scaled by" in note for note in made.notes)
 
 
+@pytest.mark.parametrize("off", [0.02, 0.05, 0.08])
+def test_a_ring_around_the_hips_stays_there(off: float) -> None:
+    """Of so low a band hardly any skin is within; a wide one was taken down to the feet."""
+    skin = load_body("female").v_template.double().numpy()
+    hips = skin[(skin[:, 1] > -0.18) & (skin[:, 1] < -0.1) & (np.abs(skin[:, 0]) < 0.3)]
+    middle, half = (hips.max(0) + hips.min(0)) / 2, (hips.max(0) - hips.min(0)) / 2 + off
+    band = cone((1.0, -0.18), (1.0, -0.1), rows=4, n=24)
+    v = band.vertices * (half[0], 1, half[2] / 0.9) + (middle[0], 0, middle[2] - 0.035 * half[2] / 0.9)
+    place = next(find_places(SurfaceMesh(v, band.faces), load_body("female"), Placing()))
+    assert place.unit == 1
+    np.testing.assert_array_equal(place.turn, np.eye(3))
+    np.testing.assert_array_equal(place.shift, 0)
+
+
 def test_what_cannot_be_where_it_belongs_is_worn_nowhere_else(monkeypatch: pytest.MonkeyPatch) -> None:
     """A dress that is narrower than the shoulders, and reaches over them, was worn on the head, and above it: in metres
     on a floor it has its middle there, if its origin is taken for the body's."""

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import igl
 import numpy as np
@@ -26,6 +28,7 @@ from refu_core.outputs import (
     Openings,
     PinholeCamera,
     PlannerMesh,
+    Sigma,
     all_visible,
     depth_image,
     visible,
@@ -285,6 +288,18 @@ def test_clearance_is_exact_where_it_says_so(pipeline: GarmentPipeline) -> None:
         assert np.abs(raw[inside < 0] - inside[inside < 0]).max() < 1e-6
     with pytest.raises(MeshError, match="no garment 'cap' here: wanted one of tshirt-male, short-pant-male"):
         ask.of_garment("cap", out["tshirt-male"].local)
+
+
+def test_what_another_pipeline_put_out_is_refused(pipeline: GarmentPipeline) -> None:
+    frame = standing(arms=1.4)
+    other = GarmentPipeline.load(["shirt-male"], backbone="skinned", sdf="none")(frame)
+    clearance, contacts, sigma = Clearance.of(pipeline), LimbContacts.of(pipeline), Sigma(pipeline)
+    asked: list[Callable[[Any], object]] = [clearance, contacts, lambda output: sigma(frame, output)]
+    for ask in asked:
+        with pytest.raises(MeshError, match="no garment 'shirt-male' here: wanted one of tshirt-male, short-pant-male"):
+            ask(other)
+        with pytest.raises(MeshError, match="wanted a pipeline's output of one person, got NoneType"):
+            ask(None)
 
 
 def test_limbs_that_touch_are_told_with_what_they_gave_way(pipeline: GarmentPipeline) -> None:

@@ -168,6 +168,20 @@ def test_a_margin_that_is_none_is_refused(margin: float) -> None:
         Resolver(garment.faces, len(points))(points, sdf, sdf.query(points), margin=margin)
 
 
+def test_points_that_are_none_are_refused_and_faces_may_be_arrays() -> None:
+    """A pipeline's own faces are arrays; with NaN nothing is near, and nobody is counted as inside."""
+    body, garment = load_body("male"), load_garment("short-pant-male")
+    sdf = ExactSdf(body.faces)
+    sdf.update(body.v_template.float())
+    points = garment.v_template.float()
+    start = sdf.query(points)
+    done = Resolver(garment.faces.numpy(), len(points))(points, sdf, start)
+    torch.testing.assert_close(done.vertices, Resolver(garment.faces, len(points))(points, sdf, start).vertices)
+    points[7] = math.nan
+    with pytest.raises(MeshError, match="points must be finite, got 1 of"):
+        Resolver(garment.faces, len(points))(points, sdf, start)
+
+
 @pytest.mark.parametrize("given", [{"gap": 0.0}, {"gap": math.nan}, {"around": 3}, {"levellings": 47}])
 def test_settings_that_never_end_or_end_elsewhere_are_refused(given: dict[str, float]) -> None:
     with pytest.raises(MeshError, match=str(next(iter(given.values())))):

@@ -1,0 +1,17 @@
+"""What outputs ask of what they are given."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+
+from refu_core.errors import MeshError, require_type
+
+
+def require_worn(output: object, known: Collection[str]) -> None:
+    """Raises `MeshError` for what no pipeline made, and for a garment that isn't `known`."""
+    require_type(output, Mapping, "a pipeline's output of one person", error=MeshError)
+    assert isinstance(output, Mapping)
+    for name in output:
+        if name not in known:
+            msg = f"no garment {name!r} here: wanted one of {', '.join(known)}"
+            raise MeshError(msg)
