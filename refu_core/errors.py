@@ -15,8 +15,13 @@ def printable(text: object) -> str:
 
 
 def _shortened(text: str, most: int) -> str:
-    """The start says where the fault is, the end what to do."""
-    return text if len(text) <= most else f"{text[: most - most // 3 - 3]} … {text[-(most // 3) :]}"
+    """The start says where the fault is, the end what to do; words stay whole where there are any."""
+    if len(text) <= most:
+        return text
+    start, end = text[: most - most // 3 - 3], text[-(most // 3) :]
+    if " " in start[len(start) // 2 :] and " " in end[: len(end) // 2]:
+        start, end = start.rpartition(" ")[0], end.partition(" ")[2]
+    return f"{start} … {end}"
 
 
 class RefuError(Exception):

@@ -209,9 +209,9 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
         raise GarmentError(msg + "say its --unit or --up, or place it on the body first")
     fit = min((one.fit for one in tiers), key=lambda fit: fit.cost)
     msg = (
-        f"the mesh doesn't surround the body {body.name}: where it fits best, {100 * fit.inside:.0f} % of it is "
-        f"inside the body, it is {1e3 * fit.distance:.0f} mm off on average, and {100 * fit.facing:.0f} % of it faces "
-        "outward; is it a garment for this body? Say its --unit, --up or --pose, or place it on the body first"
+        f"the mesh doesn't surround the body {body.name}: at best {100 * fit.inside:.0f} % of it is inside, it is "
+        f"{1e3 * fit.distance:.0f} mm off, and {100 * fit.facing:.0f} % faces outward; say its --unit, --up or --pose, "
+        "or place it on the body first"
     )
     if not len(rim_vertices(mesh.faces)):
         msg += NO_OPENING
