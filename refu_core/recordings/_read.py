@@ -176,7 +176,9 @@ def _recording(
     tell_pace(transl, hertz, notes)
     (bad,) = np.nonzero(~(np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(transl).all(axis=1)))
     if len(bad):
-        notes.append(f"{len(bad)} of {n} frames aren't finite (the first: {bad[0]}): nobody is dressed there")
+        notes.append(
+            f"NaN or infinite in {len(bad)} of {len(poses)}, first in number {bad[0]}: nobody is dressed there"
+        )
     gender = gender_of(word_of(content, _first(above, table.GENDERS), which), notes)
     with np.errstate(over="ignore", invalid="ignore"):  # becomes inf or NaN, which the frame refuses
         return Recording(poses.astype(np.float32), transl, betas, hertz, gender, tuple(notes))
