@@ -56,7 +56,7 @@ def test_frames_that_are_not_finite_are_told(tmp_path: Path) -> None:
     poses[3] = np.nan
     np.savez(tmp_path / "a.npz", poses=poses, trans=np.zeros((10, 3)), betas=np.zeros(10), mocap_framerate=30)
     motion = adapters.read_motion(tmp_path / "a.npz", axes="smpl")
-    assert "NaN or infinite in 1 of 10, first in 3: nobody is dressed there" in motion.notes
+    assert "NaN or infinite in 1 of 10, first in number 3: nobody is dressed there" in motion.notes
 
 
 def test_z_up_is_seen_and_pictures_stand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
