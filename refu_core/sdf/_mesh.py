@@ -38,6 +38,8 @@ class Found(NamedTuple):
         return SdfSample(self.distance, self.gradient, self.face)
 
 
+_FARTHEST = 1e7
+"""Largest coordinate [m]: as far as a body may be moved. Fourth powers of it are numbers still."""
 FOUND = (wp.int32, wp.float32, wp.vec3)
 """The fields' types, as `Repeated` takes them."""
 
@@ -196,11 +198,16 @@ def require_points(points: Tensor) -> None:
 
 
 def require_finite(name: str, values: Tensor) -> None:
-    """Raises `MeshError` where `values`, shape (N, 3), aren't all finite."""
+    """Raises `MeshError` where `values`, shape (N, 3) [m], aren't all finite, or are so large that squares overflow."""
     if values.is_cuda and torch.cuda.is_current_stream_capturing():
         return  # a CUDA graph can't wait for the answer; what it replays was checked where it came in
-    # A finite sum has finite terms, and takes a tenth of the time of looking at each.
-    if not math.isfinite(float(values.detach().sum())) and not bool(torch.isfinite(values).all()):
+    if not len(values):
+        return
+    largest = float(values.detach().abs().max())  # NaN as soon as one is; as quick as a sum
+    if not math.isfinite(largest):
         bad = int((~torch.isfinite(values)).any(dim=-1).sum())
         msg = f"{name} must be finite, got {bad} of {len(values)} with NaN or infinite coordinates"
+        raise MeshError(msg)
+    if largest > _FARTHEST:
+        msg = f"{name} must be within {_FARTHEST:.0e} m of the origin, got {largest:.3g} m; is the unit metres?"
         raise MeshError(msg)

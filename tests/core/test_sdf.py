@@ -276,6 +276,10 @@ def test_refuses_bad_vertices_points_and_order() -> None:
     sdf.update(vertices)
     with pytest.raises(MeshError, match=r"shape \(N, 3\), got \(162, 2\)"):
         sdf.query(vertices[:, :2])
+    with pytest.raises(
+        MeshError, match=r"points must be within 1e\+07 m of the origin, got 1e\+18 m; is the unit metres"
+    ):
+        sdf.query(1e18 * torch.ones(2, 3))  # its square is no number any more: the distance was infinite
     with pytest.raises(MeshError, match=r"points must be finite, got 1 of 162"):
         sdf.query(broken)
     with pytest.raises(MeshError, match=r"max_distance must be positive"):
