@@ -35,7 +35,7 @@ SEQUENCE_SECONDS = 10.0
 PAUSE_NS = 2 * 10**9
 """Between sequences."""
 MOST_BYTES = 8_000_000
-TrueFrame = tuple[SmplFrame, NDArray[np.float32] | None]
+FrameAndTruth = tuple[SmplFrame, NDArray[np.float32] | None]
 """A frame, and a row of the set, its garments at zero translation [m], shape (N, 3), where there is one."""
 
 
@@ -52,7 +52,7 @@ def spread_samples(dataset: GarmentDataset, count: int, seed: int) -> NDArray[np
     return ordered[((np.arange(count) + first) * len(ordered) / count).astype(np.intp)]
 
 
-def sample_moments(dataset: GarmentDataset, count: int, seed: int) -> Iterator[TrueFrame]:
+def sample_moments(dataset: GarmentDataset, count: int, seed: int) -> Iterator[FrameAndTruth]:
     """Unrelated frames, each standing on the floor."""
     body = load_body(load_garment(next(iter(dataset.parts))).body)
     quantum = dataset.card["quantum_m"]
@@ -66,7 +66,7 @@ def sample_moments(dataset: GarmentDataset, count: int, seed: int) -> Iterator[T
         yield frame, sample.vertices
 
 
-def sequence_moments(sequences: GarmentSequences, *, seconds: float = SEQUENCE_SECONDS) -> Iterator[TrueFrame]:
+def sequence_moments(sequences: GarmentSequences, *, seconds: float = SEQUENCE_SECONDS) -> Iterator[FrameAndTruth]:
     """The test sequences that are simulated first, one at least, so many seconds of them with pauses in between.
 
     Ground truth is in each third frame, as far as those are in the set.
@@ -85,7 +85,7 @@ def sequence_moments(sequences: GarmentSequences, *, seconds: float = SEQUENCE_S
         stamp = now + PAUSE_NS
 
 
-def write_bag(path: Path, parts: Mapping[str, slice], moments: Iterator[TrueFrame]) -> tuple[int, int]:
+def write_bag(path: Path, parts: Mapping[str, slice], moments: Iterator[FrameAndTruth]) -> tuple[int, int]:
     """One bag as a rosbag2 directory; returns the number of frames and of those with ground truth."""
     encode = encoder_for("multiarray")
     colors = {garment: (*load_garment(garment).card.color, 1.0) for garment in parts}

@@ -17,7 +17,7 @@ from refu_core.errors import printable
 from refu_core.garments import worn_on
 from refu_core.options import check
 from refu_core.sdf import SDF_PRESETS
-from refu_core.simulation import GarmentDataset, open_dataset
+from refu_core.simulation import GarmentDataset, GarmentSequences, open_dataset
 from refu_core.training import (
     CarrySettings,
     DynamicsSettings,
@@ -54,13 +54,14 @@ def train(options: TrainOptions, *, progress: bool) -> dict[str, Any]:
         return _train(options, dataset, progress=progress)
 
 
-def _train(options: TrainOptions, dataset: Any, *, progress: bool) -> dict[str, Any]:
+def _train(options: TrainOptions, dataset: GarmentDataset | GarmentSequences, *, progress: bool) -> dict[str, Any]:
     template = load_garment(options.garment)
     fit = load_fit(options.body or template.body)
     template, body = worn_on(template, fit), fit.body
     steps: dict[str, Any] = {} if options.steps is None else {"steps": options.steps}
     common: dict[str, Any] = {"device": options.device, "quiet": not progress}
     if options.network == "sdf":
+        assert isinstance(dataset, GarmentDataset)  # `train` has opened it as that
         to_sdf = replace(SdfSettings.of(options.preset), seed=options.seed, **steps)
         return train_sdf(dataset, body, template, options.folder, settings=to_sdf, **common)
     common["body"] = body

@@ -157,17 +157,17 @@ class Worker:
     def tick(self, take: Callable[[], Mapping[str, Arrival]]) -> None:
         """Works on one frame each of some persons: those that `take` gives."""
         with self._taking:
-            job = self._plan(take())
+            batch = self._plan(take())
         outputs: dict[str, PipelineOutput] = {}
         try:
             outputs = self._infer(
-                job.pipeline, {person: frame for person, frame in job.frames.items() if person not in job.known}
+                batch.pipeline, {person: frame for person, frame in batch.frames.items() if person not in batch.known}
             )
         finally:  # a turn that nobody takes would be waited for
             with self._in_order:
-                self._in_order.wait_for(lambda: self._n_done == job.turn)
+                self._in_order.wait_for(lambda: self._n_done == batch.turn)
                 try:
-                    self._finish(job, outputs)
+                    self._finish(batch, outputs)
                 finally:
                     self._n_done += 1
                     self._in_order.notify_all()
@@ -195,14 +195,14 @@ class Worker:
                 person: self._told(frame, person, _there(near[person], settings)) for person, frame in frames.items()
             }
         known: dict[str, _Known] = {}
-        job = _Batch(self._n_taken, settings, pipeline, fittings, near, frames, known, gone)
+        batch = _Batch(self._n_taken, settings, pipeline, fittings, near, frames, known, gone)
         for person, frame in frames.items():
             last = self._dressed.get(person)
-            if last is not None and last.inputs == job.inputs(frame):
+            if last is not None and last.inputs == batch.inputs(frame):
                 self._statistics.count("skip.unchanged")
                 known[person] = last
         self._n_taken += 1
-        return job
+        return batch
 
     def _told(self, frame: SmplFrame, person: str, there: Placement) -> SmplFrame:
         """A frame with its past, as it was where messages are: what a moving camera sees move stands still there."""
@@ -213,16 +213,16 @@ class Worker:
         place = there.rotation @ (frame.transl + pelvis) + there.translation
         return replace(frame, past=self._history(replace(frame, pose=pose, transl=place), person).past)
 
-    def _finish(self, job: _Batch, outputs: Mapping[str, PipelineOutput]) -> None:
-        """Sends what came of a job."""
-        self._remove(job.gone)
-        found, unresolved = self._remember(job, outputs)
-        dressed = {person: frame for person, frame in job.frames.items() if person in self._dressed}
+    def _finish(self, batch: _Batch, outputs: Mapping[str, PipelineOutput]) -> None:
+        """Sends what came of a batch."""
+        self._remove(batch.gone)
+        found, unresolved = self._remember(batch, outputs)
+        dressed = {person: frame for person, frame in batch.frames.items() if person in self._dressed}
         if not dressed:
             return
-        self._send(job, dressed)
+        self._send(batch, dressed)
         done = time.monotonic()
-        latencies = [1e3 * (done - job.arrivals[person].received) for person in dressed]
+        latencies = [1e3 * (done - batch.arrivals[person].received) for person in dressed]
         self._statistics.publish(latencies, found=found, unresolved=unresolved)
 
     def _near(self, arrivals: Mapping[str, Arrival], settings: NodeSettings) -> dict[str, Arrival]:
@@ -236,18 +236,18 @@ class Worker:
                 near[person] = arrival
         return near
 
-    def _remember(self, job: _Batch, outputs: Mapping[str, PipelineOutput]) -> tuple[int, int]:
+    def _remember(self, batch: _Batch, outputs: Mapping[str, PipelineOutput]) -> tuple[int, int]:
         """Brings `_dressed` up to date; returns how many vertices were inside, and still are."""
         found = unresolved = 0
-        for person, frame in job.frames.items():
+        for person, frame in batch.frames.items():
             self._dressed.pop(person, None)
-            if person in job.known:
-                self._dressed[person] = job.known[person]
+            if person in batch.known:
+                self._dressed[person] = batch.known[person]
             elif (output := outputs.get(person)) is not None:
                 if not all(np.isfinite(mesh.local).all() for mesh in output.values()):
                     self._statistics.drop("not_finite", f"{person or 'the person'}: a garment isn't finite")
                     continue
-                self._dressed[person] = _Known(job.inputs(frame), output)
+                self._dressed[person] = _Known(batch.inputs(frame), output)
                 found += sum(stats.n_inside for stats in output.stats.garments.values())
                 unresolved += sum(stats.n_unresolved for stats in output.stats.garments.values())
                 self._statistics.shift(output.stats.shift.largest)
@@ -276,21 +276,21 @@ class Worker:
             self._is_lost = True
             self._outlet.device_lost(str(error))
 
-    def _send(self, job: _Batch, frames: Mapping[str, SmplFrame]) -> None:
+    def _send(self, batch: _Batch, frames: Mapping[str, SmplFrame]) -> None:
         """What anybody wants to know of these people."""
-        if job.fittings is not self._sent_with:
-            self._sent_with = job.fittings
+        if batch.fittings is not self._sent_with:
+            self._sent_with = batch.fittings
             for row in self._outputs:
                 row.forget()
         worn = []
         for person, frame in frames.items():
-            arrival, output = job.arrivals[person], self._dressed[person].output
-            there = _there(arrival, job.settings)
+            arrival, output = batch.arrivals[person], self._dressed[person].output
+            there = _there(arrival, batch.settings)
             offset = there.rotation @ frame.transl + there.translation
-            worn.append(DressedPerson(person, frame, output, job.fittings, there.rotation, offset, arrival.camera))
+            worn.append(DressedPerson(person, frame, output, batch.fittings, there.rotation, offset, arrival.camera))
         self._here.update(frames)
         for row in self._outputs:
-            self._publish(row.messages(worn, self._moment(job.settings)))
+            self._publish(row.messages(worn, self._moment(batch.settings)))
 
     def _publish(self, messages: Iterable[tuple[str, bytes]]) -> None:
         try:

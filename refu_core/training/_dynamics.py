@@ -101,8 +101,8 @@ def train_dynamics(
         torch.manual_seed(settings.loop.seed)
         dynamics = Dynamics(DynamicsConfig(still.config.joints), still)
     mirror = Mirror.of(template)
-    plain = _known(still, opened.samples, _pasts(rows, rows.train))
-    turned = _known(still, mirrored(opened.samples, mirror), _pasts(rows, rows.train, is_mirrored=True))
+    plain = _prepared(still, opened.samples, _pasts(rows, rows.train))
+    turned = _prepared(still, mirrored(opened.samples, mirror), _pasts(rows, rows.train, is_mirrored=True))
     train, validation = _split(opened.samples, (plain, turned), settings)
     dynamics.standardise(*train[:3], still.features.are_bounded(template))
     described = {
@@ -132,7 +132,7 @@ def train_dynamics(
     objective = Objective([dynamics], predict, CodeLoss(still))
     loop.run(TrainingStage("dynamics", objective, settings.steps, train, validation))
     dynamics.to("cpu").eval()
-    figures = _figures(still, dynamics, test, _known(still, test, _pasts(rows, rows.test)), body, template)
+    figures = _figures(still, dynamics, test, _prepared(still, test, _pasts(rows, rows.test)), body, template)
     card = {**described, "dataset": opened.card, "figures": figures}
     if is_writer():
         save_dynamics(folder, dynamics, card)
@@ -157,7 +157,7 @@ def _pasts(dataset: GarmentSequences, rows: NDArray[np.bool_], *, is_mirrored: b
 
 
 @torch.no_grad()
-def _known(still: TailorNet, samples: TrainingSamples, past: Tensor) -> _Prepared:
+def _prepared(still: TailorNet, samples: TrainingSamples, past: Tensor) -> _Prepared:
     def owed(pose: Tensor, style_shape: Tensor, displacement: Tensor) -> Tensor:
         return still.decoder.encode(displacement) - still.code(still.features(pose), style_shape)
 
@@ -166,12 +166,12 @@ def _known(still: TailorNet, samples: TrainingSamples, past: Tensor) -> _Prepare
 
 
 def _split(
-    samples: TrainingSamples, known: tuple[_Prepared, _Prepared], settings: DynamicsSettings
+    samples: TrainingSamples, prepared: tuple[_Prepared, _Prepared], settings: DynamicsSettings
 ) -> tuple[_Prepared, _Prepared]:
     """To learn from, mirrored ones included, and to choose by."""
     which = replace(samples, displacement=torch.arange(len(samples)))  # their numbers, to split those
     train, validation = split_validation(which, share=settings.validation_share, seed=settings.loop.seed)
-    plain, turned = known
+    plain, turned = prepared
     to_learn = [torch.cat((a[train.displacement], b[train.displacement])) for a, b in zip(plain, turned, strict=True)]
     return _Prepared(*to_learn), _Prepared(*(one[validation.displacement] for one in plain))
 
@@ -181,7 +181,7 @@ def _figures(
     still: TailorNet,
     dynamics: Dynamics,
     test: TrainingSamples,
-    known: _Prepared,
+    prepared: _Prepared,
     body: SmplBody,
     garment: GarmentTemplate,
 ) -> dict[str, Any]:
@@ -191,7 +191,7 @@ def _figures(
         displacement: Tensor = still.decoder(still.code(still.features(pose), style_shape) + owed)
         return displacement
 
-    moved = in_chunks(dynamics, *known[:3])
-    owed = {"mpve_mm": moved, "still_mm": torch.zeros_like(moved), "basis_mm": known.code}
-    garments = {name: in_chunks(predicted, test.pose, known.style_shape, code) for name, code in owed.items()}
+    moved = in_chunks(dynamics, *prepared[:3])
+    owed = {"mpve_mm": moved, "still_mm": torch.zeros_like(moved), "basis_mm": prepared.code}
+    garments = {name: in_chunks(predicted, test.pose, prepared.style_shape, code) for name, code in owed.items()}
     return {"samples": len(test), **{name: mpve(one, test, body, garment) for name, one in garments.items()}}

@@ -38,7 +38,7 @@ class Player:
 
     def __init__(self, server: viser.ViserServer, film: Film) -> None:
         self._server, self._film = server, film
-        self._stage, self._marker = Stage(server), BandFinder()
+        self._stage, self._finder = Stage(server), BandFinder()
         self._times = film.times
         self._moment, self._index = 0.0, 0
         self._playing = len(self._times) > 1
@@ -121,7 +121,7 @@ class Player:
             own = [shape for shape in shapes if shape.person == person]
             garments = [shape for shape in own if shape.is_garment and self._is_shown(shape.name)]
             body = next((shape for shape in own if shape.name == BODY), None)
-            found += zip(garments, self._marker.bands(marking, garments, body), strict=True)
+            found += zip(garments, self._finder.bands(marking, garments, body), strict=True)
             found += [(shape, [Band(shape.faces, shape.color)]) for shape in own if shape.name == shown]
         return found
 
