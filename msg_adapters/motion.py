@@ -15,7 +15,7 @@ from msg_adapters.errors import BagError, MotionFileError
 from msg_adapters.people import Track
 from refu_core.frames import SmplFrame
 from refu_core.keypoints import Proportions
-from refu_core.recordings import SUFFIXES, Axes, Recording, interpolated, n_resampled, read_recording
+from refu_core.recordings import SUFFIXES, Axes, Recording, interpolated, n_resampled, not_finite, read_recording
 from refu_core.skeleton import JOINT_NAMES
 
 _PAUSE_NS = NS_PER_S
@@ -57,7 +57,7 @@ class Motion(Recording):
         except ValueError as error:
             msg = f"{self.source}: {error}"
             raise MotionFileError(msg) from error
-        bad = np.flatnonzero(~(np.isfinite(self.poses).all(axis=(1, 2)) & np.isfinite(self.transl).all(axis=1)))
+        bad = not_finite(self.poses, self.transl)
         if bad.size:
             msg = (
                 f"{self.source}: {bad.size} of {len(self)} frames aren't finite (the first: {bad[0]}); cut them out, "

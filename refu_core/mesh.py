@@ -136,11 +136,11 @@ class Connectivity:
 
 
 def check_faces(faces: Any, *, n_vertices: int | None = None) -> NDArray[np.int32]:
-    """`faces` as a contiguous int32 array of shape (F, 3).
+    """`faces` (a tensor, too) as a contiguous int32 array of shape (F, 3).
 
     Raises `MeshError` where they aren't integers of that shape, three different ones each, below `n_vertices`.
     """
-    array = np.asarray(faces)
+    array = np.asarray(faces.cpu() if hasattr(faces, "cpu") else faces)
     if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0 or array.dtype.kind not in "iu":
         msg = f"faces must be integers of shape (F, 3), got {array.dtype} of shape {array.shape}"
         raise MeshError(msg)

@@ -71,10 +71,10 @@ class Resolver:
         Raises:
             MeshError: a face that names a vertex there isn't.
         """
-        faces = faces if isinstance(faces, Tensor) else torch.tensor(np.asarray(faces))
-        self._settings, self.device = settings, faces.device
+        self._settings = settings
+        self.device = faces.device if isinstance(faces, Tensor) else torch.device("cpu")
         self._n_vertices = n = n_vertices
-        mesh = Connectivity.of(faces.cpu(), n)
+        mesh = Connectivity.of(faces, n)
         self._n_edges = e = len(mesh.edges)
         self._cloth = _cloth(mesh, self.device)
         self._state = state = _state.State()

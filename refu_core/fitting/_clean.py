@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from refu_core.errors import GarmentError
 from refu_core.fitting._mesh_file import SurfaceMesh
 from refu_core.garments import UvMap
-from refu_core.mesh import linked
+from refu_core.mesh import Connectivity, linked
 
 Ints = NDArray[np.int64]
 
@@ -61,8 +61,7 @@ def face_normals(v: NDArray[np.float64], f: Ints) -> NDArray[np.float64]:
 
 def rim_vertices(f: Ints) -> Ints:
     """Vertices of edges of one face."""
-    edges, of_corner = _edges(f)
-    return np.unique(edges[np.bincount(of_corner.ravel()) == 1])
+    return np.unique(Connectivity.of(f).boundary).astype(np.int64)
 
 
 def split_long_edges(mesh: SurfaceMesh, longest: float) -> SurfaceMesh:

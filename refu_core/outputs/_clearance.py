@@ -8,9 +8,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from refu_core.errors import MeshError
 from refu_core.mesh import as_points
-from refu_core.outputs._worn import require_worn
+from refu_core.outputs._worn import require_known, require_worn
 from refu_core.sdf import BandSdf
 
 if TYPE_CHECKING:
@@ -59,9 +58,7 @@ class Clearance:
         Exact inside and up to `reach`; farther out it is `reach`, which the vertex is at least away. Raises `MeshError`
         for an unknown garment, for what aren't its vertices, and where `update` was given no body yet.
         """
-        if name not in self._rings:
-            msg = f"no garment {name!r} here: wanted one of {', '.join(self._rings)}"
-            raise MeshError(msg)
+        require_known(name, self._rings)
         ring = self._rings[name]
         points = as_points("the garment's vertices", vertices, len(ring.start) - 1, dtype=np.float32)
         distance: NDArray[np.float32] = self._sdf.clipped(torch.from_numpy(points), ring).distance.numpy()

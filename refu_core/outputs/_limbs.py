@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 import warp as wp
 from numpy.typing import NDArray
 
@@ -84,8 +83,9 @@ class LimbContacts:
         Raises `MeshError` for what is no output, or one of other garments.
         """
         require_worn(output, self._faces)
-        self._points.copy_(torch.tensor(output.body))
-        self._shift.copy_(torch.from_numpy(output.body - output.skin))
+        body = output.body
+        self._points.numpy()[:] = body
+        self._shift.numpy()[:] = body - output.skin
         for mesh in self._meshes:
             mesh.refit()
         wp.launch(kernels.box_kernel, len(_PARTS), [self._parts], device="cpu")

@@ -12,6 +12,11 @@ def require_worn(output: object, known: Collection[str]) -> None:
     require_type(output, Mapping, "a pipeline's output of one person", error=MeshError)
     assert isinstance(output, Mapping)
     for name in output:
-        if name not in known:
-            msg = f"no garment {name!r} here: wanted one of {', '.join(known)}"
-            raise MeshError(msg)
+        require_known(name, known)
+
+
+def require_known(name: str, known: Collection[str]) -> None:
+    """Raises `MeshError` for a garment that isn't `known`."""
+    if name not in known:
+        msg = f"no garment {name!r} here: wanted one of {', '.join(known)}"
+        raise MeshError(msg)

@@ -8,6 +8,7 @@ from refu_core.recordings._recording import MAX_FRAMES as MAX_FRAMES
 from refu_core.recordings._recording import Recording as Recording
 from refu_core.recordings._recording import interpolated as interpolated
 from refu_core.recordings._recording import n_resampled as n_resampled
+from refu_core.recordings._recording import not_finite as not_finite
 from refu_core.recordings._rotations import LONGEST_TURN as LONGEST_TURN
 from refu_core.recordings._upright import AXES as AXES
 from refu_core.recordings._upright import PELVIS as PELVIS

@@ -18,7 +18,7 @@ from refu_core.recordings._bvh import read_bvh
 from refu_core.recordings._containers import Content, Key, entries, open_content
 from refu_core.recordings._followed import SMPL_POINTS, are_places, follow, metres_of
 from refu_core.recordings._mhr import POINTS, is_of_mhr, places_of_mhr
-from refu_core.recordings._recording import MAX_FRAMES, Recording, check_fps, tell_pace
+from refu_core.recordings._recording import MAX_FRAMES, Recording, check_fps, not_finite, tell_pace
 from refu_core.recordings._rotations import BODY, WHOLE, rotvecs_of
 from refu_core.recordings._soma import smpl_of_soma
 from refu_core.recordings._tracks import filled, frames_of, places_in_time
@@ -174,7 +174,7 @@ def _recording(
             poses[:, 0] = roots
     hertz = rate()
     tell_pace(transl, hertz, notes)
-    (bad,) = np.nonzero(~(np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(transl).all(axis=1)))
+    bad = not_finite(poses, transl)
     if len(bad):
         notes.append(
             f"NaN or infinite in {len(bad)} of {len(poses)}, first in number {bad[0]}: nobody is dressed there"

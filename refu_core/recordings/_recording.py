@@ -70,6 +70,11 @@ def interpolated(
     return np.stack(joints, 1), np.stack([np.interp(wanted, at, along) for along in transl.T], 1)
 
 
+def not_finite(poses: NDArray[np.floating], transl: NDArray[np.floating]) -> NDArray[np.intp]:
+    """The numbers of the frames with NaN or infinity, of poses (T, J, 3) and transl (T, 3)."""
+    return np.flatnonzero(~(np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(transl).all(axis=1)))
+
+
 def tell_pace(transl: NDArray[np.float64], rate: float, notes: list[str]) -> None:
     """Adds a note where translations (T, 3) [m] at so many frames a second can't be of a person, and in metres."""
     with np.errstate(over="ignore", invalid="ignore"):

@@ -61,7 +61,7 @@ class MeshSdf(ABC):
     """Whether the face found is always the closest one."""
 
     def __init__(self, faces: Tensor | NDArray[Any], *, device: str | torch.device = "cpu") -> None:
-        mesh = Connectivity.of(faces.cpu() if isinstance(faces, Tensor) else faces)
+        mesh = Connectivity.of(faces)
         self.device = torch.device(device)
         self.n_vertices = mesh.n_vertices
         self.faces = torch.as_tensor(mesh.faces, device=self.device)
