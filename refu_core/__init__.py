@@ -14,6 +14,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from refu_core._versions import VERSION
 from refu_core.errors import BodyError, FrameError, GarmentError, MeshError, RefuError, WeightsError
 from refu_core.frames import SmplFrame
 from refu_core.modes import BackboneName, SdfMode
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from refu_core.refu import Refu
     from refu_core.sdf import ApproxSdf, BandSdf, BodySdf, ExactSdf, SdfSample
 
-__version__ = "0.2.0"
+__version__ = VERSION
 __all__ = [
     "ApproxSdf",
     "BackboneName",

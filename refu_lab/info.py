@@ -3,24 +3,17 @@
 from __future__ import annotations
 
 import platform
-from importlib import metadata
 from importlib.util import find_spec
 from typing import Any
 
 from refu_core import BodyError, MeshError, RefuError, __version__
+from refu_core._versions import installed
 from refu_core.body import BUILTIN_BODIES, load_body, load_fit
 from refu_core.garments import garment_files, load_garment
 from refu_core.mesh import Connectivity
 from refu_core.modes import BackboneName, SdfMode
 from refu_core.weights import load_card, weights_folder
 from refu_lab.sources import fit_facts
-
-
-def _version(distribution: str) -> str:
-    try:
-        return metadata.version(distribution)
-    except metadata.PackageNotFoundError:
-        return "not installed"
 
 
 def describe_body(source: str) -> dict[str, Any]:
@@ -81,7 +74,7 @@ def collect() -> dict[str, Any]:
         "refu": __version__,
         "python": platform.python_version(),
         "machine": f"{platform.system()} {platform.machine()}",
-        **{name: _version(name) for name in ("torch", "warp-lang", "numpy", "mcap")},
+        **{name: installed(name) for name in ("torch", "warp-lang", "numpy", "mcap")},
         "rclpy": "importable" if find_spec("rclpy") else "not found (needed by the node only)",
         "devices": ["cpu", *(f"cuda: {name}" for name in cuda)],
         "bodies": {body.name: f"{body.n_vertices} vertices, {body.fingerprint}" for body in bodies},

@@ -19,7 +19,20 @@ PACKAGES = ("refu_core", "msg_adapters", "refu_ros", "refu_lab")
 """What is shipped; each may import those before it, and refu_lab nothing of refu_ros."""
 CORE = (
     {"errors"},
-    {"_engine", "_files", "_npz", "_cache", "_device", "_kernel_cache", "_warp", "frames", "modes", "mesh", "weights"},
+    {
+        "_engine",
+        "_files",
+        "_npz",
+        "_cache",
+        "_device",
+        "_kernel_cache",
+        "_versions",
+        "_warp",
+        "frames",
+        "modes",
+        "mesh",
+        "weights",
+    },
     {"skeleton", "_pickle_machine", "history"},
     {"_pickle", "keypoints"},
     {"recordings"},

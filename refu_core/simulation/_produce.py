@@ -8,13 +8,13 @@ import platform
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from refu_core._engine import Engine, InProcess, Lost
+from refu_core._versions import versions
 from refu_core.errors import SimulationError
 from refu_core.simulation._plan import SamplePlan
 from refu_core.simulation._poses import Clip, as_clips, split_clips
@@ -115,7 +115,7 @@ def _card_of(simulator: Simulator) -> dict[str, Any]:
         "clips": {"train": [clip.name for clip in clips[0]], "test": [clip.name for clip in clips[1]]},
         "versions": {
             "python": platform.python_version(),
-            **{name: version(name) for name in ("refu-ros", "numpy", "torch", "warp-lang", "numba")},
+            **versions("numpy", "torch", "warp-lang", "numba"),
         },
     }
 

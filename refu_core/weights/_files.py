@@ -13,7 +13,6 @@ import os
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from importlib.metadata import version
 from pathlib import Path
 from types import NoneType
 from typing import Any
@@ -25,6 +24,7 @@ from torch import Tensor
 
 from refu_core._files import InputFile, open_file, parse_json, replacing
 from refu_core._npz import DAMAGE
+from refu_core._versions import versions
 from refu_core.errors import WeightsError, require_type
 
 FORMAT = "refu-weights-1"
@@ -87,7 +87,7 @@ def save_weights(
         **card,
         **differs,
         "sha256": hashlib.sha256(data).hexdigest(),
-        "versions": {name: version(name) for name in ("refu-ros", "torch")},
+        "versions": versions("torch"),
     }
     path = Path(f"{stem}.safetensors")
     try:

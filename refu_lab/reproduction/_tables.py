@@ -7,11 +7,11 @@ import os
 import platform
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from refu_core._files import read_json
+from refu_core._versions import versions
 from refu_core.errors import RefuError
 from refu_lab.reproduction._methods import METHODS
 from refu_lab.tables import RESULT_TABLES, TextTable, picture_markdown, write_json, write_page
@@ -229,7 +229,7 @@ class ResultTable:
         facts = {
             "samples": dict(n_samples),
             "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
-            "versions": {name: version(name) for name in ("refu-ros", "torch", "warp-lang")},
+            "versions": versions("torch", "warp-lang"),
         }
         content = {
             "table": self.name,

@@ -11,6 +11,8 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from refu_core import __version__
+from refu_core._versions import versions
 from refu_core.errors import WeightsError
 from refu_core.garments import PAPER_GARMENTS
 from refu_core.weights import load_weights, save_weights, weights_folder
@@ -24,6 +26,15 @@ def stem(tmp_path: Path) -> Path:
     stem = tmp_path / "weights" / "tailornet-hybrid.v2"  # a dot in the name is no suffix
     save_weights(stem, TENSORS, CARD)
     return stem
+
+
+def test_a_card_is_written_without_installation() -> None:
+    """A source tree on the path has no metadata, which mustn't cost a training its weights."""
+    assert versions("torch", "no-such-distribution") == {
+        "refu-ros": __version__,
+        "torch": torch.__version__,
+        "no-such-distribution": "not installed",
+    }
 
 
 def test_what_was_saved_is_loaded(stem: Path) -> None:
