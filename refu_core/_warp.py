@@ -7,8 +7,8 @@ import functools
 import os
 import threading
 import warnings
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -16,6 +16,8 @@ import warp as wp
 from torch import Tensor
 
 from refu_core._kernel_cache import guard, no_cache
+
+Result = TypeVar("Result")
 
 
 @contextlib.contextmanager
@@ -63,6 +65,11 @@ def memory(*shape: int, device: Any = "cpu", dtype: torch.dtype = torch.float32)
         return torch.zeros(*shape, device=device, dtype=dtype)
 
 
+def refit(trees: Sequence[Any], device: torch.device) -> None:
+    """Fits trees to their points, on a GPU at the same time."""
+    side_by_side([tree.refit for tree in trees], device)
+
+
 def ints(values: Any, device: Any) -> Any:
     """Whole numbers as a Warp array."""
     return wp.array(np.ascontiguousarray(values, np.int32), dtype=wp.int32, device=str(device))
@@ -108,15 +115,15 @@ class Repeated(threading.local):
 
 
 @functools.cache
-def strips(n: int, device: torch.device) -> tuple[int, Tensor]:
+def strips(n: int, device: torch.device, *, at_least: int = 1) -> tuple[int, Tensor]:
     """Into how many strips a kernel's n items are cut, and how many each has, int32, shape (1,).
 
     A thread takes a strip. A CPU's compiler keeps more in registers in a loop than from thread to thread, so it gets
-    one strip; a GPU as many as there are items.
+    one strip; a GPU as many as there are items, of `at_least` so many each. The last one may be shorter.
     """
-    n_strips = 1 if device.type == "cpu" else n
+    n_strips, each = (1, max(n, 1)) if device.type == "cpu" else (-(-n // at_least), at_least)
     with torch.inference_mode(False):
-        return n_strips, torch.tensor([max(n, 1) // max(n_strips, 1)], dtype=torch.int32, device=device)
+        return n_strips, torch.tensor([each], dtype=torch.int32, device=device)
 
 
 _MOST_SIZES = 64
@@ -148,6 +155,30 @@ _NO_STREAM = contextlib.nullcontext()
 def _same_stream(stream: torch.cuda.Stream) -> Any:
     """Warp's object of one of torch's few streams, kept: with the first one to go Warp would forget the stream."""
     return wp.stream_from_torch(stream)
+
+
+def side_by_side(works: Sequence[Callable[[], Result]], device: torch.device) -> list[Result]:
+    """Does them in order; on a GPU each on a stream of its own, so that they run at the same time as far as they can.
+
+    A single work, or the launches of a small mesh, leave most of a GPU idle.
+    """
+    if device.type != "cuda" or len(works) < 2:
+        return [work() for work in works]
+    here = torch.cuda.current_stream(device)
+    streams, done = _beside(here, len(works)), []
+    for stream, work in zip(streams, works, strict=True):
+        stream.wait_stream(here)
+        with torch.cuda.stream(stream), torch_stream(device):
+            done.append(work())
+    for stream in streams:
+        here.wait_stream(stream)
+    return done
+
+
+@functools.cache
+def _beside(stream: torch.cuda.Stream, n: int) -> list[torch.cuda.Stream]:
+    """Streams for what is done beside each other, kept."""
+    return [torch.cuda.Stream(stream.device) for _ in range(n)]  # type: ignore[no-untyped-call]
 
 
 @contextlib.contextmanager

@@ -200,18 +200,26 @@ class Anatomy:
         return segments
 
     def _bind_skins(self, gap: NDArray[np.float32]) -> Any:
-        """The vertices of the bundles; each vertex (V, K) that keeps a `gap` is in the first one that has it."""
+        """The vertices of the bundles; each vertex (V, K) that keeps a `gap` is in the first one that has it.
+
+        A thread takes a piece: of a CPU, what is one bundle's; of a GPU, one vertex.
+        """
         start, corner = self.bundles.start.numpy(), self.bundles.corner.numpy()
-        is_free, own = np.ones(len(gap), np.bool_), []
-        for vertices in np.split(corner, start[1:-1]):
+        is_free = np.ones(len(gap), np.bool_)
+        own: list[NDArray[np.int32]] = []
+        bundle: list[int] = []
+        for i, vertices in enumerate(np.split(corner, start[1:-1])):
             some = vertices[vertices < len(gap)]
             some = some[is_free[some]]
             is_free[some] = False
-            own.append(some)
+            pieces = np.split(some, len(some)) if self.device.type == "cuda" and len(some) else [some]
+            own += pieces
+            bundle += [i] * len(pieces)
         skins = parting.Skins()
         skins.start, skins.vertex = self._ints(np.cumsum([0, *map(len, own)])), self._ints(np.concatenate(own))
         first = self.bundles.first.numpy()
-        skins.of = self._ints(np.repeat(np.arange(len(first) - 1), np.diff(first)))
+        skins.bundle = self._ints(bundle)
+        skins.of = self._ints(np.repeat(np.arange(len(first) - 1), np.diff(first))[bundle])
         skins.gap = self._floats(np.stack([gap[some].max(axis=0, initial=0.0) for some in own]))
         return skins
 

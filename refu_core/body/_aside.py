@@ -78,6 +78,8 @@ class Aside:
         self._box = memory(2, 1, 3, device=device)
         self._corners = [as_warp(corner, wp.vec3) for corner in self._box]
         self._points = memory(len(rest) + len(rows) - self._first_cap, 3, device=device)
+        at_rest = body.v_template.to(self._points)
+        self._points.copy_(torch.cat((at_rest, self._means(at_rest)[self._first_cap :])))
         self._tree: Any = wp.Mesh(as_warp(self._points, wp.vec3), ints(solids.faces[0].ravel(), device))
         self._find = Repeated(kernels.inside_kernel, (wp.vec3, wp.int32, wp.vec3), [self._tree.id, *self._corners])
         if self._is_serial:

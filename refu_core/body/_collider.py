@@ -9,7 +9,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import Repeated, as_warp, is_plain, recorded, strips, torch_stream
+from refu_core._warp import Repeated, as_warp, is_plain, recorded, refit, strips, torch_stream
 from refu_core.body import _collider_kernels as kernels
 from refu_core.body import _step_kernels as steps
 from refu_core.body._anatomy import DEFAULT_GAP, Anatomy, ColliderSettings
@@ -98,9 +98,7 @@ class Collider:
         """Which segments each vertex has to give way to."""
         self._run("look")
         wanted = int(self.anatomy.memory.counts[kernels.WANTED]) if self._is_serial else -1
-        for k, tree in enumerate(self.anatomy.trees):
-            if (wanted >> k) & 1:
-                tree.refit()
+        refit([tree for k, tree in enumerate(self.anatomy.trees) if (wanted >> k) & 1], self.device)
         if wanted:
             self._run("touch")
 
@@ -147,7 +145,7 @@ class Collider:
         one of the two: there two parts may still be in each other, as deep as flesh doesn't give way to.
         """
         numbers = skin.new_zeros(len(skin), 4, dtype=torch.float32)
-        n_strips, each = strips(skin.shape[1], self.device)
+        n_strips, each = strips(skin.shape[1], self.device, at_least=32)
         bodies = (one.float().contiguous() for one in (skin, aside, apart))
         self._shift((len(skin), n_strips), *bodies, each, numbers)
         return numbers

@@ -50,24 +50,28 @@ class Segments:
 
 @wp.struct
 class Skins:
-    """The vertices of each bundle of segments; every vertex is listed once."""
+    """The vertices of bundles of segments, in pieces; every vertex is listed once."""
 
     start: wp.array[int]
     vertex: wp.array[int]
+    bundle: wp.array[int]
+    """The bundle of each piece."""
     of: wp.array[int]
-    """The segment of each bundle."""
+    """The segment of each piece."""
     gap: wp.array2d[float]
     """The most that any of its vertices keeps from segment k [m]."""
 
 
 @wp.func
 def find_near(i: int, work: Work, segments: Segments, bundles: Bundles, skins: Skins) -> None:
-    """Lists the vertices of bundle i that may be nearer to a segment than they may be, by boxes."""
+    """Lists the vertices of piece i that may be nearer to a segment than they may be, by boxes."""
     found = int(0)
+    low = bundles.low[skins.bundle[i]]
+    high = bundles.high[skins.bundle[i]]
     for k in range(segments.trees.shape[0]):
         # Where no joint is bent, segments are as far from each other as at rest.
         may = (segments.path[skins.of[i], k] & work.counts[BENT_JOINTS]) != 0 and skins.gap[i, k] > 0.0
-        if may and is_near(bundles.low[i], bundles.high[i], k, skins.gap[i, k], bundles):
+        if may and is_near(low, high, k, skins.gap[i, k], bundles):
             found |= 1 << k
     if found == 0:
         return

@@ -116,7 +116,7 @@ def look_kernel(
         for k in range(first, segments.trees.shape[0], stride):
             enclose(k, bundles)
     if is_due(3, only):
-        for i in range(first, bundles.low.shape[0], stride):
+        for i in range(first, skins.bundle.shape[0], stride):
             find_near(i, work, segments, bundles, skins)
 
 

@@ -41,8 +41,9 @@ class Parting:
         data.marked = as_warp(self._marked, wp.float32)
         data.pulled = wp.zeros(n, dtype=wp.int32, device=str(rest.device))
         bounds = [settings.tolerance, settings.gap]
+        each = int(BLOCK) if self._is_serial else 1
         launches: dict[str, tuple[Any, int, list[Any]]] = {
-            "find": (kernels.find_kernel, -(-n_faces // int(BLOCK)), [sheet.data, data]),
+            "find": (kernels.find_kernel, -(-n_faces // each), [each, sheet.data, data]),
             "measure": (kernels.measure_kernel, n_faces, [sheet.data, data, *bounds]),
             "part": (kernels.part_kernel, n, [data]),
         }

@@ -3,7 +3,7 @@
 import warp as wp
 
 from refu_core.contact._layers_kernels import Below, Cut
-from refu_core.sdf._crossing_kernels import BLOCK, Corners, double, meeting_edges
+from refu_core.sdf._crossing_kernels import Corners, double, meeting_edges
 
 wp.set_module_options({"fuse_fp": False, "enable_backward": False})
 
@@ -64,10 +64,10 @@ def cut_each_other(face: int, own: wp.mat33, other: wp.mat33, faces: wp.array2d[
 
 
 @wp.kernel
-def find_kernel(below: Below, outer: Outer) -> None:
-    """Marks the corners of faces that cut the sheet, and counts the pairs."""
-    first = BLOCK * wp.tid()
-    end = wp.min(first + BLOCK, outer.order.shape[0])
+def find_kernel(each: int, below: Below, outer: Outer) -> None:
+    """Marks the corners of faces that cut the sheet, and counts the pairs; `each` faces a thread, `BLOCK` at most."""
+    first = each * wp.tid()
+    end = wp.min(first + each, outer.order.shape[0])
     lower = wp.vec3(wp.inf)
     upper = wp.vec3(-wp.inf)
     lows = Corners()

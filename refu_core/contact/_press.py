@@ -10,7 +10,7 @@ import warp as wp
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from refu_core._warp import as_warp, ints, memory, recorded, torch_stream
+from refu_core._warp import as_warp, ints, memory, recorded, refit, torch_stream
 from refu_core.body import ARMS, LEGS, SmplBody, joints_of, part_of_faces, weight_of_parts
 from refu_core.body._bundle_kernels import bound_kernel, enclose_kernel
 from refu_core.body._bundles import bundled
@@ -55,10 +55,9 @@ class LimbMeshes:
 
     def pose(self, which: int) -> None:
         """Refits the meshes of the limbs `which`, as bits, unless they are already."""
-        for k, mesh in enumerate(self.meshes):
-            if self._is_late[k] and (which >> k) & 1:
-                mesh.refit()
-                self._is_late[k] = False
+        late = [k for k in np.flatnonzero(self._is_late) if (which >> k) & 1]
+        refit([self.meshes[k] for k in late], self._vertices.device)
+        self._is_late[late] = False
 
 
 class Press:
@@ -97,7 +96,7 @@ class Press:
         fabric.cut, fabric.spread = (as_warp(one, wp.float32) for one in self._cut)
         fabric.counts = as_warp(self._counts, wp.int32)
         lists = {
-            "start": [*range(0, len(order), _PIECE), len(order)],
+            "start": [*range(0, len(order), _PIECE if self._is_serial else 1), len(order)],
             "vertex": order,
             "foreign": foreign,
             "ring_start": ring.start,
@@ -150,4 +149,4 @@ class Press:
 
 
 _PIECE = 32
-"""Vertices of a garment that are looked at together."""
+"""Vertices of a garment that are looked at together; on a GPU each is looked at alone."""

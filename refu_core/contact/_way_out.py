@@ -51,10 +51,11 @@ class WayOut:
         away from `around` (N, 3) [m]. A GPU isn't waited for. Not differentiable.
         """
         winding = self._winding(points).clone()
-        n_inside = torch.count_nonzero(winding)
+        n_inside = (winding != 0).sum(dtype=torch.int32)
         if self._is_serial and not int(n_inside):
             return points, n_inside
-        above = self._winding_above()
+        wanted = n_inside[None]
+        above = self._winding_above(wanted)
         farthest, least = self._settings.max_displacement, self._settings.tolerance
         is_inside = winding != 0
         for of_samples in (False, True):
@@ -64,7 +65,7 @@ class WayOut:
                 at = foot + max(share * margin, least) * normal
                 at = around + torch.renorm(at - around, 2, 0, farthest)
                 tried = torch.where((is_inside & has_skin)[:, None], at, points)
-                is_in = self._winding(tried) != 0
+                is_in = self._winding(tried, wanted) != 0
                 points = torch.where((is_inside & ~is_in)[:, None], tried, points)
                 is_inside = is_inside & is_in
         return points, torch.count_nonzero(is_inside)
@@ -79,12 +80,12 @@ class WayOut:
         foot, normal = self._nearest_skin(points, is_inside, self._winding_above(), of_samples=False)
         return foot, is_inside & (normal != 0).any(1)
 
-    def _winding_above(self) -> Tensor:
+    def _winding_above(self, wanted: Tensor | None = None) -> Tensor:
         """The winding numbers above the samples of the skin: its vertices, and the middles of its faces."""
         with torch_stream(self.device):
             self._tree.refit()
             self._lift.launch()
-        return self._winding(self._above).clone()
+        return self._winding(self._above, wanted).clone()
 
     def _nearest_skin(
         self, points: Tensor, is_inside: Tensor, above: Tensor, *, of_samples: bool

@@ -5,12 +5,15 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
+from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from refu_core._warp import side_by_side
 from refu_core.body import Collider
 from refu_core.errors import MeshError
 from refu_core.realtime._contact import N_NUMBERS, ContactStage, Worn
@@ -165,6 +168,17 @@ class FrameStep:
                 for i, name in enumerate(self.outfit.wearables)
             }
             yield Person(lambda points: points, body.view(-1, 3), skin.view(-1, 3), shift, garments)
+
+
+def packed_by(steps: Sequence[FrameStep], inputs: Mapping[str, Tensor], margins: tuple[float, ...]) -> Tensor:
+    """`FrameStep.packed` of a batch that several steps share, on a GPU at the same time."""
+    ends = [len(inputs["pose"]) * i // len(steps) for i in range(len(steps) + 1)]
+    works = [
+        partial(step.packed, {name: tensor[start:end] for name, tensor in inputs.items()}, margins)
+        for step, (start, end) in zip(steps, pairwise(ends), strict=True)
+        if end > start
+    ]
+    return torch.cat(side_by_side(works, inputs["pose"].device))
 
 
 def _shift(dressed: Dressed, collider: Collider | None) -> Tensor:

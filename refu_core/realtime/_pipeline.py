@@ -24,7 +24,7 @@ from refu_core.garments import GarmentTemplate
 from refu_core.modes import MAX_MARGIN, BackboneName, SdfMode
 from refu_core.realtime._contact import ContactStage
 from refu_core.realtime._crew import Crew
-from refu_core.realtime._frame import FrameStep, StageClock
+from refu_core.realtime._frame import FrameStep, StageClock, packed_by
 from refu_core.realtime._graph import StepGraphs
 from refu_core.realtime._load import load_outfit
 from refu_core.realtime._outputs import FrameStats, GarmentMesh, GarmentStats, PipelineOutput, SkinShift
@@ -85,10 +85,10 @@ class GarmentPipeline:
         self._margin = margin
         self._style = style
         on_gpu = outfit.body.device.type == "cuda"
-        self._graphs = StepGraphs(steps[0].packed, outfit.body.device) if graph and on_gpu else None
+        self._graphs = StepGraphs(partial(packed_by, steps), outfit.body.device) if graph and on_gpu else None
         contact = steps[0].contact
         self._is_certified = contact is not None and contact.way_out is not None
-        self._crew = Crew(steps, on_gpu=on_gpu)
+        self._crew = Crew(steps[:1] if on_gpu else steps, on_gpu=on_gpu)
         self._lock = threading.Lock()
         """Of what is remembered."""
         self._faces = {name: one.template.faces.cpu().numpy().copy() for name, one in outfit.wearables.items()}
@@ -165,7 +165,8 @@ class GarmentPipeline:
             collider: bring garments off a body whose overlaps were pulled apart (`PipelineOutput.body`); without, off
                 the posed body itself as in the paper, in which there is no room where limbs run through each other.
             contact: the tuned numbers of collision handling.
-            threads: how many calls, or parts of a batch, may run at once, each in memory of its own; on a GPU one.
+            threads: how many calls, or parts of a batch, may run at once, each in memory of its own; on a GPU calls
+                take turns, and parts of a batch run at once in a graph.
 
         Raises:
             GarmentError: no garment, an unknown one, garments of two bodies, or a bad style.
@@ -195,7 +196,7 @@ class GarmentPipeline:
             for one in outfit.wearables.values():
                 one.template.rest(gamma.new_zeros(1, N_BETAS), gamma)  # says now if it has no styles
         steps = []
-        for k in range(threads if torch_device.type == "cpu" else 1):
+        for k in range(threads):
             own = outfit.beside() if k else outfit
             stage = None
             if mode is not SdfMode.NONE:

@@ -11,6 +11,8 @@ from refu_core.mesh import Connectivity
 from refu_core.sdf._winding_kernels import CELLS, bin_kernel, crossings_kernel, extent_kernel
 
 _N_CELLS = int(CELLS)
+_IN_ROW = 32
+"""Points that a thread of a GPU puts in one box before all threads put theirs together, one after another."""
 
 
 class Winding:
@@ -38,18 +40,22 @@ class Winding:
         each = n_faces if device.type == "cpu" else 1
         self._n_threads = n_faces // each
         body = as_warp(self._body, wp.vec3), wp.array(mesh.faces, dtype=wp.vec3i, device=str(device))
-        listed = (wp.vec3, wp.vec3, wp.int32, wp.int32, wp.float32)
-        self._bound = Repeated(extent_kernel, (wp.int32, wp.vec3, wp.vec3))
+        listed = (wp.int32, wp.vec3, wp.vec3, wp.int32, wp.int32, wp.float32)
+        self._bound = Repeated(extent_kernel, (wp.int32, wp.int32, wp.vec3, wp.vec3))
         self._sort = Repeated(bin_kernel, listed)
         self._cross = Repeated(crossings_kernel, (*listed, wp.int32), [each, *body])
+        self._always = memory(1, dtype=torch.int32, device=device).fill_(1)
 
     def update(self, vertices: Tensor) -> None:
         """Takes over a pose: the body's vertices [m], shape (V, 3)."""
         self._body.copy_(vertices.detach()[: len(self._body)])
 
     @torch.no_grad()
-    def __call__(self, points: Tensor) -> Tensor:
-        """The winding numbers of points [m], shape (N, 3): int32, (N,). A GPU isn't waited for."""
+    def __call__(self, points: Tensor, wanted: Tensor | None = None) -> Tensor:
+        """The winding numbers of points [m], shape (N, 3): int32, (N,). A GPU isn't waited for.
+
+        Where they are `wanted` only if a number on the device, int32 of shape (1,), isn't 0, zeros do else.
+        """
         n, device = len(points), self._body.device
         points = points.to(device=device, dtype=torch.float32).contiguous()
         winding, following = (torch.zeros(n, dtype=torch.int32, device=device) for _ in range(2))
@@ -58,9 +64,10 @@ class Winding:
             self._farthest_in.fill_(torch.inf)
             self._box[0].fill_(torch.inf)
             self._box[1].fill_(-torch.inf)
-            listed = points, self._box, self._first, following, self._farthest_in
-            n_strips, each = strips(n, device)
-            self._bound((n_strips,), each, points, self._box)
+            wanted = self._always if wanted is None else wanted
+            listed = wanted, points, self._box, self._first, following, self._farthest_in
+            n_strips, each = strips(n, device, at_least=_IN_ROW)
+            self._bound((n_strips,), wanted, each, points, self._box)
             self._sort((n,), *listed)
             self._cross((self._n_threads,), *listed, winding)
         return winding

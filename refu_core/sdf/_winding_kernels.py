@@ -70,16 +70,20 @@ def per_metre_of(grid: wp.array[wp.vec3]) -> wp.vec3:
 
 @wp.kernel
 def extent_kernel(
+    wanted: wp.array[int],
     each: wp.array[int],
     points: wp.array[wp.vec3],
     # output, and infinite before
     grid: wp.array[wp.vec3],
 ) -> None:
-    """The corners of the box around the points; `each` points a thread."""
+    """The corners of the box around the points; `each` points a thread. As all of these kernels it does nothing where
+    `wanted` is 0."""
+    if wanted[0] == 0:
+        return
     begin = wp.tid() * each[0]
     low = points[begin]
     high = low
-    for q in range(begin + 1, begin + each[0]):
+    for q in range(begin + 1, wp.min(begin + each[0], points.shape[0])):
         low = lesser(low, points[q])
         high = greater(high, points[q])
     wp.atomic_min(grid, 0, low)
@@ -88,6 +92,7 @@ def extent_kernel(
 
 @wp.kernel
 def bin_kernel(
+    wanted: wp.array[int],
     points: wp.array[wp.vec3],
     grid: wp.array[wp.vec3],
     # outputs
@@ -96,6 +101,8 @@ def bin_kernel(
     farthest_in: wp.array[float],
 ) -> None:
     """Lists the points by cell; `farthest_in` is the least distance of a cell's points before the middle plane."""
+    if wanted[0] == 0:
+        return
     q = wp.tid()
     p = points[q]
     per_metre = per_metre_of(grid)
@@ -112,6 +119,7 @@ def crossings_kernel(
     each: int,
     body: wp.array[wp.vec3],
     faces: wp.array[wp.vec3i],
+    wanted: wp.array[int],
     points: wp.array[wp.vec3],
     grid: wp.array[wp.vec3],
     first: wp.array[int],
@@ -121,6 +129,8 @@ def crossings_kernel(
     winding: wp.array[int],
 ) -> None:
     """Each face adds itself to the winding numbers of the points that look through it; `each` faces a thread."""
+    if wanted[0] == 0:
+        return
     low = grid[0]
     high = grid[1]
     per_metre = per_metre_of(grid)

@@ -73,6 +73,9 @@ def test_winding_numbers_are_libigls_on_vertices_edges_and_far_away() -> None:
         here = where.astype(np.float32)
         expected = igl.winding_number(body.astype(np.float64), faces.numpy(), here.astype(np.float64))
         assert np.array_equal(winding(torch.from_numpy(here)).numpy(), np.round(expected))
+        for wanted in (0, 1):
+            found = winding(torch.from_numpy(here), torch.tensor([wanted], dtype=torch.int32))
+            assert np.array_equal(found.numpy(), wanted * np.round(expected)), "nothing is done where none is wanted"
 
 
 def test_the_promised_range_is_of_rotations_and_of_both_sides() -> None:

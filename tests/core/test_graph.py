@@ -28,7 +28,7 @@ from torch.utils._pytree import tree_flatten
 from refu_core import GarmentPipeline, SmplFrame
 from refu_core.errors import MeshError
 from refu_core.realtime import GarmentStats, SkinShift, Wearer
-from refu_core.realtime._frame import FrameStep
+from refu_core.realtime._frame import FrameStep, packed_by
 from refu_core.realtime._graph import CudaCapture, StepGraphs
 from refu_core.sdf import ApproxSdf, ExactSdf, _mesh
 
@@ -335,6 +335,16 @@ def test_packed_and_unpacked() -> None:
         list(step.unpacked(packed))
 
 
+def test_steps_share_a_batch() -> None:
+    """Each has memory of its own, so a person is dressed as by any other of them: but for what a batch rounds."""
+    pipeline = GarmentPipeline.load(["tshirt-male"], threads=3)
+    inputs = step_inputs(pipeline, frames(0, 1, 2, 3, 4))
+    alone = pipeline._steps[0].packed(inputs, (0.004,))
+    for n in (5, 2):
+        shared = packed_by(pipeline._steps, {name: one[:n] for name, one in inputs.items()}, (0.004,))
+        torch.testing.assert_close(shared, alone[:n], atol=1e-5, rtol=0)
+
+
 def test_a_cpu_has_no_graphs() -> None:
     assert GarmentPipeline.load(["tshirt-male"], graph=True)._graphs is None
 
@@ -384,7 +394,7 @@ def test_a_capture_warms_up_on_the_stream_that_it_then_captures(monkeypatch: pyt
 @pytest.mark.parametrize("sdf", ["hybrid", "accurate"])
 def test_on_a_gpu(sdf: str) -> None:
     garments = ["tshirt-male", "short-pant-male"]
-    replaying = GarmentPipeline.load(garments, sdf=sdf, device="cuda")
+    replaying = GarmentPipeline.load(garments, sdf=sdf, device="cuda", threads=2)
     launching, usual = (
         GarmentPipeline.load(garments, sdf=sdf, device=device, graph=False) for device in ("cuda", "cpu")
     )
