@@ -27,7 +27,7 @@ class NodeSettings(DressOptions):
     """
 
     threads: int = fixed(
-        2, "How many frames, or people of a frame, are processed at once; one on a GPU.", within=(1, 64)
+        2, "How many frames, or people of a frame, are processed at once; on a GPU people alone.", within=(1, 64)
     )
     on_device_loss: str = setting(
         "cpu", "When the device fails: go on on the cpu, with an ERROR, or stop the node.", choices=("cpu", "stop")
