@@ -61,6 +61,7 @@ class PoseHistory:
     def __call__(self, frame: SmplFrame, person: str = "") -> SmplFrame:
         """A person's next frame, with its past. Raises `FrameError` for what is none."""
         require_type(frame, SmplFrame, "an SmplFrame", error=FrameError)
+        require_type(person, str, "a person's name", error=FrameError)
         now = _Moment(frame.stamp_ns, Rotation.from_rotvec(frame.pose.astype(np.float64)).as_matrix(), frame.transl)
         known = self._people.pop(person, None)
         if known is None or not _goes_on(known[-1], now):

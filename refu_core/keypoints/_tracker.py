@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from numbers import Integral
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from refu_core.errors import FrameError
+from refu_core.errors import FrameError, require_type
 from refu_core.frames import N_BETAS, N_JOINTS, SmplFrame
 from refu_core.keypoints._guess import first_pose
 from refu_core.keypoints._pose import Pose, Skeleton, exp_so3, log_so3
@@ -84,8 +85,9 @@ class KeypointTracker:
                 100.
 
         Raises:
-            FrameError: another number of keypoints.
+            FrameError: another number of keypoints, or no numbers.
         """
+        require_type(stamp_ns, Integral, "a whole number of nanoseconds", error=FrameError)
         seen = self._cleaned(points, confidence)
         dt = 1e-9 * (stamp_ns - self._stamp)
         if self._pose is not None and not -1.0 < dt <= 1.0:
@@ -131,8 +133,12 @@ class KeypointTracker:
 
     def _cleaned(self, points: ArrayLike, confidence: ArrayLike | None) -> _Seen:
         n = len(self.skeleton.layout)
-        given = np.asarray(points, np.float64)
-        weights = np.ones(n) if confidence is None else np.asarray(confidence, np.float64).copy()
+        try:
+            given = np.asarray(points, np.float64)
+            weights = np.ones(n) if confidence is None else np.asarray(confidence, np.float64).copy()
+        except (TypeError, ValueError) as error:
+            msg = f"wanted {n} keypoints of {self.skeleton.layout.name} as numbers: {error}"
+            raise FrameError(msg) from error
         if given.shape != (n, 3) or weights.shape != (n,):
             msg = f"wanted {n} keypoints of {self.skeleton.layout.name}, got {given.shape} and {weights.shape}"
             raise FrameError(msg)

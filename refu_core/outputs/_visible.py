@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from refu_core import _warp  # noqa: F401  (quiets Warp before it starts)
 from refu_core.errors import MeshError
+from refu_core.frames import checked_numbers
 from refu_core.mesh import as_points, check_faces
 from refu_core.outputs import _visible_kernels as kernels
 
@@ -74,9 +75,17 @@ class PinholeCamera:
     ) -> PinholeCamera:
         """A camera at `eye` [m], shape (3,), that has `target` [m] in the middle and the y axis up.
 
-        `fov` is the angle from its left to its right border [rad]. Raises `MeshError` if it looks straight up or down.
+        `fov` is the angle from its left to its right border [rad].
+
+        Raises:
+            FrameError: `target` or `eye` aren't three numbers.
+            MeshError: it looks straight up or down, or has no width.
         """
-        away = np.asarray(target, np.float64) - np.asarray(eye, np.float64)
+        target, eye = (checked_numbers(name, at, (3,), np.float64) for name, at in (("target", target), ("eye", eye)))
+        if not 0 < fov < math.pi or not width > 0:
+            msg = f"wanted a positive width and an angle below 180 degrees, got {width} pixels and {fov} rad"
+            raise MeshError(msg)
+        away = target - eye
         right = np.cross(away, [0.0, 1.0, 0.0])
         if not np.linalg.norm(right) > 1e-6 * np.linalg.norm(away):
             msg = f"a camera at {eye!r} can't have {target!r} in the middle and the y axis up: give its rotation"
@@ -84,7 +93,7 @@ class PinholeCamera:
         forward, right = away / np.linalg.norm(away), right / np.linalg.norm(right)
         rotation = np.stack((right, np.cross(forward, right), forward))
         f = 0.5 * width / math.tan(0.5 * fov)
-        return cls(width, height, (f, f), (0.5 * width, 0.5 * height), rotation, -rotation @ np.asarray(eye))
+        return cls(width, height, (f, f), (0.5 * width, 0.5 * height), rotation, -rotation @ eye)
 
     @property
     def eye(self) -> NDArray[np.float64]:

@@ -239,6 +239,10 @@ class GarmentPipeline:
             RefuError: as `__call__`, and what `adjust` raises.
         """
         require_type(frame, SmplFrame, "a SmplFrame", error=FrameError)
+        given: object = adjust
+        if not callable(given):
+            msg = f"wanted a function of a Dressed, got {type(given).__name__}"
+            raise FrameError(msg)
         with self._crew.turn() as step:
             return self._run(step, [frame], self._margin, adjust)[0]
 

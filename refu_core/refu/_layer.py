@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict
+from numbers import Real
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from refu_core.errors import MeshError, WeightsError
+from refu_core.errors import MeshError, WeightsError, require_type
 from refu_core.modes import DEFAULT_MARGIN
 from refu_core.refu._scale import REALTIME, ScaleNet, ScaleSettings, VertexScale
 from refu_core.refu._unit import pushed_rows, repulse
@@ -37,9 +38,14 @@ class Refu(nn.Module):
             margin: ε > 0 [m], or 0 for the paper's.
 
         Raises:
-            MeshError: a margin that is negative or not finite.
+            MeshError: no vertices, or a margin that is negative or not finite.
         """
         super().__init__()
+        require_type(n_vertices, int, "a number of vertices", error=MeshError)
+        if n_vertices < 1:
+            msg = f"wanted a garment of at least one vertex, got {n_vertices}"
+            raise MeshError(msg)
+        require_type(margin, Real, "a margin in metres", error=MeshError)
         if not 0 <= margin < math.inf:
             msg = f"wanted a margin of 0 m or more, got {margin}"
             raise MeshError(msg)
@@ -88,6 +94,7 @@ class Refu(nn.Module):
             MeshError: Another number of vertices than N, shapes that don't belong together, or no z for learned scales.
         """
         require_tensor("points", points)
+        require_type(sample, SdfSample, "an SdfSample, as the query of a signed distance gives", error=MeshError)
         batch = len(points)
         if points.shape != (batch, self.n_vertices, 3):
             msg = f"wanted garments of the shape (B, {self.n_vertices}, 3), got {tuple(points.shape)}"

@@ -12,7 +12,9 @@ import pytest
 import torch
 
 import refu_core
-from refu_core import ExactSdf, GarmentPipeline, RefuError, Resolver, SmplFrame, load_body
+from refu_core import ExactSdf, GarmentPipeline, PoseHistory, RefuError, Resolver, SmplFrame, load_body
+from refu_core.keypoints import KeypointTracker, Proportions, Skeleton, keypoint_layout
+from refu_core.outputs import PinholeCamera
 from refu_core.refu import Refu, repulse
 from refu_core.sdf import SdfSample
 
@@ -57,6 +59,10 @@ def resolver() -> Resolver:
     return Resolver(torch.tensor([[0, 1, 2]]), 3)
 
 
+def skeleton() -> Skeleton:
+    return Skeleton(keypoint_layout("coco17"), Proportions.builtin("male"))
+
+
 FRAME = SmplFrame(pose=np.zeros(72))
 SAMPLE = SdfSample(torch.zeros(3), torch.zeros(3, 3))
 
@@ -88,6 +94,17 @@ SAMPLE = SdfSample(torch.zeros(3), torch.zeros(3, 3))
         (lambda: resolver()(np.zeros((3, 3)), posed(), SAMPLE), "points must be .*torch.Tensor, got ndarray"),
         (lambda: resolver()(torch.zeros(1, 3), posed(), SAMPLE), r"wanted 3 points .* shapes \(1, 3\)"),
         (lambda: resolver()(torch.zeros(3, 3), posed(), SAMPLE), "start must name the closest faces"),
+        (lambda: Refu(-1, least=1.0), "wanted a garment of at least one vertex, got -1"),
+        (lambda: Refu("3", least=1.0), "wanted a number of vertices, got str"),
+        (lambda: Refu(3, least=1.0, margin="4 mm"), "wanted a margin in metres, got str"),
+        (lambda: Refu(3, least=1.0)(torch.zeros(1, 3, 3), 5), "wanted an SdfSample.*, got int"),
+        (lambda: pipeline().adjusted(FRAME, 3), "wanted a function of a Dressed, got int"),
+        (lambda: PoseHistory()(FRAME, []), "wanted a person's name, got list"),
+        (lambda: KeypointTracker(skeleton()).update("x", 0), "wanted 17 keypoints of coco17 as numbers: "),
+        (lambda: KeypointTracker(skeleton()).update(np.zeros((17, 3)), "now"), "whole number of nanoseconds, got str"),
+        (lambda: PinholeCamera.looking_at([0, 0], [0, 0, 1]), r"target must have the shape \(3,\), got \(2,\)"),
+        (lambda: PinholeCamera.looking_at([0, 0, 0], "x"), r"eye must be \(3,\) numbers, got str"),
+        (lambda: PinholeCamera.looking_at([0, 0, 0], [0, 0, 1], fov=4.0), "an angle below 180 degrees, got 640 pixels"),
     ],
 )
 def test_a_wrong_type_gets_a_sentence(call: Callable[[], object], said: str) -> None:
