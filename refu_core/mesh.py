@@ -225,10 +225,14 @@ def grouped(places: NDArray[np.floating[Any]], width: int = 8) -> NDArray[np.int
     while (is_open := np.diff(bounds) > 1).any():
         starts, sizes = bounds[:-1], np.diff(bounds)
         here = places[order]
-        extent = np.maximum.reduceat(here, starts) - np.minimum.reduceat(here, starts)
-        group = np.repeat(np.arange(len(starts)), sizes)
-        along = here[np.arange(n), extent.argmax(1)[group]]
-        order = order[np.lexsort((along, group))]
+        low = np.minimum.reduceat(here, starts)
+        extent = np.maximum.reduceat(here, starts) - low
+        groups, axis = np.arange(len(starts)), extent.argmax(1)
+        group = np.repeat(groups, sizes)
+        along = here[np.arange(n), axis[group]] - low[groups, axis][group]
+        # Whole numbers keep groups apart: one sort takes half the time of two.
+        key = group + 0.5 * along / np.maximum(extent[groups, axis], np.finfo(np.float32).tiny)[group]
+        order = order[np.argsort(key, kind="stable")]
         # Into halves, of whole groups of the next smaller size: only the last one of all may have less.
         unit = sizes_of_groups[np.searchsorted(sizes_of_groups, sizes[is_open]) - 1]
         half = np.maximum(-(-sizes[is_open] // unit) // 2, 1) * unit

@@ -187,7 +187,8 @@ class Anatomy:
         segments.path = self._ints(_paths(weights, solids.of_vertex))
         clearance = wp.zeros((n, n_segments), dtype=wp.float32, device=device)
         segments.gap = clearance
-        wp.launch(parting.clearance_kernel, (n, n_segments), [points, segments, clearance], device=device)
+        most = how.gap / max(how.segment_share, 1e-3)  # whoever is farther keeps the whole gap
+        wp.launch(parting.clearance_kernel, (n, n_segments), [most, points, segments, clearance], device=device)
         segments.gap = self._floats(np.minimum(how.gap, how.segment_share * clearance.numpy()))
         self.bundles = bundled(points.numpy(), solids.faces, self.device)
         self.skins = self._bind_skins(segments.gap.numpy())

@@ -343,14 +343,17 @@ def thickness_kernel(
 
 
 @wp.kernel
-def clearance_kernel(points: wp.array[wp.vec3], segments: Segments, clearance: wp.array2d[float]) -> None:
-    """The signed distance of each vertex from each segment but its own [m]."""
+def clearance_kernel(most: float, points: wp.array[wp.vec3], segments: Segments, clearance: wp.array2d[float]) -> None:
+    """The signed distance of each vertex from each segment but its own, at `most` so much [m]."""
     v, k = wp.tid()
+    p = points[v]
     distance = float(0.0)
     if segments.own[v] != k:
-        hit = wp.mesh_query_point_no_sign(segments.trees[k], points[v], 1.0e3)
+        hit = wp.mesh_query_point_no_sign(segments.trees[k], p, most)
         if hit.result:
-            distance = distance_of(segments.trees[k], points[v], hit)
+            distance = distance_of(segments.trees[k], p, hit)
+        else:  # so it is outside, or deep inside
+            distance = wp.where(wp.mesh_query_ray_count_intersections(segments.trees[k], p, _RAY) % 2 == 1, -most, most)
     clearance[v, k] = distance
 
 
