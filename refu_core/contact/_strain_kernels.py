@@ -74,9 +74,11 @@ def sweep_kernel(net: Net, points: wp.array[wp.vec3], other: wp.array[wp.vec3]) 
 def limit_kernel(net: Net, sweeps: int) -> None:
     """All sweeps, by one thread: over the ends of edges that are too long, and of those that become it."""
     for v in range(net.points.shape[0]):
+        if net.points[v] == net.before[v]:
+            continue  # an edge that contact has made longer has an end that was moved
         for r in range(net.cut.ring_start[v], net.cut.ring_start[v + 1]):
             w = net.cut.ring[r]
-            if w > v and is_long(v, w, net.points, net):
+            if is_long(v, w, net.points, net):
                 enlist(v, net)
                 enlist(w, net)
     for _ in range(sweeps):
