@@ -7,6 +7,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+WORLD_FRAME = "map"
+"""The frame of whatever names no other (REP-105)."""
+
 InputAxes = Literal["smpl", "frame"]
 """What a sender's root orientation and translation are expressed in.
 

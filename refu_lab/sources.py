@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import msg_adapters as adapters
-from msg_adapters.axes import up_of
+from msg_adapters.axes import WORLD_FRAME, up_of
 from msg_adapters.inputs import body_of
 from refu_core import FrameError, RefuError
 from refu_core.history import PoseHistory
@@ -55,7 +55,7 @@ class Source:
     """Whose motion it is, where the file says it."""
     is_fitted: bool = False
     """Whether its betas were fitted to the body that wears the garments."""
-    frame_id: str = "map"
+    frame_id: str = WORLD_FRAME
     """Of what comes of it."""
 
     track: adapters.Track = field(default_factory=adapters.Track)

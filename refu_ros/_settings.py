@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from msg_adapters import INPUT_TYPES, KEYPOINT_TYPES, POINT_FIELDS, InputAxes
+from msg_adapters.axes import WORLD_FRAME
 from refu_core.keypoints import LAYOUTS
 from refu_core.options import DressOptions, SettingsError, check, fixed, setting
 from refu_ros._parameters import coerced
@@ -47,7 +48,7 @@ class NodeSettings(DressOptions):
     input_axes: str = setting(
         "smpl", "Axes of the root: smpl (y up; turned into ROS axes) or frame (those of frame_id).", choices=_AXES
     )
-    frame_id: str = setting("map", "Frame of all that comes out; inputs of other frames are transformed (tf2).")
+    frame_id: str = setting(WORLD_FRAME, "Frame of all that comes out; inputs of other frames are transformed (tf2).")
     transform_tolerance: float = setting(
         0.1, "How much older than the input a transform may be [s]; without one it is dropped.", within=(0.0, 10.0)
     )

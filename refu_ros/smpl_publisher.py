@@ -15,6 +15,7 @@ from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from msg_adapters import INPUT_TYPES, Encoder, encoder_for, load_motion
+from msg_adapters.axes import WORLD_FRAME
 from refu_core import FrameError, SmplFrame
 from refu_core.options import SettingsError, check, fixed
 from refu_core.recordings import Axes
@@ -39,7 +40,7 @@ class PublisherOptions:
         "Axes that are sent: smpl (y up; files are turned), or frame (as files have them).",
         choices=("smpl", "frame"),
     )
-    frame_id: str = fixed("map", "Frame of messages that have a header.")
+    frame_id: str = fixed(WORLD_FRAME, "Frame of messages that have a header.")
     fps: float = fixed(0.0, "Frame rate of a file of motion, in place of its own; 0 for that [Hz].", within=(0.0, 1e4))
     rate: float = fixed(
         30.0,

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from msg_adapters.axes import WORLD_FRAME
 from msg_adapters.cdr import Buffer, CdrReader, CdrWriter
 from msg_adapters.errors import DecodeError, decoding
 from msg_adapters.inputs import _ros4hri
@@ -126,7 +127,7 @@ def body_of(data: Buffer) -> str | None:
     return _ros4hri.body_of(names)
 
 
-def to_bytes(frame: SmplFrame, *, frame_id: str = "map") -> bytes:
+def to_bytes(frame: SmplFrame, *, frame_id: str = WORLD_FRAME) -> bytes:
     """The message in CDR, with betas and translation."""
     writer = CdrWriter()
     writer.fields("Ts", frame.stamp_ns, frame_id)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from msg_adapters.axes import WORLD_FRAME
 from msg_adapters.cdr import Buffer, CdrReader, CdrWriter
 from msg_adapters.errors import DecodeError, decoding
 from refu_core.frames import N_BETAS, N_JOINTS, N_STYLES, SmplFrame
@@ -69,7 +70,7 @@ def from_bytes(data: Buffer) -> SmplFrame:
         return SmplFrame(**_blocks(dimensions, offset, values))
 
 
-def to_bytes(frame: SmplFrame, *, frame_id: str = "map") -> bytes:  # noqa: ARG001 - the type has no header
+def to_bytes(frame: SmplFrame, *, frame_id: str = WORLD_FRAME) -> bytes:  # noqa: ARG001 - the type has no header
     """The message in CDR: pose, betas, transl, and style where the frame has one."""
     blocks: dict[str, NDArray[Any]] = {"pose": frame.pose.ravel(), "betas": frame.betas, "transl": frame.transl}
     if frame.style is not None:

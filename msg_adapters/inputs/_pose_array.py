@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from msg_adapters.axes import WORLD_FRAME
 from msg_adapters.cdr import Buffer, CdrReader, CdrWriter
 from msg_adapters.errors import DecodeError, decoding
 from refu_core.frames import N_JOINTS, SmplFrame
@@ -43,7 +44,7 @@ def from_bytes(data: Buffer) -> SmplFrame:
         return SmplFrame(pose, transl=poses[0, :3], stamp_ns=stamp_ns)
 
 
-def to_bytes(frame: SmplFrame, *, frame_id: str = "map") -> bytes:
+def to_bytes(frame: SmplFrame, *, frame_id: str = WORLD_FRAME) -> bytes:
     """The message in CDR; the betas aren't in it."""
     poses = np.zeros((N_JOINTS, _POSE_NUMBERS))
     poses[0, :3] = frame.transl

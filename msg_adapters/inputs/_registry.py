@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import Protocol
 
+from msg_adapters.axes import WORLD_FRAME
 from msg_adapters.cdr import Buffer, CdrReader
 from msg_adapters.definitions import full_type_name
 from msg_adapters.errors import DecodeError
@@ -26,7 +27,7 @@ INPUT_TYPES: dict[str, str] = {name: codec.MESSAGE_TYPE for name, codec in _CODE
 class Encoder(Protocol):
     """Turns a frame into a message's CDR bytes."""
 
-    def __call__(self, frame: SmplFrame, *, frame_id: str = "map") -> bytes:
+    def __call__(self, frame: SmplFrame, *, frame_id: str = WORLD_FRAME) -> bytes:
         """The message in CDR; raises `EncodeError` for a stamp outside the message's range."""
 
 

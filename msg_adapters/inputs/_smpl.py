@@ -11,6 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from msg_adapters.axes import WORLD_FRAME
 from msg_adapters.cdr import Buffer, CdrReader, CdrWriter
 from msg_adapters.definitions import message_definition
 from msg_adapters.errors import DecodeError, decoding
@@ -70,7 +71,7 @@ def bytes_decoder(definition: str | None = None) -> Callable[[Buffer], SmplFrame
     return from_bytes
 
 
-def to_bytes(frame: SmplFrame, *, frame_id: str = "map") -> bytes:
+def to_bytes(frame: SmplFrame, *, frame_id: str = WORLD_FRAME) -> bytes:
     """The message in CDR; its keypoints are zero."""
     pose = frame.pose.ravel()
     values = {"global_orient": pose[:3], "body_pose": pose[3:], "betas": frame.betas, "transl": frame.transl}

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from msg_adapters.axes import SMPL_COLUMNS, InputAxes
+from msg_adapters.axes import SMPL_COLUMNS, WORLD_FRAME, InputAxes
 from msg_adapters.cdr import HEADER_BYTES, CdrWriter, split_stamp
 from msg_adapters.errors import EncodeError
 
@@ -147,7 +147,7 @@ class MarkerArrayEncoder:
         self,
         meshes: Sequence[MarkerMesh],
         *,
-        frame_id: str = "map",
+        frame_id: str = WORLD_FRAME,
         axes: InputAxes = "smpl",
         lifetime_ns: int = 0,
     ) -> None:
@@ -261,7 +261,7 @@ def encode_lists(
     return writer.to_bytes()
 
 
-def encode_delete(names: Sequence[str], *, stamp_ns: int, frame_id: str = "map") -> bytes:
+def encode_delete(names: Sequence[str], *, stamp_ns: int, frame_id: str = WORLD_FRAME) -> bytes:
     """A MarkerArray that removes the markers of these namespaces: a person has left.
 
     Raises `EncodeError` when the stamp doesn't fit the message.

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from msg_adapters.axes import WORLD_FRAME
 from msg_adapters.cdr import CdrWriter
 from msg_adapters.errors import EncodeError
 from msg_adapters.markers import MarkerMesh, finite_points, triangles
@@ -36,7 +37,7 @@ def encode_collision_object(
     name: str,
     *,
     stamp_ns: int,
-    frame_id: str = "map",
+    frame_id: str = WORLD_FRAME,
     placement: Placement | None = None,
     mesh: tuple[ArrayLike, ArrayLike] | None = None,
     subframes: Mapping[str, Placement] | None = None,
@@ -108,7 +109,7 @@ def encode_scene(
     *,
     deleted: Sequence[str] = (),
     stamp_ns: int = 0,
-    frame_id: str = "map",
+    frame_id: str = WORLD_FRAME,
     lifetime_ns: int = 0,
 ) -> bytes:
     """A `foxglove_msgs/SceneUpdate`: the entities are shown, and those named in `deleted` are no longer.

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from msg_adapters.axes import WORLD_FRAME
 from msg_adapters.cdr import HEADER_BYTES, CdrWriter, split_stamp
 from msg_adapters.errors import DecodeError, EncodeError
 
@@ -32,7 +33,9 @@ class PointCloudEncoder:
     `counts` are the garments' vertices. One encoder serves one thread at a time.
     """
 
-    def __init__(self, counts: Sequence[int], *, frame_id: str = "map", fields: Sequence[str] = POINT_FIELDS) -> None:
+    def __init__(
+        self, counts: Sequence[int], *, frame_id: str = WORLD_FRAME, fields: Sequence[str] = POINT_FIELDS
+    ) -> None:
         dtype = _layout(fields, most_vertices=max(counts))
         writer = CdrWriter()
         total, n_bytes = sum(counts), sum(counts) * dtype.itemsize

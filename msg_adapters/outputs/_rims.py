@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from msg_adapters.axes import WORLD_FRAME
 from msg_adapters.cdr import CdrWriter
 from msg_adapters.markers import LINE_STRIP, encode_lists, finite_points
 from msg_adapters.transforms import Transform, encode_transforms, quaternion_from_matrix
@@ -32,7 +33,7 @@ class Rim:
     """Vertices of the rim in order [m], shape (K, 3)."""
 
 
-def encode_polygon(ring: ArrayLike, *, stamp_ns: int, frame_id: str = "map") -> bytes:
+def encode_polygon(ring: ArrayLike, *, stamp_ns: int, frame_id: str = WORLD_FRAME) -> bytes:
     """A `geometry_msgs/PolygonStamped` of points [m], shape (K, 3).
 
     Raises `EncodeError` for points that aren't finite or of another shape, and a stamp that doesn't fit a ROS time.
@@ -43,7 +44,7 @@ def encode_polygon(ring: ArrayLike, *, stamp_ns: int, frame_id: str = "map") -> 
     return writer.to_bytes()
 
 
-def encode_rims(rims: Sequence[Rim], *, frame_id: str = "map", lifetime_ns: int = 0) -> bytes:
+def encode_rims(rims: Sequence[Rim], *, frame_id: str = WORLD_FRAME, lifetime_ns: int = 0) -> bytes:
     """A MarkerArray with a LINE_STRIP a rim, closed; the marker's pose is the opening's frame, its points lie in that.
 
     Raises `EncodeError` for what can't be drawn.
@@ -57,7 +58,7 @@ def encode_rims(rims: Sequence[Rim], *, frame_id: str = "map", lifetime_ns: int 
     return encode_lists(LINE_STRIP, strips, frame_id=frame_id, color=_COLOR, size=_WIDTH_M, lifetime_ns=lifetime_ns)
 
 
-def encode_frames(rims: Sequence[Rim], *, frame_id: str = "map") -> bytes:
+def encode_frames(rims: Sequence[Rim], *, frame_id: str = WORLD_FRAME) -> bytes:
     """A `tf2_msgs/TFMessage` with a frame a rim. Raises `EncodeError` for a stamp that doesn't fit a ROS time."""
     return encode_transforms(
         [Transform(rim.stamp_ns, frame_id, rim.name, rim.centre, quaternion_from_matrix(rim.rotation)) for rim in rims]
