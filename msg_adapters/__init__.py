@@ -3,6 +3,7 @@
 Nothing here imports rclpy or torch.
 """
 
+from msg_adapters.axes import WORLD_FRAME as WORLD_FRAME
 from msg_adapters.axes import InputAxes as InputAxes
 from msg_adapters.axes import vertices_ros_from_smpl as vertices_ros_from_smpl
 from msg_adapters.axes import vertices_smpl_from_ros as vertices_smpl_from_ros

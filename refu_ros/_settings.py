@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
-from msg_adapters import INPUT_TYPES, KEYPOINT_TYPES, POINT_FIELDS, InputAxes
-from msg_adapters.axes import WORLD_FRAME
+from msg_adapters import INPUT_TYPES, KEYPOINT_TYPES, POINT_FIELDS, WORLD_FRAME, InputAxes
 from refu_core.keypoints import LAYOUTS
 from refu_core.options import DressOptions, SettingsError, check, fixed, setting
 from refu_ros._parameters import coerced
@@ -17,7 +16,7 @@ from refu_ros._parameters import coerced
 _PERSON = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,99}")
 _FRAME = re.compile(r"[^/\s\x00-\x1f\x7f][^\s\x00-\x1f\x7f]{0,254}")
 _SLOWEST_HZ = 0.01
-_AXES = ("smpl", "frame")
+AXES = ("smpl", "frame")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,9 +26,7 @@ class NodeSettings(DressOptions):
     Raises `SettingsError` for a value out of range and for values that can't go together.
     """
 
-    threads: int = fixed(
-        2, "How many frames, or people of a frame, are processed at once; on a GPU people alone.", within=(1, 64)
-    )
+    threads: int = fixed(2, "Frames, or people of a frame, processed at once; on a GPU people alone.", within=(1, 64))
     on_device_loss: str = setting(
         "cpu", "When the device fails: go on on the cpu, with an ERROR, or stop the node.", choices=("cpu", "stop")
     )
@@ -46,7 +43,7 @@ class NodeSettings(DressOptions):
         1.0, "How much smoother than people usually move poses of keypoints are: 2 is later.", within=(0.1, 10.0)
     )
     input_axes: str = setting(
-        "smpl", "Axes of the root: smpl (y up; turned into ROS axes) or frame (those of frame_id).", choices=_AXES
+        "smpl", "Axes of the root: smpl (y up; turned into ROS axes) or frame (those of frame_id).", choices=AXES
     )
     frame_id: str = setting(WORLD_FRAME, "Frame of all that comes out; inputs of other frames are transformed (tf2).")
     transform_tolerance: float = setting(

@@ -14,8 +14,7 @@ import numpy as np
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from msg_adapters import INPUT_TYPES, Encoder, encoder_for, load_motion
-from msg_adapters.axes import WORLD_FRAME
+from msg_adapters import INPUT_TYPES, WORLD_FRAME, Encoder, encoder_for, load_motion
 from refu_core import FrameError, SmplFrame
 from refu_core.options import SettingsError, check, fixed
 from refu_core.recordings import Axes
@@ -23,6 +22,7 @@ from refu_ros._guard import GuardedNode
 from refu_ros._interfaces import interface
 from refu_ros._parameters import declare, listing
 from refu_ros._program import hear, run, spin
+from refu_ros._settings import AXES
 
 TOPIC = "smpl_params"
 
@@ -35,18 +35,10 @@ class PublisherOptions:
         "", "File of motion (docs/guide/inputs.md), .mcap, or rosbag2 directory to play; empty: a march on the spot."
     )
     input_type: str = fixed("multiarray", f"Message to send: {', '.join(INPUT_TYPES)}.")
-    input_axes: str = fixed(
-        "smpl",
-        "Axes that are sent: smpl (y up; files are turned), or frame (as files have them).",
-        choices=("smpl", "frame"),
-    )
+    input_axes: str = fixed("smpl", "Axes that are sent: smpl (y up), or frame (as files have them).", choices=AXES)
     frame_id: str = fixed(WORLD_FRAME, "Frame of messages that have a header.")
     fps: float = fixed(0.0, "Frame rate of a file of motion, in place of its own; 0 for that [Hz].", within=(0.0, 1e4))
-    rate: float = fixed(
-        30.0,
-        "Messages a second, the motion resampled to it; 0 for the rate it was recorded at [Hz].",
-        within=(0.0, 1e4),
-    )
+    rate: float = fixed(30.0, "Messages a second, resampled to that; 0 for the recording's [Hz].", within=(0.0, 1e4))
     loop: bool = fixed(True, "Start again after the last frame, instead of stopping the node.")
     in_place: bool = fixed(False, "Hold the horizontal position of the first frame.")
     persons: tuple[str, ...] = fixed(
