@@ -126,6 +126,8 @@ def strips(n: int, device: torch.device, *, at_least: int = 1) -> tuple[int, Ten
         return n_strips, torch.tensor([each], dtype=torch.int32, device=device)
 
 
+IN_ROW = 32
+"""Items that a thread of a GPU adds up before all threads add to one number, one after another."""
 _MOST_SIZES = 64
 """Sizes of a kernel's arguments that are remembered."""
 
@@ -158,10 +160,7 @@ def _same_stream(stream: torch.cuda.Stream) -> Any:
 
 
 def side_by_side(works: Sequence[Callable[[], Result]], device: torch.device) -> list[Result]:
-    """Does them in order; on a GPU each on a stream of its own, so that they run at the same time as far as they can.
-
-    A single work, or the launches of a small mesh, leave most of a GPU idle.
-    """
+    """Does them in order; on a GPU each on a stream of its own, as the small launches of one leave most of it idle."""
     if device.type != "cuda" or len(works) < 2:
         return [work() for work in works]
     here = torch.cuda.current_stream(device)

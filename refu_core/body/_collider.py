@@ -9,7 +9,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import Repeated, as_warp, is_plain, recorded, refit, strips, torch_stream
+from refu_core._warp import IN_ROW, Repeated, as_warp, is_plain, recorded, refit, strips, torch_stream
 from refu_core.body import _collider_kernels as kernels
 from refu_core.body import _step_kernels as steps
 from refu_core.body._anatomy import DEFAULT_GAP, Anatomy, ColliderSettings
@@ -145,7 +145,7 @@ class Collider:
         one of the two: there two parts may still be in each other, as deep as flesh doesn't give way to.
         """
         numbers = skin.new_zeros(len(skin), 4, dtype=torch.float32)
-        n_strips, each = strips(skin.shape[1], self.device, at_least=32)
+        n_strips, each = strips(skin.shape[1], self.device, at_least=IN_ROW)
         bodies = (one.float().contiguous() for one in (skin, aside, apart))
         self._shift((len(skin), n_strips), *bodies, each, numbers)
         return numbers

@@ -6,13 +6,11 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import Repeated, as_warp, memory, strips
+from refu_core._warp import IN_ROW, Repeated, as_warp, memory, strips
 from refu_core.mesh import Connectivity
 from refu_core.sdf._winding_kernels import CELLS, bin_kernel, crossings_kernel, extent_kernel
 
 _N_CELLS = int(CELLS)
-_IN_ROW = 32
-"""Points that a thread of a GPU puts in one box before all threads put theirs together, one after another."""
 
 
 class Winding:
@@ -66,7 +64,7 @@ class Winding:
             self._box[1].fill_(-torch.inf)
             wanted = self._always if wanted is None else wanted
             listed = wanted, points, self._box, self._first, following, self._farthest_in
-            n_strips, each = strips(n, device, at_least=_IN_ROW)
+            n_strips, each = strips(n, device, at_least=IN_ROW)
             self._bound((n_strips,), wanted, each, points, self._box)
             self._sort((n,), *listed)
             self._cross((self._n_threads,), *listed, winding)
