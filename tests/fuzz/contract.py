@@ -83,6 +83,7 @@ class Contract:
         self.executions = self.refused = 0
         self.slowest_s = self.peak_mb = 0.0
         self._has_timer = threading.current_thread() is threading.main_thread()
+        tempfile.gettempdir()  # tries a folder the first time, with a file that it removes
         sys.addaudithook(self._audit)  # stays as long as the process; it sleeps outside of `hold`
 
     def hold(self, read: Callable[[Any], None], value: Any) -> bool:
