@@ -36,7 +36,7 @@ class Collider:
     """
 
     def __init__(self, body: SmplBody, *, gap: float = DEFAULT_GAP, settings: ColliderSettings | None = None) -> None:
-        """Prepares for a body, on its device, in about a second.
+        """Prepares for a body, on its device, in a tenth of a second.
 
         Raises `MeshError` for a body that isn't a closed, consistently oriented surface.
         """
