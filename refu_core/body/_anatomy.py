@@ -213,9 +213,9 @@ class Anatomy:
             some = vertices[vertices < len(gap)]
             some = some[is_free[some]]
             is_free[some] = False
-            pieces = np.split(some, len(some)) if self.device.type == "cuda" and len(some) else [some]
-            own += pieces
-            bundle += [i] * len(pieces)
+            n_pieces = max(len(some), 1) if self.device.type == "cuda" else 1
+            own += np.split(some, n_pieces)
+            bundle += [i] * n_pieces
         skins = parting.Skins()
         skins.start, skins.vertex = self._ints(np.cumsum([0, *map(len, own)])), self._ints(np.concatenate(own))
         first = self.bundles.first.numpy()

@@ -50,8 +50,8 @@ class ContactSettings:
     strain_limit: float = 1.6
     """How many times their rest length edges may be, unless they were predicted longer, before their ends are drawn
     together. In 116 recorded frames .0016 % of a skirt's edges are twice as long as at rest, and .026 % with a limit of
-    3.2. Some T-shirt's edge is longer in 33 % of frames, which then cost a
-    push more; with a limit of 1.4 in 48 %, with 1.25 in 96 %, for as many crossings and jumps."""
+    3.2. Some edge of a T-shirt is longer in 33 % of frames, which then cost a push more; with a limit of 1.4 in 48 %,
+    with 1.25 in 96 %, for as many crossings and jumps."""
     alike: float = 0.5
     """Cosine from which on two sheets face alike; at a right angle they don't at all. So much does a push off a garment
     below count, and so much is cloth left as it is that faces where skinning turns it: what faces elsewhere has folded

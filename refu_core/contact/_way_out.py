@@ -51,10 +51,10 @@ class WayOut:
         away from `around` (N, 3) [m]. A GPU isn't waited for. Not differentiable.
         """
         winding = self._winding(points).clone()
-        n_inside = (winding != 0).sum(dtype=torch.int32)
+        n_inside = torch.count_nonzero(winding)
         if self._is_serial and not int(n_inside):
             return points, n_inside
-        wanted = n_inside[None]
+        wanted = n_inside[None].int()
         above = self._winding_above(wanted)
         farthest, least = self._settings.max_displacement, self._settings.tolerance
         is_inside = winding != 0

@@ -8,14 +8,13 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cached_property, partial
-from itertools import pairwise
 from queue import Empty, LifoQueue
 
 import torch
 
 from refu_core.errors import RefuError
 from refu_core.frames import SmplFrame
-from refu_core.realtime._frame import FrameStep
+from refu_core.realtime._frame import FrameStep, shares
 from refu_core.realtime._outputs import PipelineOutput
 
 Work = Callable[[FrameStep, Sequence[SmplFrame]], list[PipelineOutput]]
@@ -53,8 +52,7 @@ class Crew:
         with contextlib.suppress(Empty):
             while len(steps) < len(frames) and os.getpid() == self._process:
                 steps.append(self._free.get_nowait())
-        ends = [len(frames) * i // len(steps) for i in range(len(steps) + 1)]
-        own, *others = (frames[start:end] for start, end in pairwise(ends))
+        own, *others = (frames[part] for part in shares(len(frames), len(steps)))
         started = [self._pool.submit(work, *pair) for pair in zip(steps[1:], others, strict=True)]
         try:
             done = work(step, own)

@@ -170,13 +170,17 @@ class FrameStep:
             yield Person(lambda points: points, body.view(-1, 3), skin.view(-1, 3), shift, garments)
 
 
+def shares(n: int, parts: int) -> list[slice]:
+    """A batch of n persons in so many parts, of one size as far as that goes."""
+    return [slice(start, end) for start, end in pairwise(n * i // parts for i in range(parts + 1))]
+
+
 def packed_by(steps: Sequence[FrameStep], inputs: Mapping[str, Tensor], margins: tuple[float, ...]) -> Tensor:
     """`FrameStep.packed` of a batch that several steps share, on a GPU at the same time."""
-    ends = [len(inputs["pose"]) * i // len(steps) for i in range(len(steps) + 1)]
+    parts = shares(len(inputs["pose"]), min(len(steps), len(inputs["pose"])))
     works = [
-        partial(step.packed, {name: tensor[start:end] for name, tensor in inputs.items()}, margins)
-        for step, (start, end) in zip(steps, pairwise(ends), strict=True)
-        if end > start
+        partial(step.packed, {name: tensor[part] for name, tensor in inputs.items()}, margins)
+        for step, part in zip(steps, parts, strict=False)
     ]
     return torch.cat(side_by_side(works, inputs["pose"].device))
 

@@ -81,7 +81,7 @@ class GarmentPipeline:
         self.heeds_past = any(one.backbone.heeds_past for one in outfit.wearables.values())
         """Whether frames should tell their past (`PoseHistory`): with the backbone `dynamic`."""
         self.threads = len(steps)
-        """How many calls may run at the same time."""
+        """How many calls may run at the same time, and on a GPU parts of a batch."""
         self._margin = margin
         self._style = style
         on_gpu = outfit.body.device.type == "cuda"
@@ -196,7 +196,7 @@ class GarmentPipeline:
             for one in outfit.wearables.values():
                 one.template.rest(gamma.new_zeros(1, N_BETAS), gamma)  # says now if it has no styles
         steps = []
-        for k in range(threads):
+        for k in range(threads if torch_device.type == "cpu" or graph else 1):
             own = outfit.beside() if k else outfit
             stage = None
             if mode is not SdfMode.NONE:

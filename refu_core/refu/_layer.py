@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict
-from numbers import Real
+from numbers import Integral, Real
 from typing import Any
 
 import torch
@@ -41,7 +41,7 @@ class Refu(nn.Module):
             MeshError: no vertices, or a margin that is negative or not finite.
         """
         super().__init__()
-        require_type(n_vertices, int, "a number of vertices", error=MeshError)
+        require_type(n_vertices, Integral, "a number of vertices", error=MeshError)
         if n_vertices < 1:
             msg = f"wanted a garment of at least one vertex, got {n_vertices}"
             raise MeshError(msg)
